@@ -320,7 +320,7 @@ def switched_rows(
     As many steps later, beside that of worlds that had its code from the start, at `STEP`.
     """
     (before,) = grown(rule, tasks, checkpoints=(STEP,), seeds=SEEDS, device=device)
-    x, s = (torch.roll(part, -1, dims=0) for part in before)
+    x, s = (torch.roll(part, -1, dims=0) for part in before[:2])
     coded = torch.stack([task.coded(own) for task, own in zip(tasks, s, strict=True)])
     x, s = npa_envs.rollout(
         rule,
@@ -331,7 +331,7 @@ def switched_rows(
         update_prob=tasks[0].update_prob,
         generator=npa_envs.WorldRandom([*SEEDS] * len(tasks), device=device),
     )
-    worlds = zip(tasks, x.split(len(SEEDS)), s.split(len(SEEDS)), *before, strict=True)
+    worlds = zip(tasks, x.split(len(SEEDS)), s.split(len(SEEDS)), *before[:2], strict=True)
     return [
         {
             "target": task.target.name,
@@ -347,7 +347,7 @@ def control_rows(rule: npa_envs.NPARule, config: Any, device: str) -> list[dict[
     task = Morphogenesis2D(config, device=device)
     rows = []
     worlds = grown(rule, [task], seeds=SEEDS, device=device)
-    for step, (x, s) in zip(PICTURE_CHECKPOINTS, worlds, strict=True):
+    for step, (x, s, *_) in zip(PICTURE_CHECKPOINTS, worlds, strict=True):
         loss = task.metric(x[0], s[0]).mean().item()
         ratio = psnr(task.picture(x[0], s[0]), task.target_picture).mean().item()
         rows.append({"step": step, "target": task.target.name, "loss": loss, "psnr": ratio})

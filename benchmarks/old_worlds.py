@@ -17,11 +17,12 @@ from recipe_arms import SEEDS
 from torch import Tensor
 
 from npa_envs.measure.accuracy import endurance as long_runs
-from npa_envs.measure.quality import healing
+from npa_envs.measure.quality import RuleRunner, healing
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
 from npa_envs.training import preset
+from npa_envs.world.particles import Particles, combined
 from npa_envs.world.recorded import release_recordings
 from npa_envs.world.rollout import rollout
 
@@ -92,7 +93,7 @@ def follow(arguments: argparse.Namespace) -> None:
 
 
 def endurance(
-    home: long_runs.TrialWorlds, steps: int, generators: Sequence[torch.Generator]
+    home: long_runs.Habitat, steps: int, generators: Sequence[torch.Generator]
 ) -> dict[str, Any]:
     """Return losses and figures of all worlds of a case, each against itself when settled.
 
@@ -106,19 +107,20 @@ def endurance(
         round(settled * (steps / settled) ** (k / long_runs.MARKS))
         for k in range(long_runs.MARKS + 1)
     ]
-    run = long_runs.LongRun(home, generators[0], home.options())
-    count = len(home.x)
+    runner, energy_runner = (RuleRunner(home.rule, home.task, each) for each in generators)
+    count = len(home.worlds.x)
     first: list[dict[str, float]] = [{} for _ in range(count)]
     largest: list[dict[str, float]] = [{} for _ in range(count)]
     over: dict[int, str] = {}
     losses = {}
-    centroids = home.x.mean(1)
-    for step, x, s in run.marks(marks):
+    centroids = home.worlds.x.mean(1)
+    for step, worlds in runner.at(marks, home.worlds):
+        x, s, *_ = worlds
         losses[step] = home.task.metric(x, s).tolist()
         if step == settled:
             centroids = x.mean(1)
         for k in range(count):
-            found = long_runs.measured(home, x[k : k + 1], s[k : k + 1], generators[1])
+            found = long_runs.measured(energy_runner, Particles(x[k : k + 1], s[k : k + 1]))
             if not found["not_finite"]:
                 first[k] = first[k] or dict(found)
                 found["drift"] = float((x[k].mean(0) - centroids[k]).norm())
@@ -179,8 +181,8 @@ def run_long(arguments: argparse.Namespace) -> None:
             task.seed(1, generator=torch.Generator(device).manual_seed(seed), device=device)
             for seed in SEEDS
         ]
-        x, s = torch.cat([one.x for one in seeds]), torch.cat([one.s for one in seeds])
-        home = long_runs.TrialWorlds(rule, task, x.float(), s.float())
+        worlds = combined(torch.cat, seeds).map(torch.Tensor.float)
+        home = long_runs.Habitat(rule, task, worlds)
         generators = [torch.Generator(device).manual_seed(seed) for seed in (1, 2)]
         line = {"picture": picture} | endurance(home, arguments.steps, generators)
         append_line(arguments.out / "long.jsonl", line)

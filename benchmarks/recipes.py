@@ -148,13 +148,11 @@ def strip(trainer: Trainer, steps: Sequence[int]) -> np.ndarray[Any, Any]:
     task: Any = trainer.task
     rule = trainer.saved_rule
     device = torch.device(trainer.config.device)
-    runner = RuleRunner(rule, task, device, SEEDS[0], None)
-    x, s, *_ = task.seed(1, generator=torch.Generator(device).manual_seed(SEEDS[0]), device=device)
-    frames, before = [task.target_picture[None]], 0
-    for step in steps:
-        x, s = runner.run(x, s, step - before)
-        frames.append(task.picture(x, s))
-        before = step
+    runner = RuleRunner(rule, task.for_rule(rule), torch.Generator(device).manual_seed(SEEDS[0]))
+    generator = torch.Generator(device).manual_seed(SEEDS[0])
+    seed = task.seed(1, generator=generator, device=device)
+    worlds = [now for _, now in runner.at(steps, seed)]
+    frames = [task.target_picture[None], *(task.picture(now.x, now.s) for now in worlds)]
     picture = to_uint8(torch.cat([frame.cpu() for frame in frames]))
     side = max(1, picture.shape[1] // 128)
     return np.concatenate(list(picture[:, ::side, ::side]), axis=1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import importlib
 import io
 import os
@@ -46,6 +47,15 @@ USAGE_ERROR = 2
 INTERRUPTED = 130
 
 
+HINTS = {
+    errno.ENOSPC: ": free some space, or choose another disk",
+    errno.EDQUOT: ": free some space, or choose another disk",
+    errno.EACCES: ": choose another folder (that of compiled kernels is WARP_CACHE_PATH)",
+    errno.EPERM: ": choose another folder (that of compiled kernels is WARP_CACHE_PATH)",
+}
+"""What to do about errors of the system, by their numbers."""
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line, by default the process's arguments, and return the exit code.
 
@@ -74,11 +84,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     except OSError as error:
         where = f" {error.filename!r}" if error.filename else ""
-        print(
-            f"npa-envs: error: {error.strerror or error}{where}: make room or choose another "
-            "folder (that of compiled kernels is WARP_CACHE_PATH)",
-            file=sys.stderr,
-        )
+        hint = HINTS.get(error.errno or 0, "")
+        print(f"npa-envs: error: {error.strerror or error}{where}{hint}", file=sys.stderr)
         return USAGE_ERROR
 
 

@@ -6,7 +6,7 @@ import argparse
 import contextlib
 import inspect
 import json
-import re
+import math
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 OptionsT = TypeVar("OptionsT")
 
-_EXAMPLES = """
+EXAMPLES = """\
 bench --quick
 bench --suite scaling --out results --plots
 compare --quick --out quick
@@ -71,18 +71,16 @@ train texture --target wall.png --loss filter_swd
 train point_classification --out runs/digits
 train point_classification --preset paper --data mnist --device cuda
 """
+"""Examples that the help of each command shows, a line each."""
 
-EXAMPLES: dict[str, list[str]] = {}
-"""Examples that the help of each command shows."""
 
-for _line in _EXAMPLES.split("\n")[1:-1]:
-    _command = re.match(r"train \w+|[\w-]+", _line)
-    assert _command is not None, "every example begins with a command"
-    EXAMPLES.setdefault(_command[0], []).append(_line)
+def examples_of(command: str) -> list[str]:
+    """Return the examples of a command."""
+    return [line for line in EXAMPLES.splitlines() if f"{line} ".startswith(f"{command} ")]
 
 
 def parse_options(
-    kind: type[OptionsT],
+    cls: type[OptionsT],
     command: str,
     arguments: Sequence[str],
     *,
@@ -94,15 +92,15 @@ def parse_options(
     Ends the process after `--help`, and with code 2 for a wrong argument. The help begins with
     `description` or the dataclass's docstring.
     """
-    shown = "\n".join(f"  npa-envs {example}" for example in EXAMPLES.get(command, [command]))
-    given: dict[str, Any] = {} if default is None else {"default": default}
+    shown = "\n".join(f"  npa-envs {example}" for example in examples_of(command) or [command])
+    kwargs: dict[str, Any] = {} if default is None else {"default": default}
     options: OptionsT = tyro.cli(
-        kind,
+        cls,
         prog=f"npa-envs {command}",
-        description=f"{description or inspect.getdoc(kind)}\n\nExamples:\n{shown}",
+        description=f"{description or inspect.getdoc(cls)}\n\nExamples:\n{shown}",
         args=arguments,
         config=(tyro.conf.OmitArgPrefixes, tyro.conf.DisallowNone, tyro.conf.SuppressFixed),
-        **given,
+        **kwargs,
     )
     return options
 
@@ -162,21 +160,21 @@ def named_rules(arguments: Iterable[str]) -> dict[str, str]:
     from npa_envs.web.rule_world import name_of
 
     arguments = list(arguments)
-    own = [*shipped_rules(), *(name for name in preset_rules() if name not in shipped_rules())]
+    known = list(dict.fromkeys([*shipped_rules(), *preset_rules()]))
     files = [
-        w for w in arguments if w not in own and (w.endswith(".safetensors") or Path(w).is_dir())
+        w for w in arguments if w not in known and (w.endswith(".safetensors") or Path(w).is_dir())
     ]
-    named = [word for word in arguments if word not in files]
-    found = {name: name for name in (chosen_names("rule", named, own) if named else ())}
+    names = [word for word in arguments if word not in files]
+    sources = {name: name for name in (chosen_names("rule", names, known) if names else ())}
     for source in files:
         name = name_of(source)
-        if found.setdefault(name, source) != source:
+        if sources.setdefault(name, source) != source:
             raise NPAError(
-                f"rules must have names of their own, but {found[name]!r} and {source!r} are both "
-                f"called {name!r}: rename a file or folder, or measure them one by one, each with "
-                "its own --out"
+                f"rules must have names of their own, but {sources[name]!r} and {source!r} are "
+                f"both called {name!r}: rename a file or folder, or measure them one by one, each "
+                "with its own --out"
             )
-    return found
+    return sources
 
 
 def duration(seconds: float) -> str:
@@ -208,6 +206,17 @@ def writable_folder(path: Path, name: str = "out") -> Path:
 
 
 @dataclass(frozen=True, kw_only=True)
+class PartOptions:
+    """Options of commands that distribute runs over devices and machines."""
+
+    part: Annotated[str | None, tyro.conf.arg(metavar="K/N")] = None
+    """Run only the K-th of N parts: several machines, or tasks of a scheduler's array, run one part
+    each, all with the same --out on a shared disk."""
+    max_seconds: float = math.inf
+    """No run starts after this time [s]; the next call continues."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class MeasureOptions(RunOptions):
     """Options of the commands that measure and keep records."""
 
@@ -230,45 +239,55 @@ def check_numbers(options: Any, **least: int) -> None:
 
 def named_values(name: str, arguments: Iterable[str]) -> dict[str, Any]:
     """Parse arguments NAME=VALUE of an option; values are JSON or plain text."""
-    found: dict[str, Any] = {}
+    values: dict[str, Any] = {}
     for word in arguments:
         key, mark, value = word.partition("=")
         if not mark:
             raise NPAError(f"{name} must be NAME=VALUE, got {word!r}: target=heart")
         try:
-            found[key] = json.loads(value)
+            values[key] = json.loads(value)
         except ValueError:
-            found[key] = value
-    return found
+            values[key] = value
+    return values
 
 
-def resolve_resume(arguments: Sequence[str], out_of: Callable[[Sequence[str]], Path]) -> list[str]:
-    """Return arguments in which `--resume auto` is replaced by `--resume` or nothing.
-
-    `out_of` returns the folder of the run, in which a checkpoint is looked for.
-    """
+def first_options(arguments: Sequence[str]) -> argparse.Namespace:
+    """Return the options of a run that decide the defaults of others, before all are parsed."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    for name in ("preset", "device", "gpus"):
+        parser.add_argument(f"--{name}")
+    for name in ("config", "out"):
+        parser.add_argument(f"--{name}", type=Path)
     parser.add_argument("--resume", nargs="?", const=True, choices=("auto",))
     parser.add_argument("--overwrite", action="store_true")
     try:
-        first, _ = parser.parse_known_args(arguments)
+        return parser.parse_known_args(arguments)[0]
     except argparse.ArgumentError as error:
         raise NPAError(f"{error.argument_name}: {error.message}") from error
-    chosen = list(arguments)
-    if first.resume is None:
-        return chosen
-    from npa_envs.training.run import RunFolder, check_choice
 
-    check_choice(resume=True, overwrite=first.overwrite)
-    if first.resume == "auto":
-        if "--resume=auto" in chosen:
-            chosen.remove("--resume=auto")
-        else:
-            index = chosen.index("--resume")
-            del chosen[index : index + 2]
-        if RunFolder(out_of(chosen)).checkpoint.exists():
-            chosen.append("--resume")
-    return chosen
+
+def resolve_run(arguments: Sequence[str], out_of: Callable[[Sequence[str]], Path]) -> list[str]:
+    """Return arguments with the device of `--gpus`, and `--resume` or nothing for `--resume auto`.
+
+    `out_of` returns the folder of the run, in which a checkpoint is looked for.
+    """
+    first = first_options(arguments)
+    resolved = list(arguments)
+    if first.gpus is not None and first.device is None:
+        resolved += ["--device", "cuda"]
+    if first.resume is not None:
+        from npa_envs.training.run import RunFolder, check_choice
+
+        check_choice(resume=True, overwrite=first.overwrite)
+        if first.resume == "auto":
+            if "--resume=auto" in resolved:
+                resolved.remove("--resume=auto")
+            else:
+                index = resolved.index("--resume")
+                del resolved[index : index + 2]
+            if RunFolder(out_of(resolved)).checkpoint.exists():
+                resolved.append("--resume")
+    return resolved
 
 
 def chosen_names(kind: str, names: Sequence[str], known: Iterable[str]) -> list[str]:
@@ -297,12 +316,10 @@ class StepBar:
     """A progress bar, as a context manager."""
 
     def __init__(self, total: int | None, *, show: bool, unit: str = "step") -> None:
-        self.done = 0
         self._bar = tqdm(total=total, disable=not show, unit=unit)
 
     def advance(self, steps: int) -> None:
         """Count steps done since the last call."""
-        self.done += steps
         self._bar.update(steps)
 
     def __enter__(self) -> StepBar:

@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from npa_envs.agents.comparison.plan import Axis, ComparisonPlan
     from npa_envs.agents.comparison.run import RunRecord
 
-RUN_FAILED = 1
-
 ROWS = "rows"
 """Folder of a suite's rows in that of the comparison."""
 
@@ -41,7 +39,7 @@ QUICK: dict[str, Any] = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class CompareOptions(common.MeasureOptions):
+class CompareOptions(common.PartOptions, common.MeasureOptions):
     """Compare methods on tasks over seeds, for equal wall time, equal particle-steps, or both.
 
     Each run learns in its own process. A failed run is recorded with its error, and the others
@@ -80,11 +78,6 @@ class CompareOptions(common.MeasureOptions):
     jobs: int | None = None
     """Runs at the same time; default: one for each device. With --seconds each device must have the
     same number, as runs on one device share its time."""
-    part: Annotated[str | None, tyro.conf.arg(metavar="K/N")] = None
-    """Run only the K-th of N parts: several machines, or tasks of a scheduler's array, run one part
-    each, all with the same --out on a shared disk."""
-    max_seconds: float = math.inf
-    """No run starts after this time [s]; the next call continues."""
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -137,7 +130,7 @@ def main(arguments: Sequence[str]) -> int:
     left = sum(job not in records for job in mine)
     lines += [f"{left} runs are left: call again with the same options"] if left else []
     print("\n".join(lines))
-    return RUN_FAILED if failed else 0
+    return 1 if failed else 0
 
 
 def make_plan(options: CompareOptions) -> ComparisonPlan:
@@ -207,21 +200,17 @@ def make_plan(options: CompareOptions) -> ComparisonPlan:
 
 
 def _budgets(options: CompareOptions) -> dict[Axis, float]:
-    steps = options.particle_steps
-    if options.quick and steps is None and options.seconds is None:
+    seconds, steps = options.seconds, options.particle_steps
+    if options.quick and steps is None and seconds is None:
         steps = QUICK_STEPS
-    budgets: dict[Axis, float] = {}
-    if options.seconds is not None:
-        budgets["seconds"] = options.seconds
-    if steps is not None:
-        budgets["particle-steps"] = steps
+    given: dict[Axis, float | None] = {"seconds": seconds, "particle-steps": steps}
+    budgets = {axis: value for axis, value in given.items() if value is not None}
     if not budgets:
         raise NPAError(
             "a comparison needs a budget: give --seconds 60, --particle-steps 1e8 or both"
         )
     for axis, value in budgets.items():
-        least = 1.0 if axis == "particle-steps" else 0.0
-        if not (value > 0.0 and value >= least and math.isfinite(value)):
+        if not (0.0 < value < math.inf and (axis == "seconds" or value >= 1.0)):
             raise NPAError(f"{axis} must be positive and finite, got {value}: try 60 or 1e8")
     return budgets
 

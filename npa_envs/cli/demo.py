@@ -74,8 +74,8 @@ def grow_and_heal(options: DemoOptions, device: torch.device) -> Iterator[str]:
     """Grow the rule, damage it twice, write a film of it, and yield the figures."""
     import torch
 
-    from npa_envs.cli.film import WorldFilm, film_world, write_film
     from npa_envs.measure.quality import measure
+    from npa_envs.render.world_film import WorldFilm, film_world
     from npa_envs.rule.files import load_rule
     from npa_envs.tasks.damage import DamageEvent
     from npa_envs.training.task_of_rule import task_of_rule
@@ -83,32 +83,32 @@ def grow_and_heal(options: DemoOptions, device: torch.device) -> Iterator[str]:
     rule = load_rule(options.rule, device=device).float()
     trained = task_of_rule(options.rule, rule, device)
     generator = torch.Generator(device).manual_seed(options.seed)
-    x, s, _, goal = trained.task.seed(1, generator=generator, device=device)
-    task = trained.task.toward(goal)
-    yield f"{options.rule}: {x.shape[1]} particles, {rule.weight_count} weights"
+    worlds = trained.task.seed(1, generator=generator, device=device)
+    task = trained.task.toward(worlds.goal)
+    yield f"{options.rule}: {worlds.x.shape[1]} particles, {rule.weight_count} weights"
     figures, film, step = [], WorldFilm(), 0
     with common.StepBar(GROW_STEPS + 2 * HEAL_STEPS, show=options.progress) as bar:
         for kind, steps in ((None, GROW_STEPS), ("cut", HEAL_STEPS), ("wipe", HEAL_STEPS)):
             damages = [] if kind is None else [DamageEvent(step, kind)]
-            x, s, film = film_world(
-                rule, task, x, s, steps, generator=generator, damages=damages, every=FRAME_STEPS,
+            worlds, film = film_world(
+                rule, task, worlds, steps, generator=generator, damages=damages, every=FRAME_STEPS,
                 first_step=step, film=film, progress=bar.advance,
             )  # fmt: skip
             step += steps
             text = "grown" if kind is None else f"healed after {damages[0].text}"
-            found = trained.doubt or measure(task, x, s, step).figures
-            figures.append(f"  {text} for {steps} steps: {found}")
+            result = trained.doubt or measure(task, worlds.x, worlds.s, step).figures
+            figures.append(f"  {text} for {steps} steps: {result}")
     yield from figures
     name = Path(options.rule.rpartition("#")[2]).stem
-    yield from (f"  wrote {path}" for path in write_film(film, options.out, name))
+    yield from (f"  wrote {path}" for path in film.write(options.out, name))
 
 
 def train_small(options: DemoOptions, device: torch.device) -> Iterator[str]:
     """Train a small rule from a picture, write a film of it, and yield the figures."""
     import torch
 
-    from npa_envs.cli.film import film_world, write_film
     from npa_envs.measure.quality import measure
+    from npa_envs.render.world_film import film_world
     from npa_envs.tasks.morphogenesis2d import HALF_SEEDS
     from npa_envs.training import RunFolder, override, preset, task_entry, train
 
@@ -139,9 +139,9 @@ def train_small(options: DemoOptions, device: torch.device) -> Iterator[str]:
     # Figures and film have more pixels than the loss.
     task = task_entry(task_name).make(override(config, resolution=192).task, device)
     generator = torch.Generator(device).manual_seed(options.seed + 1)
-    x, s, *_ = task.seed(1, generator=generator, device=device)
+    worlds = task.seed(1, generator=generator, device=device)
     steps = 4 * config.steps[1]
-    x, s, film = film_world(result.rule, task, x, s, steps, generator=generator, every=1)
-    yield f"  grown for {steps} steps: {measure(task, x, s, steps).figures}"
-    paths = write_film(film, options.out, f"trained-{Path(options.target).stem}")
+    worlds, film = film_world(result.rule, task, worlds, steps, generator=generator, every=1)
+    yield f"  grown for {steps} steps: {measure(task, worlds.x, worlds.s, steps).figures}"
+    paths = film.write(options.out, f"trained-{Path(options.target).stem}")
     yield from (f"  wrote {path}" for path in (*paths, RunFolder(result.folder).rule))

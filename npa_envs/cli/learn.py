@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from npa_envs.cli import common
-from npa_envs.cli.launch import asked_count, launch, print_once, with_device_of_gpus
 from npa_envs.errors import NPAError
 
 if TYPE_CHECKING:
@@ -70,19 +69,18 @@ class LearnOptions(common.RunOptions):
 
 def main(arguments: Sequence[str]) -> int:
     """Learn; return 130 if it was stopped."""
+    from npa_envs.training.launch import launch, print_once, requested_processes
     from npa_envs.training.ranks import joined_ranks
 
     with joined_ranks() as ranks:
-        asked = None
+        request = None
         if ranks.first:
-            resolved = common.resolve_resume(
-                with_device_of_gpus(arguments), lambda given: parse(given).out
-            )
-            asked = resolved, parse(resolved)
-        asked = ranks.broadcast(asked)
-        assert asked is not None, "broadcast by the first process"
-        resolved, options = asked
-        count = asked_count(options.gpus, options.processes, options.device) or 1
+            resolved = common.resolve_run(arguments, lambda words: parse(words).out)
+            request = resolved, parse(resolved)
+        request = ranks.broadcast(request)
+        assert request is not None, "broadcast by the first process"
+        resolved, options = request
+        count = requested_processes(options.gpus, options.processes, options.device) or 1
         if count > 1 and not ranks.together:
             return launch(count, ("learn", *resolved), options.out, options.device)
         with print_once(ranks):

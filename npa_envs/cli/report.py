@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 
 from npa_envs.cli import common
-from npa_envs.cli.film import film_world, frame_steps, large_task, write_film, write_solid
 from npa_envs.errors import MissingDependencyError
 from npa_envs.files import write_text
 from npa_envs.measure.judge import TextureJudge
@@ -33,10 +32,11 @@ from npa_envs.measure.record import (
     tables_json,
     versions,
 )
+from npa_envs.render.world_film import SCREEN, film_world, write_3d_world
 from npa_envs.rule.files import load_rule
 from npa_envs.tasks.damage import DamageEvent
 from npa_envs.tasks.texture import Texture
-from npa_envs.training.task_of_rule import task_of_rule, tasks_of_codes
+from npa_envs.training.task_of_rule import task_for_film, task_of_rule, tasks_of_codes
 
 if TYPE_CHECKING:
     from npa_envs.rule.rule import NPARule
@@ -100,23 +100,21 @@ def write_report(
             judge=judge,
         )
         generator = torch.Generator(device).manual_seed(FIRST_SEED)
-        x, s, *_ = task.seed(1, generator=generator, device=device)
-        shown = large_task(task, str(path), rule, device)
-        x, s, film = film_world(
+        worlds = task.seed(1, generator=generator, device=device)
+        film_task = task_for_film(task, str(path), rule, device, least=SCREEN)
+        worlds, film = film_world(
             rule,
-            shown,
-            x,
-            s,
+            film_task,
+            worlds,
             FILM_STEPS,
             generator=generator,
             damages=FILM_DAMAGES if task.aligned else (),
-            every=frame_steps(FILM_STEPS),
             progress=bar.advance,
         )
         try:
             if task.has_views:
-                write_solid(task, x, s, folder)
-            write_film(film, folder, path.stem)
+                write_3d_world(task, worlds, folder, drawn_by=task)
+            film.write(folder, path.stem)
         except MissingDependencyError as error:
             not_filmed = f"; not all films: {error}"
     if len(tasks := tasks_of_codes(str(path), rule, device)) > 1:

@@ -86,8 +86,8 @@ def main(arguments: Sequence[str]) -> int:
                 task = task_name(sources[name])
                 plan = quick_plan(task) if options.quick else PLANS[task]
                 small = QUICK_PARTICLES if options.quick else None
-                ground = RuleTrial(sources[name], device, plan, seeds, small)
-                study.measure_rule(record, ground, most, enough=enough)
+                trial = RuleTrial(sources[name], device, plan, seeds, small)
+                study.measure_rule(record, trial, most, enough=enough)
             bar.advance(1)
     done = [record for record in records.values() if record.done]
     lines = []

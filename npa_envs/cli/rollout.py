@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, cast
+from typing import Annotated, Literal, cast
 
 import tyro
 
@@ -61,13 +61,13 @@ def main(arguments: Sequence[str]) -> int:
     options = common.parse_options(RolloutCommand, "rollout", arguments)
     import torch
 
-    from npa_envs.cli import film
     from npa_envs.measure.quality import measure
+    from npa_envs.render.world_film import SCREEN, WorldFilm, film_world, write_3d_world
     from npa_envs.rule.files import load_rule
     from npa_envs.tasks.damage import parse_damage
     from npa_envs.tasks.point_classification import PointClassification, majority
     from npa_envs.training.run import stop_flag
-    from npa_envs.training.task_of_rule import task_of_rule
+    from npa_envs.training.task_of_rule import task_for_film, task_of_rule
 
     device = options.checked_device()
     damages = [parse_damage(text) for texts in options.damage for text in texts]
@@ -81,46 +81,48 @@ def main(arguments: Sequence[str]) -> int:
     trained = task_of_rule(options.rule, rule, device, **options.world)
     # The film has the size and style of the options; figures are those of the trained task.
     task = trained.task
-    looks: dict[str, Any] = {"resolution": options.resolution, "style": options.style}
-    shown = film.large_task(task, options.rule, rule, device, **looks, **options.world)
+    points = options.style == "points"
+    film_task = task_for_film(
+        task, options.rule, rule, device,
+        least=SCREEN, resolution=options.resolution, points=points, **options.world,
+    )  # fmt: skip
     folder = common.writable_folder(options.out)
     generator = torch.Generator(device).manual_seed(options.seed)
-    x, s, _, goal = task.seed(1, generator=generator, device=device)
+    worlds = task.seed(1, generator=generator, device=device)
+    goal = worlds.goal
     task = task.toward(goal)
     with stop_flag() as stop, common.StepBar(options.steps, show=options.progress) as bar:
-        x, s, filmed = film.film_world(
+        worlds, film = film_world(
             rule,
-            shown,
-            x,
-            s,
+            film_task,
+            worlds,
             options.steps,
             generator=generator,
             damages=damages,
-            every=options.every or film.frame_steps(options.steps),
-            film=film.WorldFilm(background=options.background),
+            every=options.every,
+            film=WorldFilm(background=options.background),
             progress=bar.advance,
             stop=stop.is_set,
         )
-    done = bar.done
+    done = max(film.steps.values())
     if done < options.steps:
         print(f"stopped at step {done} of {options.steps}; the film goes that far")
     if trained.doubt is not None:
         print(f"no figures for {options.rule}: {trained.doubt}; give --target")
     else:
-        row = measure(task, x, s, done)
+        row = measure(task, worlds.x, worlds.s, done)
         print(f"step {done}: {row.figures}, extent {row.extent:.3f}")
     if task.classifies and goal is not None:
-        vote = int(majority(cast(PointClassification, task).outputs(s)))
+        vote = int(majority(cast(PointClassification, task).outputs(worlds.s)))
         print(f"most particles say {vote}; the cloud is a {int(goal)}")
-    paths = film.write_film(filmed, folder, "growth", fps=options.fps)
+    paths = film.write(folder, "growth", fps=options.fps)
     if task.has_views:
-        paths += film.write_solid(
+        paths += write_3d_world(
             task,
-            x,
-            s,
+            worlds,
             folder,
-            shown=shown,
-            resolution=options.resolution or film.SCREEN,
+            drawn_by=film_task,
+            resolution=options.resolution or SCREEN,
             background=options.background,
         )
     for path in paths:

@@ -53,7 +53,7 @@ def main(arguments: Sequence[str]) -> int:
     chosen = suite.chosen_checks(checks, options.only)
     if options.list:
         for group, summary in suite.GROUPS.items():
-            some = [check for check in chosen if suite.group_of(check.name) == group]
+            some = [check for check in chosen if check.group == group]
             if some:
                 print(f"{group}: {summary}")
                 print("\n".join(f"  {check.name}: {check.expected}" for check in some))

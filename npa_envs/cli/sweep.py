@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import math
 import os
 import subprocess
 import sys
@@ -35,7 +34,7 @@ SHOWN = 300
 
 
 @dataclass(frozen=True, kw_only=True)
-class SweepOptions:
+class SweepOptions(common.PartOptions):
     """Train with every combination of some options, each run in its own process.
 
     The arguments after `--` are those of `npa-envs train`, the same for all runs. A stopped sweep
@@ -54,11 +53,6 @@ class SweepOptions:
     """Runs at the same time; default: one for each device."""
     threads: int = 1
     """CPU threads of each run."""
-    part: Annotated[str | None, tyro.conf.arg(metavar="K/N")] = None
-    """Run only the K-th of N parts: several machines, or tasks of a scheduler's array, run one part
-    each, all with the same --out on a shared disk."""
-    max_seconds: float = math.inf
-    """No run starts after this time [s]; the next call continues."""
     progress: bool = True
     """Show a progress bar."""
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import importlib.util
 import math
 import shlex
@@ -16,7 +15,6 @@ import torch.distributed as dist
 import tyro
 
 from npa_envs.cli import INTERRUPTED, common
-from npa_envs.cli.launch import asked_count, launch, print_once, with_device_of_gpus
 from npa_envs.cli.report import Training, write_report
 from npa_envs.errors import NPAError, shown
 from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2DConfig
@@ -35,6 +33,7 @@ from npa_envs.training import (
     train,
 )
 from npa_envs.training.checkpoint import check_task, drawn_by_world, load_checkpoint
+from npa_envs.training.launch import launch, print_once, requested_processes
 from npa_envs.training.ranks import Ranks, joined_ranks
 
 VIEWER = ("starlette", "uvicorn")
@@ -92,35 +91,38 @@ class TrainOptions:
 
 def resolve_task(task_name: str, arguments: Sequence[str]) -> list[str]:
     """Return the arguments with `--resume auto` replaced, and with the device of `--gpus`."""
+    return common.resolve_run(arguments, lambda words: parse_run(task_name, words)[1].out)
 
-    def out_of(given: Sequence[str]) -> Path:
-        return parse(task_name, starting_configuration(task_name, given), given)[1].out
 
-    return common.resolve_resume(with_device_of_gpus(arguments), out_of)
+def parse_run(task_name: str, arguments: Sequence[str]) -> tuple[TrainOptions, TrainConfig[Any]]:
+    """Return the launch options and the configuration of a command line."""
+    return parse(task_name, starting_configuration(task_name, arguments), arguments)
 
 
 def _check_preset(
     name: str, run: TrainConfig[Any], task_name: str, folder: RunFolder, arguments: Sequence[str]
 ) -> None:
     """Check that a resumed run was started with the preset of the arguments."""
-    names = task_entry(task_name).presets
-    flat = {preset_name: _fields_of(preset(preset_name, task_name)) for preset_name in names}
-    wanted, found = flat[name], _fields_of(run)
-    given = {word.partition("=")[0].lstrip("-").replace("-", "_") for word in arguments}
-    given |= {word.removeprefix("no_") for word in given} | {"out", "device"}
+    presets = {
+        preset_name: _fields_of(preset(preset_name, task_name))
+        for preset_name in task_entry(task_name).presets
+    }
+    values = _fields_of(run)
+    changed = {word.partition("=")[0].lstrip("-").replace("-", "_") for word in arguments}
+    changed |= {word.removeprefix("no_") for word in changed} | {"out", "device"}
     others = [
-        field
-        for field, value in wanted.items()
-        if field not in given
-        and found.get(field) != value
-        and any(other.get(field) != value for other in flat.values())
+        f"{field}: {shown(values.get(field))}"
+        for field, value in presets[name].items()
+        if field not in changed
+        and values.get(field) != value
+        and any(fields.get(field) != value for fields in presets.values())
     ]
     if others:
-        shown_fields = ", ".join(f"{field}: {shown(found.get(field))}" for field in others[:3])
         more = f" and {len(others) - 3} more" if len(others) > 3 else ""
         raise NPAError(
             f"preset must be the one that the run in {shown(str(folder.path))} was begun with, "
-            f"but {name!r} differs from it ({shown_fields}{more} there): leave --preset out"
+            f"but {name!r} differs from it ({', '.join(others[:3])}{more} there): leave --preset "
+            "out"
         )
 
 
@@ -131,18 +133,8 @@ def _fields_of(config: TrainConfig[Any]) -> dict[str, Any]:
 
 def starting_configuration(task_name: str, arguments: Sequence[str]) -> TrainConfig[Any]:
     """Return the configuration that the options change: that of the preset, file or resumed run."""
-    # Parsed first, as these options decide the defaults of the others.
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
-    parser.add_argument("--preset")
-    parser.add_argument("--config", type=Path)
-    parser.add_argument("--device", default="cpu")
-    parser.add_argument("--resume", action="store_true")
-    parser.add_argument("--out", type=Path)
-    try:
-        first, _ = parser.parse_known_args(arguments)
-    except argparse.ArgumentError as error:
-        raise NPAError(f"{error.argument_name}: {error.message}") from error
-    device = first.device if first.config is None else "cpu"
+    first = common.first_options(arguments)
+    device = first.device if first.device and first.config is None else "cpu"
     base = preset(first.preset or default_preset(task_name, device), task_name)
     if first.resume and not {"-h", "--help", "--help-all"} & set(arguments):
         folder = RunFolder(first.out or base.out)
@@ -318,22 +310,22 @@ def main(arguments: Sequence[str]) -> int:
     task_name = arguments[0]
     task_entry(task_name)
     with joined_ranks() as ranks:
-        asked = None
+        request = None
         if ranks.first:
-            given = resolve_task(task_name, arguments[1:])
-            asked = given, *parse(task_name, starting_configuration(task_name, given), given)
+            resolved = resolve_task(task_name, arguments[1:])
+            request = resolved, *parse_run(task_name, resolved)
         # Only the first process reads files, so that all have the same configuration.
-        asked = ranks.broadcast(asked)
-        assert asked is not None, "broadcast by the first process"
-        given, options, config = asked
+        request = ranks.broadcast(request)
+        assert request is not None, "broadcast by the first process"
+        resolved, options, config = request
         count = process_count(task_name, options, config)
         if count > 1 and not ranks.together:
-            command = ["train", task_name, *given]
+            command = ["train", task_name, *resolved]
             if options.processes is None and options.gpus is None:
                 command += ["--processes", str(count)]
             return launch(count, command, config.out, config.device)
         with print_once(ranks):
-            return run(task_name, options, config, (task_name, *given), ranks)
+            return run(task_name, options, config, (task_name, *resolved), ranks)
 
 
 def run(
@@ -432,9 +424,9 @@ def process_count(task_name: str, options: TrainOptions, config: TrainConfig[Any
     1 for runs of less than a minute, in which the start of the second process takes too long, and
     for resumed runs of one process, which draw other random numbers than two.
     """
-    asked = asked_count(options.gpus, options.processes, config.device)
-    if asked is not None:
-        return asked
+    count = requested_processes(options.gpus, options.processes, config.device)
+    if count is not None:
+        return count
     seconds = task_entry(task_name).expected_seconds(config)
     idle = thread_count(config) < torch.get_num_threads() and dist.is_available()
     if not idle or seconds is None or seconds < 60.0:

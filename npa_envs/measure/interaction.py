@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -24,6 +24,8 @@ from npa_envs.ops import species_fields
 from npa_envs.render import draw_worlds
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Task
+from npa_envs.world.divergence import divergence
+from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import StreamId, WorldRandom
 from npa_envs.world.species import rollout_species
 
@@ -38,50 +40,45 @@ MIXED = 0.25
 class InteractionSettings:
     """Settings of an interaction measurement."""
 
-    particle_count: int
-    """Particles of a world with two species, N."""
+    seed_count: int = 8
+    """Worlds of each pair, each from its own seed."""
+    first_seed: int = 1_000_000
+    """The first world's seed; training uses others."""
     distances: tuple[float, ...] = (0.0, 0.5, 1.0)
     """Distances between the centres of the two seeds [length units]."""
     ratios: tuple[float, ...] = (0.5,)
-    """Fractions of the particles that belong to the measured species, in (0, 1)."""
+    """Fractions of the particles that are the measured rule's."""
     eps_factors: tuple[float, ...] = (1.0,)
-    """Factors on the rules' perception radius (dimensionless)."""
+    """Perception radii as multiples of the rules' own."""
     steps: int = 512
     """Steps from the seeds."""
-    seeds: tuple[int, ...] = tuple(range(8))
-    """Seeds of the worlds, one each; the same seeds give the same table."""
+    particle_count: int | None = None
+    """Particles of both together; default: the most that one of the rules was trained with."""
     update_prob: float | None = None
-    """Probability of each particle's update in a step; None: as each species was trained."""
+    """Probability of each particle's update in a step; default: of each rule as trained."""
     margin: float = MARGIN
-    """Least fraction by which a loss must change to count as changed, in (0, 1)."""
+    """Fraction by which a loss must change to count as changed."""
 
     def __post_init__(self) -> None:
         """Check every field; raises NPAError."""
-        for name, count, least in (
-            ("particle_count", self.particle_count, 2),
-            ("steps", self.steps, 1),
-            ("seed count", len(self.seeds), 1),
-        ):
-            if count < least:
+        for name, least in (("particle_count", 2), ("steps", 1), ("seed_count", 1)):
+            count = getattr(self, name)
+            if count is not None and count < least:
                 raise NPAError(f"{name} must be at least {least}, got {count}")
-        if not self.distances or not all(0.0 <= d < math.inf for d in self.distances):
+        for name in ("distances", "eps_factors"):
+            if not all(0.0 <= value < math.inf for value in getattr(self, name)):
+                raise NPAError(f"{name} must be finite and not negative, got {getattr(self, name)}")
+        if not all(0.0 < value < 1.0 for value in (*self.ratios, self.margin)):
             raise NPAError(
-                f"distances must be finite and not negative, got {self.distances}: try 0 0.5 1"
+                f"ratios and margin must lie in (0, 1), got {self.ratios} and {self.margin}"
             )
-        if not self.eps_factors or not all(0.0 < f < math.inf for f in self.eps_factors):
-            raise NPAError(
-                f"eps_factors must be finite and above 0, got {self.eps_factors}: try 0.7 1 1.4"
-            )
-        for name, shares in (("ratios", self.ratios), ("margin", (self.margin,))):
-            if not shares or not all(0.0 < share < 1.0 for share in shares):
-                raise NPAError(f"{name} must lie in (0, 1), got {shares}")
-        if self.update_prob is not None and not 0.0 < self.update_prob <= 1.0:
-            raise NPAError(f"update_prob must lie in (0, 1], got {self.update_prob}")
+        if not (self.distances and self.eps_factors and self.ratios):
+            raise NPAError("distances, eps_factors and ratios must have a value each")
 
-    def counts(self, ratio: float) -> tuple[int, int]:
-        """Return the numbers of particles of the measured species and of the other one."""
-        own = min(max(round(ratio * self.particle_count), 1), self.particle_count - 1)
-        return own, self.particle_count - own
+    @property
+    def seeds(self) -> tuple[int, ...]:
+        """Seeds of the worlds; the same seeds give the same table."""
+        return tuple(range(self.first_seed, self.first_seed + self.seed_count))
 
 
 @dataclass(frozen=True)
@@ -156,35 +153,16 @@ def mixing_index(x: Tensor, counts: Sequence[int], *, eps: float) -> Tensor:
 PROGRESS_STEPS = 32
 """Steps between two reports of progress."""
 
-FRAME_SHARES = (0.0, 0.125, 0.25, 0.5, 1.0)
+FRAME_TIMES = (0.0, 0.125, 0.25, 0.5, 1.0)
 """Times of pictures, as fractions of the run."""
 
 
-@dataclass(frozen=True)
-class RuleUnderTest:
-    """A trained rule that grows in 2D; `task_of` makes its task for a number of particles."""
+class RuleUnderTest(NamedTuple):
+    """A trained rule that grows in 2D, and its task."""
 
     name: str
     rule: NPARule
-    task_of: Callable[[int], Task]
-    update_prob: float
-    """Probability of a particle's update in a step, as trained (dimensionless)."""
-    particle_count: int = 0
-    """Particles of a world, as trained."""
-
-
-class Scenes(NamedTuple):
-    """Pictures of the first worlds, uint8, [R, R, 3]: `len(FRAME_SHARES)` for each setting."""
-
-    frames: list[NDArray[np.uint8]]
-    captions: list[str]
-
-
-class _Solo(NamedTuple):
-    """A rule grown alone: its metric [B], infinite if blown up, and centroids [B, 2]."""
-
-    losses: Tensor
-    centroids: Tensor
+    task: Task
 
 
 class Encounters:
@@ -195,133 +173,153 @@ class Encounters:
 
     def __init__(
         self,
+        rules: Sequence[RuleUnderTest],
         settings: InteractionSettings,
-        *,
-        device: torch.device,
         progress: Callable[[int], None] = lambda _: None,
     ) -> None:
         self.settings = settings
-        self._device = device
+        self.particle_count = settings.particle_count or max(
+            rule.task.config.particle_count for rule in rules
+        )
+        """Particles of both rules together."""
         self._progress = progress
-        self._solos: dict[tuple[str, int, float], _Solo] = {}
-
-    def check(self, organisms: Sequence[RuleUnderTest]) -> None:
-        """Check that any two of the rules can share a world."""
-        for other in organisms:
+        self._alone: dict[tuple[str, int, float], tuple[Tensor, Tensor]] = {}
+        """Losses [B] and centroids [B, 2] by rule, number of particles and radius factor."""
+        for other in rules:
             weight = other.rule.hidden.weight
             x, s = weight.new_zeros(1, 2, 2), weight.new_zeros(1, 2, other.rule.state_dim)
             try:
-                rollout_species([organisms[0].rule, other.rule], x, s, 0, counts=[1, 1])
+                rollout_species([rules[0].rule, other.rule], x, s, 0, counts=[1, 1])
             except NPAError as error:
                 raise NPAError(
-                    f"{organisms[0].name} and {other.name} cannot share a world: {error}"
+                    f"{rules[0].name} and {other.name} cannot share a world: {error}"
                 ) from error
+
+    def counts(self, ratio: float) -> tuple[int, int]:
+        """Return the numbers of particles of the measured species and of the other one."""
+        measured = min(max(round(ratio * self.particle_count), 1), self.particle_count - 1)
+        return measured, self.particle_count - measured
 
     @torch.no_grad()
     def meet(
         self, first: RuleUnderTest, second: RuleUnderTest
-    ) -> tuple[list[InteractionRow], Scenes]:
-        """Grow and measure `first` together with `second`: return a row for each setting."""
-        rows, scenes, given = [], Scenes([], []), self.settings
-        for factor, ratio, distance in itertools.product(
-            given.eps_factors, given.ratios, given.distances
-        ):
-            counts = given.counts(ratio)
-            solo = self._solo(first, counts[0], factor)
-            radius = "" if factor == 1.0 else f"eps x {factor:g}, "
-            caption = f"{radius}d {distance:g}, r {ratio:g}, step"
-            snapshots: list[tuple[Tensor, Tensor, int]] = []
-            x, s, lost = self._grow([first, second], counts, distance, factor, snapshots)
-            for then_x, then_s, step in snapshots:
-                frame = draw_worlds(
-                    then_x,
-                    then_s,
-                    resolution=160,
-                    pixel_size=0.5 * math.sqrt(4.0 / given.particle_count),
-                    half_width=1.2 + 0.5 * distance,
-                )[0]
-                scenes.frames.append(frame)
-                scenes.captions.append(f"{caption} {step}")
-            own = x[:, : counts[0]]
-            losses = first.task_of(counts[0]).metric(own, s[:, : counts[0]])
-            losses = losses.masked_fill(lost, math.inf)
-            alone, together = solo.losses.mean().item(), losses.mean().item()
-            change = together / alone if alone > 0.0 else math.inf
-            mixings = mixing_index(x, counts, eps=factor * first.rule.eps0)
-            mixing = mixings.mean().item()
-            away = (own.mean(dim=1) - solo.centroids).norm(dim=-1).mean().item()
-            word = verdict(change, mixing, given.margin)
-            setting, figures = (distance, ratio), (alone, together, change, mixing, away)
-            intervals = (
-                *ratio_interval(losses, solo.losses),
-                *ratio_interval(mixings, torch.ones_like(mixings)),
-            )
-            names = first.name, second.name
-            rows.append(InteractionRow(*names, *setting, *figures, word, factor, *intervals))
-        return rows, scenes
+    ) -> tuple[list[InteractionRow], dict[str, NDArray[np.uint8]]]:
+        """Grow and measure `first` together with `second`.
 
-    def _solo(self, organism: RuleUnderTest, count: int, factor: float) -> _Solo:
-        key = organism.name, count, factor
-        if key not in self._solos:
-            x, s, lost = self._grow([organism], (count,), 0.0, factor)
-            losses = organism.task_of(count).metric(x, s).masked_fill(lost, math.inf)
-            self._solos[key] = _Solo(losses, x.mean(dim=1))
-        return self._solos[key]
+        Returns a row for each setting, and pictures of the first worlds by their captions,
+        `len(FRAME_TIMES)` for each setting.
+        """
+        rows, frames, settings = [], {}, self.settings
+        for factor, ratio, distance in itertools.product(
+            settings.eps_factors, settings.ratios, settings.distances
+        ):
+            counts = self.counts(ratio)
+            losses_alone, centroids_alone = self._grown_alone(first, counts[0], factor)
+            radius = "" if factor == 1.0 else f"eps x {factor:g}, "
+            for step, now in self._grow([first, second], counts, distance, factor):
+                if step in self._frame_steps:
+                    # The picture is centred between the two seeds.
+                    frame = draw_worlds(
+                        now.x[:1],
+                        now.s[:1],
+                        centre=(0.5 * distance, 0.0),
+                        resolution=160,
+                        pixel_size=0.5 * math.sqrt(4.0 / self.particle_count),
+                        half_width=1.2 + 0.5 * distance,
+                    )[0]
+                    frames[f"{radius}d {distance:g}, r {ratio:g}, step {step}"] = frame
+                worlds = now
+            x = worlds.x[:, : counts[0]]
+            losses = self._losses(first, counts[0], worlds)
+            alone, together = losses_alone.mean().item(), losses.mean().item()
+            change = together / alone if alone > 0.0 else math.inf
+            mixings = mixing_index(worlds.x, counts, eps=factor * first.rule.eps0)
+            mixing = mixings.mean().item()
+            moved = (x.mean(dim=1) - centroids_alone).norm(dim=-1)
+            row = InteractionRow(
+                first.name, second.name, distance, ratio,
+                alone, together, change, mixing, moved.mean().item(),
+                verdict(change, mixing, settings.margin), factor,
+                *ratio_interval(losses, losses_alone),
+                *ratio_interval(mixings, torch.ones_like(mixings)),
+            )  # fmt: skip
+            rows.append(row)
+        return rows, frames
+
+    def _grown_alone(self, rule: RuleUnderTest, count: int, factor: float) -> tuple[Tensor, Tensor]:
+        key = rule.name, count, factor
+        if key not in self._alone:
+            *_, (_, worlds) = self._grow([rule], (count,), 0.0, factor)
+            self._alone[key] = self._losses(rule, count, worlds), worlds.x.mean(dim=1)
+        return self._alone[key]
+
+    @staticmethod
+    def _losses(rule: RuleUnderTest, count: int, worlds: _Grown) -> Tensor:
+        """Return the metric of the first `count` particles, [B], infinite if diverged."""
+        losses = _resized(rule, count).metric(worlds.x[:, :count], worlds.s[:, :count])
+        return losses.masked_fill(worlds.diverged, math.inf)
+
+    @property
+    def _frame_steps(self) -> set[int]:
+        return {round(time * self.settings.steps) for time in FRAME_TIMES}
 
     def _grow(
         self,
-        organisms: Sequence[RuleUnderTest],
+        rules: Sequence[RuleUnderTest],
         counts: tuple[int, ...],
         distance: float,
         factor: float,
-        snapshots: list[tuple[Tensor, Tensor, int]] | None = None,
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return one or two species grown from their seeds, and which worlds blew up.
+    ) -> Iterator[tuple[int, _Grown]]:
+        """Grow one or two species from their seeds; yield the step and worlds.
 
         The first is seeded at the origin and has the same random stream as alone; the second is
-        seeded at `distance` along the first axis. `snapshots` gets the first world at
-        `FRAME_SHARES`.
+        seeded at `distance` along the first axis. Worlds that diverge stay as they were, so that
+        the others can be measured.
         """
         settings = self.settings
-        random = WorldRandom(settings.seeds, device=self._device)
+        device = rules[0].rule.hidden.weight.device
+        random = WorldRandom(settings.seeds, device=device)
         streams = (random, random.substream(StreamId.SPECIES))
-        parts = [
-            organism.task_of(count).seed(
-                len(settings.seeds), generator=stream, device=self._device
-            )[:2]
-            for organism, count, stream in zip(organisms, counts, streams, strict=False)
+        species = [
+            _resized(rule, count).seed(settings.seed_count, generator=stream, device=device)
+            for rule, count, stream in zip(rules, counts, streams, strict=False)
         ]
-        for number, (x, _) in enumerate(parts):
-            x[..., 0] += number * distance
-        like = organisms[0].rule.hidden.weight
-        x, s = (torch.cat(of_all, dim=1).to(like) for of_all in zip(*parts, strict=True))
-        lost = torch.zeros(len(x), dtype=torch.bool, device=x.device)
-        frames = {round(share * settings.steps) for share in FRAME_SHARES}
-        stops = sorted({*range(0, settings.steps, PROGRESS_STEPS), *frames})
-        for now, then in zip([0, *stops], stops, strict=False):
+        for k, (x, *_) in enumerate(species):
+            x[..., 0] += k * distance
+        weight = rules[0].rule.hidden.weight
+        x = torch.cat([worlds.x for worlds in species], dim=1).to(weight)
+        s = torch.cat([worlds.s for worlds in species], dim=1).to(weight)
+        diverged = torch.zeros(len(x), dtype=torch.bool, device=x.device)
+        stops = sorted({*range(0, settings.steps, PROGRESS_STEPS), *self._frame_steps})
+        for before, step in zip([0, *stops], stops, strict=False):
             new_x, new_s = rollout_species(
-                [organism.rule for organism in organisms],
+                [rule.rule for rule in rules],
                 x,
                 s,
-                then - now,
+                step - before,
                 counts=counts,
-                eps=factor * organisms[0].rule.eps0,
-                update_prob=[settings.update_prob or own.update_prob for own in organisms],
+                eps=factor * rules[0].rule.eps0,
+                update_prob=[settings.update_prob or rule.task.update_prob for rule in rules],
                 generator=random,
                 density_counts=counts,
             )
-            # Worlds that blew up stay as they were, so that the others can be measured.
-            fine = new_x.isfinite().all(dim=(1, 2)) & new_s.isfinite().all(dim=(1, 2))
-            x = torch.where(fine[:, None, None], new_x, x)
-            s = torch.where(fine[:, None, None], new_s, s)
-            lost |= ~fine
-            self._progress(then - now)
-            if then in frames and snapshots is not None:
-                # Centre the picture between the two seeds.
-                shift = x.new_zeros(x.shape[2])
-                shift[0] = 0.5 * distance
-                snapshots.append((x[:1] - shift, s[:1], then))
-        return x, s, lost
+            broken = divergence(new_x, new_s).non_finite
+            x, s = Particles(x, s).where(broken, Particles(new_x, new_s))[:2]
+            diverged = diverged | broken
+            self._progress(step - before)
+            yield step, _Grown(x, s, diverged)
+
+
+def _resized(rule: RuleUnderTest, particle_count: int) -> Task:
+    return rule.task.resized(particle_count).for_rule(rule.rule)
+
+
+class _Grown(NamedTuple):
+    """Worlds, and which of them have diverged, bool, [B]."""
+
+    x: Tensor
+    s: Tensor
+    diverged: Tensor
 
 
 MAX_CHANGE = 4.0
@@ -329,19 +327,9 @@ MAX_CHANGE = 4.0
 
 
 class InteractionRecord(Record[InteractionRow]):
-    """Rows, and their figures as matrices over the rules for each setting."""
+    """Rows of all pairs of rules and settings."""
 
     command, key = "interact", "settings"
-
-    def content(self) -> dict[str, Any]:
-        """Return rows and matrices."""
-        kinds, names = ("change", "mixing", "displacement", "verdict"), list(self.facts["rules"])
-        matrices = [
-            {"ratio": ratio, "distance": distance, "eps_factor": factor}
-            | {what: _matrix(some, names, what) for what in kinds}
-            for (factor, ratio, distance), some in _by_setting(self.rows).items()
-        ]
-        return {**super().content(), "matrices": matrices}
 
     def parse(self, held: dict[str, Any]) -> list[InteractionRow]:
         """Return the rows; null stands for infinite numbers."""
@@ -351,89 +339,76 @@ class InteractionRecord(Record[InteractionRow]):
         return [InteractionRow(**row) for row in rows]
 
 
-def _by_setting(
-    rows: Sequence[InteractionRow],
-) -> dict[tuple[float, float, float], list[InteractionRow]]:
-    """Return the rows by radius factor, ratio and distance."""
-    found: dict[tuple[float, float, float], list[InteractionRow]] = {}
-    for row in rows:
-        found.setdefault((row.eps_factor, row.ratio, row.distance), []).append(row)
-    return found
-
-
-def _matrix(rows: Sequence[InteractionRow], names: Sequence[str], what: str) -> list[list[Any]]:
-    """Return a field of each pair of rules as a matrix; None for missing pairs."""
-    found = {(row.rule, row.beside): getattr(row, what) for row in rows}
-    return [[found.get((down, across)) for across in names] for down in names]
-
-
 def heat_map(rows: Sequence[InteractionRow]) -> bytes:
-    """Return a PNG of two matrices for each setting: change of the loss, and mixing index.
-
-    Rows are the measured rules, columns the other ones. Needs matplotlib.
-    """
+    """Return a PNG of matrices over all rules and the rules beside them, for each setting."""
     names = list(dict.fromkeys([row.rule for row in rows] + [row.beside for row in rows]))
-    settings = _by_setting(rows)
-    side = 1.6 + 0.55 * len(names)
-    figure, grid = new_figure(len(settings), 2, (2 * side + 2.0, side * len(settings)))
-    for ((factor, ratio, distance), some), panels in zip(settings.items(), grid, strict=True):
-        setting = f"distance {distance:g}, ratio {ratio:g}" + _radius(factor)
-        for panel, (what, title, colours, norm, bar) in zip(panels, _shades(), strict=True):
-            values = _matrix(some, names, what)
-            scale = draw_matrix(panel, names, names, values, colours=colours, norm=norm)
-            panel.set(xlabel="beside", title=f"{title}\n{setting}")
-            figure.colorbar(scale, ax=panel, **bar).minorticks_off()
-        panels[0].set_ylabel("rule")
-    return png(figure)
+    settings: dict[str, list[InteractionRow]] = {}
+    for row in rows:
+        title = f"distance {row.distance:g}, ratio {row.ratio:g}{_radius(row)}"
+        settings.setdefault(title, []).append(row)
+    return _draw(settings, "rule", names, "beside", names)
 
 
 def phase_diagram(rows: Sequence[InteractionRow]) -> bytes:
-    """Return a PNG of one pair of rules over distance, ratio and radius. Needs matplotlib.
+    """Return a PNG of matrices over ratio and distance of a pair of rules, for each radius."""
+    ratios, distances = (sorted({getattr(row, of) for row in rows}) for of in ("ratio", "distance"))
+    radii: dict[str, list[InteractionRow]] = {}
+    for row in sorted(rows, key=lambda row: row.eps_factor):
+        radii.setdefault(f"{row.rule} beside {row.beside}{_radius(row)}", []).append(row)
+    return _draw(radii, "ratio", ratios, "distance", distances, intervals=True)
 
-    The upper panels show the change of the loss, the lower ones the mixing index, with intervals.
+
+def _draw(
+    groups: dict[str, list[InteractionRow]],
+    down: str,
+    down_values: Sequence[Any],
+    across: str,
+    across_values: Sequence[Any],
+    *,
+    intervals: bool = False,
+) -> bytes:
+    """Return a PNG of two matrices for each group of rows: change of the loss, and mixing index.
+
+    Needs matplotlib.
     """
-    factors, ratios, distances = (
-        sorted(set(each)) for each in zip(*_by_setting(rows), strict=True)
+    from matplotlib.colors import LogNorm, Normalize
+
+    ticks = {"ticks": [0.25, 0.5, 1.0, 2.0, 4.0], "format": "%g"}
+    changes = LogNorm(1.0 / MAX_CHANGE, MAX_CHANGE)
+    matrices = (
+        ("change", "loss together / alone", "RdBu_r", changes, ticks),
+        ("mixing", "mixing index", "viridis", Normalize(0.0, 1.0), {}),
     )
-    found = {(row.eps_factor, row.ratio, row.distance): row for row in rows}
-    size = 1.6 + 0.62 * len(distances), 1.4 + 0.4 * len(ratios)
-    figure, grid = new_figure(2, len(factors), (size[0] * len(factors) + 1.0, 2 * size[1]))
-    down, across = ([f"{value:g}" for value in values] for values in (ratios, distances))
-    for panels, (what, title, colours, norm, bar) in zip(grid, _shades(), strict=True):
-        for panel, factor in zip(panels, factors, strict=True):
-            held = [[found.get((factor, r, d)) for d in distances] for r in ratios]
-            values = [
-                [None if row is None else getattr(row, what) for row in line] for line in held
-            ]
-            notes = [["" if row is None else _interval(row, what) for row in line] for line in held]
+    width, height = 1.6 + 0.6 * len(across_values), 1.6 + 0.5 * len(down_values)
+    figure, grid = new_figure(len(groups), 2, (2 * width + 2.0, height * len(groups)))
+    for (title, rows), panels in zip(groups.items(), grid, strict=True):
+        found = {(getattr(row, down), getattr(row, across)): row for row in rows}
+        cells = [[found.get((first, second)) for second in across_values] for first in down_values]
+        for panel, (what, name, colours, norm, bar) in zip(panels, matrices, strict=True):
+            values = [[row and getattr(row, what) for row in line] for line in cells]
+            notes = [[_interval(row, what) for row in line] for line in cells]
             scale = draw_matrix(
-                panel, down, across, values, colours=colours, norm=norm, notes=notes
+                panel,
+                list(map(str, down_values)),
+                list(map(str, across_values)),
+                values,
+                colours=colours,
+                norm=norm,
+                notes=notes if intervals else None,
             )
-            panel.set(xlabel="distance")
-            panel.set_title(title + _radius(factor), fontsize=9)
-        panels[0].set_ylabel(f"ratio of {rows[0].rule}")
-        figure.colorbar(scale, ax=list(panels), **bar).minorticks_off()
-    figure.suptitle(f"{rows[0].rule} beside {rows[0].beside}", fontsize=10)
+            panel.set(xlabel=across, ylabel=down)
+            panel.set_title(f"{name}\n{title}", fontsize=9)
+            figure.colorbar(scale, ax=panel, **bar).minorticks_off()
     return png(figure)
 
 
-def _interval(row: InteractionRow, what: str) -> str:
+def _interval(row: InteractionRow | None, what: str) -> str:
+    if row is None:
+        return ""
     ends = (getattr(row, f"{what}_{end}") for end in ("low", "high"))
     # A cell has room for one digit of small numbers.
     return " to ".join(f"{end:.2g}" if end >= 0.01 else f"{end:.1g}" for end in ends)
 
 
-def _radius(factor: float) -> str:
-    return "" if factor == 1.0 else f", ε × {factor:g}"
-
-
-def _shades() -> tuple[tuple[str, str, str, Any, dict[str, Any]], ...]:
-    """Return, for each drawn field, its name, title, colour map, norm and options of the bar."""
-    from matplotlib.colors import LogNorm, Normalize
-
-    ticks = {"ticks": [0.25, 0.5, 1.0, 2.0, 4.0], "format": "%g"}
-    changes = LogNorm(1.0 / MAX_CHANGE, MAX_CHANGE)
-    return (
-        ("change", "loss together / alone", "RdBu_r", changes, ticks),
-        ("mixing", "mixing index", "viridis", Normalize(0.0, 1.0), {}),
-    )
+def _radius(row: InteractionRow) -> str:
+    return "" if row.eps_factor == 1.0 else f", ε × {row.eps_factor:g}"

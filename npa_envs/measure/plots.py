@@ -89,50 +89,38 @@ def draw_matrix(
 ) -> Any:
     """Draw a matrix with its numbers, and return the argument of `figure.colorbar`.
 
-    `notes` are below the numbers. NaN is black, None blank; `norm` maps numbers to [0, 1].
+    `notes` are below the numbers. Cells with None are blank; `norm` maps numbers to [0, 1].
     """
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.patches import Rectangle
-
-    scale = ScalarMappable(norm, colours)
-    colour_of: Any = scale.get_cmap()
-    panel.set(xlim=(-0.5, len(columns) - 0.5), ylim=(len(rows) - 0.5, -0.5), aspect="auto")
+    numbers = [[math.nan if value is None else value for value in line] for line in values]
+    image = panel.imshow(numbers, cmap=colours, norm=norm, aspect="auto")
     for down, line in enumerate(values):
         for across, value in enumerate(line):
-            if value is None:
-                continue
-            wrong = math.isnan(value)
-            within = min(max(float(value), norm.vmin), norm.vmax)
-            colour: Any = "black" if wrong else colour_of(norm(within))
-            corner = (across - 0.5, down - 0.5)
-            panel.add_patch(Rectangle(corner, 1.0, 1.0, facecolor=colour, edgecolor="white"))
-            dark = wrong or sum(colour[:3]) < 1.2
-            ink = {"color": "white" if dark else "black", "ha": "center", "va": "center"}
-            text = f"{value:.2g}" + ("" if notes is None else f"\n{notes[down][across]}")
-            panel.text(across, down, text, fontsize=6 if notes is None else 7, **ink)
+            if value is not None:
+                red, green, blue, _ = image.to_rgba(value)
+                text = f"{value:.2g}" + ("" if notes is None else f"\n{notes[down][across]}")
+                ink = "white" if red + green + blue < 1.2 else "black"
+                size = 6 if notes is None else 7
+                panel.text(across, down, text, color=ink, ha="center", va="center", fontsize=size)
     panel.set_xticks(range(len(columns)), columns, rotation=45, ha="right", fontsize=7)
     panel.set_yticks(range(len(rows)), rows, fontsize=7)
-    return scale
+    return image
 
 
-def number_plainly(
-    axis: Any,
-    values: Sequence[float] | None = None,
-    *,
-    within: Sequence[float] = (1, 2, 5),
-    text: Callable[[float], str] | None = None,
-) -> None:
-    """Label a logarithmic axis with plain numbers at `values`, or `within` each decade.
+def number_plainly(axis: Any, values: Sequence[float] | None = None) -> None:
+    """Label a logarithmic axis with plain numbers at `values`, or at 1, 2 and 5 of each decade.
 
-    Without `text`, labels have k or M for thousands and millions.
+    Of a range of two decades or more only decades are labelled. Labels have k or M for thousands
+    and millions.
     """
     from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullLocator
 
+    low, high = axis.get_view_interval()
+    fine = (1, 2, 5) if high < 100.0 * low else (1,)
     axis.set_major_locator(
-        LogLocator(subs=within) if values is None else FixedLocator(values, nbins=9)
+        LogLocator(subs=fine) if values is None else FixedLocator(values, nbins=9)
     )
     axis.set_minor_locator(NullLocator())
-    axis.set_major_formatter(FuncFormatter(lambda value, _: (text or _with_unit)(value)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: _with_unit(value)))
 
 
 def _with_unit(value: float) -> str:
@@ -140,12 +128,3 @@ def _with_unit(value: float) -> str:
         if value >= unit:
             return f"{value / unit:.3g}{letter}"
     return f"{value:.3g}"
-
-
-def mark_decades(panel: Any) -> None:
-    """Label 1, 2 and 5 of each decade of a logarithmic y axis; of a long axis only decades."""
-    low, high = panel.get_ylim()
-    fine = high < 100.0 * low
-    panel.minorticks_off()
-    number_plainly(panel.yaxis, within=(1, 2, 5) if fine else (1,), text="{:g}".format)
-    panel.tick_params(labelsize=7)

@@ -6,7 +6,7 @@ import copy
 import itertools
 import json
 import statistics
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -23,6 +23,7 @@ from npa_envs.tasks.damage import random_particle
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
 from npa_envs.tasks.point_classification import PointClassification, majority
 from npa_envs.world.brushes import cut, wipe_state
+from npa_envs.world.particles import Particles, combined
 from npa_envs.world.randomness import Randomness, WorldRandom
 from npa_envs.world.rollout import rollout
 
@@ -32,8 +33,8 @@ PROGRESS_STEPS = 32
 CHECKPOINTS = (64, 128, 256, 512, 1024, 2048, 4096)
 """Default steps at which a rule is measured."""
 
-LOST = 10.0
-"""A world is lost if its loss is more than this many times that before the damage."""
+DIVERGED = 10.0
+"""A world has diverged if its loss is more than this many times that before the damage."""
 
 HEALED = 1.2
 """A world is healed once its loss is at most this many times that before the damage."""
@@ -69,7 +70,7 @@ class HealingRow:
     """Several worlds, grown and damaged: mean loss `before` and right `after` damage, and at `end`.
 
     `steps_to_heal`: steps until the mean loss is at most `HEALED` times `before`, None if never.
-    `worlds_healed`: worlds that once heal by their own loss and are not lost (`LOST`) at the end.
+    `worlds_healed`: worlds that once heal by their own loss, and at the end have not diverged.
     """
 
     damage: str
@@ -98,12 +99,12 @@ def evaluate(
     positions, states and the step. The same seeds give the same table.
     """
     check_steps("checkpoints", checkpoints)
-    runner, x, s = _from_seeds(rule, task, seeds, device, progress)
+    runner, worlds = _from_seeds(rule, task, seeds, device, progress)
     rows = []
-    for step, new_x, new_s in runner.at(checkpoints, x, s):
-        rows.append(measure(runner.task, new_x, new_s, step))
+    for step, (x, s, *_) in runner.at(checkpoints, worlds):
+        rows.append(measure(runner.task, x, s, step))
         if watch is not None:
-            watch(new_x, new_s, step)
+            watch(x, s, step)
     return rows
 
 
@@ -157,8 +158,8 @@ def healing(
     """
     for name, count in (("grow_steps", grow_steps), ("heal_steps", heal_steps), ("every", every)):
         check_steps(name, [count])
-    runner, x, s = _from_seeds(rule, task, seeds, device, progress)
-    x, s = runner.run(x, s, grow_steps)
+    runner, worlds = _from_seeds(rule, task, seeds, device, progress)
+    x, s, *_ = runner.run(worlds, grow_steps)
     task = runner.task
     before = task.metric(x, s)
     normal = torch.randn(
@@ -166,18 +167,17 @@ def healing(
     )
     centre = random_particle(x, generator=runner.generator)
     wiped = task.coded(wipe_state(x, s, centre=centre, radius=wipe_radius, box=task.box))
+    slit = cut(x, s, centre=x.mean(1), normal=normal, gap=cut_gap, box=task.box)
     damaged = {
-        f"cut, gap {cut_gap:g}": cut(
-            x, s, centre=x.mean(1), normal=normal, gap=cut_gap, box=task.box
-        ),
-        f"wiped disk, radius {wipe_radius:g}": (x, wiped),
+        f"cut, gap {cut_gap:g}": Particles(*slit),
+        f"wiped disk, radius {wipe_radius:g}": Particles(x, wiped),
     }
     steps = [*range(0, heal_steps, every), heal_steps]
     rows = []
     for name, worlds in damaged.items():
-        losses = torch.stack([task.metric(x, s) for _, x, s in runner.at(steps, *worlds)])
-        lost = ~(losses[-1] <= LOST * before)
-        mean_healed = ((losses.mean(1) <= HEALED * before.mean()) & ~lost.all()).tolist()
+        losses = torch.stack([task.metric(now.x, now.s) for _, now in runner.at(steps, worlds)])
+        diverged = ~(losses[-1] <= DIVERGED * before)
+        mean_healed = ((losses.mean(1) <= HEALED * before.mean()) & ~diverged.all()).tolist()
         healed = [step for step, is_healed in zip(steps, mean_healed, strict=True) if is_healed]
         rows.append(
             HealingRow(
@@ -185,7 +185,7 @@ def healing(
                 before=before.mean().item(),
                 after=losses[0].mean().item(),
                 steps_to_heal=healed[0] if healed else None,
-                worlds_healed=int(((losses <= HEALED * before).any(0) & ~lost).sum()),
+                worlds_healed=int(((losses <= HEALED * before).any(0) & ~diverged).sum()),
                 world_count=len(before),
                 end=losses[-1].mean().item(),
             )
@@ -198,7 +198,7 @@ def healing(
 CLOUD_CHECKPOINTS = (8, 16, 24, 32, 64, 128)
 """Default steps at which the classes of clouds are read."""
 
-CUT_SHARE = 0.25
+CUT_FRACTION = 0.25
 """Fraction of its particles that a cut cloud loses."""
 
 BATCH = 256
@@ -251,23 +251,23 @@ def accuracies(
     The rule runs on the device of the task; `seed` is that of the update masks.
     """
     check_steps("checkpoints", checkpoints)
-    runner = RuleRunner(rule, task, task.clouds.x.device, seed, progress)
-    positions = task.clouds.x.to(runner.dtype)
-    sums = torch.zeros(len(checkpoints), 5, dtype=torch.float64)
-    for index, label, blank in _batches(task):
+    runner = _copied_runner(rule, task, task.clouds.x.device, seed, progress)
+
+    def figures(index: Tensor) -> Iterator[tuple[Tensor, ...]]:
+        label, clouds = task.clouds.label[index], _blank_clouds(runner, index)
         labelled = runner.task.toward(label)
-        worlds = runner.at(checkpoints, positions[index], blank.to(runner.dtype), still=True)
-        for row, (_, x, s) in enumerate(worlds):
+        for _, (x, s, *_) in runner.at(checkpoints, clouds):
             outputs = runner.task.outputs(s)
             votes, most = outputs.argmax(-1), majority(outputs)
-            sums[row] += _sums(
+            yield (
                 most == label,
                 (votes == label[:, None]).double().mean(1),
                 (votes == most[:, None]).double().mean(1),
                 labelled.metric(x, s),
                 _overflow(s).mean((1, 2)),
             )
-    means = (sums / len(positions)).tolist()
+
+    means = _cloud_means(task, figures)
     return [AccuracyRow(step, *row) for step, row in zip(checkpoints, means, strict=True)]
 
 
@@ -289,38 +289,55 @@ def changes_of_mind(
     """
     check_steps("settle_steps", [settle_steps])
     check_steps("steps", steps, at_least=0)
-    runner = RuleRunner(rule, task, task.clouds.x.device, seed, progress)
-    positions, classes = task.clouds.x.to(runner.dtype), task.clouds.label
-    partner = _partners(classes)
-    names = (f"{CUT_SHARE:.0%} cut off", "upper half mutated", "all mutated")
-    sums = torch.zeros(len(names), len(steps), 3, dtype=torch.float64)
-    for index, label, blank in _batches(task):
-        x, other_x, other = positions[index], positions[partner[index]], classes[partner[index]]
-        _, s = runner.run(x, blank.to(runner.dtype), settle_steps)
-        changed = (
-            (*_cut(x, s, runner.generator), label),
-            (*_chimera(x, s, other_x), other),
-            (other_x, s, other),
-        )
-        for number, (new_x, new_s, goal) in enumerate(changed):
-            for row, (_, _, then) in enumerate(runner.at(steps, new_x, new_s, still=True)):
-                outputs = runner.task.outputs(then)
+    runner = _copied_runner(rule, task, task.clouds.x.device, seed, progress)
+    classes, partner = task.clouds.label, _partners(task.clouds.label)
+
+    def figures(index: Tensor) -> Iterator[tuple[Tensor, ...]]:
+        label, other_label = classes[index], classes[partner[index]]
+        x, s, *_ = runner.run(_blank_clouds(runner, index), settle_steps)
+        other_x = _blank_clouds(runner, partner[index]).x
+        for changed, goal in (
+            (_cut(x, s, runner.generator), label),
+            (_chimera(x, s, other_x), other_label),
+            ((other_x, s), other_label),
+        ):
+            for _, (_, now, *_) in runner.at(steps, Particles(*changed)):
+                outputs = runner.task.outputs(now)
                 most = majority(outputs)
                 right = (outputs.argmax(-1) == goal[:, None]).double().mean(1)
-                sums[number, row] += _sums(most == goal, right, most == label)
-    means = (sums / len(positions)).tolist()
+                yield most == goal, right, most == label
+
+    names = (f"{CUT_FRACTION:.0%} cut off", "upper half mutated", "all mutated")
+    cases = itertools.product(names, steps)
     return [
-        ChangeRow(name, step, *row)
-        for name, rows in zip(names, means, strict=True)
-        for step, row in zip(steps, rows, strict=True)
+        ChangeRow(*case, *row) for case, row in zip(cases, _cloud_means(task, figures), strict=True)
     ]
+
+
+def _blank_clouds(runner: RuleRunner, index: Tensor) -> Particles:
+    """Return clouds with zero states, by their indices."""
+    x = runner.task.clouds.x[index].to(next(runner.rule.parameters()).dtype)
+    return Particles(x, x.new_zeros(*x.shape[:2], runner.task.config.state_dim))
+
+
+def _cloud_means(
+    task: PointClassification, figures: Callable[[Tensor], Iterable[Sequence[Tensor]]]
+) -> list[list[float]]:
+    """Return means over all clouds; `figures` yields rows of figures [B] of a batch of indices."""
+    count = len(task.clouds.label)
+    sums = torch.zeros((), dtype=torch.float64)
+    for index in torch.arange(count, device=task.clouds.x.device).split(BATCH):
+        rows = [[figure.double().sum() for figure in row] for row in figures(index)]
+        sums = sums + torch.stack([torch.stack(row) for row in rows]).cpu()
+    means: list[list[float]] = (sums / count).tolist()
+    return means
 
 
 def _cut(x: Tensor, s: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
     """Return clouds without the particles farthest in a direction, which is random for each."""
     normal = torch.randn(len(x), 2, generator=generator, device=x.device, dtype=x.dtype)
     order = (x * normal[:, None]).sum(-1).argsort(dim=1)
-    kept = order[:, : max(1, round((1.0 - CUT_SHARE) * x.shape[1])), None]
+    kept = order[:, : max(1, round((1.0 - CUT_FRACTION) * x.shape[1])), None]
     return x.gather(1, kept.expand(-1, -1, 2)), s.gather(1, kept.expand(-1, -1, s.shape[2]))
 
 
@@ -365,39 +382,27 @@ def tables_of(
     They are `growth` and, if `changed`, `healing`; for clouds `accuracy` and, if `changed`,
     `changes`; and `judge`, if given. Clouds run on their task's device, with the first seed.
     """
+    tables: dict[str, Sequence[Any]] = {}
     if task.classifies:
         clouds = cast(PointClassification, task)
         steps = checkpoints or CLOUD_CHECKPOINTS
-        given: dict[str, Any] = {"seed": seeds[0], "progress": progress}
-        tables: dict[str, Sequence[Any]] = {
-            "accuracy": accuracies(rule, clouds, checkpoints=steps, **given)
-        }
-        return tables | ({"changes": changes_of_mind(rule, clouds, **given)} if changed else {})
-    given = {"seeds": seeds, "device": device, "progress": progress}
+        options: dict[str, Any] = {"seed": seeds[0], "progress": progress}
+        tables["accuracy"] = accuracies(rule, clouds, checkpoints=steps, **options)
+        if changed:
+            tables["changes"] = changes_of_mind(rule, clouds, **options)
+        return tables
+    options = {"seeds": seeds, "device": device, "progress": progress}
     judged: list[JudgeRow] = []
     watch = None if judge is None else lambda *world: judged.append(judge.row(*world))
     steps = checkpoints or CHECKPOINTS
-    tables = {"growth": evaluate(rule, task, checkpoints=steps, watch=watch, **given)}
-    tables |= {"healing": healing(rule, task, **given)} if changed else {}
+    tables["growth"] = evaluate(rule, task, checkpoints=steps, watch=watch, **options)
+    if changed:
+        tables["healing"] = healing(rule, task, **options)
     return tables | ({"judge": judged} if judged else {})
 
 
-def run_worlds(
-    rule: NPARule,
-    task: Any,
-    x: Tensor,
-    s: Tensor,
-    steps: int,
-    generator: Randomness,
-    **changed: Any,
-) -> tuple[Tensor, Tensor]:
-    """Run worlds with the options of their task, except those in `changed`."""
-    options = {"eps": task.eps, "box": task.box, "update_prob": task.update_prob} | changed
-    return rollout(rule, x, s, steps, generator=generator, **options)
-
-
 class RuleRunner:
-    """Runs worlds of a task by a copy of a rule, in the rule's precision.
+    """Runs worlds by a rule, with the options of a task, except those in `changed`.
 
     `progress` is called with the steps done since its last call.
     """
@@ -406,34 +411,46 @@ class RuleRunner:
         self,
         rule: NPARule,
         task: Any,
-        device: torch.device,
-        seed: int,
-        progress: Callable[[int], None] | None,
+        generator: Randomness,
+        progress: Callable[[int], None] | None = None,
+        **changed: Any,
     ) -> None:
-        # The caller's rule must stay on its device.
-        self._rule = copy.deepcopy(rule).to(device)
-        self.dtype = next(rule.parameters()).dtype
-        self.task = task.for_rule(self._rule)
-        self.generator = torch.Generator(device).manual_seed(seed)
-        self._progress = progress or (lambda _: None)
+        self.rule, self.task, self.generator = rule, task, generator
+        self._progress = progress
+        self._options = task.rollout_options | changed
 
-    def run(self, x: Tensor, s: Tensor, steps: int) -> tuple[Tensor, Tensor]:
+    @torch.no_grad()
+    def run(self, worlds: Particles, steps: int) -> Particles:
         """Return worlds after `steps` steps."""
+        x, s, *_ = worlds
+        most = steps if self._progress is None else PROGRESS_STEPS
         while steps > 0:
-            count = min(steps, PROGRESS_STEPS)
-            x, s = run_worlds(self._rule, self.task, x, s, count, self.generator)
-            self._progress(count)
+            count = min(steps, most)
+            x, s = rollout(self.rule, x, s, count, generator=self.generator, **self._options)
+            if self._progress is not None:
+                self._progress(count)
             steps -= count
-        return x, s
+        return worlds._replace(x=x, s=s)
 
-    def at(
-        self, steps: Sequence[int], x: Tensor, s: Tensor, *, still: bool = False
-    ) -> Iterator[tuple[int, Tensor, Tensor]]:
-        """Yield the step and worlds at each of increasing `steps`; `still`: positions stay."""
+    def at(self, steps: Sequence[int], worlds: Particles) -> Iterator[tuple[int, Particles]]:
+        """Yield the step and the worlds at each of increasing `steps`."""
         for step, before in zip(steps, (0, *steps), strict=False):
-            new_x, s = self.run(x, s, step - before)
-            x = x if still else new_x
-            yield step, x, s
+            worlds = self.run(worlds, step - before)
+            yield step, worlds
+
+
+def _copied_runner(
+    rule: NPARule,
+    task: Task,
+    device: torch.device,
+    seed: int,
+    progress: Callable[[int], None] | None,
+) -> RuleRunner:
+    """Return a runner on a device with a copy of the rule, as the caller's rule must stay."""
+    rule = copy.deepcopy(rule).to(device)
+    return RuleRunner(
+        rule, task.for_rule(rule), torch.Generator(device).manual_seed(seed), progress
+    )
 
 
 def _from_seeds(
@@ -442,30 +459,18 @@ def _from_seeds(
     seeds: Sequence[int],
     device: str | torch.device,
     progress: Callable[[int], None] | None,
-) -> tuple[RuleRunner, Tensor, Tensor]:
+) -> tuple[RuleRunner, Particles]:
     """Return a runner and one world for each of the seeds."""
     if not seeds:
         raise NPAError("seeds must have at least one number, got none: for example seeds=(0, 1)")
     device = check_device(device)
-    runner = RuleRunner(rule, task, device, seeds[0] + len(seeds), progress)
+    runner = _copied_runner(rule, task, device, seeds[0] + len(seeds), progress)
     worlds = [
         task.seed(1, generator=torch.Generator(device).manual_seed(seed), device=device)[:2]
         for seed in seeds
     ]
-    x, s = (torch.cat(parts).to(runner.dtype) for parts in zip(*worlds, strict=True))
-    return runner, x, s
-
-
-def _batches(task: PointClassification) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-    """Yield indices [B], classes [B] and blank states of batches of clouds."""
-    x, label = task.clouds.x, task.clouds.label
-    for index in torch.split(torch.arange(len(label), device=x.device), BATCH):
-        yield index, label[index], x.new_zeros(len(index), x.shape[1], task.config.state_dim)
-
-
-def _sums(*figures: Tensor) -> Tensor:
-    """Return the sums over clouds of several figures [B], float64, on the CPU."""
-    return torch.stack([figure.double().sum() for figure in figures]).cpu()
+    dtype = next(rule.parameters()).dtype
+    return runner, Particles(*(torch.cat(part).to(dtype) for part in zip(*worlds, strict=True)))
 
 
 def check_steps(name: str, steps: Sequence[int], at_least: int = 1) -> None:
@@ -513,7 +518,7 @@ def grown(
     seeds: Sequence[int],
     device: str | torch.device = "cpu",
     progress: Callable[[int], None] | None = None,
-) -> list[tuple[Tensor, Tensor]]:
+) -> list[Particles]:
     """Return x [T, B, N, 2] and s [T, B, N, C] of T tasks at each of `checkpoints`.
 
     Tasks differ in their codes only, and start from the same seeds. `progress` is called with the
@@ -521,26 +526,22 @@ def grown(
     """
     check_steps("checkpoints", checkpoints)
     at_a_time = max(1, WORLDS // len(seeds))
-    found: list[list[tuple[Tensor, Tensor]]] = [[] for _ in checkpoints]
+    batches: list[list[Particles]] = [[] for _ in checkpoints]
     for first in range(0, len(tasks), at_a_time):
         some = tasks[first : first + at_a_time]
         fresh = [
             task.seed(len(seeds), generator=WorldRandom(seeds, device=device), device=device)
             for task in some
         ]
-        x, s = torch.cat([one.x for one in fresh]), torch.cat([one.s for one in fresh])
         random = WorldRandom([*seeds] * len(some), device=device)
-        for kept, step, before in zip(found, checkpoints, (0, *checkpoints), strict=False):
-            x, s = run_worlds(rule, some[0], x, s, step - before, random)
-            kept.append((x, s))
-            if progress is not None:
-                progress(step - before)
-    whole = ([torch.cat(parts) for parts in zip(*kept, strict=True)] for kept in found)
-    return [(_by_task(tasks, x), _by_task(tasks, s)) for x, s in whole]
-
-
-def _by_task(tasks: Sequence[Morphogenesis2D], worlds: Tensor) -> Tensor:
-    return worlds.view(len(tasks), -1, *worlds.shape[1:])
+        runner = RuleRunner(rule, some[0], random, progress)
+        worlds = combined(torch.cat, fresh)
+        for batch, (_, now) in zip(batches, runner.at(checkpoints, worlds), strict=True):
+            batch.append(now)
+    shape = len(tasks), len(seeds)
+    return [
+        combined(torch.cat, batch).map(lambda part: part.unflatten(0, shape)) for batch in batches
+    ]
 
 
 @torch.no_grad()
@@ -556,19 +557,20 @@ def picture_rows(
     """Return, at each of `checkpoints`, a row for each picture and one of their medians."""
     if len(tasks) < 2:
         raise NPAError(f"pictures must be two or more, got {len(tasks)}: give another")
-    given: dict[str, Any] = {"seeds": seeds, "device": device, "progress": progress}
+    worlds = grown(
+        rule, tasks, checkpoints=checkpoints, seeds=seeds, device=device, progress=progress
+    )
     rows = []
-    worlds = grown(rule, tasks, checkpoints=checkpoints, **given)
-    for step, (x, s) in zip(checkpoints, worlds, strict=True):
-        own = []
-        for number, task in enumerate(tasks):
-            other = (number + 1) % len(tasks)
-            loss, shuffled = (task.metric(x[k], s[k]).mean().item() for k in (number, other))
-            ratio = psnr(task.picture(x[number], s[number]), task.target_picture)
-            own.append(PictureRow(step, task.target.name, loss, shuffled, ratio.mean().item()))
-        figures = ([row.loss, row.shuffled, row.psnr] for row in own)
+    for step, (x, s, *_) in zip(checkpoints, worlds, strict=True):
+        figures = []
+        for k, task in enumerate(tasks):
+            other = (k + 1) % len(tasks)
+            loss, shuffled = (task.metric(x[i], s[i]).mean().item() for i in (k, other))
+            ratio = psnr(task.picture(x[k], s[k]), task.target_picture).mean().item()
+            figures.append((loss, shuffled, ratio))
+            rows.append(PictureRow(step, task.target.name, loss, shuffled, ratio))
         medians = map(statistics.median, zip(*figures, strict=True))
-        rows += [*own, PictureRow(step, MEDIAN, *medians)]
+        rows.append(PictureRow(step, MEDIAN, *medians))
     return rows
 
 
@@ -590,16 +592,16 @@ def scores(name: str) -> dict[str, Any]:
     rules = shipped_rules()
     if not isinstance(name, str) or name not in rules:
         raise NPAError(f"unknown rule {shown(name)}: {suggest(name, rules)}")
-    found: dict[str, Any] = json.loads(rules[name].with_suffix(".json").read_text("utf-8"))
-    return found
+    content: dict[str, Any] = json.loads(rules[name].with_suffix(".json").read_text("utf-8"))
+    return content
 
 
 def score_line(measured: Mapping[str, Any]) -> str:
     """Return the result of `scores` as one line of text."""
     if "accuracy" in measured:
         (row,) = (row for row in measured["accuracy"] if row["step"] == CLOUD_STEP)
-        shares = f"{row['majority']:.1%} of clouds by majority, {row['particle']:.1%} of particles"
-        return f"{shares} at step {CLOUD_STEP}"
+        clouds, particles = (f"{row[name]:.1%}" for name in ("majority", "particle"))
+        return f"{clouds} of clouds by majority, {particles} of particles at step {CLOUD_STEP}"
     rows = [row for row in measured["growth"] if row["step"] in SCORED_STEPS]
     if measured["metric"] == "view loss":
         return f"PSNR of held-out views {_at_steps(rows, 'psnr', '.1f', ' dB')}"

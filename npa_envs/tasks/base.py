@@ -135,6 +135,11 @@ class ParticleTask(Generic[ConfigT]):
         return self.config.update_prob
 
     @property
+    def rollout_options(self) -> dict[str, Any]:
+        """Options of `npa_envs.rollout` for worlds of the task."""
+        return {"eps": self.eps, "box": self.box, "update_prob": self.update_prob}
+
+    @property
     def frame(self) -> Frame:
         """The region that viewers show: the box, or a square or cube around the origin."""
         open_space = 1.1 if self.space_dim == 2 else 0.95

@@ -105,6 +105,35 @@ def task_of_rule(
         return TrainedTask(task.for_rule(rule), doubt, task_name)
 
 
+def task_for_film(
+    task: Task,
+    source: str,
+    rule: NPARule,
+    device: torch.device,
+    *,
+    least: int,
+    resolution: int | None = None,
+    points: bool = False,
+    **world: Any,
+) -> Task:
+    """Return a rule's task with pictures that are large enough for a film.
+
+    The default resolution is that of training, at least `least` [pixels]. `points` draws particles
+    as small separate points. `world` has further options of `task_of_rule`.
+    """
+    fields = dict(world)
+    target = getattr(task, "target_picture", None)
+    side = task.config.resolution if target is None else len(target)
+    if resolution is not None or side < least:
+        fields["resolution"] = least if resolution is None else resolution
+    if points:
+        sigma = getattr(task.config, "sigma", None)
+        if sigma is None:
+            raise NPAError("style must be 'splats' for clouds that never move, got 'points'")
+        fields["sigma"] = 0.35 * sigma
+    return task if fields == world else task_of_rule(source, rule, device, **fields).task
+
+
 def tasks_of_codes(
     source: str, rule: NPARule, device: torch.device, **fields: Any
 ) -> list[Morphogenesis2D]:

@@ -16,13 +16,14 @@ import torch
 from PIL import Image
 
 from npa_envs.cli import COMMANDS, demo, doctor, main
-from npa_envs.cli.common import EXAMPLES, torch_threads
-from npa_envs.cli.film import WorldFilm, film_world
+from npa_envs.cli.common import examples_of, torch_threads
 from npa_envs.cli.train import announcement, parse, starting_configuration, thread_count
 from npa_envs.errors import NPAError
+from npa_envs.render.world_film import WorldFilm, film_world
 from npa_envs.rule.files import load_rule, save_rule
 from npa_envs.rule.rule import NPARule
-from npa_envs.training import Trainer, preset
+from npa_envs.training import TASKS, Trainer, preset
+from npa_envs.world.particles import Particles
 
 TINY = ["morphogenesis2d", "--preset", "tiny", "--no-report", "--iterations", "6", "--no-progress"]
 
@@ -72,18 +73,18 @@ def help_of(capsys, *words):
     return re.sub(r"\x1b\[[0-9;]*m", "", capsys.readouterr().out)
 
 
-@pytest.mark.parametrize("name", [*COMMANDS, *(name for name in EXAMPLES if " " in name)])
+@pytest.mark.parametrize("name", [*COMMANDS, *(f"train {task}" for task in TASKS)])
 def test_every_command_explains_itself_and_shows_examples_of_its_options(name, capsys):
     assert f"\n  {name.split()[0]} " in help_of(capsys, "--help")
     text = help_of(capsys, *name.split(), "--help")
     assert f"usage: npa-envs {name}" in text
     assert "{None}" not in text
-    for example in EXAMPLES.get(name, ()):
+    for example in [] if name == "train" else examples_of(name):
         assert f"  npa-envs {example}\n" in text
         assert example.startswith(name)
         for option in re.findall("--[a-z-]+", example):
             # Once more, among the options.
-            assert len(re.findall(rf"{option}[ ,\n]", text.split(EXAMPLES[name][-1])[1])) > 0
+            assert len(re.findall(rf"{option}[ ,\n]", text.split(examples_of(name)[-1])[1])) > 0
 
 
 def test_the_help_of_train_shows_the_most_used_options_and_help_all_all_of_them(
@@ -499,7 +500,9 @@ def test_rollout_notices_before_the_first_step_that_it_cannot_write(
 ):
     refuse = raising(PermissionError(13, "Permission denied"))
     monkeypatch.setattr("npa_envs.cli.common.tempfile.TemporaryFile", refuse)
-    monkeypatch.setattr("npa_envs.cli.film.run_worlds", lambda *_, **__: pytest.fail("a step ran"))
+    monkeypatch.setattr(
+        "npa_envs.render.world_film.rollout", lambda *_, **__: pytest.fail("a step ran")
+    )
     assert "out must be a folder that can be written to" in error_of(
         capsys, ["rollout", rule, "--steps", "9", "--out", str(tmp_path)]
     )
@@ -545,13 +548,13 @@ def test_a_film_to_share_has_the_style_and_the_background_that_were_asked_for(
 def test_filmstrip_shows_growth_damage_and_the_end(steps, every, damages, shown):
     film = WorldFilm()
     task = SimpleNamespace(picture=lambda *_: torch.zeros(1, 4, 4, 4))
-    x = s = torch.zeros(1, 1, 2)
+    worlds = Particles(torch.zeros(1, 1, 2), torch.zeros(1, 1, 2))
     for step in sorted({*range(0, steps, every), *damages, steps}):
-        film.shoot(task, x, s, f"{step}", step=step)
+        film.add(task, worlds, step)
         if step in damages:
-            film.shoot(task, x, s, f"{step}!", mark=True)
+            film.add(task, worlds, step, "!")
     frames, captions = film.strip()
-    assert captions == shown
+    assert captions == [f"step {caption.replace('!', ': !')}" for caption in shown]
     assert len(frames) == len(shown)
 
 
@@ -620,11 +623,11 @@ def test_demo_grows_rules_with_goals_and_with_codes(source, tmp_path, monkeypatc
         pytest.importorskip("sklearn")
     seen = []
 
-    def watched(rule, task, x, s, steps, **told):
-        seen.append(s)
-        return film_world(rule, task, x, s, steps, **told)
+    def watched(rule, task, worlds, steps, **options):
+        seen.append(worlds.s)
+        return film_world(rule, task, worlds, steps, **options)
 
-    monkeypatch.setattr("npa_envs.cli.film.film_world", watched)
+    monkeypatch.setattr("npa_envs.render.world_film.film_world", watched)
     monkeypatch.setattr(demo, "train_small", lambda *_: ())
     for name in ("GROW_STEPS", "HEAL_STEPS"):
         monkeypatch.setattr(demo, name, 8)

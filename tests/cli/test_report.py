@@ -10,9 +10,10 @@ import pytest
 from PIL import Image
 from small_digits import write_idx
 
-from npa_envs.cli import film, main, report
+from npa_envs.cli import main, report
 from npa_envs.errors import MissingDependencyError
 from npa_envs.measure.quality import evaluate
+from npa_envs.render import world_film
 from npa_envs.rule.files import load_rule
 from npa_envs.training import TASKS
 from npa_envs.training.task_of_rule import task_of_rule
@@ -109,7 +110,7 @@ def test_a_report_without_ffmpeg_has_all_but_the_film_that_needs_it(tmp_path, ca
     def refuse(*_arguments):
         raise MissingDependencyError("an MP4 file needs imageio with ffmpeg")
 
-    monkeypatch.setattr(film, "write_mp4", refuse)
+    monkeypatch.setattr(world_film, "write_mp4", refuse)
     assert main(words_of("morphogenesis2d", tmp_path)) == 0
     said = r"report .*rule\.md: .*; not all films: an MP4 file needs"
     assert re.search(said, capsys.readouterr().out)

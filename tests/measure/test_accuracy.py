@@ -1,6 +1,6 @@
 """The stress command finds what breaks, says where, and goes on where it was stopped."""
 
-import dataclasses
+import copy
 import json
 import math
 from pathlib import Path
@@ -23,10 +23,9 @@ from npa_envs.measure.accuracy.suite import (
     CheckResult,
     CheckSession,
     Skipped,
-    group_of,
 )
+from npa_envs.measure.quality import RuleRunner
 from npa_envs.rule.files import load_rule, rule_digest, rule_file, rule_metadata, save_rule
-from npa_envs.rule.rule import NPARule
 from npa_envs.training import preset, train
 
 CHECKS = {check.name: check for check in all_checks(quick=True)}
@@ -49,13 +48,13 @@ def test_every_check_has_a_name_of_its_own_a_group_and_an_expectation():
     for quick in (False, True):
         checks = all_checks(quick=quick)
         assert len({check.name for check in checks}) == len(checks)
-        assert {group_of(check.name) for check in checks} == set(GROUPS)
+        assert {check.group for check in checks} == set(GROUPS)
         assert all(check.expected for check in checks)
 
 
 def test_checks_are_chosen_by_group_by_name_and_by_how_names_begin():
     checks = list(CHECKS.values())
-    groups = {group_of(check.name) for check in suite.chosen_checks(checks, ["time", "values"])}
+    groups = {check.group for check in suite.chosen_checks(checks, ["time", "values"])}
     assert groups == {"time", "values"}
     assert [c.name for c in suite.chosen_checks(checks, ["time/gecko"])] == ["time/gecko"]
     clumps = suite.chosen_checks(checks, ["geometry/clump"])
@@ -86,13 +85,11 @@ def test_a_figure_above_its_limit_not_a_number_or_missing_fails(figures, holds, 
 
 
 def test_the_worst_figure_is_named():
-    entry = suite.CheckEntry.of(
-        told("a/b"), CheckResult({"x": 1.0, "y": 3.0}, {"x": 10.0, "y": 4.0, "z": 1.0}), 0.0
-    )
-    assert entry.worst() == "z nan (at most 1)"
-    assert entry.share("y") == 0.75
-    assert suite.CheckEntry("a/b", "", "fail", {"x": 1.0}, {"x": 0.0}).share("x") == math.inf
-    assert suite.CheckEntry("a/b", "", "pass", {"x": 0.0}, {"x": 0.0}).share("x") == 0.0
+    result = CheckResult({"x": 1.0, "y": 3.0}, {"x": 10.0, "y": 4.0, "z": 1.0})
+    assert result.worst() == "z nan (at most 1)"
+    assert result.fraction("y") == 0.75
+    assert CheckResult({"x": 1.0}, {"x": 0.0}).fraction("x") == math.inf
+    assert CheckResult({"x": 0.0}, {"x": 0.0}).fraction("x") == 0.0
 
 
 def test_what_raises_has_failed_and_the_others_go_on():
@@ -124,7 +121,7 @@ def test_a_record_comes_back_as_it_was_written(tmp_path: Path):
     assert suite.StressRecord(FACTS, path).read().rows == []
     figures = {"a": 1.5, "b": math.inf, "c": math.nan}
     record = suite.StressRecord(FACTS, path)
-    record.put(suite.CheckEntry("x/y", "s", "fail", figures, {"a": 1.0}, "", "n"))
+    record.put(CheckResult(figures, {"a": 1.0}, note="n", name="x/y", expected="s"))
     held = json.loads(path.read_text(encoding="utf-8"))
     assert held["counts"] == {"pass": 0, "range": 0, "fail": 1, "skipped": 0}
     assert held["checks"][0]["figures"] == {"a": 1.5, "b": "inf", "c": "nan"}
@@ -241,11 +238,10 @@ def test_scenes_are_where_their_names_say():
 def test_a_rule_that_blows_up_is_found_out(factor, count, verdict, device, monkeypatch):
     def tampered(*arguments, **options):
         home = habitat(*arguments, **options)
-        rule = NPARule(**home.rule.hyper_parameters()).to(home.x)
-        rule.load_state_dict(home.rule.state_dict())
+        rule = copy.deepcopy(home.rule)
         with torch.no_grad():
             rule.output.weight *= factor
-        return dataclasses.replace(home, rule=rule, x=home.x[:, :count], s=home.s[:, :count])
+        return home._replace(rule=rule, worlds=home.worlds.map(lambda part: part[:, :count]))
 
     monkeypatch.setattr(endurance, "habitat", tampered)
     entry = suite.run_check(CHECKS["time/heart" if count == 1 else "time/dots"], session(device))
@@ -259,20 +255,13 @@ def test_a_rule_that_blows_up_is_found_out(factor, count, verdict, device, monke
 
 def test_the_energy_of_a_world_at_rest_is_no_chance(device):
     home = habitat(session(device), "heart")
-    run = endurance.LongRun(home, torch.Generator(device).manual_seed(0), home.options())
-    run.advance(512)
-    draws = [torch.Generator(device).manual_seed(seed) for seed in range(8)]
-    energies = [endurance.measured(home, run.x, run.s, draw)["energy"] for draw in draws]
+    runners = [
+        RuleRunner(home.rule, home.task, torch.Generator(device).manual_seed(seed))
+        for seed in range(9)
+    ]
+    worlds = runners[0].run(home.worlds, 512)
+    energies = [endurance.measured(runner, worlds)["energy"] for runner in runners[1:]]
     assert max(energies) < 2.0 * min(energies)
-
-
-def test_what_grew_at_another_radius_is_measured_at_its_trained_size(device):
-    free, held = (habitat(session(device), name) for name in ("heart", "dots"))
-    eps = free.task.eps
-    torch.testing.assert_close(free.at_trained_size(2.0 * free.x, 2.0 * eps), free.x)
-    assert free.at_trained_size(free.x, eps) is free.x
-    # A periodic box keeps its size.
-    assert held.at_trained_size(held.x, 2.0 * held.task.eps) is held.x
 
 
 @pytest.mark.parametrize(
@@ -374,16 +363,13 @@ def test_the_command_lists_its_checks(capsys):
 
 
 def test_heat_maps_are_drawn_of_what_has_limits():
-    entries = [
-        suite.CheckEntry("geometry/one/2d/open", "", "fail", {"z": math.nan, "s": 0.5}, {"z": 1.0}),
-        suite.CheckEntry(
-            "geometry/nearest/2d", "", "range", {"z": 2.0}, {"z": 1.0, "s": 1.0}, "near"
-        ),
-        suite.CheckEntry("gradients/growth/heart", "", "range", {"norm": 1.0}, {}, "512 steps"),
-        suite.CheckEntry("values/nan_state", "", "skipped"),
-    ]
     record = suite.StressRecord(FACTS)
-    record.rows = entries
+    record.rows = [
+        CheckResult({"z": math.nan, "s": 0.5}, {"z": 1.0}, name="geometry/one/2d/open"),
+        CheckResult({"z": 2.0}, {"z": 1.0, "s": 1.0}, "near", name="geometry/nearest/2d"),
+        CheckResult({"norm": 1.0}, holds="512 steps", name="gradients/growth/heart"),
+        CheckResult(verdict="skipped", name="values/nan_state"),
+    ]
     pictures = suite.heat_maps(record)
     assert set(pictures) == {"geometry"}
     assert pictures["geometry"].startswith(b"\x89PNG")

@@ -11,7 +11,7 @@ from scripts import script_facts, script_parser
 
 from npa_envs.errors import NPAError
 from npa_envs.measure import record
-from npa_envs.measure.plots import mark_decades, write_plots
+from npa_envs.measure.plots import number_plainly, write_plots
 
 RESULTS = Path(__file__).resolve().parents[2] / "benchmarks" / "results"
 FACTS = {"commit": "0", "seeds": (1, 2)}
@@ -113,7 +113,7 @@ def test_plots_without_matplotlib_name_the_extra(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(
     ("low", "high", "marks"),
-    [(0.1, 1.0, ["0.1", "0.2", "0.5", "1"]), (1.0, 1000.0, ["1", "10", "100", "1000"])],
+    [(0.1, 1.0, ["0.1", "0.2", "0.5", "1"]), (1.0, 1000.0, ["1", "10", "100", "1k"])],
 )
 def test_axes_of_few_decades_are_marked_within_them(low, high, marks):
     pytest.importorskip("matplotlib")
@@ -121,7 +121,7 @@ def test_axes_of_few_decades_are_marked_within_them(low, high, marks):
 
     panel = Figure().subplots()
     panel.set(yscale="log", ylim=(0.99 * low, 1.01 * high))
-    mark_decades(panel)
+    number_plainly(panel.yaxis)
     places, labels = panel.get_yticks(), panel.yaxis.get_major_formatter().format_ticks
     assert labels([place for place in places if low <= place <= high]) == marks
     assert not panel.get_yticks(minor=True).size

@@ -20,7 +20,6 @@ from npa_envs.measure.robustness.trials import (
     RuleTrial,
     TrialPlan,
     disk,
-    loss_curves,
     quick_plan,
     trained_value,
 )
@@ -28,6 +27,7 @@ from npa_envs.rule import files
 from npa_envs.tasks.damage import random_particle
 from npa_envs.training.task_of_rule import task_of_rule, trained_config
 from npa_envs.world.brushes import nearest_image
+from npa_envs.world.particles import combined
 from npa_envs.world.randomness import WorldRandom
 
 SIDE = 2.0
@@ -36,7 +36,7 @@ VALUES = {"eps": (1.0, 2.0), "particles": (1.0, 2.0), "update_prob": (0.25, 0.5)
 TINY = TrialPlan(grow_steps=8, heal_steps=(0, 4, 8), chunk=4, values=VALUES)
 
 
-def ground(
+def trial_of(
     name: str, device: torch.device, plan: TrialPlan = TINY, particles: int = 128
 ) -> RuleTrial:
     return RuleTrial(name, device, plan, range(5, 7), particles)
@@ -231,9 +231,9 @@ def test_where_a_rule_works_follows_from_the_mean_loss_of_its_seeds(
 
 @pytest.mark.parametrize("name", ["heart", "dots", "digits"])
 def test_damaged_worlds_go_beside_twins_with_the_same_masks(name, device):
-    place = ground(name, device)
-    home, trained = study.grow(place)
-    found = {course.damage: course for course in trials.healing(place, home)}
+    trial = trial_of(name, device)
+    grown, trained = study.grow(trial)
+    found = {course.damage: course for course in trials.healing(trial, grown)}
     static = name == "digits"
     assert set(found) == {
         trials.CONTROL,
@@ -249,15 +249,15 @@ def test_damaged_worlds_go_beside_twins_with_the_same_masks(name, device):
         assert all(value != 1.0 for value in found["noise"].ratios(0))
     assert found["half"].twins == found["side"].twins != twins
     # What twins do is what the worlds do that go on alone.
-    run = place.run(home, place.random(1001))
-    alone = place.by_seed(loss_curves(home, run, place.plan.heal_steps)).T
+    _, losses = trial.run(grown, trial.random(1001), trial.plan.heal_steps)
+    alone = trial.by_seed(losses).T
     assert torch.allclose(alone, torch.tensor(twins, dtype=torch.float64).to(alone), rtol=1e-5)
 
 
 def test_conditions_are_grown_for_as_many_updates_and_left_out_where_too_large(device):
-    place = ground("heart", device)
-    _, trained = study.grow(place)
-    found = list(study.responses(place, trained, most_particles=300))
+    trial = trial_of("heart", device)
+    _, trained = study.grow(trial)
+    found = list(study.responses(trial, trained, most_particles=300))
     assert [(r.condition, r.value, r.steps) for r in found] == [
         ("eps", 1.0, 8),
         ("eps", 2.0, 8),
@@ -273,49 +273,61 @@ def test_conditions_are_grown_for_as_many_updates_and_left_out_where_too_large(d
 
 
 def test_seeds_are_worlds_of_their_own_whatever_their_number(device):
-    place = ground("heart", device)
-    two = place.home(shape="ring")
-    one = RuleTrial("heart", device, TINY, range(6, 7), 128).home(shape="ring")
+    trial = trial_of("heart", device)
+    two = trial.initial_worlds(shape="ring")
+    one = RuleTrial("heart", device, TINY, range(6, 7), 128).initial_worlds(shape="ring")
     assert torch.equal(two.x[1:], one.x)
     assert not torch.equal(two.x[0], two.x[1])
-    half = place.home(share=0.5)
-    assert half.x.shape == (2, 64, 2)
-    assert (half.task.config.target_point_count, two.task.config.target_point_count) == (64, 128)
+    assert trial.initial_worlds(0.5).x.shape == (2, 64, 2)
+    assert [trial.task_of(n).config.target_point_count for n in (64, 128)] == [64, 128]
+
+
+def test_worlds_of_another_radius_are_measured_at_their_trained_size(device):
+    free, boxed = (trial_of(name, device) for name in ("heart", "dots"))
+    for trial, scale in ((free, 2.0), (boxed, 1.0)):
+        worlds, eps = trial.initial_worlds(), trial.task.eps
+        larger = worlds._replace(x=scale * worlds.x)
+        assert torch.equal(trial.losses(larger, 2.0 * eps), trial.losses(worlds, eps))
 
 
 def test_seeds_of_a_rule_of_many_pictures_grow_them_in_turn(device):
-    place = RuleTrial("seven-pictures", device, TINY, range(5, 9), 128)
-    names = place.rule.codes.names
-    home = place.home()
-    for world, seed in enumerate(range(5, 9)):
-        code = place.rule.codes[names[seed % 7]]
-        assert torch.equal(home.s[world, :, :8], code.expand(128, 8))
-    losses = home.losses(home.x, home.s)
-    for world, seed in enumerate(range(5, 9)):
-        own = task_of_rule(
-            "seven-pictures", place.rule, device, particle_count=128, target=names[seed % 7]
+    trial = RuleTrial("seven-pictures", device, TINY, range(5, 9), 128)
+    names, eps = trial.rule.codes.names, trial.task.eps
+    worlds = trial.initial_worlds()
+    losses = trial.losses(worlds, eps)
+    for k, seed in enumerate(range(5, 9)):
+        assert torch.equal(worlds.s[k, :, :8], trial.rule.codes[names[seed % 7]].expand(128, 8))
+        task = task_of_rule(
+            "seven-pictures", trial.rule, device, particle_count=128, target=names[seed % 7]
         ).task
-        alone = own.metric(home.x[world : world + 1], home.s[world : world + 1])
-        assert torch.equal(losses[world], alone[0])
+        assert torch.equal(losses[k], task.metric(worlds.x[k : k + 1], worlds.s[k : k + 1])[0])
     # Copies grow what their worlds grow, and a seed alone what it grows among others.
-    twice = home.with_worlds(home.x.repeat(2, 1, 1), home.s.repeat(2, 1, 1))
-    assert torch.equal(twice.losses(twice.x, twice.s), losses.repeat(2))
-    one = RuleTrial("seven-pictures", device, TINY, range(8, 9), 128).home(share=0.5)
-    assert torch.equal(one.s, place.home(share=0.5).s[3:])
+    twice = combined(torch.cat, [worlds, worlds])
+    assert torch.equal(trial.losses(twice, eps), losses.repeat(2))
+    one = RuleTrial("seven-pictures", device, TINY, range(8, 9), 128).initial_worlds(0.5)
+    assert torch.equal(one.s, trial.initial_worlds(0.5).s[3:])
     # What takes codes away gives them back.
-    loss_curves = trials.healing(place, study.grow(place)[0])
-    assert all(len(course.losses) == 4 for course in loss_curves)
+    curves = trials.healing(trial, study.grow(trial)[0])
+    assert all(len(curve.losses) == 4 for curve in curves)
 
 
-def test_a_world_that_is_lost_stays_lost_and_leaves_the_others_as_they_are(device):
-    place = ground("heart", device)
-    home, _ = study.grow(place)
-    whole = loss_curves(home, place.run(home, place.random(9)), (0, 4, 8))
-    run = place.run(home, place.random(9))
-    run.s[0, :, 0] = math.nan
-    found = loss_curves(home, run, (0, 4, 8))
-    assert found[:, 0].isnan().all()
-    assert torch.equal(found[:, 1], whole[:, 1])
+def test_a_world_that_diverges_stays_lost_and_leaves_the_others_as_they_are(device, monkeypatch):
+    trial = trial_of("heart", device)
+    grown, _ = study.grow(trial)
+    _, whole = trial.run(grown, trial.random(9), (0, 4, 8))
+    run = trials.RuleRunner.run
+
+    def broken(runner, worlds, steps):
+        worlds = run(runner, worlds, steps)
+        if steps == 0:
+            worlds = worlds._replace(s=worlds.s.clone())
+            worlds.s[0, :, 0] = math.nan
+        return worlds
+
+    monkeypatch.setattr(trials.RuleRunner, "run", broken)
+    _, losses = trial.run(grown, trial.random(9), (0, 4, 8))
+    assert losses[:, 0].isnan().all()
+    assert torch.equal(losses[:, 1], whole[:, 1])
 
 
 def test_plans_are_whole_chunks_and_hold_what_was_trained():

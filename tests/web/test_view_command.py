@@ -10,7 +10,7 @@ import torch
 from npa_envs import NPAError, load_rule, save_rule
 from npa_envs.cli import main
 from npa_envs.cli import view as command
-from npa_envs.cli.common import EXAMPLES
+from npa_envs.cli.common import examples_of
 from npa_envs.cli.view import ViewOptions, open_browser, world_maker
 from npa_envs.web.environment_world import EnvironmentWorld
 from npa_envs.web.rule_world import RuleWorld, RunWorld
@@ -39,7 +39,7 @@ def test_a_rule_a_run_and_an_environment_are_by_species(tmp_path):
 
 
 def test_the_environment_and_the_policy_of_the_commands_examples_fit():
-    (words,) = (words.split() for words in EXAMPLES["view"] if "--policy" in words)
+    (words,) = (words.split() for words in examples_of("view") if "--policy" in words)
     assert type(make(words[1], policy=words[-1])) is EnvironmentWorld
 
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from functools import partial
 
-from npa_envs.measure.accuracy.endurance import ENDURANCE, rule_names
-from npa_envs.measure.accuracy.hard_cases import VALUES, geometry_checks
-from npa_envs.measure.accuracy.numerics import DIFFERENCES, GRADIENTS, PRECISION
-from npa_envs.measure.accuracy.suite import Check, by_dimension
+# These two modules register their checks.
+from npa_envs.measure.accuracy import numerics  # noqa: F401
+from npa_envs.measure.accuracy.endurance import rule_names
+from npa_envs.measure.accuracy.hard_cases import scene_checks
+from npa_envs.measure.accuracy.suite import CHECKS, GROUPS, RULE_CHECKS, Check
 
 
 def all_checks(
@@ -18,25 +19,18 @@ def all_checks(
 
     `quick` checks fewer shipped rules. The seed is that of random positions.
     """
-    # One rule of each task.
+    # Gradients are checked for one rule of each task.
     few = ("gecko", "dots") if quick else ("gecko", "dots", "digits", "duck")
-    of_rules = [*_of(ENDURANCE, rules or rule_names()), *_of(GRADIENTS, rules or few)]
-    if rules:
-        return of_rules
-    differences = [
-        Check(f"{one.name}/{where}", one.expected, partial(one.run, periodic=where == "periodic"))
-        for one in DIFFERENCES
-        for where in ("open", "periodic")
-    ]
-    hard = [*geometry_checks(seed), *by_dimension(VALUES)]
-    return [*hard, *of_rules, *differences, *by_dimension(PRECISION)]
-
-
-def _of(checks: Iterable[Check], rules: Mapping[str, str] | Iterable[str]) -> list[Check]:
-    """Return the checks for each rule, named NAME/RULE; rules: name -> source, or shipped ones."""
-    sources = rules if isinstance(rules, Mapping) else {name: name for name in rules}
-    return [
+    rule_checks = [
         Check(f"{one.name}/{name}", one.expected, partial(one.run, source), source)
-        for name, source in sources.items()
-        for one in checks
+        for group, names in {"time": rule_names(), "gradients": few}.items()
+        for name, source in (rules or dict(zip(names, names, strict=True))).items()
+        for one in RULE_CHECKS
+        if one.group == group
     ]
+    if rules:
+        return rule_checks
+    by_dimension = sorted(CHECKS, key=lambda one: ("/2d" not in one.name, "/3d" not in one.name))
+    groups = list(GROUPS)
+    checks = [*scene_checks(seed), *rule_checks, *by_dimension]
+    return sorted(checks, key=lambda one: groups.index(one.group))

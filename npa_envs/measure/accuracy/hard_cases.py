@@ -29,7 +29,7 @@ from npa_envs.measure.accuracy.scenes import (
     states_at,
     threshold_scenes,
 )
-from npa_envs.measure.accuracy.suite import Check, CheckResult, CheckSession, by_dimension, check
+from npa_envs.measure.accuracy.suite import Check, CheckResult, CheckSession, check
 from npa_envs.ops import perceive, perception_fields
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import LIFE, NPARule
@@ -39,13 +39,10 @@ from npa_envs.world.rollout import rollout
 NEAR_THRESHOLD = 1e-3
 """Relative distance from the threshold within which perception must not change more than this."""
 
-GEOMETRY: list[Check] = []
-"""Checks of the group `geometry` that have no `Scene`."""
 
-
-def geometry_checks(seed: int = 0) -> list[Check]:
-    """Return the checks of the group `geometry`; the seed is that of random positions."""
-    hard = [
+def scene_checks(seed: int = 0) -> list[Check]:
+    """Return a check for each `Scene`; the seed is that of random positions."""
+    return [
         Check(
             f"geometry/{scene.name}/{space_dim}d/{'periodic' if periodic else 'open'}",
             f"{scene.summary}: all is finite, as the float64 reference has it",
@@ -55,7 +52,6 @@ def geometry_checks(seed: int = 0) -> list[Check]:
         for periodic in (False, True)
         for scene in scenes(space_dim, periodic=periodic, seed=seed)
     ]
-    return [*hard, *by_dimension(GEOMETRY)]
 
 
 def _run_scene(scene: Scene, session: CheckSession) -> CheckResult:
@@ -69,7 +65,7 @@ def _run_scene(scene: Scene, session: CheckSession) -> CheckResult:
     return CheckResult(figures, error_limits(scene.x, scene.s, scene.box, expected))
 
 
-@check(GEOMETRY, "geometry/threshold", 2, 3)
+@check("geometry/threshold", 2, 3)
 def _run_threshold(space_dim: int, session: CheckSession) -> CheckResult:
     """A moment matrix near the threshold of its inverse is either inverted or not inverted."""
     x, offsets = threshold_scenes(space_dim, reference.MOMENT_THRESHOLD)
@@ -98,7 +94,7 @@ def _run_threshold(space_dim: int, session: CheckSession) -> CheckResult:
     return CheckResult(figures, limits)
 
 
-@check(GEOMETRY, "geometry/smooth_inverse", 2, 3)
+@check("geometry/smooth_inverse", 2, 3)
 def _run_smooth_inverse(space_dim: int, session: CheckSession) -> CheckResult:
     """With moment_inverse='smooth' perception matches the float64 reference, and is continuous at
     the determinant where the inverse with a threshold jumps."""
@@ -125,7 +121,7 @@ def _largest_jump(z: Tensor) -> float:
     return float(corner.diff(dim=0).norm(dim=-1).max() / corner.norm(dim=-1).max())
 
 
-@check(GEOMETRY, "geometry/crowd", 2, 3)
+@check("geometry/crowd", 2, 3)
 def _run_crowd(space_dim: int, session: CheckSession) -> CheckResult:
     """Very many particles in one cell: densities as float64 has them, all is finite, and the
     smoothing's adjoint conserves what it spreads."""
@@ -157,7 +153,7 @@ def _run_crowd(space_dim: int, session: CheckSession) -> CheckResult:
     )
 
 
-@check(GEOMETRY, "geometry/nearest", 2, 3)
+@check("geometry/nearest", 2, 3)
 def _run_nearest(space_dim: int, session: CheckSession) -> CheckResult:
     """A pair is perceived as such from 1e-19 length units on (float32), below it counts as
     coincident; all is finite down to denormal distances."""
@@ -182,7 +178,7 @@ def _run_nearest(space_dim: int, session: CheckSession) -> CheckResult:
     return CheckResult(figures, limits, holds=f"float32: from 1e-{holds} on")
 
 
-@check(GEOMETRY, "geometry/outside", 2, 3)
+@check("geometry/outside", 2, 3)
 def _run_outside(space_dim: int, session: CheckSession) -> CheckResult:
     """Particles outside of a periodic box are perceived as their images: in float32 with the
     rounding of their coordinates; all is finite."""
@@ -222,9 +218,6 @@ WORLD, PARTICLE = 1, 7
 
 WORLD_COUNT, PARTICLE_COUNT, STEPS = 3, 150, 8
 
-VALUES: list[Check] = []
-"""The checks of the group `values`."""
-
 
 def _worlds(session: CheckSession, space_dim: int, state_dim: int) -> tuple[Tensor, Tensor]:
     """Return worlds with about 20 neighbours a particle, in two halves that are far apart."""
@@ -243,7 +236,7 @@ def differing(value: Tensor, expected: Tensor) -> float:
     return float((~same).sum())
 
 
-@check(VALUES, "values/scale", 2, 3)
+@check("values/scale", 2, 3)
 def _run_scale(space_dim: int, session: CheckSession) -> CheckResult:
     """States of 1e-30 to 1e30 are perceived as the float64 reference has them, forwards and
     backwards; beyond, the largest scale is reported."""
@@ -265,7 +258,7 @@ def _run_scale(space_dim: int, session: CheckSession) -> CheckResult:
     return CheckResult(figures, {"wrong": 0.0}, holds=text)
 
 
-@check(VALUES, "values/infinite_channel", 2, 3)
+@check("values/infinite_channel", 2, 3)
 def _run_infinite_channel(space_dim: int, session: CheckSession) -> CheckResult:
     """A channel that is infinite at one particle changes no bit of other channels, of particles
     that do not perceive it, and of other worlds."""
@@ -289,7 +282,7 @@ def _run_infinite_channel(space_dim: int, session: CheckSession) -> CheckResult:
     return CheckResult(figures, dict.fromkeys(list(figures)[:3], 0.0))
 
 
-@check(VALUES, "values/dead", 2, 3)
+@check("values/dead", 2, 3)
 @torch.no_grad()
 def _run_dead(space_dim: int, session: CheckSession) -> CheckResult:
     """Numbers in the slots of dead particles, also NaN, change no bit of a rollout; one particle
@@ -317,7 +310,7 @@ def _run_dead(space_dim: int, session: CheckSession) -> CheckResult:
     return CheckResult(figures, {"x": 0.0, "s": 0.0, "not_finite": 0.0, "empty_slots": 5.0})
 
 
-@check(VALUES, "values/gradient_of_nan")
+@check("values/gradient_of_nan")
 def _run_gradient(session: CheckSession) -> CheckResult:
     """Cotangents and states that are NaN in one world change no bit of other worlds' gradients
     by states and positions."""
@@ -350,7 +343,7 @@ def _broken_rollout(session: CheckSession) -> tuple[tuple[Tensor, Tensor], tuple
     return run(broken), run(s)
 
 
-@check(VALUES, "values/nan_state")
+@check("values/nan_state")
 def _run_nan_state(session: CheckSession) -> CheckResult:
     """NaN in one state spreads in its own world only; other worlds' rollouts keep every bit."""
     (x, s), (clean_x, clean_s) = _broken_rollout(session)
@@ -379,7 +372,7 @@ def _unreported(calls: dict[str, Callable[[], Any]], named: str) -> CheckResult:
     return CheckResult(figures, dict.fromkeys(figures, 0.0))
 
 
-@check(VALUES, "values/nan_position")
+@check("values/nan_position")
 def _run_nan_position(session: CheckSession) -> CheckResult:
     """A position that is NaN is refused, by an error that names its world and particle."""
     rule = load_rule("gecko", device=session.device).float()
@@ -392,7 +385,7 @@ def _run_nan_position(session: CheckSession) -> CheckResult:
     return _unreported(calls, f"world {WORLD}, particle {PARTICLE}")
 
 
-@check(VALUES, "values/blown_up")
+@check("values/blown_up")
 def _run_blown_up(session: CheckSession) -> CheckResult:
     """Positions that a rollout has made NaN are reported by the next call, with their world."""
     rule = load_rule("gecko", device=session.device).float()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable, Iterator
 from typing import NamedTuple
@@ -9,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from npa_envs.measure.accuracy.endurance import TrialWorlds, habitat
+from npa_envs.measure.accuracy.endurance import Habitat, habitat
 from npa_envs.measure.accuracy.hard_cases import differing
 from npa_envs.measure.accuracy.scenes import (
     EPS,
@@ -24,9 +25,9 @@ from npa_envs.measure.accuracy.scenes import (
     scenes,
     states_at,
 )
-from npa_envs.measure.accuracy.suite import Check, CheckResult, CheckSession, Skipped, check
+from npa_envs.measure.accuracy.suite import RULE_CHECKS, CheckResult, CheckSession, Skipped, check
+from npa_envs.measure.quality import RuleRunner
 from npa_envs.ops import perceive
-from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule
 from npa_envs.world.cuda_graph import capture
 from npa_envs.world.randomness import WorldRandom
@@ -36,12 +37,6 @@ from npa_envs.world.rollout import rollout
 
 STEPS, QUICK_STEPS = 512, 32
 """Steps of the longest differentiated rollouts."""
-
-GRADIENTS: list[Check] = []
-"""Checks of the group `gradients` that run for each rule."""
-
-DIFFERENCES: list[Check] = []
-"""Checks of the group `gradients` without a rule, in open space or a periodic box."""
 
 
 class RolloutOutcome(NamedTuple):
@@ -61,26 +56,24 @@ def powers_of_two(most: int) -> list[int]:
     return [2**k for k in range(int(math.log2(most)) + 1)]
 
 
-def outcome(
-    home: TrialWorlds, session: CheckSession, steps: int, dtype: torch.dtype
-) -> RolloutOutcome:
+def outcome(home: Habitat, session: CheckSession, steps: int, dtype: torch.dtype) -> RolloutOutcome:
     """Run a rollout and return worlds and gradients; masks do not depend on the dtype."""
-    rule = NPARule(**home.rule.hyper_parameters()).to(home.x.device)
+    rule = NPARule(**home.rule.hyper_parameters()).to(home.worlds.x.device)
     rule.load_state_dict(home.rule.state_dict())
     rule.to(dtype)
-    start = home.s.to(dtype).requires_grad_()
-    x, s, path_length = rollout(
+    start = home.worlds.s.to(dtype).requires_grad_()
+    x, s, lengths = rollout(
         rule,
-        home.x.to(dtype),
+        home.worlds.x.to(dtype),
         start,
         steps,
         generator=session.generator(1),
         memory="minimal" if steps > 8 else "store",
         return_path_length=True,
-        **home.options(),
+        **home.task.rollout_options,
     )
     weights = torch.Generator().manual_seed(3)
-    worlds = torch.cat((x, s, path_length[..., None]), dim=2)
+    worlds = torch.cat((x, s, lengths[..., None]), dim=2)
     # A mean over particles, so that norms at different N can be compared.
     terms = worlds * torch.randn(worlds.shape, generator=weights).to(worlds)
     loss = terms.sum(-1).mean()
@@ -90,11 +83,11 @@ def outcome(
     return RolloutOutcome(x.detach(), s.detach(), torch.cat(flat)[None], by_states)
 
 
-def _home(session: CheckSession, name: str) -> TrialWorlds:
+def _home(session: CheckSession, name: str) -> Habitat:
     return habitat(session, name, particles=0.25 if session.quick else 1.0)
 
 
-@check(GRADIENTS, "gradients/norm")
+@check("gradients/norm", registry=RULE_CHECKS)
 def _run_norm(name: str, session: CheckSession) -> CheckResult:
     """Gradients of a functional by weights and by states at the start are finite whatever the
     number of steps; their norms are reported."""
@@ -110,7 +103,7 @@ def _run_norm(name: str, session: CheckSession) -> CheckResult:
     return CheckResult(figures | {"not_finite": not_finite}, {"not_finite": 0.0})
 
 
-@check(GRADIENTS, "gradients/float32")
+@check("gradients/float32", registry=RULE_CHECKS)
 def _run_float32(name: str, session: CheckSession) -> CheckResult:
     """One step in float32 is within 1e-5 of one in float64, also its gradients; after how many
     steps they still agree to 1e-2 is reported."""
@@ -132,8 +125,8 @@ def _run_float32(name: str, session: CheckSession) -> CheckResult:
     return CheckResult(figures, limits, holds=f"steps within 1e-2, of {counts[-1]}: {text}")
 
 
-@check(DIFFERENCES, "gradients/finite_differences", 2, 3)
-def _run_differences(space_dim: int, session: CheckSession, *, periodic: bool) -> CheckResult:
+@check("gradients/finite_differences", *itertools.product((2, 3), (False, True)))
+def _run_differences(space_dim: int, periodic: bool, session: CheckSession) -> CheckResult:
     """In float64, derivatives along smooth motions and along random states agree with finite
     differences, in every hard scene."""
     figures = {}
@@ -186,9 +179,6 @@ def _difference(scene: Scene, session: CheckSession, what: str) -> float:
 TWO_ERRORS = 2.0
 """Allowed distance of two results, in errors that the group `geometry` allows for one."""
 
-PRECISION: list[Check] = []
-"""The checks of the group `precision`."""
-
 
 def _every_scene(space_dim: int, session: CheckSession) -> Iterator[Scene]:
     for periodic in (False, True):
@@ -219,7 +209,7 @@ def _compared(pairs: Iterable[tuple[Scene, PerceptionOutcome, PerceptionOutcome]
     )
 
 
-@check(PRECISION, "precision/order", 2, 3)
+@check("precision/order", 2, 3)
 def _run_order(space_dim: int, session: CheckSession) -> CheckResult:
     """Particles in another order perceive the same up to rounding, in every hard scene."""
 
@@ -237,7 +227,7 @@ def _run_order(space_dim: int, session: CheckSession) -> CheckResult:
     return _compared(pairs())
 
 
-@check(PRECISION, "precision/repeated", 2, 3)
+@check("precision/repeated", 2, 3)
 def _run_repeated(space_dim: int, session: CheckSession) -> CheckResult:
     """Perception and gradients of every hard scene are the same bits when repeated."""
     figures = dict.fromkeys(PerceptionOutcome._fields, 0.0)
@@ -249,7 +239,7 @@ def _run_repeated(space_dim: int, session: CheckSession) -> CheckResult:
     return CheckResult(figures, dict.fromkeys(figures, 0.0))
 
 
-@check(PRECISION, "precision/batch", 2, 3)
+@check("precision/batch", 2, 3)
 def _run_batch(space_dim: int, session: CheckSession) -> CheckResult:
     """Every world of a batch perceives the bits that it perceives alone."""
     figures = {"open": 0.0, "periodic": 0.0}
@@ -267,7 +257,7 @@ def _run_batch(space_dim: int, session: CheckSession) -> CheckResult:
     return CheckResult(figures, dict.fromkeys(figures, 0.0))
 
 
-@check(PRECISION, "precision/devices")
+@check("precision/devices")
 def _run_devices(session: CheckSession) -> CheckResult:
     """A CUDA device and the CPU perceive the same up to rounding, in every hard scene."""
     if not session.cuda:
@@ -282,31 +272,29 @@ def _run_devices(session: CheckSession) -> CheckResult:
     return _compared(pairs())
 
 
-@check(PRECISION, "precision/graph")
+@check("precision/graph")
 @torch.no_grad()
 def _run_graph(session: CheckSession) -> CheckResult:
     """A rollout of 16 steps recorded in a CUDA graph has the bits of one that is not."""
     if not session.cuda:
         raise Skipped("graphs are CUDA's: run it with --device cuda")
-    rule = load_rule("gecko", device=session.device).float()
     home = habitat(session, "gecko", world_count=3)
+    worlds = home.worlds
     random = WorldRandom([0, 1, 2], device=session.device)
-    x, s = torch.empty_like(home.x), torch.empty_like(home.s)
+    result = worlds.map(torch.empty_like)
+    runner = RuleRunner(home.rule, home.task, random)
 
     def run() -> None:
-        worlds = rollout(rule, home.x, home.s, 16, generator=random, **home.options())
-        x.copy_(worlds[0])
-        s.copy_(worlds[1])
+        result.copy_(runner.run(worlds, 16))
 
     run()
-    eager = x.clone(), s.clone()
+    eager = result.map(torch.clone)
     figures = {"positions": 0.0, "states": 0.0}
     graph = capture(run, session.device, warm_up=run)
     for _ in range(2):
         random.steps.zero_()
-        x.zero_()
-        s.zero_()
+        result.map(Tensor.zero_)
         graph.replay()
-        figures["positions"] += differing(x, eager[0])
-        figures["states"] += differing(s, eager[1])
+        figures["positions"] += differing(result.x, eager.x)
+        figures["states"] += differing(result.s, eager.s)
     return CheckResult(figures, dict.fromkeys(figures, 0.0))

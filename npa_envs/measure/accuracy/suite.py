@@ -17,7 +17,7 @@ from npa_envs.measure.plots import draw_matrix, new_figure, png
 from npa_envs.measure.record import Record, aligned, as_objects, time_limit
 from npa_envs.rule.files import load_rule, rule_digest
 
-Verdict = Literal["pass", "fail", "range", "skipped"]
+Verdict = Literal["pass", "fail", "range", "skipped", ""]
 
 GROUPS = {
     "geometry": "where particles lie: forwards and backwards, against a float64 reference",
@@ -40,20 +40,53 @@ class Skipped(Exception):
 class CheckResult:
     """Figures of a check by name, and limits of some of them."""
 
-    figures: Mapping[str, float]
+    figures: Mapping[str, float] = field(default_factory=dict)
     limits: Mapping[str, float] = field(default_factory=dict)
     holds: str = ""
     """The range in which the library is right, as text, if the check measures one."""
     note: str = ""
+    """Why it was skipped, its error, or a remark."""
+    verdict: Verdict = ""
+    """By default "fail" if a figure with a limit is above it, missing or NaN, else "range" if
+    `holds` is given, or "pass"."""
+    name: str = ""
+    """Name of the check; this and all below are set by `run_check`."""
+    expected: str = ""
+    seconds: float = 0.0
+    """Duration [s]."""
+    weights: str = ""
+    """The `rule_digest` of a check's rule."""
+
+    def __post_init__(self) -> None:
+        """Set the default verdict."""
+        # Comparisons with NaN are false.
+        kept = all(self.figures.get(key, math.nan) <= limit for key, limit in self.limits.items())
+        default = "range" if self.holds else "pass"
+        object.__setattr__(self, "verdict", self.verdict or (default if kept else "fail"))
 
     @property
-    def verdict(self) -> Verdict:
-        """ "fail" if a figure with a limit is above it, missing or NaN, else "range" or "pass"."""
-        nan = float("nan")
-        # Comparisons with NaN are false.
-        if not all(self.figures.get(name, nan) <= limit for name, limit in self.limits.items()):
-            return "fail"
-        return "range" if self.holds else "pass"
+    def done(self) -> bool:
+        """Whether a resumed run need not repeat it."""
+        return self.verdict in ("pass", "range")
+
+    def fraction(self, name: str) -> float:
+        """Return a figure over its limit, which is exceeded if this is above 1 or NaN.
+
+        With a limit of 0 it is 0 or infinite.
+        """
+        value, limit = self.figures.get(name, math.nan), self.limits[name]
+        if limit == 0.0:
+            return value if value == 0.0 or math.isnan(value) else math.inf
+        return value / limit
+
+    def worst(self) -> str:
+        """Return the figure with the largest `fraction` of its limit, as text."""
+        if not self.limits:
+            return ""
+        fractions = {name: self.fraction(name) for name in self.limits}
+        name = max(fractions, key=lambda name: (math.isnan(fractions[name]), fractions[name]))
+        value = self.figures.get(name, math.nan)
+        return f"{name} {value:.2g} (at most {self.limits[name]:.2g})"
 
 
 @dataclass
@@ -63,7 +96,7 @@ class CheckSession:
     device: torch.device
     quick: bool = False
     seed: int = 0
-    kept: dict[Any, Any] = field(default_factory=dict)
+    cache: dict[Any, Any] = field(default_factory=dict)
     """Results that several checks share."""
 
     @property
@@ -90,33 +123,43 @@ class Check:
     rule: str = ""
     """Name or file of the rule, for a check of a rule."""
 
+    @property
+    def group(self) -> str:
+        """One of `GROUPS`."""
+        return self.name.partition("/")[0]
 
-def group_of(name: str) -> str:
-    """Return the group of a check's name."""
-    return name.partition("/")[0]
+
+CHECKS: list[Check] = []
+"""All checks without a rule and without a `Scene`."""
+
+RULE_CHECKS: list[Check] = []
+"""Checks that run for each of several rules."""
 
 
-def check(checks: list[Check], name: str, *space_dims: int) -> Callable[[Run], Run]:
-    """Return a decorator that adds a check to a list, or one for each space dimension: NAME/2d.
+LABELS = {2: "2d", 3: "3d", False: "open", True: "periodic"}
+"""Names of space dimensions and boundaries, the arguments of checks."""
 
-    The decorated function's docstring is the expectation.
+
+def check(
+    name: str, *cases: int | tuple[int, bool], registry: list[Check] = CHECKS
+) -> Callable[[Run], Run]:
+    """Return a decorator that registers a check, or one for each case: NAME/2d, NAME/2d/open.
+
+    A case is a space dimension, or that and whether the box is periodic. The decorated function's
+    docstring is the expectation.
     """
 
     def add(run: Run) -> Run:
         expected = " ".join((run.__doc__ or "").split()).removesuffix(".")
         if not expected.startswith("NaN"):
             expected = expected[:1].lower() + expected[1:]
-        checks.extend(Check(f"{name}/{d}d", expected, partial(run, d)) for d in space_dims)
-        if not space_dims:
-            checks.append(Check(name, expected, run))
+        for case in cases or ((),):
+            arguments = case if isinstance(case, tuple) else (case,)
+            full_name = "/".join([name, *(LABELS[argument] for argument in arguments)])
+            registry.append(Check(full_name, expected, partial(run, *arguments)))
         return run
 
     return add
-
-
-def by_dimension(checks: Iterable[Check]) -> list[Check]:
-    """Return checks in 2D first, then those in 3D, then others."""
-    return sorted(checks, key=lambda one: {"2d": 0, "3d": 1}.get(one.name.rpartition("/")[2], 2))
 
 
 def chosen_checks(checks: Sequence[Check], names: Sequence[str]) -> list[Check]:
@@ -132,55 +175,7 @@ def chosen_checks(checks: Sequence[Check], names: Sequence[str]) -> list[Check]:
     return [c for c in checks if not names or any(selects(name, c) for name in names)]
 
 
-@dataclass(frozen=True)
-class CheckEntry:
-    """Result of a check in a record."""
-
-    name: str
-    expected: str
-    verdict: Verdict
-    figures: Mapping[str, float] = field(default_factory=dict)
-    limits: Mapping[str, float] = field(default_factory=dict)
-    holds: str = ""
-    """As `CheckResult.holds`."""
-    note: str = ""
-    """Why it was skipped, its error, or a remark."""
-    seconds: float = 0.0
-    """Duration [s]."""
-    weights: str = ""
-    """The `rule_digest` of a check's rule."""
-
-    @classmethod
-    def of(cls, check: Check, found: CheckResult, seconds: float) -> CheckEntry:
-        """Return the entry of a check that ended without an error."""
-        return cls(check.name, check.expected, found.verdict, **vars(found), seconds=seconds)
-
-    @property
-    def done(self) -> bool:
-        """Whether a resumed run need not repeat it."""
-        return self.verdict in ("pass", "range")
-
-    def share(self, name: str) -> float:
-        """Return a figure over its limit, which is exceeded if this is above 1 or NaN.
-
-        With a limit of 0 it is 0 or infinite.
-        """
-        value, limit = self.figures.get(name, math.nan), self.limits[name]
-        if limit == 0.0:
-            return value if value == 0.0 or math.isnan(value) else math.inf
-        return value / limit
-
-    def worst(self) -> str:
-        """Return the figure with the largest `share` of its limit, as text."""
-        if not self.limits:
-            return ""
-        shares = {name: self.share(name) for name in self.limits}
-        name = max(shares, key=lambda name: (math.isnan(shares[name]), shares[name]))
-        value = self.figures.get(name, math.nan)
-        return f"{name} {value:.2g} (at most {self.limits[name]:.2g})"
-
-
-class StressRecord(Record[CheckEntry]):
+class StressRecord(Record[CheckResult]):
     """Entries of a run, in the order of `names`."""
 
     command = "stress"
@@ -195,14 +190,14 @@ class StressRecord(Record[CheckEntry]):
         """Return the entries; numbers that are not finite become text, such as "nan"."""
         return {"counts": self.counts(), "checks": _json_values(as_objects(self.rows))}
 
-    def parse(self, held: dict[str, Any]) -> list[CheckEntry]:
+    def parse(self, held: dict[str, Any]) -> list[CheckResult]:
         """Return the entries of a run that was stopped."""
         for fields in held["checks"]:
             for name in ("figures", "limits"):
                 fields[name] = {key: float(value) for key, value in fields[name].items()}
-        return [CheckEntry(**fields) for fields in held["checks"]]
+        return [CheckResult(**fields) for fields in held["checks"]]
 
-    def put(self, entry: CheckEntry) -> None:
+    def put(self, entry: CheckResult) -> None:
         """Add an entry or replace the one of its name, and write the file."""
         self.rows = [row for row in self.rows if row.name != entry.name] + [entry]
         self.rows.sort(key=lambda row: self._order.get(row.name, len(self._order)))
@@ -217,15 +212,15 @@ class StressRecord(Record[CheckEntry]):
         found = [entry.verdict for entry in self.rows]
         return {verdict: found.count(verdict) for verdict in ("pass", "range", "fail", "skipped")}
 
-    def failed(self) -> list[CheckEntry]:
+    def failed(self) -> list[CheckResult]:
         """Return the entries of the checks that failed."""
         return [entry for entry in self.rows if entry.verdict == "fail"]
 
-    def by_group(self) -> dict[str, list[CheckEntry]]:
+    def by_group(self) -> dict[str, list[CheckResult]]:
         """Return the entries of each group."""
-        groups: dict[str, list[CheckEntry]] = {}
+        groups: dict[str, list[CheckResult]] = {}
         for entry in self.rows:
-            groups.setdefault(group_of(entry.name), []).append(entry)
+            groups.setdefault(entry.name.partition("/")[0], []).append(entry)
         return groups
 
     def text(self) -> str:
@@ -273,15 +268,19 @@ def run_checks(
     """
     time_is_up = time_limit(max_seconds)
     for check in checks:
-        entry = next((row for row in record.rows if row.name == check.name), None)
-        if entry is None or not entry.done:
+        result = next((row for row in record.rows if row.name == check.name), None)
+        if result is None or not result.done:
             if not time_is_up():
-                entry = run_check(check, session)
-                entry = replace(entry, weights=(weights or {}).get(check.name, ""))
-            elif entry is None:
-                note = "no time was left for it"
-                entry = CheckEntry(check.name, check.expected, "skipped", note=note)
-            record.put(entry)
+                result = run_check(check, session)
+                result = replace(result, weights=(weights or {}).get(check.name, ""))
+            elif result is None:
+                result = CheckResult(
+                    note="no time was left for it",
+                    verdict="skipped",
+                    name=check.name,
+                    expected=check.expected,
+                )
+            record.put(result)
         progress(1)
 
 
@@ -292,21 +291,21 @@ def rule_weights(checks: Iterable[Check]) -> dict[str, str]:
     return {name: digests[rule] for name, rule in rules.items()}
 
 
-def run_check(check: Check, session: CheckSession) -> CheckEntry:
-    """Run a check and return its entry; an error is a failure, lack of memory skips it."""
+def run_check(check: Check, session: CheckSession) -> CheckResult:
+    """Run a check and return its result; an error is a failure, lack of memory skips it."""
     begin = time.perf_counter()
-    verdict: Verdict
     try:
-        return CheckEntry.of(check, check.run(session), time.perf_counter() - begin)
+        result = check.run(session)
     except Skipped as reason:
-        verdict, note = "skipped", str(reason)
+        result = CheckResult(verdict="skipped", note=str(reason))
     except torch.OutOfMemoryError:
-        verdict, note = "skipped", "not enough memory"
+        result = CheckResult(verdict="skipped", note="not enough memory")
     except Exception as error:
         # Any error is a finding.
-        verdict, note = "fail", f"{type(error).__name__}: {' '.join(str(error).split())}"
+        note = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        result = CheckResult(verdict="fail", note=note)
     seconds = time.perf_counter() - begin
-    return CheckEntry(check.name, check.expected, verdict, note=note, seconds=seconds)
+    return replace(result, name=check.name, expected=check.expected, seconds=seconds)
 
 
 def heat_maps(record: StressRecord) -> dict[str, bytes]:
@@ -319,16 +318,16 @@ def heat_maps(record: StressRecord) -> dict[str, bytes]:
     return drawn
 
 
-def _heat_map(group: str, entries: Sequence[CheckEntry]) -> bytes:
+def _heat_map(group: str, entries: Sequence[CheckResult]) -> bytes:
     from matplotlib.colors import LogNorm
 
     columns = list(dict.fromkeys(name for entry in entries for name in entry.limits))
-    shares = [
-        [entry.share(name) if name in entry.limits else None for name in columns]
+    fractions = [
+        [entry.fraction(name) if name in entry.limits else None for name in columns]
         for entry in entries
     ]
     rows = [entry.name.partition("/")[2] for entry in entries]
     figure, ((panel,),) = new_figure(1, 1, (3.0 + 0.6 * len(columns), 1.6 + 0.26 * len(rows)))
-    draw_matrix(panel, rows, columns, shares, colours="RdYlGn_r", norm=LogNorm(1.0 / FAR, FAR))
+    draw_matrix(panel, rows, columns, fractions, colours="RdYlGn_r", norm=LogNorm(1.0 / FAR, FAR))
     panel.set_title(f"{group}: figures over their limits")
     return png(figure, 110)

@@ -12,8 +12,7 @@ from typing import Any
 
 import torch
 
-from npa_envs.measure.accuracy.endurance import TrialWorlds
-from npa_envs.measure.plots import draw_band, legend_of, mark_decades, new_figure, png
+from npa_envs.measure.plots import draw_band, legend_of, new_figure, number_plainly, png
 from npa_envs.measure.record import NONE, Record, as_objects, markdown_table, number, short
 from npa_envs.measure.robustness.trials import (
     CONDITIONS,
@@ -23,10 +22,10 @@ from npa_envs.measure.robustness.trials import (
     LossCurve,
     RuleTrial,
     healing,
-    loss_curves,
     ratio,
     trained_value,
 )
+from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import StreamId
 
 WORKS = 2.0
@@ -117,7 +116,7 @@ class RuleRecord(Record[Response]):
 
 def measure_rule(
     record: RuleRecord,
-    ground: RuleTrial,
+    trial: RuleTrial,
     most_particles: int,
     *,
     enough: Callable[[], bool] = lambda: False,
@@ -128,18 +127,18 @@ def measure_rule(
     value, the measurement stops, and the record is not done.
     """
     begin = time.perf_counter() - record.about["seconds"]
-    home, trained = grow(ground)
+    grown, trained = grow(trial)
     if not record.curves:
-        record.curves = healing(ground, home)
+        record.curves = healing(trial, grown)
         record.about |= {
-            "task": ground.task_name,
-            "metric": ground.metric_name,
-            "update_prob": float(ground.task.update_prob),
+            "task": trial.task_name,
+            "metric": trial.metric_name,
+            "update_prob": float(trial.task.update_prob),
             "date": date.today().isoformat(),
             "done": False,
         }
     record.write()
-    rest = responses(ground, trained, most_particles, done=len(record.rows))
+    rest = responses(trial, trained, most_particles, done=len(record.rows))
     while not enough():
         response = next(rest, None)
         record.about["seconds"] = round(time.perf_counter() - begin, 2)
@@ -151,47 +150,46 @@ def measure_rule(
 
 
 def grow(
-    ground: RuleTrial, condition: str = "", value: float | str = 1.0
-) -> tuple[TrialWorlds, Response]:
+    trial: RuleTrial, condition: str = "", value: float | str = 1.0
+) -> tuple[Particles, Response]:
     """Grow seeds as in training, or with `condition` at `value`; return worlds and losses."""
-    home = ground.home(
-        share=float(value) if condition == "particles" else 1.0,
+    initial = trial.initial_worlds(
+        fraction=float(value) if condition == "particles" else 1.0,
         shape=str(value) if condition == "shape" else "trained",
     )
     changed: dict[str, Any] = {}
-    pace = 1.0
+    time_scale = 1.0
     if condition in ("update_prob", "dt"):
         changed[condition] = value
         # The same number of updates, or total time, as in training.
-        pace = float(value) / (ground.task.update_prob if condition == "update_prob" else 1.0)
+        time_scale = float(value) / (trial.task.update_prob if condition == "update_prob" else 1.0)
     elif condition in ("eps", "noise"):
         name = "eps" if condition == "eps" else "position_noise"
-        changed[name] = float(value) * ground.task.eps
-    # Whole chunks: a partial one would run eagerly, and refuse worlds that are not finite.
-    chunk = ground.plan.chunk
-    steps = chunk * max(1, round(ground.plan.grow_steps / pace / chunk))
-    run = ground.run(home, ground.random(StreamId.GROWTH), **changed)
-    losses = ground.by_seed(loss_curves(home, run, (steps,))[0]).tolist()
-    return home.with_worlds(run.x, run.s), Response(condition, value, steps, tuple(losses))
+        changed[name] = float(value) * trial.task.eps
+    chunk = trial.plan.chunk
+    steps = chunk * max(1, round(trial.plan.grow_steps / time_scale / chunk))
+    worlds, losses = trial.run(initial, trial.random(StreamId.GROWTH), [steps], **changed)
+    by_seed = tuple(trial.by_seed(losses[0]).tolist())
+    return worlds, Response(condition, value, steps, by_seed)
 
 
 @torch.no_grad()
 def responses(
-    ground: RuleTrial, trained: Response, most_particles: int, *, done: int = 0
+    trial: RuleTrial, trained: Response, most_particles: int, *, done: int = 0
 ) -> Iterator[Response]:
     """Yield the response to each value of each condition, without the first `done`."""
-    every = [(name, value) for name, values in ground.plan.values.items() for value in values]
+    every = [(name, value) for name, values in trial.plan.values.items() for value in values]
     for condition, value in every[done:]:
-        if value == trained_value(condition, ground.task.update_prob):
+        if value == trained_value(condition, trial.task.update_prob):
             yield Response(condition, value, trained.steps, trained.losses)
             continue
-        share = float(value) if condition == "particles" else 1.0
-        total = ground.world_count * ground.particles(share)
-        if total > max(most_particles, ground.world_count * ground.particle_count):
+        fraction = float(value) if condition == "particles" else 1.0
+        total = trial.world_count * trial.particles(fraction)
+        if total > max(most_particles, trial.world_count * trial.particle_count):
             yield Response(condition, value, 0, (), note=f"{total} particles in all")
             continue
         try:
-            yield grow(ground, condition, value)[1]
+            yield grow(trial, condition, value)[1]
         except torch.OutOfMemoryError:
             yield Response(condition, value, 0, (), note=f"no memory for {total} particles")
 
@@ -375,7 +373,8 @@ def _draw_curves(panel: Any, record: RuleRecord) -> None:
     panel.set_yscale("log")
     panel.set_ylabel("loss over the twin's", fontsize=8)
     panel.set_title(record.rule, fontsize=9, loc="left")
-    mark_decades(panel)
+    number_plainly(panel.yaxis)
+    panel.tick_params(labelsize=7)
 
 
 def _draw_responses(panel: Any, record: RuleRecord, condition: str) -> None:
@@ -388,7 +387,8 @@ def _draw_responses(panel: Any, record: RuleRecord, condition: str) -> None:
     panel.set(xscale="log", yscale="log")
     panel.set_ylabel("loss", fontsize=8)
     panel.set_xticks(values, [f"{value:.2g}" for value in values], rotation=45)
-    mark_decades(panel)
+    number_plainly(panel.yaxis)
+    panel.tick_params(labelsize=7)
 
 
 def _draw_seeds(

@@ -16,7 +16,8 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.measure.accuracy.endurance import MIN_VIEWS, LongRun, TrialWorlds, task_name
+from npa_envs.measure.accuracy.endurance import MIN_VIEWS, task_name
+from npa_envs.measure.quality import RuleRunner
 from npa_envs.ops import world_mean
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule
@@ -26,7 +27,8 @@ from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfi
 from npa_envs.tasks.seeds import uniform_ball, uniform_box
 from npa_envs.training.task_of_rule import task_of_rule, tasks_of_codes
 from npa_envs.world.brushes import clump, cut, nearest_image, offsets_from, wipe_state
-from npa_envs.world.particles import Particles
+from npa_envs.world.divergence import divergence
+from npa_envs.world.particles import Particles, combined
 from npa_envs.world.randomness import Randomness, StreamId, WorldRandom
 
 # Seeds of other shapes; ring, square and two blobs have the trained density.
@@ -103,7 +105,7 @@ def trained_value(condition: str, update_prob: float) -> float | str:
 
 @dataclass(frozen=True, kw_only=True)
 class TrialPlan:
-    """Plan of the measurements of a rule; steps are multiples of `chunk`, one CUDA graph.
+    """Plan of the measurements of a rule; steps of growth are rounded to multiples of `chunk`.
 
     `grow_steps`: steps from the seed to the damage, or to the loss under a condition. `heal_steps`:
     steps after the damage at which losses are measured, from 0 on. `values`: increasing values of
@@ -168,6 +170,9 @@ def quick_plan(task_name: str) -> TrialPlan:
 
 
 # Test worlds
+
+LOSS_PARTICLES = 1 << 17
+"""Most particles of a batch of worlds for a loss, as views of Gaussians take much memory."""
 
 
 class PicturesInTurn(ParticleTask[Morphogenesis2DConfig]):
@@ -237,15 +242,15 @@ class RuleTrial:
         if self.rule.space_dim == 3:
             # Losses are of held-out views, so few training views are enough.
             fields["training_views"] = MIN_VIEWS["training_views"]
-        found = task_of_rule(name, self.rule, device, **fields)
-        if found.doubt is not None:
-            raise NPAError(f"cannot measure {name!r}: {found.doubt}: choose another rule")
-        self.task: Any = found.task
-        self.metric_name = found.task.trial_name
+        trained = task_of_rule(name, self.rule, device, **fields)
+        if trained.doubt is not None:
+            raise NPAError(f"cannot measure {name!r}: {trained.doubt}: choose another rule")
+        self.task: Any = trained.task
+        self.metric_name = trained.task.trial_name
         if self.rule.codes is not None:
             pictures = tasks_of_codes(name, self.rule, device, particle_count=particle_count)
-            numbers = torch.tensor(self._numbers, device=device)
-            self.task = PicturesInTurn(pictures, numbers % len(pictures))
+            world_seeds = torch.tensor(self._world_seeds, device=device)
+            self.task = PicturesInTurn(pictures, world_seeds % len(pictures))
         self._tasks: dict[int, Any] = {self.particle_count: self.task}
 
     @property
@@ -260,56 +265,78 @@ class RuleTrial:
 
     def random(self, purpose: int) -> WorldRandom:
         """Return the streams of all worlds for a `StreamId`, at their start."""
-        return WorldRandom(self._numbers, device=self._device).substream(purpose)
+        return WorldRandom(self._world_seeds, device=self._device).substream(purpose)
 
     @property
-    def _numbers(self) -> list[int]:
-        """Random seed of each world."""
+    def _world_seeds(self) -> list[int]:
         each = self.plan.worlds_per_seed
         return [seed * each + k for seed in self.seeds for k in range(each)]
 
-    def particles(self, share: float) -> int:
+    def particles(self, fraction: float) -> int:
         """Return a fraction of the trained number of particles."""
-        return max(2, round(share * self.particle_count))
+        return max(2, round(fraction * self.particle_count))
 
-    def home(self, share: float = 1.0, shape: str = "trained") -> TrialWorlds:
+    def task_of(self, particle_count: int) -> Any:
+        """Return the task for another number of particles."""
+        if particle_count not in self._tasks:
+            self._tasks[particle_count] = self.task.resized(particle_count).for_rule(self.rule)
+        return self._tasks[particle_count]
+
+    def initial_worlds(self, fraction: float = 1.0, shape: str = "trained") -> Particles:
         """Return fresh worlds with a fraction of the trained particles, in a shape of `SHAPES`."""
-        count = self.particles(share)
-        if count not in self._tasks:
-            self._tasks[count] = self.task.resized(count).for_rule(self.rule)
-        task = self._tasks[count]
+        count = self.particles(fraction)
         random = self.random(StreamId.GROWTH)
-        x, s, _, goal = task.seed(self.world_count, generator=random, device=self._device)
+        x, s, _, goal = self.task_of(count).seed(
+            self.world_count, generator=random, device=self._device
+        )
         if shape != "trained":
             box = self.task.box
             # Trained worlds fill their box, so there is no trained radius.
             radius = self.task.config.seed_radius if box is None else 0.25 * min(box)
             x = SHAPES[shape](count, self.rule.space_dim, float(radius), random)
-        return TrialWorlds(self.rule, task.toward(goal), x.float(), s.float(), goal)
+        return Particles(x.float(), s.float(), goal=goal)
 
-    def run(self, home: TrialWorlds, random: WorldRandom, **changed: Any) -> LongRun:
-        """Return a run of worlds; `changed` overrides options of `rollout`."""
-        return LongRun(home, random, home.options(**changed), chunk=self.plan.chunk)
+    @torch.no_grad()
+    def run(
+        self, initial: Particles, random: WorldRandom, steps: Sequence[int], **changed: Any
+    ) -> tuple[Particles, Tensor]:
+        """Return worlds after the last of `steps`, and losses at each of them, [len(steps), B].
+
+        `changed` overrides options of `rollout`. A world that is not finite has the loss NaN from
+        then on; it does not affect the others.
+        """
+        task = self.task_of(initial.x.shape[1])
+        runner = RuleRunner(self.rule, task, random, **changed)
+        worlds, losses = initial, []
+        diverged = torch.zeros(len(initial.x), dtype=torch.bool, device=initial.x.device)
+        for step, before in zip(steps, (0, *steps), strict=False):
+            worlds = runner.run(worlds, step - before)
+            diverged = diverged | divergence(worlds.x, worlds.s).non_finite
+            worlds = initial.where(diverged, worlds)
+            values = self.losses(worlds, changed.get("eps", task.eps))
+            losses.append(torch.where(diverged, torch.nan, values))
+        return worlds, torch.stack(losses)
+
+    def losses(self, worlds: Particles, eps: float) -> Tensor:
+        """Return the task's metric of worlds that were run with a radius, [B].
+
+        In open space the dynamics do not change if positions and ε are scaled by one factor, so
+        positions are measured at the scale of training. Those in boxes and of static particles are
+        not scaled.
+        """
+        task = self.task_of(worlds.x.shape[1])
+        if task.box is None and not self.rule.static and eps != task.eps:
+            worlds = worlds._replace(x=worlds.x * (task.eps / eps))
+        size = max(1, LOSS_PARTICLES // worlds.x.shape[1])
+        losses = []
+        for index in torch.arange(len(worlds.x), device=worlds.x.device).split(size):
+            x, s, _, goal = worlds.take(index)
+            losses.append(task.toward(goal).trial_metric(x, s))
+        return torch.cat(losses)
 
     def by_seed(self, losses: Tensor) -> Tensor:
         """Return the mean loss of each seed's worlds, [..., seeds], from [..., B]."""
         return losses.double().reshape(*losses.shape[:-1], len(self.seeds), -1).mean(-1)
-
-
-def loss_curves(home: TrialWorlds, run: LongRun, steps: tuple[int, ...]) -> Tensor:
-    """Run worlds and return their losses at the given steps, [len(steps), B].
-
-    A world that is not finite has the loss NaN from then on; it does not affect the others.
-    """
-    lost = torch.zeros(len(home.x), dtype=torch.bool, device=home.x.device)
-    found = []
-    for _, x, s in run.marks(steps):
-        lost |= ~(x.isfinite().flatten(1).all(1) & s.isfinite().flatten(1).all(1))
-        for worlds, fresh in ((x, home.x), (s, home.s)):
-            worlds.copy_(torch.where(lost[:, None, None], fresh, worlds))
-        losses = home.losses(home.at_trained_size(x, run.eps), s)
-        found.append(torch.where(lost, torch.nan, losses))
-    return torch.stack(found)
 
 
 # Damage
@@ -435,8 +462,8 @@ class LossCurve:
 
     def median_step(self) -> float | None:
         """Return the median recovery time of the seeds that recovered [steps], or None."""
-        found = [step for step in self.recovery_steps() if step is not None]
-        return median(found) if found else None
+        steps = [step for step in self.recovery_steps() if step is not None]
+        return median(steps) if steps else None
 
     def ratios(self, index: int) -> list[float]:
         """Return for each seed the loss over its twin's at an index of `steps`."""
@@ -465,50 +492,43 @@ def recovery_step(
 
 
 @torch.no_grad()
-def healing(ground: RuleTrial, home: TrialWorlds) -> list[LossCurve]:
+def healing(trial: RuleTrial, grown: Particles) -> list[LossCurve]:
     """Damage grown worlds in every way; return a curve for the control and for each damage.
 
     If half of the particles are removed, twins are worlds that were grown from half as many.
     """
-    chosen = [d for d in DAMAGES.values() if d.static or not ground.rule.static]
-    found = _with_twins(ground, home, home, [d for d in chosen if not d.halves], control=True)
-    smaller = ground.home(share=0.5)
-    grown = ground.run(smaller, ground.random(StreamId.GROWTH))
-    grown.advance(ground.plan.grow_steps)
-    twins = smaller.with_worlds(grown.x, grown.s)
-    return found + _with_twins(ground, home, twins, [d for d in chosen if d.halves], control=False)
+    damages = [d for d in DAMAGES.values() if d.static or not trial.rule.static]
+    growth = trial.random(StreamId.GROWTH)
+    smaller, _ = trial.run(trial.initial_worlds(0.5), growth, [trial.plan.grow_steps])
+    return [
+        *_with_twins(trial, grown, grown, [d for d in damages if not d.halves], control=True),
+        *_with_twins(trial, grown, smaller, [d for d in damages if d.halves], control=False),
+    ]
 
 
 def _with_twins(
-    ground: RuleTrial,
-    home: TrialWorlds,
-    twins: TrialWorlds,
+    trial: RuleTrial,
+    grown: Particles,
+    twins: Particles,
     damages: Sequence[Damage],
     *,
     control: bool,
 ) -> list[LossCurve]:
     """Run twins and damaged worlds as one batch; return their curves, the control first."""
-    steps = ground.plan.heal_steps
-    copies = [(twins.x, twins.s)]
-    keys = [ground.random(AFTERWARDS).keys]
-    names = [damage.name for damage in damages]
-    for damage in damages:
-        random = ground.random(StreamId.DAMAGE)
-        x, s = damage.apply(home.x, home.s, random, home.task.box)
-        copies.append((x, home.task.coded(s)))
-        keys.append(keys[0])
+    steps = trial.plan.heal_steps
+    masks, other_masks = (trial.random(stream).keys for stream in (AFTERWARDS, OTHERWISE))
+    copies = {"twins": (twins, masks)}
     if control:
-        copies.append(copies[0])
-        keys.append(ground.random(OTHERWISE).keys)
-        names.append(CONTROL)
-    x, s = (torch.cat(parts) for parts in zip(*copies, strict=True))
-    batch = twins.with_worlds(x, s)
-    run = ground.run(batch, WorldRandom.from_keys(torch.cat(keys)))
-    losses = loss_curves(batch, run, steps).view(len(steps), len(copies), -1)
+        copies[CONTROL] = twins, other_masks
+    for damage in damages:
+        random = trial.random(StreamId.DAMAGE)
+        x, s = damage.apply(grown.x, grown.s, random, trial.task.box)
+        copies[damage.name] = twins._replace(x=x, s=trial.task.coded(s)), masks
+    worlds, keys = zip(*copies.values(), strict=True)
+    random = WorldRandom.from_keys(torch.cat(keys))
+    _, losses = trial.run(combined(torch.cat, worlds), random, steps)
     # One row for each copy and seed.
-    twin, *others = ground.by_seed(losses).permute(1, 2, 0).tolist()
-    rows = [
-        LossCurve(name, steps, tuple(map(tuple, other)), tuple(map(tuple, twin)))
-        for name, other in zip(names, others, strict=True)
-    ]
-    return rows[-1:] + rows[:-1] if control else rows
+    rows = trial.by_seed(losses.view(len(steps), len(copies), -1)).permute(1, 2, 0).tolist()
+    twin, *others = (tuple(map(tuple, row)) for row in rows)
+    names = list(copies)[1:]
+    return [LossCurve(name, steps, row, twin) for name, row in zip(names, others, strict=True)]

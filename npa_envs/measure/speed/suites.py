@@ -9,7 +9,6 @@ from datetime import date
 from functools import partial
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -119,15 +118,14 @@ class PublicRow:
 
 def _public_row(session: TimingSession, workload: Workload) -> PublicRow:
     x, s = workload.worlds(session.device)
-    found: dict[tuple[bool, bool], Timing] = {}
-    for recorded in (True, False):
+    timings = []
+    for options in ({}, {"cuda_graph": False}):
         for train in (False, True):
-            options: dict[str, Any] = {} if recorded else {"cuda_graph": False}
             run, _ = rollout_call(workload, x, s, train=train, **options)
             timing = timed_calls(run, session.device, warm=3, repeats=session.repeats)
-            found[recorded, train] = timing.divided(workload.steps)
+            timings.append(timing.divided(workload.steps))
     release_recordings()
-    return PublicRow(workload.name, *found.values())
+    return PublicRow(workload.name, *timings)
 
 
 # Suite `scaling`: N, neighbours, B and C, varied one at a time.
@@ -156,32 +154,27 @@ class ScalingRow:
     train_mib: float | None
 
 
-@dataclass(frozen=True)
-class SlopeRow:
-    """How time grows: the slope of log time over log value, fitted to an axis's larger half."""
-
-    axis: str
-    infer_slope: float
-    train_slope: float
-
-
 def scaling_rows(session: TimingSession) -> list[ScalingRow]:
     """Return the rows of all axes, increasing along each."""
     return session.rows(
         (f"{value} {axis}", partial(_scaling_row, session, axis, value))
-        for axis, values in zip(AXES, _values(session), strict=True)
+        for axis, values in _axis_values(session).items()
         for value in values
     )
 
 
-def _values(session: TimingSession) -> tuple[Sequence[int], ...]:
-    """Return the values of each axis."""
+def _axis_values(session: TimingSession) -> dict[str, Sequence[int]]:
     if session.small:
-        return (256, 1024), (16, 64), (1, 2), (4, 16)
-    neighbours, channels = (8, 16, 32, 64, 128, 256), (4, 8, 16, 32, 64)
-    if session.cuda:
-        return [2**k for k in range(10, 21)], neighbours, [2**k for k in range(8)], channels
-    return [2**k for k in range(8, 17)], neighbours, (1, 2, 4, 8, 16), channels
+        values: tuple[Sequence[int], ...] = (256, 1024), (16, 64), (1, 2), (4, 16)
+    else:
+        powers, worlds = (range(10, 21), 8) if session.cuda else (range(8, 17), 5)
+        values = (
+            [2**k for k in powers],
+            (8, 16, 32, 64, 128, 256),
+            [2**k for k in range(worlds)],
+            (4, 8, 16, 32, 64),
+        )
+    return dict(zip(AXES, values, strict=True))
 
 
 def varied(axis: str, value: int, *, small: bool = False) -> Workload:
@@ -202,21 +195,6 @@ def _scaling_row(session: TimingSession, axis: str, value: int) -> ScalingRow:
     cost = throughput_row(session, workload)
     own = (axis, value, cost.workload, workload.neighbour_count, workload.state_dim)
     return ScalingRow(*own, cost.infer_us, cost.train_us, cost.infer_mib, cost.train_mib)
-
-
-def slope_rows(rows: Sequence[ScalingRow]) -> list[SlopeRow]:
-    """Return the slope of the times along each axis."""
-    slopes = []
-    for axis in AXES:
-        found = [row for row in rows if row.axis == axis]
-        if len(found) > 1:
-            larger = found[-max(2, math.ceil(len(found) / 2)) :]
-            values = np.log([row.value for row in larger])
-            infer = np.log([row.infer_us.median for row in larger])
-            train = np.log([row.train_us.median for row in larger if row.train_us])
-            fits = (float(np.polyfit(values, times, 1)[0]) for times in (infer, train))
-            slopes.append(SlopeRow(axis, *fits))
-    return slopes
 
 
 # Suite `skips`: time saved by computations that a scene does not need.
@@ -250,39 +228,45 @@ def skips(workload: Workload) -> list[Skip]:
     training: dict[str, Any] = {"train": True}
     # Cells and densities are computed in each step if positions may have a gradient.
     rebuilt: dict[str, Any] = {"detach_positions": False}
+    longer = rebuilt | {"steps": 32}
     static: dict[str, Any] = {"rule": {"static": True}}
-    stored = "what a backward pass reads: signs of hidden units, volumes, kernel sums"
-    inactive = "perception, network and lists of inactive particles"
-    built, longer = "cells, densities and neighbour lists", {"steps": 32}
-    again = "a second forward pass, for the backward pass"
-    columns: list[Skip] = [
-        (what, f"{option}=False", {}, {"rule": {option: False}})
-        for what, option in (
-            ("the state gradient", "state_gradient"),
-            ("the moment matrix and its inverse", "moment_correction"),
-            ("columns of the density gradient", "density_gradient"),
-        )
-    ]
+
+    def option(name: str) -> dict[str, Any]:
+        return {"rule": {name: False}}
+
     return [
-        (stored, "no gradient is enabled", {"gradients": True}, {}),
+        (
+            "what a backward pass reads: signs of hidden units, volumes, kernel sums",
+            "no gradient is enabled", {"gradients": True}, {},
+        ),
         (
             "cotangents of positions and densities",
-            "detach_positions (default)",
-            training | rebuilt,
-            training,
+            "detach_positions (default)", training | rebuilt, training,
         ),
-        (inactive, "update_prob < 1", {"update_prob": 1.0}, {}),
-        *columns,
+        (
+            "perception, network and lists of inactive particles",
+            "update_prob < 1", {"update_prob": 1.0}, {},
+        ),
+        ("the state gradient", "state_gradient=False", {}, option("state_gradient")),
+        (
+            "the moment matrix and its inverse",
+            "moment_correction=False", {}, option("moment_correction"),
+        ),
+        (
+            "columns of the density gradient",
+            "density_gradient=False", {}, option("density_gradient"),
+        ),
         ("displacements", "static=True", rebuilt, static | rebuilt),
         (
-            built,
-            "static=True, without position_noise",
-            static | rebuilt | longer,
-            static | longer,
+            "cells, densities and neighbour lists",
+            "static=True, without position_noise", static | longer, static | {"steps": 32},
         ),
         ("periodic images", "box=None (default)", {"box": (side, side)}, {}),
-        (again, "memory='store' (default)", training | {"memory": "minimal"}, training),
-    ]
+        (
+            "a second forward pass, for the backward pass",
+            "memory='store' (default)", training | {"memory": "minimal"}, training,
+        ),
+    ]  # fmt: skip
 
 
 def skip_rows(session: TimingSession) -> list[SkipRow]:
@@ -390,8 +374,7 @@ def paper(session: TimingSession) -> Tables:
 
 def scaling(session: TimingSession) -> Tables:
     """Return time and memory against N, neighbours, B and C."""
-    rows = scaling_rows(session)
-    return {"scaling": rows, "slopes": slope_rows(rows)}
+    return {"scaling": scaling_rows(session)}
 
 
 def quick(session: TimingSession) -> Tables:

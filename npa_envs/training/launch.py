@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import logging
 import os
@@ -16,10 +15,9 @@ from typing import TYPE_CHECKING
 import torch
 import torch.distributed as dist
 
-from npa_envs.cli import INTERRUPTED, USAGE_ERROR
 from npa_envs.errors import LostProcessError, NPAError, shown
-from npa_envs.training import RunFolder
 from npa_envs.training.ranks import Ranks
+from npa_envs.training.run import RunFolder
 
 if TYPE_CHECKING:
     from torch.distributed.elastic.multiprocessing.errors import ProcessFailure
@@ -31,11 +29,11 @@ def launch(count: int, arguments: Sequence[str], out: Path, device: str) -> int:
     If one ends early, the others are terminated, and killed after half a minute. On CUDA each
     process gets one device. `out` is the folder of the run, for errors.
     """
-    found = torch.cuda.device_count()
-    if device != "cpu" and count > found:
+    device_count = torch.cuda.device_count()
+    if device != "cpu" and count > device_count:
         raise NPAError(
-            f"processes must be at most the {found} CUDA devices that torch sees, got {count}: "
-            "take fewer, or --device cpu"
+            f"processes must be at most the {device_count} CUDA devices that torch sees, got "
+            f"{count}: take fewer, or --device cpu"
         )
     if not dist.is_available():
         raise NPAError(
@@ -66,18 +64,18 @@ def launch(count: int, arguments: Sequence[str], out: Path, device: str) -> int:
     try:
         elastic_launch(config, sys.executable)("-m", "npa_envs", *arguments)
     except SignalException:
-        return INTERRUPTED
+        return 128 + signal.SIGINT
     except RendezvousError as error:
         raise NPAError(
             f"processes must reach each other at localhost, but they cannot ({shown(error)}): "
             "take --processes 1"
         ) from error
     except ChildFailedError as error:
-        left = {rank: _left_by(failure) for rank, failure in error.failures.items()}
-        for reason in left.values():
+        messages = {rank: _message_of(failure) for rank, failure in error.failures.items()}
+        for message in messages.values():
             # The first process prints its own.
-            if reason not in ("", left.get(0)):
-                raise NPAError(reason) from error
+            if message not in ("", messages.get(0)):
+                raise NPAError(message) from error
         # First a killed process, then those that report it, then those terminated afterwards.
         rank, failure = min(
             error.failures.items(),
@@ -94,17 +92,7 @@ def launch(count: int, arguments: Sequence[str], out: Path, device: str) -> int:
     return 0
 
 
-def with_device_of_gpus(arguments: Sequence[str]) -> list[str]:
-    """Add `--device cuda` to arguments that have `--gpus` and no device."""
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    parser.add_argument("--gpus")
-    parser.add_argument("--device")
-    first, _ = parser.parse_known_args(arguments)
-    cuda = first.gpus is not None and first.device is None
-    return [*arguments, "--device", "cuda"] if cuda else list(arguments)
-
-
-def asked_count(gpus: int | None, processes: int | None, device: str) -> int | None:
+def requested_processes(gpus: int | None, processes: int | None, device: str) -> int | None:
     """Return the number of processes of `--gpus` or `--processes`; None if neither is given."""
     if gpus is not None and processes is not None:
         raise NPAError(
@@ -130,12 +118,12 @@ def print_once(ranks: Ranks) -> Iterator[None]:
 
             get_error_handler().record_exception(error)
         if not ranks.first:
-            raise SystemExit(USAGE_ERROR) from error
+            raise SystemExit(2) from error
         raise
 
 
-def _left_by(failure: ProcessFailure) -> str:
-    """Return the error message that a process has left, or an empty string."""
+def _message_of(failure: ProcessFailure) -> str:
+    """Return the message of the error that ended a process, or an empty string."""
     content = failure.error_file_data["message"]
     # Torch writes the error's class before it.
     return str(content["message"]).partition(": ")[2] if isinstance(content, dict) else ""

@@ -1,0 +1,155 @@
+"""Films of a world: frames during a rollout with damage, and their files."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from npa_envs.render.colours import to_uint8
+from npa_envs.render.film import Frame, turntable_frames, write_filmstrip, write_gif, write_mp4
+from npa_envs.render.point_files import write_gaussians, write_points, write_splat
+from npa_envs.rule.rule import NPARule
+from npa_envs.tasks.base import Task
+from npa_envs.tasks.damage import DamageEvent, damage_worlds
+from npa_envs.world.particles import Particles
+from npa_envs.world.rollout import rollout
+
+SCREEN = 256
+"""Least default resolution of a film [pixels]."""
+
+FRAME_COUNT = 150
+"""Default number of frames of a film, without those of damage."""
+
+EARLY_STEPS = (0, 16, 32, 64, 128)
+"""Steps whose nearest frames are in every filmstrip: most of the growth is there."""
+
+
+@dataclass
+class WorldFilm:
+    """Frames of one world, each with a caption."""
+
+    background: str = "white"
+    """The colour behind the particles: a name or "#rrggbb"."""
+    frames: list[Frame] = field(default_factory=list)
+    captions: list[str] = field(default_factory=list)
+    damaged: list[int] = field(default_factory=list)
+    """Frames that show fresh damage, which are in every filmstrip."""
+    steps: dict[int, int] = field(default_factory=dict)
+    """Steps from the seed by frame; frames of fresh damage are left out."""
+
+    def add(self, task: Task, worlds: Particles, step: int, damage: str = "") -> None:
+        """Add a picture of one world, or of its `damage` at that step."""
+        if damage:
+            self.damaged.append(len(self.frames))
+        else:
+            self.steps[len(self.frames)] = step
+        self.frames.append(to_uint8(task.picture(worlds.x, worlds.s)[0], self.background))
+        self.captions.append(f"step {step}: {damage}" if damage else f"step {step}")
+
+    def strip(self, count: int = 10) -> tuple[list[Frame], list[str]]:
+        """Return frames and captions of a filmstrip: early, damaged, some between, the last.
+
+        Of a film that is not longer than the early steps: damaged and evenly spaced ones.
+        """
+        last = len(self.frames) - 1
+        if max(self.steps.values(), default=0) <= EARLY_STEPS[-1]:
+            others = max(count - 2 - len(self.damaged), 2)
+            even = np.linspace(0, last, min(others, len(self.frames)))
+            chosen = sorted({*self.damaged, *(round(float(k)) for k in even)})
+        else:
+            early = {min(self.steps, key=lambda k: abs(self.steps[k] - n)) for n in EARLY_STEPS}
+            chosen = sorted({*early, *self.damaged, last})
+            while len(chosen) < min(count, len(self.frames)):
+                start, end = max(pairwise(chosen), key=lambda pair: pair[1] - pair[0])
+                chosen = sorted([*chosen, (start + end) // 2])
+        return [self.frames[k] for k in chosen], [self.captions[k] for k in chosen]
+
+    def write(self, folder: Path, name: str, *, fps: float = 25.0) -> list[Path]:
+        """Write the film as GIF, MP4 and filmstrip, and return the files."""
+        strip, captions = self.strip()
+        paths = [folder / f"{name}.gif", folder / f"{name}.mp4", folder / f"{name}-filmstrip.png"]
+        write_gif(paths[0], self.frames, fps)
+        rows = math.ceil(len(strip) / 8)
+        columns = math.ceil(len(strip) / rows)
+        write_filmstrip(paths[2], strip, captions, columns=columns, background=self.background)
+        # Written last, as it needs ffmpeg and the others do not.
+        write_mp4(paths[1], self.frames, fps)
+        return paths
+
+
+@torch.no_grad()
+def film_world(
+    rule: NPARule,
+    task: Task,
+    worlds: Particles,
+    steps: int,
+    *,
+    generator: torch.Generator,
+    damages: Sequence[DamageEvent] = (),
+    every: int | None = None,
+    first_step: int = 0,
+    film: WorldFilm | None = None,
+    progress: Callable[[int], None] = lambda _: None,
+    stop: Callable[[], bool] = lambda: False,
+) -> tuple[Particles, WorldFilm]:
+    """Run one world with damage, and add a frame to `film` every `every` steps.
+
+    By default there are about `FRAME_COUNT` frames. `first_step` is the world's age in steps.
+    `progress` is called with the number of steps since its last call. After each frame the run ends
+    if `stop` returns true.
+    """
+    film = WorldFilm() if film is None else film
+    last = first_step + steps
+    every = every or math.ceil(steps / FRAME_COUNT)
+    stops = {damage.step for damage in damages if first_step <= damage.step < last}
+    stops |= {*range(first_step, last, every), last}
+    x, s, *_ = worlds
+    now = first_step
+    for step in sorted(stops):
+        x, s = rollout(rule, x, s, step - now, generator=generator, **task.rollout_options)
+        progress(step - now)
+        now = step
+        if not film.frames or step > first_step:
+            film.add(task, Particles(x, s), step)
+        for damage in damages:
+            if damage.step == step < last:
+                x, s = damage_worlds(x, s, kind=damage.kind, size=damage.size, generator=generator)
+                s = task.coded(s)
+                film.add(task, Particles(x, s), step, damage.text)
+        if stop():
+            break
+    return worlds._replace(x=x, s=s), film
+
+
+@torch.no_grad()
+def write_3d_world(
+    task: Task,
+    worlds: Particles,
+    folder: Path,
+    *,
+    drawn_by: Task,
+    resolution: int = SCREEN,
+    background: str = "white",
+) -> list[Path]:
+    """Write a 3D world as a turntable, drawn by another task, and as point files; return them."""
+    names = ("turntable.gif", "points.ply", "gaussians.ply", "cloud.splat")
+    paths = [folder / name for name in names]
+    x, s, *_ = worlds
+    frames = turntable_frames(
+        lambda cameras: drawn_by.views(x, s, cameras),
+        resolution=resolution,
+        background=background,
+        device=x.device,
+    )
+    gaussians = task.gaussians(s)
+    write_gif(paths[0], frames, fps=20.0)
+    write_points(paths[1], x, gaussians)
+    write_gaussians(paths[2], x, gaussians)
+    write_splat(paths[3], x, gaussians)
+    return paths
