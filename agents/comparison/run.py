@@ -201,16 +201,15 @@ def final_picture(
     keywords = {**problem.keywords, "render_mode": "rgb_array", "render_size": SIZE}
     # One more step, as an environment at the end of an episode shows the next start.
     longer = replace(problem, keywords=keywords, episode_steps=problem.episode_steps + 1)
-    envs = longer.make_envs(1, device=device)
+    envs: Any = longer.make_envs(1, device=device)
     policy = policy_in(envs, policy)
     observation, _ = envs.reset(seed=[seed])
-    shown: Any = getattr(envs, "species_env", envs)
-    (picture,) = shown.render()
+    (picture,) = envs.render()
     for _ in range(problem.episode_steps):
         observation, _, terminated, truncated, _ = envs.step(policy(observation))
         if bool(terminated | truncated):
             break
-        (picture,) = shown.render()
+        (picture,) = envs.render()
     envs.close()
     found: NDArray[np.uint8] = picture
     return found

@@ -131,7 +131,7 @@ class Tending:
 
 def tend_scripted(progress: Progress) -> Tending:
     """Return the scripted gardener, or in `npa/Shepherd2D-v0` the scripted shepherd."""
-    shepherd = issubclass(progress.problem.env_type.task_type, ShepherdTask)
+    shepherd = issubclass(progress.problem.task_type, ShepherdTask)
     return _evaluated(progress, Tending(ScriptedShepherd if shepherd else ScriptedGardener))
 
 
