@@ -76,12 +76,12 @@ class RunRecord:
     @property
     def mean_return(self) -> float:
         """Mean return of the held-out episodes; NaN without any."""
-        return _mean(self.returns)
+        return mean_of(self.returns)
 
     @property
     def mean_loss(self) -> float:
         """Mean loss at the ends of the held-out episodes; NaN without any."""
-        return _mean(self.final_losses)
+        return mean_of(self.final_losses)
 
     def write(self, folder: Path) -> None:
         """Write the record into the run's folder; numbers that are not finite become null."""
@@ -105,7 +105,8 @@ class RunRecord:
         return read_record(folder / RECORD, facts, made, command="compare")
 
 
-def _mean(values: Sequence[float]) -> float:
+def mean_of(values: Sequence[float]) -> float:
+    """Return the mean of numbers, NaN without any."""
     return sum(values) / len(values) if values else math.nan
 
 

@@ -20,6 +20,9 @@ import torch
 from torch import Tensor, nn
 
 from npa_envs.agents.learning.ppo_common import (
+    CRITIC_RATE,
+    CRITIC_WIDTH,
+    MAX_GRADIENT_NORM,
     CommonOptions,
     GaussianRules,
     Minibatches,
@@ -34,7 +37,7 @@ from npa_envs.agents.learning.ppo_common import (
 from npa_envs.agents.learning.problem import ROW_REWARDS, WORLDS_PER_SEED, Problem, world_seeds
 from npa_envs.agents.learning.progress import Budget, Progress
 from npa_envs.agents.learning.rule_set import RuleSet
-from npa_envs.checks import check_flag, check_non_negative, check_positive
+from npa_envs.checks import check_flag, check_positive
 from npa_envs.envs.core.state import free_bytes, needed_bytes
 from npa_envs.errors import NPAError
 from npa_envs.training.ranks import ALONE, Ranks, registered, restart
@@ -58,8 +61,6 @@ class PPOOptions(CommonOptions):
     worlds: int | None = None
     """Worlds B of all processes; None: the problem's `num_envs`, or more on CUDA: 131 072 particles
     on each GPU, if they fit into memory and the particle-steps are enough for 128 rounds."""
-    critic_learning_rate: float = 1e-3
-    """The critic's learning rate at the start."""
     clip: float | None = None
     """Likelihood ratios are clipped to 1 ± this (dimensionless). None: 0.2, or 0.02 with
     `ratio="world"`, where log-ratios are means over many particles."""
@@ -71,14 +72,10 @@ class PPOOptions(CommonOptions):
     action makes to the world's."""
     masked: bool = False
     """Ignore actions in steps that did not update their particles; not with several species."""
-    critic_width: int = 64
-    """Units in a hidden layer of the critic."""
 
     def __post_init__(self) -> None:
         """Check every field; raises NPAError."""
         super().__post_init__()
-        check_positive(self, int, "critic_width")
-        check_non_negative(self, "critic_learning_rate")
         check_flag(self, "masked")
         if self.clip is not None:
             check_positive(self, float, "clip")
@@ -151,7 +148,7 @@ class PPOLearner:
         rules = zero_output_rules(problem, seed, start)
         self.actor = GaussianRules(rules, self.pace.initial_std).to(device)
         perception_dim = problem.interface.perception_dim
-        self.critic = seeded_critic(problem, perception_dim, options, seed).to(device)
+        self.critic = seeded_critic(problem, perception_dim, options.critic, seed).to(device)
         self.modules = {"actor": self.actor, "critic": self.critic}
         # CUDA graphs read the learning rate from a tensor.
         self.optimisers = {
@@ -293,7 +290,7 @@ class PPOLearner:
         self.critic.observe(self.memory.observations[:-1], self.ranks)
         self.critic.rescale(self.memory.targets, self.ranks)
         rate = self.optimisers["critic"].param_groups[0]["lr"]
-        rate.fill_(options.critic_learning_rate * budget_left)
+        rate.fill_(CRITIC_RATE * budget_left)
         self._rules_rate.fill_(self.pace.learning_rate * budget_left)
         self._within_kl.fill_(1.0)
         for _ in range(options.epochs):
@@ -355,7 +352,7 @@ class PPOLearner:
 
     def _descend(self, optimiser: torch.optim.Optimizer) -> None:
         parameters = optimiser.param_groups[0]["params"]
-        nn.utils.clip_grad_norm_(parameters, self.options.max_gradient_norm)
+        nn.utils.clip_grad_norm_(parameters, MAX_GRADIENT_NORM)
         optimiser.step()
 
     def _critic_rows(self, part: int, values: Sequence[Tensor]) -> list[Tensor]:
@@ -399,10 +396,7 @@ class PPOLearner:
         if options.ratio == "world":
             log_ratio = over_particles(log_ratio, acted)
         weights, total = self._gain_weights(acted), self._weight_sums[self._current_part, 1]
-        gain = clipped_gain(log_ratio, advantages, weights, total, clip=options.largest_change)
-        if options.entropy_weight:
-            gain = gain + options.entropy_weight * actor.entropy()
-        return gain
+        return clipped_gain(log_ratio, advantages, weights, total, clip=options.largest_change)
 
 
 class Round(NamedTuple):
@@ -551,6 +545,6 @@ def world_bytes(problem: Problem, options: PPOOptions, device: torch.device) -> 
     columns = interface.perception_dim + interface.action_dim
     # A step stores observations, actions and rewards; a minibatch also gradients.
     kept = (options.steps + 1) * (columns + interface.action_dim + 16)
-    hidden = 4 * problem.hidden_dim + 8 * options.critic_width
+    hidden = 4 * problem.hidden_dim + 8 * CRITIC_WIDTH
     learned = -(-options.steps // options.minibatches) * (2 * columns + hidden)
     return needed_bytes(1, count, problem.physics, device) + 4 * count * (kept + learned)

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from npa_envs.agents.learning.baselines import check_no_start
 from npa_envs.agents.learning.ppo_common import (
+    MAX_GRADIENT_NORM,
     CommonOptions,
     Critic,
     CriticKind,
@@ -93,8 +94,7 @@ def train(progress: Progress, options: WorldOptions = DEFAULTS) -> RuleSet:
         gamma=options.gamma,
         gae_lambda=options.gae_lambda,
         clip_range=options.clip,
-        ent_coef=options.entropy_weight,
-        max_grad_norm=options.max_gradient_norm,
+        max_grad_norm=MAX_GRADIENT_NORM,
         target_kl=world_kl(pace.target_kl),
         policy_kwargs={
             "rules": zero_output_rules(problem, seed, progress.initial),
@@ -184,7 +184,7 @@ class RoundCallback(ProgressCallback):
 class WorldRulePolicy(ActorCriticPolicy):
     """Policy of Stable-Baselines3 for `WorldVecEnv`: particles act by their species' rule.
 
-    Log-probability, entropy and value of a world are means over its particles. Rules are copied.
+    Log-probability and value of a world are means over its particles. Rules are copied.
     """
 
     def __init__(
@@ -219,11 +219,10 @@ class WorldRulePolicy(ActorCriticPolicy):
             action, log_prob = self.actor.sample(obs)
         return action, self.predict_values(obs), log_prob.mean(dim=1)
 
-    def evaluate_actions(self, obs: Any, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return values [M, 1], log-probabilities [M] and entropies [M] of actions."""
+    def evaluate_actions(self, obs: Any, actions: Tensor) -> tuple[Tensor, Tensor, None]:
+        """Return values [M, 1] and log-probabilities [M] of actions; no entropy is needed."""
         log_prob = self.actor.log_prob(obs, actions.view(*obs.shape[:2], -1))
-        entropy = self.actor.entropy().expand(len(obs))
-        return self.predict_values(obs), log_prob.mean(dim=1), entropy
+        return self.predict_values(obs), log_prob.mean(dim=1), None
 
     def predict_values(self, obs: Any) -> Tensor:
         """Return the values of worlds, shape [M, 1]."""
@@ -266,13 +265,11 @@ class SACOptions(GardenOptions):
 
     learning_starts: int = 1000
     """Steps of worlds before the first gradient step."""
-    world_steps: int = 8
-    """Steps of worlds for each gradient step, about: it depends on the number of worlds."""
 
     def __post_init__(self) -> None:
         """Check every field; raises NPAError."""
         super().__post_init__()
-        check_positive(self, int, "learning_starts", "world_steps")
+        check_positive(self, int, "learning_starts")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -296,8 +293,8 @@ SAC_DEFAULTS, GARDEN_PPO_DEFAULTS = SACOptions(), GardenPPOOptions()
 
 def train_garden_sac(progress: Progress, options: SACOptions = SAC_DEFAULTS) -> GardenPolicy:
     """Return the policy that SAC (Haarnoja et al., arXiv 1801.01290) finds within a budget."""
-    steps = max(1, progress.problem.num_envs // options.world_steps)
-    starts = options.learning_starts
+    # A gradient step for about eight steps of worlds.
+    steps, starts = max(1, progress.problem.num_envs // 8), options.learning_starts
     return _garden_policy(SAC, progress, options, learning_starts=starts, gradient_steps=steps)
 
 
