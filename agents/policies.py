@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import accumulate, pairwise
@@ -14,7 +13,7 @@ from gymnasium.vector import SyncVectorEnv, VectorEnv
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.checks import checked_count, checked_finite, checked_positive
+from npa_envs.checks import checked_count, checked_finite, checked_positive, number_tensor
 from npa_envs.errors import NPAError, shown
 from npa_envs.rule.rule import COLOUR_OFFSET, NPARule, check_rule
 from npa_envs.world.actions import Physics
@@ -94,14 +93,14 @@ def unwrapped(env: Any) -> Any:
     if isinstance(inner, SyncVectorEnv):
         inner = inner.envs[0].unwrapped
     if not hasattr(inner, "worlds"):
-        cure = "gymnasium.make('npa/Morphogenesis2D-v0')"
+        hint = "gymnasium.make('npa/Morphogenesis2D-v0')"
         if isinstance(env, VectorEnv):
-            cure = (
+            hint = (
                 "gymnasium.make_vec('npa/Morphogenesis2D-v0', num_envs=8, "
                 "vectorization_mode='vector_entry_point')"
             )
         raise NPAError(
-            f"env must be an environment of npa_envs, got {type(env).__name__}: make it with {cure}"
+            f"env must be an environment of npa_envs, got {type(env).__name__}: make it with {hint}"
         )
     return inner
 
@@ -187,26 +186,29 @@ class Policy:
         """Return the actions of agents that observe [P] or [N_k, P] or [B, N_k, P]."""
         if not observations:
             return {}
-        rows = {agent: torch.as_tensor(own) for agent, own in observations.items()}
-        rows = {agent: own if own.ndim > 1 else own[None] for agent, own in rows.items()}
-        spans = self._spans({agent: own.shape[-2] for agent, own in rows.items()})
+        rows = {
+            agent: torch.atleast_2d(torch.as_tensor(values))
+            for agent, values in observations.items()
+        }
+        spans = self._spans({agent: values.shape[-2] for agent, values in rows.items()})
         first = next(iter(rows.values()))
         count = max(span.stop for span in spans.values())
         joined = first.new_zeros(*first.shape[:-2], count, first.shape[-1])
         for agent, span in spans.items():
-            if rows[agent].shape != joined[..., span, :].shape:
+            part = joined[..., span, :]
+            if rows[agent].shape != part.shape:
                 raise NPAError(
-                    f"observation[{agent!r}] must have shape "
-                    f"{tuple(joined[..., span, :].shape)}, got {tuple(rows[agent].shape)}: "
-                    "use the policy with the environment that it was made for"
+                    f"observation[{agent!r}] must have shape {tuple(part.shape)}, got "
+                    f"{tuple(rows[agent].shape)}: use the policy with the environment that it was "
+                    "made for"
                 )
-            joined[..., span, :] = rows[agent]
+            part.copy_(rows[agent])
         actions = self._act_on(joined).to(joined.device)
         result: dict[str, Any] = {}
         for agent, observed in observations.items():
-            own = actions[..., spans[agent], :]
-            own = own if np.ndim(observed) > 1 else own[0]
-            result[agent] = own if isinstance(observed, Tensor) else own.cpu().numpy()
+            action = actions[..., spans[agent], :]
+            action = action if np.ndim(observed) > 1 else action[0]
+            result[agent] = action if isinstance(observed, Tensor) else action.cpu().numpy()
         return result
 
     def _spans(self, counts: Mapping[str, int]) -> dict[str, slice]:
@@ -254,18 +256,17 @@ class RulePolicy(Policy):
                 f"a policy needs a rule without codes, got code_dim={rule.code_dim}: run it with "
                 "npa_envs.rollout, or in npa/Shapeshifter2D-v0"
             )
+        _check_correction(rule)
         state_scale = checked_positive("state_scale", state_scale)
-        if env is None:
-            _check_correction(rule)
-        else:
-            spaces = [
+        if env is not None:
+            given, own = (
                 getattr(e, "single_observation_space", None) or e.observation_space
                 for e in (env, unwrapped(env))
-            ]
-            if spaces[0] != spaces[1]:
+            )
+            if given != own:
                 raise NPAError(
                     "a rule needs the environment's own observations, but a wrapper changes them "
-                    f"from {spaces[1]} to {spaces[0]}: give RulePolicy the environment without it"
+                    f"from {own} to {given}: give RulePolicy the environment without it"
                 )
             check_rule_fits(rule, interface_of(env), unwrapped(env).config)
             state_scale = interface_of(env).state_scale
@@ -376,13 +377,11 @@ class PaintPolicy(SpreadPolicy):
         self, env: Any, colour: Sequence[float] | Tensor | None = None, gain: float = 0.03
     ) -> None:
         super().__init__(env, gain)
+        colour = target_colour(env) if colour is None else colour
         if colour is None:
-            colour = target_colour(env)
-            if colour is None:
-                raise NPAError("colour must be given if env has no target: colour=(0, 0.5, 0)")
-        with contextlib.suppress(TypeError, ValueError, RuntimeError, OverflowError):
-            self._colour = torch.as_tensor(colour, dtype=torch.float32)
-        if getattr(self, "_colour", torch.zeros(0)).shape != (3,):
+            raise NPAError("colour must be given if env has no target: colour=(0, 0.5, 0)")
+        self._colour = number_tensor("colour", colour).float()
+        if self._colour.shape != (3,):
             raise NPAError(
                 f"colour must have three numbers, got {shown(colour)}: for example "
                 "colour=(0, 0.5, 0)"
@@ -458,22 +457,19 @@ def perceived(rule: NPARule, rows: Tensor) -> Tensor:
         return rows
     first, end = 2 * rule.state_dim, rule_interface(rule, 1.0).shared_dim
     density = end - rule.space_dim
-    groups = [rows[:, :first]]
-    if rule.state_gradient:
-        groups.append(rows[:, first:density])
-    if rule.density_gradient:
-        groups.append(rows[:, density:end])
     # All rules that perceive by species read all columns of the species.
-    return torch.cat((*groups, rows[:, end:]), dim=1)
+    read = torch.ones(rows.shape[1], dtype=torch.bool, device=rows.device)
+    read[first:density], read[density:end] = rule.state_gradient, rule.density_gradient
+    return rows[:, read]
 
 
 def check_rule_fits(rule: NPARule, wanted: Interface, config: Any) -> None:
     """Check that a rule can act in an environment with this interface and configuration."""
     _check_correction(rule)
     if rule.static == wanted.moving:
-        kind, other = ("static", "moving") if rule.static else ("moving", "static")
+        own, other = ("static", "moving") if rule.static else ("moving", "static")
         raise NPAError(
-            f"rule must be one of {other} particles like the environment's, got one of {kind} "
+            f"rule must be one of {other} particles like the environment's, got one of {own} "
             f"particles (static={rule.static}): choose another environment or another rule"
         )
     if rule.species_count != wanted.species_count:
@@ -493,11 +489,13 @@ def check_rule_fits(rule: NPARule, wanted: Interface, config: Any) -> None:
         own = getattr(rule, name)
         if math.isclose(own, value, rel_tol=1e-6) if isinstance(own, float) else own == value:
             continue
-        shown, found = (f"{n:g}" if isinstance(n, float) else repr(n) for n in (value, own))
-        cure = f"make the environment with {name}={found}"
+        wanted_text, text = (f"{n:g}" if isinstance(n, float) else repr(n) for n in (value, own))
+        hint = f"make the environment with {name}={text}"
         if name == "space_dim":
-            cure = "choose another environment or another rule"
-        raise NPAError(f"rule must have the environment's {name}, {shown}, got {found}: {cure}")
+            hint = "choose another environment or another rule"
+        raise NPAError(
+            f"rule must have the environment's {name}, {wanted_text}, got {text}: {hint}"
+        )
 
 
 def _check_correction(rule: NPARule) -> None:

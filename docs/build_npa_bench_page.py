@@ -50,10 +50,11 @@ def plain_name(suite: Suite) -> str:
 def problems(suite: Suite) -> str:
     """Return the table of the problems, Markdown."""
     lines = []
-    for env_id, entry in suite.entries.items():
-        count = suite.problem_of(task_name(env_id)).particle_count
-        steps = f"{entry.particle_steps:.1e}".replace("e+0", "e").replace(".0e", "e")
-        line = (count, entry.episode_steps, entry.num_envs, entry.hidden_dim, steps)
+    for env_id, budget in suite.budgets.items():
+        problem = suite.problem_of(task_name(env_id))
+        steps = f"{budget:.1e}".replace("e+0", "e").replace(".0e", "e")
+        sizes = (problem.particle_count, problem.episode_steps, problem.num_envs)
+        line = (*sizes, problem.hidden_dim, steps)
         lines.append((f"`{env_id}`", *map(str, line)))
     heads = ("Id", "Particles", "Steps", "Worlds", "Hidden units", "Particle-steps of a run")
     return table(heads, lines)
@@ -68,7 +69,7 @@ def ranked(rows: dict[str, BenchRow]) -> list[str]:
 def measured(suite: Suite, rows: dict[str, BenchRow]) -> list[str]:
     """Return the ids of the problems that have runs."""
     ran = {run.env_id for row in rows.values() for run in row.runs}
-    return [env_id for env_id in suite.entries if env_id in ran]
+    return [env_id for env_id in suite.budgets if env_id in ran]
 
 
 def scored(suite: Suite, rows: dict[str, BenchRow], group: str) -> str:

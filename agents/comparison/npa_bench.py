@@ -9,7 +9,6 @@ have the scores 0 and 1.
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,12 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from npa_envs.agents.comparison.plan import NOTHING, YARDSTICK, Axis, ComparisonPlan
-from npa_envs.agents.comparison.run import RunRecord
+from npa_envs.agents.comparison.run import RunRecord, mean_of
 from npa_envs.agents.learning import methods_for
-from npa_envs.agents.learning.problem import Problem
+from npa_envs.agents.learning.problem import Problem, registered_steps
 from npa_envs.errors import MissingDependencyError, NPAError, shown, suggest
 from npa_envs.files import read_json
 from npa_envs.measure.record import number, write_record
+from npa_envs.registration import GARDEN_IDS
 
 AXIS: Axis = "particle-steps"
 
@@ -54,16 +54,10 @@ EXCESS = 1.25
 SCHEMA = Path(__file__).with_name("npa_bench_v0.schema.json")
 
 
-class BenchProblem(NamedTuple):
-    """Fields of a `Problem`, and its budget."""
+HIDDEN_DIM = 64
+"""Hidden units of new rules."""
 
-    episode_steps: int
-    num_envs: int
-    hidden_dim: int
-    particle_steps: int
-
-
-QUICK_SHARE = 1e-3
+QUICK_FRACTION = 1e-3
 """Factor on the budgets of quick runs, which only test that everything runs."""
 
 LEFT_OUT = frozenset({("npa/PointClassificationSmall-v0", "scripted")})
@@ -72,37 +66,37 @@ LEFT_OUT = frozenset({("npa/PointClassificationSmall-v0", "scripted")})
 
 @dataclass(frozen=True)
 class Suite:
-    """Problems and budgets by ids, in groups; a change would make another version."""
+    """Problems and budgets; a change would make another version."""
 
     name: str
-    groups: Mapping[str, Mapping[str, BenchProblem]]
+    groups: Mapping[str, Mapping[str, int]]
+    """Particle-steps of a run by ids of environments, in groups of problems."""
 
     @property
-    def entries(self) -> dict[str, BenchProblem]:
-        """All problems by their ids."""
-        return {env_id: entry for group in self.groups.values() for env_id, entry in group.items()}
+    def budgets(self) -> dict[str, int]:
+        """Particle-steps of a run by ids, of all groups."""
+        return {env_id: steps for group in self.groups.values() for env_id, steps in group.items()}
 
     @property
     def tasks(self) -> dict[str, str]:
         """Ids by task names."""
-        return {task_name(env_id): env_id for env_id in self.entries}
+        return {task_name(env_id): env_id for env_id in self.budgets}
 
     @property
     def methods(self) -> list[str]:
         """Methods that can learn at least one of the problems."""
-        suited = [methods_for(self.problem_of(task)) for task in self.tasks]
-        return [name for name in METHODS if any(name in table for table in suited)]
+        known = [methods_for(self.problem_of(task)) for task in self.tasks]
+        return [name for name in METHODS if any(name in table for table in known)]
 
     def problem_of(self, task: str) -> Problem:
-        """Return the problem of a task name."""
+        """Return the problem of a task name: the registered environment in 16 or 64 worlds."""
         if task not in self.tasks:
             raise NPAError(
                 f"unknown task {shown(task)} of {self.name}: {suggest(task, self.tasks)}"
             )
         env_id = self.tasks[task]
-        fields = self.entries[env_id]._asdict()
-        del fields["particle_steps"]
-        return Problem(env_id=env_id, **fields)
+        steps, worlds = registered_steps(env_id), 64 if env_id in GARDEN_IDS else 16
+        return Problem(env_id=env_id, episode_steps=steps, num_envs=worlds, hidden_dim=HIDDEN_DIM)
 
     def leaves_out(self, task: str, method: str) -> bool:
         """Return whether a method cannot learn a task; "module:function" can learn any."""
@@ -111,10 +105,6 @@ class Suite:
         known = methods_for(self.problem_of(task))
         return method not in known or (self.tasks[task], method) in LEFT_OUT
 
-    def budget_of(self, task: str, *, quick: bool = False) -> float:
-        """Return the particle-steps of a run."""
-        return self.entries[self.tasks[task]].particle_steps * (QUICK_SHARE if quick else 1.0)
-
 
 def task_name(env_id: str) -> str:
     """Return the task name of an id: without "npa/"."""
@@ -122,29 +112,29 @@ def task_name(env_id: str) -> str:
 
 
 _PARTICLES = {
-    "npa/Morphogenesis2DSmall-v0": BenchProblem(32, 16, 64, 5_000_000),
-    "npa/Regeneration2DSmall-v0": BenchProblem(24, 16, 64, 5_000_000),
+    "npa/Morphogenesis2DSmall-v0": 5_000_000,
+    "npa/Regeneration2DSmall-v0": 5_000_000,
     # Less, as its loss is slow.
-    "npa/TextureSmall-v0": BenchProblem(24, 16, 64, 1_000_000),
-    "npa/PointClassificationSmall-v0": BenchProblem(16, 16, 64, 5_000_000),
-    "npa/MixingSmall-v0": BenchProblem(32, 16, 64, 5_000_000),
+    "npa/TextureSmall-v0": 1_000_000,
+    "npa/PointClassificationSmall-v0": 5_000_000,
+    "npa/MixingSmall-v0": 5_000_000,
 }
 
 _GARDENS = {
     # 48 828 steps of an environment, of 8 steps of the rule each.
-    "npa/Gardener2DSmall-v0": BenchProblem(32, 64, 64, 100_000_000),
-    "npa/Shepherd2DSmall-v0": BenchProblem(32, 64, 64, 100_000_000),
+    "npa/Gardener2DSmall-v0": 100_000_000,
+    "npa/Shepherd2DSmall-v0": 100_000_000,
 }
 
 _SMALL = {
-    "npa/Morphogenesis2DSmall-v0": BenchProblem(32, 16, 64, 1_000_000),
-    "npa/Regeneration2DSmall-v0": BenchProblem(24, 16, 64, 500_000),
-    "npa/TextureSmall-v0": BenchProblem(24, 16, 64, 300_000),
-    "npa/PointClassificationSmall-v0": BenchProblem(16, 16, 64, 1_000_000),
-    "npa/MixingSmall-v0": BenchProblem(32, 16, 64, 500_000),
-    "npa/SegregationSmall-v0": BenchProblem(32, 16, 64, 500_000),
-    "npa/CoMorphogenesisSmall-v0": BenchProblem(32, 16, 64, 500_000),
-    "npa/SymbiosisSmall-v0": BenchProblem(32, 16, 64, 1_500_000),
+    "npa/Morphogenesis2DSmall-v0": 1_000_000,
+    "npa/Regeneration2DSmall-v0": 500_000,
+    "npa/TextureSmall-v0": 300_000,
+    "npa/PointClassificationSmall-v0": 1_000_000,
+    "npa/MixingSmall-v0": 500_000,
+    "npa/SegregationSmall-v0": 500_000,
+    "npa/CoMorphogenesisSmall-v0": 500_000,
+    "npa/SymbiosisSmall-v0": 1_500_000,
 }
 """Budgets of at most a minute on a CPU core."""
 
@@ -202,104 +192,99 @@ def write_rows(
     commits, machines and versions of all of its runs, separated by semicolons.
     """
     paths = []
-    for method in dict.fromkeys(record.job.method for record in records):
-        some = [r for r in records if r.job.method == method and r.status != "failed"]
-        if some:
-            paths.append(folder / f"{method}.json")
-            row = {
-                "benchmark": suite.name,
-                "method": method,
-                "about": METHODS.get(method) or plan.own[method],
-                "options": dict(plan.options.get(method, {})),
-                "command": command,
-                "date": max(record.date for record in some),
-                **{name: plan.settings[name] for name in ("machine", "commit", "versions")},
-                "runs": [
-                    {
-                        "id": suite.tasks[record.job.task],
-                        "seed": record.job.seed,
-                        "particle_steps": record.curve[-1].particle_steps if record.curve else 0,
-                        "seconds": round(record.curve[-1].seconds, 2) if record.curve else 0.0,
-                        "returns": [round(value, 5) for value in record.returns],
-                        "curve": [
-                            [p.particle_steps, round(p.mean_return, 5)] for p in record.curve
-                        ],
-                    }
-                    for record in some
-                ],
-            }
-            held = _held_row(suite, plan, method, folder)
-            write_record(paths[-1], row if held is None else _joined(suite, held, row))
+    ended = [record for record in records if record.status != "failed"]
+    for method in dict.fromkeys(record.job.method for record in ended):
+        runs = [record for record in ended if record.job.method == method]
+        row = {
+            "benchmark": suite.name,
+            "method": method,
+            "about": METHODS.get(method) or plan.own[method],
+            "options": dict(plan.options.get(method, {})),
+            "command": command,
+            "date": max(record.date for record in runs),
+            **{name: plan.settings[name] for name in ("machine", "commit", "versions")},
+            "runs": [_run_of(suite, record) for record in runs],
+        }
+        stored = _stored_row(suite, plan, method, folder)
+        paths.append(folder / f"{method}.json")
+        write_record(paths[-1], row if stored is None else _joined(suite, stored, row))
     return paths
+
+
+def _run_of(suite: Suite, record: RunRecord) -> dict[str, Any]:
+    """Return a run as a row has it."""
+    learned = record.curve[-1] if record.curve else None
+    return {
+        "id": suite.tasks[record.job.task],
+        "seed": record.job.seed,
+        "particle_steps": 0 if learned is None else learned.particle_steps,
+        "seconds": 0.0 if learned is None else round(learned.seconds, 2),
+        "returns": [round(value, 5) for value in record.returns],
+        "curve": [[point.particle_steps, round(point.mean_return, 5)] for point in record.curve],
+    }
 
 
 def check_rows(suite: Suite, plan: ComparisonPlan, folder: Path) -> None:
     """Check that runs of a plan can be added to the rows in a folder."""
     for method in plan.methods:
-        _held_row(suite, plan, method, folder)
+        _stored_row(suite, plan, method, folder)
 
 
-def _held_row(
+def _stored_row(
     suite: Suite, plan: ComparisonPlan, method: str, folder: Path
 ) -> dict[str, Any] | None:
     """Return a method's row in a folder as JSON, or None; raises if runs cannot be added."""
     path = folder / f"{method}.json"
     if not path.exists():
         return None
-    cure = "choose another folder with --out, or remove the row"
-    wanted = {"benchmark": suite.name, "method": method}
+    hint = "choose another folder with --out, or remove the row"
+    wanted = {"benchmark": suite.name, "method": method, "episodes": plan.episodes}
     wanted["options"] = json.loads(json.dumps(plan.options.get(method, {})))
     if method in plan.own:
         wanted["about"] = plan.own[method]
     try:
-        held: dict[str, Any] = read_json(path)
-        found = {"options": {}} | held
-        lengths = {len(run["returns"]) for run in held["runs"]}
-        for run in held["runs"]:
-            run["id"], run["seed"]
-        texts = [held[name] for name in ("machine", "commit", "command", "date")]
-        if not all(isinstance(text, str) for text in texts):
+        row: dict[str, Any] = read_json(path)
+        episodes = {(run["id"], run["seed"]): len(run["returns"]) for run in row["runs"]}
+        if not all(isinstance(row[name], str) for name in ("machine", "commit", "command", "date")):
             raise TypeError("machine, commit, command and date must be text")
     except (TypeError, KeyError, AttributeError, NPAError) as error:
         raise NPAError(
             f"{str(path)!r} must be a row that runs can be added to, but cannot be read "
-            f"({shown(error)}): {cure}"
+            f"({shown(error)}): {hint}"
         ) from error
+    # Runs that diverged have no episodes.
+    others = set(episodes.values()) - {0, plan.episodes}
+    facts = {"options": {}, "episodes": max(others, default=plan.episodes)} | row
     for name, value in wanted.items():
-        if found.get(name) != value:
+        if facts.get(name) != value:
             raise NPAError(
                 f"{str(path)!r} must have the {name} {shown(value)} for runs to be added, got "
-                f"{shown(found.get(name))}: {cure}, or give the method a name of its own"
+                f"{shown(facts.get(name))}: {hint}, or give the method a name of its own"
             )
-    if lengths - {0, plan.episodes}:
-        raise NPAError(
-            f"{str(path)!r} must have runs of {plan.episodes} episodes for runs to be added, got "
-            f"{max(lengths)}: {cure}"
-        )
-    return held
+    return row
 
 
-def _joined(suite: Suite, held: Mapping[str, Any], row: dict[str, Any]) -> dict[str, Any]:
-    """Return `row` with the runs of the stored row `held` added that it lacks."""
+def _joined(suite: Suite, stored: Mapping[str, Any], row: dict[str, Any]) -> dict[str, Any]:
+    """Return `row` with the runs of the stored row added that it lacks."""
     new = {(run["id"], run["seed"]) for run in row["runs"]}
-    kept = [dict(run) for run in held["runs"] if (run["id"], run["seed"]) not in new]
+    kept = [dict(run) for run in stored["runs"] if (run["id"], run["seed"]) not in new]
     if not kept:
         return row
     added = [dict(run) for run in row["runs"]]
-    for some, machine in ((kept, held["machine"]), (added, row["machine"])):
+    for some, machine in ((kept, stored["machine"]), (added, row["machine"])):
         # In a row of several machines each run names its machine already.
-        if held["machine"] != row["machine"] and ";" not in machine:
+        if stored["machine"] != row["machine"] and ";" not in machine:
             for run in some:
                 run.setdefault("machine", machine)
-    order, runs = list(suite.entries), [*kept, *added]
+    order, runs = list(suite.budgets), [*kept, *added]
     runs.sort(key=lambda run: (run["seed"], order.index(run["id"]) if run["id"] in order else -1))
-    before, now = held.get("versions", {}), row["versions"]
+    before, now = stored.get("versions", {}), row["versions"]
     versions = {
         name: _both(before.get(name, version), now.get(name, version))
         for name, version in {**before, **now}.items()
     }
-    both = {name: _both(held[name], row[name]) for name in ("command", "commit", "machine")}
-    date = max(held["date"], row["date"])
+    both = {name: _both(stored[name], row[name]) for name in ("command", "commit", "machine")}
+    date = max(stored["date"], row["date"])
     return {**row, **both, "date": date, "versions": versions, "runs": runs}
 
 
@@ -319,56 +304,55 @@ def read_row(path: Path) -> BenchRow:
         raise MissingDependencyError(
             "rows are checked by jsonschema, which is not installed: pip install 'npa-envs[bench]'"
         ) from error
-    held = read_json(path)
+    row = read_json(path)
     try:
-        jsonschema.validate(held, json.loads(SCHEMA.read_text("utf-8")))
+        jsonschema.validate(row, json.loads(SCHEMA.read_text("utf-8")))
     except jsonschema.ValidationError as error:
         raise NPAError(
             f"{path.name} must follow {SCHEMA.name}, but at {error.json_path} {error.message}"
         ) from error
-    runs = tuple(map(_read_run, held["runs"]))
-    suite, about = SUITES[held["benchmark"]], held.get("about", "")
-    row = BenchRow(suite, held["method"], runs, about, held["machine"])
-    _check_row(row, path.name)
-    return row
-
-
-def _read_run(held: Mapping[str, Any]) -> BenchRun:
-    returns = [number(value) for value in held["returns"]]
-    mean = sum(returns) / len(returns) if returns else math.nan
-    curve = tuple((at, value) for at, value in held["curve"] if value is not None)
-    machine = held.get("machine", "")
-    return BenchRun(held["id"], held["seed"], held["particle_steps"], mean, curve, machine)
+    runs = tuple(
+        BenchRun(
+            env_id=run["id"],
+            seed=run["seed"],
+            particle_steps=run["particle_steps"],
+            mean_return=mean_of(list(map(number, run["returns"]))),
+            curve=tuple((at, value) for at, value in run["curve"] if value is not None),
+            machine=run.get("machine", ""),
+        )
+        for run in row["runs"]
+    )
+    suite, about = SUITES[row["benchmark"]], row.get("about", "")
+    read = BenchRow(suite, row["method"], runs, about, row["machine"])
+    _check_row(read, path.name)
+    return read
 
 
 def _check_row(row: BenchRow, name: str) -> None:
     """Check the rules that are not in the schema; raises NPAError."""
-    entries = row.suite.entries
+    budgets = row.suite.budgets
     for run in row.runs:
         if run.machine and run.machine not in row.machine.split("; "):
             raise NPAError(
                 f"{name} has a run on {shown(run.machine)} that its machine does not name, got "
                 f"{shown(row.machine)}: name it there, behind a semicolon"
             )
-    for env_id in dict.fromkeys(run.env_id for run in row.runs):
-        if env_id not in entries:
+        if run.env_id not in budgets:
             raise NPAError(
-                f"{name} has runs of {env_id}, no problem of {row.suite.name}: leave them out"
+                f"{name} has runs of {run.env_id}, no problem of {row.suite.name}: leave them out"
             )
-        some = [run for run in row.runs if run.env_id == env_id]
-        seeds = {run.seed for run in some}
-        if len(seeds) < len(some) or len(seeds) < MIN_SEEDS:
+        seeds = sorted(other.seed for other in row.runs if other.env_id == run.env_id)
+        if len(set(seeds)) < max(len(seeds), MIN_SEEDS):
             raise NPAError(
-                f"{name} must have runs of {env_id} from at least {MIN_SEEDS} seeds, each once, "
-                f"got {sorted(run.seed for run in some)}: run the missing ones"
+                f"{name} must have runs of {run.env_id} from at least {MIN_SEEDS} seeds, each "
+                f"once, got {seeds}: run the missing ones"
             )
-        most = EXCESS * entries[env_id].particle_steps
-        for run in some:
-            if run.particle_steps > most:
-                raise NPAError(
-                    f"{name} must take at most {most:.3g} particle-steps on {env_id}, got "
-                    f"{run.particle_steps:.3g} from seed {run.seed}: learn from fewer"
-                )
+        most = EXCESS * budgets[run.env_id]
+        if run.particle_steps > most:
+            raise NPAError(
+                f"{name} must take at most {most:.3g} particle-steps on {run.env_id}, got "
+                f"{run.particle_steps:.3g} from seed {run.seed}: learn from fewer"
+            )
 
 
 def read_rows(suite: Suite, folder: Path) -> dict[str, BenchRow]:

@@ -76,12 +76,12 @@ class RunRecord:
     @property
     def mean_return(self) -> float:
         """Mean return of the held-out episodes; NaN without any."""
-        return _mean(self.returns)
+        return mean_of(self.returns)
 
     @property
     def mean_loss(self) -> float:
         """Mean loss at the ends of the held-out episodes; NaN without any."""
-        return _mean(self.final_losses)
+        return mean_of(self.final_losses)
 
     def write(self, folder: Path) -> None:
         """Write the record into the run's folder; numbers that are not finite become null."""
@@ -105,7 +105,8 @@ class RunRecord:
         return read_record(folder / RECORD, facts, made, command="compare")
 
 
-def _mean(values: Sequence[float]) -> float:
+def mean_of(values: Sequence[float]) -> float:
+    """Return the mean of numbers, NaN without any."""
     return sum(values) / len(values) if values else math.nan
 
 
@@ -201,16 +202,15 @@ def final_picture(
     keywords = {**problem.keywords, "render_mode": "rgb_array", "render_size": SIZE}
     # One more step, as an environment at the end of an episode shows the next start.
     longer = replace(problem, keywords=keywords, episode_steps=problem.episode_steps + 1)
-    envs = longer.make_envs(1, device=device)
+    envs: Any = longer.make_envs(1, device=device)
     policy = policy_in(envs, policy)
     observation, _ = envs.reset(seed=[seed])
-    shown: Any = getattr(envs, "species_env", envs)
-    (picture,) = shown.render()
+    (picture,) = envs.render()
     for _ in range(problem.episode_steps):
         observation, _, terminated, truncated, _ = envs.step(policy(observation))
         if bool(terminated | truncated):
             break
-        (picture,) = shown.render()
+        (picture,) = envs.render()
     envs.close()
     found: NDArray[np.uint8] = picture
     return found

@@ -104,7 +104,7 @@ def train(
     start: RuleSet | None = None,
     evaluation_seeds: Iterable[int] = EVALUATION_SEEDS,
     entries: int = 20,
-    on_entry: Callable[[CurvePoint], None] | None = None,
+    on_entry: Callable[[CurvePoint], None] = lambda _: None,
     on_stop: Callable[[], None] = lambda: None,
     out: str | Path | None = None,
     resume: bool = False,
@@ -140,12 +140,14 @@ def train(
         DivergedError: The rules' weights have become infinite or NaN.
         MissingDependencyError: The method needs a library that is not installed.
     """
-    for name, value, kind in (("problem", problem, Problem), ("budget", budget, Budget)):
-        if not isinstance(value, kind):
-            example = "env_id='npa/Mixing-v0', episode_steps=96"
-            cure = f"Problem({example})" if kind is Problem else "Budget(particle_steps=10**6)"
+    for value, cls, make in (
+        (problem, Problem, "Problem(env_id='npa/Mixing-v0', episode_steps=96)"),
+        (budget, Budget, "Budget(particle_steps=10**6)"),
+    ):
+        if not isinstance(value, cls):
+            name = cls.__name__
             raise NPAError(
-                f"{name} must be a {kind.__name__}, got {shown(value)}: make it with {cure}"
+                f"{name.lower()} must be a {name}, got {shown(value)}: make it with {make}"
             )
     if problem.actor == "codes" and method in GARDEN_METHODS | METHODS:
         raise NPAError(
@@ -153,7 +155,6 @@ def train(
             "give a function of your own, 'package.module:function', or take another library"
         )
     function = _function(method, methods_for(problem))
-    declared = _declared(function)
     known = _options_of(function)
     for name in options:
         if name not in known:
@@ -163,14 +164,14 @@ def train(
     check_run_seed(seed)
     several = Ranks.current().count > 1
     if method not in KEPT_METHODS and (several or out is not None):
-        asked = "be shared by processes" if several else "be kept in a folder (out)"
+        wanted = "be shared by processes" if several else "be kept in a folder (out)"
         raise NPAError(
-            f"method {shown(method)} cannot {asked}: take one of {', '.join(KEPT_METHODS)}"
+            f"method {shown(method)} cannot {wanted}: take one of {', '.join(KEPT_METHODS)}"
         )
     if (resume or overwrite) and out is None:
         raise NPAError("resume and overwrite need a folder: give out='runs/heart'")
-    run = {"method": method, "problem": problem.to_json(), "seed": seed, "options": options}
-    run |= {"started": start is not None}
+    settings = {"method": method, "problem": problem.to_json(), "seed": seed, "options": options}
+    settings |= {"started": start is not None}
     progress = Progress(
         problem,
         budget,
@@ -181,13 +182,15 @@ def train(
         on_entry=on_entry,
         initial=start,
         out=None if out is None else Path(out),
-        run=None if out is None else json.loads(json.dumps(run)),
+        run=None if out is None else json.loads(json.dumps(settings)),
         resume=resume,
         overwrite=overwrite,
         on_stop=on_stop,
     )
-    given = {"options": replace(declared, **options)} if declared is not None else options
-    result = function(progress, **given)
+    defaults = _default_options(function)
+    result = function(
+        progress, **(options if defaults is None else {"options": replace(defaults, **options)})
+    )
     if isinstance(result, RuleSet):
         # Gradients may keep the memory of CUDA graphs.
         result.zero_grad()
@@ -217,14 +220,14 @@ def method_options(method: str) -> dict[str, Any]:
 
 
 def _options_of(function: Callable[..., Any]) -> dict[str, Any]:
-    declared = _declared(function)
-    if declared is not None:
-        return {field.name: getattr(declared, field.name) for field in fields(declared)}
+    defaults = _default_options(function)
+    if defaults is not None:
+        return {field.name: getattr(defaults, field.name) for field in fields(defaults)}
     parameters = inspect.signature(function).parameters.values()
     return {p.name: p.default for p in parameters if p.kind is p.KEYWORD_ONLY}
 
 
-def _declared(function: Callable[..., Any]) -> Any:
+def _default_options(function: Callable[..., Any]) -> Any:
     """Return the options of a method that declares them as a dataclass, else None."""
     parameter = inspect.signature(function).parameters.get("options")
     default = None if parameter is None else parameter.default
@@ -236,12 +239,8 @@ def _function(method: str, table: dict[str, str]) -> Callable[..., Any]:
         raise NPAError(
             f"method must be a known word, got {shown(method)}: {suggest(method, table)}"
         )
-    function: Callable[..., Any]
-    if method in table:
-        function = pkgutil.resolve_name(table[method])
-        return function
     try:
-        function = pkgutil.resolve_name(method)
+        function: Callable[..., Any] = pkgutil.resolve_name(table.get(method, method))
     except MissingDependencyError:
         raise
     except (ImportError, AttributeError, ValueError) as error:

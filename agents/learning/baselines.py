@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any
 
 from npa_envs.agents.evaluation import evaluate_policy
 from npa_envs.agents.gardening import (
@@ -30,8 +30,6 @@ from npa_envs.checks import is_real
 from npa_envs.envs.shepherd2d import ShepherdTask
 from npa_envs.errors import NPAError, shown
 
-PolicyT = TypeVar("PolicyT", bound=Callable[[Any], Any])
-
 SCRIPTED: tuple[Callable[..., Policy], ...] = (PaintPolicy, SpreadPolicy, MendPolicy)
 
 GAINS = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, -0.01, -0.03, -0.1, -0.3)
@@ -40,28 +38,26 @@ GAINS = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, -0.01, -0.03, -0.1, -0.3)
 
 def train_random(progress: Progress) -> Policy | Tending:
     """Return the policy that acts at random; no particle-steps are used."""
-    return _baseline(progress, RandomPolicy, RandomGardener, seed=progress.seed)
+    return _evaluated(progress, RandomPolicy, RandomGardener, seed=progress.seed)
 
 
 def train_zero(progress: Progress) -> Policy | Tending:
     """Return the policy that does nothing; no particle-steps are used."""
-    return _baseline(progress, ZeroPolicy, StillGardener)
+    return _evaluated(progress, ZeroPolicy, StillGardener)
 
 
-def _baseline(
-    progress: Progress, policy: Callable[..., Policy], gardener: Any, **given: int
+def _evaluated(
+    progress: Progress, policy: Callable[..., Policy], gardener: Any, **options: int
 ) -> Policy | Tending:
-    if progress.problem.actor == "brushes":
-        return _evaluated(progress, Tending(lambda env: gardener(env, **given)))
-    return _evaluated(
-        progress, policy(progress.problem.make_envs(1, device=progress.device), **given)
-    )
-
-
-def _evaluated(progress: Progress, policy: PolicyT) -> PolicyT:
+    """Return the policy for particles, or the one for brushes, after its evaluation."""
     check_no_start(progress)
-    progress.start(policy)
-    return policy
+    made: Policy | Tending
+    if progress.problem.actor == "brushes":
+        made = Tending(lambda env: gardener(env, **options))
+    else:
+        made = policy(progress.problem.make_envs(1, device=progress.device), **options)
+    progress.start(made)
+    return made
 
 
 def train_scripted(progress: Progress, *, gains: Sequence[float] = GAINS) -> Policy:
@@ -129,12 +125,12 @@ class Tending:
         )
 
 
-def tend_scripted(progress: Progress) -> Tending:
+def tend_scripted(progress: Progress) -> Policy | Tending:
     """Return the scripted gardener, or in `npa/Shepherd2D-v0` the scripted shepherd."""
-    shepherd = issubclass(progress.problem.env_type.task_type, ShepherdTask)
-    return _evaluated(progress, Tending(ScriptedShepherd if shepherd else ScriptedGardener))
+    shepherd = issubclass(progress.problem.task_type, ShepherdTask)
+    return _evaluated(progress, ZeroPolicy, ScriptedShepherd if shepherd else ScriptedGardener)
 
 
-def tend_gradient(progress: Progress) -> Tending:
+def tend_gradient(progress: Progress) -> Policy | Tending:
     """Return the gardener that plans by the gradient through the world's physics."""
-    return _evaluated(progress, Tending(lambda env: GradientGardener(env, seed=progress.seed)))
+    return _evaluated(progress, ZeroPolicy, GradientGardener, seed=progress.seed)

@@ -14,6 +14,9 @@ from npa_envs.agents.learning.rule_set import RuleSet, Source
 from npa_envs.checks import check_fraction, check_positive, is_real
 from npa_envs.errors import NPAError, shown
 
+STORED_STEPS = 64
+"""Last steps of all worlds that are learned from, if they are not collected all at once."""
+
 VARIANCE_FLOOR = 1e-8
 """Added to the variance of the teacher's actions, which may be 0."""
 
@@ -32,8 +35,6 @@ class CloneOptions:
     """Fraction of the worlds in which the student acts, in [0, 1]; 0: plain cloning."""
     collect_steps: int = 8
     """Steps of the worlds in an iteration."""
-    kept_steps: int = 64
-    """Last steps of all worlds that are learned from, at least `collect_steps`."""
     updates: int = 16
     """Optimiser's steps in an iteration."""
     batch_worlds: int = 4
@@ -49,14 +50,9 @@ class CloneOptions:
             raise NPAError(
                 f"student_share must lie in [0, 1], got {shown(self.student_share)}: try 0.5"
             )
-        check_positive(self, int, "collect_steps", "kept_steps", "updates", "batch_worlds")
+        check_positive(self, int, "collect_steps", "updates", "batch_worlds")
         check_positive(self, float, "learning_rate")
         check_fraction(self, "last_rate")
-        if self.kept_steps < self.collect_steps:
-            raise NPAError(
-                f"kept_steps must be at least collect_steps = {self.collect_steps}, got "
-                f"{self.kept_steps}: give {8 * self.collect_steps}"
-            )
 
 
 DEFAULTS = CloneOptions()
@@ -106,7 +102,8 @@ def _taught(
     teacher = RuleSet.of(problem, given).to(device).policy()
     student, envs = rules.policy(), problem.make_envs(device=device)
     observation, _ = envs.reset(seed=world_seeds(seed, problem.num_envs))
-    pairs = Demonstrations(options.kept_steps * problem.num_envs, observation, teacher(observation))
+    stored_steps = max(STORED_STEPS, options.collect_steps)
+    pairs = Demonstrations(stored_steps * problem.num_envs, observation, teacher(observation))
     taught = problem.num_envs - round(options.student_share * problem.num_envs)
 
     def collect() -> int:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import itertools
 import sys
 from collections.abc import Mapping
@@ -146,7 +145,9 @@ class EnvironmentTask(ParticleTask[Any]):
 
     def __init__(self, problem: Problem, device: torch.device) -> None:
         self.problem, self.config, self.physics = problem, problem.config, problem.physics
-        self.inner = task = problem.make_task(device)
+        task = problem.make_task(device)
+        self.inner: Any = task
+        """The environment's task."""
         self._species = species_of(problem.counts).to(device)
         self._clamped: tuple[RuleSet, list[ClampedRule]] | None = None
         if not isinstance(task, SpeciesTask):
@@ -182,63 +183,61 @@ class EnvironmentTask(ParticleTask[Any]):
 
     def toward(self, goal: Tensor | None) -> Self:
         """Return a copy of the task whose losses are for these goals, shape [B]."""
-        if goal is None:
-            return self
-        assert isinstance(self.inner, EnvTask), "species have no goals"
-        task = copy.copy(self)
-        task.inner = self.inner.toward(goal)
-        return task
+        return self if goal is None else self._with(inner=self.inner.toward(goal))
 
-    def loss(self, x: Tensor, s: Tensor, path_length: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+    def compare(self, x: Tensor, s: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the loss, averaged over worlds and species, and its parts by name."""
-        parts = {name: part.mean() for name, part in self._losses(x, s).items()}
+        worlds = Particles(x, s)
+        parts = {name: part.mean() for name, part in self._losses(worlds).items()}
         total = torch.stack(list(parts.values())).sum()
-        self._check_gradient(total, x, s)
+        self._check_gradient(total, worlds)
         return total, parts
 
-    def world_losses(self, x: Tensor, s: Tensor) -> Tensor:
+    def penalties(self, *_: Any) -> dict[str, tuple[float, Tensor]]:
+        """Return no terms: environments have none."""
+        return {}
+
+    def world_losses(self, worlds: Particles) -> Tensor:
         """Return the loss of each world, averaged over its species, shape [B]."""
-        total = torch.stack(list(self._losses(x, s).values())).sum(dim=0)
+        parts = self.toward(worlds.goal)._losses(worlds)
+        total = torch.stack(list(parts.values())).sum(dim=0)
         total = total.flatten(1).mean(dim=1) if total.dim() > 1 else total
-        self._check_gradient(total, x, s)
+        self._check_gradient(total, worlds)
         return total
 
-    def rollout(
-        self, rules: Any, x: Tensor, s: Tensor, steps: int, /, **options: Any
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def rollout(self, rules: Any, x: Tensor, s: Tensor, steps: int, /, **options: Any) -> Any:
         """Run a `RuleSet` by the environment's physics; options are those of `npa_envs.rollout`."""
         physics, config = self.physics, self.config
         if self._clamped is None or self._clamped[0] is not rules:
             # Made once, as recorded rollouts identify rules by `id`.
             limit = physics.limits.state_scale
             self._clamped = rules, [ClampedRule(rule, limit) for rule in rules]
-        clamped = self._clamped[1]
-        options = {
-            "eps": self.eps,
-            "update_prob": self.update_prob,
+        rule: Any = self._clamped[1]
+        options |= {
             "dt": physics.dt,
             "position_noise": physics.position_noise,
-            "return_path_length": True,
-            **options,
             "box": physics.box or physics.walls,
             "boundary": config.boundary,
         }
-        rollout: Any = npa_envs.rollout
-        rule: Any = clamped[0]
         if isinstance(config, SpeciesConfig):
-            rollout, rule = npa_envs.rollout_species, clamped
             options |= {"counts": config.counts, "perception": config.perception}
-        last: tuple[Tensor, Tensor, Tensor] = rollout(rule, x, s, steps, **options)
-        return last
+            run: Any = npa_envs.rollout_species
+        else:
+            run, (rule,) = npa_envs.rollout, rule
+        return run(rule, x, s, steps, **options)
 
-    def _losses(self, x: Tensor, s: Tensor) -> Mapping[str, Tensor]:
+    def _losses(self, worlds: Particles) -> Mapping[str, Tensor]:
         """Return the parts of each world's loss, shape [B], or [B, K] of K species."""
+        x, s, *_ = worlds
+        losses: Mapping[str, Tensor]
         if isinstance(self.inner, SpeciesTask):
-            return self.inner.losses(Population(x, s, self.problem.counts, self._species))
-        return self.inner.losses(x, s)
+            losses = self.inner.losses(Population(x, s, self.problem.counts, self._species))
+        else:
+            losses = self.inner.losses(x, s)
+        return losses
 
-    def _check_gradient(self, total: Tensor, x: Tensor, s: Tensor) -> None:
-        needed = torch.is_grad_enabled() and (x.requires_grad or s.requires_grad)
+    def _check_gradient(self, total: Tensor, worlds: Particles) -> None:
+        needed = torch.is_grad_enabled() and (worlds.x.requires_grad or worlds.s.requires_grad)
         if needed and not total.requires_grad:
             raise NPAError(
                 f"the losses of {type(self.inner).__name__} must be differentiable for "
@@ -270,17 +269,20 @@ def clamp_inward(values: Tensor, limit: float) -> Tensor:
     return clamped
 
 
+def with_clamped_states(update: Tensor, rule: ClampedRule) -> Tensor:
+    """Return updates [..., δ | Δs] with state steps clamped to the rule's limit."""
+    first = rule.update_dim - rule.state_dim
+    return torch.cat((update[..., :first], clamp_inward(update[..., first:], rule.limit)), dim=-1)
+
+
 class ClampedWeights(FoldedRule):
     """Folded weights of a rule, whose state steps are clamped to a limit."""
 
-    displacement_dim: int
-    limit: float
+    rule: ClampedRule
 
     def __call__(self, rows: Tensor) -> Tensor:
         """Map rows [z | 1 | 0] to updates [δ | clamped Δs | 0]."""
-        update = super().__call__(rows)
-        first = self.displacement_dim
-        return torch.cat((update[:, :first], clamp_inward(update[:, first:], self.limit)), dim=1)
+        return with_clamped_states(super().__call__(rows), self.rule)
 
 
 class ClampedRule(NPARule):
@@ -297,11 +299,7 @@ class ClampedRule(NPARule):
 
     def forward(self, perception: Tensor) -> Tensor:
         """Map perception vectors [..., P] to updates with clamped state steps."""
-        update = super().forward(perception)
-        first = self.update_dim - self.state_dim
-        return torch.cat(
-            (update[..., :first], clamp_inward(update[..., first:], self.limit)), dim=-1
-        )
+        return with_clamped_states(super().forward(perception), self)
 
     def is_plain(self) -> bool:
         """Return whether the other rule is plain, so that `folded` may replace `forward`."""
@@ -314,6 +312,5 @@ class ClampedRule(NPARule):
     def folded(self) -> FoldedRule:
         """Return the folded weights with clamped state steps."""
         clamped = ClampedWeights(*super().folded())
-        clamped.displacement_dim = self.update_dim - self.state_dim
-        clamped.limit = self.limit
+        clamped.rule = self
         return clamped

@@ -20,6 +20,9 @@ import torch
 from torch import Tensor, nn
 
 from npa_envs.agents.learning.ppo_common import (
+    CRITIC_RATE,
+    CRITIC_WIDTH,
+    MAX_GRADIENT_NORM,
     CommonOptions,
     GaussianRules,
     Minibatches,
@@ -34,7 +37,7 @@ from npa_envs.agents.learning.ppo_common import (
 from npa_envs.agents.learning.problem import ROW_REWARDS, WORLDS_PER_SEED, Problem, world_seeds
 from npa_envs.agents.learning.progress import Budget, Progress
 from npa_envs.agents.learning.rule_set import RuleSet
-from npa_envs.checks import check_flag, check_non_negative, check_positive
+from npa_envs.checks import check_flag, check_positive
 from npa_envs.envs.core.state import free_bytes, needed_bytes
 from npa_envs.errors import NPAError
 from npa_envs.training.ranks import ALONE, Ranks, registered, restart
@@ -58,8 +61,6 @@ class PPOOptions(CommonOptions):
     worlds: int | None = None
     """Worlds B of all processes; None: the problem's `num_envs`, or more on CUDA: 131 072 particles
     on each GPU, if they fit into memory and the particle-steps are enough for 128 rounds."""
-    critic_learning_rate: float = 1e-3
-    """The critic's learning rate at the start."""
     clip: float | None = None
     """Likelihood ratios are clipped to 1 ± this (dimensionless). None: 0.2, or 0.02 with
     `ratio="world"`, where log-ratios are means over many particles."""
@@ -71,14 +72,10 @@ class PPOOptions(CommonOptions):
     action makes to the world's."""
     masked: bool = False
     """Ignore actions in steps that did not update their particles; not with several species."""
-    critic_width: int = 64
-    """Units in a hidden layer of the critic."""
 
     def __post_init__(self) -> None:
         """Check every field; raises NPAError."""
         super().__post_init__()
-        check_positive(self, int, "critic_width")
-        check_non_negative(self, "critic_learning_rate")
         check_flag(self, "masked")
         if self.clip is not None:
             check_positive(self, float, "clip")
@@ -151,7 +148,7 @@ class PPOLearner:
         rules = zero_output_rules(problem, seed, start)
         self.actor = GaussianRules(rules, self.pace.initial_std).to(device)
         perception_dim = problem.interface.perception_dim
-        self.critic = seeded_critic(problem, perception_dim, options, seed).to(device)
+        self.critic = seeded_critic(problem, perception_dim, options.critic, seed).to(device)
         self.modules = {"actor": self.actor, "critic": self.critic}
         # CUDA graphs read the learning rate from a tensor.
         self.optimisers = {
@@ -164,7 +161,6 @@ class PPOLearner:
             )
             for name, net in self.modules.items()
         }
-        self.optimizer, self.critic_optimizer = self.optimisers.values()
         self._seed, self._indices, self._total = seed, indices.tolist(), total
         observation = self._worlds_of_part(0)
         self.memory = RoundMemory(
@@ -186,25 +182,21 @@ class PPOLearner:
         self._minibatches = Minibatches(
             options.steps, len(indices), (*rows, 1), options.minibatches, self.random
         )
-        random = registered(self.random)
-        self._graphed_draw_actions = GraphedCallable(self._draw_actions, device, random)
-        self._graphed_find_values = GraphedCallable(self._find_values, device)
-        # One process records whole passes; several record what is between their reductions.
-        shared = ranks.together
-        whole = partial(GraphedCallable, device=device, recorded=not shared)
-        self._graphed_find_advantages = whole(self._find_advantages)
-        self._graphed_improve_critic = whole(self._improve_critic)
-        self._graphed_improve_both = whole(self._improve_both)
-        pool = torch.cuda.graph_pool_handle() if shared and device.type == "cuda" else None
-        between_reductions = partial(GraphedCallable, device=device, recorded=shared, pool=pool)
-        self._graphed_sum_part_weights = between_reductions(self._sum_part_weights)
-        self._graphed_step_both = between_reductions(self._step_both)
-        self._graphed_find_gradients = [
-            between_reductions(self._find_gradients) for _ in range(self._minibatches.count)
-        ]
+        count = self._minibatches.count
         self._current_part = 0
-        self._part_weights: Tensor = self._within_kl.new_zeros(self._minibatches.count, 2)
+        self._weight_sums: Tensor = self._within_kl.new_zeros(count, 2)
         self._kl_sums = self._within_kl.new_zeros(2)
+        # Means over processes are taken between graphs.
+        graph = partial(GraphedCallable, device=device)
+        self._graphed_draw_actions = graph(self._draw_actions, generator=registered(self.random))
+        self._graphed_find_values = graph(self._find_values)
+        self._graphed_find_advantages = graph(self._find_advantages, recorded=not ranks.together)
+        graph = partial(
+            graph, pool=torch.cuda.graph_pool_handle() if device.type == "cuda" else None
+        )
+        self._graphed_sum_weights = graph(self._sum_weights)
+        self._graphed_find_gradients = [graph(self._find_gradients) for _ in range(count)]
+        self._graphed_step = graph(self._step)
 
     def resume(self, iteration: int, part: int) -> None:
         """Resume after `iteration` rounds, for the `part`-th time, in new worlds."""
@@ -244,9 +236,9 @@ class PPOLearner:
                 # It describes the step before a restart.
                 memory.acted[step].mul_(infos["updated"])
             # A species may end before its world does.
-            gone = infos.get("particle_terminated", terminated[:, None])
-            memory.terminated[step].copy_(terminated[:, None] | gone)
-            memory.ended[step].copy_((terminated | truncated)[:, None] | gone)
+            ended = infos.get("particle_terminated", terminated[:, None])
+            memory.terminated[step].copy_(terminated[:, None] | ended)
+            memory.ended[step].copy_((terminated | truncated)[:, None] | ended)
         self._graphed_find_values()
         for step, observation in last_observations.items():
             memory.next_values[step].copy_(self.critic(observation))
@@ -297,16 +289,13 @@ class PPOLearner:
         self.rounds += 1
         self.critic.observe(self.memory.observations[:-1], self.ranks)
         self.critic.rescale(self.memory.targets, self.ranks)
-        rate = self.critic_optimizer.param_groups[0]["lr"]
-        rate.fill_(options.critic_learning_rate * budget_left)
+        rate = self.optimisers["critic"].param_groups[0]["lr"]
+        rate.fill_(CRITIC_RATE * budget_left)
         self._rules_rate.fill_(self.pace.learning_rate * budget_left)
         self._within_kl.fill_(1.0)
         for _ in range(options.epochs):
             self._minibatches.shuffle()
-            if not rules_learn:
-                self._graphed_improve_critic()
-                continue
-            self._graphed_improve_both()
+            self._improve_once(rules_learn)
             # The only synchronisation with the device.
             if not bool(self._within_kl):
                 break
@@ -314,70 +303,57 @@ class PPOLearner:
             noise_left(budget_left, self.pace.last_noise, options.noise_decay_share)
         )
 
-    def _improve_critic(self) -> None:
-        """Train the critic on one pass over a round, in the order of `_minibatches`."""
-        self._reduce_part_weights()
-        for part in range(self._minibatches.count):
-            self._current_part = part
-            self._find_critic_gradients()
-            self.ranks.reduce(gradients_of(self.critic_optimizer))
-            self._descend(self.critic_optimizer)
-
-    def _improve_both(self) -> None:
-        """Train critic and rules on one pass over a round, in the orders of `_minibatches`."""
-        self._reduce_part_weights()
+    def _improve_once(self, rules_learn: bool) -> None:
+        """Train on one pass over a round, in the orders of `_minibatches`."""
+        self._graphed_sum_weights()
+        self.ranks.reduce([self._weight_sums])
+        critic = self.optimisers["critic"]
         for part, find_gradients_of_part in enumerate(self._graphed_find_gradients):
             self._current_part = part
-            find_gradients_of_part()
-            found = gradients_of(self.critic_optimizer) + gradients_of(self.optimizer)
-            self.ranks.reduce([*found, self._kl_sums])
-            self._graphed_step_both()
+            if rules_learn:
+                find_gradients_of_part()
+                gradients = gradients_of(critic) + gradients_of(self.optimisers["actor"])
+                self.ranks.reduce([*gradients, self._kl_sums])
+                self._graphed_step()
+            else:
+                self._find_critic_gradients()
+                self.ranks.reduce(gradients_of(critic))
+                self._descend(critic)
 
-    def _find_gradients(self) -> None:
-        self._find_critic_gradients()
-        rows = [Round(*own) for own in self._rule_rows(self._current_part, self.memory.round)]
-        find_gradients(self.optimizer, -self._gain(rows))
-
-    def _find_critic_gradients(self) -> None:
-        worlds = Round(*self._critic_rows(self._current_part, self.memory.round))
-        error = (self.critic(worlds.observations) - worlds.targets) / self.critic.scale
-        squares = (worlds.acted * error.square()).sum()
-        loss = 0.5 * squares / self._total_weight(worlds.acted, 0).clamp(min=1.0)
-        find_gradients(self.critic_optimizer, loss)
-
-    def _step_both(self) -> None:
-        self._descend(self.critic_optimizer)
-        # Rules that moved too far get the learning rate 0, without a synchronisation.
-        moved, count = self._kl_sums
-        self._within_kl *= moved / count.clamp(min=1.0) <= self.pace.target_kl
-        self.optimizer.param_groups[0]["lr"].copy_(self._within_kl * self._rules_rate)
-        self._descend(self.optimizer)
-
-    def _descend(self, optimizer: torch.optim.Optimizer) -> None:
-        parameters = optimizer.param_groups[0]["params"]
-        nn.utils.clip_grad_norm_(parameters, self.options.max_gradient_norm)
-        optimizer.step()
-
-    def _reduce_part_weights(self) -> None:
-        """Average the weights of the minibatches of a pass over the processes, if several."""
-        if self.ranks.together:
-            self._graphed_sum_part_weights()
-            self.ranks.reduce([self._part_weights])
-
-    def _sum_part_weights(self) -> None:
+    def _sum_weights(self) -> None:
         """Sum the weights of the critic's and of the rules' rows in each minibatch of a pass."""
         acted = [self.memory.round.acted]
         for part in range(self._minibatches.count):
             (worlds,) = self._critic_rows(part, acted)
             rows = torch.cat([own for (own,) in self._rule_rows(part, acted)])
-            weights = worlds.sum(), self._gain_weights(rows).sum()
-            self._part_weights[part].copy_(torch.stack(weights))
+            sums = worlds.sum(), self._gain_weights(rows).sum()
+            self._weight_sums[part].copy_(torch.stack(sums))
 
-    def _total_weight(self, weights: Tensor, column: int) -> Tensor:
-        """Return the sum of a minibatch's weights; with several processes its mean over them."""
-        if self.ranks.together:
-            return self._part_weights[self._current_part, column]
-        return weights.sum()
+    def _find_gradients(self) -> None:
+        self._find_critic_gradients()
+        rows = [Round(*own) for own in self._rule_rows(self._current_part, self.memory.round)]
+        find_gradients(self.optimisers["actor"], -self._gain(rows))
+
+    def _find_critic_gradients(self) -> None:
+        worlds = Round(*self._critic_rows(self._current_part, self.memory.round))
+        error = (self.critic(worlds.observations) - worlds.targets) / self.critic.scale
+        squares = (worlds.acted * error.square()).sum()
+        loss = 0.5 * squares / self._weight_sums[self._current_part, 0].clamp(min=1.0)
+        find_gradients(self.optimisers["critic"], loss)
+
+    def _step(self) -> None:
+        self._descend(self.optimisers["critic"])
+        # Rules that moved too far get the learning rate 0, without a synchronisation.
+        moved, count = self._kl_sums
+        self._within_kl *= moved / count.clamp(min=1.0) <= self.pace.target_kl
+        optimiser = self.optimisers["actor"]
+        optimiser.param_groups[0]["lr"].copy_(self._within_kl * self._rules_rate)
+        self._descend(optimiser)
+
+    def _descend(self, optimiser: torch.optim.Optimizer) -> None:
+        parameters = optimiser.param_groups[0]["params"]
+        nn.utils.clip_grad_norm_(parameters, MAX_GRADIENT_NORM)
+        optimiser.step()
 
     def _critic_rows(self, part: int, values: Sequence[Tensor]) -> list[Tensor]:
         """Return the worlds of the critic's minibatch `part`, from each of values [M, N, ...]."""
@@ -419,12 +395,8 @@ class PPOLearner:
         self._kl_sums.copy_(torch.stack((moved, acted.sum())))
         if options.ratio == "world":
             log_ratio = over_particles(log_ratio, acted)
-        weights = self._gain_weights(acted)
-        total = self._total_weight(weights, 1)
-        gain = clipped_gain(log_ratio, advantages, weights, total, clip=options.largest_change)
-        if options.entropy_weight:
-            gain = gain + options.entropy_weight * actor.entropy()
-        return gain
+        weights, total = self._gain_weights(acted), self._weight_sums[self._current_part, 1]
+        return clipped_gain(log_ratio, advantages, weights, total, clip=options.largest_change)
 
 
 class Round(NamedTuple):
@@ -573,6 +545,6 @@ def world_bytes(problem: Problem, options: PPOOptions, device: torch.device) -> 
     columns = interface.perception_dim + interface.action_dim
     # A step stores observations, actions and rewards; a minibatch also gradients.
     kept = (options.steps + 1) * (columns + interface.action_dim + 16)
-    hidden = 4 * problem.hidden_dim + 8 * options.critic_width
+    hidden = 4 * problem.hidden_dim + 8 * CRITIC_WIDTH
     learned = -(-options.steps // options.minibatches) * (2 * columns + hidden)
     return needed_bytes(1, count, problem.physics, device) + 4 * count * (kept + learned)

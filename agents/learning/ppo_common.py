@@ -6,14 +6,14 @@ import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor, nn
 
 from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.learning.rule_set import RuleSet, species_of
-from npa_envs.checks import check_fraction, check_non_negative, check_positive
+from npa_envs.checks import check_fraction, check_positive
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.training.ranks import ALONE, Ranks, restart, world_streams
 from npa_envs.world.randomness import Randomness, WorldRandom, normal_draws
@@ -33,6 +33,16 @@ FRESH = Pace(learning_rate=1e-3, initial_std=0.2, last_noise=0.25, critic_rounds
 
 WARM = Pace(learning_rate=1e-4, initial_std=0.05, last_noise=1.0, critic_rounds=4, target_kl=0.05)
 """With a `start`: much noise, large steps and an untrained critic would spoil those rules."""
+
+MAX_GRADIENT_NORM = 0.5
+"""Gradients are clipped to this norm: separately for rules and critic in `ppo.py`, together in
+Stable-Baselines3."""
+
+CRITIC_RATE = 1e-3
+"""Adam's learning rate for the critic."""
+
+CRITIC_WIDTH = 64
+"""Units in a hidden layer of the critic."""
 
 CriticKind = Literal["particle", "central"]
 """Input of a value: a "particle" alone, or also the mean over its world ("central")."""
@@ -56,11 +66,6 @@ class CommonOptions:
     """Discount of a reward one step later (dimensionless)."""
     gae_lambda: float = 0.9
     """λ of generalised advantage estimation (dimensionless)."""
-    entropy_weight: float = 0.0
-    """Weight of the entropy of an action in the objective."""
-    max_gradient_norm: float = 0.5
-    """Gradients are clipped to this norm: separately for rules and critic in `ppo.py`, together in
-    Stable-Baselines3."""
     target_kl: float | None = None
     """The rules learn no more in a round once the KL divergence from the rules that played it is
     larger [nats]. None: 0.2, or 0.05 with a `start`."""
@@ -79,8 +84,6 @@ class CommonOptions:
     def __post_init__(self) -> None:
         """Check every field; raises NPAError."""
         check_positive(self, int, "steps", "epochs", "minibatches")
-        check_positive(self, float, "max_gradient_norm")
-        check_non_negative(self, "entropy_weight")
         check_fraction(self, "gamma", "gae_lambda", "noise_decay_share")
         for name in ("learning_rate", "initial_std", "target_kl"):
             if getattr(self, name) is not None:
@@ -215,10 +218,6 @@ class GaussianRules(nn.Module):
         mean = self._each[species].mean(rows[:, None])[:, 0]
         return gaussian_log_prob(mean, self.log_std[species], action)
 
-    def entropy(self) -> Tensor:
-        """Return the mean entropy of a particle's action [nats]."""
-        return (self.row_log_std() + HALF_LOG_TAU + 0.5).sum(dim=-1).mean()
-
 
 MIN_RATE = 0.01
 """Least weight of a new batch in the running moments; the first batches are averaged plainly."""
@@ -240,13 +239,10 @@ class Critic(nn.Module):
     row_species: Tensor
 
     def __init__(
-        self,
-        perception_dim: int,
-        counts: Sequence[int],
-        kind: CriticKind = "particle",
-        width: int = 64,
+        self, perception_dim: int, counts: Sequence[int], kind: CriticKind = "particle"
     ) -> None:
         super().__init__()
+        width = CRITIC_WIDTH
         self.features = nn.Linear(perception_dim, width)
         self.own = nn.Linear(width, width)
         self.pooled = nn.Linear(width, width, bias=False) if kind == "central" else None
@@ -299,11 +295,11 @@ class Critic(nn.Module):
         return (1.0 / self.updates[moment]).clamp(min=MIN_RATE)
 
 
-def seeded_critic(problem: Problem, input_dim: int, options: Any, seed: int) -> Critic:
+def seeded_critic(problem: Problem, input_dim: int, kind: CriticKind, seed: int) -> Critic:
     """Return a new critic; torch's global random state does not change."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        return Critic(input_dim, problem.counts, options.critic, options.critic_width)
+        return Critic(input_dim, problem.counts, kind)
 
 
 def learner_random(

@@ -9,7 +9,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
-from typing import Any, Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import gymnasium
 import numpy as np
@@ -134,51 +134,25 @@ class Problem:
         """What acts: "particles", those of several "species", "brushes", or "codes" of a rule."""
         return self.task_type.actor
 
-    @property
-    def _is_species(self) -> bool:
-        return isinstance(self.env_id, str) and self.env_id in SPECIES
-
     @cached_property
-    def env_type(self) -> type[NPAVectorEnv]:
-        """Class of the batched environment; raises NPAError where there is none, as for species."""
-        spec = gymnasium.registry.get(self.env_id) if isinstance(self.env_id, str) else None
-        entry: Any = None if spec is None else spec.vector_entry_point
-        if isinstance(entry, str):
-            entry = gymnasium.envs.registration.load_env_creator(entry)
-        if not (isinstance(entry, type) and issubclass(entry, NPAVectorEnv)):
-            known = [environment.id for environment in ALL]
-            raise NPAError(
-                f"env_id must be of an environment of many worlds, got {shown(self.env_id)}: "
-                f"{suggest(self.env_id, [*known, *SPECIES])}"
-            )
-        return entry
+    def registered(self) -> Registered:
+        """What the id is registered with."""
+        return registered(self.env_id)
 
     @property
     def task_type(self) -> type[EnvTask[Any]] | type[SpeciesTask]:
         """Class of the task."""
-        if self._is_species:
-            return species_task_type(task_settings(self.env_id)[0])
-        return self.env_type.task_type
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        """Keywords that the id is registered with."""
-        if self._is_species:
-            settings = task_settings(self.env_id)[1]
-            settings.pop("max_cycles", None)
-            return settings
-        return dict(gymnasium.spec(self.env_id).kwargs)
+        return self.registered.task_type
 
     @cached_property
     def config(self) -> EnvConfig | SpeciesConfig:
         """The environment's configuration, on the CPU."""
-        config_type = self.task_type.config_type
-        given = self.settings | dict(self.keywords)
-        if self._is_species:
-            given["max_cycles"] = self.episode_steps
-        elif given.get("reward") == "sparse":
-            given["episode_steps"] = self.episode_steps
-        return config_type.from_keywords(given)
+        keywords = self.registered.keywords | dict(self.keywords)
+        if self.registered.species_task is not None:
+            keywords["max_cycles"] = self.episode_steps
+        elif keywords.get("reward") == "sparse":
+            keywords["episode_steps"] = self.episode_steps
+        return self.task_type.config_type.from_keywords(keywords)
 
     @property
     def physics(self) -> Physics:
@@ -248,25 +222,26 @@ class Problem:
         """
         count = self.num_envs if num_envs is None else num_envs
         place = str(check_device(device))
-        if self._is_species:
+        keywords = dict(self.keywords)
+        if self.registered.species_task is not None:
             return ConcatenatedSpeciesEnv(
-                task_settings(self.env_id)[0],
-                count,
-                self.episode_steps,
-                place,
-                self.settings | dict(self.keywords),
+                self.registered.species_task,
+                world_count=count,
+                max_cycles=self.episode_steps,
+                device=place,
+                output="torch",
+                **self.registered.keywords | keywords,
             )
-        given = dict(self.keywords)
         if row_rewards:
-            if given.get("reward", "dense") != "dense":
+            if keywords.get("reward", "dense") != "dense":
                 raise NPAError(
                     "row_rewards needs the problem's reward to be 'dense', got "
-                    f"{shown(given['reward'])}: leave it out of keywords"
+                    f"{shown(keywords['reward'])}: leave it out of keywords"
                 )
-            given["reward"] = row_rewards
+            keywords["reward"] = row_rewards
         if tell_updated:
-            given["tell_updated"] = True
-        envs: Any = gymnasium.make_vec(
+            keywords["tell_updated"] = True
+        envs = gymnasium.make_vec(
             self.env_id,
             num_envs=count,
             vectorization_mode="vector_entry_point",
@@ -275,10 +250,10 @@ class Problem:
             output="torch",
             device=place,
             copy=copy,
-            **given,
-        )
-        made: NPAVectorEnv = envs.unwrapped
-        return made
+            **keywords,
+        ).unwrapped
+        assert isinstance(envs, NPAVectorEnv), "checked by `registered`"
+        return envs
 
     def new_rules(self, seed: int) -> RuleSet:
         """Return `RuleSet.new` of the problem: untrained rules, one for each species."""
@@ -304,13 +279,42 @@ class Problem:
             ) from error
 
 
+class Registered(NamedTuple):
+    """What an id is registered with."""
+
+    task_type: type[EnvTask[Any]] | type[SpeciesTask]
+    """Class of the task."""
+    keywords: dict[str, Any]
+    """Fields of the environment's configuration."""
+    steps: int | None
+    """Steps after which an episode is truncated; None: no limit."""
+    species_task: str | None = None
+    """Name of the task of several species; None: there is one species."""
+
+
+def registered(env_id: Any) -> Registered:
+    """Return what an id is registered with; raises NPAError if there is no batched environment."""
+    if isinstance(env_id, str) and env_id in SPECIES:
+        name, keywords = task_settings(env_id)
+        steps = keywords.pop("max_cycles", None)
+        return Registered(species_task_type(name), keywords, steps, name)
+    spec = gymnasium.registry.get(env_id) if isinstance(env_id, str) else None
+    entry: Any = None if spec is None else spec.vector_entry_point
+    if isinstance(entry, str):
+        entry = gymnasium.envs.registration.load_env_creator(entry)
+    if spec is None or not (isinstance(entry, type) and issubclass(entry, NPAVectorEnv)):
+        known = [environment.id for environment in ALL]
+        raise NPAError(
+            f"env_id must be of an environment of many worlds, got {shown(env_id)}: "
+            f"{suggest(env_id, [*known, *SPECIES])}"
+        )
+    return Registered(entry.task_type, dict(spec.kwargs), spec.max_episode_steps)
+
+
 def registered_steps(env_id: str) -> int:
     """Return the steps after which episodes of an id are truncated; 256 without a limit."""
-    if env_id in SPECIES:
-        steps = task_settings(env_id)[1].get("max_cycles")
-    else:
-        steps = getattr(gymnasium.registry.get(env_id), "max_episode_steps", None)
-    return DEFAULT_STEPS if steps is None else int(steps)
+    steps = registered(env_id).steps
+    return DEFAULT_STEPS if steps is None else steps
 
 
 def check_run_seed(seed: Any) -> None:
@@ -337,7 +341,7 @@ def world_seeds(seed: int, count: int, part: int = 0) -> list[int]:
     return [first + (part * count + world) % WORLDS_PER_SEED for world in range(count)]
 
 
-class ConcatenatedSpeciesEnv:
+class ConcatenatedSpeciesEnv(MultiSpeciesVectorEnv):
     """Worlds of several species as one agent: species concatenated to [B, N, P] and [B, N, A].
 
     It has what learners need of the interface of `NPAVectorEnv`. Reward and loss of a world are
@@ -347,39 +351,29 @@ class ConcatenatedSpeciesEnv:
     was alive, `acted`, and whether it terminated in this step, `particle_terminated`.
     """
 
-    def __init__(
-        self, task: str, num_envs: int, episode_steps: int, device: str, keywords: Mapping[str, Any]
-    ) -> None:
-        self.species_env = env = MultiSpeciesVectorEnv(
-            task,
-            world_count=num_envs,
-            max_cycles=episode_steps,
-            device=device,
-            output="torch",
-            **keywords,
-        )
-        self.num_envs, self.config, self.render_mode = num_envs, env.config, env.render_mode
-        self.task = env.worlds.task
-        self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
-        self.worlds, self.episode_steps = env.worlds, episode_steps
-        counts = env.config.played_counts
-        self.spans = dict(zip(env.agents, spans_of(counts), strict=True))
-        self.single_observation_space = _concatenated_space(env.single_observation_spaces)
-        self.single_action_space = _concatenated_space(env.single_action_spaces)
-        self._counts = torch.tensor(counts, device=device)
-        self._loss = torch.zeros(num_envs, len(counts), device=device)
-        self._reasons = np.full(num_envs, None, dtype=object)
+    def __init__(self, task: str, **config: Any) -> None:
+        super().__init__(task, **config)
+        self.num_envs, self.episode_steps = self.world_count, self.max_cycles
+        self.task = self.worlds.task
+        self.metadata = self.metadata | {"autoreset_mode": AutoresetMode.SAME_STEP}
+        counts = self.config.played_counts
+        self.spans = dict(zip(self.agents, spans_of(counts), strict=True))
+        self.single_observation_space = _concatenated_space(self.single_observation_spaces)
+        self.single_action_space = _concatenated_space(self.single_action_spaces)
+        self._counts = torch.tensor(counts, device=self.worlds.device)
+        self._loss = torch.zeros(self.num_envs, len(counts), device=self.worlds.device)
+        self._reasons = np.full(self.num_envs, None, dtype=object)
 
     @property
     def unwrapped(self) -> ConcatenatedSpeciesEnv:
         """The environment itself."""
         return self
 
-    def reset(
+    def reset(  # type: ignore[override]
         self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Tensor, dict[str, Any]]:
         """Start episodes as `MultiSpeciesVectorEnv.reset`; infos have `loss`."""
-        rows, infos = self.species_env.reset(seed, options)
+        rows, infos = super().reset(seed, options)
         chosen = worlds_to_reset(options, self.num_envs)
         self._reasons[chosen] = None
         # In worlds that are not reset, infos have no loss of species that ended.
@@ -387,50 +381,48 @@ class ConcatenatedSpeciesEnv:
         self._loss = self._loss.index_copy(0, index, losses[index])
         return self._concatenated(rows), {"loss": self._loss.mean(dim=1)}
 
-    def step(self, actions: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
+    def step(  # type: ignore[override]
+        self, actions: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
         """Apply actions, [B, N, A], in [-1, 1], and observe; an error changes no world."""
         by_species = {agent: actions[:, span] for agent, span in self.spans.items()}
-        rows, rewards, terminations, truncations, infos = self.species_env.step(by_species)
+        rows, rewards, terminations, truncations, infos = super().step(by_species)
         reward, ended, cut = (
             torch.stack(list(part.values()), dim=1) for part in (rewards, terminations, truncations)
         )
         acted, truncated = self._stacked(infos, "acted"), cut.any(dim=1)
         self._loss = torch.where(acted, self._stacked(infos, "loss"), self._loss)
-        found: dict[str, Any] = {
+        result: dict[str, Any] = {
             "loss": self._loss.mean(dim=1),
             "particle_reward": self._by_particle(reward),
             "acted": self._by_particle(acted),
             "particle_terminated": self._by_particle(ended),
         }
-        for agent in self.spans:
-            own = infos[agent].get("reason")
-            if own is not None:
-                new = own != None  # noqa: E711
+        for agent in self.agents:
+            reasons = infos[agent].get("reason")
+            if reasons is not None:
+                new = reasons != None  # noqa: E711
                 known = (self._reasons != None) & (self._reasons != TIME_LIMIT)  # noqa: E711
-                self._reasons = np.where((new & ~known) | (own == LEFT), own, self._reasons)
-        first = infos[self.species_env.agents[0]]
+                self._reasons = np.where((new & ~known) | (reasons == LEFT), reasons, self._reasons)
+        first = infos[self.agents[0]]
         over = first.get("_final_obs", torch.zeros_like(truncated))
         if "final_obs" in first:
-            last = {agent: infos[agent]["final_obs"] for agent in self.spans}
+            last = {agent: infos[agent]["final_obs"] for agent in self.agents}
             which = over.cpu().numpy()
             reasons = self._reasons.copy()
             reasons[~which] = None
             self._reasons[which] = None
-            final = {"loss": found["loss"], "_loss": over, "reason": reasons}
-            found |= {"final_obs": self._concatenated(last), "_final_obs": over}
-            found |= {"final_info": final, "_final_info": over}
+            final = {"loss": result["loss"], "_loss": over, "reason": reasons}
+            result |= {"final_obs": self._concatenated(last), "_final_obs": over}
+            result |= {"final_info": final, "_final_info": over}
         ended, cut = over & ~truncated, over & truncated
-        return self._concatenated(rows), reward.mean(dim=1), ended, cut, found
-
-    def close(self) -> None:
-        """Close the window, if there is one."""
-        self.species_env.close()
+        return self._concatenated(rows), reward.mean(dim=1), ended, cut, result
 
     def _concatenated(self, rows: Mapping[str, Tensor]) -> Tensor:
-        return torch.cat([rows[agent] for agent in self.spans], dim=1)
+        return torch.cat([rows[agent] for agent in self.agents], dim=1)
 
     def _stacked(self, infos: Mapping[str, Mapping[str, Any]], name: str) -> Tensor:
-        return torch.stack([infos[agent][name] for agent in self.spans], dim=1)
+        return torch.stack([infos[agent][name] for agent in self.agents], dim=1)
 
     def _by_particle(self, values: Tensor) -> Tensor:
         """Return values of species, [B, K], for each of their particles, shape [B, N]."""

@@ -117,20 +117,11 @@ class Progress:
     With a default process group of torch, all processes use the clock of rank 0, each evaluates the
     same episodes, and rank 0 reports and writes.
 
+    Args are those of `npa_envs.agents.learning.train`, but for:
+
     Args:
-        problem: The problem to learn.
-        budget: Time or particle-steps to learn for.
-        seed: Seed of new rules and of the learner's random numbers.
-        device: Device of worlds, rules and evaluations.
-        evaluation_seeds: Seeds of the evaluations' episodes, one each.
-        entries: Evaluations after the first, at equal parts of the budget.
-        on_entry: Called with each entry of the curve.
         initial: Rules to begin with, which are copied; None: new ones.
-        out: Folder for checkpoint, rules and curve; None: nothing is written.
         run: Settings of the run, of JSON's types, which must be equal when it is resumed.
-        resume: Continue from the checkpoint in `out`.
-        overwrite: Start again although `out` contains a run; its files are removed.
-        on_stop: Called when a signal stops the run before its budget is spent.
 
     Raises:
         NPAError: Seeds are missing or wrong, or the number of entries is not positive. Or as for
@@ -146,7 +137,7 @@ class Progress:
         device: str | torch.device,
         evaluation_seeds: Iterable[int],
         entries: int = 20,
-        on_entry: Callable[[CurvePoint], None] | None = None,
+        on_entry: Callable[[CurvePoint], None] = lambda _: None,
         initial: RuleSet | None = None,
         out: Path | None = None,
         run: Mapping[str, Any] | None = None,
@@ -173,20 +164,20 @@ class Progress:
         """Evaluations so far."""
         self.ranks = Ranks.current()
         """The processes that share the run."""
-        self._seeds = checked_seeds("evaluation_seeds", evaluation_seeds)
+        self._evaluation_seeds = checked_seeds("evaluation_seeds", evaluation_seeds)
         check_count("entries", entries, ": try 20")
         self._entries = entries
-        self._on_entry = on_entry
+        self._entries_due = 0
+        self._on_entry, self._on_stop = on_entry, on_stop
         self._envs: Any = None
         self._started = False
         self._since: float | None = None
-        self._seconds = self._elapsed = 0.0
-        self._looks = 0
+        self._seconds = self._agreed_seconds = 0.0
         self._previous: torch.cuda.Event | None = None
         self._part = 0
-        self._of, self._on_stop = dict(run or {}), on_stop
+        self._settings = dict(run or {})
         folder = None if out is None else RunFolder(out)
-        self._kept = Run(
+        self._run = Run(
             folder, self.ranks, self._check_same_run, resume=resume, overwrite=overwrite
         )
         if folder is not None and self.ranks.first:
@@ -212,7 +203,7 @@ class Progress:
                 there.
             DivergedError: A weight of the rules is not finite, or an action.
         """
-        kept = self._kept
+        this = self._run
 
         def begin() -> None:
             self.start(rules)
@@ -220,10 +211,8 @@ class Progress:
 
         def step() -> None:
             self.advance(iteration())
-            kept.iteration += 1
-            entries = len(self.log)
-            self.look(rules)
-            if len(self.log) > entries:
+            this.iteration += 1
+            if self.look(rules):
                 self._save(rules, learner)
 
         def end(stopped: bool) -> None:
@@ -234,12 +223,12 @@ class Progress:
             self.look(rules, force=True)
             self._save(rules, learner)
 
-        with kept.held(begin=True):
-            content, kept.content = kept.content, None
+        with this.held(begin=True):
+            content, this.content = this.content, None
             if content is not None:
                 assert learner is not None, "methods whose runs are kept are learners"
                 self._restore(learner, content)
-            kept.go(step, begin=begin, over=lambda: self.over, end=end)
+            this.go(step, begin=begin, over=lambda: self.over, end=end)
         return rules
 
     def start(self, actor: RuleSet | Callable[[Any], Any]) -> None:
@@ -263,7 +252,7 @@ class Progress:
     @property
     def share(self) -> float:
         """Fraction of the budget that is spent; the last iteration may take it above 1."""
-        seconds = self._elapsed if self.ranks.together else self.seconds
+        seconds = self._agreed_seconds if self.ranks.together else self.seconds
         return self.budget.share(seconds, self.particle_steps)
 
     @property
@@ -284,8 +273,8 @@ class Progress:
         if self.budget.seconds is not None:
             self._agree_on_time()
 
-    def look(self, actor: RuleSet | Callable[[Any], Any], force: bool = False) -> None:
-        """Evaluate if the next entry of the curve is due, or with `force`.
+    def look(self, actor: RuleSet | Callable[[Any], Any], force: bool = False) -> bool:
+        """Evaluate if the next entry of the curve is due, or with `force`; return whether it did.
 
         Without particle-steps since the last evaluation there is none.
 
@@ -293,24 +282,25 @@ class Progress:
             DivergedError: A weight of the rules is not finite, or an action.
         """
         self._check_started("look")
-        fresh = self.particle_steps > self.log[-1].particle_steps
-        due = self.share >= (self._looks + 1) / self._entries
-        if fresh and (force or due):
-            with self._stopped_clock():
-                self._looks = int(self.share * self._entries)
-                self._evaluate(actor)
+        due = self.share >= (self._entries_due + 1) / self._entries
+        if self.particle_steps == self.log[-1].particle_steps or not (force or due):
+            return False
+        with self._stopped_clock():
+            self._entries_due = int(self.share * self._entries)
+            self._evaluate(actor)
+        return True
 
     @contextlib.contextmanager
     def _stopped_clock(self) -> Iterator[None]:
         """Stop the clock while a block runs; all processes enter it."""
-        self._wait()
+        self._synchronise()
         self._agree_on_time()
-        self._seconds, self._since = self._elapsed, None
+        self._seconds, self._since = self._agreed_seconds, None
         yield
         self._since = time.perf_counter()
 
     def _agree_on_time(self) -> None:
-        self._elapsed = self.ranks.broadcast(self.seconds)
+        self._agreed_seconds = self.ranks.broadcast(self.seconds)
 
     def _check_started(self, caller: str) -> None:
         if not self._started:
@@ -318,14 +308,14 @@ class Progress:
 
     def _evaluate(self, actor: RuleSet | Callable[[Any], Any]) -> None:
         if self._envs is None:
-            count = min(len(self._seeds), self.problem.num_envs)
+            count = min(len(self._evaluation_seeds), self.problem.num_envs)
             self._envs = self.problem.make_envs(count, device=self.device)
         policy = actor
         if isinstance(actor, RuleSet):
             policy = actor.policy()
             check_finite(actor, self.particle_steps)
             self.ranks.check_same(list(actor.parameters()))
-        episodes = evaluate_policy(self._envs, policy, self._seeds)
+        episodes = evaluate_policy(self._envs, policy, self._evaluation_seeds)
         entry = CurvePoint(
             seconds=self._seconds,
             particle_steps=self.particle_steps,
@@ -333,18 +323,18 @@ class Progress:
             standard_error=episodes.standard_error,
             final_loss=float(episodes.final_losses.mean()),
         )
-        self._wait()
+        self._synchronise()
         self.log.append(entry)
-        if self._on_entry is not None and self.ranks.first:
+        if self.ranks.first:
             self._on_entry(entry)
 
-    def _wait(self) -> None:
+    def _synchronise(self) -> None:
         if self.device.type == "cuda":
             torch.cuda.synchronize(self.device)
 
     def _save(self, rules: RuleSet, learner: Learner | None) -> None:
         """Write checkpoint, rules and curve, after a check that all processes have the same."""
-        folder = self._kept.folder
+        folder = self._run.folder
         if folder is None:
             return
         assert learner is not None, "methods whose runs are kept are learners"
@@ -355,35 +345,35 @@ class Progress:
             if not self.ranks.first:
                 return
             curve = [asdict(entry) for entry in self.log]
-            content = {"learner": self._of, "part": self._part, "curve": curve}
-            content |= {"iteration": self._kept.iteration, "seconds": self._elapsed}
-            self._kept.keep(content | {"particle_steps": self.particle_steps} | state)
+            counts = {"iteration": self._run.iteration, "particle_steps": self.particle_steps}
+            counts |= {"part": self._part, "seconds": self._agreed_seconds}
+            self._run.keep({"learner": self._settings, "curve": curve, **counts, **state})
             rules.save(folder.path)
             lines = [" ".join(json_text(line).split()) for line in curve]
             write_text(folder.log, "\n".join(lines) + "\n")
 
     def _check_same_run(self, content: dict[str, Any], path: Path) -> None:
-        held = content.get("learner")
-        if held != self._of:
-            held = held if isinstance(held, dict) else {}
-            names = [name for name, value in self._of.items() if held.get(name) != value]
+        stored = content.get("learner")
+        stored = stored if isinstance(stored, dict) else {}
+        names = [name for name, value in self._settings.items() if stored.get(name) != value]
+        if names:
             raise NPAError(
                 f"the checkpoint {str(path)!r} must be of the same run, but "
                 f"differs in {', '.join(names)}: learn what it is of, or choose another folder"
             )
 
     def _restore(self, learner: Learner, content: dict[str, Any]) -> None:
-        assert self._kept.folder is not None, "it holds the checkpoint"
-        path, like = self._kept.folder.checkpoint, learner_state(learner)
+        assert self._run.folder is not None, "it contains the checkpoint"
+        path, like = self._run.folder.checkpoint, learner_state(learner)
         like |= {"iteration": 0, "part": 0, "particle_steps": 0, "seconds": 0.0}
         moments = content.get("optimisers")
         for name, optimiser in learner.optimisers.items():
-            own = moments.get(name) if isinstance(moments, dict) else None
+            stored = moments.get(name) if isinstance(moments, dict) else None
             # Parameters without a gradient have no moments.
             like["optimisers"][name] = {
-                number: {"step": torch.zeros(()), "exp_avg": value, "exp_avg_sq": value}
-                for number, value in enumerate(optimiser.param_groups[0]["params"])
-                if isinstance(own, dict) and number in own
+                index: {"step": torch.zeros(()), "exp_avg": value, "exp_avg_sq": value}
+                for index, value in enumerate(optimiser.param_groups[0]["params"])
+                if isinstance(stored, dict) and index in stored
             }
         random, drawn = learner.random, content.get("random")
         if not isinstance(drawn, Tensor) or drawn.shape != like["random"].shape:
@@ -407,11 +397,11 @@ class Progress:
         # A single episode has an infinite standard error.
         if not self.log or not all(is_real(value) or value == math.inf for value in numbers):
             raise unusable_checkpoint(path, "curve must hold the numbers of its entries")
-        self._kept.iteration, self._part = content["iteration"], content["part"] + 1
+        self._run.iteration, self._part = content["iteration"], content["part"] + 1
         self.particle_steps = content["particle_steps"]
-        self._seconds = self._elapsed = content["seconds"]
-        self._looks = int(self.share * self._entries)
-        learner.resume(self._kept.iteration, self._part)
+        self._seconds = self._agreed_seconds = content["seconds"]
+        self._entries_due = int(self.share * self._entries)
+        learner.resume(self._run.iteration, self._part)
 
 
 def annealed(rate: float, last_rate: float, share: float) -> float:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from gymnasium.spaces import Dict, Space
@@ -19,6 +19,7 @@ from torch import Tensor
 
 from npa_envs.agents.learning.baselines import check_no_start
 from npa_envs.agents.learning.ppo_common import (
+    MAX_GRADIENT_NORM,
     CommonOptions,
     Critic,
     CriticKind,
@@ -43,6 +44,8 @@ except ImportError as error:
         "this method needs Stable-Baselines3: pip install 'npa-envs[sb3]'"
     ) from error
 
+LearnedT = TypeVar("LearnedT")
+
 KL_FACTOR = 1.5
 """Stable-Baselines3 ends a round when its divergence exceeds this times `target_kl`."""
 
@@ -54,8 +57,6 @@ class WorldOptions(CommonOptions):
     clip: float = 0.02
     """Likelihood ratios are clipped to 1 ± this (dimensionless); it is small, as log-ratios are
     means over many particles."""
-    tensorboard_log: str | None = None
-    """Folder for Stable-Baselines3's log; None: no log."""
 
     def __post_init__(self) -> None:
         """Check every field; raises NPAError."""
@@ -82,7 +83,7 @@ def train(progress: Progress, options: WorldOptions = DEFAULTS) -> RuleSet:
             f"got {options.minibatches}: give fewer, more steps, or more worlds"
         )
     env = WorldVecEnv(problem.make_envs(device=device))
-    callback = ProgressCallback(progress, options, pace)
+    callback = RoundCallback(progress, options, pace)
     model = PPO(
         WorldRulePolicy,
         env,
@@ -93,10 +94,8 @@ def train(progress: Progress, options: WorldOptions = DEFAULTS) -> RuleSet:
         gamma=options.gamma,
         gae_lambda=options.gae_lambda,
         clip_range=options.clip,
-        ent_coef=options.entropy_weight,
-        max_grad_norm=options.max_gradient_norm,
+        max_grad_norm=MAX_GRADIENT_NORM,
         target_kl=world_kl(pace.target_kl),
-        tensorboard_log=options.tensorboard_log,
         policy_kwargs={
             "rules": zero_output_rules(problem, seed, progress.initial),
             "initial_std": pace.initial_std,
@@ -105,14 +104,8 @@ def train(progress: Progress, options: WorldOptions = DEFAULTS) -> RuleSet:
         seed=seed,
         device=device,
     )
-    _learn(model, env, progress, callback)
-    return callback.rules
-
-
-def _learn(model: Any, env: WorldVecEnv, progress: Progress, callback: BaseCallback) -> None:
-    # Stable-Baselines3 would use the seeds seed, seed + 1, and so on.
-    env.seed(world_seeds(progress.seed, progress.problem.num_envs)[0])
-    model.learn(sys.maxsize, callback)
+    policy: Any = model.policy
+    return callback.learn(model, policy.actor.rules)
 
 
 def world_kl(particle_kl: float) -> float:
@@ -125,48 +118,73 @@ def world_kl(particle_kl: float) -> float:
 
 
 class ProgressCallback(BaseCallback):
-    """Reports to `Progress` while Stable-Baselines3 learns; stops it at the end of the budget."""
+    """Reports to `Progress` while Stable-Baselines3 learns; stops it at the end of the budget.
+
+    By default it does both at every step of all worlds.
+    """
+
+    def __init__(self, progress: Progress) -> None:
+        super().__init__()
+        self.progress = progress
+        self.world_steps = progress.problem.num_envs * progress.problem.particle_count
+        """Particle-steps of a step of all worlds."""
+
+    def learn(self, model: Any, learned: LearnedT) -> LearnedT:
+        """Let a model learn until the budget is spent; evaluate and return what is learned."""
+        self.learned: Any = learned
+        # Stable-Baselines3 would use the seeds seed, seed + 1, and so on.
+        model.env.seed(world_seeds(self.progress.seed, self.progress.problem.num_envs)[0])
+        model.learn(sys.maxsize, self)
+        return learned
+
+    def _on_training_start(self) -> None:
+        self.progress.start(self.learned)
+
+    def _on_step(self) -> bool:
+        self.progress.advance(self.world_steps)
+        self.progress.look(self.learned)
+        return not self.progress.over
+
+    def _on_training_end(self) -> None:
+        self.progress.look(self.learned, force=True)
+
+
+class RoundCallback(ProgressCallback):
+    """As `ProgressCallback`, once a round; anneals the noise, and lets the critic begin alone."""
 
     def __init__(self, progress: Progress, options: WorldOptions, pace: Pace) -> None:
-        super().__init__()
-        self.progress, self.options, self.pace = progress, options, pace
+        super().__init__(progress)
+        self.options, self.pace = options, pace
         self.rounds = 0
         self.budget_left = 1.0
         """Fraction of the budget that was left at the start of the round."""
 
-    def _on_training_start(self) -> None:
-        policy: Any = self.model.policy
-        self.actor: GaussianRules = policy.actor
-        self.rules: RuleSet = self.actor.rules
-        self._trained = [p for p in self.actor.parameters() if p.requires_grad]
-        self.progress.start(self.rules)
-
     def _on_rollout_start(self) -> None:
-        self.progress.look(self.rules)
+        self.progress.look(self.learned)
         self.budget_left = max(0.0, 1.0 - self.progress.share)
-        self.actor.leave_noise(
+        policy: Any = self.model.policy
+        actor: GaussianRules = policy.actor
+        actor.leave_noise(
             noise_left(self.budget_left, self.pace.last_noise, self.options.noise_decay_share)
         )
+        if self.rounds == 0:
+            self._trained = [p for p in actor.parameters() if p.requires_grad]
         for parameter in self._trained:
             parameter.requires_grad_(self.rounds >= self.pace.critic_rounds)
         self.rounds += 1
 
     def _on_step(self) -> bool:
-        """Return whether to go on: a round that begins with no budget left ends at once."""
+        # A round that begins with no budget left ends at once.
         return self.budget_left > 0.0
 
     def _on_rollout_end(self) -> None:
-        problem = self.progress.problem
-        self.progress.advance(self.options.steps * problem.num_envs * problem.particle_count)
-
-    def _on_training_end(self) -> None:
-        self.progress.look(self.rules, force=True)
+        self.progress.advance(self.options.steps * self.world_steps)
 
 
 class WorldRulePolicy(ActorCriticPolicy):
     """Policy of Stable-Baselines3 for `WorldVecEnv`: particles act by their species' rule.
 
-    Log-probability, entropy and value of a world are means over its particles. Rules are copied.
+    Log-probability and value of a world are means over its particles. Rules are copied.
     """
 
     def __init__(
@@ -181,7 +199,6 @@ class WorldRulePolicy(ActorCriticPolicy):
         **keywords: Any,
     ) -> None:
         super().__init__(observation_space, action_space, lr_schedule, net_arch=[], **keywords)
-        self._arguments = {"rules": rules, "initial_std": initial_std, "critic": critic}
         self.actor = GaussianRules(rules, initial_std)
         """Rules with exploration noise; `actor.rules` acts without."""
         self.log_std = self.actor.log_std
@@ -202,20 +219,15 @@ class WorldRulePolicy(ActorCriticPolicy):
             action, log_prob = self.actor.sample(obs)
         return action, self.predict_values(obs), log_prob.mean(dim=1)
 
-    def evaluate_actions(self, obs: Any, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return values [M, 1], log-probabilities [M] and entropies [M] of actions."""
+    def evaluate_actions(self, obs: Any, actions: Tensor) -> tuple[Tensor, Tensor, None]:
+        """Return values [M, 1] and log-probabilities [M] of actions; no entropy is needed."""
         log_prob = self.actor.log_prob(obs, actions.view(*obs.shape[:2], -1))
-        entropy = self.actor.entropy().expand(len(obs))
-        return self.predict_values(obs), log_prob.mean(dim=1), entropy
+        return self.predict_values(obs), log_prob.mean(dim=1), None
 
     def predict_values(self, obs: Any) -> Tensor:
         """Return the values of worlds, shape [M, 1]."""
         values: Tensor = self.critic(obs)
         return values.mean(dim=1, keepdim=True)
-
-    def get_distribution(self, obs: Any) -> Any:
-        """Raise: `forward` draws actions, and `evaluate_actions` computes their likelihoods."""
-        raise NotImplementedError("there is no distribution object: see forward")
 
     def _predict(self, observation: Any, deterministic: bool = False) -> Tensor:
         if deterministic:
@@ -224,11 +236,6 @@ class WorldRulePolicy(ActorCriticPolicy):
 
     def _build(self, lr_schedule: Any) -> None:
         """Do nothing: `__init__` makes networks and optimiser."""
-
-    def _get_constructor_parameters(self) -> dict[str, Any]:
-        given = super()._get_constructor_parameters()
-        del given["net_arch"]
-        return given | self._arguments
 
 
 # Gardens: unchanged SAC and PPO, one row for each world.
@@ -258,13 +265,11 @@ class SACOptions(GardenOptions):
 
     learning_starts: int = 1000
     """Steps of worlds before the first gradient step."""
-    world_steps: int = 8
-    """Steps of worlds for each gradient step, about: it depends on the number of worlds."""
 
     def __post_init__(self) -> None:
         """Check every field; raises NPAError."""
         super().__post_init__()
-        check_positive(self, int, "learning_starts", "world_steps")
+        check_positive(self, int, "learning_starts")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -288,8 +293,8 @@ SAC_DEFAULTS, GARDEN_PPO_DEFAULTS = SACOptions(), GardenPPOOptions()
 
 def train_garden_sac(progress: Progress, options: SACOptions = SAC_DEFAULTS) -> GardenPolicy:
     """Return the policy that SAC (Haarnoja et al., arXiv 1801.01290) finds within a budget."""
-    steps = max(1, progress.problem.num_envs // options.world_steps)
-    starts = options.learning_starts
+    # A gradient step for about eight steps of worlds.
+    steps, starts = max(1, progress.problem.num_envs // 8), options.learning_starts
     return _garden_policy(SAC, progress, options, learning_starts=starts, gradient_steps=steps)
 
 
@@ -317,32 +322,11 @@ def _garden_policy(
         device=progress.device,
         **settings,
     )
-    policy = GardenPolicy(model)
-    _learn(model, env, progress, GardenCallback(progress, policy))
+    callback = ProgressCallback(progress)
+    callback.world_steps *= getattr(progress.problem.config, "rule_steps", 1)
+    policy = callback.learn(model, GardenPolicy(model))
     env.close()
     return policy
-
-
-class GardenCallback(BaseCallback):
-    """As `ProgressCallback`, for gardens."""
-
-    def __init__(self, progress: Progress, policy: GardenPolicy) -> None:
-        super().__init__()
-        self._progress, self._policy = progress, policy
-        rule_steps: int = getattr(progress.problem.config, "rule_steps", 1)
-        self._step = progress.problem.num_envs * progress.problem.particle_count * rule_steps
-
-    def _on_training_start(self) -> None:
-        self._progress.start(self._policy)
-
-    def _on_step(self) -> bool:
-        """Count a step of all worlds, and return whether budget is left."""
-        self._progress.advance(self._step)
-        self._progress.look(self._policy)
-        return not self._progress.over
-
-    def _on_training_end(self) -> None:
-        self._progress.look(self._policy, force=True)
 
 
 class GardenPolicy:
@@ -355,16 +339,14 @@ class GardenPolicy:
 
     def __call__(self, observation: Any) -> NDArray[np.float32]:
         """Return actions [B, K, W] for observations [B, ...]."""
-        wanted = self._shapes
-        found = {name: shape[1:] for name, shape in _shapes(observation).items()}
-        if wanted != found:
+        shapes = {name: shape[1:] for name, shape in _shapes(observation).items()}
+        if shapes != self._shapes:
             raise NPAError(
-                f"observation must have the shapes {wanted} of the garden that the policy was "
-                f"trained in, got {found}: take a policy that was trained in this garden"
+                f"observation must have the shapes {self._shapes} of the garden that the policy "
+                f"was trained in, got {shapes}: take a policy that was trained in this garden"
             )
-        arrays: Any = observation
         if isinstance(observation, dict):
-            arrays = dict(zip(observation, on_host(*observation.values()), strict=True))
+            arrays: Any = dict(zip(observation, on_host(*observation.values()), strict=True))
         else:
             (arrays,) = on_host(observation)
         action, _ = self.model.predict(arrays, deterministic=True)

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from npa_envs.agents.learning.gradient import EnvironmentTask
 from npa_envs.agents.learning.ppo_common import (
+    CRITIC_RATE,
     Critic,
     CriticKind,
     Minibatches,
@@ -55,8 +56,6 @@ class SHACOptions:
     """AdamW's for the rules, at first; gradients are normalised parameter by parameter."""
     last_rate: float = 0.05
     """Learning rate at the end, as a fraction of the first (dimensionless)."""
-    critic_learning_rate: float = 1e-3
-    """Adam's for the critic."""
     critic_epochs: int = 4
     """Passes of the critic over a window."""
     minibatches: int = 4
@@ -64,8 +63,6 @@ class SHACOptions:
     critic: CriticKind = "central"
     """Input of the critic: each particle, or also its whole world ("central"). A world's value is
     the mean over its particles."""
-    critic_width: int = 64
-    """Units in a hidden layer of the critic."""
     target_rate: float = 0.2
     """Rate at which the target critic follows the critic after each window (dimensionless)."""
     memory: Memory = "store"
@@ -74,9 +71,8 @@ class SHACOptions:
     def __post_init__(self) -> None:
         """Check every field; raises NPAError. `memory` is checked where rollouts begin."""
         check_positive(self, int, "steps", "world_count", "critic_epochs", "minibatches")
-        check_positive(self, int, "critic_width")
         check_choice("critic", self.critic, get_args(CriticKind))
-        check_positive(self, float, "learning_rate", "critic_learning_rate")
+        check_positive(self, float, "learning_rate")
         check_fraction(self, "gamma", "td_lambda", "last_rate", "target_rate")
         check_non_negative(self, "value_weight")
 
@@ -140,16 +136,14 @@ class SHACLearner:
         self.task = EnvironmentTask(problem, device)
         self.random = learner_random(seed, options.world_count, indices, device, ranks)
         width = problem.physics.space_dim + problem.physics.state_dim + 1
-        self.critic = seeded_critic(problem, width, options, seed).to(device)
+        self.critic = seeded_critic(problem, width, options.critic, seed).to(device)
         self.target = copy.deepcopy(self.critic).requires_grad_(False)
-        weights = [p for p in self.rules.parameters() if p.requires_grad]
-        self._optimizer = torch.optim.AdamW(weights, fused=True)
-        self._critic_optimizer = torch.optim.Adam(
-            self.critic.parameters(), lr=options.critic_learning_rate, fused=True
-        )
         self.modules = {"rules": self.rules, "critic": self.critic, "target": self.target}
-        self.optimisers = {"rules": self._optimizer, "critic": self._critic_optimizer}
-        self._limits = problem.physics.limits.position, problem.physics.limits.state
+        weights = [p for p in self.rules.parameters() if p.requires_grad]
+        self.optimisers: dict[str, torch.optim.Optimizer] = {
+            "rules": torch.optim.AdamW(weights, fused=True),
+            "critic": torch.optim.Adam(self.critic.parameters(), lr=CRITIC_RATE, fused=True),
+        }
         self.window_count = count
         self._indices = indices.tolist()
         self._minibatches = Minibatches(
@@ -170,42 +164,45 @@ class SHACLearner:
 
     def learn(self, rate: float) -> None:
         """Run the worlds for a window, and train rules and critic on it."""
-        window = self.play()
-        find_gradients(self._optimizer, -self.gain(window))
-        means = gradients_of(self._optimizer)
+        window, optimiser = self.play(), self.optimisers["rules"]
+        find_gradients(optimiser, -self.gain(window))
+        means = gradients_of(optimiser)
         self.ranks.reduce(means)
         normalise_gradients(means)
-        self._optimizer.param_groups[0]["lr"] = rate
-        self._optimizer.step()
+        optimiser.param_groups[0]["lr"] = rate
+        optimiser.step()
         self.learn_values(StepWindow(*(part.detach() for part in window)))
 
     def play(self) -> StepWindow:
         """Run the rules for a window, differentiably; restart worlds whose episode is over."""
         task, steps = self.task, self.window
-        x0, s0, _, goal = self.worlds
+        begin, limits = self.worlds, task.physics.limits
         restart(self.random)
-        x, s, _ = task.rollout(
+        later = task.rollout(
             self.rules,
-            x0,
-            s0,
+            begin.x,
+            begin.s,
             steps,
+            eps=task.eps,
+            update_prob=task.update_prob,
             memory=self.options.memory,
             generator=self.random,
             keep_every=1,
             cuda_graph=True,
         )
-        x, s = torch.cat((x0[None], x)), torch.cat((s0[None], s))
-        goals = None if goal is None else goal.repeat(steps + 1)
-        losses = task.toward(goals).world_losses(x.flatten(0, 1), s.flatten(0, 1))
-        losses = losses.view(steps + 1, -1)
+        x, s = (torch.cat(pair) for pair in zip((begin.x[None], begin.s[None]), later, strict=True))
+        every = Particles(x, s).map(lambda values: values.flatten(0, 1))
+        if begin.goal is not None:
+            every = every._replace(goal=begin.goal.repeat(steps + 1))
+        losses = task.world_losses(every).view(steps + 1, -1)
         level = losses[..., None, None].expand(*s.shape[:-1], 1)
         features = torch.cat((x - x.mean(dim=-2, keepdim=True), s, level), dim=-1)
-        # Worlds that run away are clamped to the environment's limits until their restart.
+        # Worlds that diverge are clamped to the environment's limits until their restart.
         x, s = (
-            torch.nan_to_num(each[-1].detach()).clamp(-limit, limit)
-            for each, limit in zip((x, s), self._limits, strict=True)
+            torch.nan_to_num(values[-1].detach()).clamp(-limit, limit)
+            for values, limit in ((x, limits.position), (s, limits.state))
         )
-        self.worlds = Particles(x, s, goal=goal)
+        self.worlds = begin._replace(x=x, s=s)
         self._restart()
         return StepWindow(features, losses)
 
@@ -254,9 +251,9 @@ class SHACLearner:
             self._minibatches.shuffle()
             for part in self._minibatches.parts[0]:
                 error = (values(self.critic, features[part]) - targets[part]) / self.critic.scale
-                find_gradients(self._critic_optimizer, 0.5 * error.square().mean())
-                self.ranks.reduce(gradients_of(self._critic_optimizer))
-                self._critic_optimizer.step()
+                find_gradients(self.optimisers["critic"], 0.5 * error.square().mean())
+                self.ranks.reduce(gradients_of(self.optimisers["critic"]))
+                self.optimisers["critic"].step()
         with torch.no_grad():
             pairs = zip(self.target.parameters(), self.critic.parameters(), strict=True)
             for target, parameter in pairs:

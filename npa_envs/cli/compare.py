@@ -171,7 +171,9 @@ def make_plan(options: CompareOptions) -> ComparisonPlan:
     budgets: dict[Axis, dict[str, float]]
     if suite:
         problems = {name: suite.problem_of(name) for name in tasks}
-        budgets = {npa_bench.AXIS: {name: suite.budget_of(name, quick=quick) for name in tasks}}
+        part = npa_bench.QUICK_FRACTION if quick else 1.0
+        steps = {name: part * suite.budgets[suite.tasks[name]] for name in tasks}
+        budgets = {npa_bench.AXIS: steps}
         left_out = [
             (task, method)
             for task, method in itertools.product(tasks, methods)

@@ -204,7 +204,6 @@ REFUSED = {
         ({"method": "evolution", "sigmas": 0.1}, "did you mean 'sigma'"),
         ({"method": "clone"}, "teacher must be given"),
         ({"method": "clone", "teacher": "heart", "student_share": 1.5}, "student_share"),
-        ({"method": "clone", "teacher": "heart", "kept_steps": 2}, "be at least collect_steps"),
         ({"method": "clone", "teacher": "heart", "updates": 0}, "updates"),
         ({"method": "clone", "teacher": "heart"}, "state_dim"),
         ({"method": "clone", "last_rate": 2.0}, r"last_rate must lie in \(0, 1\], got 2.0"),

@@ -564,7 +564,7 @@ def test_a_picture_shows_the_end_of_the_episode_and_not_the_next_start(name, dev
     observation, _ = envs.reset(seed=[3])
     for _ in range(problem.episode_steps):
         observation, *_ = envs.step(first(observation))
-    (last,) = getattr(envs, "species_env", envs).render()
+    (last,) = envs.render()
     assert np.array_equal(last, final_picture(problem, again, 3, device=place))
     assert not np.array_equal(last, shown)
 

@@ -157,7 +157,7 @@ def test_every_step_of_an_episode_is_a_step_of_the_rules_rollout(problem):
 def particles(problem, envs):
     if problem.actor != "species":
         return envs.particles()
-    state = envs.species_env.state()
+    state = envs.state()
     return state[..., :2], state[..., 2:-1]
 
 

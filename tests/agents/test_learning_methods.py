@@ -409,10 +409,9 @@ def test_an_undiscounted_gain_is_what_the_windows_took_off_the_loss_and_what_is_
     assert window.losses.requires_grad
     # The next window begins where this one ended, but where an episode of two windows was over; no
     # gradient leads back.
-    x, s, _, goal = made.worlds
-    assert not x.requires_grad
-    assert not s.requires_grad
-    now = made.task.world_losses(x, s) if goal is None else made.play().losses[0]
+    assert not made.worlds.x.requires_grad
+    assert not made.worlds.s.requires_grad
+    now = made.task.world_losses(made.worlds)
     torch.testing.assert_close(now[1], window.losses[-1, 1])
     assert ((now - window.losses[-1]).abs()[[0, 2]] > 1e-3).all()
 
@@ -422,10 +421,10 @@ def test_worlds_begin_anew_where_their_episode_is_over():
     # Three windows of four steps: twelve steps are the fewest that are enough.
     assert (made.window, made.window_count) == (4, 3)
     assert made.windows_left == [1, 2, 3, 1]
-    fresh = made.task.world_losses(made.worlds.x, made.worlds.s)
+    fresh = made.task.world_losses(made.worlds)
     for _ in range(4):
         made.learn(0.05)
-    now = made.task.world_losses(made.worlds.x, made.worlds.s)
+    now = made.task.world_losses(made.worlds)
     begun = [left == 3 for left in made.windows_left]
     assert begun == [True, False, False, True]
     assert (now[begun] - fresh[begun]).abs().max() < (now - fresh).abs()[[1, 2]].min()
