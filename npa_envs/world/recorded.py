@@ -19,7 +19,7 @@ import itertools
 import logging
 import operator
 import weakref
-from collections.abc import Hashable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import torch
