@@ -62,7 +62,7 @@ class RslRlParticleEnv(ParticleRowsBase, VecEnv):  # type: ignore[misc]
         self.device = base.worlds.x.device
         self.cfg = vars(base.config) | {"num_envs": base.num_envs}
         self._elapsed = torch.zeros(self.num_envs, dtype=torch.int64, device=self.device)
-        self._seen, _ = env.reset(seed=seed)
+        self._observations, _ = env.reset(seed=seed)
 
     @property
     def episode_length_buf(self) -> Tensor:
@@ -78,7 +78,7 @@ class RslRlParticleEnv(ParticleRowsBase, VecEnv):  # type: ignore[misc]
 
     def get_observations(self) -> TensorDict:
         """Return the current observations, "policy" of shape [B N, P]."""
-        rows = self._seen.reshape(self.num_envs, -1)
+        rows = self._observations.reshape(self.num_envs, -1)
         return TensorDict({"policy": rows}, batch_size=[self.num_envs], device=self.device)
 
     def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict[str, Any]]:
@@ -97,7 +97,7 @@ class RslRlParticleEnv(ParticleRowsBase, VecEnv):  # type: ignore[misc]
         """
         # RSL-RL collects in inference mode, whose tensors later steps could not write to.
         with torch.inference_mode(False), torch.no_grad():
-            self._seen, rewards, ended, cut, infos = self.step_worlds(actions.clone())
+            self._observations, rewards, ended, cut, infos = self.step_worlds(actions.clone())
             over = ended | cut
             self._elapsed = torch.where(over, 0, self._elapsed + 1)
             extras: dict[str, Any] = {}
