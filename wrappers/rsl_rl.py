@@ -40,8 +40,6 @@ class RslRlParticleEnv(ParticleRowsBase, VecEnv):  # type: ignore[misc]
         env: A vector environment of this package, wrapped or not, made with `output="torch"`, with
             same-step autoreset and `copy=True` (the default), as RSL-RL stores the tensors.
         seed: World w begins with the episode of seed + w; None: a drawn one.
-        bootstrap: Whether extras mark truncation by the step limit, so that RSL-RL bootstraps the
-            value there; False: truncation counts as termination.
 
     Raises:
         NPAError: The environment is not of this package, returns arrays or the same tensors in each
@@ -49,14 +47,10 @@ class RslRlParticleEnv(ParticleRowsBase, VecEnv):  # type: ignore[misc]
         MissingDependencyError: RSL-RL is not installed (on import).
     """
 
-    def __init__(
-        self, env: AnyVectorEnv, *, seed: int | None = None, bootstrap: bool = True
-    ) -> None:
+    def __init__(self, env: AnyVectorEnv, *, seed: int | None = None) -> None:
         base = torch_env(env, type(self).__name__)
         check_same_step(autoreset_mode(env))
         self.set_env(env, base)
-        self.bootstrap = bootstrap
-        """Whether extras mark truncation by the step limit."""
         self.num_actions = base.worlds.physics.action_dim
         self.max_episode_length = base.worlds.episode_steps or 2**31 - 1
         self.device = base.worlds.x.device
@@ -100,9 +94,7 @@ class RslRlParticleEnv(ParticleRowsBase, VecEnv):  # type: ignore[misc]
             self._observations, rewards, ended, cut, infos = self.step_worlds(actions.clone())
             over = ended | cut
             self._elapsed = torch.where(over, 0, self._elapsed + 1)
-            extras: dict[str, Any] = {}
-            if self.bootstrap:
-                extras["time_outs"] = cut & ~ended
+            extras: dict[str, Any] = {"time_outs": cut & ~ended}
             if "final_info" in infos:
                 extras["log"] = _episode_log(infos)
             return self.get_observations(), rewards, over.long(), extras
