@@ -144,9 +144,9 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     the block raises, it is removed and `path` is unchanged. Symbolic links are followed: the file
     that they point to is replaced.
     """
-    given = checked_path(path)
-    target = Path(os.path.realpath(given))
-    _check_target(given, target)
+    path = checked_path(path)
+    target = Path(os.path.realpath(path))
+    _check_target(path, target)
     temporary = target.with_name(_temporary_name(target, secrets.token_hex(_TOKEN_BYTES)))
     try:
         # os.open respects the umask; files of the tempfile module are private to their owner.
@@ -163,11 +163,11 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         if error.filename is not None and os.fsdecode(error.filename) not in ours:
             # The error is about another file.
             raise
-        raise NPAError(_explain(given, error)) from error
+        raise NPAError(_explain(path, error)) from error
     except Exception as error:
         # Writers in C report a full disk by other exceptions.
         if not isinstance(error, NPAError) and _disk_is_full(target.parent):
-            raise NPAError(_explain(given, OSError(errno.ENOSPC, str(error)))) from error
+            raise NPAError(_explain(path, OSError(errno.ENOSPC, str(error)))) from error
         raise
     finally:
         with contextlib.suppress(OSError):
@@ -191,9 +191,9 @@ def made_folder(path: Path) -> Iterator[None]:
 def remove_unfinished(path: Path) -> None:
     """Remove temporary files of a file that interrupted writes have left in its folder."""
     pattern = _temporary_name(path, "[0-9a-f]" * 2 * _TOKEN_BYTES)
-    for left in path.parent.glob(pattern):
+    for unfinished in path.parent.glob(pattern):
         with contextlib.suppress(OSError):
-            left.unlink()
+            unfinished.unlink()
 
 
 def _temporary_name(path: Path, token: str) -> str:
@@ -213,13 +213,13 @@ def write_text(path: str | Path, text: str) -> None:
     write_bytes(path, text.encode("utf-8"))
 
 
-def _check_target(given: Path, target: Path) -> None:
+def _check_target(path: Path, target: Path) -> None:
     folder, fault = shown(str(target.parent)), ""
     try:
         if target.is_dir():
             fault = "that is a folder: give the path of a file inside it"
-        # `given`, not `target`: a system link to a pipe resolves to a name that does not exist.
-        elif given.exists() and not given.is_file():
+        # `path`, not `target`: a system link to a pipe resolves to a name that does not exist.
+        elif path.exists() and not path.is_file():
             fault = "that is a pipe or a device, which must not be replaced by a file: give the "
             fault += "path of a file"
         elif not target.parent.exists():
@@ -227,9 +227,9 @@ def _check_target(given: Path, target: Path) -> None:
         elif not target.parent.is_dir():
             fault = f"{folder} is a file, not a folder: give a path in a folder"
     except OSError as error:
-        raise NPAError(_explain(given, error)) from error
+        raise NPAError(_explain(path, error)) from error
     if fault:
-        raise NPAError(f"cannot write {shown(str(given))}: {fault}")
+        raise NPAError(f"cannot write {shown(str(path))}: {fault}")
 
 
 def _sync(path: Path) -> None:
@@ -249,15 +249,15 @@ def _disk_is_full(folder: Path) -> bool:
         return False
 
 
-def _explain(given: Path, error: OSError) -> str:
-    folder = str(given.parent)
+def _explain(path: Path, error: OSError) -> str:
+    folder = str(path.parent)
     if error.errno in _DISK_FULL:
         rule, hint = "the disk is full", "free some space or choose another disk"
     elif error.errno in _NO_PERMISSION:
         rule, hint = "no write permission", f"choose another path, or check: ls -ld {shown(folder)}"
     else:
         rule, hint = (error.strerror or type(error).__name__), "choose another path"
-    return f"cannot write {shown(str(given))}: {rule} ({error}): {hint}; nothing was changed"
+    return f"cannot write {shown(str(path))}: {rule} ({error}): {hint}; nothing was changed"
 
 
 def plain_numbers(value: Any) -> Any:

@@ -27,20 +27,20 @@ if hasattr(os, "register_at_fork"):
     )
 
 
-def cached_under_lock(kept: int | None = None) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Return a decorator like `functools.lru_cache(kept)` that calls the function under the lock.
+def cached_under_lock(maxsize: int | None = None) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Return a decorator like `functools.lru_cache(maxsize)` that calls functions under the lock.
 
     Threads that call it at the same time get the same object.
     """
 
     def decorate(make: Callable[P, R]) -> Callable[P, R]:
-        made = cast("Callable[P, R]", functools.lru_cache(kept)(make))
+        cached = cast("Callable[P, R]", functools.lru_cache(maxsize)(make))
 
         @functools.wraps(make)
         def make_under_lock(*arguments: P.args, **keywords: P.kwargs) -> R:
             with kernel_lock:
-                return made(*arguments, **keywords)
+                return cached(*arguments, **keywords)
 
-        return cast("Callable[P, R]", functools.lru_cache(kept)(make_under_lock))
+        return cast("Callable[P, R]", functools.lru_cache(maxsize)(make_under_lock))
 
     return decorate

@@ -57,7 +57,7 @@ def quiet_warp() -> Iterator[None]:
 def without_line(unwanted: bytes) -> Iterator[None]:
     """Remove lines with `unwanted` from what native code writes to standard error in the block."""
     try:
-        own = os.dup(2)
+        stderr = os.dup(2)
     except OSError:  # There is no standard error.
         yield
         return
@@ -66,8 +66,8 @@ def without_line(unwanted: bytes) -> Iterator[None]:
         try:
             yield
         finally:
-            os.dup2(own, 2)
-            os.close(own)
+            os.dup2(stderr, 2)
+            os.close(stderr)
             written.seek(0)
             for line in written:
                 if unwanted not in line:

@@ -231,12 +231,12 @@ def run_species(maker: str, **keywords: Any) -> None:
 
 
 WRAPPERS: dict[str, dict[str, Any]] = {
-    "DamageEvents": {"events": ["1:cut"], "every": 5},
+    "DamageEvents": {"events": ["1:cut"]},
     "NormalizePerception": {"clip": 5.0, "epsilon": 1e-8, "training": True},
-    "SpeciesTags": {"species_count": 2, "fractions": [0.5, 0.5]},
-    "VectorDamageEvents": {"events": ["1:cut"], "every": 5},
+    "SpeciesTags": {"species_count": 2},
+    "VectorDamageEvents": {"events": ["1:cut"]},
     "VectorNormalizePerception": {"clip": 5.0, "epsilon": 1e-8, "training": True},
-    "VectorSpeciesTags": {"species_count": 2, "fractions": None},
+    "VectorSpeciesTags": {"species_count": 2},
     "TorchRecordEpisodeStatistics": {"buffer_length": 10, "stats_key": "episode"},
     "TorchNormalizeObservation": {"epsilon": 1e-8},
     "TorchNormalizeReward": {"gamma": 0.9, "epsilon": 1e-8},

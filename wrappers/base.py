@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import gymnasium
@@ -39,20 +40,25 @@ VectorStep = tuple[Any, Any, Any, Any, dict[str, Any]]
 """Observations, rewards, terminations, truncations and infos of a step of many worlds."""
 
 
-def vector_env(env: Any, wrapper: str) -> NPAVectorEnv:
-    """Return this package's vector environment below wrappers; `wrapper` is named in errors."""
-    return _base_env(env, wrapper, NPAVectorEnv, "a vector environment", MAKE_VECTOR)
-
-
-def _base_env(env: Any, wrapper: str, cls: type[BaseEnv], what: str, hint: str) -> BaseEnv:
+def base_env(env: Any, wrapper: str, cls: type[BaseEnv]) -> BaseEnv:
+    """Return this package's environment below wrappers; `wrapper` is named in errors."""
     base = getattr(env, "unwrapped", None)
     if isinstance(base, cls):
         return base
-    if cls is NPAEnv and isinstance(base, NPAVectorEnv):
-        hint = f"use Vector{wrapper} for vector environments"
-    if isinstance(base, NPAEnv) and wrapper.startswith("Vector"):
-        hint = f"use {wrapper.removeprefix('Vector')} for a single environment"
+    if cls is NPAEnv:
+        what, hint = "an environment", "make one with gym.make('npa/...')"
+        if isinstance(base, NPAVectorEnv):
+            hint = f"use Vector{wrapper} for vector environments"
+    else:
+        what, hint = "a vector environment", MAKE_VECTOR
+        if isinstance(base, NPAEnv) and wrapper.startswith("Vector"):
+            hint = f"use {wrapper.removeprefix('Vector')} for a single environment"
     raise NPAError(f"env must be {what} of npa_envs, got {type(base).__name__}: {hint}")
+
+
+def vector_env(env: Any, wrapper: str) -> NPAVectorEnv:
+    """Return this package's vector environment below wrappers."""
+    return base_env(env, wrapper, NPAVectorEnv)
 
 
 def torch_env(env: Any, adapter: str) -> NPAVectorEnv:
@@ -292,16 +298,10 @@ class EpisodeWrapper(AnyVectorWrapper):
 class VectorObservations(ChangesObservations, EpisodeWrapper):
     """Base class of wrappers that change observations of many worlds, final ones included."""
 
-    @property
-    def observation_space(self) -> Space[Any]:
+    @cached_property
+    def observation_space(self) -> Space[Any]:  # type: ignore[override]
         """Space of all worlds' observations; large, so made at the first use."""
-        if self._observation_space is None:
-            self._observation_space = batch_space(self.single_observation_space, self.num_envs)
-        return self._observation_space
-
-    @observation_space.setter
-    def observation_space(self, space: Space[Any]) -> None:
-        self._observation_space = space
+        return batch_space(self.single_observation_space, self.num_envs)
 
     def after_reset(self, observations: Any, infos: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
         """Return changed observations and infos."""
@@ -333,16 +333,10 @@ class WrapperBase(RecordConstructorArgs):
     def __init__(self, env: Any, **recorded: Any) -> None:
         self.many = isinstance(self, EpisodeWrapper)
         """Whether there are many worlds."""
-        self._base = self.base_of(env)
+        cls: Any = NPAVectorEnv if self.many else NPAEnv
+        self._base: Any = base_env(env, type(self).__name__, cls)
         RecordConstructorArgs.__init__(self, **recorded)
         # The next class in the method resolution order is Gymnasium's wrapper.
         super(RecordConstructorArgs, self).__init__(env)  # type: ignore[call-arg]
         self.space_name = "single_observation_space" if self.many else "observation_space"
         """Name of the space of one world's observations."""
-
-    def base_of(self, env: Any) -> Any:
-        """Return this package's environment below wrappers, single or vector."""
-        name = type(self).__name__
-        if isinstance(self, EpisodeWrapper):
-            return vector_env(env, name)
-        return _base_env(env, name, NPAEnv, "an environment", "make one with gym.make('npa/...')")

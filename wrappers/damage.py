@@ -10,9 +10,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.checks import entries, is_whole
+from npa_envs.checks import entries
 from npa_envs.envs.core.base import to_output
-from npa_envs.errors import NPAError, shown
+from npa_envs.errors import NPAError
 from npa_envs.tasks.damage import DamageEvent, damage_worlds, parse_damage
 from npa_envs.world.randomness import StreamId
 from npa_envs.wrappers.base import (
@@ -31,18 +31,12 @@ Event = str | DamageEvent
 class _DamagesWorlds(WrapperBase):
     """Mixin with the events and their damage, for one world or many."""
 
-    def __init__(
-        self, env: Any, events: Event | Sequence[Event], *, every: int | None = None
-    ) -> None:
+    def __init__(self, env: Any, events: Event | Sequence[Event]) -> None:
         several = entries(events)
         if several is None:
             several = [events]
         if not several:
             raise NPAError("events must have at least one event, got none: for example '100:cut'")
-        if every is not None and not (is_whole(every) and 1 <= every < 2**63):
-            raise NPAError(
-                f"every must be a whole number of at least 1 and below 2^63, got {shown(every)}"
-            )
         for event in several:
             if not isinstance(event, str | DamageEvent):
                 raise NPAError(
@@ -51,9 +45,7 @@ class _DamagesWorlds(WrapperBase):
                 )
         self.events = tuple(parse_damage(e) if isinstance(e, str) else e for e in several)
         """The events; those of one step are applied in this order."""
-        self.every = every
-        """Steps after which each event repeats."""
-        super().__init__(env, events=[str(event) for event in self.events], every=every)
+        super().__init__(env, events=[str(event) for event in self.events])
         check_untouched(env, type(self).__name__)
         # Events of nested wrappers have different numbers, so that they draw different places.
         self._first = 0
@@ -64,9 +56,8 @@ class _DamagesWorlds(WrapperBase):
 
     def _due(self, elapsed: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Return which events are due in which worlds, [E, B], by steps of their episodes, [B]."""
-        since = elapsed - np.array([[event.step] for event in self.events])
-        due = since == 0 if self.every is None else (since >= 0) & (since % self.every == 0)
-        return np.asarray(due, dtype=bool)
+        due: NDArray[np.bool_] = np.array([[event.step] for event in self.events]) == elapsed
+        return due
 
     def _particles(self, due: NDArray[np.bool_]) -> tuple[Tensor, Tensor]:
         """Return positions and states of all worlds, damaged where events are due, shape [E, B]."""
@@ -98,7 +89,6 @@ class DamageEvents(_DamagesWorlds, AnyWrapper):
     Args:
         env: An environment of this package, without wrappers that change observations.
         events: "STEP:KIND", "STEP:KIND:SIZE" or `DamageEvent`; one or several.
-        every: Each event repeats every `every` steps; None: it happens once.
 
     Raises:
         NPAError: An event or the environment is wrong.

@@ -86,12 +86,12 @@ def _recorded(env: Any, policy: Callable[[Any], Any], seeds: list[int]) -> list[
             action = action.clip(-1.0, 1.0)
         observation, *outcome, infos = env.step(action)
         steps.append(tuple(map(_host, (action, *outcome))))
-        over = (steps[-1][2] | steps[-1][3]) & (lengths == 0)
+        ended = (steps[-1][2] | steps[-1][3]) & (lengths == 0)
         loss = _host(infos["loss"])
-        if over.any():
+        if ended.any():
             final = _host(infos["final_obs"])
-            loss = np.where(over, _host(infos["final_info"]["loss"]), loss)
-            for k in np.flatnonzero(over).tolist():
+            loss = np.where(ended, _host(infos["final_info"]["loss"]), loss)
+            for k in np.flatnonzero(ended).tolist():
                 last[k], lengths[k] = _of_world(final, k), len(steps)
         observations.append(_host(observation))
         losses.append(loss)

@@ -108,9 +108,7 @@ def rllib_config(name: str, *, shared: bool = False, **keywords: Any) -> PPOConf
     return config
 
 
-def rllib_rows_config(
-    name: str, *, particle_count: int | None = None, world_count: int = 4, **keywords: Any
-) -> PPOConfig:
+def rllib_rows_config(name: str, *, world_count: int = 4, **keywords: Any) -> PPOConfig:
     """Register a Gymnasium environment with RLlib, and return a configuration of PPO for it.
 
     Particles are the rows of a vector environment, and share one policy. In environments whose
@@ -121,27 +119,23 @@ def rllib_rows_config(
 
     Args:
         name: An id of Gymnasium's registry, of any size.
-        particle_count: Particles N of a world; None: those of the id.
         world_count: Worlds B of an environment runner.
-        keywords: Of `gymnasium.make_vec`, for example `max_episode_steps`.
+        keywords: Of `gymnasium.make_vec`, for example `particle_count`, `max_episode_steps`.
 
     Raises:
         NPAError: There is no such id, or a keyword is wrong.
     """
     _check_id(name, ROW_IDS, MAKERS, "rllib_config")
-    fields = dict(keywords)
-    if particle_count is not None:
-        fields["particle_count"] = checked_count("particle_count", particle_count)
     rows = checked_count("world_count", world_count)
-    world = _worlds(name, 1, fields)
+    world = _worlds(name, 1, keywords)
     if name not in WHOLE_IDS:
-        fields["particle_count"] = vector_env(world, "rllib_rows_config").config.particle_count
-        rows *= fields["particle_count"]
+        keywords["particle_count"] = vector_env(world, "rllib_rows_config").config.particle_count
+        rows *= keywords["particle_count"]
     world.close()
     register_env(name, partial(_rows, name))
     config: PPOConfig = (
         PPOConfig()
-        .environment(name, env_config=fields)
+        .environment(name, env_config=keywords)
         .env_runners(
             gym_env_vectorize_mode=gymnasium.VectorizeMode.VECTOR_ENTRY_POINT,
             num_envs_per_env_runner=rows,
@@ -150,8 +144,8 @@ def rllib_rows_config(
     return config
 
 
-def _check_id(name: str, known: Collection[str], others: Collection[str], cure: str) -> None:
-    """Check that an id is among the known ones; `cure` is the function for the others."""
+def _check_id(name: str, known: Collection[str], others: Collection[str], function: str) -> None:
+    """Check that an id is among the known ones; `function` takes the others."""
     if name not in known:
-        hint = f"take {cure} for it; " if name in others else ""
+        hint = f"take {function} for it; " if name in others else ""
         raise NPAError(f"name must be a known id, got {shown(name)}: {hint}{suggest(name, known)}")

@@ -40,8 +40,6 @@ class RslRlParticleEnv(ParticleRowsBase, VecEnv):  # type: ignore[misc]
         env: A vector environment of this package, wrapped or not, made with `output="torch"`, with
             same-step autoreset and `copy=True` (the default), as RSL-RL stores the tensors.
         seed: World w begins with the episode of seed + w; None: a drawn one.
-        bootstrap: Whether extras mark truncation by the step limit, so that RSL-RL bootstraps the
-            value there; False: truncation counts as termination.
 
     Raises:
         NPAError: The environment is not of this package, returns arrays or the same tensors in each
@@ -49,20 +47,16 @@ class RslRlParticleEnv(ParticleRowsBase, VecEnv):  # type: ignore[misc]
         MissingDependencyError: RSL-RL is not installed (on import).
     """
 
-    def __init__(
-        self, env: AnyVectorEnv, *, seed: int | None = None, bootstrap: bool = True
-    ) -> None:
+    def __init__(self, env: AnyVectorEnv, *, seed: int | None = None) -> None:
         base = torch_env(env, type(self).__name__)
         check_same_step(autoreset_mode(env))
         self.set_env(env, base)
-        self.bootstrap = bootstrap
-        """Whether extras mark truncation by the step limit."""
         self.num_actions = base.worlds.physics.action_dim
         self.max_episode_length = base.worlds.episode_steps or 2**31 - 1
         self.device = base.worlds.x.device
         self.cfg = vars(base.config) | {"num_envs": base.num_envs}
         self._elapsed = torch.zeros(self.num_envs, dtype=torch.int64, device=self.device)
-        self._seen, _ = env.reset(seed=seed)
+        self._observations, _ = env.reset(seed=seed)
 
     @property
     def episode_length_buf(self) -> Tensor:
@@ -78,7 +72,7 @@ class RslRlParticleEnv(ParticleRowsBase, VecEnv):  # type: ignore[misc]
 
     def get_observations(self) -> TensorDict:
         """Return the current observations, "policy" of shape [B N, P]."""
-        rows = self._seen.reshape(self.num_envs, -1)
+        rows = self._observations.reshape(self.num_envs, -1)
         return TensorDict({"policy": rows}, batch_size=[self.num_envs], device=self.device)
 
     def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict[str, Any]]:
@@ -97,12 +91,10 @@ class RslRlParticleEnv(ParticleRowsBase, VecEnv):  # type: ignore[misc]
         """
         # RSL-RL collects in inference mode, whose tensors later steps could not write to.
         with torch.inference_mode(False), torch.no_grad():
-            self._seen, rewards, ended, cut, infos = self.step_worlds(actions.clone())
+            self._observations, rewards, ended, cut, infos = self.step_worlds(actions.clone())
             over = ended | cut
             self._elapsed = torch.where(over, 0, self._elapsed + 1)
-            extras: dict[str, Any] = {}
-            if self.bootstrap:
-                extras["time_outs"] = cut & ~ended
+            extras: dict[str, Any] = {"time_outs": cut & ~ended}
             if "final_info" in infos:
                 extras["log"] = _episode_log(infos)
             return self.get_observations(), rewards, over.long(), extras

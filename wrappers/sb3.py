@@ -301,10 +301,8 @@ class WorldVecEnv(_EpisodeRows):
     [N, P], and its action all their actions, [N, A]. Stable-Baselines3's own policies draw those
     from one Gaussian of N A dimensions, which cannot learn: after a small update the ratio of two
     likelihoods is near zero or overflows. Take a policy that averages log-likelihoods over
-    particles, such as `npa_envs.agents.learning.sb3.WorldRulePolicy`.
-
-    Rows of a finished world have their own infos, with `terminal_observation`,
-    `TimeLimit.truncated` and, where there is one, `is_success`; the others share an empty one.
+    particles, such as `npa_envs.agents.learning.sb3.WorldRulePolicy`. Infos are those of
+    `ParticleVecEnv`.
 
     Args:
         env: A vector environment, wrapped or not, with same-step autoreset.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,45 +9,21 @@ import torch
 from gymnasium.spaces import Box, Space
 from torch import Tensor
 
-from npa_envs.checks import entries, is_real, is_whole
+from npa_envs.checks import check_count
 from npa_envs.envs.core.base import to_output
-from npa_envs.errors import NPAError, shown
+from npa_envs.errors import NPAError
 from npa_envs.wrappers.base import Observations, VectorObservations, WrapperBase
 
 
 class _TagsSpecies(WrapperBase):
     """Mixin with the species of all particles and their tags, for one world or many."""
 
-    def __init__(
-        self,
-        env: Any,
-        species_count: int = 2,
-        *,
-        fractions: Sequence[float] | None = None,
-    ) -> None:
-        super().__init__(env, species_count=species_count, fractions=fractions)
+    def __init__(self, env: Any, species_count: int = 2) -> None:
+        super().__init__(env, species_count=species_count)
         particle_count = self._base.config.particle_count
-        if not is_whole(species_count) or species_count < 1:
-            raise NPAError(
-                f"species_count must be a whole number of at least 1, got {shown(species_count)}"
-            )
-        if species_count > particle_count:
-            raise NPAError(
-                f"species_count must be at most the {particle_count} particles, got {species_count}"
-            )
-        sizes = [1.0] * species_count if fractions is None else entries(fractions) or []
-        if len(sizes) != species_count or not all(is_real(size) and size > 0 for size in sizes):
-            raise NPAError(
-                f"fractions must be {species_count} numbers greater than 0, one for each species, "
-                f"got {fractions}: for example {[1.0] * species_count}"
-            )
-        bounds = np.round(np.cumsum(sizes) / np.sum(sizes) * particle_count).astype(np.int64)
-        counts = np.diff(bounds, prepend=0)
-        if counts.min() < 1:
-            raise NPAError(
-                f"fractions must leave each species a particle, got {counts.tolist()} of "
-                f"{particle_count}: give more particles or larger fractions"
-            )
+        check_count("species_count", species_count, at_most=particle_count)
+        bounds = np.round(np.arange(1, species_count + 1) / species_count * particle_count)
+        counts = np.diff(bounds.astype(np.int64), prepend=0)
         species = torch.arange(species_count).repeat_interleave(torch.from_numpy(counts))
         species = species.to(self._base.task.device)
         tags = torch.nn.functional.one_hot(species, species_count).to(torch.float32)
@@ -85,15 +60,14 @@ class _TagsSpecies(WrapperBase):
 class SpeciesTags(_TagsSpecies, Observations):
     """Give each particle a species, and append it to its observation as one-hot.
 
-    The first particles are species 0, the next species 1, and so on.
+    The first particles are species 0, the next species 1, and so on, in groups of equal sizes.
 
     Args:
         env: An environment of this package.
         species_count: Species K.
-        fractions: Relative size of each species, with any sum; None: equal sizes.
 
     Raises:
-        NPAError: An argument is wrong, or a species would have no particle.
+        NPAError: An argument is wrong, or there are fewer particles than species.
     """
 
 

@@ -102,7 +102,8 @@ class _NormalizesPerception(WrapperBase):
         self._physics: Physics = self._base.worlds.physics
         # Of the states, smoothed states, state gradients (C each) and the density gradient.
         self.statistics = RunningMoments(3 * self._physics.state_dim + 1)
-        shape, wanted = getattr(env, self.space_name).shape or (), self._physics.perception_dim
+        shape: tuple[int, ...] = getattr(env, self.space_name).shape or ()
+        wanted = self._physics.perception_dim
         if len(shape) != 2 or shape[1] != wanted:
             raise NPAError(
                 f"observations must be perception vectors, shape [N, {wanted}], got shape "

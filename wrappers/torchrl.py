@@ -129,8 +129,8 @@ class NPATorchRLEnv(EnvBase):  # type: ignore[misc]
     def _entries(self, observation: Tensor, **entries: Tensor) -> TensorDictBase:
         """Return the results of a reset or a step as a TensorDict."""
         entries["observation"] = observation
-        made: TensorDictBase = TensorDict(entries, batch_size=self.batch_size, device=self.device)
-        return made
+        result: TensorDictBase = TensorDict(entries, self.batch_size, device=self.device)
+        return result
 
 
 def _bounded(space: Any, world_count: int, device: torch.device | None) -> Bounded:

@@ -67,8 +67,8 @@ def background_colour(background: Background) -> tuple[float, float, float]:
                 "give 'white', 'black', another name of CSS, or '#rrggbb'"
             ) from error
         return red / 255, green / 255, blue / 255
-    given = entries(background)
-    channels = [checked_number("a channel of background", part) for part in given or ()]
+    several = entries(background) or []
+    channels = [checked_number("a channel of background", part) for part in several]
     if len(channels) != 3 or not all(0 <= channel <= 1 for channel in channels):
         raise NPAError(
             f"background must be red, green and blue in [0, 1], got {shown(background)}: "

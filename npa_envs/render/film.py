@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from npa_envs.checks import checked_count, checked_finite, is_real, is_whole
+from npa_envs.checks import checked_count, checked_finite, entries, is_real, is_whole
 from npa_envs.errors import MissingDependencyError, NPAError, shown
 from npa_envs.files import atomic_path, write_bytes
 from npa_envs.ops import Cameras, orbit
@@ -198,17 +198,11 @@ def write_filmstrip(
 
 
 def _checked_captions(captions: Any, count: int) -> list[str]:
-    several = isinstance(captions, Iterable) and not isinstance(captions, str)
-    texts = list(captions) if several else []
-    if not several or not all(isinstance(text, str) for text in texts):
+    texts = entries(captions) or []
+    if len(texts) != count or not all(isinstance(text, str) for text in texts):
         raise NPAError(
-            f"captions must be texts, one for each frame, got {shown(captions)}: give a list of "
-            "str, or None"
-        )
-    if len(texts) != count:
-        raise NPAError(
-            f"captions must be as many as the frames, {count}, got {len(texts)}: "
-            "give one for each frame, or None"
+            f"captions must be texts, one for each of the {count} frames, got {shown(captions)}: "
+            "give a list of str, or None"
         )
     return texts
 
@@ -221,14 +215,14 @@ def check_rate(fps: float, *, highest: float = 1000) -> None:
 
 def checked_frames(frames: Iterable[Frame]) -> list[Frame]:
     """Return pictures as a list, after checking their number, shapes and dtype."""
-    given: Any = frames
-    if not isinstance(given, Iterable) or getattr(given, "ndim", 1) == 0:
+    several: Any = frames
+    if not isinstance(several, Iterable) or getattr(several, "ndim", 1) == 0:
         raise NPAError(
-            f"frames must be a sequence of pictures, got {type(given).__name__}: "
+            f"frames must be a sequence of pictures, got {type(several).__name__}: "
             "give [frame] for one"
         )
     try:
-        pictures = [np.ascontiguousarray(frame) for frame in given]
+        pictures = [np.ascontiguousarray(frame) for frame in several]
     except (TypeError, ValueError, RuntimeError) as error:
         raise NPAError(f"frames must be uint8 [H, W, 3] arrays, got others ({error})") from error
     if not pictures:
@@ -268,9 +262,9 @@ def _shared_palette(pictures: list[Frame]) -> tuple[Image.Image, Frame, int]:
     palette = Image.fromarray(swatch).quantize(
         colors=255, method=Image.Quantize.MEDIANCUT, kmeans=2, dither=Image.Dither.NONE
     )
-    entries = (palette.getpalette() or [])[: 255 * 3]
-    entry = len(entries) // 3
-    palette.putpalette([*entries, *(int(v) for v in background)])
+    colours = (palette.getpalette() or [])[: 255 * 3]
+    entry = len(colours) // 3
+    palette.putpalette([*colours, *(int(v) for v in background)])
     return palette, background, entry
 
 
@@ -287,11 +281,11 @@ def _import_imageio() -> tuple[Any, Any]:
 def _check_film(path: Path, frame_count: int, ffmpeg: Any) -> None:
     # The writer does not report failures of the encoder, for example on a full disk.
     try:
-        found, _ = ffmpeg.count_frames_and_secs(str(path))
+        written, _ = ffmpeg.count_frames_and_secs(str(path))
     except RuntimeError as error:
         raise OSError(f"the encoder left a broken film: {error}") from error
-    if found != frame_count:
-        raise OSError(f"the encoder wrote {found} of {frame_count} frames")
+    if written != frame_count:
+        raise OSError(f"the encoder wrote {written} of {frame_count} frames")
 
 
 def _caption_font(

@@ -56,10 +56,10 @@ def write_splat(path: str | Path, x: Tensor, gaussians: Gaussians) -> None:
     """
     positions = _checked(x)
     scales, opacities = _numpy(gaussians.scales), _numpy(gaussians.opacities)
-    kind = np.dtype(
+    layout = np.dtype(
         [("position", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)]
     )
-    rows = np.zeros(len(positions), kind)
+    rows = np.zeros(len(positions), layout)
     rows["position"], rows["scale"] = positions, scales
     rgba = np.concatenate((_colours(gaussians), opacities[:, None]), axis=1)
     rows["rgba"] = (255.0 * rgba).round()

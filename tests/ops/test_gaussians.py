@@ -102,12 +102,26 @@ SCENES = {
 
 
 def expected_pictures(gaussians, cameras, *, background=None, dilation=0.3):
-    shape = (gaussians[0].shape[0], cameras.count)
-    lens = cameras.world_to_camera.expand(*shape, 4, 4), cameras.intrinsics.expand(*shape, 4)
+    worlds, views = gaussians[0].shape[0], cameras.count
+    motions = cameras.world_to_camera.expand(worlds, views, 4, 4)
+    lenses = cameras.intrinsics.expand(worlds, views, 4)
     size = {"width": cameras.width, "height": cameras.height, "near": cameras.near}
-    return oracle.render_gaussians(
-        *gaussians, *lens, dilation=dilation, background=background, **size
-    )
+    drawn = [
+        oracle.draw(
+            *(tensor[world] for tensor in gaussians),
+            view=motions[world, view],
+            intrinsics=lenses[world, view],
+            dilation=dilation,
+            **size,
+        )
+        for world in range(worlds)
+        for view in range(views)
+    ]
+    parts = zip(*drawn, strict=True)
+    image, passing = (torch.stack(part).unflatten(0, (worlds, views)) for part in parts)
+    if background is not None:
+        image = image + passing[..., None] * background
+    return image, 1.0 - passing
 
 
 def pulled(gaussians, cameras, **options):

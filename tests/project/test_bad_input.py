@@ -21,7 +21,7 @@ from npa_envs.agents.learning import train as learn
 from npa_envs.envs import multispecies_v0
 from npa_envs.measure.quality import scores
 from npa_envs.ops import orbit, periodic_splat, splat, warmup
-from npa_envs.render import to_uint8, write_gif
+from npa_envs.render import write_gif
 from npa_envs.tasks.damage import damage_worlds, parse_damage
 from npa_envs.tasks.seeds import uniform_ball, uniform_box
 from npa_envs.tasks.texture import TextureConfig
@@ -74,7 +74,7 @@ def test_numbers_of_other_libraries_are_numbers(function, box):
     assert torch.isfinite(function(X, S, np.float64(0.1), box=box)[0]).all()
 
 
-def test_numbers_of_other_libraries_run_worlds_and_survive_in_a_rule(tmp_path):
+def test_numbers_of_other_libraries_survive_in_a_rule(tmp_path):
     rule = NPARule(alpha=np.float32(0.5))
     assert all(torch.isfinite(t).all() for t in rollout(rule, X, S, np.int64(2)))
     save_rule(rule, tmp_path / "rule.safetensors")
@@ -85,7 +85,6 @@ def test_numbers_of_other_libraries_run_worlds_and_survive_in_a_rule(tmp_path):
     ("options", "message"),
     [
         ({"update_prob": 0.0}, r"update_prob must lie in \(0, 1\], got 0.0"),
-        ({"update_prob": 1.5}, "update_prob"),
         ({"update_prob": NAN}, "update_prob"),
         ({"dt": 0.0}, "dt must be positive"),
         ({"position_noise": -1.0}, "position_noise"),
@@ -94,8 +93,6 @@ def test_numbers_of_other_libraries_run_worlds_and_survive_in_a_rule(tmp_path):
         ({"dt": "fast"}, "dt must be a number"),
         ({"generator": 3}, "generator must be a torch.Generator or a WorldRandom, got int"),
         ({"memory": "forget"}, "memory must be 'store', 'recompute' or 'minimal'"),
-        ({"memory": []}, "memory must be 'store'"),
-        ({"cuda_graph": np.array([1, 2])}, "cuda_graph must be 'auto', True or False"),
         *(({"steps": steps}, "steps must be an integer") for steps in (-1, 2.0, True, "3")),
         ({"s": S[..., :8]}, "the rule's 2 coordinates and 16 channels"),
         ({"x": X.double(), "s": S.double()}, "share dtype and device"),
@@ -140,10 +137,7 @@ WIDE = NPARule(state_dim=2)
         (lambda: perceive(X, S, 0.1, 0.0), "eps0 must be positive"),
         (lambda: species_fields(X, torch.tensor(4), eps=0.1), "counts must have one number"),
         (lambda: rollout_species(np.array(1.0), X, S, 1, counts=[4]), "rules must"),
-        (rule(space_dim=4), "space_dim must be 2 or 3"),
         (rule(state_dim=0), "state_dim must be at least 1"),
-        (rule(hidden_dim=0), "hidden_dim"),
-        (rule(eps0=0.0), "eps0"),
         (rule(alpha=INF), "alpha"),
         (rule(alpha=[]), "alpha must be a number"),
         (rule(readout_dim=3), "readout_hidden_dim"),
@@ -187,7 +181,6 @@ WIDE = NPARule(state_dim=2)
             lambda: periodic_splat(X, S[..., :3], resolution=8, pixel_size=0.2, sigma=1e5),
             "stay within 16384 pixels",
         ),
-        (camera(centre=1.0), "centre must be 3 numbers"),
         (camera(fov=[1]), "fov must be a number"),
         (camera(width=(4,)), "width must be an integer"),
         (lambda: uniform_ball(2, None, 2, 0.1), "particle_count must be an integer"),
@@ -197,12 +190,9 @@ WIDE = NPARule(state_dim=2)
         (damaged(size={}), "size must be a number"),
         (damaged(size=1e300), "at least 0"),
         (lambda: preset("tiny", 3), "unknown task 3"),
-        (lambda: preset("tiny", weight_decay=10**400), "weight_decay must be of type float"),
         (lambda: TextureConfig(eps=10**400), "eps must be a finite number"),
-        (lambda: to_uint8(torch.zeros(2, 2, 4), background=2.0), "background must be red"),
         (lambda: write_gif("a.gif", 3), "frames must be a sequence"),
         (small(eps=5e-324), "eps must be at least 1e-09"),
-        (small(success_loss=2**64), "success_loss must be at most"),
         (lambda: TorchNormalizeReward(()), "needs a vector environment, got tuple"),
     ],
 )

@@ -27,7 +27,6 @@ from npa_envs.cli import COMMANDS, main
 from npa_envs.envs import multispecies_v0, particles_v0
 from npa_envs.ops.backend import KernelRequest, describe
 from npa_envs.registration import ENVIRONMENTS, GARDEN_IDS
-from npa_envs.rule.files import shipped_rules
 from npa_envs.training import TASKS as TRAINED
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -37,6 +36,13 @@ TEXTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.rglob("*.md"
 
 every_text = pytest.mark.parametrize("path", TEXTS, ids=lambda p: p.relative_to(ROOT).as_posix())
 every_environment = pytest.mark.parametrize("name", [row.name for row in ENVIRONMENTS])
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    """Programs write to a folder of their own."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
 
 
 def text_of(page: str) -> str:
@@ -85,89 +91,13 @@ def anchors(path: Path) -> set[str]:
 # Pages that scripts make.
 
 
-def test_check_finds_pages_that_are_changed_missing_or_nobodys(tmp_path, capsys):
-    builder = script("build_environment_pages")
-    for name, text in builder.pages().items():
-        (tmp_path / name).write_text(text, encoding="utf-8")
-    assert builder.main(["--check"], tmp_path) == 0
-    changed = tmp_path / "Morphogenesis2D.md"
-    text = changed.read_text(encoding="utf-8").replace("1024", "1023", 1)
-    changed.write_text(text, encoding="utf-8")
-    (tmp_path / "README.md").unlink()
-    (tmp_path / "Forgotten.md").write_text("# An environment of the past\n", encoding="utf-8")
-    assert builder.main(["--check"], tmp_path) == 1
-    printed = capsys.readouterr().err
-    assert "not current: Forgotten.md, Morphogenesis2D.md, README.md: run python docs/" in printed
-
-
-@pytest.mark.parametrize("name", ["environment_pages", "gallery_page", "npa_bench_page"])
+@pytest.mark.parametrize("name", ["environment_pages", "gallery_page", "npa_bench_page", "tables"])
 def test_made_pages_are_current(name, capsys):
     if name == "npa_bench_page":
         pytest.importorskip("jsonschema")
         pytest.importorskip("scipy")
     status = script(f"build_{name}").main(["--check"])
     assert status == 0, capsys.readouterr().err
-
-
-def test_the_gallery_shows_every_rule_by_a_small_film():
-    text = text_of("gallery")
-    assert sorted(re.findall(r"^### (.+)$", text, re.MULTILINE)) == sorted(shipped_rules())
-    films = re.findall(r"\(images/(gallery/[\w-]+\.webp)\)", text)
-    assert len(films) == len(shipped_rules())
-    assert all((DOCS / "images" / film).stat().st_size < 300_000 for film in films)
-
-
-# Measured tables.
-
-tables = script("build_tables")
-SPEC = """[times]
-record: tests/project/*.json
-rows: r.times.rows
-Case | {name}
-Time [ms] | {us * 1e-3:.1f}
-Error | {relative:.0e}
-caption: no
-"""
-PAGE = "<!-- table: times -->\n<!-- /table -->\n"
-
-
-def test_tables_are_current(capsys):
-    status = tables.main(["--check"])
-    assert status == 0, capsys.readouterr().err
-
-
-def test_a_table_is_made_of_a_record(tmp_path, monkeypatch):
-    folder = tmp_path / "tests" / "project"
-    folder.mkdir(parents=True)
-    monkeypatch.setattr(tables, "ROOT", tmp_path)
-    row = '{"name": "one | world", "us": 1260, "relative": 3.6e-07}'
-    (folder / "times.json").write_text(f'{{"rows": [{row}]}}', encoding="utf-8")
-    (folder / "other.json").write_text("{}", encoding="utf-8")
-    pages = {"docs/page.md": f"{PAGE}It takes long."}
-    made = tables.rebuilt(pages, tables.specs(SPEC))
-    assert "\n| one \\| world | 1.3 | 4e-7 |\n<!-- /table -->\nIt takes" in made["docs/page.md"]
-    assert tables.rebuilt(made, tables.specs(SPEC)) == made
-    with pytest.raises(SystemExit, match="table times: NameError: name 'us_' is not defined"):
-        tables.rebuilt(pages, tables.specs(SPEC.replace("{us *", "{us_ *")))
-    for texts in ({"docs/page.md": "nothing"}, {"a.md": PAGE, "b.md": PAGE}):
-        with pytest.raises(SystemExit, match="described once and shown once, not times"):
-            tables.rebuilt(texts, tables.specs(SPEC))
-    with pytest.raises(SystemExit, match="a table is described twice"):
-        tables.specs(SPEC + SPEC)
-
-
-def test_a_measurement_outside_of_made_text_is_found():
-    for loose in ("It takes 48 µs.", "32.1 dB", "as 1.0 ± 0.2", "is 3 times as fast", "9 % of it"):
-        assert tables.loose_figures(f"# Page\n\n{loose}\n") == [loose]
-    fine = "`dt=0.1 ms`, [8, 4096], three times, `5 %`\n\n```sh\nwait 5 ms\n```\n"
-    assert tables.loose_figures(PAGE.replace("\n", "\n5 ms\n", 1) + fine) == []
-
-
-@every_text
-def test_a_page_has_no_measurement_that_is_not_made(path):
-    # The gallery is made as a whole.
-    made = path.stem == "gallery" or path.parent != DOCS
-    assert made or tables.loose_figures(path.read_text(encoding="utf-8")) == []
 
 
 # Names that pages list.
@@ -336,16 +266,6 @@ def test_the_own_environment_passes_the_check_of_gymnasium(ring, monkeypatch, re
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     check_env(gym.make("my/Ring-v0", particle_count=64).unwrapped)
     assert [str(warning.message) for warning in recwarn] == []
-
-
-def test_the_own_environment_measures_the_distance_from_the_ring(ring):
-    env = gym.make("my/Ring-v0", particle_count=60, ring_radius=0.25).unwrapped
-    env.reset(seed=0)
-    angle = torch.arange(60) * (2 * torch.pi / 60)
-    circle = torch.stack((angle.cos(), angle.sin()), dim=1)
-    for points, loss in ((0.25 * circle + 0.5, 0.0), (0.35 * circle, 0.01)):
-        env.place_particles(points, torch.zeros(60, 16))
-        assert env.worlds.loss.item() == pytest.approx(loss, rel=1e-5, abs=1e-12)
     with pytest.raises(npa_envs.NPAError, match="did you mean 'ring_radius'"):
         gym.make("my/Ring-v0", ringradius=0.3)
 
@@ -429,18 +349,14 @@ PROGRAMS = {
 
 
 @pytest.mark.parametrize("page", PROGRAMS)
-def test_the_code_of_a_page_runs(page, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
+def test_the_code_of_a_page_runs(page, folder, capsys):
     checks, changes, blocks = PROGRAMS[page]
     names = run_code(page, *changes, blocks=blocks)
-    names |= {"printed": capsys.readouterr().out, "folder": tmp_path, "text_of": text_of}
+    names |= {"printed": capsys.readouterr().out, "folder": folder, "text_of": text_of}
     assert [check for check in checks if not eval(check, names)] == []
 
 
 # The tutorials.
-
-
-ROUNDS = r"model\.learn\(100 \* 16"
 
 
 def printed_returns(text: str) -> dict[str, tuple[float, float]]:
@@ -449,29 +365,20 @@ def printed_returns(text: str) -> dict[str, tuple[float, float]]:
     return {name: (float(mean), float(error)) for name, mean, error in rows}
 
 
-def test_the_tutorial_runs_and_gives_the_returns_that_need_no_training(
-    tmp_path, monkeypatch, capsys
-):
+def test_the_tutorial_runs_and_gives_the_returns_that_need_no_training(folder, capsys):
     pytest.importorskip("stable_baselines3")
-    monkeypatch.chdir(tmp_path)
-    run_code("tutorial", (ROUNDS, "model.learn(16"), blocks=slice(-1, None))
-    returns, on_page = (
-        printed_returns(capsys.readouterr().out),
-        printed_returns(text_of("tutorial")),
-    )
+    run_code("tutorial", (r"model\.learn\(100 \* 16", "model.learn(16"), blocks=slice(-1, None))
+    returns, on_page = map(printed_returns, (capsys.readouterr().out, text_of("tutorial")))
     assert returns.keys() == on_page.keys()
     for name in ("RandomPolicy", "ZeroPolicy", "RulePolicy"):
         assert returns[name][0] == pytest.approx(on_page[name][0], abs=0.02)
-    with Image.open(tmp_path / "ppo.png") as picture:
+    with Image.open(folder / "ppo.png") as picture:
         assert picture.width >= 5 * 256
 
 
 @pytest.mark.slow
-def test_ppo_beats_random_actions_by_three_standard_errors_in_five_minutes(
-    tmp_path, monkeypatch, capsys
-):
+def test_ppo_beats_random_actions_by_three_standard_errors_in_five_minutes(capsys):
     pytest.importorskip("stable_baselines3")
-    monkeypatch.chdir(tmp_path)
     start = time.process_time()
     run_code("tutorial", blocks=slice(-1, None))
     assert time.process_time() - start < 300.0
@@ -483,16 +390,15 @@ def test_ppo_beats_random_actions_by_three_standard_errors_in_five_minutes(
     assert mean == pytest.approx(printed_returns(text_of("tutorial"))["RowPolicy"][0], abs=0.2)
 
 
-def test_the_program_for_a_graphics_card_runs_on_any_device(tmp_path, monkeypatch, capsys):
+def test_the_program_for_a_graphics_card_runs_on_any_device(folder, capsys):
     pytest.importorskip("stable_baselines3")
-    monkeypatch.chdir(tmp_path)
     smaller = ("[13]0_000_000", "500"), ("episode_steps=48", "episode_steps=2")
     fewer = ("particle_count=512", "particle_count=16"), ("num_envs=32", "num_envs=2")
     run_code("gpu", *smaller, *fewer, blocks=slice(-1, None))
-    told = re.findall(r"^([\w, ']+): -?[\d.]+", capsys.readouterr().out, re.MULTILINE)
-    assert told == ["zero", "ppo", "gradient", "ppo, begun with the gradient's rule"]
+    methods = re.findall(r"^([\w, ']+): -?[\d.]+", capsys.readouterr().out, re.MULTILINE)
+    assert methods == ["zero", "ppo", "gradient", "ppo, begun with the gradient's rule"]
     for method in ("ppo", "gradient"):
-        assert (tmp_path / "runs" / method / "rule-0.safetensors").is_file()
+        assert (folder / "runs" / method / "rule-0.safetensors").is_file()
 
 
 @pytest.mark.slow
@@ -504,10 +410,10 @@ def test_the_code_about_the_search_runs():
     assert names["rule"].weight_count == len(names["best"].solution)
 
 
-def test_the_code_about_datasets_runs(tmp_path, monkeypatch):
+def test_the_code_about_datasets_runs(folder, monkeypatch):
     pytest.importorskip("minari")
     pytest.importorskip("h5py")
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(folder))
     small = ["target=heart", "particle_count=32", "eps=0.3", "eps0=0.1", "resolution=16"]
     words = ["record", "npa/Morphogenesis2D-v0", "--policy", "heart", "--episodes", "2"]
     words += ["--dataset", "npa/heart/shipped-v0", "--no-progress", "--options", *small]
@@ -533,8 +439,7 @@ def test_the_code_of_the_first_minutes_and_about_graphics_cards_runs():
     assert isinstance(names["observations"], torch.Tensor)
 
 
-def test_the_code_about_learning_runs(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
+def test_the_code_about_learning_runs(folder, monkeypatch, capsys):
     # Less learning: tested is that it runs, and what needs no learning.
     names = run_code("learning", ("00_000", "0_000"), blocks=slice(1))
     printed = capsys.readouterr().out.splitlines()
@@ -543,9 +448,9 @@ def test_the_code_about_learning_runs(tmp_path, monkeypatch, capsys):
     random, scripted = (float(line.split()[1]) for line in printed[1:3])
     # Its search pays for episodes too, and ends early here.
     assert scripted > random
-    assert (tmp_path / "grown" / "rule-0.safetensors").exists()
-    (tmp_path / "mine.py").write_text(code_blocks("learning")[2], encoding="utf-8")
-    monkeypatch.syspath_prepend(tmp_path)
+    assert (folder / "grown" / "rule-0.safetensors").exists()
+    (folder / "mine.py").write_text(code_blocks("learning")[2], encoding="utf-8")
+    monkeypatch.syspath_prepend(folder)
     budget = Budget(particle_steps=2000)
     trained = train("mine:train", names["problem"], budget, 0, noise=0.2, entries=1)
     assert [entry.particle_steps for entry in trained.log] == [0, 2000]
@@ -579,9 +484,8 @@ def test_the_code_about_gardening_runs(capsys):
 
 
 @pytest.mark.usefixtures("_quick_gardens")
-def test_the_tutorial_of_gardeners_runs(capsys, tmp_path, monkeypatch):
+def test_the_tutorial_of_gardeners_runs(folder, capsys):
     pytest.importorskip("stable_baselines3")
-    monkeypatch.chdir(tmp_path)
     names = run_code(
         "tutorial_gardener",
         (r"learn\([\d_]+\)", "learn(34)"),
@@ -595,7 +499,7 @@ def test_the_tutorial_of_gardeners_runs(capsys, tmp_path, monkeypatch):
     policies = ["StillGardener", "RandomGardener", "ScriptedGardener", "learned"]
     assert [line.split()[0] for line in printed[:4]] == policies
     assert printed[4].startswith("arrived and whole: ")
-    assert (tmp_path / "gardener.webp").stat().st_size > 1000
+    assert (folder / "gardener.webp").stat().st_size > 1000
     assert names["model"].num_timesteps >= 34
     assert names["shepherd"].num_timesteps == 34
 

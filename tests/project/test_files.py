@@ -6,7 +6,6 @@ import io
 import os
 import shutil
 import signal
-import stat
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -112,20 +111,6 @@ def test_long_names_are_written_and_their_left_overs_found(tmp_path: Path, stem:
     assert list(tmp_path.iterdir()) == [target]
 
 
-def test_what_is_brought_to_the_disk_is_open_for_writing(tmp_path: Path, monkeypatch) -> None:
-    fcntl = pytest.importorskip("fcntl")
-    synced = []
-
-    def fsync(descriptor: int) -> None:
-        file = stat.S_ISREG(os.fstat(descriptor).st_mode)
-        synced.append((file, fcntl.fcntl(descriptor, fcntl.F_GETFL) & os.O_ACCMODE == os.O_RDWR))
-
-    monkeypatch.setattr(os, "fsync", fsync)
-    write_text(tmp_path / "a.txt", "1")
-    # Windows refuses to do it for a file that is open for reading only.
-    assert synced == [(True, True), (False, False)]
-
-
 def _fail_with(number: int) -> Any:
     def refuse(path: Any, *_: Any) -> int:
         name = None if isinstance(path, int) else os.fspath(path)
@@ -154,16 +139,6 @@ def test_what_the_system_refuses_is_said_and_keeps_the_old_file(
         write_bytes(target, b"new")
     assert target.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [target]
-
-
-@pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="root may write anywhere")
-def test_a_read_only_folder_is_refused_before_any_work(tmp_path: Path) -> None:
-    tmp_path.chmod(0o500)
-    try:
-        with pytest.raises(NPAError, match="no write permission"), atomic_path(tmp_path / "a.bin"):
-            pytest.fail("the block must not run")
-    finally:
-        tmp_path.chmod(0o700)
 
 
 @pytest.fixture

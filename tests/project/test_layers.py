@@ -88,7 +88,6 @@ LAYERS = {
     ),
     "npa_envs.__main__": layer(23),
 }
-WARP_AND_TORCH = {"npa_envs.ops"}
 
 
 def source_files() -> list[Path]:
@@ -167,11 +166,6 @@ def test_every_source_file_keeps_to_the_layers(path: Path) -> None:
     is_package = path.name == "__init__.py"
     source = path.read_text(encoding="utf-8")
     assert violations(module_name(path), source, is_package=is_package) == []
-
-
-def test_only_the_operators_and_the_benchmarked_hash_grid_know_both_warp_and_torch() -> None:
-    both = {name for name, here in LAYERS.items() if {"warp", "torch"} <= here.libraries}
-    assert both == WARP_AND_TORCH
 
 
 WRONG = [

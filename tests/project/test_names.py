@@ -15,8 +15,9 @@ FENCE = re.compile(r"^ *```.*?^ *```$", re.MULTILINE | re.DOTALL)
 NAME = r"[A-Za-z_]\w*(?:\.\w+)*"
 
 OTHERS = {
-    *("GymEnv", "NormalizeObservation", "NormalizeReward", "NumpyToTorch", "SubprocVecEnv"),
-    *("VecMonitor", "VecVideoRecorder", "black_death_v3", "num_gpus_per_learner", "heart_h100"),
+    *("GymEnv", "NormalizeObservation", "NormalizeReward", "NumpyToTorch", "RescaleAction"),
+    *("SubprocVecEnv", "VecMonitor", "VecVideoRecorder", "black_death_v3", "heart_h100"),
+    "num_gpus_per_learner",
 }
 """Names of other libraries that no program of ours uses, and of a rule in records."""
 

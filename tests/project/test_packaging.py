@@ -122,15 +122,6 @@ def test_folders_called_envs_in_site_packages_are_not_taken_for_ours(tmp_path: P
     assert path == [str(package), str(tmp_path)]
 
 
-def test_every_package_is_listed_in_pyproject() -> None:
-    listed = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
-    folders = ("npa_envs", *MAPPED_PACKAGES)
-    inits = [path for folder in folders for path in (ROOT / folder).rglob("__init__.py")]
-    names = {".".join(path.parent.relative_to(ROOT).parts) for path in inits}
-    found = {name if name.startswith("npa_envs") else f"npa_envs.{name}" for name in names}
-    assert sorted(listed["tool"]["setuptools"]["packages"]) == sorted(found)
-
-
 def test_constraints_pin_every_direct_dependency() -> None:
     requirements = [*PROJECT["dependencies"]]
     for extra in PROJECT["optional-dependencies"].values():

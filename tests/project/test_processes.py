@@ -60,47 +60,47 @@ def run(*children, jobs=2, ahead=False):
     return finished
 
 
-def test_a_signal_asks_all_to_end_before_one_is_waited_for(send):
+def once(send):
+    """Return a function that sends the signal when it is first called."""
+    calls = [send]
+    return lambda: calls.pop()() if calls else None
+
+
+def break_down():
+    raise ValueError("out of luck")
+
+
+@pytest.mark.parametrize(
+    ("at", "options", "after"),
+    [
+        # All are asked to end before one is waited for; what ended with the signal is no result.
+        (
+            lambda send: {name: {"over": send} for name in "abcd"},
+            {"ahead": True},
+            "go a, go b, over a, stop a, stop b, stop c, stop d, end a, end b, end c, end d",
+        ),
+        # A second signal ends all at once.
+        (
+            lambda send: {"a": {"over": send, "end": once(send)}, "b": {}},
+            {},
+            "go a, go b, over a, stop a, stop b, end a, kill a, kill b, end a, end b",
+        ),
+        # A child that a signal finds starting is ended as well.
+        (lambda send: {"a": {"go": send}, "b": {}}, {}, "go a, stop a, end a"),
+        # An error ends the others, and a signal meanwhile ends them at once.
+        (
+            lambda send: {"a": {"over": break_down}, "b": {"stop": send}},
+            {},
+            "go a, go b, over a, stop a, stop b, kill a, kill b, end a, end b",
+        ),
+    ],
+)
+def test_a_signal_ends_all(send, at, options, after):
     notes = []
-    children = [Noted(name, notes, {"over": send}) for name in "abcd"]
+    children = [Noted(name, notes, actions) for name, actions in at(send).items()]
     with pytest.raises(KeyboardInterrupt):
-        run(*children, ahead=True)
-    asked = [f"{what} {name}" for what in ("stop", "end") for name in "abcd"]
-    # What ended with the signal is no result.
-    assert notes == ["go a", "go b", "over a", *asked]
-
-
-def test_a_second_signal_ends_all_at_once(send):
-    notes, once = [], [True]
-
-    def again():
-        if once:
-            once.pop()
-            send()
-
-    children = [Noted(name, notes, {"over": send, "end": again}) for name in "ab"]
-    with pytest.raises(KeyboardInterrupt):
-        run(*children)
-    assert notes[3:] == ["stop a", "stop b", "end a", "kill a", "kill b", "end a", "end b"]
-
-
-def test_a_child_that_a_signal_finds_starting_is_ended_as_well(send):
-    notes = []
-    with pytest.raises(KeyboardInterrupt):
-        run(Noted("a", notes, {"go": send}), Noted("b", notes))
-    assert notes == ["go a", "stop a", "end a"]
-
-
-def test_an_error_ends_the_others_and_a_signal_meanwhile_ends_them_at_once(send):
-    notes = []
-
-    def break_down():
-        raise ValueError("out of luck")
-
-    children = [Noted("a", notes, {"over": break_down}), Noted("b", notes, {"stop": send})]
-    with pytest.raises(KeyboardInterrupt):
-        run(*children)
-    assert notes[3:] == ["stop a", "stop b", "kill a", "kill b", "end a", "end b"]
+        run(*children, **options)
+    assert ", ".join(notes) == after
 
 
 @pytest.mark.parametrize("number", SIGNALS)

@@ -85,11 +85,10 @@ REFUSED = [
     ),
     (lambda folder: write_mp4(folder / "film.mp4", FILM, fps=0), "fps must be in"),
     (lambda folder: write_webp(folder / "a.webp", FILM, quality=101), "quality must be in"),
-    (strip(["a", "b"]), "as many as the frames, 6, got 2"),
-    (strip(range(6)), "captions must be texts, one for each frame"),
-    (strip([None, *"abcde"]), "captions must be texts, one for each frame"),
-    (strip(6), "captions must be texts, one for each frame"),
-    (strip("abcdef"), "captions must be texts, one for each frame"),
+    *(
+        (strip(captions), "captions must be texts, one for each of the 6 frames, got")
+        for captions in (["a", "b"], range(6), [None, *"abcde"], 6, "abcdef")
+    ),
     (strip(columns=0), "columns must be an integer of at least 1"),
     (drawn(style="densty"), "did you mean 'density'"),
     (drawn(half_width=0.0), "half_width must be positive"),

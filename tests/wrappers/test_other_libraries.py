@@ -113,46 +113,36 @@ def test_rllib_trains_a_policy_for_each_species_or_one_for_all(shared, runner_co
     refused("'npa/TextureSmall-v0': take rllib_rows_config", rllib_config, "npa/TextureSmall-v0")
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("runner_count", [0, 2])
-def test_rllib_trains_one_policy_on_the_particles_of_worlds_of_one_species(runner_count, trained):
-    from npa_envs.wrappers.rllib import rllib_rows_config
-
-    keywords = {"particle_count": 16, "eps": 0.3, "resolution": 16, "max_episode_steps": 6}
-    config = (
-        rllib_rows_config("npa/Morphogenesis2D-v0", world_count=2, reward="particle", **keywords)
-        .env_runners(
-            num_env_runners=runner_count, rollout_fragment_length=12 // (runner_count or 1)
-        )
-        .training(train_batch_size_per_learner=12 * 32, minibatch_size=12 * 32, num_epochs=1)
-    )
-    algorithm, results = trained(config, rounds=2)
-    assert results["learners"]["default_policy"]["num_module_steps_trained"] > 0
-    module = algorithm.get_module()
-    observed, acted = module.observation_space, module.action_space
-    assert (observed.shape, acted.shape) == ((66,), (18,))
+PARTICLES = {"reward": "particle", "particle_count": 16, "eps": 0.3, "resolution": 16}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "fields", "observed", "acted", "rows"),
+    ("name", "fields", "runner_count", "observed", "acted", "rows"),
     [
-        ("npa/TextureSmall-v0", {}, 18, 6, 192),
-        ("npa/Gardener2DSmall-v0", {}, 96, 32, 2),
-        ("npa/Gardener2DSmall-v0", {"actions": "discrete"}, 96, 4, 2),
-        ("npa/Shepherd2DSmall-v0", {}, 30, 8, 2),
+        ("npa/Morphogenesis2D-v0", PARTICLES, 0, 66, 18, 32),
+        ("npa/Morphogenesis2D-v0", PARTICLES, 2, 66, 18, 32),
+        ("npa/TextureSmall-v0", {}, 0, 18, 6, 192),
+        ("npa/Gardener2DSmall-v0", {}, 0, 96, 32, 2),
+        ("npa/Gardener2DSmall-v0", {"actions": "discrete"}, 0, 96, 4, 2),
+        ("npa/Shepherd2DSmall-v0", {}, 0, 30, 8, 2),
     ],
 )
-def test_rllib_trains_on_small_worlds_and_in_gardens(name, fields, observed, acted, rows, trained):
+def test_rllib_trains_one_policy_on_rows(
+    name, fields, runner_count, observed, acted, rows, trained
+):
     from npa_envs.wrappers.rllib import rllib_rows_config
 
     config = (
         rllib_rows_config(name, world_count=2, max_episode_steps=6, **fields)
-        .env_runners(num_env_runners=0, rollout_fragment_length=14)
+        .env_runners(
+            num_env_runners=runner_count, rollout_fragment_length=14 // (runner_count or 1)
+        )
         .training(train_batch_size_per_learner=14 * rows, minibatch_size=12, num_epochs=1)
     )
     assert config.num_envs_per_env_runner == rows
-    algorithm, _ = trained(config)
+    algorithm, results = trained(config)
+    assert results["learners"]["default_policy"]["num_module_steps_trained"] > 0
     module = algorithm.get_module()
     spaces = module.observation_space, module.action_space
     assert [space.shape for space in spaces] == [(observed,), (acted,)]

@@ -42,11 +42,6 @@ def started(wrapper, *given, **named):
 STATE = {"mean": torch.zeros(3), "var": torch.zeros(3), "count": 1.0}
 NEXT = {"autoreset_mode": "next-step"}
 DISABLED = {"autoreset_mode": "disabled"}
-FRACTIONS = [
-    ([1.0], "fractions must be 2 numbers"),
-    ([1.0, -1.0], "greater than 0"),
-    ([1, 1e-4], "leave each species a particle"),
-]
 FOREIGN = "rows need an environment that gives and takes one for"
 
 REFUSALS = [
@@ -60,7 +55,6 @@ REFUSALS = [
     (lambda: DamageEvents(single(), [3]), "text or a DamageEvent"),
     (lambda: DamageEvents(single(), 5), "text or a DamageEvent, got int"),
     (lambda: DamageEvents(single(), None), "text or a DamageEvent, got NoneType"),
-    (lambda: DamageEvents(single(), "3:cut", every=0), "every must be a whole number"),
     (lambda: DamageEvents(batched(), "3:cut"), "use VectorDamageEvents"),
     (lambda: VectorDamageEvents(single(), "3:cut"), "use DamageEvents for a single"),
     (lambda: DamageEvents(gym.make("CartPole-v1"), "3:cut"), "environment of npa_envs"),
@@ -77,8 +71,8 @@ REFUSALS = [
     (lambda: TorchRecordEpisodeStatistics(batched(), 0), "buffer_length must be"),
     (lambda: TorchNormalizeObservation(batched(), epsilon=0.0), "epsilon must be"),
     (lambda: TorchNormalizeReward(batched(), gamma=1.5), r"gamma must lie in \[0, 1\]"),
-    (lambda: SpeciesTags(single(), 0), "species_count must be a whole number"),
-    *((lambda f=f: SpeciesTags(single(), 2, fractions=f), message) for f, message in FRACTIONS),
+    (lambda: SpeciesTags(single(), 0), "species_count must be an integer of at least 1"),
+    (lambda: SpeciesTags(single(), 65), "species_count must be at most 64, got 65"),
     (lambda: SpeciesTags(FlattenObservation(single())), "each of 64 particles.* put SpeciesTags"),
     (lambda: SpeciesTags(TimeAwareObservation(single(), flatten=False)), "particles, got Dict"),
     (lambda: VectorSpeciesTags(FlattenAll(batched(**DISABLED))), "put VectorSpeciesTags"),

@@ -61,16 +61,12 @@ def test_logs_are_means_over_the_worlds_that_ended():
     assert extras["log"]["Episode/loss"].item() == pytest.approx(expected, rel=1e-6)
 
 
-def test_success_is_no_time_limit_and_bootstrapping_can_be_left_out():
+def test_success_is_no_time_limit():
     rows = RslRlParticleEnv(batched(success_loss=1e6), seed=0)
     *_, dones, extras = rows.step(torch.zeros(128, ACTIONS))
     assert dones.all()
     assert not extras["time_outs"].any()
     assert extras["log"]["Episode/success"].item() == 1.0
-    rows = RslRlParticleEnv(batched(max_episode_steps=1), bootstrap=False)
-    *_, dones, extras = rows.step(torch.zeros(128, ACTIONS))
-    assert dones.all()
-    assert "time_outs" not in extras
 
 
 def test_steps_in_inference_mode_leave_no_tensors_that_cannot_be_written_to():

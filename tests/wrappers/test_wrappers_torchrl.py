@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 import torch
 import wrapped_envs
+from refusals import refused
 from small_envs import make_vec
 from wrapped_envs import STEPS, policy
-
-from npa_envs.errors import NPAError
 
 torchrl = pytest.importorskip("torchrl.envs")
 from tensordict import TensorDict  # noqa: E402
@@ -131,17 +130,17 @@ def test_wrapped_worlds_are_seen_as_wrappers_show_them():
 
 
 def test_what_is_refused():
-    with pytest.raises(NPAError, match="needs torch tensors, got output='numpy'"):
-        NPATorchRLEnv(wrapped_envs.batched(2, autoreset_mode="disabled"))
-    with pytest.raises(NPAError, match="make the environment with copy=True"):
-        NPATorchRLEnv(wrapped_envs.batched(output="torch", autoreset_mode="disabled", copy=False))
-    with pytest.raises(NPAError, match="make it with autoreset_mode='disabled'"):
-        NPATorchRLEnv(wrapped_envs.batched(2, output="torch"))
-    with pytest.raises(NPAError, match="env must be a vector environment of npa_envs, got"):
-        NPATorchRLEnv(wrapped_envs.single())
+    disabled = {"autoreset_mode": "disabled"}
+    for envs, message in (
+        (wrapped_envs.batched(2, **disabled), "needs torch tensors, got output='numpy'"),
+        (wrapped_envs.batched(output="torch", copy=False, **disabled), "with copy=True"),
+        (wrapped_envs.batched(2, output="torch"), "make it with autoreset_mode='disabled'"),
+        (wrapped_envs.single(), "env must be a vector environment of npa_envs, got"),
+    ):
+        refused(message, NPATorchRLEnv, envs)
     env = wrapped(2, rows=True)
     env.reset()
     some = torch.zeros(2, 64, 1, dtype=torch.bool)
     some[1, :5] = True
-    with pytest.raises(NPAError, match="_reset must choose all particles of a world or none"):
-        env.reset(TensorDict({"_reset": some}, batch_size=[2, 64]))
+    mask = TensorDict({"_reset": some}, batch_size=[2, 64])
+    refused("_reset must choose all particles of a world or none", env.reset, mask)
