@@ -422,16 +422,6 @@ def test_rotation_turns_vectors_and_keeps_scalars(space_dim, moment_inverse, dev
     assert relative_error(turned[..., 10:], vectors.flatten(2)) < 1e-12
 
 
-def test_runs_are_bit_identical(space_dim, dtype, device):
-    x, s = random_world(3, 700, space_dim, 16, dtype=dtype, device=device)
-
-    def perceived(x, s):
-        return npa_envs.perceive(x, s, 0.2, detach_positions=False)
-
-    first, *others = (with_gradients(perceived, x, s) for _ in range(3))
-    assert_same(others, [first] * 2)
-
-
 class TestGeometryLimits:
     """Any position is legal in open space; boxes may be as small as 2 eps."""
 
