@@ -334,7 +334,8 @@ def perceive_rows(
         perception, maps = saved.perception, [saved.row_of, row_source, saved.starts]
     if rows is not None:
         maps = [rows.row_of, rows.row_source, rows.starts]
-    return perception, Rows(*maps, row_base=x.shape[0] * x.shape[1] if masked else 0)
+    row_of, row_source, starts = maps
+    return perception, Rows(row_of, row_source, starts, x.shape[0] * x.shape[1] if masked else 0)
 
 
 ROWS_TOGETHER = 2**22
@@ -364,8 +365,10 @@ def updates_in_parts(
     updates = None
     for first in range(0, row_capacity, ROWS_TOGETHER):
         some = perception[: min(ROWS_TOGETHER, row_capacity - first)]
-        options = {"first_row": first, "row_count": len(some)}
-        launch(*perception_launch(plan, ordered, densities, some, **options))
+        arguments = perception_launch(
+            plan, ordered, densities, some, first_row=first, row_count=len(some)
+        )
+        launch(*arguments)
         mapped = network(some)
         if updates is None:
             updates = mapped.new_empty(row_capacity, mapped.shape[1])

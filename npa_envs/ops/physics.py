@@ -204,7 +204,8 @@ def _checked(
         raise NPAError(f"box must be None where boundary is 'open', got {shown(box)}: leave it out")
     if boundary == "reflecting" and box is None:
         raise NPAError("box must be given where boundary is 'reflecting', got None: give its sides")
-    radius = checked_eps("eps", eps0 if eps is None else eps, space_dim, dtype)
+    unchecked: Any = eps0 if eps is None else eps
+    radius = checked_eps("eps", unchecked, space_dim, dtype)
     radius0 = radius if eps0 is None else constant(eps0)
     check_scale(radius, radius0, space_dim, dtype)
     update_prob = checked_number("update_prob", update_prob)

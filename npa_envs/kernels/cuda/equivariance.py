@@ -12,7 +12,6 @@ import warp as wp
 from npa_envs.kernel_lock import cached_under_lock
 from npa_envs.kernels import native
 from npa_envs.kernels.access import WARP, await_earlier
-from npa_envs.kernels.cuda.network import make_partial_sum
 
 READ_WARPS, PULL_WARPS, STEER_WARPS, MIXING_SUM_WARPS = 4, 4, 4, 16
 """Warps of a block of `read_rows`, `pull_back_rows`, the steering kernels and `add_blocks`."""
@@ -53,26 +52,7 @@ def row_kernels(
     form = space_dim, scalars, perceived, mixed, chiral
     module = native.module(f"npa_envs.kernels.vector_rows_{'_'.join(str(int(k)) for k in form)}")
 
-    rows = rows_of_warp(mixed)
-
-    @native.func_native(*form, READ_WARPS, rows)
-    def read_vectors(
-        rows: wp.array2d[wp.float32],
-        mixing: wp.array[wp.float32],
-        mixed: wp.array[wp.float32],
-        inputs: wp.array2d[wp.float32],
-    ): ...
-
-    @native.func_native(*form, PULL_WARPS, rows)
-    def pull_back_vectors(
-        rows: wp.array2d[wp.float32],
-        mixing: wp.array[wp.float32],
-        mixed: wp.array[wp.float32],
-        mixed_bar: wp.array[wp.float32],
-        inputs_bar: wp.array2d[wp.float32],
-        rows_bar: wp.array2d[wp.float32],
-        partial_sums: wp.array2d[wp.float32],
-    ): ...
+    warp_rows = rows_of_warp(mixed)
 
     @wp.kernel(enable_backward=False, module=module)
     def read_rows(
@@ -101,13 +81,16 @@ def row_kernels(
         await_earlier()
         pull_back_vectors(rows, mixing, mixed, mixed_bar, inputs_bar, rows_bar, partial_sums)
 
+    read_vectors = native.call_of(read_rows, "read_vectors", *form, READ_WARPS, warp_rows)
+    pull_back_vectors = native.call_of(
+        pull_back_rows, "pull_back_vectors", *form, PULL_WARPS, warp_rows
+    )
     return SimpleNamespace(read_rows=read_rows, pull_back_rows=pull_back_rows)
 
 
 @cached_under_lock()
 def mixing_sum() -> wp.Kernel:
     """Return the kernel that adds the sums of blocks; its own blocks are larger."""
-    add_partial_sums = make_partial_sum(MIXING_SUM_WARPS)
 
     @wp.kernel(
         enable_backward=False,
@@ -123,6 +106,7 @@ def mixing_sum() -> wp.Kernel:
         await_earlier()
         add_partial_sums(partial_sums, total)
 
+    add_partial_sums = native.call_of(add_blocks, "add_partial_sums", MIXING_SUM_WARPS)
     return add_blocks
 
 
@@ -134,24 +118,6 @@ def steering_kernels(space_dim: int, mixed: int, chiral: bool) -> SimpleNamespac
     """
     form = space_dim, mixed, chiral
     module = native.module(f"npa_envs.kernels.steering_{'_'.join(str(int(k)) for k in form)}")
-
-    @native.func_native(*form, STEER_WARPS, STEERED_ROWS)
-    def steer_by_gates(
-        output: wp.array2d[wp.float32],
-        mixed: wp.array[wp.float32],
-        signs: wp.array[wp.float32],
-        update: wp.array2d[wp.float32],
-    ): ...
-
-    @native.func_native(*form, STEER_WARPS, STEERED_ROWS)
-    def pull_back_gates(
-        output: wp.array2d[wp.float32],
-        mixed: wp.array[wp.float32],
-        signs: wp.array[wp.float32],
-        update_bar: wp.array2d[wp.float32],
-        output_bar: wp.array2d[wp.float32],
-        mixed_bar: wp.array[wp.float32],
-    ): ...
 
     @wp.kernel(enable_backward=False, module=module)
     def steer(
@@ -179,4 +145,7 @@ def steering_kernels(space_dim: int, mixed: int, chiral: bool) -> SimpleNamespac
         await_earlier()
         pull_back_gates(output, mixed, signs, update_bar, output_bar, mixed_bar)
 
+    sizes = *form, STEER_WARPS, STEERED_ROWS
+    steer_by_gates = native.call_of(steer, "steer_by_gates", *sizes)
+    pull_back_gates = native.call_of(pull_back_steering, "pull_back_gates", *sizes)
     return SimpleNamespace(steer=steer, pull_back_steering=pull_back_steering)

@@ -5,7 +5,6 @@ warp. float16 has a small range, so rows are first scaled by powers of two, whic
 """
 
 from types import SimpleNamespace
-from typing import Any
 
 import warp as wp
 
@@ -56,17 +55,6 @@ def two_layer_kernel(steps: int, tiles: int, mode: str) -> wp.Kernel:
     name = f"npa_envs.kernels.network_{mode}_{steps}_{tiles}"
     registers = WIDE_REGISTERS if max(16 * steps, 8 * tiles) in WIDE else LAYER_REGISTERS
 
-    @native.func_native(steps, tiles, mode.upper(), ROW_TARGET)
-    def two_layers(
-        unit_count: int,
-        rows: wp.array2d[wp.float32],
-        hidden_weights: wp.array[wp.float16],
-        output_weights: wp.array[wp.float16],
-        output_unscale: wp.array[wp.float32],
-        signs_of: wp.array2d[wp.int32],
-        output: wp.array2d[wp.float32],
-    ): ...
-
     @wp.kernel(enable_backward=False, module=native.module(name), cuda_max_registers=registers)
     def network_layers(
         unit_count: int,
@@ -82,6 +70,9 @@ def two_layer_kernel(steps: int, tiles: int, mode: str) -> wp.Kernel:
         await_earlier()
         two_layers(unit_count, rows, hidden_weights, output_weights, output_unscale, signs, output)
 
+    two_layers = native.call_of(
+        network_layers, "two_layers", steps, tiles, mode.upper(), ROW_TARGET
+    )
     return network_layers
 
 
@@ -98,18 +89,6 @@ def weight_gradient_kernels(
     """
     variant = f"{steps}_{tiles}_{out_tiles}_{warps}_{unit_blocks}_{words}"
     module = native.module(f"npa_envs.kernels.network_gradients_{variant}")
-
-    @native.func_native(steps, tiles, out_tiles, warps, unit_blocks, words, ROW_TILE)
-    def weight_sums(
-        unit_count: int,
-        part_rows: int,
-        rows: wp.array2d[wp.float32],
-        output_bar: wp.array2d[wp.float32],
-        signs_of: wp.array2d[wp.int32],
-        hidden_weights: wp.array[wp.bfloat16],
-        output_weights: wp.array[wp.bfloat16],
-        partial_sums: wp.array2d[wp.float32],
-    ): ...
 
     @wp.kernel(enable_backward=False, module=module, cuda_max_registers=GRADIENT_REGISTERS)
     def sum_weight_gradients(
@@ -137,8 +116,6 @@ def weight_gradient_kernels(
             partial_sums,
         )
 
-    add_partial_sums = make_partial_sum(SUM_WARPS)
-
     @wp.kernel(enable_backward=False, module=module)
     def add_parts(
         partial_sums: wp.array2d[wp.float32],
@@ -150,18 +127,10 @@ def weight_gradient_kernels(
         allow_next_launch()
         add_partial_sums(partial_sums, total)
 
+    sizes = steps, tiles, out_tiles, warps, unit_blocks, words, ROW_TILE
+    weight_sums = native.call_of(sum_weight_gradients, "weight_sums", *sizes)
+    add_partial_sums = native.call_of(add_parts, "add_partial_sums", SUM_WARPS)
     return SimpleNamespace(sum_weight_gradients=sum_weight_gradients, add_parts=add_parts)
-
-
-@cached_under_lock()
-def make_partial_sum(warps: int) -> Any:
-    """Return a Warp function that adds partial sums; a block has `warps` warps and 32 columns."""
-
-    @native.func_native(warps)
-    def add_partial_sums(partial_sums: wp.array2d[wp.float32], total: wp.array[wp.float32]):
-        """Add the partial sums in a fixed order."""
-
-    return add_partial_sums
 
 
 @native.func_native()
