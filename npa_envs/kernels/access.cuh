@@ -163,11 +163,6 @@ CUDA_CALLABLE inline float kept(float value)
 
 CUDA_CALLABLE inline double kept(double value) { return value; }
 
-template <typename Value> CUDA_CALLABLE inline Value warp_sum(Value value)
-{
-    return lane_sum<double, 32, true, 1>(value);
-}
-
 template <typename Scalar> CUDA_CALLABLE inline Scalar shuffle(Scalar value, int thread)
 {
 #if defined(__CUDA_ARCH__)

@@ -46,7 +46,7 @@ def allow_next_launch():
 
 
 @cached_under_lock()
-def make_wide_load(value_type: type, scalar: type) -> Any:
+def make_wide_load(value_type: type) -> Any:
     """Return a Warp function that reads an entry of a flat array, on CUDA in few, wide loads.
 
     The array must be dense and aligned to the size of an entry, or to 16 bytes; the index must not
@@ -54,55 +54,56 @@ def make_wide_load(value_type: type, scalar: type) -> Any:
     """
 
     @native.func_native()
-    def wide_load(entries: wp.array(dtype=value_type), index: wp.int32) -> value_type: ...
+    def wide_load(entries: wp.array[value_type], index: int) -> value_type: ...
 
     return wide_load
 
 
-load_integer = make_wide_load(wp.int32, wp.int32)
-load_scalar = make_wide_load(wp.float32, wp.float32)
+load_integer = make_wide_load(wp.int32)
+load_scalar = make_wide_load(wp.float32)
 
 
 @cached_under_lock()
-def make_wide_store(value_type: type, scalar: type) -> Any:
+def make_wide_store(value_type: type) -> Any:
     """Return a Warp function that writes an entry of a flat array, on CUDA in few, wide stores.
 
     The array and the index are as those of `make_wide_load`.
     """
 
     @native.func_native()
-    def wide_store(entries: wp.array(dtype=value_type), index: wp.int32, value: value_type): ...
+    def wide_store(entries: wp.array[value_type], index: int, value: value_type): ...
 
     return wide_store
 
 
+def scalar_of(value_type: Any) -> Any:
+    """Return the scalar type of a vector's or a matrix's entries; a scalar type itself."""
+    return getattr(value_type, "_wp_scalar_type_", value_type)
+
+
 @cached_under_lock()
-def make_read_at(value_type: type, scalar: type, alignment: int) -> Any:
+def make_read_at(value_type: type, alignment: int) -> Any:
     """Return a Warp function that reads a vector from index `place` of an array of scalars.
 
     Its address must be a multiple of `alignment` bytes, 4, 8 or 16: the width of a load.
     """
+    scalar = scalar_of(value_type)
 
     @native.func_native(value_type, alignment)
-    def read_at(values: wp.array(dtype=scalar), place: wp.int32) -> value_type: ...
+    def read_at(values: wp.array[scalar], place: int) -> value_type: ...
 
     return read_at
 
 
 @cached_under_lock()
-def make_read_channels(value_type: type, scalar: type) -> Any:
+def make_read_channels(value_type: Any) -> Any:
     """Return a Warp function that reads adjacent channels of a particle, 0 beyond the last one."""
-    count = value_type._length_
-    alignment = min(wp.types.type_size_in_bytes(value_type), 16)
-    read_at = make_read_at(value_type, scalar, alignment)
+    scalar, count = scalar_of(value_type), value_type._length_
+    read_at = make_read_at(value_type, min(wp.types.type_size_in_bytes(value_type), 16))
 
     @wp.func
     def read_channels(
-        states: wp.array(dtype=scalar),
-        state_dim: wp.int32,
-        aligned: wp.int32,
-        particle: wp.int32,
-        first: wp.int32,
+        states: wp.array[scalar], state_dim: int, aligned: int, particle: int, first: int
     ):
         result = value_type()
         place = particle * state_dim + first
@@ -118,55 +119,45 @@ def make_read_channels(value_type: type, scalar: type) -> Any:
 
 
 @cached_under_lock()
-def make_write_at(value_type: type, scalar: type) -> Any:
+def make_write_at(value_type: type) -> Any:
     """Return a Warp function that writes a vector to index `place` of an array of scalars.
 
     Address and size of the vector must be multiples of 16 bytes.
     """
+    scalar = scalar_of(value_type)
 
     @native.func_native()
-    def write_at(values: wp.array(dtype=scalar), place: wp.int32, value: value_type): ...
+    def write_at(values: wp.array[scalar], place: int, value: value_type): ...
 
     return write_at
 
 
-def share_type(value_type: type, scalar: type, lanes: int) -> type:
-    """Return the type of one lane's part of a vector [W] or matrix [D, W]: W / lanes columns."""
-    *rows, width = value_type._shape_
-    share = width // lanes
-    if rows:
-        return wp.types.matrix((rows[0], share), scalar)
-    return wp.types.vector(share, scalar)
-
-
 @cached_under_lock()
-def make_lane_sum(
-    value_type: type, scalar: type, lanes: int, whole_warps: bool = False, stride: int = 1
-) -> Any:
+def make_lane_sum(value_type: type, lanes: int, whole_warps: bool = False, stride: int = 1) -> Any:
     """Return a Warp function that sums a value over a particle's lanes; each lane gets the sum.
 
     On a CPU there is one lane. With `whole_warps` all threads of a warp must call it together,
     which takes fewer instructions. Every `stride`-th lane is summed, a power of two.
     """
 
-    @native.func_native(scalar, lanes, whole_warps, stride)
+    @native.func_native(scalar_of(value_type), lanes, whole_warps, stride)
     def lane_sum(value: value_type) -> value_type: ...
 
     return lane_sum
 
 
 @cached_under_lock()
-def make_lane_collect(value_type: type, scalar: type, lanes: int) -> Any:
+def make_lane_collect(value_type: Any, lanes: int) -> Any:
     """Return a Warp function that sums matrices [D, W] over lanes; each lane gets its columns.
 
     In lane i the k-th group of columns has to be that of lane i ^ k, so its own group comes first:
     then all indices are constants.
     """
-    rows, width = value_type._shape_
-    share = share_type(value_type, scalar, lanes)
+    scalar, (rows, width) = scalar_of(value_type), value_type._shape_
+    lane_columns = wp.types.matrix((rows, width // lanes), scalar)
 
-    @native.func_native(share, scalar, rows, width, lanes)
-    def lane_collect(value: value_type) -> share: ...
+    @native.func_native(lane_columns, scalar, rows, width, lanes)
+    def lane_collect(value: value_type) -> lane_columns: ...
 
     return lane_collect
 
@@ -185,24 +176,11 @@ def make_kept(scalar: type) -> Any:
 
 
 @cached_under_lock()
-def make_warp_sum(value_type: type) -> Any:
-    """Return a Warp function that sums a value over the 32 threads of a warp; each gets the sum.
-
-    All 32 must call it. On a CPU it returns its argument.
-    """
-
-    @native.func_native()
-    def warp_sum(value: value_type) -> value_type: ...
-
-    return warp_sum
-
-
-@cached_under_lock()
 def make_shuffle(scalar: type) -> wp.Function:
     """Return a Warp function that reads another thread's value in the warp; on a CPU its own."""
 
     @native.func_native()
-    def shuffle(value: scalar, thread: wp.int32) -> scalar: ...
+    def shuffle(value: scalar, thread: int) -> scalar: ...
 
     return shuffle
 
@@ -212,22 +190,22 @@ scalar_of_warp = make_shuffle(wp.float32)
 
 
 @native.func_native()
-def of_lane(value: wp.int32, lane: wp.int32, lanes: wp.uint32) -> wp.int32:
+def of_lane(value: int, lane: int, lanes: wp.uint32) -> int:
     """Return the value of one of the `lanes` threads that work on the same particle."""
 
 
 @native.func_native()
-def thread_number() -> wp.int32:
+def thread_number() -> int:
     """Return this thread's index in the launch, without the divisions of `wp.tid`."""
 
 
 @native.func_native()
-def block_number() -> wp.int32:
+def block_number() -> int:
     """Return this block's index in the launch."""
 
 
 @native.func_native()
-def thread_of_block() -> wp.int32:
+def thread_of_block() -> int:
     """Return this thread's index in its block."""
 
 
@@ -242,51 +220,52 @@ def sync_warp():
 
 
 @native.func_native()
-def any_in_warp(condition: wp.bool) -> wp.bool:
+def any_in_warp(condition: bool) -> bool:
     """Return whether a condition is true for some thread of the warp."""
 
 
 @native.func_native()
-def first_in_warp(condition: wp.bool) -> wp.int32:
+def first_in_warp(condition: bool) -> int:
     """Return the first thread for which a condition is true, -1 for none."""
 
 
 @native.func_native()
-def vote_of_warp(condition: wp.bool) -> wp.uint32:
+def vote_of_warp(condition: bool) -> wp.uint32:
     """Return a bit for each thread of the warp: whether a condition is true."""
 
 
 @native.func_native()
-def largest_in_warp(value: wp.int32) -> wp.int32:
+def largest_in_warp(value: int) -> int:
     """Return the largest value of the warp's threads."""
 
 
 @native.func_native()
-def sum_up_to(value: wp.int32) -> wp.int32:
+def sum_up_to(value: int) -> int:
     """Return the sum of the values of this thread and of those before it in the warp."""
 
 
 @native.func_native()
-def thread_of(ends: wp.int32, number: wp.int32) -> wp.int32:
+def thread_of(ends: int, number: int) -> int:
     """Return the first thread of the warp whose `ends`, ascending over threads, is > `number`."""
 
 
 @native.func_native()
-def as_number(word: wp.float32) -> wp.int32:
+def as_number(word: float) -> int:
     """Return the integer whose bits are those of a float32."""
 
 
 @native.func_native()
-def as_word(number: wp.int32) -> wp.float32:
+def as_word(number: int) -> float:
     """Return the float32 whose bits are those of an integer."""
 
 
 @cached_under_lock()
-def make_add_scaled(group: type, scalar: type) -> Any:
+def make_add_scaled(group: type) -> Any:
     """Return a Warp function for total + factor * value, rounded after each operation on a CPU.
 
     It uses vector registers of the CPU, which the compiler does not use by itself.
     """
+    scalar = scalar_of(group)
 
     @native.func_native()
     def add_scaled(total: group, factor: scalar, value: group) -> group: ...

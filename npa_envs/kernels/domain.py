@@ -67,13 +67,13 @@ def domain_types(space_dim: int, scalar: type) -> SimpleNamespace:
         inverse_squared_eps: scalar
         smoothing_norm: scalar
         spiky_norm: scalar
-        periodic: wp.int32
+        periodic: int
         box: vector
         inverse_box: vector
         cell_scale: double_vector
         cell_shape: cell_vector
-        cell_count: wp.int32
-        cell_reach: wp.int32
+        cell_count: int
+        cell_reach: int
 
     @wp.func
     def cell_of(domain: Domain, position: vector):
@@ -101,7 +101,7 @@ def domain_types(space_dim: int, scalar: type) -> SimpleNamespace:
         return index
 
     @wp.func
-    def cell_place(domain: Domain, index: wp.int32):
+    def cell_place(domain: Domain, index: int):
         """Return the cell at an index in row-major order within its world."""
         cell = cell_vector()
         rest = index
@@ -113,11 +113,11 @@ def domain_types(space_dim: int, scalar: type) -> SimpleNamespace:
         return cell
 
     @wp.func
-    def row_width(domain: Domain, d: wp.int32):
+    def row_width(domain: Domain, d: int):
         return wp.min(wp.int32(2) * domain.cell_reach + 1, domain.cell_shape[d])
 
     @wp.func
-    def wrapped(coordinate: wp.int32, count: wp.int32):
+    def wrapped(coordinate: int, count: int):
         result = coordinate
         if coordinate < 0:
             result = coordinate + count
@@ -138,7 +138,7 @@ def domain_types(space_dim: int, scalar: type) -> SimpleNamespace:
         return rows
 
     @wp.func
-    def segment_cells(domain: Domain, cell: cell_vector, segment: wp.int32):
+    def segment_cells(domain: Domain, cell: cell_vector, segment: int):
         """Return the first cell and one past the last cell of a run, in row-major order."""
         width = row_width(domain, 0)
         nx = domain.cell_shape[0]

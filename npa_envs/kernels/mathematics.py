@@ -56,7 +56,7 @@ def spiky_factor(distance: Any, inverse_eps: Any, norm: Any):
 
 
 @wp.func
-def spiky_factor_wide(exact: wp.float64, start: Any, inverse_eps: Any, norm: Any):
+def spiky_factor_f64(exact: wp.float64, start: Any, inverse_eps: Any, norm: Any):
     """Spiky factor f in float64 from `exact` = r · r; a Newton step refines `start`, about 1 / |r|.
 
     In float64, because sums of spiky kernels cancel almost fully where particles are dense.
@@ -173,6 +173,14 @@ def make_smooth_inverse(space_dim: int, scalar: type) -> wp.Function:
     return smooth_inverse
 
 
+def perception_topic(state_gradient: bool, moment_inverse: str | None) -> str:
+    """Return the part of a perception module's name that says which sums it has."""
+    if not state_gradient:
+        return "smoothing"
+    corrections = {None: "uncorrected_", "threshold": "", "smooth": "smoothly_corrected_"}
+    return corrections[moment_inverse] + "perception"
+
+
 @cached_under_lock()
 def make_corrected(space_dim: int, scalar: type, width: int, moment_inverse: str | None) -> Any:
     """Return a Warp function that multiplies state gradients [D, width] by an inverse of M.
@@ -219,20 +227,20 @@ def make_log_scale_pull(vector: type) -> Any:
 
 
 @native.func_native()
-def falloff_within(squared: wp.float32, inverse_squared_eps: wp.float32) -> wp.float32:
+def falloff_within(squared: float, inverse_squared_eps: float) -> float:
     """1 - r^2 / eps^2 on CUDA, 0 beyond eps and for NaN."""
 
 
 @native.func_native()
-def log_scale_of_square(squared: wp.float32) -> wp.float32:
+def log_scale_of_square(squared: float) -> float:
     """L(v) / v on CUDA, from v . v: log(1 + |v|) / |v|."""
 
 
 @native.func_native()
-def inverse_root(value: wp.float32) -> wp.float32:
+def inverse_root(value: float) -> float:
     """1 / sqrt(value) on CUDA, with an error of at most two units in the last place."""
 
 
 @native.func_native()
-def within(value: wp.float32, limit: wp.float32) -> wp.float32:
+def within(value: float, limit: float) -> float:
     """The value clipped to plus and minus a limit, on CUDA; unchanged if the limit is NaN."""

@@ -56,15 +56,25 @@ def func_native(*parameters: Any) -> Callable[[Any], Any]:
     this decorator's name, used as an attribute of a module. `parameters` are the C++ template
     parameters that do not follow from the arguments: numbers, booleans, `npa`'s constants, types.
     """
+    return lambda stub: _native(stub, stub.__name__, parameters)
+
+
+def call_of(kernel: wp.Kernel, name: str, *parameters: Any) -> Any:
+    """Return a Warp function of the C++ function `npa::name`, with the arguments of a kernel."""
+
+    def stub(): ...
+
+    stub.__signature__ = inspect.signature(kernel.func)  # type: ignore[attr-defined]
+    stub.__annotations__, stub.__qualname__ = kernel.func.__annotations__, name
+    return _native(stub, name, parameters)
+
+
+def _native(stub: Any, name: str, parameters: tuple[Any, ...]) -> Any:
     template = f"<{', '.join(map(_in_cpp, parameters))}>" if parameters else ""
-
-    def make(stub: Any) -> Any:
-        signature = inspect.signature(stub)
-        call = f"npa::{stub.__name__}{template}({', '.join(signature.parameters)});"
-        returns = signature.return_annotation is not inspect.Signature.empty
-        return wp.func_native(f"    {'return ' * returns}{call}\n")(stub)
-
-    return make
+    signature = inspect.signature(stub)
+    returns = signature.return_annotation is not inspect.Signature.empty
+    call = f"npa::{name}{template}({', '.join(signature.parameters)});"
+    return wp.func_native(f"    {'return ' * returns}{call}\n")(stub)
 
 
 def named(*functions: Any, **others: Any) -> SimpleNamespace:

@@ -4,7 +4,7 @@ There are two backends. `kernels/portable/` is plain Warp for a CPU and for CUDA
 float64; it reads like `reference.py`. `kernels/cuda/` is for CUDA in float32 on compute capability
 8.0 and above: neighbour lists in 16 bits, sums shared by threads, tensor cores. An operator takes
 the first implementation in `TABLE` whose condition holds for a call. `npa-envs bench --explain`
-prints what was chosen.
+prints what was chosen. The operators of `ops/pictures/` choose by the device alone.
 """
 
 from __future__ import annotations
@@ -17,23 +17,19 @@ import torch
 
 from npa_envs.kernels.cuda.density import MIN_SIDE
 from npa_envs.kernels.cuda.equivariance import fits_block
+from npa_envs.kernels.cuda.network import WARP_UNITS
+from npa_envs.kernels.cuda.sort import BLOCKS, MAX_GRID
 
 Operator = Literal["sort", "density", "perceive", "adjoint", "vectors", "network", "update"]
 
 MAX_ROW, MAX_UPDATE, MAX_HIDDEN = 128, 32, 512
 """Widest rows and updates, and most hidden units, that the fused network takes."""
 
-UNIT_SHARE = 32
-"""Hidden units that one warp of the fused network computes."""
-
 MAX_THREAD_WORLD = 4096
 """Particles of the largest world that one CPU thread sorts."""
 
-MAX_BLOCK_WORLD = 4096
+MAX_BLOCK_WORLD = max(BLOCKS)
 """Particles of the largest world that one CUDA block sorts."""
-
-MAX_BLOCK_GRID = 4096
-"""Cells of the largest grid that fits into one CUDA block's shared memory."""
 
 SMALL_WORLD = 2048
 """Particles of the largest world that environments take as small."""
@@ -106,7 +102,7 @@ def _block(request: KernelRequest) -> bool:
         _cuda(request)
         and request.aligned
         and request.particle_count <= MAX_BLOCK_WORLD
-        and request.cell_count <= MAX_BLOCK_GRID
+        and request.cell_count <= MAX_GRID
     )
 
 
@@ -124,7 +120,7 @@ def _fused(request: KernelRequest) -> bool:
     return (
         _cuda(request)
         and all(width % 4 == 0 for width in widths)
-        and request.hidden_dim % UNIT_SHARE == 0
+        and request.hidden_dim % WARP_UNITS == 0
         and request.row_width <= MAX_ROW
         and request.update_width <= MAX_UPDATE
         and request.hidden_dim <= MAX_HIDDEN
@@ -143,7 +139,7 @@ TABLE: tuple[Implementation, ...] = (
         "block",
         "kernels/cuda/sort.py",
         f"{_MODERN}, worlds of at most {MAX_BLOCK_WORLD} particles and "
-        f"{MAX_BLOCK_GRID} cells: a block of threads sorts a world",
+        f"{MAX_GRID} cells: a block of threads sorts a world",
         _block,
     ),
     Implementation(
@@ -207,7 +203,7 @@ TABLE: tuple[Implementation, ...] = (
         "cuda",
         "kernels/cuda/network.py",
         f"{_MODERN}, rows of at most {MAX_ROW} columns, updates of {MAX_UPDATE}, "
-        f"{MAX_HIDDEN} hidden units in multiples of {UNIT_SHARE}: tensor cores",
+        f"{MAX_HIDDEN} hidden units in multiples of {WARP_UNITS}: tensor cores",
         _fused,
     ),
     Implementation("network", "torch", "torch's products", "otherwise", _always),
@@ -255,11 +251,14 @@ class Listing(NamedTuple):
         return -(-row_count // 32), self.capacity, 32
 
 
-CAPACITY, LARGE_CAPACITY, HUGE_CAPACITY, CROWDED_CAPACITY = 64, 128, 96, 256
-"""Longest lists: in small worlds of environments, by default, in huge worlds, in crowded boxes."""
+CAPACITY, CROWDED_CAPACITY = 128, 256
+"""Longest neighbour lists: by default, and in crowded boxes."""
+
+SMALL_WORLD_CAPACITY, HUGE_WORLD_CAPACITY = 64, 96
+"""The same in small worlds of environments, and in huge worlds of rollouts."""
 
 CROWD = range(80, 200)
-"""Mean neighbours at which many lists are longer than `LARGE_CAPACITY`, few `CROWDED_CAPACITY`."""
+"""Mean neighbours at which many lists are longer than `CAPACITY`, and few `CROWDED_CAPACITY`."""
 
 HUGE_WORLD = 2**22
 """Particles of the largest world whose neighbour lists may take more memory than its rows."""
@@ -272,17 +271,17 @@ def rollout_listing(request: KernelRequest, mean_neighbours: float = 0.0) -> Lis
     """Return how rollouts list neighbours: also a few worlds have to fill a GPU."""
     if request.particle_count <= SHARED_WORLD:
         crowded = int(mean_neighbours) in CROWD
-        capacity = CROWDED_CAPACITY if crowded else LARGE_CAPACITY
+        capacity = CROWDED_CAPACITY if crowded else CAPACITY
         tiled = choose("density", request).name == "tiles"
         return Listing(capacity, lanes=DENSITY_LANES, teams=2, tiled=tiled)
     # The lists of worlds that fill a device's memory would be the largest part of it.
     huge = request.particle_count > HUGE_WORLD
-    return Listing(HUGE_CAPACITY if huge else LARGE_CAPACITY, lanes=1, teams=1)
+    return Listing(HUGE_WORLD_CAPACITY if huge else CAPACITY, lanes=1, teams=1)
 
 
 def batch_listing(request: KernelRequest) -> Listing:
     """Return how environments list neighbours: their batches fill a GPU with less work a world."""
     if request.particle_count <= SMALL_WORLD:
-        return Listing(CAPACITY, lanes=1, teams=1)
+        return Listing(SMALL_WORLD_CAPACITY, lanes=1, teams=1)
     tiled = choose("density", request).name == "tiles"
-    return Listing(LARGE_CAPACITY, lanes=DENSITY_LANES if tiled else 1, teams=1, tiled=tiled)
+    return Listing(CAPACITY, lanes=DENSITY_LANES if tiled else 1, teams=1, tiled=tiled)

@@ -30,10 +30,10 @@ _transforms_active = torch._C._are_functorch_transforms_active
 PLAIN_TYPES = {Tensor, nn.Parameter, Physics, torch.dtype, bool, int, float, str, list, NoneType}
 """Types of arguments that kernels can read; a tensor subclass may wrap other tensors."""
 
-CURE = "or take small worlds with the slow operators of npa_envs.reference, which are plain torch"
+HINT = "or take small worlds with the slow operators of npa_envs.reference, which are plain torch"
 
 
-def check_derivatives(**given: Any) -> None:
+def check_derivatives(**arguments: Any) -> None:
     """Check that no forward-mode derivative and no function of `torch.func` uses these arguments.
 
     Forward-mode derivatives would be lost silently where no tensor requires a gradient.
@@ -45,22 +45,22 @@ def check_derivatives(**given: Any) -> None:
     # In this order: a compiler cannot trace the second condition.
     if not torch.compiler.is_compiling() and _transforms_active():
         raise NPAError(
-            f"{', '.join(given)} must not be given within a function of torch.func (grad, vjp, "
+            f"{', '.join(arguments)} must not be given within a function of torch.func (grad, vjp, "
             "jvp, jacrev, jacfwd, vmap, ...), which cannot look into kernels, got a call within "
             "one: take torch.autograd.grad for derivatives and a batch of worlds [B, N, D] for "
-            f"vmap, {CURE}"
+            f"vmap, {HINT}"
         )
     if forward_ad._current_level >= 0:
-        _check_tangents(given)
+        _check_tangents(arguments)
 
 
-def _check_tangents(given: dict[str, Any]) -> None:
+def _check_tangents(arguments: dict[str, Any]) -> None:
     """Check within a `dual_level` that no tensor carries a tangent."""
     if torch.compiler.is_compiling():
         # Tangents are visible only to calls that a compiler does not trace.
-        torch.compiler.disable(_check_tangents)(given)  # type: ignore[no-untyped-call]
+        torch.compiler.disable(_check_tangents)(arguments)  # type: ignore[no-untyped-call]
         return
-    for name, value in given.items():
+    for name, value in arguments.items():
         for tensor in _tensors(value):
             _, tangent = forward_ad.unpack_dual(tensor)  # type: ignore[no-untyped-call]
             if tangent is not None:
@@ -68,7 +68,7 @@ def _check_tangents(given: dict[str, Any]) -> None:
                     f"{name} must carry no tangent of forward-mode derivatives "
                     "(torch.autograd.forward_ad, strategy='forward-mode'), got one: kernels have "
                     "backward passes alone; take backward(), torch.autograd.grad or "
-                    f"strategy='reverse-mode', {CURE}"
+                    f"strategy='reverse-mode', {HINT}"
                 )
 
 
@@ -193,7 +193,7 @@ def once_differentiable(backward: Callable[Arguments, Result]) -> Callable[Argum
                 raise NPAError(
                     "is_grads_batched must be False where particles are perceived, moved or drawn, "
                     "and vectorize too, got several cotangents at once: run one backward pass for "
-                    f"each, {CURE}"
+                    f"each, {HINT}"
                 ) from error
             raise
 

@@ -2,18 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor
 
-from npa_envs.kernels.portable.draws import (
-    BITS_PER_THREAD,
-    INTEGERS_PER_THREAD,
-    draw_bernoulli,
-    draw_integers,
-    draw_kernels,
-)
+from npa_envs.kernels.portable.draws import draw_kernel
 from npa_envs.ops.custom_op import custom_op
 from npa_envs.ops.launch import launch, scalar_type
 
@@ -40,14 +32,7 @@ def draw(
     values = keys.new_empty(keys.shape[0], count, dtype=dtype)
     if values.numel() == 0:
         return values
-    arguments: tuple[Any, ...] = number, keys, episodes, steps, values
-    if kind == "bernoulli":
-        kernel, per_thread, arguments = draw_bernoulli, BITS_PER_THREAD, (bound, *arguments)
-    elif kind == "integers":
-        kernel, per_thread, arguments = draw_integers, INTEGERS_PER_THREAD, (bound, *arguments)
-    else:
-        kernels = draw_kernels(scalar_type(dtype))
-        kernel = kernels.draw_uniform if kind == "uniform" else kernels.draw_normal
-        per_thread = kernels.per_thread
-    launch(kernel, (values.shape[0], -(-count // per_thread)), keys.device, *arguments)
+    kernel, per_thread = draw_kernel(kind, scalar_type(dtype))
+    size = values.shape[0], -(-count // per_thread)
+    launch(kernel, size, keys.device, bound, number, keys, episodes, steps, values)
     return values

@@ -66,8 +66,8 @@ class EpisodeUpdate:
         flags: Tensor,
         endings: Tensor,
     ) -> None:
-        way = ON_DIVERGENCE[rules.on_divergence]
-        self._rules = (rules.last_step or 0, rules.rewarded_step or 0, way)
+        on_divergence = ON_DIVERGENCE[rules.on_divergence]
+        self._rules = (rules.last_step or 0, rules.rewarded_step or 0, on_divergence)
         self._read = (enabled, diverged, first_loss, success_loss)
         self._written = (elapsed, numbers, flags.view(torch.uint8), endings)
 

@@ -256,12 +256,12 @@ class _ReadRows(torch.autograd.Function):
     def forward(
         ctx: Any, rows: Tensor, mixing: Tensor, width: int, form: VectorForm
     ) -> tuple[Tensor, Tensor]:
-        found: tuple[Tensor, Tensor] = _read_rows(
+        outputs: tuple[Tensor, Tensor] = _read_rows(
             rows, mixing, width, form.space_dim, form.scalars, form.chiral
         )
         ctx.form = form
-        ctx.save_for_backward(rows, mixing, found[0])
-        return found
+        ctx.save_for_backward(rows, mixing, outputs[0])
+        return outputs
 
     @staticmethod
     @once_differentiable
@@ -306,8 +306,8 @@ def read_rows(rows: Tensor, mixing: Tensor, form: VectorForm, width: int) -> tup
     tensors = rows.contiguous(), mixing.contiguous()
     if not (torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)):
         return _read_rows(*tensors, width, form.space_dim, form.scalars, form.chiral)
-    found: tuple[Tensor, Tensor] = _ReadRows.apply(*tensors, width, form)  # type: ignore[no-untyped-call]
-    return found
+    outputs: tuple[Tensor, Tensor] = _ReadRows.apply(*tensors, width, form)  # type: ignore[no-untyped-call]
+    return outputs
 
 
 def signed_gates(weight: Tensor, steering: Tensor) -> tuple[Tensor, Tensor]:

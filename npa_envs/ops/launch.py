@@ -27,15 +27,20 @@ from npa_envs.kernels.native import MIN_RANGES
 from npa_envs.ops.driver import DriverLaunch
 from npa_envs.runtime import in_turn, quiet_warp, start_warp
 
-SCALARS: dict[torch.dtype, Any] = {torch.float32: wp.float32, torch.float64: wp.float64}
-"""Warp's scalar type for each floating dtype that the operators take."""
+SCALARS: dict[torch.dtype, Any] = {
+    torch.float32: wp.float32,
+    torch.float64: wp.float64,
+    torch.uint8: wp.uint8,
+    torch.int64: wp.int64,
+}
+"""Warp's scalar type for each dtype."""
 
 GROUP_WIDTHS = (4, 8, 16)
 """Channels that one thread sums together; worlds with more channels than 16 have several groups."""
 
 
 def scalar_type(dtype: torch.dtype) -> Any:
-    """Return Warp's scalar type for a checked floating dtype."""
+    """Return Warp's scalar type for a checked dtype."""
     return SCALARS[dtype]
 
 
@@ -115,9 +120,9 @@ def _null(tensor: Tensor) -> int:
     return 0
 
 
-def _overwrite(place: Any, made: Any) -> None:
+def _overwrite(place: Any, value: Any) -> None:
     """Copy a descriptor or a struct into the memory of the arguments."""
-    ctypes.memmove(ctypes.addressof(place), ctypes.addressof(made), ctypes.sizeof(made))
+    ctypes.memmove(ctypes.addressof(place), ctypes.addressof(value), ctypes.sizeof(value))
 
 
 def _description(tensor: Tensor, array_type: Any) -> Any:
@@ -126,10 +131,18 @@ def _description(tensor: Tensor, array_type: Any) -> Any:
     if array_type.ndim == 1:
         entry = getattr(array_type.dtype, "_shape_", ())
         tensor = tensor.view(tensor.numel() // math.prod(entry), *entry)
-    made = wp.from_torch(tensor, dtype=array_type.dtype, requires_grad=False, return_ctype=True)
+    descriptor = wp.from_torch(
+        tensor, dtype=array_type.dtype, requires_grad=False, return_ctype=True
+    )
     # Launches are cached, and must not keep their first tensors alive.
-    made._ref = None
-    return made
+    descriptor._ref = None
+    return descriptor
+
+
+def _type_of(argument: Any) -> Any:
+    """Return the type of a kernel's argument: a `wp.array` also for `wp.array2d[...]`."""
+    kind = argument.type
+    return wp.array(dtype=kind.dtype, ndim=kind.ndim) if hasattr(kind, "ndim") else kind
 
 
 class _StructArgument:
@@ -161,8 +174,8 @@ class _Arguments:
         arguments: tuple[Any, ...],
     ) -> None:
         where = warp_device(device)
-        types = [argument.type for argument in kernel.adj.args]
-        given = [
+        types = [_type_of(argument) for argument in kernel.adj.args]
+        values = [
             _description(value, kind) if isinstance(value, Tensor) else value
             for value, kind in zip(arguments, types, strict=True)
         ]
@@ -170,7 +183,7 @@ class _Arguments:
             self._launch = wp.launch(
                 kernel,
                 size,
-                inputs=given,
+                inputs=values,
                 device=where,
                 block_dim=block_dim if where.is_cuda else None,
                 record_tape=False,
@@ -179,22 +192,22 @@ class _Arguments:
             launched.add((kernel, device))
         self._device = device
         self._bounds = {size: self._launch.bounds}
-        made = self._launch.params[1:]
-        fields = [(f"a{k}", type(value)) for k, value in enumerate(made)]
-        self._memory: Any = _struct(tuple(fields))(*made)
+        parameters = self._launch.params[1:]
+        fields = [(f"a{k}", type(value)) for k, value in enumerate(parameters)]
+        self._memory: Any = _struct(tuple(fields))(*parameters)
         self._names = [name for name, _ in fields]
         setters = [
             self._setter(*argument) for argument in zip(self._names, types, arguments, strict=True)
         ]
         self._described = [(k, setter) for k, setter in enumerate(setters) if setter is not None]
         self._numbers = [k for k, setter in enumerate(setters) if setter is None]
-        self._last: list[Any] = [None] * len(made)
+        self._last: list[Any] = [None] * len(parameters)
         self._addresses: Any = None
         self._driven: DriverLaunch | None = None
         if where.is_cuda:
             begin, layout = ctypes.addressof(self._memory), type(self._memory)
             places = [begin + getattr(layout, name).offset for name in self._names]
-            self._addresses = (ctypes.c_void_p * (1 + len(made)))(0, *places)
+            self._addresses = (ctypes.c_void_p * (1 + len(parameters)))(0, *places)
             self._launch.params_addr = self._addresses
             self._driven = DriverLaunch(self._launch, device, self._addresses)
 
@@ -216,8 +229,8 @@ class _Arguments:
             if value != last[k]:
                 last[k] = value
                 kind = self._launch.kernel.adj.args[k].type
-                made = kind(*value) if isinstance(value, tuple) else value
-                setattr(self._memory, self._names[k], made)
+                number = kind(*value) if isinstance(value, tuple) else value
+                setattr(self._memory, self._names[k], number)
 
     def set_address(self, index: int, tensor: Tensor) -> None:
         """Set the address of an array argument to that of a tensor of the same form."""
@@ -353,14 +366,14 @@ def launch(
     if kernel in MIN_RANGES:
         arguments = (0, *arguments)
     tape = _ready.tape
+    ready: _Arguments | None
     if tape is not None:
         ready = tape.arguments(kernel, size, device, block_dim, arguments)
     else:
         key = (kernel, device, block_dim)
-        found = _ready.by_kernel.get(key)
-        if found is None:
-            found = _ready.by_kernel[key] = _Arguments(kernel, size, device, block_dim, arguments)
-        ready = found
+        ready = _ready.by_kernel.get(key)
+        if ready is None:
+            ready = _ready.by_kernel[key] = _Arguments(kernel, size, device, block_dim, arguments)
     ready.set(arguments)
     ready.run(size)
 
@@ -401,7 +414,7 @@ class Tape:
 
     def __init__(self) -> None:
         self._launches: list[tuple[_Arguments, tuple[int, ...]]] = []
-        self._given: list[list[Any]] = []
+        self._tensors: list[list[Any]] = []
         """Tensors in the arguments, kept alive: the arguments contain only their addresses."""
 
     def add(self, kernel: Any, size: Any, device: torch.device, *arguments: Any) -> None:
@@ -428,10 +441,10 @@ class Tape:
         arguments: tuple[Any, ...],
     ) -> _Arguments:
         """Add a launch to the tape, and return memory for its arguments."""
-        made = _Arguments(kernel, size, device, block_dim, arguments)
-        self._launches.append((made, size))
-        self._given.append(list(arguments))
-        return made
+        memory = _Arguments(kernel, size, device, block_dim, arguments)
+        self._launches.append((memory, size))
+        self._tensors.append(list(arguments))
+        return memory
 
     def __len__(self) -> int:
         """Return the number of launches."""
@@ -439,35 +452,35 @@ class Tape:
 
     def argument_slots(self, tensor: Tensor) -> list[tuple[_Arguments, int]]:
         """Return the arguments that are this tensor, which the caller now has to keep alive."""
-        places, address = [], tensor.data_ptr()
-        for (made, _), arguments in zip(self._launches, self._given, strict=True):
+        slots, address = [], tensor.data_ptr()
+        for (memory, _), arguments in zip(self._launches, self._tensors, strict=True):
             for k, value in enumerate(arguments):
                 if isinstance(value, Tensor) and value.data_ptr() == address:
                     arguments[k] = None
-                    places.append((made, k))
-        return places
+                    slots.append((memory, k))
+        return slots
 
-    def move(self, places: list[tuple[_Arguments, int]], tensor: Tensor) -> None:
+    def move(self, slots: list[tuple[_Arguments, int]], tensor: Tensor) -> None:
         """Replace these arguments by a tensor of the same form, which the caller keeps alive."""
-        for made, index in places:
-            made.set_address(index, tensor)
+        for memory, index in slots:
+            memory.set_address(index, tensor)
 
     def replay(
         self, begin: int = 0, end: int | None = None, *, last_count: int | None = None
     ) -> None:
         """Repeat some of the launches, the last with `last_count` threads if given."""
         launches = self._launches[begin:end]
-        for made, size in launches[:-1]:
-            made.run(size)
-        made, size = launches[-1]
-        made.run(size if last_count is None else (last_count, *size[1:]))
+        for memory, size in launches[:-1]:
+            memory.run(size)
+        memory, size = launches[-1]
+        memory.run(size if last_count is None else (last_count, *size[1:]))
 
 
 # CPU threads, as many as torch is set to use. Where torch ships GNU's OpenMP, they are torch's own
 # threads: after each operation these wait for the next one in a busy loop, and would compete for
 # the cores with another pool.
 
-SHARES = 4
+RANGES_PER_THREAD = 4
 """Ranges per thread, at most: a thread that is delayed, as by another process, runs fewer."""
 
 _Task = ctypes.CFUNCTYPE(None, ctypes.c_void_p)
@@ -527,7 +540,7 @@ def even_ranges(count: int, smallest: int) -> list[range]:
     if count < 2 * smallest:
         return [range(count)]
     threads = thread_count()
-    parts = min(threads * SHARES, count // smallest) if threads > 1 else 1
+    parts = min(threads * RANGES_PER_THREAD, count // smallest) if threads > 1 else 1
     ends = [count * k // parts for k in range(parts + 1)]
     return [range(begin, end) for begin, end in itertools.pairwise(ends)]
 

@@ -98,7 +98,7 @@ ROW_GROUP = 16
 LAYER_BLOCK = 64
 """Threads of a block of the forward pass: few, so that also few rows fill the device."""
 
-SHARES_PER_PROCESSOR = 2
+BLOCKS_PER_PROCESSOR = 2
 """Blocks per multiprocessor that sum weight gradients in parallel, where there are many rows."""
 
 FEW_ROWS = 160
@@ -153,17 +153,17 @@ def _weight_gradients(
         -(-width // 16), -(-width // 8), -(-out_width // 8), warps, unit_blocks, int(signs.shape[1])
     )
     processors = multiprocessor_count(rows.device)
-    each = 1 if count <= FEW_ROWS * processors else SHARES_PER_PROCESSOR
+    each = 1 if count <= FEW_ROWS * processors else BLOCKS_PER_PROCESSOR
     most = max(each * processors // unit_blocks, 1)
-    share_rows = max(-(-count // (most * ROW_GROUP)), 1) * ROW_GROUP
-    shares = -(-count // share_rows)
-    partial_sums = rows.new_empty(shares, unit_count * (width + out_width))
+    part_rows = max(-(-count // (most * ROW_GROUP)), 1) * ROW_GROUP
+    part_count = -(-count // part_rows)
+    partial_sums = rows.new_empty(part_count, unit_count * (width + out_width))
     launch(
         kernels.sum_weight_gradients,
-        shares * unit_blocks * warps * WARP,
+        part_count * unit_blocks * warps * WARP,
         rows.device,
         unit_count,
-        share_rows,
+        part_rows,
         aligned(rows),
         aligned(update_bar),
         signs,
@@ -173,7 +173,7 @@ def _weight_gradients(
     )
     total = rows.new_empty(partial_sums.shape[1])
     launch(
-        kernels.add_shares,
+        kernels.add_parts,
         -(-total.shape[0] // WARP) * SUM_WARPS * WARP,
         rows.device,
         partial_sums,

@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.kernels.access import CUDA_LANES, WARP
-from npa_envs.kernels.cuda.adjoint import SHARE, listed_adjoint
+from npa_envs.kernels.access import WARP
+from npa_envs.kernels.cuda.adjoint import THREAD_CHANNELS, listed_adjoint
 from npa_envs.kernels.cuda.adjoint import TILE as ADJOINT_TILE
 from npa_envs.kernels.cuda.density import LIST_BLOCK, TILE, listed_density, tiled_density
-from npa_envs.kernels.cuda.perceive import listed_perception
+from npa_envs.kernels.cuda.perceive import PerceptionVariant, listed_perception
 from npa_envs.kernels.portable.adjoint import adjoint_kernels
 from npa_envs.kernels.portable.density import density_kernels
 from npa_envs.kernels.portable.perceive import perception_kernels
@@ -198,10 +198,9 @@ def perception_launch(
         shifted = lists.steps[first_row // INTERLEAVED_LISTS :], lists.lengths[first_row:]
         lists = lists._replace(steps=shifted[0], lengths=shifted[1])
     if lists is not None:
-        kernel = listed_perception(
+        variant = PerceptionVariant(
             plan.space_dim,
             plan.width,
-            CUDA_LANES,
             terms.state_gradient,
             terms.correction,
             plan.periodic,
@@ -212,11 +211,10 @@ def perception_launch(
             lists.by_place,
             lists.listing.tiled,
         )
-        threads = row_count * plan.group_count * CUDA_LANES * lists.listing.teams
         source = ordered.states if states is None else states
         return (
-            kernel,
-            -(-threads // WARP) * WARP,
+            listed_perception(variant),
+            -(-row_count * plan.group_count * variant.lanes // WARP) * WARP,
             out.device,
             plan.domain,
             *numbers,
@@ -358,9 +356,7 @@ def _gather_by_cells(
         plan.domain,
         plan.particle_count,
         plan.state_dim,
-        plan.active_offset,
-        plan.row_base,
-        plan.row_capacity,
+        *plan.row_numbers,
         plan.group_count,
         saved.starts,
         ends,
@@ -408,10 +404,10 @@ def _gather_by_tiles(plan: KernelPlan, saved: SavedPerception, bar: Tensor) -> T
     norm = plan.domain.spiky_norm if state_gradient else plan.domain.smoothing_norm
     kinds = 1 + plan.space_dim * state_gradient
     entries = plan.row_capacity * plan.group_count + 1
-    cotangents = bar.new_empty(entries * kinds * plan.width // SHARE, SHARE)
+    cotangents = bar.new_empty(entries * kinds * plan.width // THREAD_CHANNELS, THREAD_CHANNELS)
     launch(
         kernels.unscale_cotangents,
-        entries * plan.width // SHARE,
+        entries * plan.width // THREAD_CHANNELS,
         bar.device,
         plan.state_dim,
         plan.physics.scale(),
@@ -435,9 +431,7 @@ def _gather_by_tiles(plan: KernelPlan, saved: SavedPerception, bar: Tensor) -> T
         plan.particle_count,
         tile_count,
         plan.state_dim,
-        plan.active_offset,
-        plan.row_base,
-        plan.row_capacity,
+        *plan.row_numbers,
         plan.group_count,
         saved.starts,
         saved.particles,

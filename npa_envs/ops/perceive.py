@@ -107,12 +107,12 @@ def perceive(
         inverse if checked_flag("moment_correction", moment_correction) else None,
         checked_flag("density_gradient", density_gradient),
     )
-    made = physics(space_dim, state_dim, x.dtype, eps=eps, eps0=eps0, box=box, terms=terms)
+    constants = physics(space_dim, state_dim, x.dtype, eps=eps, eps0=eps0, box=box, terms=terms)
     check_finite_positions(x)
     perception, rows = perceive_rows(
         x.detach() if checked_flag("detach_positions", detach_positions) else x,
         s,
-        made,
+        constants,
         mask=None,
         row_capacity=x.shape[0] * x.shape[1],
         row_width=terms.perception_dim(space_dim, state_dim),
@@ -144,12 +144,12 @@ def perception_fields(
     terms = Terms(moment_inverse=checked_moment_inverse(moment_inverse))
     check_world(x, s)
     check_derivatives(x=x, s=s)
-    made = physics(x.shape[2], s.shape[2], x.dtype, eps=eps, box=box, terms=terms)
-    check_finite_positions(x)
-    x, s = x.contiguous(), s.contiguous()
     world_count, particle_count, space_dim = x.shape
     state_dim = s.shape[2]
-    plan = plan_kernels(x, x.shape, state_dim, world_count * particle_count, False, made)
+    constants = physics(space_dim, state_dim, x.dtype, eps=eps, box=box, terms=terms)
+    check_finite_positions(x)
+    x, s = x.contiguous(), s.contiguous()
+    plan = plan_kernels(x, x.shape, state_dim, world_count * particle_count, False, constants)
     ordered = sort_worlds(plan, x, s, None)
     densities = compute_density_gradients(plan, ordered)
     fields = PerceptionFields(
@@ -237,15 +237,15 @@ class _PerceiveRows(torch.autograd.Function):
     """Perception of the active particles; the adjoint gathers, without atomics."""
 
     @staticmethod
-    def forward(ctx: Any, x: Tensor, s: Tensor, *given: Any) -> tuple[Tensor, ...]:
-        saved, row_source = _perceived(x, s, *given, for_adjoint=True)
-        _, static, _, masked, *_, physics = given
+    def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
+        saved, row_source = _perceived(*arguments, True)
+        _, s, _, static, _, masked, *_, physics = arguments
         ctx.set_materialize_grads(False)
         ctx.shape, ctx.masked, ctx.physics = s.shape, masked, physics
-        kept = saved if ctx.needs_input_grad[0] else saved[:-1]
+        tensors = saved if ctx.needs_input_grad[0] else saved[:-1]
         listed = () if static is None else static.listed or ()
-        ctx.saved_count = len(kept)
-        ctx.save_for_backward(*kept, *listed)
+        ctx.saved_count = len(tensors)
+        ctx.save_for_backward(*tensors, *listed)
         if static is not None:
             return (saved.perception,)
         ctx.mark_non_differentiable(saved.row_of, row_source, saved.starts)
@@ -274,18 +274,15 @@ def _perceived(
     mask: Tensor | None,
     static: StaticWorlds | None,
     rows: StaticRows | None,
-    masked: bool,
-    row_capacity: int,
-    row_width: int,
-    physics: Physics,
-    *,
-    for_adjoint: bool,
+    *options: Any,
 ) -> tuple[SavedPerception, Tensor]:
-    """Return perception with the tensors of its adjoint, and the particles of its rows."""
-    options = masked, row_capacity, row_width, physics, for_adjoint
+    """Return perception with the tensors of its adjoint, and the particles of its rows.
+
+    Options are those of `_perceive_rows`, from `masked` on.
+    """
     if static is None or rows is None:
-        *found, row_source = _perceive_rows(x, s, mask, [], *options)
-        return SavedPerception(*found), row_source
+        *saved_tensors, row_source = _perceive_rows(x, s, mask, [], *options)
+        return SavedPerception(*saved_tensors), row_source
     perception, kernel_sum = _perceive_rows(x, s, None, [*rows, *static.flat()], *options)
     saved = SavedPerception(
         perception,
@@ -329,15 +326,15 @@ def perceive_rows(
     if static is not None:
         x = x.detach()
         rows = all_rows(static, x) if rows is None else rows
-    given = x, s, mask, static, rows, masked, row_capacity, row_width, physics
+    arguments = x, s, mask, static, rows, masked, row_capacity, row_width, physics
     if torch.is_grad_enabled() and (x.requires_grad or s.requires_grad):
-        perception, *places = _PerceiveRows.apply(*given)  # type: ignore[no-untyped-call]
+        perception, *maps = _PerceiveRows.apply(*arguments)  # type: ignore[no-untyped-call]
     else:
-        saved, row_source = _perceived(*given, for_adjoint=False)
-        perception, places = saved.perception, [saved.row_of, row_source, saved.starts]
+        saved, row_source = _perceived(*arguments, False)
+        perception, maps = saved.perception, [saved.row_of, row_source, saved.starts]
     if rows is not None:
-        places = [rows.row_of, rows.row_source, rows.starts]
-    row_of, row_source, starts = places
+        maps = [rows.row_of, rows.row_source, rows.starts]
+    row_of, row_source, starts = maps
     return perception, Rows(row_of, row_source, starts, x.shape[0] * x.shape[1] if masked else 0)
 
 
@@ -368,8 +365,10 @@ def updates_in_parts(
     updates = None
     for first in range(0, row_capacity, ROWS_TOGETHER):
         some = perception[: min(ROWS_TOGETHER, row_capacity - first)]
-        given = plan, ordered, densities, some
-        launch(*perception_launch(*given, first_row=first, row_count=len(some)))
+        arguments = perception_launch(
+            plan, ordered, densities, some, first_row=first, row_count=len(some)
+        )
+        launch(*arguments)
         mapped = network(some)
         if updates is None:
             updates = mapped.new_empty(row_capacity, mapped.shape[1])

@@ -15,6 +15,7 @@ from npa_envs.checks import (
     checked_box,
     checked_eps,
     checked_number,
+    checked_positive,
     constant,
 )
 from npa_envs.errors import NPAError, shown
@@ -205,17 +206,15 @@ def _checked(
         raise NPAError(f"box must be None where boundary is 'open', got {shown(box)}: leave it out")
     if boundary == "reflecting" and box is None:
         raise NPAError("box must be given where boundary is 'reflecting', got None: give its sides")
-    given: Any = eps0 if eps is None else eps
-    radius = checked_eps("eps", given, space_dim, dtype)
+    unchecked: Any = eps0 if eps is None else eps
+    radius = checked_eps("eps", unchecked, space_dim, dtype)
     radius0 = radius if eps0 is None else constant(eps0)
     check_scale(radius, radius0, space_dim, dtype)
     update_prob = checked_number("update_prob", update_prob)
-    dt = checked_number("dt", dt)
+    dt = checked_positive("dt", dt)
     position_noise = checked_number("position_noise", position_noise)
     if not 0.0 < update_prob <= 1.0:
         raise NPAError(f"update_prob must lie in (0, 1], got {update_prob}")
-    if not (math.isfinite(dt) and dt > 0.0):
-        raise NPAError(f"dt must be positive and finite, got {dt}")
     if not (math.isfinite(position_noise) and position_noise >= 0.0):
         raise NPAError(f"position_noise must be finite and not negative, got {position_noise}")
     periodic = boundary != "reflecting"

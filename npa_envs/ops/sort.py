@@ -11,7 +11,7 @@ from torch import Tensor
 
 from npa_envs.errors import NPAError
 from npa_envs.kernels.access import CUDA_LANES, WARP
-from npa_envs.kernels.cuda.sort import BLOCKS, STATE_SHARE, order_particles, sort_small_worlds
+from npa_envs.kernels.cuda.sort import BLOCKS, THREAD_CHANNELS, order_particles, sort_small_worlds
 from npa_envs.kernels.domain import cell_grid, make_domain
 from npa_envs.kernels.portable.sort import sort_kernels
 from npa_envs.ops.backend import (
@@ -118,6 +118,11 @@ class KernelPlan(NamedTuple):
     def row_base(self) -> int:
         """Offset of the entries for active rows in `starts`: entry minus offset is a row."""
         return self.total if self.masked else 0
+
+    @property
+    def row_numbers(self) -> tuple[int, int, int]:
+        """What kernels need to give active particles rows: offset, base and capacity."""
+        return self.active_offset, self.row_base, self.row_capacity
 
     @property
     def density_scale(self) -> float:
@@ -259,11 +264,11 @@ def sort_worlds(
         arrived,
     )
 
-    ordered = _empty_worlds(plan, x, s, with_rows)
+    ordered = _empty_worlds(plan, x, s is not None, with_rows, starts)
     on_cuda = plan.runs("sort", aligned=False) == "cuda"
     # Channels that a thread reads and writes at once where they are aligned.
-    share = plan.width // CUDA_LANES if on_cuda else plan.width
-    aligned = s is not None and plan.state_dim % share == 0 and is_aligned(s)
+    together = plan.width // CUDA_LANES if on_cuda else plan.width
+    aligned = s is not None and plan.state_dim % together == 0 and is_aligned(s)
     launch(
         order_particles(plan.space_dim, plan.width) if on_cuda else kernels.order_particles,
         # A warp moves the states of 32 particles.
@@ -274,29 +279,32 @@ def sort_worlds(
         plan.group_count,
         int(aligned),
         s,
-        plan.active_offset,
-        plan.row_base,
-        plan.row_capacity,
+        *plan.row_numbers,
         arrived,
-        starts,
         *ordered,
     )
-    return SortedWorlds(starts, *ordered)
+    return ordered
 
 
-def _empty_worlds(plan: KernelPlan, x: Tensor, s: Tensor | None, with_rows: bool) -> list[Tensor]:
-    """Return empty tensors for all fields of `SortedWorlds` except `starts`."""
-    total, device = plan.total, x.device
-    source, sorted_cell = torch.empty(2, total, dtype=torch.int32, device=device).unbind()
+def _empty_worlds(
+    plan: KernelPlan, x: Tensor, with_states: bool, with_rows: bool, starts: Tensor | None = None
+) -> SortedWorlds:
+    """Return tensors for sorted worlds, not written yet, except for `starts` if given."""
+    total = plan.total
+    source, cell = torch.empty(2, total, dtype=torch.int32, device=x.device).unbind()
     row_capacity = plan.row_capacity if with_rows else 0
-    row_of = source.new_empty(total if with_rows else 0)
     row_source = source.new_empty(row_capacity)
-    row_place = torch.empty_like(row_source)
-    sorted_positions = x.new_empty(total, plan.space_dim)
-    row_positions = x.new_empty(row_capacity, plan.space_dim)
-    sorted_states = x.new_empty(0 if s is None else total * plan.group_count, plan.width)
-    integers = [source, sorted_cell, row_of, row_source, row_place]
-    return [*integers, sorted_positions, row_positions, sorted_states]
+    return SortedWorlds(
+        starts=source.new_empty(plan.start_count) if starts is None else starts,
+        source=source,
+        cell=cell,
+        row_of=source.new_empty(total if with_rows else 0),
+        row_source=row_source,
+        row_place=torch.empty_like(row_source),
+        positions=x.new_empty(total, plan.space_dim),
+        row_positions=x.new_empty(row_capacity, plan.space_dim),
+        states=x.new_empty(total * plan.group_count if with_states else 0, plan.width),
+    )
 
 
 def block_capacity(request: KernelRequest, *tensors: Tensor | None) -> int:
@@ -317,9 +325,7 @@ def _sort_by_threads(
     plan: KernelPlan, x: Tensor, s: Tensor | None, mask: Tensor | None, with_rows: bool
 ) -> SortedWorlds:
     """Sort small worlds on a CPU in one launch, a thread each."""
-    ordered = _empty_worlds(plan, x, s, with_rows)
-    source = ordered[0]
-    starts = source.new_empty(plan.start_count)
+    ordered = _empty_worlds(plan, x, s is not None, with_rows)
     launch(
         sort_kernels(plan.space_dim, plan.scalar, plan.width).sort_worlds,
         plan.world_count,
@@ -333,14 +339,11 @@ def _sort_by_threads(
         plan.group_count,
         int(s is not None and plan.state_dim % plan.width == 0 and is_aligned(s)),
         s,
-        plan.active_offset,
-        plan.row_base,
-        plan.row_capacity,
-        torch.empty_like(source),
-        starts,
+        *plan.row_numbers,
+        torch.empty_like(ordered.source),
         *ordered,
     )
-    return SortedWorlds(starts, *ordered)
+    return ordered
 
 
 def _sort_by_blocks(
@@ -352,8 +355,7 @@ def _sort_by_blocks(
     with_rows: bool,
 ) -> SortedWorlds:
     """Sort small worlds on CUDA in one launch, a block each."""
-    ordered = _empty_worlds(plan, x, s, with_rows)
-    starts = torch.empty(plan.start_count, dtype=torch.int32, device=x.device)
+    ordered = _empty_worlds(plan, x, s is not None, with_rows)
     slices = slice_count(x.device, plan.world_count, plan.particle_count)
     block = BLOCKS[capacity]
     launch(
@@ -365,19 +367,16 @@ def _sort_by_blocks(
         slices,
         x,
         plan.state_dim,
-        1 if s is None else plan.group_count * plan.width // STATE_SHARE,
-        int(plan.state_dim % STATE_SHARE == 0),
+        1 if s is None else plan.group_count * plan.width // THREAD_CHANNELS,
+        int(plan.state_dim % THREAD_CHANNELS == 0),
         s,
         int(plan.masked),
         mask,
-        plan.active_offset,
-        plan.row_base,
-        plan.row_capacity,
-        starts,
+        *plan.row_numbers,
         *ordered,
         block_dim=block,
     )
-    return SortedWorlds(starts, *ordered)
+    return ordered
 
 
 def grouped_states(plan: KernelPlan, s: Tensor) -> Tensor:

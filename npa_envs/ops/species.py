@@ -40,13 +40,13 @@ class SpeciesFields(NamedTuple):
 
 def checked_counts(counts: Sequence[int], particle_count: int) -> tuple[int, ...]:
     """Return how many particles each species has, integers of at least 1 that sum to N."""
-    given = entries(counts)
-    if given is None:
+    numbers = entries(counts)
+    if numbers is None:
         raise NPAError(
             f"counts must have one number of particles for each species, got {shown(counts)}: "
             f"for example counts=({particle_count},)"
         )
-    checked = tuple(checked_count("an entry of counts", count) for count in given)
+    checked = tuple(checked_count("an entry of counts", count) for count in numbers)
     if not 1 <= len(checked) <= MAX_SPECIES:
         raise NPAError(f"counts must name 1 to {MAX_SPECIES} species, got {len(checked)}")
     if min(checked) < 1:
@@ -128,9 +128,9 @@ def species_fields(
     check_world(x, x)
     check_derivatives(x=x)
     checked = checked_counts(counts, x.shape[1])
-    made = physics(x.shape[2], 1, x.dtype, eps=eps, box=box)
+    constants = physics(x.shape[2], 1, x.dtype, eps=eps, box=box)
     check_finite_positions(x)
-    return SpeciesFields(*_gather_species(x.detach().contiguous(), list(checked), made, False))
+    return SpeciesFields(*_gather_species(x.detach().contiguous(), list(checked), constants, False))
 
 
 def perceive_species(
@@ -168,7 +168,7 @@ def perceive_species(
     checked = checked_counts(counts, x.shape[1])
     if eps0 is not None:
         eps0 = checked_eps("eps0", eps0, x.shape[2], x.dtype)
-    made = physics(x.shape[2], s.shape[2], x.dtype, eps=eps, eps0=eps0, box=box)
-    shared = perceive(x, s, made.eps, made.eps0, made.box, detach_positions)
-    appended = perceive_by_species(x, checked, made)
+    constants = physics(x.shape[2], s.shape[2], x.dtype, eps=eps, eps0=eps0, box=box)
+    shared = perceive(x, s, constants.eps, constants.eps0, constants.box, detach_positions)
+    appended = perceive_by_species(x, checked, constants)
     return torch.cat((shared, appended), dim=-1)

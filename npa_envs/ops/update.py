@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -10,11 +10,11 @@ from torch import Tensor
 from npa_envs.checks import check_world
 from npa_envs.errors import NPAError
 from npa_envs.kernels.portable.update import (
-    CHANNEL_SHARE,
     OPEN,
     PERIODIC,
     REFLECTING,
     TEAM,
+    THREAD_CHANNELS,
     UPDATE_ALIGNMENT,
     VALUES_PER_THREAD,
     find_not_finite,
@@ -29,7 +29,7 @@ from npa_envs.ops.sort import MAX_INDEX
 
 def _threads_for(count: int) -> int:
     """Return the number of threads that share `count` channels."""
-    return -(-count // CHANNEL_SHARE)
+    return -(-count // THREAD_CHANNELS)
 
 
 def _boundary(physics: Physics, space_dim: int) -> tuple[int, tuple[float, ...]]:
@@ -62,7 +62,7 @@ def _update_particles(
     update = update.contiguous()
     # Adjacent channels are read and written at once where their addresses are aligned.
     alignment = UPDATE_ALIGNMENT[space_dim]
-    aligned = state_dim % CHANNEL_SHARE == 0 and is_aligned(s)
+    aligned = state_dim % THREAD_CHANNELS == 0 and is_aligned(s)
     aligned = aligned and (4 * update.shape[1]) % alignment == 0
     aligned = aligned and is_aligned(update, alignment)
     launch(
@@ -111,7 +111,7 @@ def _update_particles_backward(
         row_base,
         state_dim,
         update.shape[1],
-        int(update.shape[1] % CHANNEL_SHARE == 0),
+        int(update.shape[1] % THREAD_CHANNELS == 0),
         starts,
         row_source,
         update.contiguous(),
@@ -146,8 +146,8 @@ class _UpdateParticles(torch.autograd.Function):
     def backward(ctx: Any, *bars: Tensor) -> tuple[Tensor | None, ...]:
         update, row_source, starts, *places = ctx.saved_tensors
         bars = _before_reflection(ctx.options[1], update, *places, *bars) if places else bars
-        given: list[Any] = [update, *bars, row_source, starts, *ctx.options]
-        update_bar = _update_particles_backward(*given)
+        arguments: list[Any] = [update, *bars, row_source, starts, *ctx.options]
+        update_bar = _update_particles_backward(*arguments)
         return (update_bar, *bars, None, None)
 
 
@@ -179,8 +179,8 @@ def update_particles(
 
 def _images(x: Tensor, sides: tuple[float, ...]) -> Tensor:
     """Return the integer index of the image of the box in which each coordinate lies."""
-    own = [torch.floor(x.detach()[..., d] / side + 0.5) for d, side in enumerate(sides)]
-    return torch.stack(own, dim=-1)
+    images = [torch.floor(x.detach()[..., d] / side + 0.5) for d, side in enumerate(sides)]
+    return torch.stack(images, dim=-1)
 
 
 def _mirror_signs(x: Tensor, walls: tuple[float, ...]) -> Tensor:
@@ -200,6 +200,91 @@ def bounded(x: Tensor, physics: Physics) -> Tensor:
     """Return a copy of positions, wrapped into a periodic box or reflected at walls."""
     inside = wrapped(x, physics.walls or physics.box)
     return inside if physics.walls is None else inside * _mirror_signs(x, physics.walls)
+
+
+class ActedWorlds(NamedTuple):
+    """Worlds that actions change in place, and the other tensors of a step."""
+
+    x: Tensor
+    """Positions [length units], shape [B, N, D]."""
+    s: Tensor
+    """States, dimensionless, shape [B, N, C]."""
+    mask: Tensor | None
+    """Which particles act, uint8, shape [B, N]; None: all."""
+    noise: Tensor | None
+    """Added to every position [length units], shape [B, N, D]."""
+    enabled: Tensor | None
+    """Whether anything changes, uint8, shape [1]."""
+    diverged: Tensor
+    """Set to 1 for worlds that diverged, uint8, shape [B]."""
+
+    def check(self, action: Tensor, physics: Physics) -> None:
+        """Check shapes, dtypes, devices and strides."""
+        x, s = self.x, self.s
+        check_world(x, s)
+        check_derivatives(action=action, x=x, s=s, noise=self.noise)
+        worlds = x.shape[:2]
+        action_dim = s.shape[2] + (x.shape[2] if physics.moving else 0)
+        for name, tensor, size, dtype in (
+            ("x", x, x.shape, x.dtype),
+            ("s", s, s.shape, x.dtype),
+            ("action", action, (*worlds, action_dim), x.dtype),
+            ("mask", self.mask, worlds, torch.uint8),
+            ("noise", self.noise, x.shape, x.dtype),
+            ("enabled", self.enabled, (1,), torch.uint8),
+            ("diverged", self.diverged, worlds[:1], torch.uint8),
+        ):
+            if tensor is None:
+                continue
+            shape = tuple(size)
+            if tuple(tensor.shape) != shape or tensor.dtype != dtype or tensor.device != x.device:
+                raise NPAError(
+                    f"{name} must be {dtype} of shape {shape} on {x.device}, got {tensor.dtype} of "
+                    f"shape {tuple(tensor.shape)} on {tensor.device}: convert or reshape it"
+                )
+            if not tensor.is_contiguous():
+                raise NPAError(
+                    f"{name} must be contiguous, got strides {tensor.stride()}: "
+                    f"make it so with {name}.contiguous()"
+                )
+        if action.numel() >= MAX_INDEX:
+            raise NPAError(
+                f"actions must stay below {MAX_INDEX} numbers in one batch, got "
+                f"{action.numel()}: split the batch"
+            )
+
+    def launch_of(self, action: Tensor, physics: Physics, aligned: bool) -> tuple[Any, ...]:
+        """Return the arguments of `launch`; `aligned`: states and actions are, to 16 bytes."""
+        x, s, mask, noise, enabled, diverged = self
+        world_count, particle_count, space_dim = x.shape
+        state_dim = s.shape[2]
+        # Then adjacent channels are read and written at once.
+        aligned = aligned and state_dim % THREAD_CHANNELS == 0
+        aligned = aligned and (space_dim % 2 == 0 or not physics.moving)
+        return (
+            update_kernels(space_dim, scalar_type(x.dtype)).apply_actions,
+            world_count * particle_count * _threads_for(state_dim),
+            x.device,
+            particle_count,
+            physics.max_displacement * physics.dt,
+            physics.limits.state_scale * physics.dt,
+            *_boundary(physics, space_dim),
+            int(physics.moving),
+            physics.limits.position,
+            physics.limits.state,
+            int(mask is not None),
+            mask,
+            int(noise is not None),
+            noise,
+            int(enabled is not None),
+            enabled,
+            state_dim,
+            int(aligned),
+            action,
+            x,
+            s,
+            diverged,
+        )
 
 
 def apply_actions(
@@ -224,35 +309,24 @@ def apply_actions(
     every position. Nothing changes if `enabled` (uint8, [1]) is 0. `diverged` (uint8, [B]) is set
     to 1 for worlds that diverged and not changed for others.
     """
-    _check_worlds(action, x, s, physics, mask, noise, enabled, diverged)
-    aligned = is_aligned(s) and is_aligned(action)
-    launch(*_launch_of(action, x, s, physics, mask, noise, enabled, diverged, aligned=aligned))
+    worlds = ActedWorlds(x, s, mask, noise, enabled, diverged)
+    worlds.check(action, physics)
+    launch(*worlds.launch_of(action, physics, is_aligned(s) and is_aligned(action)))
 
 
 class PreparedActions:
     """`apply_actions` to worlds in fixed tensors, with launches prepared once.
 
-    Arguments are those of `apply_actions`. The values of mask and noise may change before each
-    call. `enabled` is set to 0 if an action is not finite, and never set to 1.
+    The values of mask and noise may change before each call. `enabled` is set to 0 if an action is
+    not finite, and never set to 1.
     """
 
-    def __init__(
-        self,
-        x: Tensor,
-        s: Tensor,
-        physics: Physics,
-        *,
-        mask: Tensor | None,
-        noise: Tensor | None,
-        enabled: Tensor,
-        diverged: Tensor,
-    ) -> None:
-        self._buffer = s.new_zeros(*s.shape[:2], physics.action_dim)
-        self._worlds = (x, s)
+    def __init__(self, worlds: ActedWorlds, physics: Physics) -> None:
+        self._buffer = worlds.s.new_zeros(*worlds.s.shape[:2], physics.action_dim)
+        self._worlds = worlds
         self._physics = physics
-        self._step = (mask, noise, enabled, diverged)
         self._tape: Tape | None = None
-        _check_worlds(self._buffer, x, s, physics, *self._step)
+        worlds.check(self._buffer, physics)
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out the tape, which cannot be pickled."""
@@ -288,102 +362,11 @@ class PreparedActions:
     def _run(self, action: Tensor) -> None:
         if self._tape is None:
             self._tape = Tape()
-            x, s = self._worlds
+            x, s = self._worlds[:2]
             threads = -(-action.numel() // VALUES_PER_THREAD)
             check = find_not_finite(scalar_type(x.dtype))
-            self._tape.add(check, threads, x.device, threads, action, self._step[2])
-            aligned = is_aligned(s)
-            launched = _launch_of(action, x, s, self._physics, *self._step, aligned=aligned)
-            self._tape.add(*launched)
+            self._tape.add(check, threads, x.device, threads, action, self._worlds.enabled)
+            self._tape.add(*self._worlds.launch_of(action, self._physics, is_aligned(s)))
             self._places = self._tape.argument_slots(action)
         self._tape.move(self._places, action)
         self._tape.replay()
-
-
-def _launch_of(
-    action: Tensor,
-    x: Tensor,
-    s: Tensor,
-    physics: Physics,
-    mask: Tensor | None,
-    noise: Tensor | None,
-    enabled: Tensor | None,
-    diverged: Tensor,
-    *,
-    aligned: bool,
-) -> tuple[Any, ...]:
-    """Return the update's arguments of `launch`; `aligned`: tensors are aligned to 16 bytes."""
-    world_count, particle_count, space_dim = x.shape
-    state_dim = s.shape[2]
-    # Then adjacent channels are read and written at once.
-    aligned = (
-        aligned and state_dim % CHANNEL_SHARE == 0 and (space_dim % 2 == 0 or not physics.moving)
-    )
-    return (
-        update_kernels(space_dim, scalar_type(x.dtype)).apply_actions,
-        world_count * particle_count * -(-state_dim // CHANNEL_SHARE),
-        x.device,
-        particle_count,
-        physics.max_displacement * physics.dt,
-        physics.limits.state_scale * physics.dt,
-        *_boundary(physics, space_dim),
-        int(physics.moving),
-        physics.limits.position,
-        physics.limits.state,
-        int(mask is not None),
-        mask,
-        int(noise is not None),
-        noise,
-        int(enabled is not None),
-        enabled,
-        state_dim,
-        int(aligned),
-        action,
-        x,
-        s,
-        diverged,
-    )
-
-
-def _check_worlds(
-    action: Tensor,
-    x: Tensor,
-    s: Tensor,
-    physics: Physics,
-    mask: Tensor | None,
-    noise: Tensor | None,
-    enabled: Tensor | None,
-    diverged: Tensor,
-) -> None:
-    check_world(x, s)
-    check_derivatives(action=action, x=x, s=s, noise=noise)
-    world_count, particle_count, space_dim = x.shape
-    action_dim = s.shape[2] + (space_dim if physics.moving else 0)
-    worlds = (world_count, particle_count)
-    for name, tensor, size, dtype in (
-        ("x", x, x.shape, x.dtype),
-        ("s", s, s.shape, x.dtype),
-        ("action", action, (*worlds, action_dim), x.dtype),
-        ("mask", mask, worlds, torch.uint8),
-        ("noise", noise, x.shape, x.dtype),
-        ("enabled", enabled, (1,), torch.uint8),
-        ("diverged", diverged, (world_count,), torch.uint8),
-    ):
-        if tensor is None:
-            continue
-        shape = tuple(size)
-        if tuple(tensor.shape) != shape or tensor.dtype != dtype or tensor.device != x.device:
-            raise NPAError(
-                f"{name} must be {dtype} of shape {shape} on {x.device}, got {tensor.dtype} of "
-                f"shape {tuple(tensor.shape)} on {tensor.device}: convert or reshape it"
-            )
-        if not tensor.is_contiguous():
-            raise NPAError(
-                f"{name} must be contiguous, got strides {tensor.stride()}: "
-                f"make it so with {name}.contiguous()"
-            )
-    if action.numel() >= MAX_INDEX:
-        raise NPAError(
-            f"actions must stay below {MAX_INDEX} numbers in one batch, got {action.numel()}: "
-            f"split the batch"
-        )

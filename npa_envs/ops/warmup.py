@@ -16,15 +16,15 @@ from npa_envs.ops.draws import draw
 from npa_envs.ops.episodes import EpisodeRules, EpisodeUpdate
 from npa_envs.ops.equivariance import MIXED_VECTORS, VectorForm, read_rows, steer_rows
 from npa_envs.ops.network import arrange_weights, run_network
-from npa_envs.ops.perceive import Rows, build_neighbours, perceive, perceive_rows
-from npa_envs.ops.physics import Limits, Physics, Terms
+from npa_envs.ops.perceive import build_neighbours, perceive, perceive_rows
+from npa_envs.ops.physics import Limits, Physics
 from npa_envs.ops.pictures.cameras import orbit
 from npa_envs.ops.pictures.gaussians import render_gaussians
 from npa_envs.ops.pictures.losses import picture_losses
 from npa_envs.ops.pictures.splat import splat
 from npa_envs.ops.pictures.triangles import nearest_triangles
 from npa_envs.ops.static import prepare_static, static_rows
-from npa_envs.ops.update import PreparedActions, update_particles
+from npa_envs.ops.update import ActedWorlds, PreparedActions, update_particles
 from npa_envs.ops.world_mean import world_mean
 
 
@@ -63,24 +63,25 @@ def warmup(
             x = torch.zeros(1, 2, space_dim, dtype=dtype, device=device, requires_grad=True)
             s = torch.zeros(1, 2, state_dim, dtype=dtype, device=device, requires_grad=True)
             _pull_back(perceive(x, s, 0.1, detach_positions=False))
-            _warm_rows(x, s)
-            _warm_network(x, s)
-            _warm_invariants(x, s)
-            _warm_update(x, s)
-            _warm_actions(x, s)
-            for places, states in _sizes(x, s):
-                build_neighbours(places, states, _physics(x, s)).perceive()
+            limits = Limits(1.0, 1.0, 1.0, 1.0)
+            physics = Physics(space_dim, state_dim, 0.1, 0.1, max_displacement=0.1, limits=limits)
+            _warm_steps(x, s, physics)
+            _warm_network(x, physics)
+            _warm_invariants(x, state_dim)
+            _warm_actions(x, s, physics)
+            for positions, states in _sizes(x, s):
+                build_neighbours(positions, states, physics).perceive()
             if space_dim == 2:
                 _warm_pictures(x)
             else:
                 _warm_views(x)
 
 
-def _chosen(name: str, given: Any, known: tuple[Any, ...]) -> list[Any]:
+def _chosen(name: str, value: Any, known: tuple[Any, ...]) -> list[Any]:
     """Return the values given, one or several, after checking that each is known."""
-    chosen = entries(given)
+    chosen = entries(value)
     if not chosen or not all(value in known for value in chosen):
-        raise NPAError(f"{name} must be some of {known}, got {shown(given)}: name one or both")
+        raise NPAError(f"{name} must be some of {known}, got {shown(value)}: name one or both")
     return chosen
 
 
@@ -100,30 +101,28 @@ def _warm_judgement(elapsed: torch.Tensor) -> None:
     judge(number[None])
 
 
-def _physics(x: torch.Tensor, s: torch.Tensor) -> Physics:
-    return Physics(
-        x.shape[2], s.shape[2], 0.1, 0.1, max_displacement=0.1, limits=Limits(1.0, 1.0, 1.0, 1.0)
-    )
-
-
 def _sizes(x: torch.Tensor, *others: torch.Tensor) -> Iterator[list[torch.Tensor]]:
     """Yield small, medium and large worlds, which run different kernels."""
     for count in (x.shape[1], SHARED_WORLD, SHARED_WORLD + 1):
         yield [value.detach()[:, :1].expand(-1, count, -1) for value in (x, *others)]
 
 
-def _warm_rows(x: torch.Tensor, s: torch.Tensor) -> None:
-    """Run perception as in rollouts: moving and static worlds, with and without a mask."""
-    physics = _physics(x, s)
+def _warm_steps(x: torch.Tensor, s: torch.Tensor, physics: Physics) -> None:
+    """Run perception and update as in rollouts: moving and static worlds, all or some particles."""
     width = physics.perception_dim + 1
-    for places, states in _sizes(x, s):
-        count = places.shape[1]
+    for positions, states in _sizes(x, s):
+        count = positions.shape[1]
         mask = torch.ones(1, count, dtype=torch.uint8, device=x.device)
         for chosen, gradients in itertools.product((None, mask), (False, True)):
-            given = places, states.clone().requires_grad_(gradients), physics
-            rows, _ = perceive_rows(*given, mask=chosen, row_capacity=count, row_width=width)
+            worlds = positions, states.clone().requires_grad_(gradients)
+            rows, maps = perceive_rows(
+                *worlds, physics, mask=chosen, row_capacity=count, row_width=width
+            )
+            update = rows[:, : physics.action_dim]
+            path_length = x.new_zeros(1, count)
+            _, moved, _ = update_particles(update, *worlds, path_length, maps, physics)
             if gradients:
-                _pull_back(rows)
+                _pull_back(moved)
     static = prepare_static(x, physics)
     mask = torch.ones(x.shape[:2], dtype=torch.uint8, device=x.device)
     for active in (None, *static_rows(static, x.detach(), [mask], x.shape[1])):
@@ -132,11 +131,10 @@ def _warm_rows(x: torch.Tensor, s: torch.Tensor) -> None:
         _pull_back(rows)
 
 
-def _warm_network(x: torch.Tensor, s: torch.Tensor) -> None:
+def _warm_network(x: torch.Tensor, physics: Physics) -> None:
     """Run the fused network where it supports the sizes, with and without displacements."""
-    space_dim, state_dim = x.shape[2], s.shape[2]
-    width = Terms().perception_dim(space_dim, state_dim) + 1
-    for out in (space_dim + state_dim, state_dim):
+    width = physics.perception_dim + 1
+    for out in (physics.action_dim, physics.state_dim):
         shapes = (1, width + -width % 4), (128, width + -width % 4), (out + -out % 4, 128)
         rows, hidden, update = (x.new_zeros(shape).requires_grad_() for shape in shapes)
         for gradients in (False, True):
@@ -149,9 +147,9 @@ def _warm_network(x: torch.Tensor, s: torch.Tensor) -> None:
             _pull_back(updates)
 
 
-def _warm_invariants(x: torch.Tensor, s: torch.Tensor) -> None:
+def _warm_invariants(x: torch.Tensor, state_dim: int) -> None:
     """Run the vector kernels of equivariant rules."""
-    space_dim, state_dim = x.shape[2], s.shape[2]
+    space_dim = x.shape[2]
     for chiral in (False, True)[: 4 - space_dim]:
         form = VectorForm(space_dim, 2 * state_dim, state_dim + 1, MIXED_VECTORS, chiral)
         rows = x.new_zeros(1, form.perception_dim + 1).requires_grad_()
@@ -166,8 +164,8 @@ def _warm_pictures(x: torch.Tensor) -> None:
     picture = splat(x, colours, resolution=8, pixel_size=0.1)
     _pull_back(picture)
     target, middle = picture.detach()[0], x.new_zeros(2)
-    for places, states in _sizes(x, colours):
-        picture_losses(places, states, target, goal=middle, shift=0.0, pixel_size=0.1)
+    for positions, states in _sizes(x, colours):
+        picture_losses(positions, states, target, goal=middle, shift=0.0, pixel_size=0.1)
 
 
 def _warm_views(x: torch.Tensor) -> None:
@@ -189,27 +187,10 @@ def _warm_views(x: torch.Tensor) -> None:
     )
 
 
-def _warm_update(x: torch.Tensor, s: torch.Tensor) -> None:
-    none = torch.full((x.shape[1],), -1, dtype=torch.int32, device=x.device)
-    rows = Rows(row_of=none, row_source=none, starts=torch.zeros_like(none), row_base=0)
-    update = torch.zeros(
-        x.shape[1], x.shape[2] + s.shape[2], dtype=x.dtype, device=x.device, requires_grad=True
-    )
-    moved = update_particles(update, x, s, x.new_zeros(x.shape[:2]), rows, _physics(x, s))
-    _pull_back(moved[0])
-
-
-def _warm_actions(x: torch.Tensor, s: torch.Tensor) -> None:
-    actions = PreparedActions(
-        x.detach().clone(),
-        s.detach().clone(),
-        _physics(x, s),
-        mask=None,
-        noise=None,
-        enabled=torch.ones(1, dtype=torch.uint8, device=x.device),
-        diverged=torch.zeros(x.shape[0], dtype=torch.uint8, device=x.device),
-    )
-    actions(x.new_zeros(*x.shape[:2], x.shape[2] + s.shape[2]))
+def _warm_actions(x: torch.Tensor, s: torch.Tensor, physics: Physics) -> None:
+    enabled, diverged = torch.ones(2, 1, dtype=torch.uint8, device=x.device)
+    worlds = ActedWorlds(x.detach().clone(), s.detach().clone(), None, None, enabled, diverged)
+    PreparedActions(worlds, physics)(x.new_zeros(*x.shape[:2], physics.action_dim))
 
 
 def _pull_back(value: torch.Tensor) -> None:

@@ -23,7 +23,7 @@ from npa_envs.ops.episodes import (
 from npa_envs.ops.perceive import NeighbourState, build_neighbours
 from npa_envs.ops.physics import Boundary, Limits, Physics, Terms
 from npa_envs.ops.species import perceive_by_species
-from npa_envs.ops.update import PreparedActions, wrapped
+from npa_envs.ops.update import ActedWorlds, PreparedActions, wrapped
 from npa_envs.ops.world_mean import world_mean
 from npa_envs.world.randomness import WorldRandom
 from npa_envs.world.steps import draw_step
@@ -82,23 +82,23 @@ class Actions(PreparedActions):
             mask = torch.zeros(x.shape[:2], dtype=torch.uint8, device=x.device)
         if physics.position_noise > 0.0:
             noise = torch.zeros_like(x)
-        super().__init__(x, s, physics, mask=mask, noise=noise, enabled=enabled, diverged=diverged)
+        super().__init__(ActedWorlds(x, s, mask, noise, enabled, diverged), physics)
 
     apply = PreparedActions.__call__
 
     @torch.no_grad()
     def draw(self) -> None:
         """Draw the next step's masks and noise; may be captured in a CUDA graph."""
-        *held, _, diverged = self._step
+        x, _, mask, noise, _, diverged = self._worlds
         diverged.zero_()
-        drawn = draw_step(self._worlds[0], self._physics, self._random)
-        for own, new in zip(held, drawn[:2], strict=True):
+        drawn = draw_step(x, self._physics, self._random)
+        for own, new in zip((mask, noise), drawn[:2], strict=True):
             if own is not None and new is not None:
                 own.copy_(new)
 
     def updated(self) -> Tensor:
         """Return which particles the last draw updates, bool, shape [B, N]."""
-        mask = self._step[0]
+        mask = self._worlds.mask
         return self._everyone if mask is None else mask.bool()
 
 

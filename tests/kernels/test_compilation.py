@@ -16,7 +16,7 @@ from npa_envs.kernels.cuda.network import (
     two_layer_kernel,
     weight_gradient_kernels,
 )
-from npa_envs.kernels.cuda.perceive import listed_perception
+from npa_envs.kernels.cuda.perceive import PerceptionVariant, listed_perception
 from npa_envs.kernels.cuda.sort import BLOCKS, order_particles, sort_small_worlds
 from npa_envs.kernels.cuda.splat import sort_small_splats
 from npa_envs.kernels.pictures.blending import block_kernels
@@ -25,21 +25,38 @@ from npa_envs.kernels.portable.episodes import update_episodes
 from npa_envs.ops import warmup
 from npa_envs.ops.launch import launched
 
+
+def perception(*switches: Any, **more: Any) -> wp.Kernel:
+    return listed_perception(PerceptionVariant(*switches, **more))
+
+
 VARIANTS: dict[str, Callable[[], Any]] = {
     "sort": lambda: sort_small_worlds(3, 1024),
+    "sort 2D": lambda: sort_small_worlds(2, max(BLOCKS)),
+    "order": lambda: order_particles(2, 16),
+    "splats": lambda: sort_small_splats(max(BLOCKS)),
     "density": lambda: listed_density(2, 4, True, 128, True),
+    "density 3D": lambda: listed_density(3, 1, False, 128, False),
     "density in tiles": lambda: tiled_density(True, 256, True),
-    "perceive": lambda: listed_perception(
-        3, 16, 4, True, "smooth", False, True, 128, True, teams=2
+    "perceive": lambda: perception(3, 16, True, "smooth", False, True, 128, True, 2),
+    "perceive tiles": lambda: perception(
+        2, 16, True, "threshold", True, False, 256, False, 2, by_place=True, tiled=True
     ),
     "adjoint": lambda: listed_adjoint(3, 16, True, True, True).gather_state_cotangents,
+    "adjoint 2D": lambda: listed_adjoint(2, 16, True, False, False).unscale_cotangents,
     "network": lambda: two_layer_kernel(4, 2, "note"),
-    "network's gradients": lambda: weight_gradient_kernels(4, 8, 2, 4, 1, 4).add_shares,
+    "network's masks": lambda: two_layer_kernel(5, 3, "mask"),
+    "network without masks": lambda: two_layer_kernel(5, 3, "rectify"),
+    "network's gradients": lambda: weight_gradient_kernels(4, 8, 2, 4, 1, 4).add_parts,
+    "arrangement": lambda: arrangement_kernels().arrange_hidden,
     "vectors": lambda: row_kernels(2, 32, 17, 8, True).pull_back_rows,
+    "vectors 3D": lambda: row_kernels(3, 32, 17, 8, False).read_rows,
     "sums of vectors": mixing_sum,
     "steering": lambda: steering_kernels(2, 8, True).steer,
+    "steering 3D": lambda: steering_kernels(3, 8, False).steer,
     "pictures": lambda: block_kernels(wp.float32).pull_back_blocks,
     "errors of pictures": lambda: gather_errors(wp.float64),
+    "errors in float32": lambda: gather_errors(wp.float32),
 }
 
 
@@ -69,33 +86,6 @@ def compile_for(kernel, capability, folder):
     wp.compile_aot_module(kernel.module, arch=capability, module_dir=folder, use_ptx=False)
 
 
-def cuda_engine():
-    """A variant of each kernel of kernels/cuda/, in 2D and 3D."""
-    for space_dim in (2, 3):
-        yield listed_density(space_dim, 1, True, 128, False)
-        yield listed_density(space_dim, 4, False, 128, True)
-        yield listed_perception(
-            space_dim, 16, 4, True, "threshold", False, False, 128, True, teams=2
-        )
-        yield listed_adjoint(space_dim, 16, True, False, False).unscale_cotangents
-        yield order_particles(space_dim, 16)
-        yield sort_small_worlds(space_dim, max(BLOCKS))
-    yield sort_small_splats(max(BLOCKS))
-    yield gather_errors(wp.float32)
-    yield tiled_density(True, 256, False)
-    yield listed_perception(
-        2, 16, 4, True, "smooth", True, False, 256, False, teams=2, by_place=True, tiled=True
-    )
-    yield arrangement_kernels().arrange_hidden
-    for mode in ("rectify", "note", "mask"):
-        yield two_layer_kernel(5, 3, mode)
-    yield weight_gradient_kernels(5, 9, 3, 4, 1, 4).sum_weight_gradients
-    yield mixing_sum()
-    for space_dim in (2, 3):
-        yield row_kernels(space_dim, 32, 17, 8, space_dim == 2).read_rows
-        yield steering_kernels(space_dim, 8, space_dim == 2).steer
-
-
 @pytest.mark.parametrize("capability", [TURING, MODERN[-1]])
 def test_a_kernel_compiles_with_all_native_code_for_the_oldest_and_the_newest(capability, tmp_path):
     compile_for(update_episodes, capability, tmp_path)
@@ -114,5 +104,5 @@ def test_portable_kernels_compile_for_turing(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("capability", MODERN)
 def test_cuda_kernels_compile_from_ampere_on(capability, tmp_path):
-    for kernel in cuda_engine():
-        compile_for(kernel, capability, tmp_path)
+    for kernel in VARIANTS.values():
+        compile_for(kernel(), capability, tmp_path)

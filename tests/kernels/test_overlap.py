@@ -43,7 +43,7 @@ def test_kernels_that_wait_do_so_first():
         "adjoint.unscale_cotangents",
         "adjoint.gather_state_cotangents",
         "network.sum_weight_gradients",
-        "network.add_shares",
+        "network.add_parts",
     }
 
 

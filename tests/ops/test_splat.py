@@ -5,7 +5,7 @@ import torch
 from worlds import assert_same, exact, relative_error, with_gradients
 
 from npa_envs import reference as oracle
-from npa_envs.kernels.pictures.splat import make_lens
+from npa_envs.kernels.pictures.splat import make_view
 from npa_envs.ops import periodic_splat, splat
 from npa_envs.ops.launch import launch, scalar_type
 from npa_envs.ops.pictures import splat as pictures
@@ -93,12 +93,12 @@ def test_picture_and_adjoints_equal_the_oracle(dtype, draw, options, device):
 def test_gathered_and_scattered_pictures_are_the_same(resolution, pixel_size, device):
     x, colour = scattered(2, 61, torch.float64, device)
     x[1, 3] = torch.nan
-    lens = make_lens(scalar_type(x.dtype), resolution, pixel_size, 1.0, -1.0, 1.0)
-    expected, *_ = scatter_splats(Splats(x, colour), lens)
-    starts, footprints, source = sort_splats(Splats(x, colour), lens)
+    view = make_view(scalar_type(x.dtype), resolution, pixel_size, 1.0, -1.0, 1.0)
+    expected, *_ = scatter_splats(Splats(x, colour), view)
+    starts, footprints, source = sort_splats(Splats(x, colour), view)
     assert sorted(source.tolist()) == list(range(122))
     picture = torch.full_like(expected, torch.nan)
-    threads, given = gather_threads(2, resolution, x.device), (lens, starts, footprints)
+    threads, given = gather_threads(2, resolution, x.device), (view, starts, footprints)
     launch(device_kernels(x).gather_splats, threads, x.device, *given, picture.view(-1, 4))
     torch.testing.assert_close(picture, expected, rtol=1e-12, atol=1e-13)
 
@@ -117,14 +117,14 @@ def test_splats_of_small_worlds_are_sorted_as_others_are(
     x[-1, 0, 1] = 1e30
     if goal is None:
         x[-1, 0, 0] = torch.nan
-    lens = make_lens(scalar_type(x.dtype), 24, 0.11, 1.0, -1.0, 1.0)
+    view = make_view(scalar_type(x.dtype), 24, 0.11, 1.0, -1.0, 1.0)
     splats = Splats(x, states, 0.5, None if goal is None else torch.tensor(goal, device=device))
-    found = sort_splats(splats, lens)
+    found = sort_splats(splats, view)
     monkeypatch.setattr(pictures, "block_capacity", lambda *worlds: 0)
-    starts, footprints, source = sort_splats(splats, lens)
+    starts, footprints, source = sort_splats(splats, view)
     assert torch.equal(found[0], starts)
     # What nobody sees lies in any order at each world's end.
-    hidden = starts[lens.cell_count - 1 :: lens.cell_count]
+    hidden = starts[view.cell_count - 1 :: view.cell_count]
     for world, begin in enumerate(hidden.tolist()):
         seen = slice(world * particle_count, begin)
         assert torch.equal(found[1][seen], footprints[seen])

@@ -23,7 +23,7 @@ from npa_envs.ops.perceive import build_neighbours
 from npa_envs.ops.physics import Limits, Physics, Terms
 from npa_envs.ops.pictures.losses import picture_losses
 from npa_envs.ops.pictures.splat import splat
-from npa_envs.ops.update import PreparedActions, update_particles
+from npa_envs.ops.update import ActedWorlds, PreparedActions, update_particles
 
 STATE_DIM = 5
 SMALL_RANGE = 7
@@ -82,8 +82,8 @@ def acted(x, s):
     x, s = x.clone(), s.clone()
     diverged = torch.zeros(x.shape[0], dtype=torch.uint8)
     enabled = torch.ones(1, dtype=torch.uint8)
-    given = {"mask": None, "noise": None, "enabled": enabled, "diverged": diverged}
-    actions = PreparedActions(x, s, physics_of(x), **given)
+    worlds = ActedWorlds(x, s, None, None, enabled, diverged)
+    actions = PreparedActions(worlds, physics_of(x))
     generator = torch.Generator().manual_seed(2)
     for _ in range(2):
         shape = (*x.shape[:2], x.shape[2] + STATE_DIM)
@@ -125,7 +125,7 @@ def test_results_are_the_same_bits_for_every_number_of_threads(
         cuts.clear()
         set_threads(thread_count)
         assert_same(run(x, s), expected)
-        assert max(cuts) == thread_count * threads.SHARES
+        assert max(cuts) == thread_count * threads.RANGES_PER_THREAD
 
 
 @pytest.mark.parametrize(("particle_count", "ranges"), [(2000, [3, 3]), (1000, [])])

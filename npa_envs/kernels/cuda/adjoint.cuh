@@ -127,7 +127,7 @@ __device__ inline FourChannels sum_listed(
 }
 
 // A thread has two channels of two particles; adjacent threads swap, to have four of one particle.
-__device__ inline FourChannels share_tile(FourChannels total)
+__device__ inline FourChannels regroup_tile(FourChannels total)
 {
     const bool odd = threadIdx.x & 4u;
     const float first = __shfl_xor_sync(~0u, odd ? total[0] : total[1], 4);

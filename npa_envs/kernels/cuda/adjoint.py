@@ -49,14 +49,14 @@ CHANNELS = wp.types.vector(4, wp.float32)
 CUDA_REGISTERS = 64
 """Registers per thread in the gathering of state cotangents."""
 
-SHARE = 4
+THREAD_CHANNELS = 4
 """Channels of a row that one thread unscales."""
 
 MAX_LENGTH = 3.4028234663852886e38
 """The largest float32, a bound on any coordinate [length units]."""
 
-load_channels = make_wide_load(CHANNELS, wp.float32)
-store_channels = make_wide_store(CHANNELS, wp.float32)
+load_channels = make_wide_load(CHANNELS)
+store_channels = make_wide_store(CHANNELS)
 
 
 @cached_under_lock()
@@ -70,13 +70,13 @@ def make_sum_listed(space_dim: int, width: int, kinds: int, periodic: bool) -> w
     @native.func_native(space_dim, width, kinds, periodic)
     def sum_listed(
         address: wp.uint32,
-        count: wp.int32,
+        count: int,
         position: vector,
-        inverse_eps: wp.float32,
-        inverse_squared_eps: wp.float32,
+        inverse_eps: float,
+        inverse_squared_eps: float,
         box: vector,
         inverse_box: vector,
-        channels: wp.array(dtype=wp.float32),
+        channels: wp.array[wp.float32],
         value: CHANNELS,
     ) -> CHANNELS: ...
 
@@ -95,59 +95,53 @@ def make_read_columns(count: int) -> wp.Function:
 
     @native.func_native(count)
     def read_columns(
-        values: wp.array(dtype=wp.float32, ndim=2), row: wp.int32, column: wp.int32, end: wp.int32
+        values: wp.array2d[wp.float32], row: int, column: int, end: int
     ) -> result_type: ...
 
     return read_columns
 
 
 @native.func_native()
-def write_columns(
-    values: wp.array(dtype=wp.float32, ndim=2), row: wp.int32, column: wp.int32, entry: CHANNELS
-):
+def write_columns(values: wp.array2d[wp.float32], row: int, column: int, entry: CHANNELS):
     """Write four adjacent columns of a row, except those beyond its end."""
 
 
 @native.func_native()
-def append_entry(address: wp.uint32, count: wp.int32, accepted: wp.bool, entry: ENTRY) -> wp.int32:
+def append_entry(address: wp.uint32, count: int, accepted: bool, entry: ENTRY) -> int:
     """Append the entries of the threads with `accepted`; return the list's new length."""
 
 
 @native.func_native()
-def pad_list(address: wp.uint32, count: wp.int32, entry: ENTRY) -> wp.int32:
+def pad_list(address: wp.uint32, count: int, entry: ENTRY) -> int:
     """Pad a list with an entry up to a multiple of `TILE`; return its new length."""
 
 
 @native.func_native()
-def carry_rest(address: wp.uint32, summed: wp.int32, count: wp.int32):
+def carry_rest(address: wp.uint32, summed: int, count: int):
     """Move entries that are not summed yet, fewer than `TILE`, to the list's beginning."""
 
 
 @native.func_native()
-def prefetch_columns(values: wp.array(dtype=wp.float32, ndim=2), row: wp.int32, column: wp.int32):
+def prefetch_columns(values: wp.array2d[wp.float32], row: int, column: int):
     """Prefetch a column of a row, which is read later."""
 
 
 @native.func_native()
-def share_tile(total: CHANNELS) -> CHANNELS:
+def regroup_tile(total: CHANNELS) -> CHANNELS:
     """Redistribute the sums of `sum_listed`: each thread gets four channels of one particle."""
 
 
 @native.func_native()
-def smallest_in_tile(value: wp.float32) -> wp.float32:
+def smallest_in_tile(value: float) -> float:
     """Return the smallest value of the tile's particles, which have four threads each."""
 
 
-read_channels = make_read_columns(SHARE)
+read_channels = make_read_columns(THREAD_CHANNELS)
 
 
 @cached_under_lock()
 def listed_adjoint(
-    space_dim: int,
-    width: int,
-    state_gradient: bool,
-    periodic: bool,
-    grouped: bool,
+    space_dim: int, width: int, state_gradient: bool, periodic: bool, grouped: bool
 ) -> SimpleNamespace:
     """Return the kernels of one variant.
 
@@ -160,30 +154,30 @@ def listed_adjoint(
     vector, Domain = types.vector, types.Domain
     cell_of, periodic_image = types.cell_of, types.periodic_image
     cell_vector = wp.types.vector(space_dim, wp.int32)
-    share_gradient = wp.types.matrix((space_dim, SHARE), scalar)
+    thread_gradient = wp.types.matrix((space_dim, THREAD_CHANNELS), scalar)
     kinds = 1 + space_dim if state_gradient else 1
     topic = "listed_adjoint" if state_gradient else "listed_smoothing_adjoint"
     topic += "_in_box" * periodic + "_grouped" * grouped
     module = kernel_module(topic, space_dim, scalar, width)
-    load_vector = make_wide_load(vector, scalar)
-    parts = width // SHARE
+    load_vector = make_wide_load(vector)
+    parts = width // THREAD_CHANNELS
     sum_listed = make_sum_listed(space_dim, width, kinds, periodic)
     log_scale_pull = make_log_scale_pull(vector)
-    read_gradients = make_read_columns(SHARE * space_dim)
+    read_gradients = make_read_columns(THREAD_CHANNELS * space_dim)
 
     @wp.kernel(enable_backward=False, module=module, grid_stride=False)
     def unscale_cotangents(
-        state_dim: wp.int32,
+        state_dim: int,
         gradient_scale: scalar,
         blur_scale: scalar,
-        row_base: wp.int32,
-        row_capacity: wp.int32,
-        group_count: wp.int32,
-        starts: wp.array(dtype=wp.int32),
-        perception: wp.array(dtype=scalar, ndim=2),
-        perception_bar: wp.array(dtype=scalar, ndim=2),
+        row_base: int,
+        row_capacity: int,
+        group_count: int,
+        starts: wp.array[wp.int32],
+        perception: wp.array2d[scalar],
+        perception_bar: wp.array2d[scalar],
         # outputs
-        cotangents: wp.array(dtype=CHANNELS),
+        cotangents: wp.array[CHANNELS],
     ):
         """Write the cotangents of each row's unscaled sums from the cotangent of z.
 
@@ -195,7 +189,7 @@ def listed_adjoint(
         row_parts = group_count * wp.static(parts)
         row = wp.int32(wp.uint32(thread) / wp.uint32(row_parts))
         part = thread - row * row_parts
-        channel = part * wp.static(SHARE)
+        channel = part * wp.static(THREAD_CHANNELS)
         entry = row * group_count + part / wp.static(parts)
         place = entry * wp.static(kinds * parts) + part % wp.static(parts)
         if row == row_capacity and part < wp.static(parts):
@@ -210,8 +204,8 @@ def listed_adjoint(
                 end = (2 + wp.static(space_dim)) * state_dim
                 scaled = read_gradients(perception, row, column, end)
                 bars = read_gradients(perception_bar, row, column, end)
-                pulled = share_gradient()
-                for c in range(wp.static(SHARE)):
+                pulled = thread_gradient()
+                for c in range(wp.static(THREAD_CHANNELS)):
                     value = vector()
                     bar = vector()
                     for d in range(wp.static(space_dim)):
@@ -224,12 +218,12 @@ def listed_adjoint(
                     store_channels(cotangents, place + (d + 1) * wp.static(parts), pulled[d])
 
     @wp.func
-    def lines_around(domain: Domain, d: wp.int32):
+    def lines_around(domain: Domain, d: int):
         """Return the number of lines of cells with neighbours, along a direction across lines."""
         return wp.min(wp.int32(2) * domain.cell_reach + 1, domain.cell_shape[d])
 
     @wp.func
-    def around(place: wp.int32, count: wp.int32):
+    def around(place: int, count: int):
         """Wrap a cell coordinate that is at most one grid size outside."""
         return wp.where(place < 0, place + count, wp.where(place < count, place, place - count))
 
@@ -242,7 +236,7 @@ def listed_adjoint(
         return line
 
     @wp.func
-    def run_cells(domain: Domain, line: wp.int32, begin: wp.int32, end: wp.int32, run: wp.int32):
+    def run_cells(domain: Domain, line: int, begin: int, end: int, run: int):
         """Return the first cell and one past the last cell of a run, in row-major order.
 
         Runs go from column `begin` to `end` on the lines around a line; a line has two runs if the
@@ -270,7 +264,7 @@ def listed_adjoint(
         return base + first, base + last
 
     @wp.func
-    def columns_around(domain: Domain, first: wp.int32, last: wp.int32):
+    def columns_around(domain: Domain, first: int, last: int):
         """Return the range of columns with neighbours of particles in a range, not wrapped."""
         nx = domain.cell_shape[0]
         width = wp.min(last - first + 2 * domain.cell_reach + 1, nx)
@@ -278,7 +272,7 @@ def listed_adjoint(
         return begin, begin + width
 
     @wp.func
-    def count_runs(domain: Domain, to_column: wp.int32):
+    def count_runs(domain: Domain, to_column: int):
         """Return the number of runs of cells around particles on a line, up to a column."""
         runs = lines_around(domain, 1)
         if wp.static(space_dim == 3):
@@ -286,7 +280,7 @@ def listed_adjoint(
         return wp.where(to_column > domain.cell_shape[0], 2 * runs, runs)
 
     @wp.func
-    def box_around(domain: Domain, position: vector, origin: vector, served: wp.bool):
+    def box_around(domain: Domain, position: vector, origin: vector, served: bool):
         """Return centre, relative to an origin, and half sides of served particles' bounds."""
         relative = position - origin
         if wp.static(periodic):
@@ -313,7 +307,7 @@ def listed_adjoint(
         return squared < scalar(SLACK) * domain.squared_eps
 
     @wp.func
-    def entry_of(position: vector, number: wp.int32):
+    def entry_of(position: vector, number: int):
         """Return the list entry of a row."""
         entry = ENTRY()
         for d in range(wp.static(space_dim)):
@@ -322,7 +316,7 @@ def listed_adjoint(
         return entry
 
     @wp.func
-    def load_position(particles: wp.array(dtype=scalar), k: wp.int32):
+    def load_position(particles: wp.array[scalar], k: int):
         """Return the position of a particle [length units]."""
         position = vector()
         for d in range(wp.static(space_dim)):
@@ -343,24 +337,24 @@ def listed_adjoint(
     def gather_state_cotangents(
         domain: Domain,
         norm: scalar,
-        particle_count: wp.int32,
-        tile_count: wp.int32,
-        state_dim: wp.int32,
-        active_offset: wp.int32,
-        row_base: wp.int32,
-        row_capacity: wp.int32,
-        group_count: wp.int32,
-        starts: wp.array(dtype=wp.int32),
-        particles: wp.array(dtype=scalar),
-        source: wp.array(dtype=wp.int32),
-        row_of: wp.array(dtype=wp.int32),
-        row_positions: wp.array(dtype=vector),
-        row_kernel_sum: wp.array(dtype=vector),
-        perception_bar: wp.array(dtype=scalar, ndim=2),
-        cotangents: wp.array(dtype=CHANNELS),
-        flat_cotangents: wp.array(dtype=scalar),
+        particle_count: int,
+        tile_count: int,
+        state_dim: int,
+        active_offset: int,
+        row_base: int,
+        row_capacity: int,
+        group_count: int,
+        starts: wp.array[wp.int32],
+        particles: wp.array[scalar],
+        source: wp.array[wp.int32],
+        row_of: wp.array[wp.int32],
+        row_positions: wp.array[vector],
+        row_kernel_sum: wp.array[vector],
+        perception_bar: wp.array2d[scalar],
+        cotangents: wp.array[CHANNELS],
+        flat_cotangents: wp.array[scalar],
         # outputs
-        states_bar: wp.array(dtype=scalar, ndim=2),
+        states_bar: wp.array2d[scalar],
     ):
         """Write the cotangent of every particle's state, from the active rows around it.
 
@@ -384,7 +378,7 @@ def listed_adjoint(
         k = first + (lane >> 2)
         written = first + 2 * (lane & 3) + ((lane >> 2) & 1)
         part = lane >> 3
-        channel = g * wp.static(width) + part * wp.static(SHARE)
+        channel = g * wp.static(width) + part * wp.static(THREAD_CHANNELS)
         i = load_integer(source, wp.min(written, end - 1))
         position = load_position(particles, wp.min(k, end - 1))
         own_row = load_integer(row_of, i)
@@ -465,8 +459,8 @@ def listed_adjoint(
                                     total[n + 2] += found[n + 2]
                             found = CHANNELS()
                             block = wp.int32(0)
-        total = share_tile(total)
-        if written < end and part * wp.static(SHARE) < wp.static(width) and channel < state_dim:
+        total = regroup_tile(total)
+        if written < end and part < wp.static(parts) and channel < state_dim:
             volume_place = written * wp.static(space_dim + 1) + wp.static(space_dim)
             bar = (norm * load_scalar(particles, volume_place)) * total
             if own_row >= 0:

@@ -66,7 +66,7 @@ are nearest to its tile's particles may differ."""
 TILE_REGISTERS = 64
 """Registers per thread, so that a multiprocessor runs 32 warps."""
 
-store_record = make_wide_store(RECORD, wp.float32)
+store_record = make_wide_store(RECORD)
 
 
 @cached_under_lock()
@@ -84,8 +84,8 @@ def listed_density(
     cell_place, segment_count = types.cell_place, types.segment_count
     segment_cells = types.segment_cells
     periodic_image = types.periodic_image
-    load_vector = make_wide_load(vector, scalar)
-    add_scalar = make_lane_sum(scalar, scalar, lanes)
+    load_vector = make_wide_load(vector)
+    add_scalar = make_lane_sum(scalar, lanes)
     many = AHEAD if lanes == 1 else SHARED_AHEAD
     positions_ahead = wp.types.matrix((many, space_dim), scalar)
     room = min(capacity, SHARE_OF_LIST * capacity // lanes)
@@ -94,21 +94,18 @@ def listed_density(
     def list_address() -> wp.uint32: ...
 
     @native.func_native(LIST_BLOCK)
-    def list_end_of(address: wp.uint32, entries: wp.int32) -> LIST_END: ...
+    def list_end_of(address: wp.uint32, entries: int) -> LIST_END: ...
 
     @native.func_native(LIST_BLOCK)
-    def append_step(end: LIST_END, weight: wp.float32, step: wp.int32) -> LIST_END: ...
+    def append_step(end: LIST_END, weight: float, step: int) -> LIST_END: ...
 
     @native.func_native(room, LIST_BLOCK)
     def cut_off(address: wp.uint32, end: LIST_END) -> LIST_END: ...
 
     @native.func_native(room, LIST_BLOCK, capacity, lanes)
     def leave_list(
-        address: wp.uint32,
-        list_end: LIST_END,
-        row: wp.int32,
-        lists: wp.array(dtype=wp.int16, ndim=3),
-    ) -> wp.int32: ...
+        address: wp.uint32, list_end: LIST_END, row: int, lists: wp.array3d[wp.int16]
+    ) -> int: ...
 
     @wp.func
     def falloff_at(domain: Domain, offset: vector):
@@ -120,7 +117,7 @@ def listed_density(
         return falloff_within(squared, domain.inverse_squared_eps)
 
     @wp.func
-    def cells_beyond(within_cell: vector, line: wp.int32):
+    def cells_beyond(within_cell: vector, line: int):
         """Return how many of the first, and of the last, of a line's five cells are beyond eps.
 
         `within_cell` is the particle's position in its cell, in units of a cell. Lines are numbered
@@ -145,17 +142,17 @@ def listed_density(
     )
     def compute_density(
         domain: Domain,
-        starts: wp.array(dtype=wp.int32),
-        sorted_cell: wp.array(dtype=wp.int32),
-        sorted_positions: wp.array(dtype=vector),
-        state_place: wp.array(dtype=wp.int32),
-        source: wp.array(dtype=wp.int32),
-        row_of: wp.array(dtype=wp.int32),
+        starts: wp.array[wp.int32],
+        sorted_cell: wp.array[wp.int32],
+        sorted_positions: wp.array[vector],
+        state_place: wp.array[wp.int32],
+        source: wp.array[wp.int32],
+        row_of: wp.array[wp.int32],
         # outputs
-        particles: wp.array(dtype=particle),
-        records: wp.array(dtype=RECORD),
-        lists: wp.array(dtype=wp.int16, ndim=3),
-        list_lengths: wp.array(dtype=wp.int32),
+        particles: wp.array[particle],
+        records: wp.array[RECORD],
+        lists: wp.array3d[wp.int16],
+        list_lengths: wp.array[wp.int32],
     ):
         """Write every particle's record, and the list of each row's neighbours.
 
@@ -265,15 +262,13 @@ def make_steps_at(capacity: int, tiled: bool) -> wp.Function:
     """Return a Warp function that reads two steps of a row's list, packed in 32 bits."""
 
     @native.func_native(capacity, tiled)
-    def steps_at(
-        lists: wp.array(dtype=wp.int16, ndim=3), row: wp.int32, pair: wp.int32
-    ) -> wp.int32: ...
+    def steps_at(lists: wp.array3d[wp.int16], row: int, pair: int) -> int: ...
 
     return steps_at
 
 
 @native.func_native()
-def step_of(steps: wp.int32, entry: wp.int32) -> wp.int32:
+def step_of(steps: int, entry: int) -> int:
     """Return the first or the second of two packed steps."""
 
 
@@ -282,22 +277,22 @@ def tiled_density(periodic: bool, capacity: int, masked: bool) -> wp.Kernel:
     """Return the density kernel of one variant, in which a block is a warp that serves a tile."""
     types = domain_types(2, wp.float32)
     vector, particle, Domain = types.vector, types.particle, types.Domain
-    load_vector = make_wide_load(vector, wp.float32)
+    load_vector = make_wide_load(vector)
 
     @native.func_native(capacity, periodic, TILE, MIN_SIDE)
     def density_of_tile(
         domain: Domain,
-        starts: wp.array(dtype=wp.int32),
-        sorted_cell: wp.array(dtype=wp.int32),
-        sorted_positions: wp.array(dtype=vector),
-        base: wp.int32,
-        first: wp.int32,
-        k: wp.int32,
-        inside: wp.bool,
-        row: wp.int32,
-        lists: wp.array(dtype=wp.int16, ndim=3),
-        list_lengths: wp.array(dtype=wp.int32),
-    ) -> wp.float32: ...
+        starts: wp.array[wp.int32],
+        sorted_cell: wp.array[wp.int32],
+        sorted_positions: wp.array[vector],
+        base: int,
+        first: int,
+        k: int,
+        inside: bool,
+        row: int,
+        lists: wp.array3d[wp.int16],
+        list_lengths: wp.array[wp.int32],
+    ) -> float: ...
 
     topic = "tiled_density" + "_in_box" * periodic + f"_{capacity}" + "_of_rows" * masked
 
@@ -309,18 +304,18 @@ def tiled_density(periodic: bool, capacity: int, masked: bool) -> wp.Kernel:
     )
     def compute_density(
         domain: Domain,
-        particle_count: wp.int32,
-        starts: wp.array(dtype=wp.int32),
-        sorted_cell: wp.array(dtype=wp.int32),
-        sorted_positions: wp.array(dtype=vector),
-        state_place: wp.array(dtype=wp.int32),
-        source: wp.array(dtype=wp.int32),
-        row_of: wp.array(dtype=wp.int32),
+        particle_count: int,
+        starts: wp.array[wp.int32],
+        sorted_cell: wp.array[wp.int32],
+        sorted_positions: wp.array[vector],
+        state_place: wp.array[wp.int32],
+        source: wp.array[wp.int32],
+        row_of: wp.array[wp.int32],
         # outputs
-        particles: wp.array(dtype=particle),
-        records: wp.array(dtype=RECORD),
-        lists: wp.array(dtype=wp.int16, ndim=3),
-        list_lengths: wp.array(dtype=wp.int32),
+        particles: wp.array[particle],
+        records: wp.array[RECORD],
+        lists: wp.array3d[wp.int16],
+        list_lengths: wp.array[wp.int32],
     ):
         """Write the outputs of `listed_density`, with lists stored one after the other."""
         await_earlier()

@@ -49,10 +49,8 @@ template <int ROWS, int COLUMNS> struct RowsOnTheWay {
 // Write the mixed vectors of rows, and [scalars | products | 1 | 0].
 template <int D, int SCALARS, int PERCEIVED, int MIXED, int CHIRAL, int WARPS, int ROWS>
 __device__ inline void read_vectors(
-    const wp::array_t<float>& rows,
-    const wp::array_t<float>& mixing,
-    const wp::array_t<float>& mixed,
-    const wp::array_t<float>& inputs)
+    const wp::array_t<float>& rows, const wp::array_t<float>& mixing,
+    const wp::array_t<float>& mixed, const wp::array_t<float>& inputs)
 {
     using Form = VectorForm<D, SCALARS, PERCEIVED, MIXED, CHIRAL>;
     constexpr int ENTRIES = Form::ROW_END + 1;
@@ -118,12 +116,9 @@ __device__ inline void read_vectors(
 // Write the cotangents of rows, and each block's sum of the mixing weights' cotangents.
 template <int D, int SCALARS, int PERCEIVED, int MIXED, int CHIRAL, int WARPS, int ROWS>
 __device__ inline void pull_back_vectors(
-    const wp::array_t<float>& rows,
-    const wp::array_t<float>& mixing,
-    const wp::array_t<float>& mixed,
-    const wp::array_t<float>& mixed_bar,
-    const wp::array_t<float>& inputs_bar,
-    const wp::array_t<float>& rows_bar,
+    const wp::array_t<float>& rows, const wp::array_t<float>& mixing,
+    const wp::array_t<float>& mixed, const wp::array_t<float>& mixed_bar,
+    const wp::array_t<float>& inputs_bar, const wp::array_t<float>& rows_bar,
     const wp::array_t<float>& partial_sums)
 {
     using Form = VectorForm<D, SCALARS, PERCEIVED, MIXED, CHIRAL>;
@@ -235,10 +230,8 @@ __device__ inline void pull_back_vectors(
 // all its rows before it uses them.
 template <int D, int MIXED, int CHIRAL, int WARPS, int ROWS>
 __device__ inline void steer_by_gates(
-    const wp::array_t<float>& output,
-    const wp::array_t<float>& mixed,
-    const wp::array_t<float>& signs,
-    const wp::array_t<float>& update)
+    const wp::array_t<float>& output, const wp::array_t<float>& mixed,
+    const wp::array_t<float>& signs, const wp::array_t<float>& update)
 {
     constexpr int GATES = CHIRAL ? 2 * MIXED : MIXED;
     const int first = (blockIdx.x * WARPS + threadIdx.x / 32) * ROWS, lane = threadIdx.x % 32;
@@ -293,12 +286,9 @@ __device__ inline void steer_by_gates(
 // Write the cotangents of the inputs of `steer_by_gates`.
 template <int D, int MIXED, int CHIRAL, int WARPS, int ROWS>
 __device__ inline void pull_back_gates(
-    const wp::array_t<float>& output,
-    const wp::array_t<float>& mixed,
-    const wp::array_t<float>& signs,
-    const wp::array_t<float>& update_bar,
-    const wp::array_t<float>& output_bar,
-    const wp::array_t<float>& mixed_bar)
+    const wp::array_t<float>& output, const wp::array_t<float>& mixed,
+    const wp::array_t<float>& signs, const wp::array_t<float>& update_bar,
+    const wp::array_t<float>& output_bar, const wp::array_t<float>& mixed_bar)
 {
     constexpr int GATES = CHIRAL ? 2 * MIXED : MIXED;
     const int first = (blockIdx.x * WARPS + threadIdx.x / 32) * ROWS, lane = threadIdx.x % 32;

@@ -12,7 +12,6 @@ import warp as wp
 from npa_envs.kernel_lock import cached_under_lock
 from npa_envs.kernels import native
 from npa_envs.kernels.access import WARP, await_earlier
-from npa_envs.kernels.cuda.network import make_share_sum
 
 READ_WARPS, PULL_WARPS, STEER_WARPS, MIXING_SUM_WARPS = 4, 4, 4, 16
 """Warps of a block of `read_rows`, `pull_back_rows`, the steering kernels and `add_blocks`."""
@@ -53,34 +52,15 @@ def row_kernels(
     form = space_dim, scalars, perceived, mixed, chiral
     module = native.module(f"npa_envs.kernels.vector_rows_{'_'.join(str(int(k)) for k in form)}")
 
-    rows = rows_of_warp(mixed)
-
-    @native.func_native(*form, READ_WARPS, rows)
-    def read_vectors(
-        rows: wp.array(dtype=wp.float32, ndim=2),
-        mixing: wp.array(dtype=wp.float32),
-        mixed: wp.array(dtype=wp.float32),
-        inputs: wp.array(dtype=wp.float32, ndim=2),
-    ): ...
-
-    @native.func_native(*form, PULL_WARPS, rows)
-    def pull_back_vectors(
-        rows: wp.array(dtype=wp.float32, ndim=2),
-        mixing: wp.array(dtype=wp.float32),
-        mixed: wp.array(dtype=wp.float32),
-        mixed_bar: wp.array(dtype=wp.float32),
-        inputs_bar: wp.array(dtype=wp.float32, ndim=2),
-        rows_bar: wp.array(dtype=wp.float32, ndim=2),
-        partial_sums: wp.array(dtype=wp.float32, ndim=2),
-    ): ...
+    warp_rows = rows_of_warp(mixed)
 
     @wp.kernel(enable_backward=False, module=module)
     def read_rows(
-        rows: wp.array(dtype=wp.float32, ndim=2),
-        mixing: wp.array(dtype=wp.float32),
+        rows: wp.array2d[wp.float32],
+        mixing: wp.array[wp.float32],
         # outputs
-        mixed: wp.array(dtype=wp.float32),
-        inputs: wp.array(dtype=wp.float32, ndim=2),
+        mixed: wp.array[wp.float32],
+        inputs: wp.array2d[wp.float32],
     ):
         """Write the mixed vectors and the network's inputs, from rows of perception."""
         await_earlier()
@@ -88,26 +68,29 @@ def row_kernels(
 
     @wp.kernel(enable_backward=False, module=module)
     def pull_back_rows(
-        rows: wp.array(dtype=wp.float32, ndim=2),
-        mixing: wp.array(dtype=wp.float32),
-        mixed: wp.array(dtype=wp.float32),
-        mixed_bar: wp.array(dtype=wp.float32),
-        inputs_bar: wp.array(dtype=wp.float32, ndim=2),
+        rows: wp.array2d[wp.float32],
+        mixing: wp.array[wp.float32],
+        mixed: wp.array[wp.float32],
+        mixed_bar: wp.array[wp.float32],
+        inputs_bar: wp.array2d[wp.float32],
         # outputs
-        rows_bar: wp.array(dtype=wp.float32, ndim=2),
-        partial_sums: wp.array(dtype=wp.float32, ndim=2),
+        rows_bar: wp.array2d[wp.float32],
+        partial_sums: wp.array2d[wp.float32],
     ):
         """Write cotangents of rows, and each block's sum of cotangents of the mixing weights."""
         await_earlier()
         pull_back_vectors(rows, mixing, mixed, mixed_bar, inputs_bar, rows_bar, partial_sums)
 
+    read_vectors = native.call_of(read_rows, "read_vectors", *form, READ_WARPS, warp_rows)
+    pull_back_vectors = native.call_of(
+        pull_back_rows, "pull_back_vectors", *form, PULL_WARPS, warp_rows
+    )
     return SimpleNamespace(read_rows=read_rows, pull_back_rows=pull_back_rows)
 
 
 @cached_under_lock()
 def mixing_sum() -> wp.Kernel:
     """Return the kernel that adds the sums of blocks; its own blocks are larger."""
-    add_partial_sums = make_share_sum(MIXING_SUM_WARPS)
 
     @wp.kernel(
         enable_backward=False,
@@ -115,14 +98,15 @@ def mixing_sum() -> wp.Kernel:
         launch_bounds=MIXING_SUM_WARPS * WARP,
     )
     def add_blocks(
-        partial_sums: wp.array(dtype=wp.float32, ndim=2),
+        partial_sums: wp.array2d[wp.float32],
         # outputs
-        total: wp.array(dtype=wp.float32),
+        total: wp.array[wp.float32],
     ):
         """Add the blocks' sums."""
         await_earlier()
         add_partial_sums(partial_sums, total)
 
+    add_partial_sums = native.call_of(add_blocks, "add_partial_sums", MIXING_SUM_WARPS)
     return add_blocks
 
 
@@ -135,31 +119,13 @@ def steering_kernels(space_dim: int, mixed: int, chiral: bool) -> SimpleNamespac
     form = space_dim, mixed, chiral
     module = native.module(f"npa_envs.kernels.steering_{'_'.join(str(int(k)) for k in form)}")
 
-    @native.func_native(*form, STEER_WARPS, STEERED_ROWS)
-    def steer_by_gates(
-        output: wp.array(dtype=wp.float32, ndim=2),
-        mixed: wp.array(dtype=wp.float32),
-        signs: wp.array(dtype=wp.float32),
-        update: wp.array(dtype=wp.float32, ndim=2),
-    ): ...
-
-    @native.func_native(*form, STEER_WARPS, STEERED_ROWS)
-    def pull_back_gates(
-        output: wp.array(dtype=wp.float32, ndim=2),
-        mixed: wp.array(dtype=wp.float32),
-        signs: wp.array(dtype=wp.float32),
-        update_bar: wp.array(dtype=wp.float32, ndim=2),
-        output_bar: wp.array(dtype=wp.float32, ndim=2),
-        mixed_bar: wp.array(dtype=wp.float32),
-    ): ...
-
     @wp.kernel(enable_backward=False, module=module)
     def steer(
-        output: wp.array(dtype=wp.float32, ndim=2),
-        mixed: wp.array(dtype=wp.float32),
-        signs: wp.array(dtype=wp.float32),
+        output: wp.array2d[wp.float32],
+        mixed: wp.array[wp.float32],
+        signs: wp.array[wp.float32],
         # outputs
-        update: wp.array(dtype=wp.float32, ndim=2),
+        update: wp.array2d[wp.float32],
     ):
         """Write updates from gates and state changes."""
         await_earlier()
@@ -167,16 +133,19 @@ def steering_kernels(space_dim: int, mixed: int, chiral: bool) -> SimpleNamespac
 
     @wp.kernel(enable_backward=False, module=module)
     def pull_back_steering(
-        output: wp.array(dtype=wp.float32, ndim=2),
-        mixed: wp.array(dtype=wp.float32),
-        signs: wp.array(dtype=wp.float32),
-        update_bar: wp.array(dtype=wp.float32, ndim=2),
+        output: wp.array2d[wp.float32],
+        mixed: wp.array[wp.float32],
+        signs: wp.array[wp.float32],
+        update_bar: wp.array2d[wp.float32],
         # outputs
-        output_bar: wp.array(dtype=wp.float32, ndim=2),
-        mixed_bar: wp.array(dtype=wp.float32),
+        output_bar: wp.array2d[wp.float32],
+        mixed_bar: wp.array[wp.float32],
     ):
         """Write cotangents of outputs and mixed vectors."""
         await_earlier()
         pull_back_gates(output, mixed, signs, update_bar, output_bar, mixed_bar)
 
+    sizes = *form, STEER_WARPS, STEERED_ROWS
+    steer_by_gates = native.call_of(steer, "steer_by_gates", *sizes)
+    pull_back_gates = native.call_of(pull_back_steering, "pull_back_gates", *sizes)
     return SimpleNamespace(steer=steer, pull_back_steering=pull_back_steering)

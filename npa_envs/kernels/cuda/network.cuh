@@ -197,7 +197,7 @@ __device__ inline void two_layers(
 template <int STEPS, int TILES, int OUT_TILES, int WARPS, int UNIT_BLOCKS, int WORDS, int ROWS,
     typename Bfloat>
 __device__ inline void weight_sums(
-    int unit_count, int share_rows, const wp::array_t<float>& rows,
+    int unit_count, int part_rows, const wp::array_t<float>& rows,
     const wp::array_t<float>& output_bar, const wp::array_t<int>& signs_of,
     const wp::array_t<Bfloat>& hidden_weights,
     const wp::array_t<Bfloat>& output_weights, const wp::array_t<float>& partial_sums)
@@ -213,7 +213,7 @@ __device__ inline void weight_sums(
     const int width = rows.shape[1], out_width = output_bar.shape[1];
     const int share = blockIdx.x / UNIT_BLOCKS;
     const int base = ((blockIdx.x % UNIT_BLOCKS) * WARPS + threadIdx.x / 32) * 32;
-    const int begin = share * share_rows, end = min(begin + share_rows, rows.shape[0]);
+    const int begin = share * part_rows, end = min(begin + part_rows, rows.shape[0]);
 
     // Rows are loaded while the previous ones are summed. A thread splits the numbers it loads.
     const auto ask_for_rows = [&](int first) {
@@ -352,19 +352,17 @@ __device__ inline void weight_sums(
                 }
             }
             #pragma unroll
-            for (int tile = 0; tile < TILES; ++tile) {
+            for (int tile = 0; tile < TILES; tile += 2) {
                 unsigned high[4], low[4];
-                if (tile % 2 == 0) {
-                    const int from = (row + turned) * pitch + 8 * tile + turned_column;
-                    fetch_turned(high, inputs[0] + from);
-                    fetch_turned(low, inputs[1] + from);
+                const int from = (row + turned) * pitch + 8 * tile + turned_column;
+                fetch_turned(high, inputs[0] + from);
+                fetch_turned(low, inputs[1] + from);
+                #pragma unroll
+                for (int other = 0; other < 2 && tile + other < TILES; ++other) {
                     #pragma unroll
-                    for (int other = 0; other < 2 && tile + other < TILES; ++other) {
-                        #pragma unroll
-                        for (int group = 0; group < 2; ++group) {
-                            add_product(hidden_total[group][tile + other], unit_bars[group],
-                                unit_bars_rest[group], high, low, other);
-                        }
+                    for (int group = 0; group < 2; ++group) {
+                        add_product(hidden_total[group][tile + other], unit_bars[group],
+                            unit_bars_rest[group], high, low, other);
                     }
                 }
             }

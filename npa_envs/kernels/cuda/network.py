@@ -5,7 +5,6 @@ warp. float16 has a small range, so rows are first scaled by powers of two, whic
 """
 
 from types import SimpleNamespace
-from typing import Any
 
 import warp as wp
 
@@ -56,32 +55,24 @@ def two_layer_kernel(steps: int, tiles: int, mode: str) -> wp.Kernel:
     name = f"npa_envs.kernels.network_{mode}_{steps}_{tiles}"
     registers = WIDE_REGISTERS if max(16 * steps, 8 * tiles) in WIDE else LAYER_REGISTERS
 
-    @native.func_native(steps, tiles, mode.upper(), ROW_TARGET)
-    def two_layers(
-        unit_count: wp.int32,
-        rows: wp.array(dtype=wp.float32, ndim=2),
-        hidden_weights: wp.array(dtype=wp.float16),
-        output_weights: wp.array(dtype=wp.float16),
-        output_unscale: wp.array(dtype=wp.float32),
-        signs_of: wp.array(dtype=wp.int32, ndim=2),
-        output: wp.array(dtype=wp.float32, ndim=2),
-    ): ...
-
     @wp.kernel(enable_backward=False, module=native.module(name), cuda_max_registers=registers)
     def network_layers(
-        unit_count: wp.int32,
-        rows: wp.array(dtype=wp.float32, ndim=2),
-        hidden_weights: wp.array(dtype=wp.float16),
-        output_weights: wp.array(dtype=wp.float16),
-        output_unscale: wp.array(dtype=wp.float32),
-        signs: wp.array(dtype=wp.int32, ndim=2),
+        unit_count: int,
+        rows: wp.array2d[wp.float32],
+        hidden_weights: wp.array[wp.float16],
+        output_weights: wp.array[wp.float16],
+        output_unscale: wp.array[wp.float32],
+        signs: wp.array2d[wp.int32],
         # outputs
-        output: wp.array(dtype=wp.float32, ndim=2),
+        output: wp.array2d[wp.float32],
     ):
         """Map rows through both layers; the hidden units between stay in registers."""
         await_earlier()
         two_layers(unit_count, rows, hidden_weights, output_weights, output_unscale, signs, output)
 
+    two_layers = native.call_of(
+        network_layers, "two_layers", steps, tiles, mode.upper(), ROW_TARGET
+    )
     return network_layers
 
 
@@ -99,36 +90,24 @@ def weight_gradient_kernels(
     variant = f"{steps}_{tiles}_{out_tiles}_{warps}_{unit_blocks}_{words}"
     module = native.module(f"npa_envs.kernels.network_gradients_{variant}")
 
-    @native.func_native(steps, tiles, out_tiles, warps, unit_blocks, words, ROW_TILE)
-    def weight_sums(
-        unit_count: wp.int32,
-        share_rows: wp.int32,
-        rows: wp.array(dtype=wp.float32, ndim=2),
-        output_bar: wp.array(dtype=wp.float32, ndim=2),
-        signs_of: wp.array(dtype=wp.int32, ndim=2),
-        hidden_weights: wp.array(dtype=wp.bfloat16),
-        output_weights: wp.array(dtype=wp.bfloat16),
-        partial_sums: wp.array(dtype=wp.float32, ndim=2),
-    ): ...
-
     @wp.kernel(enable_backward=False, module=module, cuda_max_registers=GRADIENT_REGISTERS)
     def sum_weight_gradients(
-        unit_count: wp.int32,
-        share_rows: wp.int32,
-        rows: wp.array(dtype=wp.float32, ndim=2),
-        output_bar: wp.array(dtype=wp.float32, ndim=2),
-        signs: wp.array(dtype=wp.int32, ndim=2),
-        hidden_weights: wp.array(dtype=wp.bfloat16),
-        output_weights: wp.array(dtype=wp.bfloat16),
+        unit_count: int,
+        part_rows: int,
+        rows: wp.array2d[wp.float32],
+        output_bar: wp.array2d[wp.float32],
+        signs: wp.array2d[wp.int32],
+        hidden_weights: wp.array[wp.bfloat16],
+        output_weights: wp.array[wp.bfloat16],
         # outputs
-        partial_sums: wp.array(dtype=wp.float32, ndim=2),
+        partial_sums: wp.array2d[wp.float32],
     ):
         """Sum both weights' gradients over each part of the rows."""
         await_earlier()
         allow_next_launch()
         weight_sums(
             unit_count,
-            share_rows,
+            part_rows,
             rows,
             output_bar,
             signs,
@@ -137,37 +116,25 @@ def weight_gradient_kernels(
             partial_sums,
         )
 
-    add_partial_sums = make_share_sum(SUM_WARPS)
-
     @wp.kernel(enable_backward=False, module=module)
-    def add_shares(
-        partial_sums: wp.array(dtype=wp.float32, ndim=2),
+    def add_parts(
+        partial_sums: wp.array2d[wp.float32],
         # outputs
-        total: wp.array(dtype=wp.float32),
+        total: wp.array[wp.float32],
     ):
         """Add the partial sums."""
         await_earlier()
         allow_next_launch()
         add_partial_sums(partial_sums, total)
 
-    return SimpleNamespace(sum_weight_gradients=sum_weight_gradients, add_shares=add_shares)
-
-
-@cached_under_lock()
-def make_share_sum(warps: int) -> Any:
-    """Return a Warp function that adds partial sums; a block has `warps` warps and 32 columns."""
-
-    @native.func_native(warps)
-    def add_partial_sums(
-        partial_sums: wp.array(dtype=wp.float32, ndim=2), total: wp.array(dtype=wp.float32)
-    ):
-        """Add the partial sums in a fixed order."""
-
-    return add_partial_sums
+    sizes = steps, tiles, out_tiles, warps, unit_blocks, words, ROW_TILE
+    weight_sums = native.call_of(sum_weight_gradients, "weight_sums", *sizes)
+    add_partial_sums = native.call_of(add_parts, "add_partial_sums", SUM_WARPS)
+    return SimpleNamespace(sum_weight_gradients=sum_weight_gradients, add_parts=add_parts)
 
 
 @native.func_native()
-def scale_to(size: wp.float32, target: wp.uint32) -> wp.float32:
+def scale_to(size: float, target: wp.uint32) -> float:
     """Return the power of two that scales a positive number into [2^target, 2^(target + 1))."""
 
 
@@ -181,10 +148,10 @@ def arrangement_kernels() -> SimpleNamespace:
 
     @wp.kernel(enable_backward=False, module=module)
     def arrange_hidden(
-        weights: wp.array(dtype=wp.float32, ndim=2),
+        weights: wp.array2d[wp.float32],
         # outputs
-        unit_unscale: wp.array(dtype=wp.float32),
-        fragments: wp.array(dtype=wp.float16),
+        unit_unscale: wp.array[wp.float32],
+        fragments: wp.array[wp.float16],
     ):
         """Scale and lay out a first layer [H, width]; threads (H / 8, width / 16, lanes)."""
         await_earlier()
@@ -208,11 +175,11 @@ def arrangement_kernels() -> SimpleNamespace:
 
     @wp.kernel(enable_backward=False, module=module)
     def arrange_output(
-        weights: wp.array(dtype=wp.float32, ndim=2),
-        unit_unscale: wp.array(dtype=wp.float32),
+        weights: wp.array2d[wp.float32],
+        unit_unscale: wp.array[wp.float32],
         # outputs
-        output_unscale: wp.array(dtype=wp.float32),
-        fragments: wp.array(dtype=wp.float16),
+        output_unscale: wp.array[wp.float32],
+        fragments: wp.array[wp.float16],
     ):
         """Scale and lay out a second layer [width, H]; threads (H / 16, width / 8, lanes)."""
         await_earlier()
@@ -237,9 +204,9 @@ def arrangement_kernels() -> SimpleNamespace:
 
     @wp.kernel(enable_backward=False, module=module)
     def arrange_left(
-        weights: wp.array(dtype=wp.float32, ndim=2),
+        weights: wp.array2d[wp.float32],
         # outputs
-        fragments: wp.array(dtype=wp.bfloat16),
+        fragments: wp.array[wp.bfloat16],
     ):
         """Write [H, width] as left operands of tensor cores; threads (H / 16, width / 16, 32)."""
         await_earlier()

@@ -10,6 +10,7 @@ capacity are searched for again.
 
 import math
 from types import SimpleNamespace
+from typing import NamedTuple
 
 import warp as wp
 
@@ -17,6 +18,7 @@ from npa_envs.kernel_lock import cached_under_lock
 from npa_envs.kernels import native
 from npa_envs.kernels.access import (
     CUDA_BLOCK,
+    CUDA_LANES,
     any_in_warp,
     as_number,
     await_earlier,
@@ -25,7 +27,6 @@ from npa_envs.kernels.access import (
     make_lane_sum,
     make_wide_load,
     of_lane,
-    share_type,
     sync_warp,
     thread_number,
 )
@@ -36,8 +37,9 @@ from npa_envs.kernels.mathematics import (
     log_scale_of_square,
     log_scaled_huge,
     make_corrected,
+    perception_topic,
     smoothing,
-    spiky_factor_wide,
+    spiky_factor_f64,
     within,
 )
 
@@ -56,13 +58,60 @@ SLOT_ENTRIES = 32
 CANDIDATES = 16
 """Candidates of a particle that are loaded at a time in a search."""
 
-load_record = make_wide_load(RECORD, wp.float32)
+load_record = make_wide_load(RECORD)
 
 
-def slot_functions(
-    space_dim: int, width: int, lanes: int, share: type, row_words: int, grouped: bool
-) -> SimpleNamespace:
+class PerceptionVariant(NamedTuple):
+    """Switches of the perception kernel; each combination is a kernel of its own."""
+
+    space_dim: int
+    width: int
+    """Channels of a group."""
+    state_gradient: bool
+    moment_inverse: str | None
+    periodic: bool
+    grouped: bool
+    """Whether there are several groups of channels."""
+    capacity: int
+    """Longest neighbour list."""
+    for_adjoint: bool
+    """Whether the rows' sums of v K are written."""
+    teams: int
+    """Teams of `CUDA_LANES` lanes that share a particle, so that few particles fill the GPU: each
+    runs through its own part of the list, for all channels."""
+    by_place: bool = False
+    """Whether there is a list for each sorted particle, not for each row."""
+    tiled: bool = False
+    """Whether lists have the layout of `tiled_density`."""
+
+    @property
+    def lanes(self) -> int:
+        """Threads that share a particle."""
+        return CUDA_LANES * self.teams
+
+    @property
+    def lane_width(self) -> int:
+        """Channels of a group that one lane sums."""
+        return self.width // CUDA_LANES
+
+    @property
+    def row_words(self) -> int:
+        """Entries of a row that belong to a group of channels."""
+        return self.width * (2 + self.space_dim * self.state_gradient)
+
+    def module(self) -> wp.Module:
+        """Return the Warp module of the variant."""
+        topic = "listed_" + perception_topic(self.state_gradient, self.moment_inverse)
+        topic += "_in_box" * self.periodic + "_grouped" * self.grouped + f"_{self.capacity}"
+        topic += "_for_adjoint" * self.for_adjoint + "_by_place" * self.by_place
+        topic += "_tiled" * self.tiled
+        return kernel_module(topic, self.space_dim, wp.float32, self.width, self.lanes)
+
+
+def slot_functions(variant: PerceptionVariant, lane_channels: type) -> SimpleNamespace:
     """Return the functions on a particle's slot, on its neighbours' states and on its row."""
+    space_dim, width, lanes = variant.space_dim, variant.width, variant.lanes
+    row_words = variant.row_words
     vector = wp.types.vector(space_dim, wp.float32)
     entry_type = wp.types.vector(space_dim + 2, wp.float32)
     # The additional 16 bytes spread a warp's slots over the banks of shared memory.
@@ -71,39 +120,35 @@ def slot_functions(
     @native.func_native(slot_bytes, lanes, CUDA_BLOCK)
     def slot_address() -> wp.uint32: ...
     @native.func_native()
-    def part_address(states: wp.array(dtype=share), part: wp.int32) -> wp.uint64: ...
+    def part_address(states: wp.array[lane_channels], part: int) -> wp.uint64: ...
 
-    @native.func_native(share)
-    def part_of_state(address: wp.uint64, part_count: wp.int32, number: wp.int32) -> share: ...
+    @native.func_native(lane_channels)
+    def part_of_state(address: wp.uint64, part_count: int, number: int) -> lane_channels: ...
 
     @native.func_native(space_dim, SLOT_ENTRIES, lanes)
-    def append_number(
-        slot: wp.uint32, count: wp.int32, accepted: wp.bool, number: wp.int32
-    ) -> wp.int32: ...
+    def append_number(slot: wp.uint32, count: int, accepted: bool, number: int) -> int: ...
 
     @native.func_native(space_dim, SLOT_ENTRIES)
-    def number_at(slot: wp.uint32, entry: wp.int32) -> wp.int32: ...
+    def number_at(slot: wp.uint32, entry: int) -> int: ...
 
     @native.func_native(space_dim, SLOT_ENTRIES)
-    def put_entry(
-        slot: wp.uint32, entry: wp.int32, smooth: wp.float32, kernel: vector, number: wp.int32
-    ): ...
+    def put_entry(slot: wp.uint32, entry: int, smooth: float, kernel: vector, number: int): ...
 
     @native.func_native(space_dim, SLOT_ENTRIES)
-    def entry_at(slot: wp.uint32, entry: wp.int32) -> entry_type: ...
+    def entry_at(slot: wp.uint32, entry: int) -> entry_type: ...
 
-    @native.func_native(space_dim, width, lanes, row_words, slot_bytes, grouped)
+    @native.func_native(space_dim, width, lanes, row_words, slot_bytes, variant.grouped)
     def write_rows(
         slot: wp.uint32,
-        destination: wp.int32,
-        group: wp.int32,
-        state_dim: wp.int32,
-        limit: wp.float32,
-        rows: wp.array(dtype=wp.float32, ndim=2),
+        destination: int,
+        group: int,
+        state_dim: int,
+        limit: float,
+        rows: wp.array2d[wp.float32],
     ): ...
 
     @wp.func
-    def padded(count: wp.int32):
+    def padded(count: int):
         """Return a number of neighbours, rounded up to a multiple of the lanes."""
         return (count + wp.static(lanes - 1)) & ~wp.int32(wp.static(lanes - 1))
 
@@ -113,26 +158,21 @@ def slot_functions(
     )
 
 
-def weighing_functions(
-    space_dim: int,
-    lanes: int,
-    slots: SimpleNamespace,
-    steps_at: wp.Function,
-    state_gradient: bool,
-    moment_correction: bool,
-    for_adjoint: bool,
-    periodic: bool,
-) -> SimpleNamespace:
+def weighing_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> SimpleNamespace:
     """Return the functions that put neighbours' weights into a slot and add up the short sums.
 
     These are sums whose terms have no channels: of v K, of the moment matrix, and of the density
     gradient. Each lane sums its own neighbours.
     """
     scalar = wp.float32
+    space_dim, lanes, periodic = variant.space_dim, variant.lanes, variant.periodic
+    state_gradient, for_adjoint = variant.state_gradient, variant.for_adjoint
+    moment_correction = variant.moment_inverse is not None
     flat = space_dim == 2
+    steps_at = make_steps_at(variant.capacity, variant.tiled)
     types = domain_types(space_dim, scalar)
     vector, Domain, periodic_image = types.vector, types.Domain, types.periodic_image
-    wide = wp.types.vector(space_dim, wp.float64)
+    vector_f64 = wp.types.vector(space_dim, wp.float64)
     square = wp.types.matrix((space_dim, space_dim), scalar)
     places_of_pair = wp.types.vector(PAIR, wp.int32)
     records_of_pair = wp.types.matrix((PAIR, 4), scalar)
@@ -143,13 +183,21 @@ def weighing_functions(
         """A row's particle, in the types that its pairs need: converted once, not for each pair."""
 
         position: vector
-        precise: wide
+        precise: vector_f64
         inverse_eps: wp.float64
 
+    @wp.struct
+    class Sums:
+        """A lane's short sums: of v K, the moment matrix, the density gradient over its norm."""
+
+        kernel: vector
+        moment: square
+        density_gradient: vector_f64
+
     @wp.func
-    def spiky_wide(domain: Domain, centre: Centre, neighbour: vector, squared: scalar):
+    def spiky_f64(domain: Domain, centre: Centre, neighbour: vector, squared: scalar):
         """Return a pair's spiky factor with norm 1, and its offset r, both in float64."""
-        r = wide()
+        r = vector_f64()
         start = squared
         for d in range(wp.static(space_dim)):
             r[d] = wp.float64(neighbour[d]) - centre.precise[d]
@@ -160,21 +208,19 @@ def weighing_functions(
             start = scalar(wp.dot(r, r))
         exact = wp.dot(r, r)
         apart = wp.where(start > scalar(0.0), inverse_root(start), scalar(0.0))
-        return spiky_factor_wide(exact, apart, centre.inverse_eps, wp.float64(1.0)), r
+        return spiky_factor_f64(exact, apart, centre.inverse_eps, wp.float64(1.0)), r
 
     @wp.func
     def weigh(
         domain: Domain,
-        state_place: wp.array(dtype=wp.int32),
+        state_place: wp.array[wp.int32],
         slot: wp.uint32,
-        entry: wp.int32,
-        j: wp.int32,
+        entry: int,
+        j: int,
         centre: Centre,
         record: RECORD,
-        counts: wp.bool,
-        kernel_sum: vector,
-        moment: square,
-        density_gradient: wide,
+        counts: bool,
+        sums: Sums,
     ):
         """Put neighbour j's weights into the slot, and add its terms to this lane's short sums.
 
@@ -194,34 +240,32 @@ def weighing_functions(
             offset = periodic_image(domain, offset)
         squared = wp.dot(offset, offset)
         weight = smoothing(squared, domain.inverse_squared_eps, volume * domain.smoothing_norm)
-        factor, r = spiky_wide(domain, centre, neighbour, squared)
-        density_gradient += factor * r
+        factor, r = spiky_f64(domain, centre, neighbour, squared)
+        sums.density_gradient += factor * r
         weighted = vector()
         if wp.static(state_gradient):
             weighted = (volume * domain.spiky_norm * scalar(factor)) * offset
             if wp.static(for_adjoint):
-                kernel_sum += weighted
+                sums.kernel += weighted
             if wp.static(moment_correction):
                 for row in range(wp.static(space_dim)):
                     for column in range(row, wp.static(space_dim)):
-                        moment[row, column] += offset[row] * weighted[column]
+                        sums.moment[row, column] += offset[row] * weighted[column]
         put_entry(slot, entry, weight, weighted, number)
-        return kernel_sum, moment, density_gradient
+        return sums
 
     @wp.func
     def weigh_found(
         domain: Domain,
-        records: wp.array(dtype=RECORD),
-        state_place: wp.array(dtype=wp.int32),
-        lane: wp.int32,
+        records: wp.array[RECORD],
+        state_place: wp.array[wp.int32],
+        lane: int,
         slot: wp.uint32,
-        begin: wp.int32,
-        count: wp.int32,
-        k: wp.int32,
+        begin: int,
+        count: int,
+        k: int,
         centre: Centre,
-        kernel_sum: vector,
-        moment: square,
-        density_gradient: wide,
+        sums: Sums,
     ):
         """Call `weigh` for neighbours whose indices are in the slot, from `begin` to `count`."""
         sync_warp()
@@ -236,7 +280,7 @@ def weighing_functions(
                 found[a] = load_record(records, places[a])
             for a in range(wp.static(PAIR)):
                 entry = first + a * wp.static(lanes)
-                kernel_sum, moment, density_gradient = weigh(
+                sums = weigh(
                     domain,
                     state_place,
                     slot,
@@ -245,30 +289,26 @@ def weighing_functions(
                     centre,
                     found[a],
                     entry >= begin and entry < count,
-                    kernel_sum,
-                    moment,
-                    density_gradient,
+                    sums,
                 )
         sync_warp()
-        return kernel_sum, moment, density_gradient
+        return sums
 
     @wp.func
     def weigh_listed(
         domain: Domain,
-        records: wp.array(dtype=RECORD),
-        lists: wp.array(dtype=wp.int16, ndim=3),
-        state_place: wp.array(dtype=wp.int32),
-        lane: wp.int32,
+        records: wp.array[RECORD],
+        lists: wp.array3d[wp.int16],
+        state_place: wp.array[wp.int32],
+        lane: int,
         slot: wp.uint32,
-        row: wp.int32,
-        begin: wp.int32,
-        length: wp.int32,
-        k: wp.int32,
+        row: int,
+        begin: int,
+        length: int,
+        k: int,
         centre: Centre,
-        steps: wp.int32,
-        kernel_sum: vector,
-        moment: square,
-        density_gradient: wide,
+        steps: int,
+        sums: Sums,
     ):
         """Call `weigh` for a list's entries from `begin` on, up to a full slot.
 
@@ -284,7 +324,7 @@ def weighing_functions(
                 found[a] = load_record(records, places[a])
             steps = steps_at(lists, row, (first >> 1) + wp.static(lanes))
             for a in range(wp.static(PAIR)):
-                kernel_sum, moment, density_gradient = weigh(
+                sums = weigh(
                     domain,
                     state_place,
                     slot,
@@ -293,41 +333,37 @@ def weighing_functions(
                     centre,
                     found[a],
                     first + a < length,
-                    kernel_sum,
-                    moment,
-                    density_gradient,
+                    sums,
                 )
         sync_warp()
-        return steps, kernel_sum, moment, density_gradient
+        return steps, sums
 
-    return SimpleNamespace(Centre=Centre, weigh_found=weigh_found, weigh_listed=weigh_listed)
+    return SimpleNamespace(
+        Centre=Centre, Sums=Sums, weigh_found=weigh_found, weigh_listed=weigh_listed
+    )
 
 
 def make_add_states(
-    space_dim: int,
-    share_width: int,
-    teams: int,
-    slots: SimpleNamespace,
-    share: type,
-    share_gradient: type,
-    state_gradient: bool,
+    variant: PerceptionVariant, slots: SimpleNamespace, lane_channels: type, lane_gradient: type
 ) -> wp.Function:
     """Return the function that adds neighbours' states to the long sums, by a slot's weights."""
     scalar = wp.float32
+    space_dim, lane_width, teams = variant.space_dim, variant.lane_width, variant.teams
+    state_gradient = variant.state_gradient
     entries_together = wp.types.matrix((TOGETHER, space_dim + 2), scalar)
-    states_together = wp.types.matrix((TOGETHER, share_width), scalar)
+    states_together = wp.types.matrix((TOGETHER, lane_width), scalar)
     padded, entry_at, part_of_state = slots.padded, slots.entry_at, slots.part_of_state
 
     @wp.func
     def add_states(
         states: wp.uint64,
-        part_count: wp.int32,
-        first: wp.int32,
+        part_count: int,
+        first: int,
         slot: wp.uint32,
-        count: wp.int32,
-        own: share,
-        blur: share,
-        gradient: share_gradient,
+        count: int,
+        own: lane_channels,
+        blur: lane_channels,
+        gradient: lane_gradient,
     ):
         """Add weighted states of this team's neighbours, from `first` on, to the long sums."""
         for entry in range(first, padded(count), wp.static(teams * TOGETHER)):
@@ -345,7 +381,7 @@ def make_add_states(
                 if wp.static(state_gradient):
                     difference = found[a] - own
                     for d in range(wp.static(space_dim)):
-                        for c in range(wp.static(share_width)):
+                        for c in range(wp.static(lane_width)):
                             gradient[d, c] += packed[a, d + 1] * difference[c]
         sync_warp()
         return blur, gradient
@@ -354,85 +390,50 @@ def make_add_states(
 
 
 @cached_under_lock()
-def listed_perception(
-    space_dim: int,
-    width: int,
-    lanes: int,
-    state_gradient: bool,
-    moment_inverse: str | None,
-    periodic: bool,
-    grouped: bool,
-    capacity: int,
-    for_adjoint: bool,
-    teams: int,
-    by_place: bool = False,
-    tiled: bool = False,
-) -> wp.Kernel:
-    """Return the perception kernel of one variant.
-
-    Args:
-        lanes: Lanes of a team, which share the channels of a group.
-        grouped: Whether there are several groups of channels.
-        teams: Teams of lanes that share a particle, so that few particles fill the GPU: each runs
-            through its own part of the list, for all channels.
-        by_place: Whether there is a list for each sorted particle, not for each row.
-        tiled: Whether lists have the layout of `tiled_density`.
-    """
+def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
+    """Return the perception kernel of a variant."""
     scalar = wp.float32
-    moment_correction = moment_inverse is not None
+    space_dim, width, lanes, teams = variant.space_dim, variant.width, variant.lanes, variant.teams
+    state_gradient, moment_correction = variant.state_gradient, variant.moment_inverse is not None
+    periodic, grouped, capacity = variant.periodic, variant.grouped, variant.capacity
+    for_adjoint, by_place = variant.for_adjoint, variant.by_place
+    lane_width, team = variant.lane_width, CUDA_LANES
     types = domain_types(space_dim, scalar)
     vector, Domain = types.vector, types.Domain
     cell_place, segment_count = types.cell_place, types.segment_count
-    segment_cells = types.segment_cells
-    periodic_image = types.periodic_image
-    wide = wp.types.vector(space_dim, wp.float64)
-    group = wp.types.vector(width, scalar)
-    share = share_type(group, scalar, lanes)
-    share_gradient = share_type(wp.types.matrix((space_dim, width), scalar), scalar, lanes)
-    share_width = width // lanes
-    share_rows = wp.types.vector(share_width * space_dim, scalar)
-    team = lanes
-    lanes *= teams
-    ahead = max(CANDIDATES // lanes, 1)
+    segment_cells, periodic_image = types.segment_cells, types.periodic_image
+    vector_f64 = wp.types.vector(space_dim, wp.float64)
     square = wp.types.matrix((space_dim, space_dim), scalar)
+    lane_channels = wp.types.vector(lane_width, scalar)
+    lane_gradient = wp.types.matrix((space_dim, lane_width), scalar)
+    lane_rows = wp.types.vector(lane_width * space_dim, scalar)
     cell_vector = wp.types.vector(space_dim, wp.int32)
-    topic = "listed_smoothing"
-    if state_gradient:
-        topic = "listed_perception" if moment_correction else "listed_uncorrected_perception"
-        topic = "listed_smoothly_corrected_perception" if moment_inverse == "smooth" else topic
-    topic += "_in_box" * periodic + "_grouped" * grouped
-    topic += f"_{capacity}" + "_for_adjoint" * for_adjoint + "_by_place" * by_place
-    topic += "_tiled" * tiled
-    module = kernel_module(topic, space_dim, scalar, width, lanes)
-    registers = CUDA_REGISTERS[space_dim] if teams == 1 else TEAM_REGISTERS
-    load_vector = make_wide_load(vector, scalar)
-    add_vector = make_lane_sum(vector, scalar, lanes, whole_warps=True)
-    add_square = make_lane_sum(square, scalar, lanes, whole_warps=True)
-    add_wide = make_lane_sum(wide, wp.float64, lanes, whole_warps=True)
-    add_share = make_lane_sum(share, scalar, lanes, whole_warps=True, stride=team)
-    add_gradient = make_lane_sum(share_gradient, scalar, lanes, whole_warps=True, stride=team)
-    steps_at = make_steps_at(capacity, tiled)
+    ahead = max(CANDIDATES // lanes, 1)
     candidates_ahead = wp.types.matrix((ahead, space_dim), scalar)
-    corrected = make_corrected(space_dim, scalar, share_width, moment_inverse)
-    stage_share, stage_rows = make_stage(share), make_stage(share_rows)
-    row_words = width * (2 + space_dim * state_gradient)
-    slots = slot_functions(space_dim, width, lanes, share, row_words, grouped)
+    registers = CUDA_REGISTERS[space_dim] if teams == 1 else TEAM_REGISTERS
+    load_vector = make_wide_load(vector)
+    add_vector = make_lane_sum(vector, lanes, whole_warps=True)
+    add_square = make_lane_sum(square, lanes, whole_warps=True)
+    add_f64 = make_lane_sum(vector_f64, lanes, whole_warps=True)
+    add_channels = make_lane_sum(lane_channels, lanes, whole_warps=True, stride=team)
+    add_gradient = make_lane_sum(lane_gradient, lanes, whole_warps=True, stride=team)
+    steps_at = make_steps_at(capacity, variant.tiled)
+    corrected = make_corrected(space_dim, scalar, lane_width, variant.moment_inverse)
+    stage_channels, stage_rows = make_stage(lane_channels), make_stage(lane_rows)
+    slots = slot_functions(variant, lane_channels)
     slot_address, append_number = slots.slot_address, slots.append_number
     part_address, part_of_state = slots.part_address, slots.part_of_state
     write_rows = slots.write_rows
-    options = state_gradient, moment_correction, for_adjoint, periodic
-    weighing = weighing_functions(space_dim, lanes, slots, steps_at, *options)
-    Centre, weigh_found = weighing.Centre, weighing.weigh_found
-    weigh_listed = weighing.weigh_listed
-    add_states = make_add_states(
-        space_dim, share_width, teams, slots, share, share_gradient, state_gradient
-    )
+    weighing = weighing_functions(variant, slots)
+    Centre, Sums = weighing.Centre, weighing.Sums
+    weigh_found, weigh_listed = weighing.weigh_found, weighing.weigh_listed
+    add_states = make_add_states(variant, slots, lane_channels, lane_gradient)
 
     @wp.func
-    def scale_huge(gradient_scale: scalar, gradient: share_gradient, scaled: share_rows):
+    def scale_huge(gradient_scale: scalar, gradient: lane_gradient, scaled: lane_rows):
         """Return scaled gradients, correct also where the squared length overflows."""
         result = scaled
-        for c in range(wp.static(share_width)):
+        for c in range(wp.static(lane_width)):
             along = vector()
             for d in range(wp.static(space_dim)):
                 along[d] = gradient_scale * gradient[d, c]
@@ -443,31 +444,34 @@ def listed_perception(
         return result
 
     @wp.kernel(
-        enable_backward=False, module=module, cuda_max_registers=registers, grid_stride=False
+        enable_backward=False,
+        module=variant.module(),
+        cuda_max_registers=registers,
+        grid_stride=False,
     )
     def perceive(
         domain: Domain,
-        state_dim: wp.int32,
-        density_gradient: wp.int32,
+        state_dim: int,
+        density_gradient: int,
         gradient_scale: scalar,
         density_scale: scalar,
-        row_base: wp.int32,
-        row_capacity: wp.int32,
-        group_count: wp.int32,
+        row_base: int,
+        row_capacity: int,
+        group_count: int,
         limit: scalar,
-        starts: wp.array(dtype=wp.int32),
-        sorted_cell: wp.array(dtype=wp.int32),
-        sorted_positions: wp.array(dtype=vector),
-        records: wp.array(dtype=RECORD),
-        states: wp.array(dtype=share),
-        state_place: wp.array(dtype=wp.int32),
-        row_place: wp.array(dtype=wp.int32),
-        row_destination: wp.array(dtype=wp.int32),
-        lists: wp.array(dtype=wp.int16, ndim=3),
-        list_lengths: wp.array(dtype=wp.int32),
+        starts: wp.array[wp.int32],
+        sorted_cell: wp.array[wp.int32],
+        sorted_positions: wp.array[vector],
+        records: wp.array[RECORD],
+        states: wp.array[lane_channels],
+        state_place: wp.array[wp.int32],
+        row_place: wp.array[wp.int32],
+        row_destination: wp.array[wp.int32],
+        lists: wp.array3d[wp.int16],
+        list_lengths: wp.array[wp.int32],
         # outputs
-        perception: wp.array(dtype=scalar, ndim=2),
-        row_kernel_sum: wp.array(dtype=vector),
+        perception: wp.array2d[scalar],
+        row_kernel_sum: wp.array[vector],
     ):
         """Write the perception vector of each row, as `perception_kernels` does.
 
@@ -494,11 +498,9 @@ def listed_perception(
             part_count = group_count * wp.static(team)
         row_count = load_integer(starts, starts.shape[0] - 1) - row_base
         present = row < wp.min(row_count, row_capacity)
-        blur = share()
-        gradient = share_gradient()
-        kernel_sum = vector()
-        moment = square()
-        wide_sum = wide()
+        blur = lane_channels()
+        gradient = lane_gradient()
+        sums = Sums()
         # Rows beyond the last one read the first particle, with no neighbours.
         safe_row = wp.where(present, row, wp.int32(0))
         k = safe_row
@@ -527,7 +529,7 @@ def listed_perception(
         longest = largest_in_warp(length)
         steps = steps_at(lists, list_number, lane)
         for first_entry in range(0, longest, wp.static(SLOT_ENTRIES)):
-            steps, kernel_sum, moment, wide_sum = weigh_listed(
+            steps, sums = weigh_listed(
                 domain,
                 records,
                 lists,
@@ -540,9 +542,7 @@ def listed_perception(
                 k,
                 centre,
                 steps,
-                kernel_sum,
-                moment,
-                wide_sum,
+                sums,
             )
             fetched = wp.clamp(length - first_entry, 0, wp.static(SLOT_ENTRIES))
             blur, gradient = add_states(
@@ -599,39 +599,28 @@ def listed_perception(
                 working = run < run_count or any_in_warp(j - lane < end)
                 crowded = any_in_warp(count > wp.static(SLOT_ENTRIES - ahead * lanes))
                 filling = working and not crowded
-            kernel_sum, moment, wide_sum = weigh_found(
-                domain,
-                records,
-                state_place,
-                lane,
-                slot,
-                begin,
-                count,
-                k,
-                centre,
-                kernel_sum,
-                moment,
-                wide_sum,
+            sums = weigh_found(
+                domain, records, state_place, lane, slot, begin, count, k, centre, sums
             )
             blur, gradient = add_states(parts, part_count, first, slot, count, own, blur, gradient)
             begin = count & wp.static(lanes - 1)
-        wide_sum = wp.float64(domain.spiky_norm) * add_wide(wide_sum)
+        gradient_f64 = wp.float64(domain.spiky_norm) * add_f64(sums.density_gradient)
         if wp.static(teams > 1):
-            blur = add_share(blur)
+            blur = add_channels(blur)
             gradient = add_gradient(gradient)
         if wp.static(state_gradient and moment_correction):
-            moment = add_square(moment)
+            moment = add_square(sums.moment)
             for r in range(1, wp.static(space_dim)):
                 for c in range(r):
                     moment[r, c] = moment[c, r]
             gradient = corrected(gradient, moment)
-        mine = (lane & wp.static(team - 1)) * wp.static(share_width)
-        stage_share(slot, mine, wp.where(present, own, share()))
-        stage_share(slot, wp.static(width) + mine, blur)
+        mine = (lane & wp.static(team - 1)) * wp.static(lane_width)
+        stage_channels(slot, mine, wp.where(present, own, lane_channels()))
+        stage_channels(slot, wp.static(width) + mine, blur)
         if wp.static(state_gradient):
-            scaled = share_rows()
+            scaled = lane_rows()
             largest_square = scalar(0.0)
-            for c in range(wp.static(share_width)):
+            for c in range(wp.static(lane_width)):
                 along = vector()
                 for d in range(wp.static(space_dim)):
                     along[d] = gradient_scale * gradient[d, c]
@@ -646,7 +635,7 @@ def listed_perception(
         bound = wp.where(limit > scalar(0.0), limit, scalar(wp.static(math.nan)))
         write_rows(slot, destination, g, state_dim, bound, perception)
         if wp.static(for_adjoint):
-            kernel_sum = add_vector(kernel_sum)
+            kernel_sum = add_vector(sums.kernel)
             if destination >= 0 and lane == 0 and g == 0:
                 row_kernel_sum[row] = kernel_sum
         column = 2 * state_dim
@@ -655,7 +644,7 @@ def listed_perception(
         if density_gradient != 0:
             along = vector()
             for d in range(wp.static(space_dim)):
-                along[d] = scalar(wide_sum[d]) * density_scale
+                along[d] = scalar(gradient_f64[d]) * density_scale
             squared = wp.dot(along, along)
             if wp.isinf(squared):
                 along = log_scaled_huge(along)
@@ -679,6 +668,6 @@ def make_stage(value_type: type) -> wp.Function:
     """Return a Warp function that writes a value to a slot, at an offset of 32-bit words."""
 
     @native.func_native()
-    def stage(slot: wp.uint32, word: wp.int32, value: value_type): ...
+    def stage(slot: wp.uint32, word: int, value: value_type): ...
 
     return stage

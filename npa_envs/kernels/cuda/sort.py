@@ -27,7 +27,7 @@ from npa_envs.kernels.access import (
 )
 from npa_envs.kernels.domain import domain_types, kernel_module
 
-load_pair = make_wide_load(wp.vec2i, wp.int32)
+load_pair = make_wide_load(wp.vec2i)
 
 BLOCKS = {1024: 256, 4096: 1024}
 """Threads of a block by its capacity in particles."""
@@ -38,14 +38,14 @@ RESIDENT_THREADS = 1024
 MAX_GRID = 4096
 """Most cells of a world that a block sorts."""
 
-STATE_SHARE = 4
+THREAD_CHANNELS = 4
 """Adjacent channels that a thread moves."""
 
-store_integer = make_wide_store(wp.int32, wp.int32)
+store_integer = make_wide_store(wp.int32)
 
 
 @native.func_native()
-def count_active(mask: wp.array(dtype=wp.uint8), count: wp.int32) -> wp.int32:
+def count_active(mask: wp.array[wp.uint8], count: int) -> int:
     """Return this thread's count of active particles among the first `count` of all worlds."""
 
 
@@ -59,38 +59,38 @@ def block_functions(capacity: int) -> SimpleNamespace:
         """Return the address of the block's shared memory."""
 
     @native.func_native(*sizes)
-    def clear_counts(address: wp.uint64, cell_count: wp.int32, earlier: wp.int32):
+    def clear_counts(address: wp.uint64, cell_count: int, earlier: int):
         """Set the counts of all cells to zero, and sum the threads' counts of earlier rows."""
 
     @native.func_native(*sizes)
-    def arrive(address: wp.uint64, particle: wp.int32, cell: wp.int32, active: wp.bool):
+    def arrive(address: wp.uint64, particle: int, cell: int, active: bool):
         """Count a particle in its cell."""
 
     @native.func_native(*sizes)
-    def add_up_counts(address: wp.uint64, cell_count: wp.int32):
+    def add_up_counts(address: wp.uint64, cell_count: int):
         """Turn counts into starts."""
 
     @native.func_native(*sizes)
-    def start_of(address: wp.uint64, cell: wp.int32) -> wp.vec2i:
+    def start_of(address: wp.uint64, cell: int) -> wp.vec2i:
         """Return a cell's first sorted index in the world, and its first row among all worlds."""
 
     @native.func_native(*sizes)
-    def place_arrived(address: wp.uint64, particle: wp.int32):
+    def place_arrived(address: wp.uint64, particle: int):
         """Assign a particle its provisional position."""
 
     @native.func_native(*sizes)
-    def span_of_slice(address: wp.uint64, begin: wp.int32, end: wp.int32) -> wp.vec2i:
+    def span_of_slice(address: wp.uint64, begin: int, end: int) -> wp.vec2i:
         """Return the range of provisional positions whose particles may belong to a slice."""
 
     @native.func_native(*sizes)
-    def ranked_at(address: wp.uint64, place: wp.int32, unordered: wp.int32) -> wp.vec3i:
+    def ranked_at(address: wp.uint64, place: int, unordered: int) -> wp.vec3i:
         """Return sorted index, cell and row (-1: none) of the particle at a provisional position.
 
         In the cell `unordered` (-1: none) provisional positions are final.
         """
 
     @native.func_native(*sizes)
-    def member_at(address: wp.uint64, place: wp.int32) -> wp.int32:
+    def member_at(address: wp.uint64, place: int) -> int:
         """Return the index of the particle at a provisional position."""
 
     functions = [block_memory, clear_counts, arrive, add_up_counts]
@@ -107,43 +107,19 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
     types = domain_types(space_dim, scalar)
     vector, Domain = types.vector, types.Domain
     cell_of, cell_index = types.cell_of, types.cell_index
-    share = wp.types.vector(STATE_SHARE, scalar)
+    channels = wp.types.vector(THREAD_CHANNELS, scalar)
     positions_ahead = wp.types.matrix((turns, space_dim), scalar)
     flags_ahead = wp.types.vector(turns, wp.int32)
-    load_vector = make_wide_load(vector, scalar)
-    read_channels = make_read_channels(share, scalar)
-    store_vector = make_wide_store(vector, scalar)
-    store_share = make_wide_store(share, scalar)
+    load_vector = make_wide_load(vector)
+    read_channels = make_read_channels(channels)
+    store_vector = make_wide_store(vector)
+    store_channels = make_wide_store(channels)
     sorting = block_functions(capacity)
     block_memory, clear_counts = sorting.block_memory, sorting.clear_counts
     arrive, add_up_counts = sorting.arrive, sorting.add_up_counts
     start_of, place_arrived = sorting.start_of, sorting.place_arrived
     span_of_slice, ranked_at = sorting.span_of_slice, sorting.ranked_at
     member_at = sorting.member_at
-
-    @wp.func
-    def write_starts(
-        memory: wp.uint64,
-        cell_count: wp.int32,
-        slice_number: wp.int32,
-        slice_count: wp.int32,
-        world: wp.int32,
-        particle_count: wp.int32,
-        masked: wp.int32,
-        active_offset: wp.int32,
-        row_base: wp.int32,
-        starts: wp.array(dtype=wp.int32),
-    ):
-        """Write the first sorted index and the first row of each of the slice's cells."""
-        share_of_cells = (cell_count + slice_count - 1) / slice_count
-        begin = slice_number * share_of_cells
-        end = wp.min(begin + share_of_cells, cell_count)
-        for cell in range(begin + thread_of_block(), end, wp.static(block)):
-            start = start_of(memory, cell)
-            written = world * cell_count + cell
-            store_integer(starts, written, world * particle_count + start[0])
-            if masked != 0:
-                store_integer(starts, active_offset + written, row_base + start[1])
 
     @wp.kernel(
         enable_backward=False,
@@ -152,28 +128,28 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
     )
     def sort_worlds(
         domain: Domain,
-        particle_count: wp.int32,
-        slice_count: wp.int32,
-        positions: wp.array(dtype=vector),
-        state_dim: wp.int32,
-        parts: wp.int32,
-        aligned: wp.int32,
-        states: wp.array(dtype=scalar),
-        masked: wp.int32,
-        mask: wp.array(dtype=wp.uint8),
-        active_offset: wp.int32,
-        row_base: wp.int32,
-        row_capacity: wp.int32,
+        particle_count: int,
+        slice_count: int,
+        positions: wp.array[vector],
+        state_dim: int,
+        parts: int,
+        aligned: int,
+        states: wp.array[scalar],
+        masked: int,
+        mask: wp.array[wp.uint8],
+        active_offset: int,
+        row_base: int,
+        row_capacity: int,
         # outputs
-        starts: wp.array(dtype=wp.int32),
-        source: wp.array(dtype=wp.int32),
-        sorted_cell: wp.array(dtype=wp.int32),
-        row_of: wp.array(dtype=wp.int32),
-        row_source: wp.array(dtype=wp.int32),
-        row_place: wp.array(dtype=wp.int32),
-        sorted_positions: wp.array(dtype=vector),
-        row_positions: wp.array(dtype=vector),
-        sorted_states: wp.array(dtype=share),
+        starts: wp.array[wp.int32],
+        source: wp.array[wp.int32],
+        sorted_cell: wp.array[wp.int32],
+        row_of: wp.array[wp.int32],
+        row_source: wp.array[wp.int32],
+        row_place: wp.array[wp.int32],
+        sorted_positions: wp.array[vector],
+        row_positions: wp.array[vector],
+        sorted_states: wp.array[channels],
     ):
         """Sort every world by cell, then index; write one slice of it.
 
@@ -212,18 +188,14 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
                 arrive(memory, i, cell, acting[turn] != 0)
         add_up_counts(memory, domain.cell_count)
 
-        write_starts(
-            memory,
-            domain.cell_count,
-            slice_number,
-            slice_count,
-            world,
-            particle_count,
-            masked,
-            active_offset,
-            row_base,
-            starts,
-        )
+        slice_cells = (domain.cell_count + slice_count - 1) / slice_count
+        from_cell = slice_number * slice_cells
+        to_cell = wp.min(from_cell + slice_cells, domain.cell_count)
+        for cell in range(from_cell + lane, to_cell, wp.static(block)):
+            start = start_of(memory, cell)
+            store_integer(starts, first_cell + cell, first_particle + start[0])
+            if masked != 0:
+                store_integer(starts, active_offset + first_cell + cell, row_base + start[1])
         is_last_world = first_particle + particle_count == positions.shape[0]
         if lane == 0 and slice_number == 0 and is_last_world:
             end_of_all = start_of(memory, domain.cell_count)
@@ -232,9 +204,9 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
             place_arrived(memory, i)
         sync_block()
 
-        share_of_places = (particle_count + slice_count - 1) / slice_count
-        begin = slice_number * share_of_places
-        end = wp.min(begin + share_of_places, particle_count)
+        slice_places = (particle_count + slice_count - 1) / slice_count
+        begin = slice_number * slice_places
+        end = wp.min(begin + slice_places, particle_count)
         if begin < end:
             span = span_of_slice(memory, begin, end)
             for chunk in range(span[0] * parts + lane, span[1] * parts, wp.static(block)):
@@ -242,15 +214,15 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
                 part = chunk - k * parts
                 i = first_particle + member_at(memory, k)
                 position = load_vector(positions, i)
-                state = share()
+                state = channels()
                 if sorted_states.shape[0] > 0:
-                    first = part * wp.static(STATE_SHARE)
+                    first = part * wp.static(THREAD_CHANNELS)
                     state = read_channels(states, state_dim, aligned, i, first)
                 ranked = ranked_at(memory, k, wp.int32(-1))
                 inside = ranked[0] >= begin and ranked[0] < end
                 place = first_particle + ranked[0]
                 if inside and sorted_states.shape[0] > 0:
-                    store_share(sorted_states, place * parts + part, state)
+                    store_channels(sorted_states, place * parts + part, state)
                 if inside and part == 0:
                     store_integer(source, place, i)
                     store_integer(sorted_cell, place, first_cell + ranked[1])
@@ -271,34 +243,34 @@ def order_particles(space_dim: int, width: int) -> wp.Kernel:
     """Return the last kernel of sorting large worlds, which moves states a warp at a time."""
     scalar = wp.float32
     vector = domain_types(space_dim, scalar).vector
-    share_width = width // CUDA_LANES
-    share = wp.types.vector(share_width, scalar)
-    shares = wp.types.matrix((CUDA_LANES, share_width), scalar)
-    read_channels = make_read_channels(share, scalar)
-    store_vector = make_wide_store(vector, scalar)
-    store_share = make_wide_store(share, scalar)
+    thread_width = width // CUDA_LANES
+    channels = wp.types.vector(thread_width, scalar)
+    held_type = wp.types.matrix((CUDA_LANES, thread_width), scalar)
+    read_channels = make_read_channels(channels)
+    store_vector = make_wide_store(vector)
+    store_channels = make_wide_store(channels)
 
     @wp.kernel(enable_backward=False, module=kernel_module("order", space_dim, scalar, width))
     def order_particles(
-        positions: wp.array(dtype=vector),
-        state_dim: wp.int32,
-        group_count: wp.int32,
-        aligned: wp.int32,
-        states: wp.array(dtype=scalar),
-        active_offset: wp.int32,
-        row_base: wp.int32,
-        row_capacity: wp.int32,
-        arrived: wp.array(dtype=wp.vec2i),
-        starts: wp.array(dtype=wp.int32),
+        positions: wp.array[vector],
+        state_dim: int,
+        group_count: int,
+        aligned: int,
+        states: wp.array[scalar],
+        active_offset: int,
+        row_base: int,
+        row_capacity: int,
+        arrived: wp.array[wp.vec2i],
+        starts: wp.array[wp.int32],
         # outputs
-        source: wp.array(dtype=wp.int32),
-        sorted_cell: wp.array(dtype=wp.int32),
-        row_of: wp.array(dtype=wp.int32),
-        row_source: wp.array(dtype=wp.int32),
-        row_place: wp.array(dtype=wp.int32),
-        sorted_positions: wp.array(dtype=vector),
-        row_positions: wp.array(dtype=vector),
-        sorted_states: wp.array(dtype=share),
+        source: wp.array[wp.int32],
+        sorted_cell: wp.array[wp.int32],
+        row_of: wp.array[wp.int32],
+        row_source: wp.array[wp.int32],
+        row_place: wp.array[wp.int32],
+        sorted_positions: wp.array[vector],
+        row_positions: wp.array[vector],
+        sorted_states: wp.array[channels],
     ):
         """Write particles sorted by cell, and by index within a cell; number active ones' rows.
 
@@ -342,23 +314,23 @@ def order_particles(space_dim: int, width: int) -> wp.Kernel:
             lane = k % wp.static(WARP)
             parts = group_count * wp.static(CUDA_LANES)
             for first_turn in range(0, parts, wp.static(CUDA_LANES)):
-                held = shares()
+                held = held_type()
                 for turn in range(wp.static(CUDA_LANES)):
                     chunk = lane + (first_turn + turn) * wp.static(WARP)
                     owner = chunk / parts
-                    first = (chunk - owner * parts) * wp.static(share_width)
+                    first = (chunk - owner * parts) * wp.static(thread_width)
                     state = read_channels(states, state_dim, aligned, of_warp(i, owner), first)
-                    for n in range(wp.static(share_width)):
+                    for n in range(wp.static(thread_width)):
                         held[turn, n] = state[n]
                 for turn in range(wp.static(CUDA_LANES)):
                     chunk = lane + (first_turn + turn) * wp.static(WARP)
                     owner = chunk / parts
                     part = chunk - owner * parts
                     to = of_warp(place, owner) * parts + part
-                    state = share()
-                    for n in range(wp.static(share_width)):
+                    state = channels()
+                    for n in range(wp.static(thread_width)):
                         state[n] = held[turn, n]
                     if k - lane + owner < total:
-                        store_share(sorted_states, to, state)
+                        store_channels(sorted_states, to, state)
 
     return order_particles

@@ -16,7 +16,7 @@ __device__ inline wp::vec_t<2, float> mean_of_world(
         for (int i = chunk * CHUNK + lane; i < end; i += 32) {
             total += (double)positions.data[first + i][task & 1];
         }
-        total = warp_sum(total);
+        total = lane_sum<double, 32, true, 1>(total);
         if (lane == 0) sums[task] = total;
     }
     __syncthreads();
@@ -25,8 +25,8 @@ __device__ inline wp::vec_t<2, float> mean_of_world(
         totals[0] += sums[2 * chunk];
         totals[1] += sums[2 * chunk + 1];
     }
-    return wp::vec_t<2, float>(
-        (float)(warp_sum(totals[0]) / count), (float)(warp_sum(totals[1]) / count));
+    for (double& total : totals) total = lane_sum<double, 32, true, 1>(total);
+    return wp::vec_t<2, float>((float)(totals[0] / count), (float)(totals[1] / count));
 }
 
 }  // namespace npa

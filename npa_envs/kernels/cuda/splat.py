@@ -27,11 +27,11 @@ def sort_small_splats(capacity: int) -> wp.Kernel:
     scalar = wp.float32
     block = BLOCKS[capacity]
     types, functions = splat_types(scalar), splat_functions(scalar)
-    Lens, vector, footprint_type = types.Lens, types.vector, types.footprint
+    View, vector, footprint_type = types.View, types.vector, types.footprint
     pixel_place, patch_centre = functions.pixel_place, functions.patch_centre
     cell_of_centre, footprint_of = functions.cell_of_centre, functions.footprint_of
-    load_vector = make_wide_load(vector, scalar)
-    store_footprint = make_wide_store(footprint_type, scalar)
+    load_vector = make_wide_load(vector)
+    store_footprint = make_wide_store(footprint_type)
     sorting = block_functions(capacity)
     block_memory, clear_counts = sorting.block_memory, sorting.clear_counts
     arrive, add_up_counts = sorting.arrive, sorting.add_up_counts
@@ -40,9 +40,7 @@ def sort_small_splats(capacity: int) -> wp.Kernel:
     member_at = sorting.member_at
 
     @native.func_native(capacity, CHUNK)
-    def mean_of_world(
-        positions: wp.array(dtype=vector), first: wp.int32, count: wp.int32
-    ) -> vector:
+    def mean_of_world(positions: wp.array[vector], first: int, count: int) -> vector:
         """Return the mean of a world's positions; the whole block calls it."""
 
     @wp.kernel(
@@ -51,18 +49,18 @@ def sort_small_splats(capacity: int) -> wp.Kernel:
         module=native.module(f"npa_envs.kernels.small_splats_{capacity}"),
     )
     def sort_splats(
-        lens: Lens,
-        slice_count: wp.int32,
-        particle_count: wp.int32,
-        positions: wp.array(dtype=vector),
-        states: wp.array(dtype=scalar, ndim=2),
+        view: View,
+        slice_count: int,
+        particle_count: int,
+        positions: wp.array[vector],
+        states: wp.array2d[scalar],
         shift: scalar,
-        centred: wp.int32,
-        goal: wp.array(dtype=vector),
+        centred: int,
+        goal: wp.array[vector],
         # outputs
-        starts: wp.array(dtype=wp.int32),
-        footprints: wp.array(dtype=footprint_type),
-        source: wp.array(dtype=wp.int32),
+        starts: wp.array[wp.int32],
+        footprints: wp.array[footprint_type],
+        source: wp.array[wp.int32],
     ):
         """Sort every world's splats by cell, then index; write one slice of them."""
         await_earlier()
@@ -74,15 +72,15 @@ def sort_small_splats(capacity: int) -> wp.Kernel:
         if centred != 0:
             mean = mean_of_world(positions, first_particle, particle_count)
         memory = block_memory()
-        clear_counts(memory, lens.cell_count, wp.int32(0))
+        clear_counts(memory, view.cell_count, wp.int32(0))
         for i in range(lane, particle_count, wp.static(block)):
             position = load_vector(positions, first_particle + i)
-            place = pixel_place(lens, position, centred, mean, goal)
-            arrive(memory, i, cell_of_centre(lens, patch_centre(place)), False)
-        add_up_counts(memory, lens.cell_count)
-        first_cell = world * lens.cell_count
+            place = pixel_place(view, position, centred, mean, goal)
+            arrive(memory, i, cell_of_centre(view, patch_centre(place)), False)
+        add_up_counts(memory, view.cell_count)
+        first_cell = world * view.cell_count
         stride = slice_count * wp.static(block)
-        for cell in range(slice_number * wp.static(block) + lane, lens.cell_count, stride):
+        for cell in range(slice_number * wp.static(block) + lane, view.cell_count, stride):
             store_integer(starts, first_cell + cell, first_particle + start_of(memory, cell)[0])
         if lane == 0 and first_particle + particle_count == positions.shape[0]:
             starts[starts.shape[0] - 1] = positions.shape[0]
@@ -90,24 +88,24 @@ def sort_small_splats(capacity: int) -> wp.Kernel:
             place_arrived(memory, i)
         sync_block()
 
-        share = (particle_count + slice_count - 1) / slice_count
-        begin = slice_number * share
+        slice_places = (particle_count + slice_count - 1) / slice_count
+        begin = slice_number * slice_places
         # Invisible splats, which may be many, can have any order. As it differs among the blocks of
         # a world, the last block writes all of them.
-        hidden = start_of(memory, lens.cell_count - 1)[0]
-        end = wp.min(begin + share, hidden)
+        hidden = start_of(memory, view.cell_count - 1)[0]
+        end = wp.min(begin + slice_places, hidden)
         if slice_number == slice_count - 1:
             begin = wp.min(begin, hidden)
             end = particle_count
         if begin < end:
             span = span_of_slice(memory, begin, end)
             for k in range(span[0] + lane, span[1], wp.static(block)):
-                target = ranked_at(memory, k, lens.cell_count - 1)[0]
+                target = ranked_at(memory, k, view.cell_count - 1)[0]
                 if target >= begin and target < end:
                     i = first_particle + member_at(memory, k)
-                    place = pixel_place(lens, load_vector(positions, i), centred, mean, goal)
+                    place = pixel_place(view, load_vector(positions, i), centred, mean, goal)
                     target += first_particle
-                    store_footprint(footprints, target, footprint_of(lens, place, i, states, shift))
+                    store_footprint(footprints, target, footprint_of(view, place, i, states, shift))
                     store_integer(source, target, i)
 
     return sort_splats

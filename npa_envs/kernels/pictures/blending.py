@@ -93,7 +93,7 @@ def blending_functions(scalar: type) -> SimpleNamespace:
         rest = scalar(1.0) / (scalar(1.0) - alpha)
         before = through * rest
         gained = wp.dot(colours_of(footprint), bar)
-        share = alpha * before
+        weight = alpha * before
         slope = scalar(0.0)
         if strength <= scalar(MAX_ALPHA):
             slope = alpha * (before * gained - behind * rest)
@@ -107,11 +107,11 @@ def blending_functions(scalar: type) -> SimpleNamespace:
         pulls[4] = slope_x * y
         pulls[5] = slope_y * y
         for c in range(wp.static(CHANNELS)):
-            pulls[6 + c] = share * bar[c]
-        return pulls, before, behind + share * gained
+            pulls[6 + c] = weight * bar[c]
+        return pulls, before, behind + weight * gained
 
     @wp.func
-    def channels_at(values: wp.array(dtype=scalar, ndim=2), pixel: wp.int32):
+    def channels_at(values: wp.array2d[scalar], pixel: int):
         result = quad()
         # In an unrolled loop the vector stays in registers.
         for c in range(wp.static(CHANNELS)):
@@ -120,7 +120,7 @@ def blending_functions(scalar: type) -> SimpleNamespace:
         return result
 
     @wp.func
-    def pixel_of(frame: Frame, image: wp.int32, row: wp.int32, column: wp.int32):
+    def pixel_of(frame: Frame, image: int, row: int, column: int):
         """Return the index of a pixel among all pictures, -1 outside of them."""
         pixel = wp.int32(-1)
         if row < frame.height and column < frame.width:
@@ -128,7 +128,7 @@ def blending_functions(scalar: type) -> SimpleNamespace:
         return pixel
 
     @wp.func
-    def middle_of(pixel: wp.int32):
+    def middle_of(pixel: int):
         """Return the coordinate of the centre of a row's or column's pixels."""
         return scalar(pixel) + scalar(0.5)
 
@@ -148,7 +148,7 @@ def tile_kernels(scalar: type) -> SimpleNamespace:
     module = native.module(f"npa_envs.kernels.blending_tiles_{scalar_name(scalar)}")
 
     @wp.func
-    def shared_pixels(frame: Frame, tile: wp.int32, footprint: footprint_type):
+    def shared_pixels(frame: Frame, tile: int, footprint: footprint_type):
         """Return first, and last + 1, column and row of a tile's pixels that a footprint covers."""
         place = tile % frame.tile_count
         row = place / frame.tile_columns * wp.static(TILE)
@@ -165,16 +165,16 @@ def tile_kernels(scalar: type) -> SimpleNamespace:
     @in_ranges(TILES)
     @wp.kernel(enable_backward=False, module=module)
     def draw_tiles(
-        range_start: wp.int32,
+        range_start: int,
         frame: Frame,
-        starts: wp.array(dtype=wp.int32),
-        owners: wp.array(dtype=wp.int32),
-        footprints: wp.array(dtype=footprint_type),
+        starts: wp.array[wp.int32],
+        owners: wp.array[wp.int32],
+        footprints: wp.array[footprint_type],
         # added to, from zeros and ones
-        picture: wp.array(dtype=scalar, ndim=2),
-        passing: wp.array(dtype=scalar),
+        picture: wp.array2d[scalar],
+        passing: wp.array[scalar],
         # outputs
-        stops: wp.array(dtype=wp.int32),
+        stops: wp.array[wp.int32],
     ):
         """Draw a tile; `stops` becomes one past the last pair that a pixel blends.
 
@@ -205,19 +205,19 @@ def tile_kernels(scalar: type) -> SimpleNamespace:
     @in_ranges(TILES)
     @wp.kernel(enable_backward=False, module=module)
     def pull_back_tiles(
-        range_start: wp.int32,
+        range_start: int,
         frame: Frame,
-        starts: wp.array(dtype=wp.int32),
-        owners: wp.array(dtype=wp.int32),
-        places: wp.array(dtype=wp.int64),
-        footprints: wp.array(dtype=footprint_type),
-        stops: wp.array(dtype=wp.int32),
-        picture_bar: wp.array(dtype=scalar, ndim=2),
+        starts: wp.array[wp.int32],
+        owners: wp.array[wp.int32],
+        places: wp.array[wp.int64],
+        footprints: wp.array[footprint_type],
+        stops: wp.array[wp.int32],
+        picture_bar: wp.array2d[scalar],
         # changed: what passes at the end, and that times its cotangent
-        through: wp.array(dtype=scalar),
-        behind: wp.array(dtype=scalar),
+        through: wp.array[scalar],
+        behind: wp.array[scalar],
         # outputs
-        pulls: wp.array(dtype=pulls_type),
+        pulls: wp.array[pulls_type],
     ):
         """Write a tile's pull on each of its Gaussians to the pair's slot."""
         tile = range_start + wp.tid()
@@ -263,15 +263,15 @@ def block_kernels(scalar: type) -> SimpleNamespace:
     name = scalar_name(scalar)
     drawing = native.module(f"npa_envs.kernels.blending_blocks_{name}")
     pulling = native.module(f"npa_envs.kernels.blending_blocks_adjoint_{name}")
-    load_footprint = make_wide_load(footprint_type, scalar)
-    add_warp = make_lane_sum(pulls_type, scalar, WARP, whole_warps=True)
+    load_footprint = make_wide_load(footprint_type)
+    add_warp = make_lane_sum(pulls_type, WARP, whole_warps=True)
 
     @native.func_native(BATCH, TILE_PIXELS // WARP)
-    def keep(write: wp.bool, i: wp.int32, entry: wp.int32, value: pulls_type) -> scalar:
+    def keep(write: bool, i: int, entry: int, value: pulls_type) -> scalar:
         """Store a warp's pulls of pair i (`write`), or return an entry of their sum over warps."""
 
     @wp.func
-    def own_pixel(frame: Frame, tile: wp.int32, k: wp.int32):
+    def own_pixel(frame: Frame, tile: int, k: int):
         """Return column and row of a thread's pixel; a warp has a patch of its tile."""
         patch = k / wp.static(WARP)
         lane = k % wp.static(WARP)
@@ -286,13 +286,13 @@ def block_kernels(scalar: type) -> SimpleNamespace:
     @wp.kernel(enable_backward=False, module=drawing)
     def draw_blocks(
         frame: Frame,
-        starts: wp.array(dtype=wp.int32),
-        owners: wp.array(dtype=wp.int32),
-        footprints: wp.array(dtype=footprint_type),
+        starts: wp.array[wp.int32],
+        owners: wp.array[wp.int32],
+        footprints: wp.array[footprint_type],
         # outputs
-        picture: wp.array(dtype=scalar, ndim=2),
-        passing: wp.array(dtype=scalar),
-        stops: wp.array(dtype=wp.int32),
+        picture: wp.array2d[scalar],
+        passing: wp.array[scalar],
+        stops: wp.array[wp.int32],
     ):
         """Draw a pixel; `stops` becomes one past the last pair that it blends."""
         t = wp.tid()
@@ -328,16 +328,16 @@ def block_kernels(scalar: type) -> SimpleNamespace:
     @wp.kernel(enable_backward=False, module=pulling)
     def pull_back_blocks(
         frame: Frame,
-        starts: wp.array(dtype=wp.int32),
-        owners: wp.array(dtype=wp.int32),
-        places: wp.array(dtype=wp.int64),
-        footprints: wp.array(dtype=footprint_type),
-        stops: wp.array(dtype=wp.int32),
-        picture_bar: wp.array(dtype=scalar, ndim=2),
-        passing: wp.array(dtype=scalar),
-        passing_bar: wp.array(dtype=scalar),
+        starts: wp.array[wp.int32],
+        owners: wp.array[wp.int32],
+        places: wp.array[wp.int64],
+        footprints: wp.array[footprint_type],
+        stops: wp.array[wp.int32],
+        picture_bar: wp.array2d[scalar],
+        passing: wp.array[scalar],
+        passing_bar: wp.array[scalar],
         # outputs
-        pulls: wp.array(dtype=scalar),
+        pulls: wp.array[scalar],
     ):
         """Write a tile's pull on each of its Gaussians to the pair's slot.
 

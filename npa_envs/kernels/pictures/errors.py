@@ -67,20 +67,20 @@ def make_pixel_errors(scalar: type) -> wp.Function:
 def gather_errors(scalar: type) -> wp.Kernel:
     """Return the kernel of one scalar type that gathers and compares; for CUDA."""
     types = splat_types(scalar)
-    Lens, colour_type, footprint_type = types.Lens, types.colour, types.footprint
+    View, colour_type, footprint_type = types.View, types.colour, types.footprint
     row_type = wp.types.matrix((CHANNELS, TILE_WIDTH), scalar)
     gathering = gather_functions(scalar, TILE_LANES)
     candidate_count, gather_tile = gathering.candidate_count, gathering.gather_tile
     pixel_errors = make_pixel_errors(scalar)
-    load_colour = make_wide_load(colour_type, scalar)
-    lane_sum = make_lane_sum(wp.vec2d, wp.float64, TILE_LANES)
+    load_colour = make_wide_load(colour_type)
+    lane_sum = make_lane_sum(wp.vec2d, TILE_LANES)
 
     @native.func_native(BLOCK_TILES)
-    def rank_tiles(tile_count: wp.int32, candidates: wp.int32):
+    def rank_tiles(tile_count: int, candidates: int):
         """Rank the block's first tiles, one of each thread, by their candidates."""
 
     @native.func_native(BLOCK_TILES)
-    def ranked_tile(rank: wp.int32) -> wp.vec2i:
+    def ranked_tile(rank: int) -> wp.vec2i:
         """Return the tile of a rank and its number of candidates, -1 for no tile."""
 
     @wp.kernel(
@@ -90,26 +90,26 @@ def gather_errors(scalar: type) -> wp.Kernel:
         grid_stride=False,
     )
     def gather_errors(
-        lens: Lens,
-        tile_count: wp.int32,
-        starts: wp.array(dtype=wp.int32),
-        footprints: wp.array(dtype=footprint_type),
-        target: wp.array(dtype=colour_type),
+        view: View,
+        tile_count: int,
+        starts: wp.array[wp.int32],
+        footprints: wp.array[footprint_type],
+        target: wp.array[colour_type],
         # outputs
-        partial_sums: wp.array(dtype=wp.vec2d, ndim=2),
+        partial_sums: wp.array2d[wp.vec2d],
     ):
         """Write the sums of both errors over each tile."""
         await_earlier()
         # Adjacent tiles belong to different blocks, so that all blocks of a world do equal work.
-        tiles = lens.tile_columns * lens.tile_rows
+        tiles = view.tile_columns * view.tile_rows
         stride = (tiles + tile_count - 1) / tile_count
         world = block_number() / stride
         first = block_number() - world * stride
         own = first + thread_of_block() * stride
         candidates = wp.int32(-1)
         if own < tiles and thread_of_block() < tile_count:
-            row = own / lens.tile_columns
-            candidates = candidate_count(lens, world, row, own - row * lens.tile_columns, starts)
+            row = own / view.tile_columns
+            candidates = candidate_count(view, world, row, own - row * view.tile_columns, starts)
         rank_tiles(tile_count, candidates)
         lane = thread_of_block() % wp.static(TILE_LANES)
         warp = thread_of_block() / wp.static(WARP)
@@ -121,16 +121,16 @@ def gather_errors(scalar: type) -> wp.Kernel:
                 batch += wp.static(BLOCK_WARPS - 1) - 2 * warp
             ranked = ranked_tile(batch * wp.static(WARP_TILES) + place)
             tile = first + ranked[0] * stride
-            row = wp.int32(wp.uint32(tile) / wp.uint32(lens.tile_columns))
-            column = tile - row * lens.tile_columns
+            row = wp.int32(wp.uint32(tile) / wp.uint32(view.tile_columns))
+            column = tile - row * view.tile_columns
             values = row_type()
             if ranked[1] > 0:
-                values = gather_tile(lens, world, row, column, lane, starts, footprints)
+                values = gather_tile(view, world, row, column, lane, starts, footprints)
             # A lane has a row of the tile.
             row = row * wp.static(TILE_HEIGHT) + lane
             column *= wp.static(TILE_WIDTH)
-            inside = wp.where(row < lens.resolution, lens.resolution - column, wp.int32(0))
-            pixel = row * lens.resolution + column
+            inside = wp.where(row < view.resolution, view.resolution - column, wp.int32(0))
+            pixel = row * view.resolution + column
             sums = wp.vec2d()
             for k in range(wp.static(TILE_WIDTH)):
                 if k < inside:
@@ -155,10 +155,10 @@ def sum_errors(scalar: type) -> wp.Kernel:
         module=native.module(f"npa_envs.kernels.drawn_errors_{scalar_name(scalar)}"),
     )
     def sum_errors(
-        picture: wp.array(dtype=colour_type, ndim=3),
-        target: wp.array(dtype=colour_type, ndim=2),
+        picture: wp.array3d[colour_type],
+        target: wp.array2d[colour_type],
         # outputs
-        partial_sums: wp.array(dtype=wp.vec2d, ndim=2),
+        partial_sums: wp.array2d[wp.vec2d],
     ):
         """Write the sums of both errors over each row of the pictures."""
         world, row = wp.tid()

@@ -54,13 +54,13 @@ def gaussian_types(scalar: type) -> SimpleNamespace:
 
     @wp.struct
     class Frame:
-        particle_count: wp.int32
-        view_count: wp.int32
-        width: wp.int32
-        height: wp.int32
-        tile_columns: wp.int32
-        tile_count: wp.int32
-        channels: wp.int32
+        particle_count: int
+        view_count: int
+        width: int
+        height: int
+        tile_columns: int
+        tile_count: int
+        channels: int
         near: scalar
         dilation: scalar
 
@@ -81,26 +81,17 @@ def gaussian_types(scalar: type) -> SimpleNamespace:
 
 @cached_under_lock(256)
 def make_frame(
-    scalar: type,
-    shape: tuple[int, int, int],
-    sizes: tuple[int, int],
-    near: float,
-    dilation: float,
+    scalar: type, shape: tuple[int, int, int], sizes: tuple[int, int], near: float, dilation: float
 ) -> Any:
     """Return the `Frame` of a batch of pictures."""
     frame = gaussian_types(scalar).Frame()
     frame.particle_count, frame.view_count, frame.channels = shape
     frame.width, frame.height = sizes
     frame.tile_columns = -(-frame.width // TILE)
-    frame.tile_count = tile_total(*sizes)
+    frame.tile_count = frame.tile_columns * -(-frame.height // TILE)
     frame.near = near
     frame.dilation = dilation
     return frame
-
-
-def tile_total(width: int, height: int) -> int:
-    """Return the number of tiles of a picture."""
-    return -(-width // TILE) * -(-height // TILE)
 
 
 @cached_under_lock()
@@ -108,7 +99,7 @@ def make_covered(scalar: type) -> wp.Function:
     """Return a Warp function for the pixels along one direction that a footprint covers."""
 
     @wp.func
-    def covered(middle: scalar, reach: scalar, size: wp.int32):
+    def covered(middle: scalar, reach: scalar, size: int):
         """Return first and last + 1 pixel along one direction whose centre is within reach."""
         end = scalar(size)
         first = wp.ceil(wp.clamp(middle - reach - scalar(0.5), scalar(0.0), end))
@@ -127,9 +118,9 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
     square, flat, cube, motion_type = types.square, types.flat, types.cube, types.motion
     covered = make_covered(scalar)
     module = native.module(f"npa_envs.kernels.gaussians_{scalar_name(scalar)}")
-    load_footprint = make_wide_load(footprint_type, scalar)
-    store_footprint = make_wide_store(footprint_type, scalar)
-    load_pulls = make_wide_load(pulls_type, scalar)
+    load_footprint = make_wide_load(footprint_type)
+    store_footprint = make_wide_store(footprint_type)
+    load_pulls = make_wide_load(pulls_type)
 
     @wp.func
     def unit_quaternion(quaternion: quad):
@@ -206,18 +197,18 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
         return wp.clamp(ratio, (-middle - margin) / focal, (size - middle + margin) / focal)
 
     @wp.func
-    def limited_ratios(frame: Frame, lens: quad, place: triple):
+    def limited_ratios(frame: Frame, camera: quad, place: triple):
         return pair(
-            limited(place[0] / place[2], lens[0], lens[2], scalar(frame.width)),
-            limited(place[1] / place[2], lens[1], lens[3], scalar(frame.height)),
+            limited(place[0] / place[2], camera[0], camera[2], scalar(frame.width)),
+            limited(place[1] / place[2], camera[1], camera[3], scalar(frame.height)),
         )
 
     @wp.func
-    def jacobian_of(frame: Frame, lens: quad, place: triple):
+    def jacobian_of(frame: Frame, camera: quad, place: triple):
         """Return J, the derivative of picture coordinates by those in the camera's frame."""
-        ratios = limited_ratios(frame, lens, place)
-        x = lens[0] / place[2]
-        y = lens[1] / place[2]
+        ratios = limited_ratios(frame, camera, place)
+        x = camera[0] / place[2]
+        y = camera[1] / place[2]
         return flat(x, scalar(0.0), -x * ratios[0], scalar(0.0), y, -y * ratios[1])
 
     @wp.func
@@ -234,7 +225,7 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
         return mean + wp.transpose(rotation_part(motion)) * shift_part(motion)
 
     @wp.func
-    def harmonics_at(colours: wp.array(dtype=scalar, ndim=2), i: wp.int32):
+    def harmonics_at(colours: wp.array2d[scalar], i: int):
         result = harmonics_type()
         for k in range(4):
             for c in range(3):
@@ -252,9 +243,7 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
         )
 
     @wp.func
-    def colours_of(
-        colours: wp.array(dtype=scalar, ndim=2), i: wp.int32, motion: motion_type, mean: triple
-    ):
+    def colours_of(colours: wp.array2d[scalar], i: int, motion: motion_type, mean: triple):
         """Return a Gaussian's colours, padded with 0; from spherical harmonics if it has 12."""
         result = quad()
         if colours.shape[1] <= wp.static(CHANNELS):
@@ -286,19 +275,19 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
     @in_ranges(PAIRS)
     @wp.kernel(enable_backward=False, module=module)
     def project_gaussians(
-        range_start: wp.int32,
+        range_start: int,
         frame: Frame,
-        means: wp.array(dtype=triple),
-        scales: wp.array(dtype=triple),
-        quaternions: wp.array(dtype=quad),
-        opacities: wp.array(dtype=scalar),
-        colours: wp.array(dtype=scalar, ndim=2),
-        motions: wp.array(dtype=motion_type),
-        intrinsics: wp.array(dtype=quad),
+        means: wp.array[triple],
+        scales: wp.array[triple],
+        quaternions: wp.array[quad],
+        opacities: wp.array[scalar],
+        colours: wp.array2d[scalar],
+        motions: wp.array[motion_type],
+        intrinsics: wp.array[quad],
         # outputs
-        footprints: wp.array(dtype=footprint_type),
-        depths: wp.array(dtype=scalar),
-        counts: wp.array(dtype=wp.int32),
+        footprints: wp.array[footprint_type],
+        depths: wp.array[scalar],
+        counts: wp.array[wp.int32],
     ):
         """Write footprint, depth and number of covered tiles of each Gaussian in each picture.
 
@@ -310,7 +299,7 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
         image = entry / frame.particle_count
         i = image / frame.view_count * frame.particle_count + entry % frame.particle_count
         motion = motions[image % motions.shape[0]]
-        lens = intrinsics[image % intrinsics.shape[0]]
+        camera = intrinsics[image % intrinsics.shape[0]]
         mean = means[i]
         opacity = opacities[i]
         rotation = rotation_part(motion)
@@ -321,7 +310,7 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
         if place[2] >= frame.near and opacity >= scalar(MIN_ALPHA):
             unit, _inverse = unit_quaternion(quaternions[i])
             spread = scaled_columns(rotation * rotation_of(unit), scales[i])
-            root = jacobian_of(frame, lens, place) * spread
+            root = jacobian_of(frame, camera, place) * spread
             x = root[0]
             y = root[1]
             squared_x = wp.dot(x, x)
@@ -334,8 +323,8 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
             squared_x += frame.dilation
             squared_y += frame.dilation
             reach = scalar(2.0) * (wp.log(scalar(255.0) * opacity) + scalar(REACH_SLACK))
-            footprint[0] = lens[0] * place[0] / place[2] + lens[2]
-            footprint[1] = lens[1] * place[1] / place[2] + lens[3]
+            footprint[0] = camera[0] * place[0] / place[2] + camera[2]
+            footprint[1] = camera[1] * place[1] / place[2] + camera[3]
             footprint[2] = squared_y * inverse
             footprint[3] = -wp.dot(x, y) * inverse
             footprint[4] = squared_x * inverse
@@ -360,16 +349,16 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
     @in_ranges(PAIRS)
     @wp.kernel(enable_backward=False, module=module)
     def list_pairs(
-        range_start: wp.int32,
+        range_start: int,
         frame: Frame,
-        footprints: wp.array(dtype=footprint_type),
-        order: wp.array(dtype=wp.int64),
-        ends: wp.array(dtype=wp.int64),
-        room: wp.int32,
+        footprints: wp.array[footprint_type],
+        order: wp.array[wp.int64],
+        ends: wp.array[wp.int64],
+        room: int,
         # outputs
-        tiles: wp.array(dtype=wp.int32),
-        owners: wp.array(dtype=wp.int32),
-        slots: wp.array(dtype=wp.int32),
+        tiles: wp.array[wp.int32],
+        owners: wp.array[wp.int32],
+        slots: wp.array[wp.int32],
     ):
         """List tile and Gaussian of each pair, near ones first, and each Gaussian's first slot.
 
@@ -398,24 +387,24 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
     @in_ranges(PAIRS)
     @wp.kernel(enable_backward=False, module=module)
     def pull_back_gaussians(
-        range_start: wp.int32,
+        range_start: int,
         frame: Frame,
-        means: wp.array(dtype=triple),
-        scales: wp.array(dtype=triple),
-        quaternions: wp.array(dtype=quad),
-        colours: wp.array(dtype=scalar, ndim=2),
-        motions: wp.array(dtype=motion_type),
-        intrinsics: wp.array(dtype=quad),
-        footprints: wp.array(dtype=footprint_type),
-        counts: wp.array(dtype=wp.int32),
-        slots: wp.array(dtype=wp.int32),
-        pulls: wp.array(dtype=pulls_type),
+        means: wp.array[triple],
+        scales: wp.array[triple],
+        quaternions: wp.array[quad],
+        colours: wp.array2d[scalar],
+        motions: wp.array[motion_type],
+        intrinsics: wp.array[quad],
+        footprints: wp.array[footprint_type],
+        counts: wp.array[wp.int32],
+        slots: wp.array[wp.int32],
+        pulls: wp.array[pulls_type],
         # outputs
-        means_bar: wp.array(dtype=triple),
-        scales_bar: wp.array(dtype=triple),
-        quaternions_bar: wp.array(dtype=quad),
-        opacities_bar: wp.array(dtype=scalar),
-        colours_bar: wp.array(dtype=scalar, ndim=2),
+        means_bar: wp.array[triple],
+        scales_bar: wp.array[triple],
+        quaternions_bar: wp.array[quad],
+        opacities_bar: wp.array[scalar],
+        colours_bar: wp.array2d[scalar],
     ):
         """Write the cotangents of each Gaussian: sums over its views and, in each, its tiles."""
         i = range_start + wp.tid()
@@ -442,7 +431,7 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
                     pull += load_pulls(pulls, k)
                 footprint = load_footprint(footprints, entry)
                 motion = motions[image % motions.shape[0]]
-                lens = intrinsics[image % intrinsics.shape[0]]
+                camera = intrinsics[image % intrinsics.shape[0]]
                 rotation = rotation_part(motion)
                 place = rotation * mean + shift_part(motion)
                 conic = square(footprint[2], footprint[3], footprint[3], footprint[4])
@@ -451,7 +440,7 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
 
                 # Of Q = (A Aᵀ + dilation)⁻¹ with A = J W R S.
                 moments = square(pull[3], pull[4], pull[4], pull[5])
-                jacobian = jacobian_of(frame, lens, place)
+                jacobian = jacobian_of(frame, camera, place)
                 towards = rotation * turned
                 spread = scaled_columns(towards, scale)
                 root_bar = conic * moments * conic * (jacobian * spread)
@@ -462,10 +451,10 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
                         scale_bar[d] += spread_bar[row, d] * towards[row, d]
                 rotation_bar += wp.transpose(rotation) * scaled_columns(spread_bar, scale)
 
-                ratios = limited_ratios(frame, lens, place)
+                ratios = limited_ratios(frame, camera, place)
                 place_bar = triple()
                 for d in range(2):
-                    focal = lens[d] / place[2]
+                    focal = camera[d] / place[2]
                     ratio = place[d] / place[2]
                     place_bar[d] = focal * centre_bar[d]
                     place_bar[2] -= focal * centre_bar[d] * ratio

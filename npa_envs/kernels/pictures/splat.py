@@ -60,26 +60,26 @@ PATCH_SIGMAS = 3.0
 
 @cached_under_lock()
 def splat_types(scalar: type) -> SimpleNamespace:
-    """Return the vector types and the `Lens` struct of one scalar type."""
+    """Return the vector types and the `View` struct of one scalar type."""
 
     @wp.struct
-    class Lens:
-        resolution: wp.int32
-        radius: wp.int32
+    class View:
+        resolution: int
+        radius: int
         low: scalar
         pixels_per_length: scalar
         falloff: scalar
         area: scalar
         pull: scalar
-        tile_columns: wp.int32
-        tile_rows: wp.int32
-        cell_columns: wp.int32
-        cells_across: wp.int32
-        cells_down: wp.int32
-        cell_count: wp.int32
+        tile_columns: int
+        tile_rows: int
+        cell_columns: int
+        cells_across: int
+        cells_down: int
+        cell_count: int
 
     return SimpleNamespace(
-        Lens=Lens,
+        View=View,
         vector=wp.types.vector(2, scalar),
         colour=wp.types.vector(CHANNELS, scalar),
         footprint=wp.types.vector(FOOTPRINT, scalar),
@@ -92,28 +92,28 @@ def splat_types(scalar: type) -> SimpleNamespace:
 
 
 @cached_under_lock(256)
-def make_lens(
+def make_view(
     scalar: type, resolution: int, pixel_size: float, sigma: float, low: float, high: float
 ) -> Any:
-    """Return the `Lens`: the sizes that follow from a picture's resolution, window and Gaussian."""
+    """Return the `View`: the sizes that follow from a picture's resolution, window and Gaussian."""
     pixels = resolution * pixel_size / (high - low)
-    lens = splat_types(scalar).Lens()
-    lens.resolution = resolution
-    lens.radius = radius = math.ceil(PATCH_SIGMAS * sigma * pixels)
-    lens.low = low
-    lens.pixels_per_length = (resolution - 1) / (high - low)
+    view = splat_types(scalar).View()
+    view.resolution = resolution
+    view.radius = radius = math.ceil(PATCH_SIGMAS * sigma * pixels)
+    view.low = low
+    view.pixels_per_length = (resolution - 1) / (high - low)
     # For powers of two, which the hardware computes.
-    lens.falloff = 0.5 / (sigma * pixels) ** 2 / math.log(2.0)
-    lens.pull = lens.pixels_per_length / (sigma * pixels) ** 2
-    lens.area = pixels * pixels
-    lens.tile_columns = -(-resolution // TILE_WIDTH)
-    lens.tile_rows = -(-resolution // TILE_HEIGHT)
-    lens.cells_across = (TILE_WIDTH - 1 + 2 * radius) // TILE_WIDTH + 1
-    lens.cell_columns = lens.tile_columns - 1 + lens.cells_across
-    lens.cells_down = (TILE_HEIGHT - 1 + 2 * radius) // TILE_HEIGHT + 1
+    view.falloff = 0.5 / (sigma * pixels) ** 2 / math.log(2.0)
+    view.pull = view.pixels_per_length / (sigma * pixels) ** 2
+    view.area = pixels * pixels
+    view.tile_columns = -(-resolution // TILE_WIDTH)
+    view.tile_rows = -(-resolution // TILE_HEIGHT)
+    view.cells_across = (TILE_WIDTH - 1 + 2 * radius) // TILE_WIDTH + 1
+    view.cell_columns = view.tile_columns - 1 + view.cells_across
+    view.cells_down = (TILE_HEIGHT - 1 + 2 * radius) // TILE_HEIGHT + 1
     # One more, for invisible particles.
-    lens.cell_count = lens.cell_columns * (lens.tile_rows - 1 + lens.cells_down) + 1
-    return lens
+    view.cell_count = view.cell_columns * (view.tile_rows - 1 + view.cells_down) + 1
+    return view
 
 
 def gather_registers(scalar: type) -> int | None:
@@ -131,7 +131,7 @@ def group_count(resolution: int) -> int:
 def splat_functions(scalar: type) -> SimpleNamespace:
     """Return the functions of several kernels: positions in pixels, and footprints."""
     types = splat_types(scalar)
-    Lens, vector, colour_type = types.Lens, types.vector, types.colour
+    View, vector, colour_type = types.View, types.vector, types.colour
     footprint_type = types.footprint
     fast_exp2 = make_fast_exp2(scalar)
 
@@ -146,19 +146,15 @@ def splat_functions(scalar: type) -> SimpleNamespace:
 
     @wp.func
     def pixel_place(
-        lens: Lens,
-        position: vector,
-        centred: wp.int32,
-        mean: vector,
-        goal: wp.array(dtype=vector),
+        view: View, position: vector, centred: int, mean: vector, goal: wp.array[vector]
     ):
         """Return a particle's position in pixels; `centred`: its world's mean is at the goal."""
         moved = position
         if centred != 0:
             moved = (position - mean) + goal[0]
         return vector(
-            (moved[0] - lens.low) * lens.pixels_per_length,
-            (moved[1] - lens.low) * lens.pixels_per_length,
+            (moved[0] - view.low) * view.pixels_per_length,
+            (moved[1] - view.low) * view.pixels_per_length,
         )
 
     @wp.func
@@ -166,39 +162,33 @@ def splat_functions(scalar: type) -> SimpleNamespace:
         return vector(wp.floor(place[0] + scalar(0.5)), wp.floor(place[1] + scalar(0.5)))
 
     @wp.func
-    def visible(lens: Lens, centre: vector):
+    def visible(view: View, centre: vector):
         """Return whether a patch covers a pixel of the picture; False for NaN."""
-        begin = -scalar(lens.radius)
-        end = scalar(lens.resolution - 1 + lens.radius)
+        begin = -scalar(view.radius)
+        end = scalar(view.resolution - 1 + view.radius)
         across = centre[0] >= begin and centre[0] <= end
         return across and centre[1] >= begin and centre[1] <= end
 
     @wp.func
-    def cell_of_centre(lens: Lens, centre: vector):
+    def cell_of_centre(view: View, centre: vector):
         """Return the cell of a patch's centre; the last cell if it is invisible."""
-        cell = lens.cell_count - 1
-        if visible(lens, centre):
-            cell = (wp.int32(centre[1]) + lens.radius) / wp.static(TILE_HEIGHT) * lens.cell_columns
-            cell += (wp.int32(centre[0]) + lens.radius) / wp.static(TILE_WIDTH)
+        cell = view.cell_count - 1
+        if visible(view, centre):
+            cell = (wp.int32(centre[1]) + view.radius) / wp.static(TILE_HEIGHT) * view.cell_columns
+            cell += (wp.int32(centre[0]) + view.radius) / wp.static(TILE_WIDTH)
         return cell
 
     @wp.func
-    def footprint_of(
-        lens: Lens,
-        place: vector,
-        i: wp.int32,
-        states: wp.array(dtype=scalar, ndim=2),
-        shift: scalar,
-    ):
+    def footprint_of(view: View, place: vector, i: int, states: wp.array2d[scalar], shift: scalar):
         """Return a particle's footprint, with its last three states plus a shift as colours."""
         centre = patch_centre(place)
         near = centre - place
-        slope = scalar(-2.0) * lens.falloff * near
+        slope = scalar(-2.0) * view.falloff * near
         sums = vector()
-        for o in range(-lens.radius, lens.radius + 1):
+        for o in range(-view.radius, view.radius + 1):
             for d in range(2):
-                sums[d] += patch_weight(lens.falloff, slope[d], scalar(o))
-        factor = lens.area / (sums[0] * sums[1])
+                sums[d] += patch_weight(view.falloff, slope[d], scalar(o))
+        factor = view.area / (sums[0] * sums[1])
         result = footprint_type()
         for d in range(2):
             result[d] = near[d]
@@ -222,39 +212,35 @@ def gather_functions(scalar: type, lanes: int) -> SimpleNamespace:
     """Return functions that sum a tile's particles; `lanes`: 1, or a thread per pixel row."""
     assert lanes in (1, TILE_HEIGHT)
     types, functions = splat_types(scalar), splat_functions(scalar)
-    Lens, footprint_type, tile_type = types.Lens, types.footprint, types.tile
+    View, footprint_type, tile_type = types.View, types.footprint, types.tile
     columns_type, rows_type, weights_type = types.columns, types.rows, types.weights
     patch_weight, footprint_colours = functions.patch_weight, functions.footprint_colours
     runs_type = wp.types.vector(RUNS, wp.int32)
-    load_footprint = make_wide_load(footprint_type, scalar)
+    load_footprint = make_wide_load(footprint_type)
     kept = make_kept(scalar)
-    collect = make_lane_collect(tile_type, scalar, lanes)
+    collect = make_lane_collect(tile_type, lanes)
 
     @wp.func
     def candidate_count(
-        lens: Lens,
-        world: wp.int32,
-        tile_row: wp.int32,
-        tile_column: wp.int32,
-        starts: wp.array(dtype=wp.int32),
+        view: View, world: int, tile_row: int, tile_column: int, starts: wp.array[wp.int32]
     ):
         """Return the number of particles in the cells around a tile."""
-        first = world * lens.cell_count + tile_row * lens.cell_columns + tile_column
+        first = world * view.cell_count + tile_row * view.cell_columns + tile_column
         total = wp.int32(0)
-        for _row in range(lens.cells_down):
-            total += load_integer(starts, first + lens.cells_across) - load_integer(starts, first)
-            first += lens.cell_columns
+        for _row in range(view.cells_down):
+            total += load_integer(starts, first + view.cells_across) - load_integer(starts, first)
+            first += view.cell_columns
         return total
 
     @wp.func
     def gather_tile(
-        lens: Lens,
-        world: wp.int32,
-        tile_row: wp.int32,
-        tile_column: wp.int32,
-        lane: wp.int32,
-        starts: wp.array(dtype=wp.int32),
-        footprints: wp.array(dtype=footprint_type),
+        view: View,
+        world: int,
+        tile_row: int,
+        tile_column: int,
+        lane: int,
+        starts: wp.array[wp.int32],
+        footprints: wp.array[footprint_type],
     ):
         """Return a lane's pixels of a tile, each the weighted sum over its particles."""
         across = columns_type()
@@ -264,10 +250,10 @@ def gather_functions(scalar: type, lanes: int) -> SimpleNamespace:
         down = rows_type()
         for r in range(wp.static(TILE_HEIGHT)):
             down[r] = kept(scalar(tile_row * wp.static(TILE_HEIGHT) + (r ^ lane)))
-        reach = scalar(lens.radius) + scalar(0.5)
+        reach = scalar(view.radius) + scalar(0.5)
         totals = tile_type()
-        base = world * lens.cell_count + tile_row * lens.cell_columns + tile_column
-        for first_row in range(0, lens.cells_down, wp.static(RUNS)):
+        base = world * view.cell_count + tile_row * view.cell_columns + tile_column
+        for first_row in range(0, view.cells_down, wp.static(RUNS)):
             # Lanes alternate along several runs as if these were one: few lanes are idle.
             shifts = runs_type()
             ends = runs_type()
@@ -275,10 +261,10 @@ def gather_functions(scalar: type, lanes: int) -> SimpleNamespace:
             for k in range(wp.static(RUNS)):
                 begin = wp.int32(0)
                 end = wp.int32(0)
-                if first_row + k < lens.cells_down:
-                    first = base + (first_row + k) * lens.cell_columns
+                if first_row + k < view.cells_down:
+                    first = base + (first_row + k) * view.cell_columns
                     begin = load_integer(starts, first)
-                    end = load_integer(starts, first + lens.cells_across)
+                    end = load_integer(starts, first + view.cells_across)
                 shifts[k] = begin - total
                 total += end - begin
                 ends[k] = total
@@ -287,17 +273,17 @@ def gather_functions(scalar: type, lanes: int) -> SimpleNamespace:
                 for k in range(wp.static(RUNS - 1)):
                     shift = wp.where(i < ends[k], shift, shifts[k + 1])
                 footprint = load_footprint(footprints, i + shift)
-                slope_x = scalar(-2.0) * lens.falloff * footprint[0]
-                slope_y = scalar(-2.0) * lens.falloff * footprint[1]
+                slope_x = scalar(-2.0) * view.falloff * footprint[0]
+                slope_y = scalar(-2.0) * view.falloff * footprint[1]
                 columns = columns_type()
                 for c in range(wp.static(TILE_WIDTH)):
                     offset = across[c] - footprint[2]
-                    weight = patch_weight(lens.falloff, slope_x, offset)
+                    weight = patch_weight(view.falloff, slope_x, offset)
                     columns[c] = wp.where(wp.abs(offset) < reach, weight, scalar(0.0))
                 rows = rows_type()
                 for r in range(wp.static(TILE_HEIGHT)):
                     offset = down[r] - footprint[3]
-                    weight = patch_weight(lens.falloff, slope_y, offset)
+                    weight = patch_weight(view.falloff, slope_y, offset)
                     rows[r] = wp.where(wp.abs(offset) < reach, weight, scalar(0.0))
                 weights = weights_type()
                 for k in range(wp.static(TILE_WIDTH * TILE_HEIGHT)):
@@ -314,16 +300,16 @@ def gather_functions(scalar: type, lanes: int) -> SimpleNamespace:
 def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
     """Return the kernels of one scalar type; `lanes` threads share a tile, or a particle."""
     types = splat_types(scalar)
-    Lens, vector, colour_type = types.Lens, types.vector, types.colour
+    View, vector, colour_type = types.View, types.vector, types.colour
     footprint_type, pulls_type = types.footprint, types.pulls
     group_tiles = GROUP_WIDTH * GROUP_HEIGHT
-    share = TILE_WIDTH * TILE_HEIGHT // lanes
+    lane_pixels = TILE_WIDTH * TILE_HEIGHT // lanes
     module = native.module(f"npa_envs.kernels.splat_{scalar_name(scalar)}_l{lanes}")
-    load_footprint = make_wide_load(footprint_type, scalar)
-    store_footprint = make_wide_store(footprint_type, scalar)
-    load_colour = make_wide_load(colour_type, scalar)
-    store_colour = make_wide_store(colour_type, scalar)
-    lane_sum = make_lane_sum(pulls_type, scalar, lanes)
+    load_footprint = make_wide_load(footprint_type)
+    store_footprint = make_wide_store(footprint_type)
+    load_colour = make_wide_load(colour_type)
+    store_colour = make_wide_store(colour_type)
+    lane_sum = make_lane_sum(pulls_type, lanes)
     functions = splat_functions(scalar)
     patch_weight, footprint_colours = functions.patch_weight, functions.footprint_colours
     patch_centre, visible = functions.patch_centre, functions.visible
@@ -333,48 +319,48 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
 
     @wp.func
     def place_in_world(
-        lens: Lens,
+        view: View,
         position: vector,
-        centred: wp.int32,
-        means: wp.array(dtype=vector),
-        goal: wp.array(dtype=vector),
-        world: wp.int32,
+        centred: int,
+        means: wp.array[vector],
+        goal: wp.array[vector],
+        world: int,
     ):
         mean = vector()
         if centred != 0:
             mean = means[world]
-        return pixel_place(lens, position, centred, mean, goal)
+        return pixel_place(view, position, centred, mean, goal)
 
     @wp.kernel(enable_backward=False, module=module)
     def count_splats(
-        lens: Lens,
-        particle_count: wp.int32,
-        positions: wp.array(dtype=vector),
-        centred: wp.int32,
-        means: wp.array(dtype=vector),
-        goal: wp.array(dtype=vector),
+        view: View,
+        particle_count: int,
+        positions: wp.array[vector],
+        centred: int,
+        means: wp.array[vector],
+        goal: wp.array[vector],
         # outputs
-        cell: wp.array(dtype=wp.int32),
-        arrival: wp.array(dtype=wp.int32),
-        counts: wp.array(dtype=wp.int32),
+        cell: wp.array[wp.int32],
+        arrival: wp.array[wp.int32],
+        counts: wp.array[wp.int32],
     ):
         """Store each particle's cell and order of arrival, and count particles at counts[cell + 1];
         counts[0] stays 0 for the prefix sum."""
         await_earlier()
         i = wp.tid()
         world = i / particle_count
-        place = place_in_world(lens, positions[i], centred, means, goal, world)
-        index = world * lens.cell_count + cell_of_centre(lens, patch_centre(place))
+        place = place_in_world(view, positions[i], centred, means, goal, world)
+        index = world * view.cell_count + cell_of_centre(view, patch_centre(place))
         cell[i] = index
         arrival[i] = wp.atomic_add(counts, index + 1, 1)
 
     @wp.kernel(enable_backward=False, module=module)
     def place_splats(
-        cell: wp.array(dtype=wp.int32),
-        arrival: wp.array(dtype=wp.int32),
-        starts: wp.array(dtype=wp.int32),
+        cell: wp.array[wp.int32],
+        arrival: wp.array[wp.int32],
+        starts: wp.array[wp.int32],
         # outputs
-        arrived: wp.array(dtype=wp.int32),
+        arrived: wp.array[wp.int32],
     ):
         """List the particles of each cell in the order in which they were counted."""
         await_earlier()
@@ -383,20 +369,20 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
 
     @wp.kernel(enable_backward=False, module=module)
     def order_splats(
-        lens: Lens,
-        particle_count: wp.int32,
-        positions: wp.array(dtype=vector),
-        states: wp.array(dtype=scalar, ndim=2),
+        view: View,
+        particle_count: int,
+        positions: wp.array[vector],
+        states: wp.array2d[scalar],
         shift: scalar,
-        centred: wp.int32,
-        means: wp.array(dtype=vector),
-        goal: wp.array(dtype=vector),
-        cell: wp.array(dtype=wp.int32),
-        arrived: wp.array(dtype=wp.int32),
-        starts: wp.array(dtype=wp.int32),
+        centred: int,
+        means: wp.array[vector],
+        goal: wp.array[vector],
+        cell: wp.array[wp.int32],
+        arrived: wp.array[wp.int32],
+        starts: wp.array[wp.int32],
         # outputs
-        footprints: wp.array(dtype=footprint_type),
-        source: wp.array(dtype=wp.int32),
+        footprints: wp.array[footprint_type],
+        source: wp.array[wp.int32],
     ):
         """Write each particle's footprint at its rank by index within its cell."""
         await_earlier()
@@ -404,12 +390,12 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         i = arrived[k]
         c = cell[i]
         world = i / particle_count
-        place = place_in_world(lens, positions[i], centred, means, goal, world)
-        footprint = footprint_of(lens, place, i, states, shift)
+        place = place_in_world(view, positions[i], centred, means, goal, world)
+        footprint = footprint_of(view, place, i, states, shift)
         begin = starts[c]
         target = k
         # Invisible particles, which may be many, can have any order.
-        if c != (world + 1) * lens.cell_count - 1:
+        if c != (world + 1) * view.cell_count - 1:
             target = begin
             for other in range(begin, starts[c + 1]):
                 if arrived[other] < i:
@@ -418,10 +404,10 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         source[target] = i
 
     @wp.func
-    def tile_of(lens: Lens, t: wp.int32):
+    def tile_of(view: View, t: int):
         """Return the world, the tile's row and column, and the lane of a thread."""
-        across = (lens.tile_columns + wp.static(GROUP_WIDTH - 1)) / wp.static(GROUP_WIDTH)
-        down = (lens.tile_rows + wp.static(GROUP_HEIGHT - 1)) / wp.static(GROUP_HEIGHT)
+        across = (view.tile_columns + wp.static(GROUP_WIDTH - 1)) / wp.static(GROUP_WIDTH)
+        down = (view.tile_rows + wp.static(GROUP_HEIGHT - 1)) / wp.static(GROUP_HEIGHT)
         tile = t / wp.static(lanes)
         group = tile / wp.static(group_tiles)
         tile -= group * wp.static(group_tiles)
@@ -432,30 +418,30 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         return world, row, column, t % wp.static(lanes)
 
     @wp.func
-    def pixel_of(lens: Lens, tile_row: wp.int32, tile_column: wp.int32, k: wp.int32):
+    def pixel_of(view: View, tile_row: int, tile_column: int, k: int):
         """Return the index of a tile's k-th pixel in its picture, -1 outside of it."""
         row = tile_row * wp.static(TILE_HEIGHT) + k / wp.static(TILE_WIDTH)
         column = tile_column * wp.static(TILE_WIDTH) + k % wp.static(TILE_WIDTH)
-        pixel = row * lens.resolution + column
-        if row >= lens.resolution or column >= lens.resolution:
+        pixel = row * view.resolution + column
+        if row >= view.resolution or column >= view.resolution:
             pixel = wp.int32(-1)
         return pixel
 
     @wp.kernel(enable_backward=False, module=module, cuda_max_registers=gather_registers(scalar))
     def gather_splats(
-        lens: Lens,
-        starts: wp.array(dtype=wp.int32),
-        footprints: wp.array(dtype=footprint_type),
+        view: View,
+        starts: wp.array[wp.int32],
+        footprints: wp.array[footprint_type],
         # outputs
-        picture: wp.array(dtype=colour_type),
+        picture: wp.array[colour_type],
     ):
         """Write each pixel of the pictures."""
-        world, row, column, lane = tile_of(lens, wp.tid())
-        if row < lens.tile_rows and column < lens.tile_columns:
-            values = gather_tile(lens, world, row, column, lane, starts, footprints)
-            begin = world * lens.resolution * lens.resolution
-            for k in range(wp.static(share)):
-                pixel = pixel_of(lens, row, column, lane * wp.static(share) + k)
+        world, row, column, lane = tile_of(view, wp.tid())
+        if row < view.tile_rows and column < view.tile_columns:
+            values = gather_tile(view, world, row, column, lane, starts, footprints)
+            begin = world * view.resolution * view.resolution
+            for k in range(wp.static(lane_pixels)):
+                pixel = pixel_of(view, row, column, lane * wp.static(lane_pixels) + k)
                 if pixel >= 0:
                     value = colour_type(values[0, k], values[1, k], values[2, k], values[3, k])
                     store_colour(picture, begin + pixel, value)
@@ -463,43 +449,43 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
     @in_ranges(WORLDS)
     @wp.kernel(enable_backward=False, module=module)
     def scatter_splats(
-        range_start: wp.int32,
-        lens: Lens,
-        particle_count: wp.int32,
-        positions: wp.array(dtype=vector),
-        states: wp.array(dtype=scalar, ndim=2),
+        range_start: int,
+        view: View,
+        particle_count: int,
+        positions: wp.array[vector],
+        states: wp.array2d[scalar],
         shift: scalar,
-        centred: wp.int32,
-        means: wp.array(dtype=vector),
-        goal: wp.array(dtype=vector),
-        scratch: wp.array(dtype=scalar, ndim=2),
+        centred: int,
+        means: wp.array[vector],
+        goal: wp.array[vector],
+        scratch: wp.array2d[scalar],
         # added to
-        picture: wp.array(dtype=colour_type, ndim=3),
+        picture: wp.array3d[colour_type],
         # outputs
-        footprints: wp.array(dtype=footprint_type),
-        source: wp.array(dtype=wp.int32),
+        footprints: wp.array[footprint_type],
+        source: wp.array[wp.int32],
     ):
         """Draw a world, particle after particle; for devices with few threads."""
         world = range_start + wp.tid()
         for i in range(world * particle_count, (world + 1) * particle_count):
-            place = place_in_world(lens, positions[i], centred, means, goal, world)
-            footprint = footprint_of(lens, place, i, states, shift)
+            place = place_in_world(view, positions[i], centred, means, goal, world)
+            footprint = footprint_of(view, place, i, states, shift)
             footprints[i] = footprint
             source[i] = i
-            if visible(lens, patch_centre(place)):
+            if visible(view, patch_centre(place)):
                 column = wp.int32(footprint[2])
                 row = wp.int32(footprint[3])
-                left = wp.max(column - lens.radius, 0)
-                right = wp.min(column + lens.radius, lens.resolution - 1) + 1
-                slope_x = scalar(-2.0) * lens.falloff * footprint[0]
-                slope_y = scalar(-2.0) * lens.falloff * footprint[1]
+                left = wp.max(column - view.radius, 0)
+                right = wp.min(column + view.radius, view.resolution - 1) + 1
+                slope_x = scalar(-2.0) * view.falloff * footprint[0]
+                slope_y = scalar(-2.0) * view.falloff * footprint[1]
                 for q in range(left, right):
-                    weight = patch_weight(lens.falloff, slope_x, scalar(q - column))
+                    weight = patch_weight(view.falloff, slope_x, scalar(q - column))
                     scratch[world, q - left] = weight
                 colours = footprint_colours(footprint)
-                low = wp.max(row - lens.radius, 0)
-                for p in range(low, wp.min(row + lens.radius, lens.resolution - 1) + 1):
-                    along = patch_weight(lens.falloff, slope_y, scalar(p - row)) * colours
+                low = wp.max(row - view.radius, 0)
+                for p in range(low, wp.min(row + view.radius, view.resolution - 1) + 1):
+                    along = patch_weight(view.falloff, slope_y, scalar(p - row)) * colours
                     for q in range(left, right):
                         drawn = picture[world, p, q]
                         picture[world, p, q] = drawn + scratch[world, q - left] * along
@@ -507,15 +493,15 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
     @in_ranges(PAIRS)
     @wp.kernel(enable_backward=False, module=module)
     def pull_back_splats(
-        range_start: wp.int32,
-        lens: Lens,
-        particle_count: wp.int32,
-        footprints: wp.array(dtype=footprint_type),
-        source: wp.array(dtype=wp.int32),
-        picture_bar: wp.array(dtype=colour_type),
+        range_start: int,
+        view: View,
+        particle_count: int,
+        footprints: wp.array[footprint_type],
+        source: wp.array[wp.int32],
+        picture_bar: wp.array[colour_type],
         # outputs
-        positions_bar: wp.array(dtype=vector),
-        colours_bar: wp.array(dtype=scalar, ndim=2),
+        positions_bar: wp.array[vector],
+        colours_bar: wp.array2d[scalar],
     ):
         """Write the cotangents of each particle's position and colours from its patch."""
         k, lane = wp.tid()
@@ -525,28 +511,28 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         colours = footprint_colours(footprint)
         centre = vector(footprint[2], footprint[3])
         near = vector(footprint[0], footprint[1])
-        slope = scalar(-2.0) * lens.falloff * near
-        seen = visible(lens, centre)
+        slope = scalar(-2.0) * view.falloff * near
+        seen = visible(view, centre)
         pulls = pulls_type()
         if seen:
             column = wp.int32(centre[0])
             row = wp.int32(centre[1])
-            left = wp.max(column - lens.radius, 0)
-            right = wp.min(column + lens.radius, lens.resolution - 1) + 1
-            low = wp.max(row - lens.radius, 0)
-            high = wp.min(row + lens.radius, lens.resolution - 1) + 1
+            left = wp.max(column - view.radius, 0)
+            right = wp.min(column + view.radius, view.resolution - 1) + 1
+            low = wp.max(row - view.radius, 0)
+            high = wp.min(row + view.radius, view.resolution - 1) + 1
             for p in range(low + lane, high, wp.static(lanes)):
                 away_y = near[1] + scalar(p - row)
-                begin = (world * lens.resolution + p) * lens.resolution
+                begin = (world * view.resolution + p) * view.resolution
                 along = colour_type()
                 pull = scalar(0.0)
                 for q in range(left, right):
                     away_x = near[0] + scalar(q - column)
-                    weight = patch_weight(lens.falloff, slope[0], scalar(q - column))
+                    weight = patch_weight(view.falloff, slope[0], scalar(q - column))
                     bar = weight * load_colour(picture_bar, begin + q)
                     along += bar
                     pull += wp.dot(bar, colours) * away_x
-                weight = patch_weight(lens.falloff, slope[1], scalar(p - row))
+                weight = patch_weight(view.falloff, slope[1], scalar(p - row))
                 for c in range(wp.static(CHANNELS)):
                     pulls[c] += weight * along[c]
                 pulls[4] += weight * pull
@@ -559,9 +545,9 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
                 # Weights are normalised to sum 1, so the derivative subtracts the mean cotangent.
                 sums = vector()
                 moments = vector()
-                for o in range(-lens.radius, lens.radius + 1):
+                for o in range(-view.radius, view.radius + 1):
                     for d in range(2):
-                        weight = patch_weight(lens.falloff, slope[d], scalar(o))
+                        weight = patch_weight(view.falloff, slope[d], scalar(o))
                         sums[d] += weight
                         moments[d] += weight * (near[d] + scalar(o))
                 for c in range(wp.static(CHANNELS)):
@@ -571,7 +557,7 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
                     position_bar[d] = pulls[4 + d] - gained * moments[d] / sums[d]
                 colour_bar *= footprint[7]
             i = source[k]
-            positions_bar[i] = lens.pull * position_bar
+            positions_bar[i] = view.pull * position_bar
             for c in range(3):
                 colours_bar[i, c] = colour_bar[c]
 

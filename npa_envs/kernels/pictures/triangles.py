@@ -19,17 +19,17 @@ def twice_area(a: wp.vec2d, b: wp.vec2d, p: wp.vec2d):
 @in_ranges(CAMERAS)
 @wp.kernel(enable_backward=False, module=module)
 def draw_triangles(
-    range_start: wp.int32,
-    width: wp.int32,
-    height: wp.int32,
-    place: wp.array(dtype=wp.vec2d, ndim=2),
-    nearness: wp.array(dtype=wp.float64, ndim=2),
-    colours: wp.array(dtype=wp.vec3d),
-    faces: wp.array(dtype=wp.vec3i),
-    seen: wp.array(dtype=wp.uint8, ndim=2),
+    range_start: int,
+    width: int,
+    height: int,
+    place: wp.array2d[wp.vec2d],
+    nearness: wp.array2d[wp.float64],
+    colours: wp.array[wp.vec3d],
+    faces: wp.array[wp.vec3i],
+    seen: wp.array2d[wp.uint8],
     # outputs
-    nearest: wp.array(dtype=wp.float64, ndim=2),
-    picture: wp.array(dtype=wp.vec4d, ndim=2),
+    nearest: wp.array2d[wp.float64],
+    picture: wp.array2d[wp.vec4d],
 ):
     """Draw all triangles that a camera sees, at every pixel whose centre they cover."""
     camera = range_start + wp.tid()

@@ -1,14 +1,13 @@
 """Hand-written adjoints of the perception pass, gathered: no float atomics, a fixed order of sums.
 
-Notation: centre i perceives neighbour j at r = x_j - x_i with smoothing W, spiky gradient K = f r,
-volume v_j. A bar marks a cotangent. b_i and G_i are the smoothed state and the (uncorrected) state
-gradient of centre i; the moment correction is a stopped gradient, so it has no adjoint.
+Notation: centre i perceives neighbour j at r = x_j - x_i, with smoothing W_ij, spiky gradient
+K_ij = f r and volume v_j = 1 / ρ_j. A bar marks a cotangent: b̄_i of centre i's smoothed state,
+Ḡ_i of its state gradient before the correction, q̄_i of its density gradient, z̄_i of its own state
+in the perception vector. The moment correction is a stopped gradient, so it has no adjoint.
 
-State:     s_k += v_k (sum_i W b_i + G_i K_ik) - G_k sum_j v_j K_kj
-Volume:    v_k += sum_i W s_k b_i + (s_k - s_i) G_i K_ik,     rho_k = -v_k^2 v_k
-Positions: pair (i, j) pulls r by
-           (rho_i + v_j s_j b_i) dW/dr + (dK/dr)^T (v_j (s_j - s_i) G_i + q_i)
-           with q the cotangent of the density gradient.
+State:     s̄_k = z̄_k + v_k Σ_i (W_ik b̄_i + Ḡ_i K_ik) - Ḡ_k Σ_j v_j K_kj
+Density:   ρ̄_k = -v_k² v̄_k,  v̄_k = Σ_i (W_ik s_k · b̄_i + (s_k - s_i) · Ḡ_i K_ik)
+Positions: r̄_ij = (ρ̄_i + v_j s_j · b̄_i) dW/dr + (dK/dr)ᵀ (v_j Ḡ_iᵀ (s_j - s_i) + q̄_i)
 """
 
 from types import SimpleNamespace
@@ -50,34 +49,34 @@ def adjoint_kernels(
     group = wp.types.vector(width, scalar)
     group_gradient = wp.types.matrix((space_dim, width), scalar)
     topic = "adjoint" if state_gradient else "smoothing_adjoint"
-    topic = "listed_by_place_" * listed + "unsifted_" * (not on_cpu) + topic
+    topic = "listed_by_place_" * listed + "unfiltered_" * (not on_cpu) + topic
     module = kernel_module(topic, space_dim, scalar, width)
     cell_vector = wp.types.vector(space_dim, wp.int32)
     search = make_search(space_dim, scalar, vector, on_cpu, listed)
     run_count, run = search.run_count, search.run
-    sift = search.sift
+    filter_near = search.filter_near
     indices = wp.types.vector(search.stride, wp.int32)
-    add_scaled = make_add_scaled(group, scalar)
-    load_group = make_wide_load(group, scalar)
-    load_gradient = make_wide_load(group_gradient, scalar)
+    add_scaled = make_add_scaled(group)
+    load_group = make_wide_load(group)
+    load_gradient = make_wide_load(group_gradient)
 
     @in_ranges(PAIRS)
     @wp.kernel(enable_backward=False, module=module)
     def unscale_cotangents(
-        range_start: wp.int32,
-        state_dim: wp.int32,
-        density_gradient: wp.int32,
+        range_start: int,
+        state_dim: int,
+        density_gradient: int,
         gradient_scale: scalar,
         density_scale: scalar,
-        row_base: wp.int32,
-        group_count: wp.int32,
-        starts: wp.array(dtype=wp.int32),
-        perception: wp.array(dtype=scalar, ndim=2),
-        perception_bar: wp.array(dtype=scalar, ndim=2),
+        row_base: int,
+        group_count: int,
+        starts: wp.array[wp.int32],
+        perception: wp.array2d[scalar],
+        perception_bar: wp.array2d[scalar],
         # outputs
-        blur_bar: wp.array(dtype=scalar),
-        gradient_bar: wp.array(dtype=scalar),
-        density_gradient_bar: wp.array(dtype=vector),
+        blur_bar: wp.array[scalar],
+        gradient_bar: wp.array[scalar],
+        density_gradient_bar: wp.array[vector],
     ):
         """Write the cotangents of each row's unscaled sums from the cotangent of z."""
         row, channel = wp.tid()
@@ -119,14 +118,14 @@ def adjoint_kernels(
     @wp.func
     def run_of_rows(
         domain: Domain,
-        starts: wp.array(dtype=wp.int32),
-        ends: wp.array(dtype=wp.int32),
-        base: wp.int32,
+        starts: wp.array[wp.int32],
+        ends: wp.array[wp.int32],
+        base: int,
         cell: cell_vector,
-        k: wp.int32,
-        r: wp.int32,
-        row_base: wp.int32,
-        row_capacity: wp.int32,
+        k: int,
+        r: int,
+        row_base: int,
+        row_capacity: int,
     ):
         """Return first and last + 1 row of a run around particle k, or entry of its list."""
         begin, end = run(domain, starts, ends, base, cell, k, r)
@@ -136,14 +135,14 @@ def adjoint_kernels(
         return begin, end
 
     @wp.func
-    def sift_rows(
+    def filter_rows(
         domain: Domain,
-        row_positions: wp.array(dtype=vector),
-        neighbours: wp.array(dtype=wp.int32),
-        row_of: wp.array(dtype=wp.int32),
+        row_positions: wp.array[vector],
+        neighbours: wp.array[wp.int32],
+        row_of: wp.array[wp.int32],
         position: vector,
-        first: wp.int32,
-        end: wp.int32,
+        first: int,
+        end: int,
     ):
         """Return the rows within eps among the candidates from `first` on, and their count."""
         near = indices()
@@ -154,34 +153,34 @@ def adjoint_kernels(
                 near[count] = row
                 count += wp.where(row >= 0, 1, 0)
         else:
-            near, count = sift(domain, row_positions, neighbours, position, first, end)
+            near, count = filter_near(domain, row_positions, neighbours, position, first, end)
         return near, count
 
     @in_ranges(PAIRS)
     @wp.kernel(enable_backward=False, module=module, cuda_max_registers=CUDA_REGISTERS)
     def gather_state_cotangents(
-        range_start: wp.int32,
+        range_start: int,
         domain: Domain,
-        particle_count: wp.int32,
-        state_dim: wp.int32,
-        active_offset: wp.int32,
-        row_base: wp.int32,
-        row_capacity: wp.int32,
-        group_count: wp.int32,
-        starts: wp.array(dtype=wp.int32),
-        ends: wp.array(dtype=wp.int32),
-        neighbours: wp.array(dtype=wp.int32),
-        particles: wp.array(dtype=particle),
-        source: wp.array(dtype=wp.int32),
-        row_of: wp.array(dtype=wp.int32),
-        row_positions: wp.array(dtype=vector),
-        row_kernel_sum: wp.array(dtype=vector),
-        perception_bar: wp.array(dtype=scalar, ndim=2),
-        blur_bar: wp.array(dtype=group),
-        gradient_bar: wp.array(dtype=group_gradient),
-        flat_gradient_bar: wp.array(dtype=scalar),
+        particle_count: int,
+        state_dim: int,
+        active_offset: int,
+        row_base: int,
+        row_capacity: int,
+        group_count: int,
+        starts: wp.array[wp.int32],
+        ends: wp.array[wp.int32],
+        neighbours: wp.array[wp.int32],
+        particles: wp.array[particle],
+        source: wp.array[wp.int32],
+        row_of: wp.array[wp.int32],
+        row_positions: wp.array[vector],
+        row_kernel_sum: wp.array[vector],
+        perception_bar: wp.array2d[scalar],
+        blur_bar: wp.array[group],
+        gradient_bar: wp.array[group_gradient],
+        flat_gradient_bar: wp.array[scalar],
         # outputs
-        states_bar: wp.array(dtype=scalar, ndim=2),
+        states_bar: wp.array2d[scalar],
     ):
         """Write the cotangent of every particle's state, from the active rows around it.
 
@@ -197,7 +196,7 @@ def adjoint_kernels(
         for r in range(run_count(domain, cell)):
             begin, end = run_of_rows(domain, starts, ends, base, cell, k, r, row_base, row_capacity)
             for first in range(begin, end, wp.static(search.stride)):
-                near, count = sift_rows(
+                near, count = filter_rows(
                     domain, row_positions, neighbours, row_of, position, first, end
                 )
                 for n in range(count):
@@ -233,19 +232,19 @@ def adjoint_kernels(
     @in_ranges(PAIRS)
     @wp.kernel(enable_backward=False, module=module)
     def gather_density_cotangents(
-        range_start: wp.int32,
+        range_start: int,
         domain: Domain,
-        particle_count: wp.int32,
-        group_count: wp.int32,
-        starts: wp.array(dtype=wp.int32),
-        particles: wp.array(dtype=particle),
-        states: wp.array(dtype=group),
-        source: wp.array(dtype=wp.int32),
-        row_of: wp.array(dtype=wp.int32),
-        blur_bar: wp.array(dtype=group),
-        gradient_bar: wp.array(dtype=group_gradient),
+        particle_count: int,
+        group_count: int,
+        starts: wp.array[wp.int32],
+        particles: wp.array[particle],
+        states: wp.array[group],
+        source: wp.array[wp.int32],
+        row_of: wp.array[wp.int32],
+        blur_bar: wp.array[group],
+        gradient_bar: wp.array[group_gradient],
         # outputs
-        density_bar: wp.array(dtype=scalar),
+        density_bar: wp.array[scalar],
     ):
         """Write the cotangent of every particle's density, through its volume."""
         k = range_start + wp.tid()
@@ -278,11 +277,7 @@ def adjoint_kernels(
 
     @wp.func
     def pair_pull(
-        domain: Domain,
-        offset: vector,
-        squared: scalar,
-        smoothing_bar: scalar,
-        kernel_bar: vector,
+        domain: Domain, offset: vector, squared: scalar, smoothing_bar: scalar, kernel_bar: vector
     ):
         """Return the cotangent of r = neighbour - centre from the cotangents of W(r) and K(r)."""
         distance = wp.sqrt(squared)
@@ -292,8 +287,8 @@ def adjoint_kernels(
         if distance > scalar(0.0):
             # For nearly coincident particles the large factor contributes only across r.
             direction = offset / distance
-            share = wp.dot(direction, kernel_bar) / wp.dot(direction, direction)
-            along = share * direction
+            fraction = wp.dot(direction, kernel_bar) / wp.dot(direction, direction)
+            along = fraction * direction
             radial = spiky_radial_slope(distance, domain.inverse_eps, domain.spiky_norm)
             pull += factor * (kernel_bar - along) + radial * along
         return pull
@@ -301,21 +296,21 @@ def adjoint_kernels(
     @in_ranges(PAIRS)
     @wp.kernel(enable_backward=False, module=module)
     def gather_position_cotangents(
-        range_start: wp.int32,
+        range_start: int,
         domain: Domain,
-        particle_count: wp.int32,
-        group_count: wp.int32,
-        starts: wp.array(dtype=wp.int32),
-        particles: wp.array(dtype=particle),
-        states: wp.array(dtype=group),
-        source: wp.array(dtype=wp.int32),
-        row_of: wp.array(dtype=wp.int32),
-        density_bar: wp.array(dtype=scalar),
-        blur_bar: wp.array(dtype=group),
-        gradient_bar: wp.array(dtype=group_gradient),
-        density_gradient_bar: wp.array(dtype=vector),
+        particle_count: int,
+        group_count: int,
+        starts: wp.array[wp.int32],
+        particles: wp.array[particle],
+        states: wp.array[group],
+        source: wp.array[wp.int32],
+        row_of: wp.array[wp.int32],
+        density_bar: wp.array[scalar],
+        blur_bar: wp.array[group],
+        gradient_bar: wp.array[group_gradient],
+        density_gradient_bar: wp.array[vector],
         # outputs
-        positions_bar: wp.array(dtype=vector),
+        positions_bar: wp.array[vector],
     ):
         """Write the cotangent of every position: as a neighbour of others, and as a centre."""
         k = range_start + wp.tid()

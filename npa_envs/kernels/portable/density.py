@@ -11,7 +11,7 @@ import warp as wp
 
 from npa_envs.kernel_lock import cached_under_lock
 from npa_envs.kernels.domain import TERMS_PER_SUM, domain_types, kernel_module
-from npa_envs.kernels.mathematics import smoothing, spiky_factor_wide
+from npa_envs.kernels.mathematics import smoothing, spiky_factor_f64
 from npa_envs.kernels.native import PAIRS, in_ranges, named
 from npa_envs.kernels.portable.search import make_search
 
@@ -24,16 +24,16 @@ def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespa
     cell_of, segment_count = types.cell_of, types.segment_count
     segment_cells = types.segment_cells
     minimum_image, position_of = types.minimum_image, types.position_of
-    wide = wp.types.vector(space_dim, wp.float64)
+    vector_f64 = wp.types.vector(space_dim, wp.float64)
     search = make_search(space_dim, scalar, particle, on_cpu)
-    run_count, run, sift = search.run_count, search.run, search.sift
-    module = kernel_module("density" if on_cpu else "unsifted_density", space_dim, scalar)
+    run_count, run, filter_near = search.run_count, search.run, search.filter_near
+    module = kernel_module("density" if on_cpu else "unfiltered_density", space_dim, scalar)
 
     @wp.func
-    def spiky_wide(domain: Domain, centre: vector, neighbour: vector):
+    def spiky_f64(domain: Domain, centre: vector, neighbour: vector):
         """Return the spiky gradient kernel of a pair in float64."""
-        kernel = wide()
-        r = wide()
+        kernel = vector_f64()
+        r = vector_f64()
         for d in range(wp.static(space_dim)):
             r[d] = wp.float64(neighbour[d]) - wp.float64(centre[d])
             if domain.periodic != 0:
@@ -45,23 +45,23 @@ def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespa
         rounded = scalar(exact)
         if rounded > scalar(0.0):
             start = scalar(1.0) / wp.sqrt(rounded)
-            kernel = spiky_factor_wide(exact, start, domain.inverse_eps, domain.spiky_norm) * r
+            kernel = spiky_factor_f64(exact, start, domain.inverse_eps, domain.spiky_norm) * r
         return kernel
 
     @in_ranges(PAIRS)
     @wp.kernel(enable_backward=False, module=module)
     def compute_density(
-        range_start: wp.int32,
+        range_start: int,
         domain: Domain,
-        particle_count: wp.int32,
-        density_gradient: wp.int32,
-        starts: wp.array(dtype=wp.int32),
-        source: wp.array(dtype=wp.int32),
-        row_of: wp.array(dtype=wp.int32),
-        sorted_positions: wp.array(dtype=vector),
+        particle_count: int,
+        density_gradient: int,
+        starts: wp.array[wp.int32],
+        source: wp.array[wp.int32],
+        row_of: wp.array[wp.int32],
+        sorted_positions: wp.array[vector],
         # outputs
-        particles: wp.array(dtype=particle),
-        density_gradients: wp.array(dtype=wide),
+        particles: wp.array[particle],
+        density_gradients: wp.array[vector_f64],
     ):
         """Write positions with volumes 1 / rho, and density gradients of particles with rows.
 
@@ -78,7 +78,7 @@ def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespa
         density = scalar(0.0)
         earlier = scalar(0.0)
         counted = wp.int32(0)
-        gradient = wide()
+        gradient = vector_f64()
         for segment in range(segment_count(domain, cell)):
             first, last = segment_cells(domain, cell, segment)
             end = starts[base + last]
@@ -92,7 +92,7 @@ def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespa
                     weight = smoothing(squared, domain.inverse_squared_eps, domain.smoothing_norm)
                     density += wp.where(seen, weight, scalar(0.0))
                     if row >= 0 and seen:
-                        gradient += spiky_wide(domain, position, neighbour)
+                        gradient += spiky_f64(domain, position, neighbour)
                 counted += stop - block
                 if counted >= wp.static(TERMS_PER_SUM):
                     earlier += density
@@ -110,12 +110,12 @@ def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespa
     @wp.func
     def list_around(
         domain: Domain,
-        particle_count: wp.int32,
-        starts: wp.array(dtype=wp.int32),
-        particles: wp.array(dtype=particle),
-        k: wp.int32,
-        begin: wp.int32,
-        neighbours: wp.array(dtype=wp.int32),
+        particle_count: int,
+        starts: wp.array[wp.int32],
+        particles: wp.array[particle],
+        k: int,
+        begin: int,
+        neighbours: wp.array[wp.int32],
     ):
         """Write neighbours of particle k from index `begin` on, unless the array is empty; return
         the end."""
@@ -126,7 +126,7 @@ def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespa
         for r in range(run_count(domain, cell)):
             first, end = run(domain, starts, neighbours, base, cell, k, r)
             for candidate in range(first, end, wp.static(search.stride)):
-                near, count = sift(domain, particles, neighbours, position, candidate, end)
+                near, count = filter_near(domain, particles, neighbours, position, candidate, end)
                 if neighbours.shape[0] > 0:
                     for n in range(count):
                         neighbours[place + n] = near[n]
@@ -136,14 +136,14 @@ def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespa
     @in_ranges(PAIRS)
     @wp.kernel(enable_backward=False, module=module)
     def count_neighbours(
-        range_start: wp.int32,
+        range_start: int,
         domain: Domain,
-        particle_count: wp.int32,
-        starts: wp.array(dtype=wp.int32),
-        particles: wp.array(dtype=particle),
-        empty: wp.array(dtype=wp.int32),
+        particle_count: int,
+        starts: wp.array[wp.int32],
+        particles: wp.array[particle],
+        empty: wp.array[wp.int32],
         # outputs
-        counts: wp.array(dtype=wp.int32),
+        counts: wp.array[wp.int32],
     ):
         """Write each particle's number of neighbours, itself included; `empty` has no entries."""
         k = range_start + wp.tid()
@@ -152,14 +152,14 @@ def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespa
     @in_ranges(PAIRS)
     @wp.kernel(enable_backward=False, module=module)
     def list_neighbours(
-        range_start: wp.int32,
+        range_start: int,
         domain: Domain,
-        particle_count: wp.int32,
-        starts: wp.array(dtype=wp.int32),
-        particles: wp.array(dtype=particle),
-        ends: wp.array(dtype=wp.int32),
+        particle_count: int,
+        starts: wp.array[wp.int32],
+        particles: wp.array[particle],
+        ends: wp.array[wp.int32],
         # outputs
-        neighbours: wp.array(dtype=wp.int32),
+        neighbours: wp.array[wp.int32],
     ):
         """Write each particle's neighbours after those of the particle before it."""
         k = range_start + wp.tid()

@@ -7,7 +7,6 @@ Source: Salmon, Moraes, Dror and Shaw, "Parallel random numbers: as easy as 1, 2
 """
 
 import math
-from types import SimpleNamespace
 
 import warp as wp
 
@@ -53,12 +52,12 @@ def philox(counter: words, low_key: wp.uint32, high_key: wp.uint32):
 
 @wp.func
 def world_words(
-    world: wp.int32,
-    block: wp.int32,
-    draw: wp.int32,
-    keys: wp.array(dtype=wp.int64),
-    episodes: wp.array(dtype=wp.int32),
-    steps: wp.array(dtype=wp.int32),
+    world: int,
+    block: int,
+    draw: int,
+    keys: wp.array[wp.int64],
+    episodes: wp.array[wp.int32],
+    steps: wp.array[wp.int32],
 ):
     """Return the four words number `block` of a world's draw, for its next 4 or 2 elements."""
     key = wp.uint64(keys[world])
@@ -81,52 +80,36 @@ def fraction_53(high: wp.uint32, low: wp.uint32):
 
 
 @cached_under_lock()
-def draw_kernels(scalar: type) -> SimpleNamespace:
-    """Return the kernels for one floating type, and how many numbers a thread of each draws."""
-    module = wp.get_module(f"npa_envs.kernels.draws_{scalar_name(scalar)}")
-    single = scalar is wp.float32
-    per_thread = 4 if single else 2
+def draw_kernel(distribution: str, value_type: type) -> tuple[wp.Kernel, int]:
+    """Return the kernel of a distribution, and how many numbers a thread of it draws.
 
-    @wp.kernel(enable_backward=False, module=module)
-    def draw_uniform(
-        draw: wp.int32,
-        keys: wp.array(dtype=wp.int64),
-        episodes: wp.array(dtype=wp.int32),
-        steps: wp.array(dtype=wp.int32),
-        # outputs
-        values: wp.array(dtype=scalar, ndim=2),
-    ):
-        """Write numbers in [0, 1): 24 bits of a word, or 53 bits of two."""
-        world, block = wp.tid()
-        w = world_words(world, block, draw, keys, episodes, steps)
-        for k in range(wp.static(per_thread)):
-            element = wp.static(per_thread) * block + k
-            if element < values.shape[1]:
-                if wp.static(single):
-                    values[world, element] = scalar(w[k] >> wp.uint32(8)) * scalar(ULP_24)
-                else:
-                    values[world, element] = scalar(fraction_53(w[2 * k % 4], w[(2 * k + 1) % 4]))
+    "uniform" numbers lie in [0, 1): 24 bits of a word in float32, 53 bits of two in float64.
+    "normal" ones are pairs by the Box-Muller transform, in float64: logarithms of devices differ in
+    the last bit, which rounding to float32 removes. "bernoulli" ones are 1 for words below `bound`,
+    at most 2^32, else 0. "integers" are 64 random bits modulo `bound`, with a bias of bound / 2^64.
+    """
+    from_one_word = distribution == "bernoulli" or value_type is wp.float32
+    count = 4 if from_one_word else 2
+    values_type = wp.types.vector(count, value_type)
 
-    @wp.kernel(enable_backward=False, module=module)
-    def draw_normal(
-        draw: wp.int32,
-        keys: wp.array(dtype=wp.int64),
-        episodes: wp.array(dtype=wp.int32),
-        steps: wp.array(dtype=wp.int32),
-        # outputs
-        values: wp.array(dtype=scalar, ndim=2),
-    ):
-        """Write pairs of standard normal numbers by the Box-Muller transform.
+    @wp.func
+    def uniform(w: words, bound: wp.uint64):
+        result = values_type()
+        for k in range(wp.static(count)):
+            if wp.static(from_one_word):
+                result[k] = value_type(w[k] >> wp.uint32(8)) * value_type(ULP_24)
+            else:
+                result[k] = value_type(fraction_53(w[2 * k % 4], w[(2 * k + 1) % 4]))
+        return result
 
-        In float64: logarithms of devices differ in the last bit, which rounding to float32 removes.
-        """
-        world, block = wp.tid()
-        w = world_words(world, block, draw, keys, episodes, steps)
-        for pair in range(wp.static(per_thread // 2)):
+    @wp.func
+    def normal(w: words, bound: wp.uint64):
+        result = values_type()
+        for pair in range(wp.static(count // 2)):
             # The logarithm's argument lies in (0, 1], so the radius is finite.
             amount = wp.float64(0.0)
             turn = wp.float64(0.0)
-            if wp.static(single):
+            if wp.static(from_one_word):
                 amount = (wp.float64(w[2 * pair]) + wp.float64(1.0)) * ULP_32
                 turn = wp.float64(w[2 * pair + 1]) * ULP_32
             else:
@@ -134,60 +117,47 @@ def draw_kernels(scalar: type) -> SimpleNamespace:
                 turn = fraction_53(w[2], w[3])
             radius = wp.sqrt(wp.float64(-2.0) * wp.log(amount))
             angle = TWO_PI * turn
-            element = wp.static(per_thread) * block + 2 * pair
+            result[2 * pair] = value_type(radius * wp.cos(angle))
+            result[2 * pair + 1] = value_type(radius * wp.sin(angle))
+        return result
+
+    @wp.func
+    def bernoulli(w: words, bound: wp.uint64):
+        result = values_type()
+        for k in range(wp.static(count)):
+            if wp.uint64(w[k]) < bound:
+                result[k] = value_type(1)
+        return result
+
+    @wp.func
+    def integers(w: words, bound: wp.uint64):
+        result = values_type()
+        for k in range(wp.static(count)):
+            result[k] = value_type(joined(w[2 * k], w[2 * k + 1]) % bound)
+        return result
+
+    functions = {"uniform": uniform, "normal": normal}
+    numbers_of = (functions | {"bernoulli": bernoulli, "integers": integers})[distribution]
+    name = distribution
+    if distribution in functions:
+        name += f"_{scalar_name(value_type)}"
+
+    @wp.kernel(enable_backward=False, module=wp.get_module(f"npa_envs.kernels.draws_{name}"))
+    def draw(
+        bound: wp.uint64,
+        number: int,
+        keys: wp.array[wp.int64],
+        episodes: wp.array[wp.int32],
+        steps: wp.array[wp.int32],
+        # outputs
+        values: wp.array2d[value_type],
+    ):
+        """Write random numbers of each world."""
+        world, block = wp.tid()
+        drawn = numbers_of(world_words(world, block, number, keys, episodes, steps), bound)
+        for k in range(wp.static(count)):
+            element = wp.static(count) * block + k
             if element < values.shape[1]:
-                values[world, element] = scalar(radius * wp.cos(angle))
-            if element + 1 < values.shape[1]:
-                values[world, element + 1] = scalar(radius * wp.sin(angle))
+                values[world, element] = drawn[k]
 
-    return SimpleNamespace(
-        draw_uniform=draw_uniform, draw_normal=draw_normal, per_thread=per_thread
-    )
-
-
-BITS_PER_THREAD = 4
-"""Elements that a thread of `draw_bernoulli` draws, one from each word."""
-
-INTEGERS_PER_THREAD = 2
-"""Elements that a thread of `draw_integers` draws, one from two words."""
-
-
-@wp.kernel(enable_backward=False)
-def draw_bernoulli(
-    threshold: wp.uint64,
-    draw: wp.int32,
-    keys: wp.array(dtype=wp.int64),
-    episodes: wp.array(dtype=wp.int32),
-    steps: wp.array(dtype=wp.int32),
-    # outputs
-    values: wp.array(dtype=wp.uint8, ndim=2),
-):
-    """Write ones for words below the threshold, at most 2^32, and zeros for others."""
-    world, block = wp.tid()
-    w = world_words(world, block, draw, keys, episodes, steps)
-    for k in range(wp.static(BITS_PER_THREAD)):
-        element = wp.static(BITS_PER_THREAD) * block + k
-        if element < values.shape[1]:
-            bit = wp.uint8(0)
-            if wp.uint64(w[k]) < threshold:
-                bit = wp.uint8(1)
-            values[world, element] = bit
-
-
-@wp.kernel(enable_backward=False)
-def draw_integers(
-    high: wp.uint64,
-    draw: wp.int32,
-    keys: wp.array(dtype=wp.int64),
-    episodes: wp.array(dtype=wp.int32),
-    steps: wp.array(dtype=wp.int32),
-    # outputs
-    values: wp.array(dtype=wp.int64, ndim=2),
-):
-    """Write integers below `high`: 64 random bits modulo it, with a bias of high / 2^64."""
-    world, block = wp.tid()
-    w = world_words(world, block, draw, keys, episodes, steps)
-    for k in range(wp.static(INTEGERS_PER_THREAD)):
-        element = wp.static(INTEGERS_PER_THREAD) * block + k
-        if element < values.shape[1]:
-            values[world, element] = wp.int64(joined(w[2 * k], w[2 * k + 1]) % high)
+    return draw, count

@@ -17,44 +17,44 @@ CONTINUE, LIMIT_LOSS, END = 0, 1, 2
 
 @wp.kernel(enable_backward=False, module=native.module("npa_envs.kernels.episodes"))
 def update_episodes(
-    part_count: wp.int32,
-    last_step: wp.int32,
-    rewarded_step: wp.int32,
-    on_divergence: wp.int32,
-    parts: wp.array(dtype=wp.float32),
-    enabled: wp.array(dtype=wp.uint8),
-    diverged: wp.array(dtype=wp.uint8),
-    first_loss: wp.array(dtype=wp.float32),
-    success_loss: wp.array(dtype=wp.float32),
-    broken: wp.array(dtype=wp.uint8),
+    part_count: int,
+    last_step: int,
+    rewarded_step: int,
+    on_divergence: int,
+    parts: wp.array[wp.float32],
+    enabled: wp.array[wp.uint8],
+    diverged: wp.array[wp.uint8],
+    first_loss: wp.array[wp.float32],
+    success_loss: wp.array[wp.float32],
+    broken: wp.array[wp.uint8],
     # changed in place
-    elapsed: wp.array(dtype=wp.int32),
-    numbers: wp.array(dtype=wp.float32),
-    flags: wp.array(dtype=wp.uint8),
+    elapsed: wp.array[wp.int32],
+    numbers: wp.array[wp.float32],
+    flags: wp.array[wp.uint8],
     # outputs
-    endings: wp.array(dtype=wp.uint8),
+    endings: wp.array[wp.uint8],
 ):
     """Write rewards, losses, flags and endings; if not enabled, only endings (all 0)."""
     await_earlier()
     world = wp.tid()
     count = elapsed.shape[0]
-    happens = enabled[0]
+    is_enabled = enabled[0]
     if world == 0:
-        endings[count] = happens
-    if happens == wp.uint8(0):
+        endings[count] = is_enabled
+    if is_enabled == wp.uint8(0):
         endings[world] = wp.uint8(0)
         return
     step = elapsed[world] + 1
-    escaped = diverged[world] != wp.uint8(0)
-    lost = escaped and on_divergence != wp.static(CONTINUE)
+    has_diverged = diverged[world] != wp.uint8(0)
+    penalised = has_diverged and on_divergence != wp.static(CONTINUE)
     loss = parts[world]
     for k in range(1, part_count):
         loss += parts[k * count + world]
     # Divergence must not be rewarded, even where an empty picture is better than the start.
-    if lost and loss < first_loss[world]:
+    if penalised and loss < first_loss[world]:
         loss = first_loss[world]
-    success = loss <= success_loss[world] and not lost
-    ended = success or (escaped and on_divergence == wp.static(END))
+    success = loss <= success_loss[world] and not penalised
+    ended = success or (has_diverged and on_divergence == wp.static(END))
     truncated = last_step > 0 and step >= last_step
     improvement = numbers[count + world] - loss
     reward = improvement
@@ -65,12 +65,12 @@ def update_episodes(
     ending = wp.int32(0)
     if success:
         ending += wp.static(SUCCESS)
-    if escaped:
+    if has_diverged:
         ending += wp.static(DIVERGED)
     if truncated:
         ending += wp.static(TIME_LIMIT)
     unfit = not wp.isfinite(improvement)
-    if broken.shape[0] > 0 and not lost:
+    if broken.shape[0] > 0 and not penalised:
         unfit = unfit or broken[world] != wp.uint8(0)
     if unfit:
         ending += wp.static(NOT_FINITE)
@@ -85,5 +85,5 @@ def update_episodes(
     flags[world] = wp.uint8(ended)
     flags[count + world] = wp.uint8(truncated)
     flags[2 * count + world] = wp.uint8(success)
-    flags[3 * count + world] = wp.uint8(escaped)
+    flags[3 * count + world] = wp.uint8(has_diverged)
     endings[world] = wp.uint8(ending)

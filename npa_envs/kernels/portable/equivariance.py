@@ -16,8 +16,8 @@ from npa_envs.kernels.native import ELEMENTS, in_ranges, named
 def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
     """Return the kernels of one variant."""
     vector = domain_types(space_dim, scalar).vector
-    numbers = wp.array(dtype=scalar, ndim=2)
-    vectors = wp.array(dtype=vector, ndim=2)
+    numbers = wp.array2d[scalar]
+    vectors = wp.array2d[vector]
     module = kernel_module("equivariance", space_dim, scalar)
     planar = space_dim == 2
 
@@ -31,15 +31,15 @@ def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         return result
 
     @wp.func
-    def place_of(a: wp.int32, b: wp.int32, first: wp.int32, count: wp.int32):
+    def place_of(a: int, b: int, first: int, count: int):
         """Return the index of the pair (a, b), b >= a + first, among pairs of `count` vectors."""
         return a * (count - first) - a * (a - 1) / 2 + b - a - first
 
     @in_ranges(ELEMENTS)
     @wp.kernel(enable_backward=False, module=module)
     def mix_vectors(
-        range_start: wp.int32,
-        scalars: wp.int32,
+        range_start: int,
+        scalars: int,
         rows: numbers,
         mixing: numbers,
         # outputs
@@ -60,10 +60,10 @@ def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
     @in_ranges(ELEMENTS)
     @wp.kernel(enable_backward=False, module=module)
     def write_inputs(
-        range_start: wp.int32,
-        scalars: wp.int32,
-        one: wp.int32,
-        chiral: wp.int32,
+        range_start: int,
+        scalars: int,
+        one: int,
+        chiral: int,
         rows: numbers,
         mixed: vectors,
         # outputs
@@ -95,9 +95,9 @@ def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
     @in_ranges(ELEMENTS)
     @wp.kernel(enable_backward=False, module=module)
     def pull_back_products(
-        range_start: wp.int32,
-        scalars: wp.int32,
-        chiral: wp.int32,
+        range_start: int,
+        scalars: int,
+        chiral: int,
         mixed: vectors,
         inputs_bar: numbers,
         mixed_bar: vectors,
@@ -128,8 +128,8 @@ def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
     @in_ranges(ELEMENTS)
     @wp.kernel(enable_backward=False, module=module)
     def pull_back_rows(
-        range_start: wp.int32,
-        scalars: wp.int32,
+        range_start: int,
+        scalars: int,
         mixing: numbers,
         inputs_bar: numbers,
         mixed_bar: vectors,
@@ -156,11 +156,11 @@ def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
     @in_ranges(ELEMENTS)
     @wp.kernel(enable_backward=False, module=module)
     def steer(
-        range_start: wp.int32,
-        gate_count: wp.int32,
+        range_start: int,
+        gate_count: int,
         output: numbers,
         mixed: vectors,
-        signs: wp.array(dtype=scalar),
+        signs: wp.array[scalar],
         # outputs
         update: numbers,
     ):
@@ -194,11 +194,11 @@ def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
     @in_ranges(ELEMENTS)
     @wp.kernel(enable_backward=False, module=module)
     def pull_back_steering(
-        range_start: wp.int32,
-        gate_count: wp.int32,
+        range_start: int,
+        gate_count: int,
         output: numbers,
         mixed: vectors,
-        signs: wp.array(dtype=scalar),
+        signs: wp.array[scalar],
         update_bar: numbers,
         # outputs
         output_bar: numbers,

@@ -16,6 +16,7 @@ from npa_envs.kernels.domain import domain_types, kernel_module
 from npa_envs.kernels.mathematics import (
     log_scaled,
     make_corrected,
+    perception_topic,
     smoothing,
     spiky_factor,
 )
@@ -42,38 +43,34 @@ def perception_kernels(
     the sums that only these need.
     """
     moment_correction = moment_inverse is not None
-    smooth = moment_inverse == "smooth"
     types = domain_types(space_dim, scalar)
     vector, particle, Domain = types.vector, types.particle, types.Domain
     cell_of, minimum_image, position_of = types.cell_of, types.minimum_image, types.position_of
-    wide = wp.types.vector(space_dim, wp.float64)
+    vector_f64 = wp.types.vector(space_dim, wp.float64)
     group = wp.types.vector(width, scalar)
     group_gradient = wp.types.matrix((space_dim, width), scalar)
     square = wp.types.matrix((space_dim, space_dim), scalar)
-    topic = "smoothing"
-    if state_gradient:
-        topic = "perception" if moment_correction else "uncorrected_perception"
-        topic = "smoothly_corrected_perception" if smooth else topic
-    topic = "listed_by_place_" * listed + "unsifted_" * (not on_cpu) + topic
+    topic = "listed_by_place_" * listed + "unfiltered_" * (not on_cpu)
+    topic += perception_topic(state_gradient, moment_inverse)
     module = kernel_module(topic, space_dim, scalar, width)
     search = make_search(space_dim, scalar, particle, on_cpu, listed)
-    run_count, run, sift = search.run_count, search.run, search.sift
-    add_scaled = make_add_scaled(group, scalar)
-    load_group = make_wide_load(group, scalar)
+    run_count, run, filter_near = search.run_count, search.run, search.filter_near
+    add_scaled = make_add_scaled(group)
+    load_group = make_wide_load(group)
     corrected = make_corrected(space_dim, scalar, width, moment_inverse)
 
     @wp.func
     def sum_neighbours(
         domain: Domain,
-        particle_count: wp.int32,
-        starts: wp.array(dtype=wp.int32),
-        ends: wp.array(dtype=wp.int32),
-        neighbours: wp.array(dtype=wp.int32),
-        particles: wp.array(dtype=particle),
-        states: wp.array(dtype=group),
-        k: wp.int32,
-        g: wp.int32,
-        group_count: wp.int32,
+        particle_count: int,
+        starts: wp.array[wp.int32],
+        ends: wp.array[wp.int32],
+        neighbours: wp.array[wp.int32],
+        particles: wp.array[particle],
+        states: wp.array[group],
+        k: int,
+        g: int,
+        group_count: int,
     ):
         """Return the smoothed state, the state gradient, the sum of v K and the moment matrix."""
         position = position_of(particles[k])
@@ -87,7 +84,7 @@ def perception_kernels(
         for r in range(run_count(domain, cell)):
             begin, end = run(domain, starts, ends, base, cell, k, r)
             for first in range(begin, end, wp.static(search.stride)):
-                near, count = sift(domain, particles, neighbours, position, first, end)
+                near, count = filter_near(domain, particles, neighbours, position, first, end)
                 for n in range(count):
                     j = near[n]
                     entry = particles[j]
@@ -119,28 +116,28 @@ def perception_kernels(
     @in_ranges(PAIRS)
     @wp.kernel(enable_backward=False, module=module, cuda_max_registers=CUDA_REGISTERS)
     def perceive(
-        range_start: wp.int32,
+        range_start: int,
         domain: Domain,
-        particle_count: wp.int32,
-        state_dim: wp.int32,
-        density_gradient: wp.int32,
+        particle_count: int,
+        state_dim: int,
+        density_gradient: int,
         gradient_scale: scalar,
         density_scale: wp.float64,
-        row_base: wp.int32,
-        group_count: wp.int32,
+        row_base: int,
+        group_count: int,
         limit: scalar,
-        starts: wp.array(dtype=wp.int32),
-        ends: wp.array(dtype=wp.int32),
-        neighbours: wp.array(dtype=wp.int32),
-        particles: wp.array(dtype=particle),
-        states: wp.array(dtype=group),
-        flat_states: wp.array(dtype=scalar, ndim=2),
-        row_place: wp.array(dtype=wp.int32),
-        row_destination: wp.array(dtype=wp.int32),
-        density_gradients: wp.array(dtype=wide),
+        starts: wp.array[wp.int32],
+        ends: wp.array[wp.int32],
+        neighbours: wp.array[wp.int32],
+        particles: wp.array[particle],
+        states: wp.array[group],
+        flat_states: wp.array2d[scalar],
+        row_place: wp.array[wp.int32],
+        row_destination: wp.array[wp.int32],
+        density_gradients: wp.array[vector_f64],
         # outputs
-        perception: wp.array(dtype=scalar, ndim=2),
-        row_kernel_sum: wp.array(dtype=vector),
+        perception: wp.array2d[scalar],
+        row_kernel_sum: wp.array[vector],
     ):
         """Write the perception vector of each row, a one and zeros up to the row's width.
 
@@ -161,16 +158,7 @@ def perception_kernels(
         if row_destination.shape[0] > 0:
             to = row_destination[row]
         blur, gradient, kernel_sum, moment = sum_neighbours(
-            domain,
-            particle_count,
-            starts,
-            ends,
-            neighbours,
-            particles,
-            states,
-            k,
-            g,
-            group_count,
+            domain, particle_count, starts, ends, neighbours, particles, states, k, g, group_count
         )
         if wp.static(state_gradient and moment_correction):
             gradient = corrected(gradient, moment)
@@ -205,37 +193,28 @@ def perception_kernels(
     @in_ranges(PAIRS)
     @wp.kernel(enable_backward=False, module=module)
     def gather_fields(
-        range_start: wp.int32,
+        range_start: int,
         domain: Domain,
-        particle_count: wp.int32,
-        state_dim: wp.int32,
-        group_count: wp.int32,
-        starts: wp.array(dtype=wp.int32),
-        particles: wp.array(dtype=particle),
-        states: wp.array(dtype=group),
-        source: wp.array(dtype=wp.int32),
+        particle_count: int,
+        state_dim: int,
+        group_count: int,
+        starts: wp.array[wp.int32],
+        particles: wp.array[particle],
+        states: wp.array[group],
+        source: wp.array[wp.int32],
         # outputs
-        density: wp.array(dtype=scalar),
-        blur_field: wp.array(dtype=scalar, ndim=2),
-        gradient_field: wp.array(dtype=scalar, ndim=3),
-        moment_field: wp.array(dtype=square),
-        corrected_field: wp.array(dtype=scalar, ndim=3),
+        density: wp.array[scalar],
+        blur_field: wp.array2d[scalar],
+        gradient_field: wp.array3d[scalar],
+        moment_field: wp.array[square],
+        corrected_field: wp.array3d[scalar],
     ):
         """Write the unscaled fields of every particle, in the caller's order."""
         k, g = wp.tid()
         k += range_start
         i = source[k]
         blur, gradient, _kernel_sum, moment = sum_neighbours(
-            domain,
-            particle_count,
-            starts,
-            starts,
-            starts,
-            particles,
-            states,
-            k,
-            g,
-            group_count,
+            domain, particle_count, starts, starts, starts, particles, states, k, g, group_count
         )
         straight = corrected(gradient, moment)
         for c in range(wp.static(width)):

@@ -12,7 +12,7 @@ import warp as wp
 from npa_envs.kernel_lock import cached_under_lock
 from npa_envs.kernels.domain import domain_types
 
-SIFTED = 32
+FILTER_BLOCK = 32
 """Candidates of a block on a CPU."""
 
 
@@ -28,7 +28,7 @@ def make_search(
         for r in range(run_count(domain, cell)):
             begin, end = run(domain, starts, ends, base, cell, k, r)
             for first in range(begin, end, stride):
-                near, count = sift(domain, entries, neighbours, position, first, end)
+                near, count = filter_near(domain, entries, neighbours, position, first, end)
 
     `listed`: `neighbours` holds the neighbours of each particle, up to its `ends`.
     """
@@ -36,7 +36,7 @@ def make_search(
     vector, Domain, minimum_image = types.vector, types.Domain, types.minimum_image
     segment_count, segment_cells = types.segment_count, types.segment_cells
     cell_vector = wp.types.vector(space_dim, wp.int32)
-    stride = SIFTED if on_cpu else 1
+    stride = FILTER_BLOCK if on_cpu else 1
     indices = wp.types.vector(stride, wp.int32)
 
     @wp.func
@@ -50,12 +50,12 @@ def make_search(
     @wp.func
     def run(
         domain: Domain,
-        starts: wp.array(dtype=wp.int32),
-        ends: wp.array(dtype=wp.int32),
-        base: wp.int32,
+        starts: wp.array[wp.int32],
+        ends: wp.array[wp.int32],
+        base: int,
         cell: cell_vector,
-        k: wp.int32,
-        r: wp.int32,
+        k: int,
+        r: int,
     ):
         """Return first and last + 1 candidate of a run of particle k, in the world whose first cell
         is `base`."""
@@ -72,7 +72,7 @@ def make_search(
         return begin, end
 
     @wp.func
-    def is_near(domain: Domain, entries: wp.array(dtype=entry_type), position: vector, j: wp.int32):
+    def is_near(domain: Domain, entries: wp.array[entry_type], position: vector, j: int):
         offset = vector()
         entry = entries[j]
         for d in range(wp.static(space_dim)):
@@ -81,13 +81,13 @@ def make_search(
         return wp.where(wp.dot(offset, offset) < domain.squared_eps, 1, 0)
 
     @wp.func
-    def sift(
+    def filter_near(
         domain: Domain,
-        entries: wp.array(dtype=entry_type),
-        neighbours: wp.array(dtype=wp.int32),
+        entries: wp.array[entry_type],
+        neighbours: wp.array[wp.int32],
         position: vector,
-        first: wp.int32,
-        end: wp.int32,
+        first: int,
+        end: int,
     ):
         """Return the candidates of the block from `first` on within eps of a position; their
         count."""
@@ -102,4 +102,4 @@ def make_search(
                 count += is_near(domain, entries, position, c)
         return near, count
 
-    return SimpleNamespace(stride=stride, run_count=run_count, run=run, sift=sift)
+    return SimpleNamespace(stride=stride, run_count=run_count, run=run, filter_near=filter_near)

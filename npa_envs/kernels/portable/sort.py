@@ -12,16 +12,11 @@ from types import SimpleNamespace
 import warp as wp
 
 from npa_envs.kernel_lock import cached_under_lock
-from npa_envs.kernels.access import (
-    await_earlier,
-    load_integer,
-    make_read_channels,
-    make_wide_store,
-)
+from npa_envs.kernels.access import await_earlier, load_integer, make_read_channels, make_wide_store
 from npa_envs.kernels.domain import domain_types, kernel_module
 from npa_envs.kernels.native import PARTICLES, WORLDS, in_ranges, named
 
-store_pair = make_wide_store(wp.vec2i, wp.int32)
+store_pair = make_wide_store(wp.vec2i)
 
 
 @cached_under_lock()
@@ -31,21 +26,21 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
     vector, Domain = types.vector, types.Domain
     cell_of, cell_index = types.cell_of, types.cell_index
     group = wp.types.vector(width, scalar)
-    read_channels = make_read_channels(group, scalar)
+    read_channels = make_read_channels(group)
     module = kernel_module("sort", space_dim, scalar, width)
 
     @wp.kernel(enable_backward=False, module=module)
     def count_cells(
         domain: Domain,
-        positions: wp.array(dtype=vector),
-        mask: wp.array(dtype=wp.uint8),
-        masked: wp.int32,
-        particle_count: wp.int32,
-        active_offset: wp.int32,
+        positions: wp.array[vector],
+        mask: wp.array[wp.uint8],
+        masked: int,
+        particle_count: int,
+        active_offset: int,
         # outputs
-        cell: wp.array(dtype=wp.int32),
-        arrival: wp.array(dtype=wp.int32),
-        counts: wp.array(dtype=wp.int32),
+        cell: wp.array[wp.int32],
+        arrival: wp.array[wp.int32],
+        counts: wp.array[wp.int32],
     ):
         """Count the particles, and the active ones, of each cell; counts[0] stays zero."""
         await_earlier()
@@ -59,13 +54,13 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
 
     @wp.kernel(enable_backward=False, module=module)
     def place_by_arrival(
-        mask: wp.array(dtype=wp.uint8),
-        masked: wp.int32,
-        cell: wp.array(dtype=wp.int32),
-        arrival: wp.array(dtype=wp.int32),
-        starts: wp.array(dtype=wp.int32),
+        mask: wp.array[wp.uint8],
+        masked: int,
+        cell: wp.array[wp.int32],
+        arrival: wp.array[wp.int32],
+        starts: wp.array[wp.int32],
         # outputs
-        arrived: wp.array(dtype=wp.vec2i),
+        arrived: wp.array[wp.vec2i],
     ):
         """List the particles of each cell in the order in which atomics counted them.
 
@@ -83,26 +78,26 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
     @in_ranges(PARTICLES)
     @wp.kernel(enable_backward=False, module=module)
     def order_particles(
-        range_start: wp.int32,
-        positions: wp.array(dtype=vector),
-        state_dim: wp.int32,
-        group_count: wp.int32,
-        aligned: wp.int32,
-        states: wp.array(dtype=scalar),
-        active_offset: wp.int32,
-        row_base: wp.int32,
-        row_capacity: wp.int32,
-        arrived: wp.array(dtype=wp.vec2i),
-        starts: wp.array(dtype=wp.int32),
+        range_start: int,
+        positions: wp.array[vector],
+        state_dim: int,
+        group_count: int,
+        aligned: int,
+        states: wp.array[scalar],
+        active_offset: int,
+        row_base: int,
+        row_capacity: int,
+        arrived: wp.array[wp.vec2i],
+        starts: wp.array[wp.int32],
         # outputs
-        source: wp.array(dtype=wp.int32),
-        sorted_cell: wp.array(dtype=wp.int32),
-        row_of: wp.array(dtype=wp.int32),
-        row_source: wp.array(dtype=wp.int32),
-        row_place: wp.array(dtype=wp.int32),
-        sorted_positions: wp.array(dtype=vector),
-        row_positions: wp.array(dtype=vector),
-        sorted_states: wp.array(dtype=group),
+        source: wp.array[wp.int32],
+        sorted_cell: wp.array[wp.int32],
+        row_of: wp.array[wp.int32],
+        row_source: wp.array[wp.int32],
+        row_place: wp.array[wp.int32],
+        sorted_positions: wp.array[vector],
+        row_positions: wp.array[vector],
+        sorted_states: wp.array[group],
     ):
         """Move every particle to its rank by index within its cell; give active ones rows.
 
@@ -139,30 +134,30 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
     @in_ranges(WORLDS)
     @wp.kernel(enable_backward=False, module=module)
     def sort_worlds(
-        range_start: wp.int32,
+        range_start: int,
         domain: Domain,
-        positions: wp.array(dtype=vector),
-        mask: wp.array(dtype=wp.uint8),
-        masked: wp.int32,
-        particle_count: wp.int32,
-        state_dim: wp.int32,
-        group_count: wp.int32,
-        aligned: wp.int32,
-        states: wp.array(dtype=scalar),
-        active_offset: wp.int32,
-        row_base: wp.int32,
-        row_capacity: wp.int32,
+        positions: wp.array[vector],
+        mask: wp.array[wp.uint8],
+        masked: int,
+        particle_count: int,
+        state_dim: int,
+        group_count: int,
+        aligned: int,
+        states: wp.array[scalar],
+        active_offset: int,
+        row_base: int,
+        row_capacity: int,
         # outputs
-        cell: wp.array(dtype=wp.int32),
-        starts: wp.array(dtype=wp.int32),
-        source: wp.array(dtype=wp.int32),
-        sorted_cell: wp.array(dtype=wp.int32),
-        row_of: wp.array(dtype=wp.int32),
-        row_source: wp.array(dtype=wp.int32),
-        row_place: wp.array(dtype=wp.int32),
-        sorted_positions: wp.array(dtype=vector),
-        row_positions: wp.array(dtype=vector),
-        sorted_states: wp.array(dtype=group),
+        cell: wp.array[wp.int32],
+        starts: wp.array[wp.int32],
+        source: wp.array[wp.int32],
+        sorted_cell: wp.array[wp.int32],
+        row_of: wp.array[wp.int32],
+        row_source: wp.array[wp.int32],
+        row_place: wp.array[wp.int32],
+        sorted_positions: wp.array[vector],
+        row_positions: wp.array[vector],
+        sorted_states: wp.array[group],
     ):
         """Sort a world by cell, then index, in one thread: all of the three kernels above.
 
@@ -243,16 +238,16 @@ def give_rows(space_dim: int, scalar: type) -> wp.Kernel:
 
     @wp.kernel(enable_backward=False, module=kernel_module("rows", space_dim, scalar))
     def give_rows(
-        total: wp.int32,
-        active_offset: wp.int32,
-        active_before: wp.array(dtype=wp.int32),
-        cell_starts: wp.array(dtype=wp.int32),
-        positions: wp.array(dtype=vector),
+        total: int,
+        active_offset: int,
+        active_before: wp.array[wp.int32],
+        cell_starts: wp.array[wp.int32],
+        positions: wp.array[vector],
         # outputs
-        row_of: wp.array(dtype=wp.int32, ndim=2),
-        row_source: wp.array(dtype=wp.int32, ndim=2),
-        starts: wp.array(dtype=wp.int32, ndim=2),
-        row_positions: wp.array(dtype=vector, ndim=2),
+        row_of: wp.array2d[wp.int32],
+        row_source: wp.array2d[wp.int32],
+        starts: wp.array2d[wp.int32],
+        row_positions: wp.array2d[vector],
     ):
         """Write the row of each particle, the particle of each row, and starts of cells and rows.
 

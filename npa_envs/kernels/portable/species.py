@@ -23,7 +23,7 @@ def species_kernel(space_dim: int, scalar: type, species_count: int) -> wp.Kerne
     cell_of, segment_count = types.cell_of, types.segment_count
     segment_cells = types.segment_cells
     minimum_image = types.minimum_image
-    wide = wp.types.vector(space_dim, wp.float64)
+    vector_f64 = wp.types.vector(space_dim, wp.float64)
     densities_type = wp.types.vector(species_count, wp.float64)
     gradients_type = wp.types.matrix((species_count, space_dim), wp.float64)
     module = kernel_module(f"species_{species_count}", space_dim, scalar)
@@ -31,19 +31,19 @@ def species_kernel(space_dim: int, scalar: type, species_count: int) -> wp.Kerne
     @in_ranges(PAIRS)
     @wp.kernel(enable_backward=False, module=module)
     def gather_species(
-        range_start: wp.int32,
+        range_start: int,
         domain: Domain,
-        particle_count: wp.int32,
+        particle_count: int,
         density_scale: wp.float64,
         gradient_scale: wp.float64,
-        logarithmic: wp.int32,
-        starts: wp.array(dtype=wp.int32),
-        source: wp.array(dtype=wp.int32),
-        sorted_species: wp.array(dtype=wp.int32),
-        sorted_positions: wp.array(dtype=vector),
+        logarithmic: int,
+        starts: wp.array[wp.int32],
+        source: wp.array[wp.int32],
+        sorted_species: wp.array[wp.int32],
+        sorted_positions: wp.array[vector],
         # outputs
-        density: wp.array(dtype=scalar, ndim=2),
-        gradient: wp.array(dtype=scalar, ndim=3),
+        density: wp.array2d[scalar],
+        gradient: wp.array3d[scalar],
     ):
         """Write each particle's scaled densities and density gradients, in the caller's order."""
         k = wp.tid()
@@ -63,7 +63,7 @@ def species_kernel(space_dim: int, scalar: type, species_count: int) -> wp.Kerne
                     own = sorted_species[j]
                     weight = smoothing(squared, domain.inverse_squared_eps, domain.smoothing_norm)
                     densities[own] += wp.float64(weight)
-                    away = wide()
+                    away = vector_f64()
                     for d in range(wp.static(space_dim)):
                         away[d] = wp.float64(neighbour[d]) - wp.float64(position[d])
                         if domain.periodic != 0:
@@ -81,7 +81,7 @@ def species_kernel(space_dim: int, scalar: type, species_count: int) -> wp.Kerne
         i = source[k]
         for q in range(wp.static(species_count)):
             density[i, q] = scalar(density_scale * densities[q])
-            sum = wide()
+            sum = vector_f64()
             for d in range(wp.static(space_dim)):
                 sum[d] = gradient_scale * gradients[q, d]
             if logarithmic != 0:

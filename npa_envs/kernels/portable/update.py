@@ -22,7 +22,7 @@ from npa_envs.kernels.access import (
 from npa_envs.kernels.domain import domain_types, kernel_module, scalar_name
 from npa_envs.kernels.native import ELEMENTS, in_ranges, named
 
-CHANNEL_SHARE = 4
+THREAD_CHANNELS = 4
 """Adjacent channels of a particle, or columns of a row, that one thread changes."""
 
 UPDATE_ALIGNMENT = {2: 8, 3: 4}
@@ -40,17 +40,17 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
     """Return the kernels of one variant."""
     types = domain_types(space_dim, scalar)
     vector = types.vector
-    wide = wp.types.vector(space_dim, wp.float64)
-    share = wp.types.vector(CHANNEL_SHARE, scalar)
-    load_scalar = make_wide_load(scalar, scalar)
-    read_states = make_read_at(share, scalar, 16)
-    read_actions = make_read_at(share, scalar, 8)
-    read_change = make_read_at(share, scalar, UPDATE_ALIGNMENT[space_dim])
-    write_share = make_write_at(share, scalar)
+    vector_f64 = wp.types.vector(space_dim, wp.float64)
+    channels = wp.types.vector(THREAD_CHANNELS, scalar)
+    load_scalar = make_wide_load(scalar)
+    read_states = make_read_at(channels, 16)
+    read_actions = make_read_at(channels, 8)
+    read_change = make_read_at(channels, UPDATE_ALIGNMENT[space_dim])
+    write_channels = make_write_at(channels)
     module = kernel_module("update", space_dim, scalar)
 
     @wp.func
-    def displaced(position: vector, factor: wp.float64, direction: wide):
+    def displaced(position: vector, factor: wp.float64, direction: vector_f64):
         """Return a position moved by factor times direction.
 
         In float64: the position is then rounded once, and rules amplify its rounding.
@@ -61,7 +61,7 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         return result
 
     @wp.func
-    def bounded(position: vector, boundary: wp.int32, box: vector):
+    def bounded(position: vector, boundary: int, box: vector):
         """Return a position's image in the box around the origin; walls mirror odd images."""
         result = position
         if boundary != wp.static(OPEN):
@@ -92,29 +92,29 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
     @in_ranges(ELEMENTS)
     @wp.kernel(enable_backward=False, module=module)
     def apply_update(
-        range_start: wp.int32,
+        range_start: int,
         largest_step: wp.float64,
         dt: scalar,
-        boundary: wp.int32,
+        boundary: int,
         box: vector,
-        moving: wp.int32,
-        state_dim: wp.int32,
-        update_width: wp.int32,
-        aligned: wp.int32,
-        row_of: wp.array(dtype=wp.int32),
-        update: wp.array(dtype=scalar),
-        positions: wp.array(dtype=vector),
-        states: wp.array(dtype=scalar),
-        path_length: wp.array(dtype=scalar),
+        moving: int,
+        state_dim: int,
+        update_width: int,
+        aligned: int,
+        row_of: wp.array[wp.int32],
+        update: wp.array[scalar],
+        positions: wp.array[vector],
+        states: wp.array[scalar],
+        path_length: wp.array[scalar],
         # outputs
-        new_positions: wp.array(dtype=vector),
-        new_states: wp.array(dtype=scalar),
-        new_path_length: wp.array(dtype=scalar),
+        new_positions: wp.array[vector],
+        new_states: wp.array[scalar],
+        new_path_length: wp.array[scalar],
     ):
         """Move and change the particles that have a row; copy the others."""
         await_earlier()
         # The first threads of a team move one particle each, the others change some channels each.
-        sharers = (state_dim + wp.static(CHANNEL_SHARE - 1)) / wp.static(CHANNEL_SHARE)
+        sharers = (state_dim + wp.static(THREAD_CHANNELS - 1)) / wp.static(THREAD_CHANNELS)
         t = range_start + wp.tid()
         team = t / (wp.static(TEAM) * (1 + sharers))
         turn = t - team * (wp.static(TEAM) * (1 + sharers))
@@ -123,7 +123,7 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         if turn >= wp.static(TEAM):
             member = (turn - wp.static(TEAM)) / sharers
             i = team * wp.static(TEAM) + member
-            first = (turn - wp.static(TEAM) - member * sharers) * wp.static(CHANNEL_SHARE)
+            first = (turn - wp.static(TEAM) - member * sharers) * wp.static(THREAD_CHANNELS)
         if i >= positions.shape[0]:
             return
         row = load_integer(row_of, i)
@@ -132,7 +132,7 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
             position = positions[i]
             path = path_length[i]
             if row >= 0 and moving != 0:
-                delta = wide()
+                delta = vector_f64()
                 for d in range(wp.static(space_dim)):
                     delta[d] = wp.float64(load_scalar(update, row_begin + d))
                 length = wp.length(delta)
@@ -151,11 +151,11 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
                 state = read_states(states, states_begin)
                 if row >= 0:
                     change = read_change(update, change_begin)
-                    for k in range(wp.static(CHANNEL_SHARE)):
+                    for k in range(wp.static(THREAD_CHANNELS)):
                         state[k] += dt * change[k]
-                write_share(new_states, states_begin, state)
+                write_channels(new_states, states_begin, state)
             else:
-                for k in range(wp.min(wp.static(CHANNEL_SHARE), state_dim - first)):
+                for k in range(wp.min(wp.static(THREAD_CHANNELS), state_dim - first)):
                     value = states[states_begin + k]
                     if row >= 0:
                         value += dt * update[change_begin + k]
@@ -164,39 +164,39 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
     @in_ranges(ELEMENTS)
     @wp.kernel(enable_backward=False, module=module)
     def pull_back_update(
-        range_start: wp.int32,
+        range_start: int,
         largest_step: scalar,
         dt: scalar,
-        moving: wp.int32,
-        row_base: wp.int32,
-        state_dim: wp.int32,
-        update_width: wp.int32,
-        aligned: wp.int32,
-        starts: wp.array(dtype=wp.int32),
-        row_source: wp.array(dtype=wp.int32),
-        update: wp.array(dtype=scalar),
-        new_positions_bar: wp.array(dtype=vector),
-        new_states_bar: wp.array(dtype=scalar),
-        new_path_bar: wp.array(dtype=scalar),
+        moving: int,
+        row_base: int,
+        state_dim: int,
+        update_width: int,
+        aligned: int,
+        starts: wp.array[wp.int32],
+        row_source: wp.array[wp.int32],
+        update: wp.array[scalar],
+        new_positions_bar: wp.array[vector],
+        new_states_bar: wp.array[scalar],
+        new_path_bar: wp.array[scalar],
         # outputs
-        update_bar: wp.array(dtype=scalar),
+        update_bar: wp.array[scalar],
     ):
         """Write the cotangent of every row's update, zero beyond the last active row."""
         await_earlier()
         allow_next_launch()
         # A thread writes some adjacent columns of a row.
-        sharers = (update_width + wp.static(CHANNEL_SHARE - 1)) / wp.static(CHANNEL_SHARE)
+        sharers = (update_width + wp.static(THREAD_CHANNELS - 1)) / wp.static(THREAD_CHANNELS)
         t = range_start + wp.tid()
         row = t / sharers
-        first = (t - row * sharers) * wp.static(CHANNEL_SHARE)
+        first = (t - row * sharers) * wp.static(THREAD_CHANNELS)
         row_begin = row * update_width
         i = load_integer(row_source, row)
-        bar = share()
+        bar = channels()
         if row < load_integer(starts, starts.shape[0] - 1) - row_base:
             offset = wp.int32(0)
             if moving != 0:
                 offset = wp.int32(wp.static(space_dim))
-            for k in range(wp.static(CHANNEL_SHARE)):
+            for k in range(wp.static(THREAD_CHANNELS)):
                 # Updates may have padding columns.
                 c = first + k - offset
                 place = i * state_dim + wp.clamp(c, 0, state_dim - 1)
@@ -216,43 +216,43 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
                 for d in range(wp.static(space_dim)):
                     bar[d] = largest_step * (shrink * pull[d] + radial * delta[d])
         if aligned != 0:
-            write_share(update_bar, row_begin + first, bar)
+            write_channels(update_bar, row_begin + first, bar)
         else:
-            for k in range(wp.static(CHANNEL_SHARE)):
+            for k in range(wp.static(THREAD_CHANNELS)):
                 if first + k < update_width:
                     update_bar[row_begin + first + k] = bar[k]
 
     @in_ranges(ELEMENTS)
     @wp.kernel(enable_backward=False, module=module)
     def apply_actions(
-        range_start: wp.int32,
-        particle_count: wp.int32,
+        range_start: int,
+        particle_count: int,
         largest_step: wp.float64,
         largest_change: wp.float64,
-        boundary: wp.int32,
+        boundary: int,
         box: vector,
-        moving: wp.int32,
+        moving: int,
         position_limit: scalar,
         state_limit: scalar,
-        masked: wp.int32,
-        mask: wp.array(dtype=wp.uint8),
-        noisy: wp.int32,
-        noise: wp.array(dtype=vector),
-        switched: wp.int32,
-        enabled: wp.array(dtype=wp.uint8),
-        state_dim: wp.int32,
-        aligned: wp.int32,
-        actions: wp.array(dtype=scalar),
+        masked: int,
+        mask: wp.array[wp.uint8],
+        noisy: int,
+        noise: wp.array[vector],
+        switched: int,
+        enabled: wp.array[wp.uint8],
+        state_dim: int,
+        aligned: int,
+        actions: wp.array[scalar],
         # changed in place
-        positions: wp.array(dtype=vector),
-        states: wp.array(dtype=scalar),
+        positions: wp.array[vector],
+        states: wp.array[scalar],
         # outputs
-        diverged: wp.array(dtype=wp.uint8),
+        diverged: wp.array[wp.uint8],
     ):
         """Apply the actions of active particles, and mark worlds in which a value was clipped."""
         await_earlier()
         # All loads are issued before any value is used, as the kernel waits for memory.
-        sharers = (state_dim + wp.static(CHANNEL_SHARE - 1)) / wp.static(CHANNEL_SHARE)
+        sharers = (state_dim + wp.static(THREAD_CHANNELS - 1)) / wp.static(THREAD_CHANNELS)
         t = range_start + wp.tid()
         i = t / sharers
         sharer = t - i * sharers
@@ -267,26 +267,26 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         first = sharer
         stride = sharers
         if aligned != 0:
-            first = sharer * wp.static(CHANNEL_SHARE)
+            first = sharer * wp.static(THREAD_CHANNELS)
             stride = wp.int32(1)
         states_begin = i * state_dim
         actions_begin = states_begin
         if moving != 0:
             actions_begin += (i + 1) * wp.static(space_dim)
-        before = share()
-        change = share()
+        before = channels()
+        change = channels()
         if aligned != 0:
             before = read_states(states, states_begin + first)
             change = read_actions(actions, actions_begin + first)
         else:
-            for k in range(wp.static(CHANNEL_SHARE)):
+            for k in range(wp.static(THREAD_CHANNELS)):
                 # The last thread of a particle may have fewer channels, and then repeats its first.
                 c = wp.where(first + k * stride < state_dim, first + k * stride, first)
                 before[k] = states[states_begin + c]
                 change[k] = actions[actions_begin + c]
         position = vector()
         push = vector()
-        direction = wide()
+        direction = vector_f64()
         # A particle's first thread also moves it.
         if sharer == 0:
             position = positions[i]
@@ -298,9 +298,9 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
                     direction[d] = wp.float64(actions[own])
         clipped_count = wp.int32(0)
         if happens != wp.uint8(0):
-            after = share()
+            after = channels()
             changed = wp.int32(0)
-            for k in range(wp.static(CHANNEL_SHARE)):
+            for k in range(wp.static(THREAD_CHANNELS)):
                 state = before[k]
                 if acting != wp.uint8(0):
                     # Comparisons keep NaN; a clamp would not.
@@ -317,9 +317,9 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
             clipped_count += changed
             if acting != wp.uint8(0) or changed != 0:
                 if aligned != 0:
-                    write_share(states, states_begin + first, after)
+                    write_channels(states, states_begin + first, after)
                 else:
-                    for k in range(wp.static(CHANNEL_SHARE)):
+                    for k in range(wp.static(THREAD_CHANNELS)):
                         c = first + k * stride
                         if c < state_dim:
                             states[states_begin + c] = after[k]
@@ -356,14 +356,14 @@ VALUES_PER_THREAD = 8
 def find_not_finite(scalar: type) -> wp.Kernel:
     """Return the kernel of one scalar type."""
     module = native.module(f"npa_envs.kernels.finite_{scalar_name(scalar)}")
-    read_quad = make_read_at(wp.types.vector(QUAD, scalar), scalar, 16)
+    read_quad = make_read_at(wp.types.vector(QUAD, scalar), 16)
 
     @wp.kernel(enable_backward=False, module=module)
     def find(
-        thread_count: wp.int32,
-        values: wp.array(dtype=scalar),
+        thread_count: int,
+        values: wp.array[scalar],
         # outputs
-        finite: wp.array(dtype=wp.uint8),
+        finite: wp.array[wp.uint8],
     ):
         """Write 0 if any of the values, aligned to 16 bytes in memory, is infinite or NaN."""
         await_earlier()

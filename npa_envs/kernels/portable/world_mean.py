@@ -9,7 +9,7 @@ import warp as wp
 
 from npa_envs.kernel_lock import cached_under_lock
 from npa_envs.kernels import native
-from npa_envs.kernels.access import await_earlier, make_warp_sum
+from npa_envs.kernels.access import await_earlier, make_lane_sum
 from npa_envs.kernels.domain import scalar_name
 
 CHUNK = 256
@@ -23,13 +23,13 @@ MEAN_LANES = 32
 def mean_kernels(scalar: type, lanes: int) -> SimpleNamespace:
     """Return the kernels of one scalar type; `lanes` threads share a sum."""
     module = native.module(f"npa_envs.kernels.worlds_{scalar_name(scalar)}_l{lanes}")
-    lane_sum = make_warp_sum(wp.float64)
+    lane_sum = make_lane_sum(wp.float64, lanes, whole_warps=True)
 
     @wp.kernel(enable_backward=False, module=module)
     def sum_chunks(
-        values: wp.array(dtype=scalar, ndim=3),
+        values: wp.array3d[scalar],
         # outputs
-        partial_sums: wp.array(dtype=wp.float64, ndim=3),
+        partial_sums: wp.array3d[wp.float64],
     ):
         """Sum each chunk of a world's values."""
         await_earlier()
@@ -45,9 +45,9 @@ def mean_kernels(scalar: type, lanes: int) -> SimpleNamespace:
     @wp.kernel(enable_backward=False, module=module)
     def average_sums(
         value_count: wp.float64,
-        partial_sums: wp.array(dtype=wp.float64, ndim=3),
+        partial_sums: wp.array3d[wp.float64],
         # outputs
-        means: wp.array(dtype=scalar, ndim=2),
+        means: wp.array2d[scalar],
     ):
         """Add the partial sums of each world and divide by the number of values."""
         await_earlier()

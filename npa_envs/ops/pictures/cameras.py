@@ -23,6 +23,7 @@ from npa_envs.checks import (
     checked_count,
     checked_finite,
     checked_number,
+    checked_positive,
     checked_side,
     number_tensor,
 )
@@ -64,12 +65,7 @@ class Cameras:
         self._check_shapes()
         for name in ("width", "height"):
             checked_side(name, getattr(self, name))
-        near = checked_number("near", self.near)
-        if not (math.isfinite(near) and near > 0.0):
-            raise NPAError(
-                f"near must be positive and finite [length units], got {shown(near)}: what is "
-                "nearer has no place on the picture"
-            )
+        checked_positive("near", self.near, " [length units]")
         if self.world_to_camera.device.type == "cpu":
             self._check_numbers()
 
@@ -99,10 +95,10 @@ class Cameras:
                 )
             check_dense(name, tensor)
         if motions.ndim not in (3, 4) or motions.shape[-2:] != (4, 4) or 0 in motions.shape:
-            cure = "add a dimension of views with world_to_camera[None]"
+            hint = "add a dimension of views with world_to_camera[None]"
             raise NPAError(
                 f"world_to_camera must have shape [V, 4, 4] or [B, V, 4, 4], "
-                f"got {tuple(motions.shape)}: {cure if motions.ndim == 2 else 'reshape it'}"
+                f"got {tuple(motions.shape)}: {hint if motions.ndim == 2 else 'reshape it'}"
             )
         views = motions.shape[:-2]
         if intrinsics.shape not in ((4,), (views[-1], 4), (*views, 4)):

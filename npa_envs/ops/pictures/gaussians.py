@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from npa_envs.checks import check_floating, checked_count, checked_number
+from npa_envs.checks import check_floating, checked_count, checked_number, constant
 from npa_envs.errors import NPAError, shown
 from npa_envs.kernels.pictures.blending import TILE_PIXELS, block_kernels, tile_kernels
 from npa_envs.kernels.pictures.gaussians import (
@@ -18,10 +17,9 @@ from npa_envs.kernels.pictures.gaussians import (
     PULLS,
     gaussian_kernels,
     make_frame,
-    tile_total,
 )
 from npa_envs.ops.custom_op import check_derivatives, custom_op, once_differentiable
-from npa_envs.ops.launch import launch, scalar_type
+from npa_envs.ops.launch import is_traced, launch, scalar_type
 from npa_envs.ops.pictures.cameras import Cameras
 from npa_envs.ops.sort import MAX_INDEX
 
@@ -33,10 +31,10 @@ def check_gaussians(
     _check_tensor("means", means, means, "[B, N, 3]")
     lead = tuple(means.shape[:2])
     if means.ndim != 3 or means.shape[2] != 3 or 0 in lead:
-        cure = "add a world dimension with means[None]" if means.ndim == 2 else "reshape it"
+        hint = "add a world dimension with means[None]" if means.ndim == 2 else "reshape it"
         raise NPAError(
             f"means must have shape [B, N, 3] with at least one world and one particle, "
-            f"got {tuple(means.shape)}: {cure}"
+            f"got {tuple(means.shape)}: {hint}"
         )
     shapes = (
         ("scales", scales, "[B, N, 3]", ((3,),)),
@@ -56,8 +54,7 @@ def check_gaussians(
                 f"{name} must have shape {shape} with [B, N] = {list(lead)} as means has, "
                 f"got {tuple(tensor.shape)}"
             )
-    given = {"means": means} | {name: tensor for name, tensor, *_ in shapes}
-    check_derivatives(**given)
+    check_derivatives(means=means, **{name: tensor for name, tensor, *_ in shapes})
     if scales.device.type == "cpu" and not torch.compiler.is_compiling():
         negative = scales.detach() < 0.0
         if bool(negative.any()):
@@ -143,6 +140,13 @@ def sort_pairs(
     Both sorts are stable: Gaussians of equal depth stay in the order of their indices.
     """
     device, images = depths.device, depths.shape[0]
+    tile_end = images * frame.tile_count
+    if is_traced():
+        size: Any = counts.numel() * pairs_per_particle
+        size = size if pairs_per_particle else torch.library.get_ctx().new_dynamic_size()
+        slots, starts, owners = map(counts.new_empty, (counts.numel(), tile_end + 1, size))
+        overflow = counts.new_empty(images, dtype=torch.bool)
+        return Pairs(overflow, slots, starts, owners, owners.new_empty(size, dtype=torch.int64))
     order = torch.sort(depths, dim=1, stable=True).indices
     ends = torch.cumsum(counts.gather(1, order), 1, dtype=torch.int64)
     room = ends.shape[1] * pairs_per_particle or max(int(ends[:, -1].max()), 1)
@@ -152,7 +156,6 @@ def sort_pairs(
             f"got room for {room} in each of {images} pictures: split the batch or lower "
             f"pairs_per_particle"
         )
-    tile_end = images * frame.tile_count
     tiles = torch.full((images * room,), tile_end, dtype=torch.int32, device=device)
     owners = torch.zeros_like(tiles)
     slots = torch.empty_like(counts)
@@ -216,7 +219,7 @@ class GaussianScene(NamedTuple):
     quaternions: Tensor
     colours: Tensor
     motions: Tensor
-    lenses: Tensor
+    intrinsics: Tensor
 
     def frame(self, width: int, height: int, near: float, dilation: float) -> Any:
         """Return the struct of sizes that all pictures share, for kernels."""
@@ -227,10 +230,10 @@ class GaussianScene(NamedTuple):
 
     def flat(self) -> list[Tensor]:
         """Return the tensors for kernels, with worlds and views flattened to one dimension."""
-        means, scales, quaternions, colours, motions, lenses = self
+        means, scales, quaternions, colours, motions, intrinsics = self
         total = means.shape[0] * means.shape[1]
         shapes = means.view(total, 3), scales.view(total, 3), quaternions.view(total, 4)
-        return [*shapes, colours.view(total, -1), motions.view(-1, 4, 4), lenses.view(-1, 4)]
+        return [*shapes, colours.view(total, -1), motions.view(-1, 4, 4), intrinsics.view(-1, 4)]
 
 
 @custom_op("npa::gaussians")
@@ -245,7 +248,7 @@ def _gaussians(
 ) -> list[Tensor]:
     """Return pictures, whether pairs found no room, and the tensors of the adjoint."""
     scene = GaussianScene(*tensors)
-    means, frame = scene.means, scene.frame(width, height, near, dilation)
+    means, frame = scene.means, scene.frame(int(width), int(height), near, dilation)
     worlds, views = means.shape[0], frame.view_count
     images, particles = worlds * views, means.shape[1]
     footprints = means.new_empty(images * particles, FOOTPRINT)
@@ -266,38 +269,6 @@ def _gaussians(
         footprints,
         counts.view(-1),
         *pairs[1:],
-    ]
-
-
-@_gaussians.register_fake
-def _(
-    opacities: Tensor,
-    tensors: list[Tensor],
-    width: int,
-    height: int,
-    near: float,
-    dilation: float,
-    pairs_per_particle: int,
-) -> list[Tensor]:
-    means, colours, motions = tensors[0], tensors[3], tensors[4]
-    views = (means.shape[0], motions.shape[-3])
-    images = views[0] * views[1]
-    seen = images * means.shape[1]
-    slots: Any = seen * pairs_per_particle
-    if pairs_per_particle == 0:
-        slots = torch.library.get_ctx().new_dynamic_size()
-    integers = functools.partial(means.new_empty, dtype=torch.int32)
-    return [
-        means.new_empty(*views, height, width, colours.shape[-1]),
-        means.new_empty(views, dtype=torch.bool),
-        means.new_empty(*views, height, width),
-        integers(images * height * width),
-        means.new_empty(seen, FOOTPRINT),
-        integers(seen),
-        integers(seen),
-        integers(images * tile_total(width, height) + 1),
-        integers(slots),
-        means.new_empty(slots, dtype=torch.int64),
     ]
 
 
@@ -337,9 +308,9 @@ def _gaussians_backward(
 
 class _Gaussians(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, *given: Any) -> tuple[Tensor, ...]:
-        means, scales, quaternions, opacities, colours, motions, lenses, *sizes = given
-        scene = [means, scales, quaternions, colours, motions, lenses]
+    def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
+        means, scales, quaternions, opacities, colours, motions, intrinsics, *sizes = arguments
+        scene = [means, scales, quaternions, colours, motions, intrinsics]
         picture, overflow, *saved = _gaussians(opacities, scene, *sizes)
         ctx.numbers = sizes[2:4]
         ctx.save_for_backward(*scene, *saved)
@@ -431,8 +402,8 @@ def render_gaussians(
         cameras.intrinsics.to(means.dtype).contiguous(),
         cameras.width,
         cameras.height,
-        float(cameras.near),
-        float(dilation),
+        constant(cameras.near),
+        dilation,
         int(pairs_per_particle),
     )
     if background is not None:

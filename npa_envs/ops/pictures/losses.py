@@ -8,7 +8,7 @@ from torch import Tensor
 from npa_envs.errors import NPAError
 from npa_envs.kernels.access import CUDA_BLOCK
 from npa_envs.kernels.pictures.errors import BLOCK_TILES, TURN_TILES, gather_errors, sum_errors
-from npa_envs.kernels.pictures.splat import CHANNELS, make_lens
+from npa_envs.kernels.pictures.splat import CHANNELS, make_view
 from npa_envs.ops.backend import multiprocessor_count
 from npa_envs.ops.custom_op import custom_op
 from npa_envs.ops.launch import aligned, launch, scalar_type
@@ -38,23 +38,23 @@ def _picture_losses(
     high: float,
 ) -> Tensor:
     world_count, device, scalar = x.shape[0], x.device, scalar_type(x.dtype)
-    lens = make_lens(scalar, int(target.shape[0]), pixel_size, sigma, low, high)
+    view = make_view(scalar, int(target.shape[0]), pixel_size, sigma, low, high)
     splats = Splats(x, states, shift, goal)
     if device.type == "cuda":
-        starts, footprints, _ = sort_splats(splats, lens)
-        tile_total = lens.tile_columns * lens.tile_rows
+        starts, footprints, _ = sort_splats(splats, view)
+        tile_total = view.tile_columns * view.tile_rows
         partial_sums = x.new_empty(world_count, tile_total, 2, dtype=torch.float64)
         tile_count = block_tiles(world_count * tile_total, multiprocessor_count(device))
         threads = world_count * -(-tile_total // tile_count) * CUDA_BLOCK
         pixels = aligned(target).view(-1, CHANNELS)
         gathered = (tile_count, starts, footprints, pixels, partial_sums)
-        launch(gather_errors(scalar), threads, device, lens, *gathered)
+        launch(gather_errors(scalar), threads, device, view, *gathered)
     else:
-        picture, *_ = scatter_splats(splats, lens)
-        rows = (world_count, lens.resolution)
+        picture, *_ = scatter_splats(splats, view)
+        rows = (world_count, view.resolution)
         partial_sums = x.new_empty(*rows, 2, dtype=torch.float64)
         launch(sum_errors(scalar), rows, device, picture, target.contiguous(), partial_sums)
-    return average_sums(partial_sums, lens.resolution**2, x)
+    return average_sums(partial_sums, view.resolution**2, x)
 
 
 def block_tiles(tile_total: int, processors: int) -> int:

@@ -27,7 +27,7 @@ from npa_envs.kernels.pictures.splat import (
     PATCH_SIGMAS,
     TILE_LANES,
     group_count,
-    make_lens,
+    make_view,
     splat_kernels,
 )
 from npa_envs.ops.backend import KernelRequest
@@ -87,23 +87,23 @@ def gather_threads(world_count: int, resolution: int, device: torch.device) -> i
     return world_count * group_count(resolution) * group
 
 
-def _check_size(largest: int, world_count: int, lens: Any) -> None:
+def _check_size(largest: int, world_count: int, view: Any) -> None:
     if largest >= MAX_INDEX:
         raise NPAError(
             f"pictures must stay below {MAX_INDEX} numbers in one batch, got {world_count} "
-            f"worlds of {lens.resolution} x {lens.resolution} pixels: split the batch"
+            f"worlds of {view.resolution} x {view.resolution} pixels: split the batch"
         )
 
 
-def sort_splats(splats: Splats, lens: Any) -> tuple[Tensor, Tensor, Tensor]:
+def sort_splats(splats: Splats, view: Any) -> tuple[Tensor, Tensor, Tensor]:
     """Return starts of the cells [B cells + 1], sorted footprints [B N, 8], their sources [B N]."""
     x, total = splats.x, splats.total
     world_count, particle_count, _ = x.shape
-    cell_total = world_count * lens.cell_count
-    _check_size(max(cell_total, x.numel()), world_count, lens)
+    cell_total = world_count * view.cell_count
+    _check_size(max(cell_total, x.numel()), world_count, view)
     footprints = x.new_empty(total, FOOTPRINT)
     source = torch.empty(total, dtype=torch.int32, device=x.device)
-    request = KernelRequest(x.device, x.dtype, particle_count, lens.cell_count, 2)
+    request = KernelRequest(x.device, x.dtype, particle_count, view.cell_count, 2)
     capacity = block_capacity(request, x)
     if capacity:
         starts = source.new_empty(cell_total + 1)
@@ -113,7 +113,7 @@ def sort_splats(splats: Splats, lens: Any) -> tuple[Tensor, Tensor, Tensor]:
             sort_small_splats(capacity),
             world_count * slices * block,
             x.device,
-            lens,
+            view,
             slices,
             *splats.contents(),
             *splats.aim(),
@@ -127,37 +127,37 @@ def sort_splats(splats: Splats, lens: Any) -> tuple[Tensor, Tensor, Tensor]:
     cell, arrival, arrived = torch.empty(3, total, dtype=torch.int32, device=x.device).unbind()
     counts = torch.zeros(cell_total + 1, dtype=torch.int32, device=x.device)
     counted = (cell, arrival, counts)
-    launch(kernels.count_splats, total, x.device, lens, *contents[:2], *places, *counted)
+    launch(kernels.count_splats, total, x.device, view, *contents[:2], *places, *counted)
     starts = torch.cumsum(counts, 0, dtype=torch.int32)
     launch(kernels.place_splats, total, x.device, cell, arrival, starts, arrived)
     sorted_splats = (cell, arrived, starts, footprints, source)
-    launch(kernels.order_splats, total, x.device, lens, *contents, *places, *sorted_splats)
+    launch(kernels.order_splats, total, x.device, view, *contents, *places, *sorted_splats)
     return starts, footprints, source
 
 
-def scatter_splats(splats: Splats, lens: Any) -> tuple[Tensor, Tensor, Tensor]:
+def scatter_splats(splats: Splats, view: Any) -> tuple[Tensor, Tensor, Tensor]:
     """Return pictures [B, R, R, 4] with footprints [B N, 8] and their sources [B N]."""
     x, total = splats.x, splats.total
-    picture = x.new_zeros(x.shape[0], lens.resolution, lens.resolution, CHANNELS)
+    picture = x.new_zeros(x.shape[0], view.resolution, view.resolution, CHANNELS)
     footprints = x.new_empty(total, FOOTPRINT)
     source = torch.empty(total, dtype=torch.int32, device=x.device)
-    scratch = x.new_empty(x.shape[0], min(2 * lens.radius + 1, lens.resolution))
+    scratch = x.new_empty(x.shape[0], min(2 * view.radius + 1, view.resolution))
     drawn = (*splats.contents(), *splats.places(), scratch, picture, footprints, source)
-    launch(device_kernels(x).scatter_splats, x.shape[0], x.device, lens, *drawn)
+    launch(device_kernels(x).scatter_splats, x.shape[0], x.device, view, *drawn)
     return picture, footprints, source
 
 
-def _draw(splats: Splats, lens: Any) -> tuple[Tensor, Tensor, Tensor]:
+def _draw(splats: Splats, view: Any) -> tuple[Tensor, Tensor, Tensor]:
     """Draw as `scatter_splats`, by the kernels for the device."""
     x = splats.x
     if x.device.type != "cuda":
-        return scatter_splats(splats, lens)
-    _check_size(x.shape[0] * CHANNELS * lens.resolution**2, x.shape[0], lens)
-    starts, footprints, source = sort_splats(splats, lens)
-    picture = x.new_empty(x.shape[0], lens.resolution, lens.resolution, CHANNELS)
-    threads = gather_threads(x.shape[0], lens.resolution, x.device)
+        return scatter_splats(splats, view)
+    _check_size(x.shape[0] * CHANNELS * view.resolution**2, x.shape[0], view)
+    starts, footprints, source = sort_splats(splats, view)
+    picture = x.new_empty(x.shape[0], view.resolution, view.resolution, CHANNELS)
+    threads = gather_threads(x.shape[0], view.resolution, x.device)
     flat = picture.view(-1, CHANNELS)
-    launch(device_kernels(x).gather_splats, threads, x.device, lens, starts, footprints, flat)
+    launch(device_kernels(x).gather_splats, threads, x.device, view, starts, footprints, flat)
     return picture, footprints, source
 
 
@@ -171,8 +171,8 @@ def _splat(
     low: float,
     high: float,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    lens = make_lens(scalar_type(x.dtype), int(resolution), pixel_size, sigma, low, high)
-    return _draw(Splats(x, colour), lens)
+    view = make_view(scalar_type(x.dtype), int(resolution), pixel_size, sigma, low, high)
+    return _draw(Splats(x, colour), view)
 
 
 @custom_op("npa::splat_backward")
@@ -193,7 +193,7 @@ def _splat_backward(
         device_kernels(footprints).pull_back_splats,
         (total, splat_lanes(footprints.device)),
         footprints.device,
-        make_lens(scalar_type(footprints.dtype), int(resolution), pixel_size, sigma, low, high),
+        make_view(scalar_type(footprints.dtype), int(resolution), pixel_size, sigma, low, high),
         total // world_count,
         footprints,
         source,
@@ -206,10 +206,10 @@ def _splat_backward(
 
 class _Splat(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, x: Tensor, colour: Tensor, resolution: int, *lens: float) -> Tensor:
+    def forward(ctx: Any, x: Tensor, colour: Tensor, resolution: int, *view: float) -> Tensor:
         picture: Tensor
-        picture, *saved = _splat(x, colour, resolution, *lens)
-        ctx.lens = lens
+        picture, *saved = _splat(x, colour, resolution, *view)
+        ctx.view = view
         ctx.shapes = (x.shape, colour.shape)
         ctx.save_for_backward(*saved)
         return picture
@@ -217,7 +217,7 @@ class _Splat(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, picture_bar: Tensor) -> tuple[Tensor | None, ...]:
-        positions_bar, colours_bar = _splat_backward(picture_bar, *ctx.saved_tensors, *ctx.lens)
+        positions_bar, colours_bar = _splat_backward(picture_bar, *ctx.saved_tensors, *ctx.view)
         x_shape, colour_shape = ctx.shapes
         gradients = (positions_bar.view(x_shape), colours_bar.view(colour_shape))
         return (*gradients, None, None, None, None, None)
