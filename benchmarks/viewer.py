@@ -73,7 +73,7 @@ def taken(address: str, seconds: float, grown: int) -> str:
             if isinstance(frame, str):
                 continue
             socket.send(json.dumps({"type": "drawn"}))
-            _, step, count, _, milliseconds, _ = HEADER.unpack_from(frame)
+            step, count, _, milliseconds, _ = HEADER.unpack_from(frame)
             if step > grown:
                 times.append(time.monotonic())
                 spent.append(milliseconds)

@@ -1,4 +1,4 @@
-"""A clock for tests of budgets of time."""
+"""A fake clock for tests of time budgets."""
 
 
 class Clock:

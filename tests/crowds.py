@@ -1,4 +1,4 @@
-"""Small worlds of several species, and how to act in them."""
+"""Environments of several species for tests: small configurations, particle positions, actions."""
 
 import functools
 import math
@@ -46,7 +46,7 @@ def make(task: str = "mixing", **keywords: Any) -> MultiSpeciesEnv:
 
 
 def module_of(module: Any, **keywords: Any) -> SimpleNamespace:
-    """What a test of a whole module needs of it, for one task; limits of steps are the test's."""
+    """Return a module's two factories bound to one task, for PettingZoo's own tests."""
     del keywords["max_cycles"]
     return SimpleNamespace(
         parallel_env=functools.partial(module.parallel_env, **keywords),

@@ -1,9 +1,9 @@
-"""Calls of operators, rules, pictures and cameras, with arguments that are right."""
+"""Fuzz test: calls of operators, rules, pictures and cameras, with legal arguments."""
 
-import dataclasses
 import functools
 import random
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -27,12 +27,8 @@ def world(draw: random.Random, dim: int | None = None, channels: int = 4) -> dic
     return {"x": torch.rand(2, 5, dim, dtype=dtype), "s": torch.rand(2, 5, channels, dtype=dtype)}
 
 
-def perceived(draw: random.Random) -> dict[str, Any]:
-    return world(draw) | {"eps": 0.3, "eps0": 0.2, "box": 1.0, "detach_positions": False}
-
-
-def fields(draw: random.Random) -> dict[str, Any]:
-    return world(draw) | {"eps": 0.3, "box": (1.0, 2.0)}
+PERCEIVED = {"eps": 0.3, "eps0": 0.2, "box": 1.0, "detach_positions": False}
+FIELDS = {"eps": 0.3, "box": (1.0, 2.0)}
 
 
 def rule_of(x: Tensor, **options: Any) -> npa_envs.NPARule:
@@ -46,10 +42,10 @@ STEPPED: dict[str, Any] = {
 
 
 def stepped(draw: random.Random) -> dict[str, Any]:
-    made = world(draw)
+    worlds = world(draw)
     generator = draw.choice((None, torch.Generator(), npa_envs.WorldRandom([0, 1])))
-    rule = rule_of(made["x"], static=draw.random() < 0.3)
-    return {"rule": rule, **made, **STEPPED, "generator": generator}
+    rule = rule_of(worlds["x"], static=draw.random() < 0.3)
+    return {"rule": rule, **worlds, **STEPPED, "generator": generator}
 
 
 def rolled(draw: random.Random) -> dict[str, Any]:
@@ -57,13 +53,13 @@ def rolled(draw: random.Random) -> dict[str, Any]:
 
 
 def rolled_species(draw: random.Random) -> dict[str, Any]:
-    made = rolled(draw)
-    rule, told = made.pop("rule"), draw.random() < 0.5
-    options = {"species_count": 2} if told else {}
-    rules = [rule_of(made["x"], static=rule.static, **options) for _ in range(2)]
-    return made | {
+    arguments = rolled(draw)
+    static, per_species = arguments.pop("rule").static, draw.random() < 0.5
+    options = {"species_count": 2} if per_species else {}
+    rules = [rule_of(arguments["x"], static=static, **options) for _ in range(2)]
+    return arguments | {
         "rules": rules, "counts": [2, 3], "update_prob": [0.5, 1.0], "density_counts": [2, 3],
-        "perception": "per_species" if told else "shared",
+        "perception": "per_species" if per_species else "shared",
     }  # fmt: skip
 
 
@@ -71,10 +67,9 @@ ONE_STEP = object()
 
 
 def run_rule(steps: Any = ONE_STEP, **arguments: Any) -> None:
-    """Run a rule, and back-propagate where something asks for it."""
+    """Run a rule, and back-propagate if any argument requires gradients."""
     run = npa_envs.step if steps is ONE_STEP else functools.partial(npa_envs.rollout, steps=steps)
-    found = run(**arguments)
-    total = sum(part.sum() for part in found)
+    total = sum(tensor.sum() for tensor in run(**arguments))
     if total.requires_grad:
         total.backward()
 
@@ -88,16 +83,11 @@ def hyper_parameters(draw: random.Random) -> dict[str, Any]:
 
 
 def save_and_load(rule: Any, path: Any, metadata: Any, device: Any) -> None:
-    """Write a rule in a folder of its own, and read it."""
+    """Write a rule in a temporary folder, and read it."""
     with tempfile.TemporaryDirectory() as folder:
-        there = Path(folder) / path if isinstance(path, str) and "/" not in path else path
-        npa_envs.save_rule(rule, there, metadata=metadata)
-        npa_envs.load_rule(there, device=device)
-
-
-def saved(draw: random.Random) -> dict[str, Any]:
-    rule = npa_envs.NPARule(2, 3, 4)
-    return {"rule": rule, "path": "a.safetensors", "metadata": {"a": "b"}, "device": "cpu"}
+        target = Path(folder) / path if isinstance(path, str) and "/" not in path else path
+        npa_envs.save_rule(rule, target, metadata=metadata)
+        npa_envs.load_rule(target, device=device)
 
 
 def load_bytes(data: Any, suffix: Any) -> None:
@@ -125,36 +115,6 @@ def draw_numbers(seeds: Any, device: Any, method: Any, size: Any, extra: Any) ->
     streams.substream(extra).advance()
 
 
-def streams(draw: random.Random) -> dict[str, Any]:
-    return {"seeds": [0, 1], "device": "cpu", "size": 3, "extra": 1}
-
-
-def drawn(draw: random.Random) -> dict[str, Any]:
-    made = {"x": torch.rand(2, 5, 2), "colour": torch.rand(2, 5, 3), "sigma": 1.0}
-    return made | {"resolution": 8, "pixel_size": 0.2, "lo": -1.0, "hi": 1.0}
-
-
-def seen(draw: random.Random) -> dict[str, Any]:
-    return {
-        "means": torch.rand(2, 5, 3), "scales": torch.rand(2, 5, 3) * 0.1,
-        "quaternions": torch.rand(2, 5, 4), "opacities": torch.rand(2, 5),
-        "colours": torch.rand(2, 5, 3), "cameras": orbit(2, width=6, height=5),
-        "background": torch.rand(3), "dilation": 0.3, "pairs_per_particle": 20,
-    }  # fmt: skip
-
-
-def camera_fields(draw: random.Random) -> dict[str, Any]:
-    made = orbit(2, width=6, height=5)
-    return {field.name: getattr(made, field.name) for field in dataclasses.fields(made)}
-
-
-def circled(draw: random.Random) -> dict[str, Any]:
-    return {
-        "count": 2, "elevation": 20.0, "radius": 3.0, "fov": 45.0, "width": 6, "height": 5,
-        "azimuth": 10.0, "centre": (0.0, 0.0, 0.0), "near": 0.01,
-    }  # fmt: skip
-
-
 def painted(draw: random.Random) -> dict[str, Any]:
     return world(draw) | {
         "style": draw.choice(("particles", "density", "states")), "resolution": 8,
@@ -164,19 +124,15 @@ def painted(draw: random.Random) -> dict[str, Any]:
 
 
 def write_pictures(path: Any, frames: Any, fps: Any) -> None:
-    """Write a GIF or PNG in a folder of its own."""
+    """Write a GIF or PNG in a temporary folder."""
     with tempfile.TemporaryDirectory() as folder:
-        there = Path(folder) / path if isinstance(path, str) and "/" not in path else path
-        if not isinstance(there, Path) or folder not in str(there):
+        if not isinstance(path, str) or "/" in path:
             return  # Nothing is written elsewhere.
+        target = Path(folder) / path
         if fps is None:
-            write_png(there, frames)
+            write_png(target, frames)
         else:
-            write_gif(there, frames, fps)
-
-
-def films(draw: random.Random) -> dict[str, Any]:
-    return {"path": "a.gif", "frames": [np.zeros((8, 6, 3), np.uint8)] * 2, "fps": 25}
+            write_gif(target, frames, fps)
 
 
 def damaged(draw: random.Random) -> dict[str, Any]:
@@ -184,62 +140,73 @@ def damaged(draw: random.Random) -> dict[str, Any]:
     return world(draw) | {"kind": kind, "size": 0.1, "generator": None}
 
 
+def fixed(function: Callable[..., Any], weight: float = 1.0, **arguments: Any) -> Target:
+    """Return a target whose legal arguments are always the same."""
+    return Target(function, lambda draw: dict(arguments), weight)
+
+
+CAMERAS = orbit(2, width=6, height=5)
+DRAWN: dict[str, Any] = {
+    "x": torch.rand(2, 5, 2), "colour": torch.rand(2, 5, 3), "sigma": 1.0, "resolution": 8,
+    "pixel_size": 0.2, "lo": -1.0, "hi": 1.0,
+}  # fmt: skip
+STREAMS: dict[str, Any] = {"seeds": [0, 1], "device": "cpu", "size": 3, "extra": 1}
+
 ENGINE: dict[str, Target] = {
-    "perceive": Target(npa_envs.perceive, perceived, 4),
-    "perception_fields": Target(npa_envs.perception_fields, fields, 2),
+    "perceive": Target(npa_envs.perceive, lambda d: world(d) | PERCEIVED, 4),
+    "perception_fields": Target(npa_envs.perception_fields, lambda d: world(d) | FIELDS, 2),
     "perceive_species": Target(
-        npa_envs.perceive_species, lambda d: perceived(d) | {"counts": [2, 3]}, 2
+        npa_envs.perceive_species, lambda d: world(d) | PERCEIVED | {"counts": [2, 3]}, 2
     ),
     "species_fields": Target(
-        npa_envs.species_fields,
-        lambda d: {k: v for k, v in fields(d).items() if k != "s"} | {"counts": [2, 3]},
-        2,
+        npa_envs.species_fields, lambda d: {"x": world(d)["x"], "counts": [2, 3]} | FIELDS, 2
     ),
     "step": Target(run_rule, stepped, 3),
     "rollout": Target(run_rule, rolled, 5),
     "rollout_species": Target(npa_envs.rollout_species, rolled_species, 5),
     "NPARule": Target(npa_envs.NPARule, hyper_parameters, 2),
-    "save_rule": Target(save_and_load, saved, 2),
-    "load_rule": Target(npa_envs.load_rule, lambda d: {"source": "gecko", "device": "cpu"}, 2),
+    "save_rule": fixed(
+        save_and_load, 2, rule=npa_envs.NPARule(2, 3, 4), path="a.safetensors",
+        metadata={"a": "b"}, device="cpu",
+    ),
+    "load_rule": fixed(npa_envs.load_rule, 2, source="gecko", device="cpu"),
     "load_rule of a file": Target(load_bytes, garbage, 3),
-    "shipped_rules": Target(npa_envs.shipped_rules, lambda d: {"task": "texture"}),
-    "scores": Target(scores, lambda d: {"name": "gecko"}),
-    "world_mean": Target(npa_envs.world_mean, lambda d: {"values": torch.rand(2, 3, 4)}),
-    "WorldRandom.uniform": Target(functools.partial(draw_numbers, method="uniform"), streams),
-    "WorldRandom.bernoulli": Target(functools.partial(draw_numbers, method="bernoulli"), streams),
-    "WorldRandom.integers": Target(functools.partial(draw_numbers, method="integers"), streams),
-    "WorldRandom.from_keys": Target(
-        npa_envs.WorldRandom.from_keys, lambda d: {"keys": torch.arange(3)}
+    "shipped_rules": fixed(npa_envs.shipped_rules, task="texture"),
+    "scores": fixed(scores, name="gecko"),
+    "world_mean": fixed(npa_envs.world_mean, values=torch.rand(2, 3, 4)),
+    **{
+        f"WorldRandom.{method}": fixed(functools.partial(draw_numbers, method=method), **STREAMS)
+        for method in ("uniform", "bernoulli", "integers")
+    },
+    "WorldRandom.from_keys": fixed(npa_envs.WorldRandom.from_keys, keys=torch.arange(3)),
+    "splat": fixed(splat, 2, **DRAWN),
+    "periodic_splat": fixed(periodic_splat, 2, **DRAWN),
+    "render_gaussians": fixed(
+        render_gaussians, 3, means=torch.rand(2, 5, 3), scales=torch.rand(2, 5, 3) * 0.1,
+        quaternions=torch.rand(2, 5, 4), opacities=torch.rand(2, 5), colours=torch.rand(2, 5, 3),
+        cameras=CAMERAS, background=torch.rand(3), dilation=0.3, pairs_per_particle=20,
     ),
-    "splat": Target(splat, drawn, 2),
-    "periodic_splat": Target(periodic_splat, drawn, 2),
-    "render_gaussians": Target(render_gaussians, seen, 3),
-    "Cameras": Target(Cameras, camera_fields, 2),
-    "orbit": Target(orbit, circled, 2),
-    "look_at": Target(
-        look_at, lambda d: {"eyes": torch.rand(2, 3) + 1, "targets": (0, 0, 0), "up": (0, 1, 0)}
+    "Cameras": fixed(Cameras, 2, **vars(CAMERAS)),
+    "orbit": fixed(
+        orbit, 2, count=2, elevation=20.0, radius=3.0, fov=45.0, width=6, height=5, azimuth=10.0,
+        centre=(0.0, 0.0, 0.0), near=0.01,
     ),
-    "cameras_of_poses": Target(
-        cameras_of_poses,
-        lambda d: {"camera_to_world": torch.eye(4)[None], "angle": 0.7, "width": 4, "height": 4},
+    "look_at": fixed(look_at, eyes=torch.rand(2, 3) + 1, targets=(0, 0, 0), up=(0, 1, 0)),
+    "cameras_of_poses": fixed(
+        cameras_of_poses, camera_to_world=torch.eye(4)[None], angle=0.7, width=4, height=4
     ),
     "draw_worlds": Target(draw_worlds, painted, 3),
-    "to_uint8": Target(
-        to_uint8, lambda d: {"picture": torch.rand(2, 4, 4, 4), "background": (0.1, 0.2, 0.3)}
-    ),
-    "turntable_frames": Target(
+    "to_uint8": fixed(to_uint8, picture=torch.rand(2, 4, 4, 4), background=(0.1, 0.2, 0.3)),
+    "turntable_frames": fixed(
         functools.partial(turntable_frames, lambda c: torch.rand(1, c.count, c.height, c.width, 4)),
-        lambda d: {"frame_count": 2, "resolution": 8, "elevation": 20.0, "background": "white"},
+        frame_count=2, resolution=8, elevation=20.0, background="white",
     ),
-    "write_gif and write_png": Target(write_pictures, films, 2),
+    "write_gif and write_png": fixed(
+        write_pictures, 2, path="a.gif", frames=[np.zeros((8, 6, 3), np.uint8)] * 2, fps=25
+    ),
     "damage_worlds": Target(damage_worlds, damaged, 2),
-    "parse_damage": Target(parse_damage, lambda d: {"text": "300:cut:0.1"}),
-    "uniform_ball": Target(
-        uniform_ball,
-        lambda d: {"world_count": 2, "particle_count": 5, "space_dim": 2, "radius": 0.2},
-    ),
-    "uniform_box": Target(
-        uniform_box, lambda d: {"world_count": 2, "particle_count": 5, "box": (1.0, 2.0)}
-    ),
-}
-"""What is called, by name."""
+    "parse_damage": fixed(parse_damage, text="300:cut:0.1"),
+    "uniform_ball": fixed(uniform_ball, world_count=2, particle_count=5, space_dim=2, radius=0.2),
+    "uniform_box": fixed(uniform_box, world_count=2, particle_count=5, box=(1.0, 2.0)),
+}  # fmt: skip
+"""Targets by name."""

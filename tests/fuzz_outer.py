@@ -1,4 +1,4 @@
-"""Calls of configurations, environments, wrappers, policies and the command line."""
+"""Fuzz test: calls of configurations, environments, wrappers, policies and the command line."""
 
 import contextlib
 import dataclasses
@@ -33,7 +33,7 @@ from npa_envs.training.presets import config_to_dict
 def configured(draw: random.Random) -> dict[str, Any]:
     task = draw.choice(tuple(TASKS))
     config = TASKS[task].presets["tiny"]
-    known = [field.name for part in (config, config.task) for field in dataclasses.fields(part)]
+    known = [f.name for level in (config, config.task) for f in dataclasses.fields(level)]
     name = draw.choice([*known, "", "itertions"])
     return {"name": "tiny", "task": task, "field": name, "value": getattr(config, name, 1)}
 
@@ -45,9 +45,9 @@ def configure(name: Any, task: Any, field: str, value: Any) -> None:
 def reconfigure(name: Any, task: Any, field: str, value: Any) -> None:
     """Make a configuration as a program does, whose types nobody converts."""
     config = override(preset(name, task))
-    for part in (config, config.task):
-        if field in {f.name for f in dataclasses.fields(part)}:
-            dataclasses.replace(part, **{field: value})
+    for level in (config, config.task):
+        if field in {f.name for f in dataclasses.fields(level)}:
+            dataclasses.replace(level, **{field: value})
 
 
 def configure_by(path: Path) -> Any:
@@ -69,31 +69,31 @@ FILES: dict[str, tuple[str, Callable[[Path], Any]]] = {
     ".gz": ("IDX", read_idx),
     ".obj": ("mesh", lambda path: load_views(path, resolution=8, training_count=1)),
 }
-"""What is written to a file of each suffix, and what reads it."""
+"""Content and reader of a file of each suffix."""
 
 
 @functools.cache
 def whole_file(suffix: str) -> bytes:
-    """Return a file of a format as it should be."""
-    kind, _ = FILES[suffix]
+    """Return an undamaged file of a format."""
+    content, _ = FILES[suffix]
     buffer = io.BytesIO()
-    if kind == "picture":
+    if content == "picture":
         picture = Image.new("RGB", (12, 12), "white")
         picture.paste("red", (3, 3, 9, 9))
         picture.save(buffer, {".jpg": "JPEG", ".tiff": "TIFF"}.get(suffix, suffix[1:].upper()))
-    elif kind == "rule":
+    elif content == "rule":
         return npa_envs.rule.files.shipped_rules()["heart"].read_bytes()
-    elif kind == "state dict":
+    elif content == "state dict":
         shapes = {"model.0.weight": (8, 22), "model.0.bias": (8,), "model.2.weight": (7, 8)}
         weights = {name: torch.zeros(shape) for name, shape in shapes.items()}
         torch.save(weights | {"eps0": 0.1, "alpha": 0.2}, buffer)
-    elif kind == "IDX":
+    elif content == "IDX":
         sizes = b"".join(size.to_bytes(4, "big") for size in (2, 3, 3))
-        content = b"\0\0\x08\x03" + sizes + bytes(18)
-        return gzip.compress(content) if suffix == ".gz" else content
-    elif kind == "mesh":
+        data = b"\0\0\x08\x03" + sizes + bytes(18)
+        return gzip.compress(data) if suffix == ".gz" else data
+    elif content == "mesh":
         return b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 2 3 4\n"
-    elif kind == "TOML":
+    elif content == "TOML":
         return b'iterations = 5\nsteps = [3, 6]\n[task]\ntarget = "heart"\neps = 0.1\n'
     else:
         return json.dumps(config_to_dict(preset("tiny"))).encode()
@@ -124,9 +124,9 @@ def damaged_files(draw: random.Random) -> dict[str, Any]:
         elif change == "repeat":
             content[place:place] = content[: draw.randrange(64)]
         else:
-            found = list(re.finditer(rb"[-\w.]+", content))
-            if found:
-                begin, end = draw.choice(found).span()
+            words = list(re.finditer(rb"[-\w.]+", content))
+            if words:
+                begin, end = draw.choice(words).span()
                 content[begin:end] = draw.choice(WORDS)
     return {"kind": suffix, "content": bytes(content)}
 
@@ -158,7 +158,7 @@ def config_type(name: str) -> type:
 
 
 def run_env(id: Any, world_count: Any, **keywords: Any) -> None:
-    """Make an environment, act in it once, look at it."""
+    """Make an environment and act in it once."""
     if world_count is None:
         env = gymnasium.make(id, disable_env_checker=True, **keywords)
     else:
@@ -171,14 +171,12 @@ def run_env(id: Any, world_count: Any, **keywords: Any) -> None:
 
 @functools.cache
 def standing(kind: str) -> Any:
-    """Return an environment that calls are made to, the same for all of them."""
+    """Return an environment that all calls share."""
     if kind == "single":
-        env = small_envs.make(small_envs.IDS[0], render_mode="rgb_array").unwrapped
-    elif kind == "vector":
-        env = small_envs.make_vec(small_envs.IDS[0], 2, render_mode="rgb_array").unwrapped
-    else:
-        env = multispecies_v0.parallel_env(particle_count=10, eps=0.3, render_size=24)
-    return env
+        return small_envs.make(small_envs.IDS[0], render_mode="rgb_array").unwrapped
+    if kind == "vector":
+        return small_envs.make_vec(small_envs.IDS[0], 2, render_mode="rgb_array").unwrapped
+    return multispecies_v0.parallel_env(particle_count=10, eps=0.3, render_size=24)
 
 
 def act(kind: str, seed: Any, options: Any, action: Any, x: Any, s: Any) -> None:
@@ -201,8 +199,8 @@ def acted(draw: random.Random) -> dict[str, Any]:
         action = draw.choice((action, {"species_0": action["species_0"]}))
     else:
         action = torch.as_tensor(env.action_space.sample())
-    made = {"x": torch.rand(*lead, 2), "s": torch.rand(*lead, 16)}
-    return {"kind": kind, "seed": 0, "options": None, "action": action, **made}
+    particles = {"x": torch.rand(*lead, 2), "s": torch.rand(*lead, 16)}
+    return {"kind": kind, "seed": 0, "options": None, "action": action, **particles}
 
 
 def crowd_fields(draw: random.Random) -> dict[str, Any]:
@@ -313,4 +311,4 @@ OUTER: dict[str, Target] = {
     "agents": Target(make_policy, policies, 2),
     "npa-envs": Target(run_command, command_line, 1, (SystemExit,)),
 }
-"""What is called, by name."""
+"""Targets by name."""

@@ -1,4 +1,4 @@
-"""Arguments that are mostly wrong, and what they are given to."""
+"""Fuzz test: wrong and extreme arguments, and the targets that take them."""
 
 import dataclasses
 import math
@@ -19,7 +19,7 @@ ORDINARY: tuple[Any, ...] = (
     (0.5, 0.5), {}, {"a": 1}, set(), object(), 1j, int, range(3), Path("no.safetensors"),
     torch.tensor(0.1), torch.tensor([1.0, 2.0]), torch.tensor(1 + 2j), torch.float16,
 )  # fmt: skip
-"""Whatever a caller may hand over by mistake."""
+"""Values of many types that a caller may pass by mistake."""
 
 EXTREME: tuple[Any, ...] = (
     math.nan, math.inf, -math.inf, 5e-324, 1e-38, 1e-12, 1e12, 1e30, 1e38, 1e300, -1e300, 2**31 - 1,
@@ -27,7 +27,7 @@ EXTREME: tuple[Any, ...] = (
     (math.inf, 1e300), torch.tensor(math.nan), torch.tensor([math.inf, 1.0]), [10**400], "1e400",
     10**5000, 10_000 * "x",
 )  # fmt: skip
-"""Numbers that are none, or at the end of a range."""
+"""Numbers that are not finite, or at the end of a range."""
 
 ENDLESS = ("steps", "frame_count", "max_cycles", "frames")
 """Arguments whose large values are legal, and take long."""
@@ -39,11 +39,11 @@ class Target:
 
     function: Callable[..., Any]
     legal: Callable[[random.Random], dict[str, Any]]
-    """Makes arguments that are right."""
+    """Returns legal arguments."""
     weight: float = 1.0
     """How often it is called."""
     documented: tuple[type[BaseException], ...] = ()
-    """What its documentation names besides `NPAError`."""
+    """Exceptions that its documentation names besides `NPAError`."""
 
 
 def read_file(read: Callable[[Path], Any], name: str, content: bytes) -> None:
@@ -55,7 +55,7 @@ def read_file(read: Callable[[Path], Any], name: str, content: bytes) -> None:
 
 
 def wrong(draw: random.Random, name: str, legal: Any) -> Any:
-    """Return what may stand in the place of a legal argument."""
+    """Return a replacement of a legal argument."""
     if isinstance(legal, Tensor) and draw.random() < 0.8:
         return wrong_tensor(draw, legal)
     if name not in ENDLESS and draw.random() < 0.4:

@@ -1,4 +1,4 @@
-"""Problems that are small enough to learn from in a second, and rules that do a lot."""
+"""Reinforcement-learning problems that train in a second, and rules with large actions."""
 
 import torch
 

@@ -1,4 +1,4 @@
-"""Hypothesis strategies of legal worlds, and how far rounding may move what is perceived of them.
+"""Property tests: Hypothesis strategies of random legal worlds, and bounds on rounding errors.
 
 Coordinates, shifts and sides of boxes are multiples of `GRID`, so that moving a world rounds
 nothing, while particles coincide, lie on borders of cells, on the seam of a box, and at ε exactly.

@@ -1,4 +1,4 @@
-"""Worlds that the engine of the exported page and Python step alike."""
+"""Worlds in which the JavaScript engine of exported pages is compared with float64 Python."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Processes that share a training run, forked from the test's own."""
+"""Forked processes that share a distributed training run."""
 
 import multiprocessing
 import os

@@ -1,4 +1,4 @@
-"""How tests say that a call is refused, and in which words."""
+"""A check that a call raises `NPAError` with a certain message."""
 
 from collections.abc import Callable
 from typing import Any

@@ -1,4 +1,4 @@
-"""Every registered environment, made small."""
+"""Every registered Gymnasium environment at a small size, and comparisons of their results."""
 
 from typing import Any
 

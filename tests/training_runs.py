@@ -1,4 +1,4 @@
-"""Small runs of training for tests: their logs, their ends, their operations recorded."""
+"""Short training runs for tests: logs, kills in the middle, a CPU stand-in for CUDA graphs."""
 
 import torch
 from circle_task import CircleTask, plain_rollout

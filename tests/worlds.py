@@ -1,4 +1,4 @@
-"""Random and hard worlds for the numerical tests, and how results are compared."""
+"""Tensors for numerical tests: random and degenerate worlds, gradients, comparisons."""
 
 import torch
 from torch.utils._pytree import tree_leaves

@@ -1,4 +1,4 @@
-"""The small environments that wrappers are tested over, and what acts in them."""
+"""Small environments for tests of wrappers, and a deterministic policy for them."""
 
 import gymnasium as gym
 import numpy as np

@@ -172,7 +172,7 @@ def page_rule(source: str, *, particle_count: int | None = None) -> dict[str, An
         "name": live.main.name,
         "classes": classes if task.classifies else None,
         "weights": {name: _packed(tensor) for name, tensor in rule.state_dict().items()},
-        "world": world | {"capabilities": ["step", "reset"], "count": live.full, "seed": seed},
+        "world": world | {"capabilities": ["step", "reset"], "count": live.count, "seed": seed},
     }
 
 

@@ -393,7 +393,7 @@ class ColouredWorld(NamedTuple):
     box: tuple[float, ...] | None
     counts: Sequence[int]
     """Particles of each species, species after species."""
-    full: int
+    usual_count: int
     """Particles of a fresh world."""
     travelled: Tensor | None
     """Distance of each particle in the last step over the largest possible one, [1, N]."""
@@ -419,7 +419,7 @@ class Colouring:
                 # 1 if the particles fill [-1, 1]^D, or the box, evenly.
                 rho = species_fields(world.x, [world.x.shape[1]], eps=world.eps, box=world.box).rho
                 volume = float(np.prod(world.box or (2.0,) * world.x.shape[2]))
-                crowding = rho[0].sum(dim=-1) * (volume / world.full)
+                crowding = rho[0].sum(dim=-1) * (volume / world.usual_count)
                 # Particles in open space are denser, as they fill only a part of [-1, 1]^D.
                 return _ramp(1.0 - torch.exp2(-crowding / (1.0 if world.box else 4.0)))
             case ["components"]:
@@ -458,14 +458,14 @@ class Colouring:
             basis = basis * torch.where(sign == 0, 1.0, sign)
         self._basis = basis
         width = values[-count:].flip(0).clamp_min(1e-12).sqrt().to(s.device)
-        parts = 0.5 + 0.22 * ((s.double() - mean) @ basis) / width
-        return torch.nn.functional.pad(parts, (0, 3 - count), value=0.5)
+        colours = 0.5 + 0.22 * ((s.double() - mean) @ basis) / width
+        return torch.nn.functional.pad(colours, (0, 3 - count), value=0.5)
 
 
 def shows_of(state_dim: int, *, species: bool = True) -> list[str]:
     """Return the choices of `Colouring` for particles with `state_dim` state channels."""
-    own = SHOWS if species else ("colours", "density", "components", "speed")
-    return [*own, *(f"state {k}" for k in range(state_dim))]
+    shows = SHOWS if species else ("colours", "density", "components", "speed")
+    return [*shows, *(f"state {k}" for k in range(state_dim))]
 
 
 def signed_colours(values: Tensor) -> Tensor:

@@ -127,8 +127,9 @@ class RuleWorld(LiveWorld):
         self._generator = torch.Generator(self._device).manual_seed(self.seed)
         seeds = self.task.seed(1, generator=self._generator, device=self._device)
         self.x, self.s, self._goal = seeds.x, seeds.s, seeds.goal
-        self.full = self.x.shape[1]
-        self.live_rules = [replace(self.main, count=self.full, divisor=float(self.full))]
+        self.count = self.x.shape[1]
+        """Particles of a fresh world."""
+        self.live_rules = [replace(self.main, count=self.count, divisor=float(self.count))]
         self._colouring = Colouring()
         self._loss_due = 0.0
         self._resting, self._next_rest_check = False, REST_CHECK_STEPS
@@ -148,11 +149,6 @@ class RuleWorld(LiveWorld):
         """Sides of the periodic box [length units]; None: open space."""
         return self.task.box
 
-    @property
-    def count(self) -> int:
-        """Particles of a fresh world."""
-        return self.full
-
     def describe(self) -> dict[str, Any]:
         """Return the event "world"."""
         frame = self.task.frame
@@ -168,7 +164,7 @@ class RuleWorld(LiveWorld):
             "others": [name for name in self._choices if self._may_join(name)],
             "species": [live_rule.name for live_rule in self.live_rules],
             "damages": list(DAMAGE_SIZES),
-            "capabilities": ["step", "reset", "film", *(["loss"] if self._has_loss() else [])],
+            "capabilities": ["step", "reset", "film", *([] if self.trained.doubt else ["loss"])],
         }
 
     def handle(self, message: Mapping[str, Any]) -> bool:
@@ -183,9 +179,6 @@ class RuleWorld(LiveWorld):
             allowed |= {"states", "species"}
             allowed |= set() if self.main.rule.static else {"growth"}
         return allowed
-
-    def _has_loss(self) -> bool:
-        return self.trained.doubt is None
 
     def _may_join(self, name: str) -> bool:
         """Return whether particles of another rule can be put into this world."""
@@ -218,7 +211,7 @@ class RuleWorld(LiveWorld):
             self._plant(value)
         elif name == "count" and name in self._ranges():
             number = self._ranges()[name].checked(name, value)
-            if number != self.full:
+            if number != self.count:
                 self.trained = self._trained(self.main.name, int(number))
                 self.reset(self.seed)
         else:
@@ -261,7 +254,7 @@ class RuleWorld(LiveWorld):
     def _is_unchanged(self) -> bool:
         """Return whether no brush has added or removed particles or rules."""
         parts = [(live_rule.count, live_rule.divisor) for live_rule in self.live_rules]
-        return parts == [(self.full, self.full)]
+        return parts == [(self.count, self.count)]
 
     def _rollout(self, steps: int, options: Mapping[str, Any]) -> Tensor:
         """Run steps and return the path length of each particle."""
@@ -296,7 +289,7 @@ class RuleWorld(LiveWorld):
             updated = None if updated is None else updated[:, alive]
         return ColouredWorld(
             x, s, functools.partial(self._rule_colours, counts), self.eps, self.box, counts,
-            self.full, travelled, updated,
+            self.count, travelled, updated,
         )  # fmt: skip
 
     def _rule_colours(self, counts: Sequence[int], s: Tensor) -> Tensor:
@@ -308,7 +301,7 @@ class RuleWorld(LiveWorld):
     def _loss(self) -> float | None:
         """Return the metric, or None where it has no meaning, or too early (`LOSS_FRACTION`)."""
         start = time.perf_counter()
-        comparable = self._has_loss() and len(self.live_rules) == 1 and self.x.shape[1]
+        comparable = self.trained.doubt is None and len(self.live_rules) == 1 and self.x.shape[1]
         if not comparable or start < self._loss_due:
             return None
         loss = float(self.task.toward(self._goal).metric(self.x, self.s))
@@ -342,12 +335,12 @@ class RuleWorld(LiveWorld):
     def _graft(self, touch: Touch, live_rule: LiveRule) -> None:
         inside = inside_ball(self.x, centre=touch.at, radius=touch.radius, box=self.box)
         # Grafted particles divide densities by the same number as their neighbours.
-        index = self._species_index(live_rule, float(self.full))
+        index = self._species_index(live_rule, float(self.count))
         s = torch.where(inside[..., None], self._coded(live_rule, self.s), self.s)
         self._arrange(self.x, s, torch.where(inside[0], index, self._species()))
 
     def _add(self, touch: Touch, live_rule: LiveRule) -> None:
-        count = max(MIN_SEED, round(touch.strength * SEED_FRACTION * self.full))
+        count = max(MIN_SEED, round(touch.strength * SEED_FRACTION * self.count))
         room = MAX_PARTICLES[self._device.type] - self.x.shape[1]
         if count > room:
             raise NPAError(f"the world has room for {max(room, 0)} particles more, got {count}")
@@ -468,7 +461,7 @@ class RunWorld(RuleWorld):
             # As in training, each species divides densities by its own number of particles.
             live_rule.count, live_rule.divisor = x.shape[1], float(x.shape[1])
         self.x, self.s = (torch.cat(tensors, dim=1) for tensors in zip(*worlds, strict=True))
-        self.full = sum(self.counts)
+        self.count = sum(self.counts)
 
     def describe(self) -> dict[str, Any]:
         """Return the event "world", without a choice of rules."""

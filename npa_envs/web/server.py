@@ -78,9 +78,8 @@ FILM_RATE = 25.0
 MAX_PICTURE = 1024
 """Most pixels on each side of a film's pictures."""
 
-KIND = 1
-HEADER = struct.Struct("<IIIIff")
-"""A frame's kind, step, particles, dimension, milliseconds, loss (NaN: not computed)."""
+HEADER = struct.Struct("<IIIff")
+"""A frame's step, particles, dimension, milliseconds, loss (NaN: not computed)."""
 
 SECURITY = {
     "Content-Security-Policy": "default-src 'self'; "
@@ -218,7 +217,7 @@ def frame_bytes(frame: WorldView) -> bytes:
     """Return the bytes of a frame: header, positions, colours."""
     count, dimension = frame.positions.shape
     loss = float("nan") if frame.loss is None else frame.loss
-    header = HEADER.pack(KIND, frame.step, count, dimension, frame.milliseconds, loss)
+    header = HEADER.pack(frame.step, count, dimension, frame.milliseconds, loss)
     positions = np.ascontiguousarray(frame.positions, dtype="<f4").tobytes()
     return header + positions + np.ascontiguousarray(frame.colours).tobytes()
 

@@ -284,24 +284,6 @@ def episode(name, steps=12, **keywords):
     return results
 
 
-def batch_of_episodes(name):
-    """Twelve steps of two worlds of one environment, which start anew by themselves."""
-    limits = {"vectorization_mode": "vector_entry_point", "max_episode_steps": 7}
-    envs = gymnasium.make_vec(name, num_envs=2, **limits, **small(name))
-    generator = np.random.default_rng(13)
-    observation, _ = envs.reset(seed=6)
-    observations, reports, ends = [observation], [], []
-    for _ in range(12):
-        action = actions(generator, envs.action_space)
-        observation, reward, terminated, truncated, info = envs.step(action)
-        observations.append(observation)
-        reports.append(np.stack([reward, info["loss"]]).astype(np.float32))
-        ends.append(np.stack([terminated, truncated]))
-    envs.close()
-    results = {"reports": np.stack(reports), "ends": np.stack(ends)}
-    return results | {"observations": kept(np.stack(observations), 1100)}
-
-
 # Environments of several species.
 
 
@@ -339,43 +321,6 @@ def crowd(module, task, **keywords):
         "picture": np.asarray(env.render()),
     }
     env.close()
-    return results
-
-
-def in_turn(task):
-    """An episode of several species, one after the other."""
-    env = multispecies_v0.env(**few(task))
-    generator = np.random.default_rng(15)
-    env.reset(seed=5)
-    seen, rewards, ends = [], [], []
-    for agent in env.agent_iter(12):
-        observation, reward, terminated, truncated, info = env.last()
-        seen.append(kept(observation, 120))
-        # The loss goes along for its size.
-        rewards.append([reward, info["loss"]])
-        ends.append([terminated, truncated])
-        over = terminated or truncated
-        env.step(None if over else actions(generator, env.action_space(agent)))
-    env.close()
-    results = {"reports": np.array(rewards, np.float32), "ends": np.array(ends)}
-    return results | {"observations": np.concatenate(seen)}
-
-
-def batch_of_crowds(task, **keywords):
-    """Ten steps of two worlds of several species, which start anew by themselves."""
-    envs = multispecies_v0.batched(world_count=2, **few(task, **keywords))
-    generator = np.random.default_rng(16)
-    observations, _ = envs.reset(seed=5)
-    seen, reports, ends = [], [], []
-    for _ in range(10):
-        seen.append(np.concatenate([rows.ravel() for rows in observations.values()]))
-        chosen = {a: actions(generator, space) for a, space in envs.action_spaces.items()}
-        observations, rewards, terminated, truncated, infos = envs.step(chosen)
-        reports.append([[rewards[a], infos[a]["loss"]] for a in envs.agents])
-        ends.append([[terminated[a], truncated[a], infos[a]["live"]] for a in envs.agents])
-    results = {"reports": np.array(reports, np.float32), "ends": np.array(ends)}
-    results |= {"observations": kept(np.stack(seen), 1100), "state": kept(envs.state())}
-    envs.close()
     return results
 
 
@@ -454,8 +399,6 @@ SCENES = {
     "env-points-shares": partial(episode, POINTS, 4, reward="particle", rotation=20.0, jitter=0.01),
     "env-morphogenesis3d": partial(episode, MORPHOGENESIS3D),
     "env-morphogenesis3d-shares": partial(episode, MORPHOGENESIS3D, 4, reward="particle"),
-    "batch-morphogenesis": partial(batch_of_episodes, MORPHOGENESIS),
-    "batch-points": partial(batch_of_episodes, POINTS),
     "crowd-mixing": partial(crowd, multispecies_v0, "mixing", perception="per_species"),
     "crowd-segregation": partial(crowd, multispecies_v0, "segregation", **THREE),
     "crowd-co_morphogenesis": partial(crowd, multispecies_v0, "co_morphogenesis"),
@@ -463,9 +406,6 @@ SCENES = {
     "crowd-symbiosis": partial(crowd, multispecies_v0, "symbiosis", reward="team"),
     "crowd-particles-mixing": partial(crowd, particles_v0, "mixing", particle_count=12),
     "crowd-particles-invasion": partial(crowd, particles_v0, "invasion", particle_count=12),
-    "crowd-in-turn": partial(in_turn, "mixing"),
-    "batch-crowd-symbiosis": partial(batch_of_crowds, "symbiosis", max_cycles=6),
-    "batch-crowd-mixing": partial(batch_of_crowds, "mixing", boundary="periodic"),
     "randomness": randomness,
 }
 """All scenes by name."""

@@ -1,5 +1,5 @@
-// Runs the page without a browser, over stubs of what browsers have: `node run_page.mjs FOLDER SCRIPT`
-// prints as JSON what the script returns. It sees: page; sent, the messages of the page to its engine;
+// Runs the page without a browser, over stubs of a browser's interfaces: `node run_page.mjs FOLDER SCRIPT`
+// prints as JSON what the script returns. Its names: page; sent, the messages of the page to its engine;
 // listen, which hands the page an event; tick, a frame of the screen; element, by its id.
 
 import { pathToFileURL } from "node:url";
@@ -9,6 +9,7 @@ function makeElement() {
     dataset: {}, style: {}, children: [], value: "0.1", hidden: false, open: false, checked: false, textContent: "",
     classList: { add() {}, remove() {}, toggle() {} }, clientWidth: 100, clientHeight: 100, offsetTop: 80,
     width: 100, height: 100, setAttribute() {}, remove() {}, addEventListener() {},
+    getBoundingClientRect: () => ({ left: 0, top: 0 }), setPointerCapture() {},
     append: (...added) => element.children.push(...added),
     prepend: (...added) => element.children.unshift(...added),
     replaceChildren: (...added) => (element.children = added),
@@ -43,6 +44,6 @@ const connect = async (_, listener) => {
 };
 const page = await start(connect, {});
 page.painter = { draw() {} };
-const told = new Function("page", "sent", "listen", "tick", "element", script)(page, sent, listen, tick, element);
-process.stdout.write(JSON.stringify(told));
+const result = new Function("page", "sent", "listen", "tick", "element", script)(page, sent, listen, tick, element);
+process.stdout.write(JSON.stringify(result));
 process.exit();

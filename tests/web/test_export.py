@@ -54,10 +54,10 @@ def run(modules):
     pipe = subprocess.PIPE
     with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, encoding="utf-8") as process:
 
-        def act(name, **told):
+        def act(name, **fields):
             limit = threading.Timer(NODE_SECONDS, process.kill)
             limit.start()
-            process.stdin.write(json.dumps({"act": name, **told}) + "\n")
+            process.stdin.write(json.dumps({"act": name, **fields}) + "\n")
             process.stdin.flush()
             line = process.stdout.readline()
             limit.cancel()
@@ -134,19 +134,19 @@ def test_brushes_are_those_of_python(run, name, dimension, box):
     x, s = scattered(200, dimension, 4, box)
     at, move = x.new_full((1, dimension), 0.2), x.new_tensor([[0.05, -0.1, 0.2][:dimension]])
     along = None if name == "cut for ever" else 0.5 * move
-    told = {"centre": at, "radius": 0.15, "box": box}
+    ball = {"centre": at, "radius": 0.15, "box": box}
     want_x, want_s = x, s
     match name.split()[0]:
         case "wipe":
-            want_s = brushes.wipe_state(x, s, **told)
+            want_s = brushes.wipe_state(x, s, **ball)
         case "push":
-            want_x = brushes.push(x, move=move, strength=0.7, **told)
+            want_x = brushes.push(x, move=move, strength=0.7, **ball)
         case "clump":
-            want_x, _ = brushes.clump(x, s, factor=0.7, **told)
+            want_x, _ = brushes.clump(x, s, factor=0.7, **ball)
         case "inject":
-            state, holds = brushes.state_around(x, s, **(told | {"centre": move}))
+            state, holds = brushes.state_around(x, s, **(ball | {"centre": move}))
             assert holds.all()
-            want_s = brushes.inject(x, s, state=state, strength=0.7, **told)
+            want_s = brushes.inject(x, s, state=state, strength=0.7, **ball)
         case "cut":
             want_x, _ = brushes.cut(
                 x, s, centre=at, normal=move.flip(1), gap=0.15, along=along, box=box
@@ -158,7 +158,7 @@ def test_brushes_are_those_of_python(run, name, dimension, box):
     )  # fmt: skip
     assert_worlds(got, want_x, want_s, bound=1e-6)
     assert not (torch.equal(want_x, x) and torch.equal(want_s, s))
-    inside = brushes.inside_ball(want_x, **told)[0]
+    inside = brushes.inside_ball(want_x, **ball)[0]
     assert got["inside"] == inside.nonzero()[:, 0].tolist()
 
 
@@ -209,21 +209,19 @@ def test_the_rubber_takes_particles_away_and_the_others_go_on(run, settings):
 
 
 def test_a_state_is_injected_where_the_pointer_is(run, settings):
-    pause = {"type": "play", "on": False}
-    told = {"type": "brush", "tool": "inject", "at": [0.1, 0], "radius": 0.08, "strength": 1}
-    before = live(run, settings, *[ADVANCE] * 9, pause)
-    x, s = unpacked(before["x"], (1, 300, 2)), unpacked(before["s"], (1, 300, 16))
-    after = live(run, settings, *[ADVANCE] * 9, pause, told | {"source": [-0.1, 0]})
-    where = {"radius": 0.08}
-    state, _ = brushes.state_around(x, s, centre=x.new_tensor([[-0.1, 0.0]]), **where)
-    want = brushes.inject(
-        x, s, centre=x.new_tensor([[0.1, 0.0]]), state=state, strength=0.5, **where
+    script = [*[ADVANCE] * 9, {"type": "play", "on": False}]
+    brush = {"type": "brush", "tool": "inject", "at": [0.1, 0], "radius": 0.08, "strength": 1}
+    before, after, none_there = (
+        live(run, settings, *script, *brushes_used)
+        for brushes_used in ([], [brush | {"source": [-0.1, 0]}], [brush | {"source": [5, 5]}])
     )
+    x, s = unpacked(before["x"], (1, 300, 2)), unpacked(before["s"], (1, 300, 16))
+    state, _ = brushes.state_around(x, s, centre=x.new_tensor([[-0.1, 0.0]]), radius=0.08)
+    ball = {"centre": x.new_tensor([[0.1, 0.0]]), "radius": 0.08}
+    want = brushes.inject(x, s, state=state, strength=0.5, **ball)
     assert float((unpacked(after["s"], s.shape) - want).abs().max()) < 1e-5
     assert float((want - s).abs().max()) > 0.01
-    nobody = live(run, settings, *[ADVANCE] * 9, pause, told | {"source": [5, 5]})
-    assert nobody["s"] == before["s"]
-    assert nobody["errors"] == after["errors"] == []
+    assert none_there["s"] == before["s"]
 
 
 def test_species_are_grafted_and_added_where_rules_agree(run, settings):
@@ -237,11 +235,8 @@ def test_species_are_grafted_and_added_where_rules_agree(run, settings):
     seed = unpacked(added["x"], (375, 2))[300:]
     assert float((seed - torch.tensor([0.1, 0.0])).norm(dim=-1).max()) <= 0.1
     wrong = live(run, settings, {**where, "tool": "graft", "rule": "dots"}, ADVANCE)
-    assert wrong["errors"] == [
-        "dots cannot live in a world of gecko: rules of one world must agree in space_dim, "
-        "state_dim, eps0, static, state_gradient, moment_correction, moment_inverse, "
-        "density_gradient"
-    ]
+    error = "dots cannot live in a world of gecko: rules of one world must agree in space_dim, st"
+    assert wrong["errors"][0].startswith(error)
     assert sum(wrong["species"]) == 0
 
 
@@ -302,11 +297,10 @@ def test_particles_that_are_no_number_leave_the_components_of_the_others_alone(r
     s = torch.randn(40, 4, generator=torch.Generator().manual_seed(2))
     broken = torch.cat((s, s[:2]))
     broken[40, 1], broken[41, 0] = float("nan"), float("inf")
-    lost = torch.full_like(s, float("nan"))
-    told = run("components", channels=4, frames=[packed(part) for part in (broken, lost, s)])
-    (whole,) = run("components", channels=4, frames=[packed(s)])
-    assert told[0][:120] == whole
-    assert len(set(told[2])) > 20
+    frames = [packed(states) for states in (broken, torch.full_like(s, float("nan")), s)]
+    first, _, last_one = run("components", channels=4, frames=frames)
+    assert first[:120] == run("components", channels=4, frames=frames[2:])[0]
+    assert len(set(last_one)) > 20
 
 
 @pytest.mark.parametrize("name", ["duck", pytest.param("digits", marks=pytest.mark.slow)])
@@ -348,8 +342,14 @@ def test_a_page_is_one_small_file_that_asks_for_nothing(tmp_path):
     assert [address for address in loads if not address.startswith(("data:", "#"))] == []
     assert not re.search(r"\bimport\b *[({'\"*]|\bfetch\(|WebSocket|XMLHttpRequest", text)
     assert "<title>gecko</title>" in text
-    export_web(["gecko"], page, title="</title><script>alert(1)</script>")
-    assert "<script>alert(1)" not in page.read_text(encoding="utf-8")
+    save_rule(load_rule("gecko"), tmp_path / "<b>.safetensors")
+    title = "</title><script>alert(1)</script>"
+    options = {"title": title, "particle_count": 64, "previews": True}
+    export_web([tmp_path / "<b>.safetensors"], page, **options)
+    text = page.read_text(encoding="utf-8")
+    assert "<script>alert(1)" not in text
+    assert "<b>" not in text
+    assert '"name":"\\u003cb>"' in text
 
 
 @pytest.mark.parametrize("modules", [PAGE_MODULES, WORKER_MODULES])
@@ -381,14 +381,6 @@ class OwnNetwork(NPARule):
 def test_rules_that_a_browser_cannot_run_are_refused(rule, message):
     with pytest.raises(NPAError, match=message):
         check_browser_rule(rule, "mine")
-
-
-def test_rules_are_named_by_paths_as_well(tmp_path):
-    save_rule(load_rule("gecko"), tmp_path / "mine.safetensors")
-    export_web(
-        [tmp_path / "mine.safetensors"], tmp_path / "page.html", particle_count=64, previews=True
-    )
-    assert '"name":"mine"' in (tmp_path / "page.html").read_text(encoding="utf-8")
 
 
 def test_bad_pages_are_refused_before_any_work(tmp_path, monkeypatch):

@@ -1,4 +1,4 @@
-"""The page without a browser: what it tells its engine, and what it makes of events."""
+"""The page without a browser: the messages that it sends to its engine, and how it takes events."""
 
 from __future__ import annotations
 
@@ -10,16 +10,21 @@ from pathlib import Path
 import pytest
 
 SETUP = """
+const usual = { takes: "", label: "", icon: "" };
 const world = {
   type: "world", title: "t", dimension: 2,
-  tools: [{ name: "remove", label: "Remove", takes: "", icon: "M0 0" }],
+  tools: [
+    { ...usual, name: "remove", sends: "frame", takes: "source" },
+    { ...usual, name: "push", sends: "motion" }, { ...usual, name: "graft", sends: "place" },
+    { ...usual, name: "add", sends: "once" }, { ...usual, name: "cut", sends: "line" },
+  ],
   capabilities: ["film", "step", "reset"],
 };
 const frame = (step, places = [0, 0, 1, 1]) => ({
   type: "frame", step, positions: new Float32Array(places), colours: new Uint8Array(6),
   milliseconds: 1,
 });
-const told = (type) => sent.filter((message) => message.type === type);
+const ofType = (type) => sent.filter((message) => message.type === type);
 listen(world);
 tick();
 sent.length = 0;
@@ -33,26 +38,55 @@ def run(modules):
     def script(text):
         program = str(Path(__file__).with_name("run_page.mjs"))
         command = ["node", program, str(modules), SETUP + text]
-        said = subprocess.check_output(command, text=True, timeout=300, encoding="utf-8")
-        return json.loads(said)
+        output = subprocess.check_output(command, text=True, timeout=300, encoding="utf-8")
+        return json.loads(output)
 
     return script
 
 
 def test_each_frame_is_answered_once_it_or_a_later_one_is_drawn(run):
-    answered = run("""
+    counts = run("""
         listen(frame(1));
         listen(frame(2));
-        const hidden = told("drawn").length;
+        const hidden = ofType("drawn").length;
         tick();
         tick();
-        const drawn = told("drawn").length;
+        const drawn = ofType("drawn").length;
         listen(frame(3));
         listen({ ...world, half_width: 2 });
-        return [hidden, drawn, told("drawn").length];
+        return [hidden, drawn, ofType("drawn").length];
     """)
-    # A page that is hidden draws nothing, and holds the world.
-    assert answered == [0, 2, 3]
+    # A page that is hidden draws nothing, and its world waits.
+    assert counts == [0, 2, 3]
+
+
+def test_each_brush_sends_its_messages_at_its_time(run):
+    strokes = run("""
+        const strokes = {};
+        for (const { name } of world.tools) {
+          page.choose(name);
+          sent.length = 0;
+          const event = (type, clientX) =>
+            ({ type, clientX, clientY: 40, pointerId: 1, button: 0, pointerType: "mouse" });
+          page.press(event("pointerdown", 40));
+          tick();
+          page.move(event("pointermove", 60));
+          tick();
+          tick();
+          page.release(event("pointerup", 60));
+          strokes[name] = ofType("brush").map(({ at, move, source }) =>
+            [at[0], move[0], source?.[0] ?? null].map((x) => x && Math.round(x / 0.275)));
+        }
+        return strokes;
+    """)
+    # In tens of pixels from the middle: position, movement, and where the stroke began.
+    assert strokes == {
+        "remove": [[-1, 0, -1], [-1, 0, -1], [-1, 2, -1], [1, 0, -1]],
+        "push": [[-1, 0, None], [-1, 2, None]],
+        "graft": [[-1, 0, None], [1, 0, None]],
+        "add": [[-1, 0, None]],
+        "cut": [[-1, 2, None]],
+    }
 
 
 def test_a_film_that_is_ready_leaves_the_next_recording_alone(run):
@@ -63,7 +97,7 @@ def test_a_film_that_is_ready_leaves_the_next_recording_alone(run):
         listen({ type: "file", name: "film-1.gif", url: "films/film-1.gif" });
         const going = page.recording !== null, button = element("record").textContent;
         page.record(!page.recording);
-        return [going, button, told("film").map(({ action }) => action)];
+        return [going, button, ofType("film").map(({ action }) => action)];
     """)
     assert recording
     assert button == "Stop"
@@ -71,12 +105,12 @@ def test_a_film_that_is_ready_leaves_the_next_recording_alone(run):
 
 
 def test_a_recording_ends_where_the_engine_ends_it(run):
-    told = run("""
+    result = run("""
         page.record(true);
         listen({ type: "film", action: "stop" });
-        return [page.recording, element("record").textContent, told("film").length];
+        return [page.recording, element("record").textContent, ofType("film").length];
     """)
-    assert told == [None, "Record", 1]
+    assert result == [None, "Record", 1]
 
 
 @pytest.mark.parametrize(
@@ -97,7 +131,7 @@ def test_the_ends_of_a_slider_lie_within_its_range(run, low, high, scale):
           input.value = String(input[end]);
           input.oninput();
         }}
-        return told("set").map(({{ value }}) => value);
+        return ofType("set").map(({{ value }}) => value);
     """)
     assert low <= first <= last <= high
     assert math.isclose(first, low, rel_tol=5e-3, abs_tol=1e-9)

@@ -138,27 +138,6 @@ def until(condition) -> None:
         time.sleep(0.05)
 
 
-def test_a_state_is_carried_from_where_one_pressed_to_where_one_drags(shown):
-    page, world = shown()
-    pause(page)
-    # The page knows before the world does, which may be within a step.
-    until(lambda: not world.playing)
-    s = torch.zeros_like(world.s)
-    s[..., 0] = (world.x[..., 0] < 0).to(s)
-    world.s = s
-    take(page, "inject")
-    page.run("document.getElementById('strength').value = 1")
-    page.drag([place_of(page, x, 0.0) for x in (-0.15, 0.0, 0.15, 0.15)])
-    middle = (world.x[0] - torch.tensor([0.15, 0.0])).norm(dim=-1) < 0.04
-    assert middle.any()
-    until(lambda: float(world.s[0, middle, 0].mean()) >= 0.2)
-    assert float(world.s[0, middle, 0].mean()) > 0.2
-    # The brush of 0.1 was never there.
-    far = world.x[0, :, 1].abs() > 0.11
-    assert far.any()
-    assert torch.equal(world.s[0, far], s[0, far])
-
-
 @pytest.mark.slow
 def test_every_tool_and_every_show_works(shown):
     page, _ = shown(count=512)

@@ -46,7 +46,7 @@ export class Colouring {
   }
 
   // 1 is a world whose particles fill [-1, 1]^D, or its box, evenly. Worlds in open space are denser.
-  densities({ physics, world, eps, box, dimension, full }, bytes) {
+  densities({ physics, world, values: { eps }, box, dimension, full }, bytes) {
     physics.sort(world, eps, box);
     physics.computeDensities(world.count, eps);
     const volume = box === null ? 2 ** dimension : box.reduce((product, side) => product * side, 1);

@@ -12,7 +12,7 @@ const PAGE_BYTES = 65536;
 // Rows that a step of the product computes together, in registers.
 const TILE_ROWS = 4;
 
-// The assembler: each function returns the bytes of one instruction.
+// The assembler: functions return the bytes of an instruction and of its operands.
 
 function unsigned(value) {
   const bytes = [];
@@ -35,36 +35,29 @@ function signed(value) {
 }
 
 const vector = (code, ...rest) => [0xfd, ...unsigned(code), ...rest];
+const unary = (...code) => (value) => [...value, ...code];
+const binary = (...code) => (left, right) => [...left, ...right, ...code];
 const get = (local) => [0x20, ...unsigned(local)];
 const set = (local, value) => [...value, 0x21, ...unsigned(local)];
+const when = (condition, body) => [...condition, 0x04, 0x40, ...body, 0x0b];
+const select = (yes, no, condition) => [...yes, ...no, ...condition, 0x1b];
+
+// Integers.
 const number = (value) => [0x41, ...signed(value)];
-const add = (left, right) => [...left, ...right, 0x6a];
-const multiply = (left, right) => [...left, ...right, 0x6c];
-const below = (left, right) => [...left, ...right, 0x49];
-const loadInteger = (at) => [...at, 0x28, 2, 0];
+const add = binary(0x6a), multiply = binary(0x6c), below = binary(0x49), ones = unary(0x69);
+const loadInteger = unary(0x28, 2, 0), storeInteger = binary(0x36, 2, 0);
+
+// Vectors of four floats, and of four integers.
+const constant = (bytes) => vector(0x0c, ...bytes);
 const load = (at, offset = 0) => [...at, ...vector(0x00, 2, ...unsigned(offset))];
 const loadSplat = (at, offset = 0) => [...at, ...vector(0x09, 2, ...unsigned(offset))];
 const store = (at, value, offset = 0) => [...at, ...value, ...vector(0x0b, 2, ...unsigned(offset))];
-const plus = (left, right) => [...left, ...right, ...vector(0xe4)];
-const minus = (left, right) => [...left, ...right, ...vector(0xe5)];
-const times = (left, right) => [...left, ...right, ...vector(0xe6)];
-const larger = (left, right) => [...left, ...right, ...vector(0xe9)];
-const storeInteger = (at, value) => [...at, ...value, 0x36, 2, 0];
-const constant = (bytes) => vector(0x0c, ...bytes);
-const over = (left, right) => [...left, ...right, ...vector(0xe7)];
-const root = (value) => [...value, ...vector(0xe3)];
-const nearest = (value) => [...value, ...vector(0x6a)];
-const less = (left, right) => [...left, ...right, ...vector(0x43)];
-const and = (left, right) => [...left, ...right, ...vector(0x4e)];
-const spreadInteger = (value) => [...value, ...vector(0x11)];
-const plusIntegers = (left, right) => [...left, ...right, ...vector(0xae)];
-const timesIntegers = (left, right) => [...left, ...right, ...vector(0xb5)];
-const lessIntegers = (left, right) => [...left, ...right, ...vector(0x39)];
-const bits = (value) => [...value, ...vector(0xa4)];
-const shuffled = (value, order) => [...value, ...order, ...vector(0x0e)];
-const ones = (value) => [...value, 0x69];
-const when = (condition, body) => [...condition, 0x04, 0x40, ...body, 0x0b];
-const select = (yes, no, condition) => [...yes, ...no, ...condition, 0x1b];
+const plus = binary(...vector(0xe4)), minus = binary(...vector(0xe5)), times = binary(...vector(0xe6));
+const over = binary(...vector(0xe7)), root = unary(...vector(0xe3)), nearest = unary(...vector(0x6a));
+const larger = binary(...vector(0xe9)), less = binary(...vector(0x43)), and = binary(...vector(0x4e));
+const spreadInteger = unary(...vector(0x11)), bits = unary(...vector(0xa4));
+const plusIntegers = binary(...vector(0xae)), timesIntegers = binary(...vector(0xb5));
+const lessIntegers = binary(...vector(0x39)), shuffled = binary(...vector(0x0e));
 
 const zeros = constant(new Array(16).fill(0));
 

@@ -33,9 +33,8 @@ export class LiveWorld {
     this.plant(this.rules[0]);
   }
 
-  // Returns the rule of a name.
-  known(name) {
-    const rule = this.rules.find((own) => own.name === name);
+  ruleNamed(name) {
+    const rule = this.rules.find((other) => other.name === name);
     if (rule === undefined) throw Error(`no rule is called ${name}`);
     return rule;
   }
@@ -76,10 +75,6 @@ export class LiveWorld {
 
   get box() {
     return this.rule.world.box;
-  }
-
-  get eps() {
-    return this.values.eps;
   }
 
   // Returns positions of a fresh world [length units].
@@ -145,8 +140,9 @@ export class LiveWorld {
       const before = world.x.slice();
       for (let i = 0; i < world.count; i++) updated[i] = random.uniform() < values.update_prob ? 1 : 0;
       const noise = values.noise > 0 ? random.normals(world.x.length, values.noise) : null;
-      await this.compute({ eps: this.eps, box, mask: updated, noise, densityCounts: this.divisors });
-      const longest = this.eps * Math.max(...this.species.map((rule) => rule.alpha));
+      const { eps } = values;
+      await this.compute({ eps, box, mask: updated, noise, densityCounts: this.divisors });
+      const longest = eps * Math.max(...this.species.map((rule) => rule.alpha));
       for (let i = 0; i < world.count; i++) {
         let square = 0;
         for (let d = 0; d < dimension; d++) {
@@ -183,7 +179,7 @@ export class LiveWorld {
 
   set(name, value) {
     if (name === "loss") return;
-    if (name === "rule") return this.plant(this.known(value));
+    if (name === "rule") return this.plant(this.ruleNamed(value));
     if (name === "show") {
       if (!this.rule.world.shows.includes(value)) throw Error(`nothing to show is called ${value}`);
       this.show = value;
@@ -205,8 +201,7 @@ export class LiveWorld {
     const { dimension, box, constants } = this;
     const { x, s, species } = this.world;
     if (tool === "remove") {
-      const gone = new Set(insideBall(x, dimension, at, radius, box));
-      this.keep((i) => !gone.has(i));
+      this.remove(new Set(insideBall(x, dimension, at, radius, box)));
     } else if (tool === "push") {
       push(x, dimension, at, move, radius, Math.min(1, constants.MIN_PUSH + strength), box);
     } else if (tool === "clump") {
@@ -219,9 +214,8 @@ export class LiveWorld {
       const state = stateAround(x, s, dimension, source ?? at, radius, box);
       if (state !== null) inject(x, s, dimension, at, radius, state, constants.INJECT_RATE * strength, box);
     } else if (tool === "graft") {
-      const inside = insideBall(x, dimension, at, radius, box);
-      const number = this.speciesOf(rule, this.full);
-      for (const i of inside) species[i] = number;
+      const index = this.speciesOf(rule, this.full);
+      for (const i of insideBall(x, dimension, at, radius, box)) species[i] = index;
     } else if (tool === "add") {
       const count = Math.round(strength * constants.SEED_FRACTION * this.full);
       this.add(at, radius, Math.max(constants.MIN_SEED, count), rule);
@@ -229,17 +223,12 @@ export class LiveWorld {
     if (box !== null) wrap(this.world.x, this.world.count, box);
   }
 
-  // Removes the particles for which kept(i) is false.
-  keep(kept) {
-    const { x, s, species, count } = this.world;
-    const left = Array.from({ length: count }, (_, i) => i).filter(kept);
-    if (left.length === count) return;
-    const rows = (array, width) => {
-      const chosen = new array.constructor(left.length * width);
-      left.forEach((i, k) => chosen.set(array.subarray(i * width, (i + 1) * width), k * width));
-      return chosen;
-    };
-    this.setParticles(rows(x, this.dimension), rows(s, this.channels), rows(species, 1));
+  // Removes the particles of a set of indices.
+  remove(removed) {
+    if (removed.size === 0) return;
+    const { x, s, species } = this.world;
+    const others = (array, width) => array.filter((_, k) => !removed.has(Math.floor(k / width)));
+    this.setParticles(others(x, this.dimension), others(s, this.channels), others(species, 1));
   }
 
   // Adds particles of a rule, with states 0, in a ball.
@@ -248,21 +237,21 @@ export class LiveWorld {
     const room = (this.rule.world.settings.count?.high ?? this.full) - this.world.count;
     if (count > room) throw Error(`the world has room for ${Math.max(0, room)} particles more, got ${count}`);
     // A new species divides densities by its own number of particles, as in a world alone.
-    const number = this.speciesOf(name, count);
+    const index = this.speciesOf(name, count);
     const ball = this.random.ball(count, this.dimension, radius);
     for (let k = 0; k < ball.length; k++) ball[k] += at[k % this.dimension];
     this.setParticles(
       joined(x, ball),
       joined(s, new Float32Array(count * this.channels)),
-      joined(species, new Uint8Array(count).fill(number)),
+      joined(species, new Uint8Array(count).fill(index)),
     );
   }
 
   // Returns the index of a rule's species; a rule that is new in the world is appended.
   speciesOf(name, divisor) {
-    const rule = this.known(name);
-    const number = this.species.indexOf(rule);
-    if (number >= 0) return number;
+    const rule = this.ruleNamed(name);
+    const index = this.species.indexOf(rule);
+    if (index >= 0) return index;
     if (!this.mayJoin(rule)) {
       throw Error(`${name} cannot live in a world of ${this.rule.name}: rules of one world must agree in ${this.constants.AGREEMENTS.join(", ")}`);
     }
@@ -274,7 +263,7 @@ export class LiveWorld {
   }
 
   mayJoin(rule) {
-    return this.constants.AGREEMENTS.every((what) => rule[what] === this.rule[what]);
+    return this.constants.AGREEMENTS.every((field) => rule[field] === this.rule[field]);
   }
 
   // Damage at a random place, or through the middle at a random angle.
@@ -317,13 +306,13 @@ export class LiveWorld {
     const settings = {};
     for (const [name, range] of Object.entries(ranges)) settings[name] = { ...range, value: values[name] };
     this.changed = true;
-    const names = (rules) => rules.map((own) => own.name);
+    const names = (rules) => rules.map(({ name }) => name);
     this.send({
       type: "world",
       ...world,
       rules: names(this.rules),
       rule: rule.name,
-      others: names(this.rules.filter((own) => this.mayJoin(own))),
+      others: names(this.rules.filter((other) => this.mayJoin(other))),
       species: names(this.species),
       show, settings, playing, seed,
     });
@@ -455,9 +444,9 @@ class Random {
 
   // A vector of length 1.
   direction(dimension) {
-    const found = Array.from({ length: dimension }, () => this.normal());
-    const length = Math.hypot(...found) || 1;
-    return found.map((part) => part / length);
+    const vector = Array.from({ length: dimension }, () => this.normal());
+    const length = Math.hypot(...vector) || 1;
+    return vector.map((part) => part / length);
   }
 
   // Points uniform in a ball around the origin [length units], one after the other.

@@ -2,8 +2,7 @@
 
 import { start } from "./page.js";
 
-const HEADER = 6; // 32-bit numbers before a frame's positions
-const KIND = 1;
+const HEADER = 5; // 32-bit numbers before a frame's positions
 
 // Connects to the server that the page came from; it has no settings.
 async function connect(settings, listener) {
@@ -31,12 +30,11 @@ async function connect(settings, listener) {
   };
 }
 
-// Frames: kind, step, count, dimension (uint32), milliseconds, loss (float32; NaN: not computed),
+// Frames: step, count, dimension (uint32), milliseconds, loss (float32; NaN: not computed),
 // positions (float32), colours (uint8); all little-endian, as browsers' arrays are.
 function frameOf(data) {
-  const [kind, step, count, dimension] = new Uint32Array(data, 0, 4);
-  if (kind !== KIND) throw Error(`frames must be of kind ${KIND}, got ${kind}`);
-  const [milliseconds, loss] = new Float32Array(data, 16, 2);
+  const [step, count, dimension] = new Uint32Array(data, 0, 3);
+  const [milliseconds, loss] = new Float32Array(data, 12, 2);
   const positions = new Float32Array(data, 4 * HEADER, count * dimension);
   const colours = new Uint8Array(data, 4 * (HEADER + count * dimension), 3 * count);
   const frame = { type: "frame", step, positions, colours, milliseconds };
