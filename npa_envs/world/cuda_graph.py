@@ -62,11 +62,9 @@ def pinned_like(tensor: Tensor) -> Tensor:
     Torch's allocator records the streams that use its pinned memory, and queries them when the
     memory is freed. A query of a stream that another thread is capturing would break the capture.
     """
-    whole = torch.empty(
-        PINNED_OFFSET + tensor.nbytes, dtype=torch.uint8, device="cpu", pin_memory=True
-    )
-    place = torch.from_numpy(whole.numpy()[PINNED_OFFSET:])
-    return place.view(tensor.dtype).view(tensor.shape)
+    size = PINNED_OFFSET + tensor.nbytes
+    whole = torch.empty(size, dtype=torch.uint8, device="cpu", pin_memory=True)
+    return torch.from_numpy(whole.numpy()[PINNED_OFFSET:]).view(tensor.dtype).view(tensor.shape)
 
 
 def _is_plain() -> bool:
@@ -227,17 +225,17 @@ def host_call(work: Callable[[], object]) -> None:
 
     `work` must use the same tensors in every replay; the caller keeps them alive.
     """
-    captured = _capturing.get()
-    if captured is None:
+    sequence = _capturing.get()
+    if sequence is None:
         work()
     else:
-        captured.pause(work)
+        sequence.pause(work)
 
 
 def draws_alone() -> bool:
     """Return whether this thread records without access to torch's own generator."""
-    captured = _capturing.get()
-    return captured is not None and captured.alone
+    sequence = _capturing.get()
+    return sequence is not None and sequence.alone
 
 
 def capture(
@@ -251,16 +249,14 @@ def capture(
 ) -> GraphSequence:
     """Record a function's launches as CUDA graphs, without running them.
 
-    It is one graph, unless the function calls `host_call`. The function must not wait for the
-    device, and its kernels must be loaded (by `warm_up`, which runs on the capture stream). A
-    `pool` of memory is shared with graphs that never run at the same time. Each replay draws new
-    numbers from a CUDA `generator`; if `alone`, a draw from torch's own generator is an error, and
-    other threads may use that meanwhile. After an error of the function the device is usable.
+    It is one graph, unless the function calls `host_call`. The function must not synchronise, and
+    its kernels must be loaded (by `warm_up`, which runs on the capture stream). A `pool` of memory
+    is shared with graphs that never run at the same time. Each replay draws new numbers from a CUDA
+    `generator`; if `alone`, a draw from torch's own generator is an error, and other threads may
+    use that meanwhile. After an error of the function the device is usable.
 
-    Without `warm_up` nothing synchronizes. `torch.cuda.graph` synchronizes, frees the allocator's
-    cache and may collect garbage at each capture, which can take longer than the capture itself. A
-    graph's pool cannot use cached memory, so the cache is freed here after the warm-up, and if a
-    capture runs out of memory.
+    Without `warm_up` nothing synchronises, unlike in `torch.cuda.graph`. A graph's pool cannot use
+    cached memory, so the cache is freed after the warm-up, and if a capture runs out of memory.
     """
     with recording_lock, torch.cuda.device(device), plain_tensors():
         stream = _capture_stream(torch.cuda.current_device())
@@ -271,40 +267,40 @@ def capture(
         if warm_up is not None:
             prepare_capture(warm_up, device)
         with contextlib.suppress(torch.OutOfMemoryError):
-            return _captured(function, stream, GraphSequence(pool, generator, alone=alone))
+            return _record(function, stream, GraphSequence(pool, generator, alone=alone))
         # Only here is the first error gone, which kept the memory of that attempt alive.
         torch.cuda.empty_cache()
-        return _captured(function, stream, GraphSequence(pool, generator, alone=alone))
+        return _record(function, stream, GraphSequence(pool, generator, alone=alone))
 
 
-def _captured(
-    function: Callable[[], object], stream: torch.cuda.Stream, captured: GraphSequence
+def _record(
+    function: Callable[[], object], stream: torch.cuda.Stream, sequence: GraphSequence
 ) -> GraphSequence:
-    """Record in `captured` what a function launches on a stream; return `captured`."""
+    """Record the launches of a function on a stream in `sequence`, and return it."""
     current = torch.cuda.current_stream()
     # A capture does run one thing: torch resets generator offsets on the device, which earlier
     # graphs read and the next replay writes. So the two streams wait for each other.
     stream.wait_stream(current)
     try:
         with torch.cuda.stream(stream), no_garbage_collection():
-            captured.begin()
-            before = _capturing.set(captured)
+            sequence.begin()
+            before = _capturing.set(sequence)
             try:
                 function()
             except BaseException:
                 # The error that broke the capture says more than the error that it is broken.
                 with contextlib.suppress(RuntimeError):
-                    captured.end()
+                    sequence.end()
                 raise
             finally:
                 _capturing.reset(before)
-            captured.end()
+            sequence.end()
     except BaseException:
         with contextlib.suppress(RuntimeError):
             current.wait_stream(stream)
         raise
     current.wait_stream(stream)
-    return captured
+    return sequence
 
 
 def may_be_disturbed(attempts: int) -> bool:
@@ -340,12 +336,11 @@ class WeakFunction:
 class GraphedCallable:
     """A function without arguments that runs as a CUDA graph on CUDA, and as it is on a CPU.
 
-    Launches of many short kernels take longer than the kernels do. The first call runs the function
-    kernel by kernel, which loads the kernels; the second captures it. The function must read and
-    write the same tensors in every call and not wait for the device; the caller keeps a method's
-    object alive (`WeakFunction`). A `generator` draws the same numbers either way. A memory `pool`
-    is shared with functions that never run at the same time and whose temporary results are not
-    needed any more.
+    The first call runs the function kernel by kernel, which loads the kernels; the second captures
+    it. The function must read and write the same tensors in every call and not synchronise; the
+    caller keeps a method's object alive (`WeakFunction`). A `generator` draws the same numbers
+    either way. A memory `pool` is shared with functions that never run at the same time and whose
+    temporary results are not needed any more.
     """
 
     def __init__(

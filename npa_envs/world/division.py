@@ -119,4 +119,4 @@ def divided(
     middle = world_mean(x * share) / world_mean(share).clamp_min(0.5 / count)
     x = torch.where(alive[..., None], x, middle[:, None])
     others = [torch.where(stays.view(*stays.shape, *[1] * (v.ndim - 2)), v, 0.0) for v in others]
-    return Particles(x, s, *others, goal=particles.goal)
+    return Particles(x, s, *others)._replace(goal=particles.goal)

@@ -27,7 +27,7 @@ class Particles(NamedTuple):
             zeros = self.x.new_zeros(self.x.shape[:2])
         return self._replace(path_length=zeros)
 
-    def per_particle(self) -> tuple[Any, ...]:
+    def per_particle(self) -> tuple[Tensor, Tensor, Any]:
         """Return the fields of particles, without those of worlds, in the order of updates."""
         return self[:-1]
 

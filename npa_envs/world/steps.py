@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import torch
@@ -96,30 +96,6 @@ def draw_step(x: Tensor, physics: Physics, generator: Randomness | None) -> Draw
     return Draws(mask, noise)
 
 
-def iterate_draws(draw: Callable[[], Draws], like: Tensor, steps: int) -> Iterator[Draws]:
-    """Yield each step's random draws, in the same order on every device.
-
-    In a CUDA graph draws are made in advance, in parallel with the steps before.
-    """
-    # In this order: a compiler cannot trace queries of streams.
-    recording = not torch.compiler.is_compiling() and like.is_cuda
-    if not (recording and torch.cuda.is_current_stream_capturing()):
-        for _ in range(steps):
-            yield draw()
-        return
-    side_stream = SideStream.of_thread(like.device, threading.get_ident())
-    ready, rest = [draw()], steps - 1
-    while rest > 0:
-        # Draws reuse the memory of earlier steps, so the two streams wait for each other.
-        count = min(3 * len(ready), MAX_AHEAD, rest)
-        with side_stream.overlap():
-            coming = [draw() for _ in range(count)]
-        yield from ready
-        side_stream.join()
-        ready, rest = coming, rest - count
-    yield from ready
-
-
 def skip_draws(x: Tensor, physics: Physics, steps: int, generator: Randomness | None) -> None:
     """Advance a random source as some steps of worlds at x would."""
     if steps == 0:
@@ -151,8 +127,27 @@ class Step:
         return draw_step(like, self.physics, source)
 
     def draw(self, like: Tensor, steps: int, source: Randomness | None) -> Iterator[Draws]:
-        """Yield each step's draws, for positions like these."""
-        return iterate_draws(lambda: self.draw_step(like, source), like, steps)
+        """Yield each step's draws, in the same order on every device.
+
+        In a CUDA graph draws are made in advance, in parallel with the steps before.
+        """
+        # In this order: a compiler cannot trace queries of streams.
+        recording = not torch.compiler.is_compiling() and like.is_cuda
+        if not (recording and torch.cuda.is_current_stream_capturing()):
+            for _ in range(steps):
+                yield self.draw_step(like, source)
+            return
+        side_stream = SideStream.of_thread(like.device, threading.get_ident())
+        ready, rest = [self.draw_step(like, source)], steps - 1
+        while rest > 0:
+            # Draws reuse the memory of earlier steps, so the two streams wait for each other.
+            count = min(3 * len(ready), MAX_AHEAD, rest)
+            with side_stream.overlap():
+                coming = [self.draw_step(like, source) for _ in range(count)]
+            yield from ready
+            side_stream.join()
+            ready, rest = coming, rest - count
+        yield from ready
 
     def advance(self, particles: Particles, draws: Draws) -> Particles:
         """Return the worlds after one step with these draws."""
@@ -169,8 +164,8 @@ def _updated(
     """Return particles after updates of the active ones and the position noise of all."""
     if draws.noise is not None:
         particles = particles._replace(x=particles.x + draws.noise)
-    fields = update_particles(update, *particles.per_particle(), rows=active, physics=physics)
-    return Particles(*fields, goal=particles.goal)
+    fields = update_particles(update, *particles.per_particle(), active, physics)
+    return Particles(*fields, particles.goal)
 
 
 @dataclasses.dataclass
