@@ -279,7 +279,7 @@ def test_seeds_are_worlds_of_their_own_whatever_their_number(device):
     assert torch.equal(two.x[1:], one.x)
     assert not torch.equal(two.x[0], two.x[1])
     assert trial.initial_worlds(0.5).x.shape == (2, 64, 2)
-    assert [trial.task_of(n).config.target_point_count for n in (64, 128)] == [64, 128]
+    assert [trial.tasks_of(n)[0].config.target_point_count for n in (64, 128)] == [64, 128]
 
 
 def test_worlds_of_another_radius_are_measured_at_their_trained_size(device):
