@@ -213,13 +213,11 @@ def table_text(rows: Sequence[Any], *, missing: str = "never") -> str:
     return "\n".join(aligned(_cells(rows, missing)))
 
 
-def aligned(lines: Sequence[Sequence[str]]) -> list[str]:
-    """Return lines of cells as text in right-aligned columns."""
+def aligned(lines: Sequence[Sequence[str]], *, left: bool = False) -> list[str]:
+    """Return lines of cells as text in columns, aligned right or left."""
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    return [
-        "  ".join(cell.rjust(width) for cell, width in zip(line, widths, strict=True))
-        for line in lines
-    ]
+    align = str.ljust if left else str.rjust
+    return ["  ".join(map(align, line, widths)).rstrip() for line in lines]
 
 
 def table_markdown(rows: Sequence[Any], *, missing: str = "never") -> str:

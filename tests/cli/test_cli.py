@@ -1,5 +1,6 @@
 """The command line does what it says, says what it did, and refuses mistakes in one line."""
 
+import errno
 import json
 import os
 import re
@@ -495,19 +496,6 @@ def test_rollout_runs_a_rule_whose_file_names_no_task(tmp_path, capsys):
         assert np.asarray(film.convert("RGB")).min() < 250
 
 
-def test_rollout_notices_before_the_first_step_that_it_cannot_write(
-    rule, tmp_path, monkeypatch, capsys
-):
-    refuse = raising(PermissionError(13, "Permission denied"))
-    monkeypatch.setattr("npa_envs.cli.common.tempfile.TemporaryFile", refuse)
-    monkeypatch.setattr(
-        "npa_envs.render.world_film.rollout", lambda *_, **__: pytest.fail("a step ran")
-    )
-    assert "out must be a folder that can be written to" in error_of(
-        capsys, ["rollout", rule, "--steps", "9", "--out", str(tmp_path)]
-    )
-
-
 def test_a_film_to_share_has_the_style_and_the_background_that_were_asked_for(
     tmp_path, rule, capsys
 ):
@@ -600,6 +588,11 @@ def test_a_message_of_several_lines_becomes_one_and_an_interruption_has_no_trace
 ):
     monkeypatch.setattr("npa_envs.cli.listing.main", raising(NPAError("x must be\n  positive")))
     assert error_of(capsys, ["list"]) == "npa-envs: error: x must be positive\n"
+    for number, hint in ((errno.ENOSPC, "free some space"), (errno.EACCES, "another folder")):
+        monkeypatch.setattr("npa_envs.cli.listing.main", raising(OSError(number, "no", "a.txt")))
+        message = error_of(capsys, ["list"])
+        assert message.startswith("npa-envs: error: no 'a.txt': ")
+        assert hint in message
     monkeypatch.setattr("npa_envs.cli.listing.main", raising(KeyboardInterrupt))
     assert main(["list"]) == 130
     assert capsys.readouterr().err == "npa-envs: interrupted\n"

@@ -24,7 +24,6 @@ from npa_envs.measure.accuracy.suite import (
     CheckSession,
     Skipped,
 )
-from npa_envs.measure.quality import RuleRunner
 from npa_envs.rule.files import load_rule, rule_digest, rule_file, rule_metadata, save_rule
 from npa_envs.training import preset, train
 
@@ -253,17 +252,6 @@ def test_a_rule_that_blows_up_is_found_out(factor, count, verdict, device, monke
         assert (entry.note == "") == (verdict == "pass")
 
 
-def test_the_energy_of_a_world_at_rest_is_no_chance(device):
-    home = habitat(session(device), "heart")
-    runners = [
-        RuleRunner(home.rule, home.task, torch.Generator(device).manual_seed(seed))
-        for seed in range(9)
-    ]
-    worlds = runners[0].run(home.worlds, 512)
-    energies = [endurance.measured(runner, worlds)["energy"] for runner in runners[1:]]
-    assert max(energies) < 2.0 * min(energies)
-
-
 @pytest.mark.parametrize(
     "fields",
     [
@@ -360,19 +348,6 @@ def test_the_command_lists_its_checks(capsys):
     assert [name in text for name in names] == [True, True, False]
     assert main(["stress", "hart"]) == 2
     assert "unknown rule 'hart': did you mean 'heart'" in capsys.readouterr().err
-
-
-def test_heat_maps_are_drawn_of_what_has_limits():
-    record = suite.StressRecord(FACTS)
-    record.rows = [
-        CheckResult({"z": math.nan, "s": 0.5}, {"z": 1.0}, name="geometry/one/2d/open"),
-        CheckResult({"z": 2.0}, {"z": 1.0, "s": 1.0}, "near", name="geometry/nearest/2d"),
-        CheckResult({"norm": 1.0}, holds="512 steps", name="gradients/growth/heart"),
-        CheckResult(verdict="skipped", name="values/nan_state"),
-    ]
-    pictures = suite.heat_maps(record)
-    assert set(pictures) == {"geometry"}
-    assert pictures["geometry"].startswith(b"\x89PNG")
 
 
 @pytest.mark.slow

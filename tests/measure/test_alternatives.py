@@ -9,12 +9,12 @@ import alternatives
 import pytest
 import torch
 from precisions import PRECISIONS
-from strategies import NEIGHBOUR_CAP, STRATEGIES, nearest
+from strategies import STRATEGIES
 
 from npa_envs import reference
 from npa_envs.errors import NPAError
 from npa_envs.measure.plots import png
-from npa_envs.measure.speed.timing import LeftOut, Timing, Workload
+from npa_envs.measure.speed.timing import Timing, Workload
 from npa_envs.world.rollout import rollout
 
 TINY = Workload(2, 2, 150, 2, hidden_dim=16, eps=0.2)
@@ -44,19 +44,6 @@ def test_every_strategy_perceives_what_the_reference_does(name, space_dim, devic
         rho = STRATEGIES[name].density(x.to(dtype), s.to(dtype), workload.eps)
         exact = reference.fields(x.double(), s.double(), workload.eps).rho
         assert float((rho - exact).norm() / exact.norm()) < tolerance
-
-
-def test_the_neighbour_cap_leaves_out_all_but_the_nearest():
-    x, s = Workload(2, 1, 400, 1).worlds(torch.device("cpu"))
-    index = nearest(x, 3)
-    distances = torch.cdist(x[0].double(), x[0].double())
-    assert torch.equal(index[0].sort().values, distances.topk(3, largest=False)[1].sort().values)
-    capped = STRATEGIES["neighbour_cap"].density(x, s, 0.1)
-    assert (capped <= STRATEGIES["dense"].density(x, s, 0.1) * (1 + 1e-5)).all()
-    crowded = (distances < 0.1).sum(1) > NEIGHBOUR_CAP
-    assert crowded.any()
-    lost = capped < 0.99 * STRATEGIES["dense"].density(x, s, 0.1)
-    assert not lost[0, ~crowded].any()
 
 
 def test_steps_composed_in_torch_are_those_of_the_library_with_the_same_masks():
@@ -116,45 +103,6 @@ def test_perception_in_float32_errs_little_and_the_reference_not_at_all():
     assert 1e-5 < short.perception < 1e-2
     left = {entry.what for entry in here.left_out}
     assert {"tf32", "perception in mixed", "plain, float32, 2D (2, 150)"} <= left
-
-
-def test_rollouts_err_more_in_shorter_precisions():
-    chosen = [PRECISIONS[name] for name in ("float64", "float32", "bf16_storage", "mixed")]
-    here = session(strategies=[STRATEGIES["library"], STRATEGIES["dense"]], precisions=chosen)
-    exact, single, storage, mixed = alternatives.rollout_rows(here, 200)
-    assert (exact.x_1, exact.s_64, exact.weights) == (0.0, 0.0, 0.0)
-    assert 0.0 < single.x_1 < FORWARD
-    assert single.s_1 < FORWARD
-    assert single.weights < 1e-4
-    for row in (storage, mixed):
-        assert 10 * single.s_8 < row.s_8 < 0.1
-    assert all(math.isfinite(row.psnr_512) for row in (exact, single, storage, mixed))
-    assert abs(exact.psnr_512 - single.psnr_512) < 1.0
-    assert {entry.what for entry in here.left_out} == {"rollouts of dense"}
-
-
-def test_peers_that_are_there_are_right_and_others_are_left_out_with_a_reason(monkeypatch):
-    def missing(*_):
-        raise ModuleNotFoundError("No module named 'absent'")
-
-    monkeypatch.setitem(alternatives.PEERS, "absent", missing)
-    here = session()
-    rows = alternatives.peer_rows(here, Workload(3, 1, 120, 1, eps=0.2))
-    assert {"npa-envs", "wp.HashGrid", "dense torch"} <= {row.peer for row in rows}
-    assert max(row.error for row in rows) < FORWARD
-    assert LeftOut("absent", "ModuleNotFoundError: No module named 'absent'") in here.left_out
-    measured = {row.peer for row in rows} | {entry.what for entry in here.left_out}
-    assert measured == set(alternatives.PEERS)
-
-
-def test_the_front_holds_what_nothing_beats():
-    points = [
-        alternatives.Point(1e-7, 5.0, "a", ""),
-        alternatives.Point(1e-3, 2.0, "b", ""),
-        alternatives.Point(1e-2, 3.0, "c", ""),
-    ]
-    points.append(alternatives.Point(1e-7, 6.0, "d", ""))
-    assert [point.strategy for point in alternatives.front(points)] == ["a", "b"]
 
 
 def rollout_row(**values) -> alternatives.RolloutRow:

@@ -248,19 +248,6 @@ class TestCommand:
         assert printed.count("\n") >= 9
         assert "undisturbed" in printed
 
-    def test_several_radii_make_phase_diagrams_of_each_pair(self, rules, tmp_path):
-        pytest.importorskip("matplotlib")
-        more = ("--eps-factors", "1", "1.5", "--no-itself")
-        assert main(self.words(rules, tmp_path, *more)) == 0
-        told = [
-            (row["rule"], row["eps_factor"], row["distance"]) for row in held_in(tmp_path)["rows"]
-        ]
-        settings = [(factor, distance) for factor in (1.0, 1.5) for distance in (0.0, 2.0)]
-        assert told == [(name, *each) for name in ("one", "two") for each in settings]
-        for name in ("one-two", "two-one"):
-            with Image.open(tmp_path / f"phases-{name}.png") as drawn:
-                assert drawn.width > drawn.height
-
     def test_mistakes_are_refused_and_nothing_is_written(self, rules, tmp_path, capsys):
         out, unknown = tmp_path / "out", tmp_path / "unknown.safetensors"
         save_rule(make_rule(), unknown)

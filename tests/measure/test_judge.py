@@ -11,7 +11,6 @@ from npa_envs.cli import main
 from npa_envs.errors import NPAError
 from npa_envs.measure import judge as judges
 from npa_envs.measure.judge import TextureJudge
-from npa_envs.tasks.losses import pieces, texture
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 from npa_envs.tasks.targets.textures import TextureTarget, draw_pattern
 from npa_envs.tasks.texture import Texture, TextureConfig
@@ -103,14 +102,6 @@ def test_a_target_with_edges_is_not_read_across_them():
     image = judges._images(half[None])
     same = [float(judge._counts(image, wrap)[pair].diagonal().sum()) for wrap in (True, False)]
     assert same[0] < same[1] - 0.01
-
-
-def test_no_loss_compares_patches_of_the_judges_size():
-    side = judges.REFERENCE
-    patches = (texture.PATCH, texture.PATCH + texture.SECOND_PATCH - 1, pieces.MATCHED_PATCH)
-    sizes = {patch * 2**level for patch in patches for level in range(pieces.LEVELS)}
-    assert round(judges.PATCH * 64 / side) == 12
-    assert judges.PATCH not in sizes | set(pieces.FILTER_SIZES)
 
 
 def test_only_textures_are_judged(task):

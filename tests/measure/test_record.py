@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from scripts import script_facts, script_parser
 
 from npa_envs.errors import NPAError
 from npa_envs.measure import record
@@ -125,11 +124,3 @@ def test_axes_of_few_decades_are_marked_within_them(low, high, marks):
     places, labels = panel.get_yticks(), panel.yaxis.get_major_formatter().format_ticks
     assert labels([place for place in places if low <= place <= high]) == marks
     assert not panel.get_yticks(minor=True).size
-
-
-def test_the_record_of_a_script_does_not_say_where_it_was_written(monkeypatch, tmp_path):
-    words = ["--device", "cpu", "--commit", "c0ffee", "--output", str(tmp_path / "it.json")]
-    monkeypatch.setattr("sys.argv", ["benchmarks/it.py", *words])
-    facts = script_facts(script_parser("It.").parse_args(words))
-    assert facts["command"] == ("python benchmarks/it.py --device cpu --commit c0ffee --output OUT")
-    assert facts["commit"] == "c0ffee"

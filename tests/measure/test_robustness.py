@@ -279,7 +279,7 @@ def test_seeds_are_worlds_of_their_own_whatever_their_number(device):
     assert torch.equal(two.x[1:], one.x)
     assert not torch.equal(two.x[0], two.x[1])
     assert trial.initial_worlds(0.5).x.shape == (2, 64, 2)
-    assert [trial.task_of(n).config.target_point_count for n in (64, 128)] == [64, 128]
+    assert [trial.tasks_of(n)[0].config.target_point_count for n in (64, 128)] == [64, 128]
 
 
 def test_worlds_of_another_radius_are_measured_at_their_trained_size(device):
@@ -448,15 +448,7 @@ def test_a_record_of_a_rule_that_was_trained_anew_is_refused(tmp_path, capsys, m
     assert "has figures of other settings: weights was" in capsys.readouterr().err
 
 
-def test_a_run_of_several_radii_is_taken_and_a_rule_of_no_task_refused(tmp_path, capsys):
-    out = str(tmp_path / "run")
-    words = ["train", "morphogenesis2d", "--preset", "tiny", "--iterations", "2", "--no-report"]
-    words += ["--milestones", "1", "--vary-eps", "0.5", "2"]
-    assert main([*words, "--no-progress", "--out", out]) == 0
-    capsys.readouterr()
-    assert main(["robustness", out, "--quick", "--no-progress", "--out", str(tmp_path / "r")]) == 0
-    assert "| run |" in capsys.readouterr().out
-    assert json.loads((tmp_path / "r" / "robustness_run.json").read_text(encoding="utf-8"))["done"]
+def test_a_rule_that_names_no_task_is_refused(tmp_path, capsys):
     files.save_rule(files.load_rule("heart"), tmp_path / "own.safetensors")
     assert main(["robustness", str(tmp_path / "own.safetensors"), "--quick"]) == 2
     assert "must name the task of its training" in capsys.readouterr().err

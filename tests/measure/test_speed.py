@@ -9,14 +9,12 @@ from functools import partial
 import pytest
 import torch
 from clock import Clock
-from drift import DriftRow, drift_rows
+from drift import DriftRow
 
 from npa_envs.cli import main
 from npa_envs.measure.speed import suites
 from npa_envs.measure.speed.explain import explain
 from npa_envs.measure.speed.timing import LeftOut, Timing, TimingSession, Workload, compare
-from npa_envs.ops import perceive
-from npa_envs.ops.launch import noted_launches
 from npa_envs.world.rollout import rollout
 
 TINY = Workload(2, 2, 150, 2, hidden_dim=16, eps=0.2)
@@ -66,20 +64,6 @@ def test_workloads_have_the_neighbours_they_claim():
 # Suites
 
 
-def test_float32_drifts_little_from_float64_over_a_rollout(device):
-    rows = drift_rows(
-        TimingSession(device, repeats=1), [Workload(2, 2, 300, 8), Workload(3, 1, 300, 8)]
-    )
-    assert [row.workload for row in rows] == ["2D (2, 300, 8)", "3D (1, 300, 8)"]
-    for row in rows:
-        assert 0.0 < row.positions < FORWARD
-        assert 0.0 < row.states < FORWARD
-        # A hidden unit may be on in one precision alone.
-        assert 0.0 < row.state_gradient < 1e-3
-        assert 0.0 < row.state_gradient_median < 1e-5
-        assert 0.0 < row.weight_gradient < 1e-3
-
-
 def test_throughput_stores_and_recomputes():
     store, recompute = suites.throughput_rows(session(), [TINY])
     assert (store.memory, recompute.memory) == ("store", "recompute")
@@ -124,14 +108,6 @@ def test_kernels_are_cudas(device):
     rows = suites.SUITES["kernels"](here)["kernels"]
     assert any("perceive" in row.kernel for row in rows) == (device.type == "cuda")
     assert [entry.what for entry in here.left_out] == ([] if rows else ["kernels"])
-
-
-def test_the_suites_measure_all_their_tables():
-    here = TimingSession(torch.device("cpu"), repeats=1)
-    tables = suites.quick(here)
-    assert list(tables) == ["throughput"]
-    assert all(tables.values())
-    assert here.small
 
 
 # One species beside `rollout`
@@ -214,16 +190,6 @@ def test_an_explanation_names_the_kernels_and_follows_what_is_asked_for():
     assert "periodic" in plain
     assert "gather_position_cotangents" in explained(gradients="positions")
     assert "f64" in explained(dtype=torch.float64)
-
-
-def test_noted_launches_are_those_of_the_block():
-    x, s = TINY.worlds(torch.device("cpu"))
-    with noted_launches() as launches:
-        perceive(x, s, TINY.eps)
-    names = [launch.kernel for launch in launches]
-    perceive(x, s, TINY.eps)
-    assert [launch.kernel for launch in launches] == names
-    assert "perceive" in names
 
 
 # The command

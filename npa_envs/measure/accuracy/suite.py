@@ -233,7 +233,7 @@ class StressRecord(Record[CheckResult]):
             for entry, words in zip(entries, found, strict=True):
                 seconds = f"{round(entry.seconds, 2):.4g}"
                 lines.append([entry.name, entry.verdict, seconds, words.ljust(width)])
-            parts.append("\n".join(line.rstrip() for line in aligned(lines)))
+            parts.append("\n".join(aligned(lines)))
         parts += [
             f"{entry.name} failed: {entry.worst() or entry.note}\n  expected: {entry.expected}"
             + (f"\n  {entry.note}" if entry.note and entry.worst() else "")

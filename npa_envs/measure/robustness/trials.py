@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from statistics import median
-from typing import Any, Self
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -21,15 +21,13 @@ from npa_envs.measure.quality import RuleRunner
 from npa_envs.ops import world_mean
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.base import ParticleTask
 from npa_envs.tasks.damage import DAMAGE_SIZES, random_particle
-from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 from npa_envs.tasks.seeds import uniform_ball, uniform_box
 from npa_envs.training.task_of_rule import task_of_rule, tasks_of_codes
 from npa_envs.world.brushes import clump, cut, nearest_image, offsets_from, wipe_state
 from npa_envs.world.divergence import divergence
 from npa_envs.world.particles import Particles, combined
-from npa_envs.world.randomness import Randomness, StreamId, WorldRandom
+from npa_envs.world.randomness import StreamId, WorldRandom
 
 # Seeds of other shapes; ring, square and two blobs have the trained density.
 
@@ -175,52 +173,6 @@ LOSS_PARTICLES = 1 << 17
 """Most particles of a batch of worlds for a loss, as views of Gaussians take much memory."""
 
 
-class PicturesInTurn(ParticleTask[Morphogenesis2DConfig]):
-    """Task of a rule of many pictures: a world's goal is the index of its picture."""
-
-    def __init__(self, tasks: Sequence[Morphogenesis2D], goal: Tensor) -> None:
-        first = tasks[0]
-        self._tasks, self._goal = tuple(tasks), goal
-        self.config, self.metric_name = first.config, first.metric_name
-
-    def resized(self, particle_count: int) -> Self:
-        """Return the task for another number of particles."""
-        return type(self)([task.resized(particle_count) for task in self._tasks], self.goal)
-
-    def for_rule(self, rule: NPARule) -> Self:
-        """Return the task for a rule."""
-        return type(self)([task.for_rule(rule) for task in self._tasks], self.goal)
-
-    def seed(
-        self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
-    ) -> Particles:
-        """Return fresh worlds with the codes of their pictures, and which ones these are."""
-        seeds = self._tasks[0].seed(world_count, generator=generator, device=device)
-        return seeds._replace(s=self.coded(seeds.s), goal=self.goal)
-
-    def toward(self, goal: Tensor | None) -> Self:
-        """Return the task for worlds with these goals, int64, shape [B]."""
-        return self if goal is None else type(self)(self._tasks, goal)
-
-    def coded(self, s: Tensor) -> Tensor:
-        """Return states with the code of each world's picture written into them."""
-        s = s.clone()
-        for task, worlds in self._worlds():
-            s[worlds] = task.coded(s[worlds])
-        return s
-
-    def metric(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return the metric of each world for its picture, shape [B]."""
-        losses = x.new_empty(len(x))
-        for task, worlds in self._worlds():
-            losses[worlds] = task.metric(x[worlds], s[worlds])
-        return losses
-
-    def _worlds(self) -> Iterator[tuple[Morphogenesis2D, Tensor]]:
-        for number in sorted(set(self.goal.tolist())):
-            yield self._tasks[number], (self.goal == number).nonzero()[:, 0]
-
-
 class RuleTrial:
     """A rule with its task and worlds from seeds unseen in training.
 
@@ -247,11 +199,13 @@ class RuleTrial:
             raise NPAError(f"cannot measure {name!r}: {trained.doubt}: choose another rule")
         self.task: Any = trained.task
         self.metric_name = trained.task.trial_name
+        self._tasks: dict[int, list[Any]] = {self.particle_count: [self.task]}
+        self._pictures = torch.zeros(self.world_count, dtype=torch.int64, device=device)
+        """Index of each world's task, [B]."""
         if self.rule.codes is not None:
-            pictures = tasks_of_codes(name, self.rule, device, particle_count=particle_count)
-            world_seeds = torch.tensor(self._world_seeds, device=device)
-            self.task = PicturesInTurn(pictures, world_seeds % len(pictures))
-        self._tasks: dict[int, Any] = {self.particle_count: self.task}
+            tasks: list[Any] = [*tasks_of_codes(name, self.rule, device, **fields)]
+            self._tasks[self.particle_count] = tasks
+            self._pictures = torch.tensor(self._world_seeds, device=device) % len(tasks)
 
     @property
     def particle_count(self) -> int:
@@ -276,17 +230,34 @@ class RuleTrial:
         """Return a fraction of the trained number of particles."""
         return max(2, round(fraction * self.particle_count))
 
-    def task_of(self, particle_count: int) -> Any:
-        """Return the task for another number of particles."""
+    def tasks_of(self, particle_count: int) -> list[Any]:
+        """Return the tasks for a number of particles: one, or one for each picture."""
         if particle_count not in self._tasks:
-            self._tasks[particle_count] = self.task.resized(particle_count).for_rule(self.rule)
+            self._tasks[particle_count] = [
+                task.resized(particle_count).for_rule(self.rule)
+                for task in self._tasks[self.particle_count]
+            ]
         return self._tasks[particle_count]
+
+    def _by_task(self, x: Tensor) -> Iterator[tuple[Any, Tensor]]:
+        """Yield each task and the indices of its worlds, of whole copies of all worlds."""
+        pictures = self._pictures.repeat(len(x) // self.world_count)
+        tasks = self.tasks_of(x.shape[1])
+        for k in pictures.unique().tolist():
+            yield tasks[k], (pictures == k).nonzero()[:, 0]
+
+    def coded(self, x: Tensor, s: Tensor) -> Tensor:
+        """Return states with the code of each world's picture, which damage may have erased."""
+        s = s.clone()
+        for task, index in self._by_task(x):
+            s[index] = task.coded(s[index])
+        return s
 
     def initial_worlds(self, fraction: float = 1.0, shape: str = "trained") -> Particles:
         """Return fresh worlds with a fraction of the trained particles, in a shape of `SHAPES`."""
         count = self.particles(fraction)
         random = self.random(StreamId.GROWTH)
-        x, s, _, goal = self.task_of(count).seed(
+        x, s, _, goal = self.tasks_of(count)[0].seed(
             self.world_count, generator=random, device=self._device
         )
         if shape != "trained":
@@ -294,7 +265,7 @@ class RuleTrial:
             # Trained worlds fill their box, so there is no trained radius.
             radius = self.task.config.seed_radius if box is None else 0.25 * min(box)
             x = SHAPES[shape](count, self.rule.space_dim, float(radius), random)
-        return Particles(x.float(), s.float(), goal=goal)
+        return Particles(x.float(), self.coded(x, s.float()), goal=goal)
 
     @torch.no_grad()
     def run(
@@ -305,7 +276,7 @@ class RuleTrial:
         `changed` overrides options of `rollout`. A world that is not finite has the loss NaN from
         then on; it does not affect the others.
         """
-        task = self.task_of(initial.x.shape[1])
+        task = self.tasks_of(initial.x.shape[1])[0]
         runner = RuleRunner(self.rule, task, random, **changed)
         worlds, losses = initial, []
         diverged = torch.zeros(len(initial.x), dtype=torch.bool, device=initial.x.device)
@@ -324,15 +295,16 @@ class RuleTrial:
         positions are measured at the scale of training. Those in boxes and of static particles are
         not scaled.
         """
-        task = self.task_of(worlds.x.shape[1])
+        task = self.task
         if task.box is None and not self.rule.static and eps != task.eps:
             worlds = worlds._replace(x=worlds.x * (task.eps / eps))
         size = max(1, LOSS_PARTICLES // worlds.x.shape[1])
-        losses = []
-        for index in torch.arange(len(worlds.x), device=worlds.x.device).split(size):
-            x, s, _, goal = worlds.take(index)
-            losses.append(task.toward(goal).trial_metric(x, s))
-        return torch.cat(losses)
+        losses = worlds.x.new_empty(len(worlds.x))
+        for task, index in self._by_task(worlds.x):
+            for some in index.split(size):
+                x, s, _, goal = worlds.take(some)
+                losses[some] = task.toward(goal).trial_metric(x, s)
+        return losses
 
     def by_seed(self, losses: Tensor) -> Tensor:
         """Return the mean loss of each seed's worlds, [..., seeds], from [..., B]."""
@@ -523,7 +495,7 @@ def _with_twins(
     for damage in damages:
         random = trial.random(StreamId.DAMAGE)
         x, s = damage.apply(grown.x, grown.s, random, trial.task.box)
-        copies[damage.name] = twins._replace(x=x, s=trial.task.coded(s)), masks
+        copies[damage.name] = twins._replace(x=x, s=trial.coded(x, s)), masks
     worlds, keys = zip(*copies.values(), strict=True)
     random = WorldRandom.from_keys(torch.cat(keys))
     _, losses = trial.run(combined(torch.cat, worlds), random, steps)

@@ -11,9 +11,10 @@ from torch import Tensor
 from torch.autograd import DeviceType  # type: ignore[attr-defined]
 from torch.profiler import ProfilerActivity, profile
 
+from npa_envs.measure.record import aligned
 from npa_envs.measure.speed.timing import TimingSession, Workload, rollout_call
 from npa_envs.ops.backend import describe
-from npa_envs.ops.launch import Launch, noted_launches
+from npa_envs.ops.launch import noted_launches
 from npa_envs.ops.physics import physics
 from npa_envs.ops.sort import plan_kernels
 from npa_envs.rule.rule import NPARule
@@ -100,17 +101,11 @@ def explain(
     with noted_launches() as backward:
         if needed:
             torch.autograd.backward(new_x.sum() + new_s.sum())
-    lines = [*_reasons(workload, x, rule, box, gradients), "", "forward:", *_listed(forward)]
-    lines += ["", "backward:", *_listed(backward)] if needed else []
+    lines = _reasons(workload, x, rule, box, gradients)
+    for name, launches in (("forward", forward), ("backward", backward)):
+        if launches:
+            lines += ["", f"{name}:", *(f"  {line}" for line in aligned(launches, left=True))]
     return "\n".join([*lines, "", "Torch's own operations are not listed."])
-
-
-def _listed(launches: list[Launch]) -> list[str]:
-    """Return a line for each launch, in columns."""
-    widths = [max(map(len, column)) for column in zip(*launches, strict=True)]
-    widths[-1] = 0
-    rows = ([cell.ljust(width) for cell, width in zip(x, widths, strict=True)] for x in launches)
-    return ["  " + "  ".join(row) for row in rows]
 
 
 def _reasons(
@@ -130,9 +125,6 @@ def _reasons(
     request = plan.request._replace(
         row_width=hidden.shape[1], update_width=output.shape[0], hidden_dim=hidden.shape[0]
     )
-    boundary = "open: positions anywhere, the grid of cells wraps around"
-    if box is not None:
-        boundary = f"periodic, side {box:g}: nearest images, positions are wrapped"
     neighbours = "searched for in each pass"
     if plan.lists_neighbours:
         neighbours = (
@@ -148,23 +140,17 @@ def _reasons(
             f"p {prob:g}: only drawn particles are perceived; {plan.row_capacity} rows of {total} "
             "hold them with probability 1 - 1e-15, and no count is read back"
         )
-    kept = {
-        "none": "none: nothing is kept for a backward pass",
-        "weights": "weights and states: the adjoint gathers state cotangents, positions detached",
-        "positions": "positions too: density and kernel slopes get cotangents of their own",
-    }
     number = str(x.dtype).removeprefix("torch.")
     return [
         f"One step of {workload.world_count} x {workload.particle_count} particles in "
-        f"{workload.space_dim}D, C {workload.state_dim}, {number} on {x.device}",
-        f"  boundary    {boundary}",
+        f"{workload.space_dim}D, C {workload.state_dim}, {number} on {x.device}, "
+        f"{'open space' if box is None else 'a periodic box'}, gradients: {gradients}",
         f"  cells       {plan.domain.cell_count} a world, eps / {plan.domain.cell_reach} wide: "
         "a neighbourhood is a few ranges of sorted particles",
         f"  channels    {plan.group_count} group(s) of {plan.width}, "
         f"{workload.state_dim} used: a kernel is compiled for a group's width",
         f"  neighbours  {neighbours}",
         f"  rows        {rows}",
-        f"  gradients   {kept[gradients]}",
         "",
         "implementations:",
         *(f"  {line}" for line in describe(request)),
