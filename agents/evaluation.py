@@ -78,16 +78,16 @@ def evaluate_policy(env: Any, policy: Callable[[Any], Any], seeds: Iterable[int]
     limits = [getattr(holder, "episode_steps", None) for holder in (worlds, env)]
     if limits == [None, None] and _step_limit(env) is None:
         raise NPAError("env must end its episodes: make it with max_episode_steps=256")
-    given = checked_seeds("seeds", seeds)
+    seeds = checked_seeds("seeds", seeds)
     policy = policy_in(env, policy)
     single = isinstance(env, gymnasium.Env)
     count = 1 if single else env.num_envs
     run = _run_single if single else _run
-    batches = [given[k : k + count] for k in range(0, len(given), count)]
-    ran = [run(env, policy, [*batch, *batch[-1:] * (count - len(batch))]) for batch in batches]
-    joined = [np.concatenate(column)[: len(given)] for column in zip(*ran, strict=True)]
-    returns, start_losses, final_losses, steps, endings = joined
-    return Episodes(returns, start_losses, final_losses, steps, tuple(endings.tolist()))
+    batches = [seeds[k : k + count] for k in range(0, len(seeds), count)]
+    results = [run(env, policy, [*batch, *batch[-1:] * (count - len(batch))]) for batch in batches]
+    columns = [np.concatenate(column)[: len(seeds)] for column in zip(*results, strict=True)]
+    *numbers, endings = columns
+    return Episodes(*numbers, tuple(endings.tolist()))
 
 
 def checked_seeds(name: str, seeds: Iterable[int]) -> list[int]:
@@ -96,12 +96,12 @@ def checked_seeds(name: str, seeds: Iterable[int]) -> list[int]:
         raise NPAError(
             f"{name} must be one for each episode, got {shown(seeds)}: give {name}=range(8)"
         )
-    given = list(seeds)
-    if not given:
+    listed = list(seeds)
+    if not listed:
         raise NPAError(f"{name} must have at least one seed, got none: give {name}=range(8)")
     # Raises on wrong seeds.
-    WorldRandom(given)
-    return given
+    WorldRandom(listed)
+    return listed
 
 
 def policy_in(env: Any, policy: Callable[[Any], Any]) -> Callable[[Any], Any]:

@@ -44,25 +44,25 @@ class BrushPolicy:
         Only type and shape of the observation count: policies read their environment's worlds.
         """
         array = observation["observation"] if isinstance(observation, dict) else observation
-        action = self.act(self.worlds.world_count)
+        action = self.act()
         action = action if array.ndim > self._observation_dims else action[0]
         return action if isinstance(array, Tensor) else action.cpu().numpy()
 
-    def act(self, world_count: int) -> Tensor:
+    def act(self) -> Tensor:
         """Return the brushes' actions in the environment's worlds, float32, shape [B, K, W]."""
         raise NotImplementedError
 
-    def still(self, world_count: int) -> Tensor:
+    def still(self) -> Tensor:
         """Return actions that do nothing."""
-        return torch.zeros(world_count, *self.shape, device=self.task.device)
+        return torch.zeros(self.worlds.world_count, *self.shape, device=self.task.device)
 
 
 class StillGardener(BrushPolicy):
     """Do nothing, so that only the rule acts."""
 
-    def act(self, world_count: int) -> Tensor:
+    def act(self) -> Tensor:
         """Return zeros."""
-        return self.still(world_count)
+        return self.still()
 
 
 class RandomGardener(BrushPolicy):
@@ -72,9 +72,10 @@ class RandomGardener(BrushPolicy):
         super().__init__(env)
         self._draws = PolicyDraws(seed)
 
-    def act(self, world_count: int) -> Tensor:
+    def act(self) -> Tensor:
         """Return numbers from [-1, 1)."""
-        return 2.0 * self._draws.next(world_count, self.task.device).uniform(*self.shape) - 1.0
+        random = self._draws.next(self.worlds.world_count, self.task.device)
+        return 2.0 * random.uniform(*self.shape) - 1.0
 
 
 class ScriptedGardener(BrushPolicy):
@@ -105,9 +106,9 @@ class ScriptedGardener(BrushPolicy):
         # In float64, as libraries sum one world in another order than several.
         self._pulls = (checked_positive("share", share) * weight[..., None] * away).double()
 
-    def act(self, world_count: int) -> Tensor:
+    def act(self) -> Tensor:
         """Return pushes towards places where worlds have less than the target."""
-        worlds, action = self.worlds, self.still(world_count)
+        worlds, action = self.worlds, self.still()
         deficit = self._deficit(worlds.x, worlds.s, self.task.middle(worlds.x))
         pull = torch.einsum("bq,pqd->bpd", deficit[..., 0].double(), self._pulls).to(deficit.dtype)
         move = (self._gain * deficit[..., 1:3] + pull).clamp(-1.0, 1.0)
@@ -115,7 +116,7 @@ class ScriptedGardener(BrushPolicy):
             action[..., self.columns.push] = move
             return action
         places, length = self._deficit.places, move.norm(dim=-1)
-        every_world = torch.arange(world_count, device=deficit.device)
+        every_world = torch.arange(len(action), device=deficit.device)
         for brush in range(len(action[0])):
             longest = length.argmax(dim=1)
             action[:, brush, self.columns.place] = places[longest]
@@ -148,9 +149,9 @@ class ScriptedShepherd(BrushPolicy):
             angle = 2.0 * torch.pi * (torch.arange(count, device=self.task.device) + 0.5) / count
             self._places = ring * torch.stack((angle.cos(), angle.sin()), dim=1)
 
-    def act(self, world_count: int) -> Tensor:
+    def act(self) -> Tensor:
         """Return pushes towards the goals of the worlds."""
-        worlds, action = self.worlds, self.still(world_count)
+        worlds, action = self.worlds, self.still()
         achieved = self.task.achieved(worlds.x, worlds.s, worlds.context)
         missing = (self.task.desired(worlds.context) - achieved)[:, None, :2]
         if self.config.aim == "move":
@@ -195,16 +196,16 @@ class GradientGardener(BrushPolicy):
         self._learning_rate = learning_rate
         self._draws = PolicyDraws(seed)
 
-    def act(self, world_count: int) -> Tensor:
+    def act(self) -> Tensor:
         """Return the first step of the best plan."""
-        draws = self._draws.next(world_count, self.task.device)
-        first = self._scripted.act(world_count)
-        plan = torch.stack([first] + [self.still(world_count)] * (self._horizon - 1))
+        draws = self._draws.next(self.worlds.world_count, self.task.device)
+        first = self._scripted.act()
+        plan = torch.stack([first] + [self.still()] * (self._horizon - 1))
         plan[1:, ..., self.columns.place] = first[..., self.columns.place]
         plan = plan.requires_grad_()
-        optimizer = torch.optim.Adam([plan], lr=self._learning_rate)
+        optimiser = torch.optim.Adam([plan], lr=self._learning_rate)
         best = plan.detach().clone()
-        highest = torch.full((world_count,), -torch.inf, device=self.task.device)
+        highest = torch.full_like(first[:, 0, 0], -torch.inf)
         for _ in range(self._iterations):
             rewards = self.planned_rewards(plan, draws)
             with torch.no_grad():
@@ -212,7 +213,7 @@ class GradientGardener(BrushPolicy):
                 highest = torch.where(better, rewards, highest)
                 best = torch.where(better[:, None, None], plan, best)
             (plan.grad,) = torch.autograd.grad(-rewards.sum(), plan)
-            optimizer.step()
+            optimiser.step()
             with torch.no_grad():
                 plan.clamp_(-1.0, 1.0)
         return best[0].detach()

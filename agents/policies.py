@@ -259,14 +259,14 @@ class RulePolicy(Policy):
         _check_correction(rule)
         state_scale = checked_positive("state_scale", state_scale)
         if env is not None:
-            given, own = (
+            changed, original = (
                 getattr(e, "single_observation_space", None) or e.observation_space
                 for e in (env, unwrapped(env))
             )
-            if given != own:
+            if changed != original:
                 raise NPAError(
                     "a rule needs the environment's own observations, but a wrapper changes them "
-                    f"from {own} to {given}: give RulePolicy the environment without it"
+                    f"from {original} to {changed}: give RulePolicy the environment without it"
                 )
             check_rule_fits(rule, interface_of(env), unwrapped(env).config)
             state_scale = interface_of(env).state_scale
@@ -457,10 +457,13 @@ def perceived(rule: NPARule, rows: Tensor) -> Tensor:
         return rows
     first, end = 2 * rule.state_dim, rule_interface(rule, 1.0).shared_dim
     density = end - rule.space_dim
+    groups = [rows[:, :first]]
+    if rule.state_gradient:
+        groups.append(rows[:, first:density])
+    if rule.density_gradient:
+        groups.append(rows[:, density:end])
     # All rules that perceive by species read all columns of the species.
-    read = torch.ones(rows.shape[1], dtype=torch.bool, device=rows.device)
-    read[first:density], read[density:end] = rule.state_gradient, rule.density_gradient
-    return rows[:, read]
+    return torch.cat((*groups, rows[:, end:]), dim=1)
 
 
 def check_rule_fits(rule: NPARule, wanted: Interface, config: Any) -> None:

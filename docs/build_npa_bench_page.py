@@ -14,18 +14,10 @@ import sys
 from pathlib import Path
 
 import numpy as np
+from npa_bench_rows import BenchRow, read_rows, score, scores_in
 from page_parts import table, write_or_check
 
-from npa_envs.agents.comparison.npa_bench import (
-    METHODS,
-    SUITES,
-    BenchRow,
-    Suite,
-    read_rows,
-    score,
-    scores_in,
-    task_name,
-)
+from npa_envs.agents.comparison.npa_bench import METHODS, SUITES, Suite, task_name
 from npa_envs.agents.comparison.plan import NOTHING, YARDSTICK
 from npa_envs.measure.plots import draw_band, legend_of, new_figure, png
 from npa_envs.measure.record import NONE

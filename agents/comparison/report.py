@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, astuple, dataclass, fields
 from pathlib import Path
@@ -13,14 +15,14 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from npa_envs.agents.comparison.plan import AXES, NOTHING, YARDSTICK, Axis, ComparisonPlan
-from npa_envs.agents.comparison.run import PICTURE, SIZE, RunRecord
+from npa_envs.agents.comparison.run import PICTURE, SIZE, RunRecord, mean_of
 from npa_envs.agents.learning import CurvePoint
 from npa_envs.files import write_text
 from npa_envs.measure.plots import draw_band, legend_of, new_figure, png, write_plots
 from npa_envs.measure.record import NONE, Record, csv_text, markdown_table, mean_with_error, short
 from npa_envs.render import write_filmstrip
 
-LOST = ("diverged", "left the world")
+DIVERGED = ("diverged", "left the world")
 """Endings of diverged episodes: of worlds, and of species."""
 
 HEADINGS: Mapping[Axis, str] = {
@@ -37,12 +39,6 @@ def write_table(
     """Write the table, in Markdown and as JSON, and all curves; return the table in Markdown."""
     table = rows(records)
     shown = text(table)
-    at_once = plan.settings.get("runs_at_once", 1)
-    if "seconds" in plan.budgets and at_once > 1:
-        shown += (
-            f"\nUp to {at_once} runs at once shared a device: their fractions of its time are not "
-            "controlled.\n"
-        )
     facts = {"command": command, **asdict(plan), "left_out": sorted(map(list, plan.left_out))}
     write_text(folder / TABLE, f"`{command}`\n\n{shown}")
     Record(facts, folder / FIGURES, table).write()
@@ -76,14 +72,12 @@ UNKNOWN = Estimate(math.nan, math.nan)
 
 def estimate(values: Iterable[float]) -> Estimate:
     """Return the mean of the finite values, one for each seed, with its standard error."""
-    kept = [value for value in values if math.isfinite(value)]
-    if not kept:
-        return UNKNOWN
-    mean = sum(kept) / len(kept)
-    if len(kept) < 2:
+    finite = [value for value in values if math.isfinite(value)]
+    mean = mean_of(finite)
+    if len(finite) < 2:
         return Estimate(mean, math.nan)
-    variance = sum((value - mean) ** 2 for value in kept) / (len(kept) - 1)
-    return Estimate(mean, math.sqrt(variance / len(kept)))
+    variance = sum((value - mean) ** 2 for value in finite) / (len(finite) - 1)
+    return Estimate(mean, math.sqrt(variance / len(finite)))
 
 
 @dataclass(frozen=True)
@@ -121,41 +115,37 @@ def rows(records: Iterable[RunRecord]) -> list[ReportRow]:
     for record in records:
         job = record.job
         groups.setdefault((job.axis, job.task, job.method), []).append(record)
-    returns = {key: estimate(r.mean_return for r in some) for key, some in groups.items()}
-
-    def fraction_of(key: tuple[Axis, str, str]) -> Estimate:
-        nothing, yardstick = (
-            returns.get((*key[:2], method), UNKNOWN) for method in (NOTHING, YARDSTICK)
+    returns = {key: estimate(r.mean_return for r in group) for key, group in groups.items()}
+    table = []
+    for (axis, task, method), group in groups.items():
+        result, nothing, yardstick = (
+            returns.get((axis, task, name), UNKNOWN) for name in (method, NOTHING, YARDSTICK)
         )
-        found = fraction(returns[key], nothing, yardstick)
-        known = key[2] == YARDSTICK and not math.isnan(found.mean)
-        return Estimate(1.0, math.nan) if known else found
-
-    return [_row(some, returns[key], fraction_of(key)) for key, some in groups.items()]
-
-
-def _row(records: Sequence[RunRecord], final_return: Estimate, of_yardstick: Estimate) -> ReportRow:
-    job = records[0].job
-    states = [record.status for record in records]
-    lasts = [record.curve[-1] for record in records if record.curve]
-    endings = [record.endings for record in records if record.endings]
-    episodes = sum(sum(ending.values()) for ending in endings)
-    lost = sum(ending.get(word, 0) for ending in endings for word in LOST)
-    return ReportRow(
-        axis=job.axis,
-        task=job.task,
-        method=job.method,
-        done=states.count("done"),
-        diverged=states.count("diverged"),
-        failed=states.count("failed"),
-        counted=sum(math.isfinite(record.mean_return) for record in records),
-        episodes_diverged=lost / episodes if episodes else math.nan,
-        final_return=final_return,
-        final_loss=estimate(record.mean_loss for record in records),
-        fraction=of_yardstick,
-        seconds=estimate(last.seconds for last in lasts).mean,
-        particle_steps=estimate(last.particle_steps for last in lasts).mean,
-    )
+        of_yardstick = fraction(result, nothing, yardstick)
+        if method == YARDSTICK and not math.isnan(of_yardstick.mean):
+            of_yardstick = Estimate(1.0, math.nan)
+        statuses = Counter(record.status for record in group)
+        endings = sum((Counter(record.endings or {}) for record in group), Counter())
+        diverged = sum(endings[word] for word in DIVERGED)
+        last_points = [record.curve[-1] for record in group if record.curve]
+        table.append(
+            ReportRow(
+                axis=axis,
+                task=task,
+                method=method,
+                done=statuses["done"],
+                diverged=statuses["diverged"],
+                failed=statuses["failed"],
+                counted=sum(math.isfinite(record.mean_return) for record in group),
+                episodes_diverged=diverged / endings.total() if endings else math.nan,
+                final_return=result,
+                final_loss=estimate(record.mean_loss for record in group),
+                fraction=of_yardstick,
+                seconds=estimate(point.seconds for point in last_points).mean,
+                particle_steps=estimate(point.particle_steps for point in last_points).mean,
+            )
+        )
+    return table
 
 
 def fraction(result: Estimate, nothing: Estimate, yardstick: Estimate) -> Estimate:
@@ -167,9 +157,9 @@ def fraction(result: Estimate, nothing: Estimate, yardstick: Estimate) -> Estima
     gain = yardstick.mean - nothing.mean
     if not gain > 0.0 or math.isnan(result.mean):
         return UNKNOWN
-    share = (result.mean - nothing.mean) / gain
-    spread = math.hypot(result.standard_error, share * yardstick.standard_error)
-    return Estimate(share, spread / gain)
+    mean = (result.mean - nothing.mean) / gain
+    spread = math.hypot(result.standard_error, mean * yardstick.standard_error)
+    return Estimate(mean, spread / gain)
 
 
 # Rows as text
@@ -179,11 +169,11 @@ def text(table: Sequence[ReportRow]) -> str:
     """Return a table in Markdown for each axis and task."""
     parts = []
     for axis in AXES:
-        found = [row for row in table if row.axis == axis]
-        if found:
+        axis_rows = [row for row in table if row.axis == axis]
+        if axis_rows:
             parts.append(f"## {HEADINGS[axis]}")
-        for task in dict.fromkeys(row.task for row in found):
-            some = [row for row in found if row.task == task]
+        for task in dict.fromkeys(row.task for row in axis_rows):
+            some = [row for row in axis_rows if row.task == task]
             parts.append(f"### {task}\n\n{_table(some)}")
             methods = {row.method for row in some}
             missing = [f"`{name}`" for name in (NOTHING, YARDSTICK) if name not in methods]
@@ -258,9 +248,9 @@ def curve(records: Sequence[RunRecord], across: Callable[[CurvePoint], float]) -
     """
     lines = []
     for record in [record for record in records if record.status == "done"] or records:
-        kept = [point for point in record.curve if np.isfinite(point.mean_return)]
-        if kept:
-            lines.append(([across(point) for point in kept], [point.mean_return for point in kept]))
+        points = [(across(p), p.mean_return) for p in record.curve if np.isfinite(p.mean_return)]
+        if points:
+            lines.append(tuple(zip(*points, strict=True)))
     if not lines:
         return None
     first, last = max(line[0][0] for line in lines), min(line[0][-1] for line in lines)
@@ -301,17 +291,17 @@ def _picture(records: Sequence[RunRecord]) -> bytes:
     return png(figure)
 
 
-def _draw(panel: Any, found: Curve | None, colour: str, name: str) -> None:
-    if found is None:
+def _draw(panel: Any, drawn: Curve | None, colour: str, name: str) -> None:
+    if drawn is None:
         panel.plot([], [], color=colour, label=name)
-    elif len(found.across) == 1:
+    elif len(drawn.across) == 1:
         # The method does not learn.
-        (mean,), (error,) = found.mean, found.error
+        (mean,), (error,) = drawn.mean, drawn.error
         panel.axhline(mean, color=colour, lw=1.0, ls="--", label=name)
         panel.axhspan(mean - error, mean + error, color=colour, alpha=0.2, lw=0)
     else:
-        lines = (found.mean - found.error, found.mean, found.mean + found.error)
-        draw_band(panel, found.across, lines, colour, name, lw=1.5)
+        lines = (drawn.mean - drawn.error, drawn.mean, drawn.mean + drawn.error)
+        draw_band(panel, drawn.across, lines, colour, name, lw=1.5)
 
 
 # Filmstrips: the last picture of a held-out episode of each run
@@ -322,33 +312,24 @@ def write_strips(records: Sequence[RunRecord], folder: Path) -> list[Path]:
 
     The pictures of the runs are read from the comparison's folder.
     """
+    groups: dict[tuple[Axis, str], dict[tuple[int, str], RunRecord]] = {}
+    for record in records:
+        job = record.job
+        groups.setdefault((job.axis, job.task), {})[job.seed, job.method] = record
     written = []
-    for axis in AXES:
-        for task in dict.fromkeys(r.job.task for r in records if r.job.axis == axis):
-            some = [r for r in records if (r.job.axis, r.job.task) == (axis, task)]
-            found = {(record.job.method, record.job.seed): record for record in some}
-            methods = list(dict.fromkeys(method for method, _ in found))
-            seeds = sorted({seed for _, seed in found})
-            cells = [(method, seed) for seed in seeds for method in methods]
-            frames = [_frame(found.get(cell), folder) for cell in cells]
-            captions = [
-                f"{method}, seed {seed}: {_result(found.get((method, seed)))}"
-                for method, seed in cells
-            ]
-            written.append(folder / f"grown_{task}_{axis}.png")
-            write_filmstrip(written[-1], frames, captions, columns=len(methods))
+    for (axis, task), runs in sorted(groups.items(), key=lambda group: AXES.index(group[0][0])):
+        methods = list(dict.fromkeys(method for _, method in runs))
+        frames, captions = [], []
+        for seed, method in itertools.product(sorted({seed for seed, _ in runs}), methods):
+            run = runs.get((seed, method))
+            frames.append(np.full((SIZE, SIZE, 3), 255, np.uint8))
+            result = "not run" if run is None else run.status
+            if run is not None and run.status == "done":
+                result = f"loss {run.mean_loss:.3f}"
+            if run is not None and (path := folder / run.job.folder / PICTURE).exists():
+                with Image.open(path) as picture:
+                    frames[-1] = np.asarray(picture.convert("RGB"))
+            captions.append(f"{method}, seed {seed}: {result}")
+        written.append(folder / f"grown_{task}_{axis}.png")
+        write_filmstrip(written[-1], frames, captions, columns=len(methods))
     return written
-
-
-def _result(record: RunRecord | None) -> str:
-    if record is None or record.status != "done":
-        return "not run" if record is None else record.status
-    return f"loss {record.mean_loss:.3f}"
-
-
-def _frame(record: RunRecord | None, folder: Path) -> NDArray[np.uint8]:
-    path = None if record is None else folder / record.job.folder / PICTURE
-    if path is None or not path.exists():
-        return np.full((SIZE, SIZE, 3), 255, np.uint8)
-    with Image.open(path) as picture:
-        return np.asarray(picture.convert("RGB"))

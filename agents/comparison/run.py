@@ -91,18 +91,16 @@ class RunRecord:
     def read(cls, folder: Path, facts: Mapping[str, Any]) -> RunRecord | None:
         """Return the record in a run's folder, or None."""
 
-        def made(held: dict[str, Any]) -> RunRecord:
+        def make(content: dict[str, Any]) -> RunRecord:
             points: list[dict[str, Any]]
-            points = [{name: number(v) for name, v in row.items()} for row in held["curve"]]
-            own = {
-                "job": Job(**held["job"]),
-                "curve": tuple(CurvePoint(**point) for point in points),
-                "returns": tuple(map(number, held["returns"])),
-                "final_losses": tuple(map(number, held["final_losses"])),
+            points = [{name: number(v) for name, v in row.items()} for row in content["curve"]]
+            fields: dict[str, Any] = {
+                name: tuple(map(number, content[name])) for name in ("returns", "final_losses")
             }
-            return cls(**held | own)
+            fields |= {"job": Job(**content["job"])}
+            return cls(**content | fields | {"curve": tuple(CurvePoint(**p) for p in points)})
 
-        return read_record(folder / RECORD, facts, made, command="compare")
+        return read_record(folder / RECORD, facts, make, command="compare")
 
 
 def mean_of(values: Sequence[float]) -> float:
@@ -126,8 +124,8 @@ class RunRequest:
     @classmethod
     def read(cls, folder: Path) -> RunRequest:
         """Return the request in a folder."""
-        held = json.loads((folder / REQUEST).read_text("utf-8"))
-        return cls(**held | {"job": Job(**held["job"])})
+        content = json.loads((folder / REQUEST).read_text("utf-8"))
+        return cls(**content | {"job": Job(**content["job"])})
 
     def record(self, status: Status, begin: float, **fields: Any) -> RunRecord:
         """Return the record of a run that began at `begin` of `time.perf_counter` [s]."""
@@ -158,16 +156,17 @@ def run(folder: Path, device: str) -> None:
         # The table reports errors.
         traceback.print_exc()
         status = "diverged" if isinstance(error, DivergedError) else "failed"
-        found: dict[str, Any] = {"error": f"{type(error).__name__}: {' '.join(str(error).split())}"}
+        result: dict[str, Any] = {}
+        result["error"] = f"{type(error).__name__}: {' '.join(str(error).split())}"
     else:
-        found = {
+        result = {
             "returns": tuple(episodes.returns.tolist()),
             "final_losses": tuple(episodes.final_losses.tolist()),
             "endings": dict(Counter(episodes.endings)),
         }
         if not math.isfinite(episodes.mean_return):
-            status, found["error"] = "diverged", "returns of held-out episodes are not finite"
-    request.record(status, begin, curve=tuple(curve), **found).write(folder)
+            status, result["error"] = "diverged", "returns of held-out episodes are not finite"
+    request.record(status, begin, curve=tuple(curve), **result).write(folder)
 
 
 def _learn(
@@ -178,10 +177,10 @@ def _learn(
     problem, amount = Problem(**facts["problem"]), facts["budget"]
     in_seconds = job.axis == "seconds"
     budget = Budget(seconds=amount) if in_seconds else Budget(particle_steps=int(amount))
-    options = dict(facts["options"]) | ({"teacher": request.teacher} if request.teacher else {})
-    trained = train(
-        facts["method"], problem, budget, job.seed, device=device, on_entry=on_entry, **options
-    )
+    options = dict(facts["options"], device=device, on_entry=on_entry)
+    if request.teacher:
+        options["teacher"] = request.teacher
+    trained = train(facts["method"], problem, budget, job.seed, **options)
     trained.save(folder)
     seeds = range(FIRST_TEST_SEED, FIRST_TEST_SEED + facts["episodes"])
     # New environments, as the method may have changed its own.
@@ -212,8 +211,7 @@ def final_picture(
             break
         (picture,) = envs.render()
     envs.close()
-    found: NDArray[np.uint8] = picture
-    return found
+    return np.asarray(picture)
 
 
 def main(folder: Path) -> None:
@@ -260,17 +258,16 @@ LAST_OUTPUT = 2000
 
 @dataclass
 class _Process(Child):
-    job: Job
+    request: RunRequest
     folder: Path
     process: subprocess.Popen[bytes]
-    lasts: bool
-    """As `RunRequest.lasts`."""
     begin: float = 0.0
 
     @property
     def over(self) -> bool:
         """Whether the run has ended."""
-        return self.process.poll() is not None or (self.lasts and (self.folder / RECORD).exists())
+        recorded = self.request.lasts and (self.folder / RECORD).exists()
+        return recorded or self.process.poll() is not None
 
     def go(self, device: str) -> None:
         """Start the run on a device."""
@@ -305,12 +302,8 @@ def lasts(plan: ComparisonPlan, job: Job) -> bool:
 
 def held_records(plan: ComparisonPlan, folder: Path) -> dict[Job, RunRecord]:
     """Return the records in a folder of an earlier comparison, without failed runs."""
-    found = {job: RunRecord.read(folder / job.folder, plan.facts(job)) for job in plan.jobs()}
-    return {
-        job: record
-        for job, record in found.items()
-        if record is not None and record.status in MEASURED
-    }
+    records = {job: RunRecord.read(folder / job.folder, plan.facts(job)) for job in plan.jobs()}
+    return {job: one for job, one in records.items() if one is not None and one.status in MEASURED}
 
 
 def run_jobs(
@@ -345,16 +338,20 @@ def run_jobs(
     idle: list[subprocess.Popen[bytes]] = []
 
     def start(unfinished: Sequence[_Process]) -> _Process | None:
-        ahead = {*waiting, *(one.job for one in unfinished)}
+        ahead = {*waiting, *(one.request.job for one in unfinished)}
         for job in waiting:
-            if plan.teacher(job) not in ahead:
+            teacher = plan.teacher(job)
+            if teacher not in ahead:
                 waiting.remove(job)
-                return _start(plan, job, folder, places, command, idle)
+                taught = "" if teacher is None else str(folder / teacher.folder)
+                last = lasts(plan, job)
+                request = RunRequest(job, plan.facts(job), places.threads, command, taught, last)
+                return _start(request, folder, idle)
         return None
 
     def finished(one: _Process) -> None:
-        record = _finish(plan, one, folder, command)
-        if one.lasts and record.status in MEASURED and one.process.poll() is None:
+        record = _finish(one, folder)
+        if one.request.lasts and record.status in MEASURED and one.process.poll() is None:
             idle.append(one.process)
         else:
             one.process.communicate()
@@ -363,8 +360,8 @@ def run_jobs(
     # Remove unfinished runs of a killed comparison.
     for job in jobs:
         target = folder / job.folder
-        for left in target.parent.glob(f".{target.name}.*"):
-            shutil.rmtree(left, ignore_errors=True)
+        for unfinished in target.parent.glob(f".{target.name}.*"):
+            shutil.rmtree(unfinished, ignore_errors=True)
     try:
         run_children(
             start,
@@ -378,30 +375,19 @@ def run_jobs(
             process.communicate()
 
 
-def _start(
-    plan: ComparisonPlan,
-    job: Job,
-    folder: Path,
-    places: Places,
-    command: str,
-    idle: list[subprocess.Popen[bytes]],
-) -> _Process:
+def _start(request: RunRequest, folder: Path, idle: list[subprocess.Popen[bytes]]) -> _Process:
     """Return the process of a run, an idle or a new one, which waits for its device."""
-    target = folder / job.folder
+    target = folder / request.job.folder
     part = target.parent / f".{target.name}.{secrets.token_hex(4)}"
     part.mkdir(parents=True)
-    teacher = plan.teacher(job)
-    taught = "" if teacher is None else str(folder / teacher.folder)
-    lasting = lasts(plan, job)
-    request = RunRequest(job, plan.facts(job), places.threads, command, taught, lasting)
     write_record(part / REQUEST, asdict(request))
-    if lasting and idle:
+    if request.lasts and idle:
         # The process opens this file itself, unless it dies before.
         (part / OUTPUT).touch()
         process = idle.pop()
         _send(process, json.dumps(str(part)))
-        return _Process(job, part, process, lasts=True)
-    environment = os.environ | {"OMP_NUM_THREADS": str(places.threads)}
+        return _Process(request, part, process)
+    environment = os.environ | {"OMP_NUM_THREADS": str(request.threads)}
     with (part / OUTPUT).open("wb") as output:
         process = subprocess.Popen(
             [*PROGRAM, str(part)],
@@ -410,23 +396,23 @@ def _start(
             stderr=output,
             env=environment,
         )
-    return _Process(job, part, process, lasts=lasting)
+    return _Process(request, part, process)
 
 
-def _finish(plan: ComparisonPlan, one: _Process, folder: Path, command: str) -> RunRecord:
+def _finish(one: _Process, folder: Path) -> RunRecord:
     """Move the results of an ended run into its folder, and return its record."""
-    if not one.lasts:
+    request = one.request
+    if not request.lasts:
         one.process.communicate()
-    request = RunRequest(one.job, plan.facts(one.job), command=command)
     record = RunRecord.read(one.folder, request.facts)
     if record is None:
         code = one.process.returncode
-        said = (one.folder / OUTPUT).read_text("utf-8", errors="replace").strip()[-LAST_OUTPUT:]
-        error = f"its process ended with code {code}: {' '.join(said.split())}"
+        text = (one.folder / OUTPUT).read_text("utf-8", errors="replace").strip()[-LAST_OUTPUT:]
+        error = f"its process ended with code {code}: {' '.join(text.split())}"
         record = request.record("failed", one.begin, error=error)
         record.write(one.folder)
     (one.folder / REQUEST).unlink(missing_ok=True)
-    target = folder / one.job.folder
+    target = folder / request.job.folder
     if target.exists():
         # A failed run, or one without a record.
         shutil.rmtree(target)

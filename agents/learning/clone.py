@@ -98,8 +98,8 @@ def _taught(
     source = options.teacher
     if source is None:
         raise NPAError("teacher must be given to clone, or a dataset: for example teacher='heart'")
-    given = list(source) if isinstance(source, RuleSet) else source
-    teacher = RuleSet.of(problem, given).to(device).policy()
+    rules_of_teacher = list(source) if isinstance(source, RuleSet) else source
+    teacher = RuleSet.of(problem, rules_of_teacher).to(device).policy()
     student, envs = rules.policy(), problem.make_envs(device=device)
     observation, _ = envs.reset(seed=world_seeds(seed, problem.num_envs))
     stored_steps = max(STORED_STEPS, options.collect_steps)
@@ -176,6 +176,6 @@ class Demonstrations:
 
     def draw(self, world_count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Return observations and actions of worlds drawn with replacement."""
-        kept, device = min(self.count, len(self.observations)), self.observations.device
-        chosen = torch.randint(kept, (world_count,), generator=generator, device=device)
-        return self.observations[chosen], self.actions[chosen]
+        stored, device = min(self.count, len(self.observations)), self.observations.device
+        index = torch.randint(stored, (world_count,), generator=generator, device=device)
+        return self.observations[index], self.actions[index]

@@ -70,8 +70,8 @@ def train(progress: Progress, options: EvolutionOptions = DEFAULTS) -> RuleSet:
         proposed = strategy.ask()
         seeds = draws.integers(FIRST_EVALUATION_SEED, size=options.worlds_per_candidate).tolist()
         weights = torch.as_tensor(np.stack(proposed), dtype=torch.float32).to(device)
-        found = fitness(envs, candidates, weights, seeds, problem.episode_steps)
-        strategy.tell(proposed, costs(found.cpu().double().numpy()))
+        returns = fitness(envs, candidates, weights, seeds, problem.episode_steps)
+        strategy.tell(proposed, costs(returns.cpu().double().numpy()))
         candidates.put(strategy.mean)
         return world_count * problem.particle_count * problem.episode_steps
 

@@ -63,14 +63,14 @@ class GradientOptions:
     def __post_init__(self) -> None:
         """Check `last_rate`, and check `steps` and make it a tuple; raises NPAError."""
         check_fraction(self, "last_rate")
-        given: Any = self.steps
-        if given is not None:
-            if not isinstance(given, list | tuple) or len(given) != 2:
+        steps: Any = self.steps
+        if steps is not None:
+            if not isinstance(steps, list | tuple) or len(steps) != 2:
                 raise NPAError(
-                    f"steps must be a range [lo, hi) of two whole numbers, got {shown(given)}: "
+                    f"steps must be a range [lo, hi) of two whole numbers, got {shown(steps)}: "
                     "steps=(32, 97), on the command line steps=[32,97]"
                 )
-            object.__setattr__(self, "steps", tuple(given))
+            object.__setattr__(self, "steps", tuple(steps))
 
 
 DEFAULTS = GradientOptions()

@@ -449,8 +449,8 @@ class RoundMemory:
     @property
     def round(self) -> Round:
         """The round, as views."""
-        kept = (self.actions, self.log_probs, self.advantages, self.targets, self.acted)
-        return Round(*(part.flatten(0, 1) for part in (self.observations[:-1], *kept)))
+        others = (self.actions, self.log_probs, self.advantages, self.targets, self.acted)
+        return Round(*(part.flatten(0, 1) for part in (self.observations[:-1], *others)))
 
 
 def generalised_advantages(
@@ -544,7 +544,7 @@ def world_bytes(problem: Problem, options: PPOOptions, device: torch.device) -> 
     interface, count = problem.interface, problem.particle_count
     columns = interface.perception_dim + interface.action_dim
     # A step stores observations, actions and rewards; a minibatch also gradients.
-    kept = (options.steps + 1) * (columns + interface.action_dim + 16)
+    stored = (options.steps + 1) * (columns + interface.action_dim + 16)
     hidden = 4 * problem.hidden_dim + 8 * CRITIC_WIDTH
     learned = -(-options.steps // options.minibatches) * (2 * columns + hidden)
-    return needed_bytes(1, count, problem.physics, device) + 4 * count * (kept + learned)
+    return needed_bytes(1, count, problem.physics, device) + 4 * count * (stored + learned)

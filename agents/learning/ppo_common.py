@@ -96,9 +96,9 @@ class CommonOptions:
 
     def pace(self, start: RuleSet | None) -> Pace:
         """Return the options that depend on `start`, with `FRESH` or `WARM` in place of None."""
-        given = {name: getattr(self, name) for name in Pace._fields}
-        given = {name: value for name, value in given.items() if value is not None}
-        return (FRESH if start is None else WARM)._replace(**given)
+        chosen = {name: getattr(self, name) for name in Pace._fields}
+        chosen = {name: value for name, value in chosen.items() if value is not None}
+        return (FRESH if start is None else WARM)._replace(**chosen)
 
 
 def noise_left(budget_left: float, last_noise: float, decay_share: float) -> float:
@@ -118,10 +118,10 @@ def check_choice(name: str, value: object, choices: Sequence[str]) -> None:
         )
 
 
-def find_gradients(optimizer: torch.optim.Optimizer, loss: Tensor) -> None:
+def find_gradients(optimiser: torch.optim.Optimizer, loss: Tensor) -> None:
     """Write the gradients of a loss into an optimiser's parameters."""
     # Read-outs and frozen layers have no gradients.
-    parameters = [p for p in optimizer.param_groups[0]["params"] if p.requires_grad]
+    parameters = [p for p in optimiser.param_groups[0]["params"] if p.requires_grad]
     # Not backward(): its accumulation nodes keep the stream of their first use, which a capture
     # on another stream must not touch.
     gradients = torch.autograd.grad(loss, parameters, allow_unused=True)
@@ -133,9 +133,9 @@ def find_gradients(optimizer: torch.optim.Optimizer, loss: Tensor) -> None:
             parameter.grad.copy_(gradient)
 
 
-def gradients_of(optimizer: torch.optim.Optimizer) -> list[Tensor]:
+def gradients_of(optimiser: torch.optim.Optimizer) -> list[Tensor]:
     """Return the gradients of an optimiser's parameters, without those that have none."""
-    return [p.grad for p in optimizer.param_groups[0]["params"] if p.grad is not None]
+    return [p.grad for p in optimiser.param_groups[0]["params"] if p.grad is not None]
 
 
 def zero_output_rules(problem: Problem, seed: int, start: RuleSet | None) -> RuleSet:
@@ -195,10 +195,10 @@ class GaussianRules(nn.Module):
         return self.log_std[self.row_species]
 
     @torch.no_grad()
-    def leave_noise(self, left: float) -> None:
+    def leave_noise(self, noise_left: float) -> None:
         """Set the factor on the first standard deviations, which are also learned."""
-        self.log_std.add_(math.log(left / self.noise_left))
-        self.noise_left = left
+        self.log_std.add_(math.log(noise_left / self.noise_left))
+        self.noise_left = noise_left
 
     def sample(
         self, observation: Tensor, generator: Randomness | None = None
@@ -303,11 +303,11 @@ def seeded_critic(problem: Problem, input_dim: int, kind: CriticKind, seed: int)
 
 
 def learner_random(
-    seed: int, total: int, places: Tensor, device: torch.device, ranks: Ranks
+    seed: int, total: int, indices: Tensor, device: torch.device, ranks: Ranks
 ) -> Randomness:
     """Return a learner's random source: with several processes one stream a world."""
     if ranks.together:
-        return world_streams((seed,), total, places, device)
+        return world_streams((seed,), total, indices, device)
     return torch.Generator(device).manual_seed(seed)
 
 

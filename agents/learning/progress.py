@@ -404,9 +404,9 @@ class Progress:
         learner.resume(self._run.iteration, self._part)
 
 
-def annealed(rate: float, last_rate: float, share: float) -> float:
-    """Return a rate that falls along half a cosine, to `rate * last_rate` at share 1."""
-    wave = 0.5 * (1.0 + math.cos(math.pi * min(share, 1.0)))
+def annealed(rate: float, last_rate: float, fraction: float) -> float:
+    """Return a rate that falls along half a cosine, to `rate * last_rate` at fraction 1."""
+    wave = 0.5 * (1.0 + math.cos(math.pi * min(fraction, 1.0)))
     return rate * (last_rate + (1.0 - last_rate) * wave)
 
 

@@ -39,13 +39,13 @@ def write_elites(search: Search, folder: Path) -> Pictures:
     for elite in search.elites():
         path = folder / ELITES / f"{elite.name}.safetensors"
         measures = zip(search.axes, elite.found.measures, strict=True)
-        found = {"quality": elite.found.quality} | {axis.name: value for axis, value in measures}
+        result = {"quality": elite.found.quality} | {axis.name: value for axis, value in measures}
         world = {"particle_count": count, "update_prob": UPDATE_PROB, "seed_radius": SEED_RADIUS}
-        metadata = {"found": json.dumps(found), "world": json.dumps(world)}
+        metadata = {"found": json.dumps(result), "world": json.dumps(world)}
         with made_folder(path.parent):
             save_rule(search.candidates.rule_of(elite.solution), path, metadata=metadata)
-        trials = search.candidates.try_all(elite.solution[None])
-        x, s = trials.x[0, :1], trials.s[0, :1]
+        worlds = search.candidates.try_all(elite.solution[None]).worlds
+        x, s, *_ = worlds.map(lambda values: values[0, :1])
         (pictures[elite.cell],) = draw_worlds(
             x,
             s,
@@ -128,8 +128,8 @@ def figure(axes: Sequence[Axis], pictures: Pictures) -> bytes:
         if layer >= last.cells:
             panel.axis("off")
             continue
-        for (column, row, own), picture in pictures.items():
-            if own == layer:
+        for (column, row, cell_layer), picture in pictures.items():
+            if cell_layer == layer:
                 left, low = across.lowest + column * width, up.lowest + row * height
                 panel.imshow(picture, extent=(left, left + width, low, low + height), aspect="auto")
         panel.set(xlim=(across.lowest, across.highest), ylim=(up.lowest, up.highest))

@@ -18,7 +18,7 @@ import torch
 from npa_envs.agents.search.worlds import Axis, Candidates, Found, Numbers, SearchWorld
 from npa_envs.checks import is_whole
 from npa_envs.errors import MissingDependencyError, NPAError, shown, suggest
-from npa_envs.measure.record import Record, installed_version
+from npa_envs.measure.record import installed_version, read_record, write_record
 
 RESULTS = "search.json"
 """The file of a search's record, from which a stopped search continues."""
@@ -74,16 +74,16 @@ class RandomProposals:
         self._archive = archive
         self._batch_size = batch_size
         self._draws = np.random.default_rng(seed)
-        self._asked: Numbers = np.empty((0, archive.solution_dim))
+        self._last: Numbers = np.empty((0, archive.solution_dim))
 
     def ask(self) -> Numbers:
         """Return candidates, shape [K, W]."""
-        self._asked = drawn(self._draws, self._batch_size, self._archive.solution_dim)
-        return self._asked
+        self._last = drawn(self._draws, self._batch_size, self._archive.solution_dim)
+        return self._last
 
     def tell(self, objective: Numbers, measures: Numbers) -> None:
         """Add the last candidates to the archive."""
-        self._archive.add(self._asked, objective, measures)
+        self._archive.add(self._last, objective, measures)
 
 
 def drawn(draws: np.random.Generator, count: int, weight_count: int) -> Numbers:
@@ -147,12 +147,12 @@ draws independent candidates.
 
 
 def qualities_and_measures(
-    found: list[Found | None], axes: tuple[Axis, ...]
+    found: Sequence[Found | None], axes: Sequence[Axis]
 ) -> tuple[Numbers, Numbers]:
     """Return qualities [K] and descriptors [K, M], which are 0 for candidates without a result."""
     nothing = Found(0.0, (0.0,) * len(axes))
-    whole = [nothing if one is None else one for one in found]
-    return np.array([one.quality for one in whole]), np.array([one.measures for one in whole])
+    qualities, measures = zip(*(one or nothing for one in found), strict=True)
+    return np.array(qualities), np.array(measures)
 
 
 # The search.
@@ -190,31 +190,6 @@ class Elite(NamedTuple):
 Batch = dict[str, Any]
 """Candidates that were tried together, as in the record: "fingerprint", the CRC-32 of their
 weights, and "found", quality and descriptors of each, or None where nothing is alive."""
-
-
-class SearchRecord(Record[Batch]):
-    """The batches of a search, and how its archive grew."""
-
-    command = "search"
-
-    def __init__(self, facts: Mapping[str, Any], path: Path | None = None) -> None:
-        super().__init__(facts, path)
-        self.growth: list[Growth] = []
-        """The archive after each batch."""
-
-    def content(self) -> Mapping[str, Any]:
-        """Return the growth and the batches."""
-        return {"growth": self.growth, "batches": self.rows}
-
-    def parse(self, held: dict[str, Any]) -> list[Batch]:
-        """Return the batches of the file's JSON object."""
-        return [
-            {
-                "fingerprint": int(batch["fingerprint"]),
-                "found": [one and list(map(float, one)) for one in batch["found"]],
-            }
-            for batch in held["batches"]
-        ]
 
 
 class Search:
@@ -266,8 +241,10 @@ class Search:
             "axes": [list(axis) for axis in self.axes],
             "versions": {name: installed_version(name) for name in LIBRARIES},
         }
-        self._record = SearchRecord(self.facts, path)
-        self.growth = self._record.growth
+        self.growth: list[Growth] = []
+        """The archive after each batch."""
+        self._path = path
+        self._batches: list[Batch] = []
         self.archive = make_archive(self.candidates.weight_count, self.axes, seed)
         """The elites, a `ribs.archives.GridArchive`."""
         self._proposals = METHODS[method](self.archive, batch_size, seed)
@@ -276,7 +253,7 @@ class Search:
     @property
     def evaluations(self) -> int:
         """Candidates that have been tried."""
-        return sum(len(batch["found"]) for batch in self._record.rows)
+        return sum(len(batch["found"]) for batch in self._batches)
 
     @property
     def particle_steps(self) -> int:
@@ -301,45 +278,56 @@ class Search:
         while self.particle_steps + batch_cost <= budget and not enough():
             solutions = self._proposals.ask()
             found = self.candidates.try_all(solutions).found
-            results = [None if one is None else [one.quality, *one.measures] for one in found]
+            results = [one and [one.quality, *one.measures] for one in found]
             self._tell({"fingerprint": _fingerprint(solutions), "found": results})
             progress(len(found) * self.world.particle_steps)
-            self._record.write()
+            if self._path is not None:
+                content = {"facts": self.facts, "growth": self.growth, "batches": self._batches}
+                write_record(self._path, content)
 
     def elites(self) -> list[Elite]:
         """Return the elites, sorted by cell."""
-        held = self.archive.data(["index", "solution", "objective", "measures"])
-        cells = self.archive.int_to_grid_index(held["index"])
+        stored = self.archive.data(["index", "objective", "measures", "solution"])
+        index, *columns = stored.values()
+        cells = self.archive.int_to_grid_index(index)
         elites = [
-            Elite(
-                tuple(int(number) for number in cell),
-                Found(float(quality), tuple(float(value) for value in measures)),
-                np.asarray(solution),
-            )
-            for cell, quality, measures, solution in zip(
-                cells, held["objective"], held["measures"], held["solution"], strict=True
-            )
+            Elite(tuple(cell.tolist()), Found(float(quality), tuple(measures.tolist())), solution)
+            for cell, quality, measures, solution in zip(cells, *columns, strict=True)
         ]
         return sorted(elites, key=lambda elite: elite.cell)
 
     def _tell(self, batch: Batch) -> None:
-        found = [None if one is None else Found(one[0], tuple(one[1:])) for one in batch["found"]]
+        found = [one and Found(one[0], tuple(one[1:])) for one in batch["found"]]
         self._proposals.tell(*qualities_and_measures(found, self.axes))
-        self._record.rows.append(batch)
+        self._batches.append(batch)
         self.growth.append(growth_of(self.archive, self.evaluations))
 
     def _replay(self) -> None:
         """Repeat the proposals of the record, if there is one, with its results."""
-        held, self._record.rows = self._record.read().rows, []
-        for number, batch in enumerate(held):
-            asked = self._proposals.ask()
-            if _fingerprint(asked) != batch["fingerprint"] or len(asked) != len(batch["found"]):
+        if self._path is None:
+            return
+        stored = read_record(self._path, self.facts, batches_of, command="search")
+        for number, batch in enumerate(stored or []):
+            solutions = self._proposals.ask()
+            same = _fingerprint(solutions) == batch["fingerprint"]
+            if not same or len(solutions) != len(batch["found"]):
                 raise NPAError(
-                    f"{str(self._record.path)!r} must have the candidates that this search "
-                    f"proposes, but batch {number} differs (another machine?): remove it, or "
-                    "choose another folder with --out"
+                    f"{str(self._path)!r} must have the candidates that this search proposes, but "
+                    f"batch {number} differs (another machine?): remove it, or choose another "
+                    "folder with --out"
                 )
             self._tell(batch)
+
+
+def batches_of(content: Mapping[str, Any]) -> list[Batch]:
+    """Return the batches of a record's JSON object."""
+    return [
+        {
+            "fingerprint": int(batch["fingerprint"]),
+            "found": [one and list(map(float, one)) for one in batch["found"]],
+        }
+        for batch in content["batches"]
+    ]
 
 
 def growth_of(archive: Any, evaluations: int) -> Growth:

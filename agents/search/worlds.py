@@ -17,6 +17,7 @@ from npa_envs.agents.learning.evolution import RuleWeights, updates_of
 from npa_envs.checks import check_positive
 from npa_envs.errors import NPAError
 from npa_envs.tasks.seeds import uniform_ball
+from npa_envs.world.particles import Particles, combined
 
 SNAPSHOTS = 16
 """Times at which a world is measured, evenly spread; the later half counts."""
@@ -108,13 +109,11 @@ class Found(NamedTuple):
 
 
 class Trials(NamedTuple):
-    """Results of K candidates, None if worlds blew up or came to rest, and their last worlds,
-    [K, B, N, D] and [K, B, N, C].
-    """
+    """Results of K candidates, None if worlds diverged or came to rest, and their last worlds."""
 
     found: list[Found | None]
-    x: Tensor
-    s: Tensor
+    worlds: Particles
+    """Worlds of each candidate: positions [K, B, N, D] and so on."""
 
 
 class RuleStack(NPARule):
@@ -177,7 +176,7 @@ class Candidates:
         together = len(weights) if self.device.type == "cpu" else 1
         parts = [self._try(some) for some in torch.split(weights, together)]
         found = [one for part in parts for one in part.found]
-        return Trials(found, torch.cat([p.x for p in parts]), torch.cat([p.s for p in parts]))
+        return Trials(found, combined(torch.cat, [part.worlds for part in parts]))
 
     def _try(self, weights: Tensor) -> Trials:
         world, count = self.world, len(weights)
@@ -185,50 +184,47 @@ class Candidates:
         shape = random.world_count, world.particle_count, 2
         x = uniform_ball(*shape, SEED_RADIUS, generator=random, device=self.device)
         s = x.new_zeros(*x.shape[:2], world.state_dim)
-        every = world.steps // SNAPSHOTS
+        every, late = world.steps // SNAPSHOTS, SNAPSHOTS // 2
         options: dict[str, Any] = {"generator": random, "keep_every": every}
         options |= {"update_prob": UPDATE_PROB, "return_path_length": True}
-        xs, ss, path = rollout(RuleStack(self._rule, weights), x, s, world.steps, **options)
-        late = SNAPSHOTS // 2
+        x, s, path = rollout(RuleStack(self._rule, weights), x, s, world.steps, **options)
         travelled = (path[-1] - path[late - 1]).mean(dim=1) / ((SNAPSHOTS - late) * every)
-        late_x, late_s = (values[late:].unflatten(1, (count, -1)) for values in (xs, ss))
         speeds = travelled.view(count, -1).mean(dim=1) / world.eps
+        later = Particles(x, s).map(lambda values: values[late:].unflatten(1, (count, -1)))
         found: list[Found | None] = []
         for k in range(count):
-            own_x, own_s = late_x[:, k], late_s[:, k]
-            finite = bool(own_x.isfinite().all() and own_s.isfinite().all())
-            quality = float(quality_of(own_x, own_s)) if finite else 0.0
-            if quality <= 0.0:
+            own = later.map(lambda values, k=k: values[:, k])
+            quality = float(quality_of(own)) if all(v.isfinite().all() for v in own[:2]) else 0.0
+            if quality > 0.0:
+                crowding, mixing = self.crowding_and_mixing(own.map(lambda v: v.flatten(0, 1)))
+                found.append(Found(quality, (float(speeds[k]), crowding, mixing)))
+            else:
                 found.append(None)
-                continue
-            measures = self.crowding_and_mixing(own_x.flatten(0, 1), own_s.flatten(0, 1))
-            found.append(Found(quality, (float(speeds[k]), *measures)))
-        return Trials(found, late_x[-1], late_s[-1])
+        return Trials(found, later.map(lambda values: values[-1]))
 
-    def crowding_and_mixing(self, x: Tensor, s: Tensor) -> tuple[float, float]:
-        """Return two descriptors of worlds x [B, N, D], s [B, N, C]."""
-        world = self.world
-        colours = _colours(s)
-        fields = perception_fields(x, colours, eps=world.eps)
-        crowding = math.log(float(fields.rho.mean()) / self._alone) / math.log(world.particle_count)
+    def crowding_and_mixing(self, worlds: Particles) -> tuple[float, float]:
+        """Return two descriptors of worlds."""
+        colours = _colours(worlds)
+        fields = perception_fields(worlds.x, colours, eps=self.world.eps)
+        excess = math.log(float(fields.rho.mean()) / self._alone)
         mixing = 1.0 - correlation(colours, fields.blur)
-        return crowding, float(mixing.mean().clamp(0.0, 1.0))
+        return excess / math.log(self.world.particle_count), float(mixing.mean().clamp(0.0, 1.0))
 
 
-def _colours(s: Tensor) -> Tensor:
+def _colours(worlds: Particles) -> Tensor:
     """Return the visible colours minus 0.5, shape [..., 3]."""
-    return s[..., -3:].clamp(-0.5, 0.5)
+    return worlds.s[..., -3:].clamp(-0.5, 0.5)
 
 
-def quality_of(xs: Tensor, ss: Tensor) -> Tensor:
+def quality_of(worlds: Particles) -> Tensor:
     """Return bounded * alive of worlds [T, B, N, ·], in [0, 1], shape [].
 
     bounded = 1 / (1 + mean |s − clip(s, −1, 1)| + mean |x − clip(x, −1, 1)|), with the terms that
     training penalises. alive = twice the standard deviation over the T times of a particle's colour
     channels, averaged: 1 if each flickers between 0 and 1.
     """
-    excess = [(values - values.clamp(-1.0, 1.0)).abs().mean() for values in (xs, ss)]
-    alive = 2.0 * _colours(ss).std(dim=0, correction=0).mean()
+    excess = [(values - values.clamp(-1.0, 1.0)).abs().mean() for values in worlds[:2]]
+    alive = 2.0 * _colours(worlds).std(dim=0, correction=0).mean()
     return alive / (1.0 + excess[0] + excess[1])
 
 

@@ -1,6 +1,7 @@
 """Comparisons: runs are processes that may fail or stop, and tables say what they reached."""
 
 import dataclasses
+import itertools
 import json
 import math
 import os
@@ -27,7 +28,6 @@ from npa_envs.agents.comparison.report import (
     rows,
     text,
     write_strips,
-    write_table,
 )
 from npa_envs.agents.comparison.run import (
     PICTURE,
@@ -41,7 +41,6 @@ from npa_envs.agents.learning import METHODS, CurvePoint, Problem, RuleSet
 from npa_envs.cli import main
 from npa_envs.cli.compare import CompareOptions, make_plan
 from npa_envs.cli.compare import _jobs as jobs_of
-from npa_envs.errors import NPAError
 from npa_envs.processes import Places
 from npa_envs.render import write_png
 
@@ -153,30 +152,15 @@ def test_every_method_runs_on_every_task_from_every_seed_in_every_budget():
 
 def test_parts_share_all_runs_and_leave_those_of_a_seed_and_task_together():
     made = plan(tasks={"a": {}, "b": {}}, methods=["gradient", "clone"], seeds=(0, 1, 2))
+    clone, gradient = (Job("seconds", "a", method, 0) for method in ("clone", "gradient"))
+    assert (made.teacher(clone), made.teacher(gradient)) == (gradient, None)
+    assert plan(options={"clone": {"teacher": "heart"}}).teacher(clone) is None
     parts = [made.part(f"{number}/4") for number in (1, 2, 3, 4)]
     assert sorted(str(job) for part in parts for job in part) == sorted(map(str, made.jobs()))
     assert [len(part) for part in parts] == [4, 4, 2, 2]
     for part in parts:
         assert all(made.teacher(job) in part for job in part if job.method == "clone")
     assert made.part(None) == made.part("1/1") == made.jobs()
-
-
-def test_a_clone_learns_from_the_gradient_of_its_seed_unless_options_name_a_teacher():
-    made = plan(methods=["clone", "gradient"])
-    clone, gradient = made.jobs()[:2]
-    assert (made.teacher(clone), made.teacher(gradient)) == (gradient, None)
-    told = plan(methods=["clone"], options={"clone": {"teacher": "heart"}})
-    assert told.teacher(clone) is None
-
-
-@pytest.mark.parametrize("name", PROBLEMS)
-@pytest.mark.parametrize("quick", [True, False])
-def test_a_task_of_the_comparison_survives_json(name, quick):
-    problem = make_problem(name, quick=quick)
-    again = Problem.from_json(json.dumps(json.loads(problem.to_json())))
-    assert again == problem
-    assert (problem.particle_count == 64) == quick
-    assert RuleSet.new(problem, 0).interface.state_scale == 0.1
 
 
 def test_the_command_line_becomes_a_plan():
@@ -195,6 +179,29 @@ def test_the_command_line_becomes_a_plan():
     asked = make_plan(CompareOptions(seconds=2.0, methods=("zero", "clone")))
     assert list(asked.methods) == ["clone", "zero"]
     assert not asked.left_out
+    quick = make_plan(CompareOptions(quick=True))
+    assert (list(quick.tasks), quick.seeds) == (["morphogenesis2d"], (0,))
+    assert set(quick.methods) == {"gradient", "evolution", "zero"}
+    quick = make_plan(CompareOptions(quick=True, tasks=("mixing",), seeds=2))
+    assert (list(quick.tasks), quick.seeds) == (["mixing"], (0, 1))
+    for name, quick in itertools.product(PROBLEMS, (True, False)):
+        problem = make_problem(name, quick=quick)
+        assert Problem.from_json(json.dumps(json.loads(problem.to_json()))) == problem
+        assert (problem.particle_count == 64) == quick
+        assert problem.interface.state_scale == 0.1
+
+
+def test_every_device_has_a_run_and_none_more_than_another_where_times_are_compared():
+    devices = ("cpu", "cpu")
+    for options, counts in (
+        ({"seconds": 1.0}, (2, 1)),
+        ({"seconds": 1.0, "jobs": 4}, (4, 2)),
+        ({"particle_steps": 1e6, "jobs": 3}, (3, 2)),
+    ):
+        given = CompareOptions(methods=("zero",), devices=devices, **options)
+        assert (jobs_of(given), make_plan(given).settings["runs_at_once"]) == counts
+    uneven = CompareOptions(seconds=1.0, devices=devices, jobs=3)
+    refused(r"multiple of the number of devices, 2.*give --jobs 4", jobs_of, uneven)
 
 
 def test_a_record_comes_back_as_it_was_written_but_for_what_is_not_finite(tmp_path):
@@ -214,6 +221,11 @@ def test_a_record_comes_back_as_it_was_written_but_for_what_is_not_finite(tmp_pa
 def test_runs_are_spread_over_devices_and_leave_their_records(tmp_path, child):
     child("Path(folder / 'place.txt').write_text(device)")
     made = plan(seeds=(0, 1, 2))
+    # What a killed comparison left half way is swept away.
+    half = tmp_path / made.jobs()[0].folder.parent / ".seed-0.1234"
+    half.mkdir(parents=True)
+    (half / "run.json").write_text("{", encoding="utf-8")
+    assert held_records(made, tmp_path) == {}
     seen = ran(made, tmp_path, "cpu", "other", jobs=2, command="it")
     assert sorted(map(str, made.jobs())) == sorted(str(one.job) for one in seen)
     found = held_records(made, tmp_path)
@@ -378,18 +390,6 @@ def test_an_interrupted_comparison_ends_its_processes_and_goes_on_where_it_was(
     assert not list(tmp_path.rglob(".seed*"))
 
 
-def test_what_a_killed_comparison_left_half_way_is_swept_away(tmp_path, child):
-    made = plan(methods=["one"], seeds=(0,))
-    (job,) = made.jobs()
-    left = tmp_path / job.folder.parent / ".seed-0.1234"
-    left.mkdir(parents=True)
-    (left / "run.json").write_text("{", encoding="utf-8")
-    assert held_records(made, tmp_path) == {}
-    run_jobs(made, [job], tmp_path, Places(("cpu",)))
-    assert not left.exists()
-    assert list(held_records(made, tmp_path)) == [job]
-
-
 @pytest.mark.parametrize("device", ["cpu", "cuda"])
 def test_no_run_begins_once_the_time_is_over_and_who_waits_leaves_nothing(
     tmp_path, monkeypatch, child, device
@@ -425,17 +425,6 @@ def test_the_process_of_a_run_ends_with_the_comparison(tmp_path, told):
 
 
 # Tables
-
-
-def test_a_fraction_counts_from_nothing_to_the_gradient():
-    nothing, gradient = Estimate(0.5, 0.0), Estimate(2.5, 0.2)
-    half = fraction(Estimate(1.5, 0.1), nothing, gradient)
-    assert half == Estimate(0.5, pytest.approx(math.hypot(0.1, 0.5 * 0.2) / 2.0))
-    assert fraction(Estimate(0.0, 0.1), nothing, gradient).mean == -0.25
-    assert fraction(Estimate(4.5, 0.1), nothing, gradient).mean == 2.0
-    # No share of an improvement that there is not.
-    assert math.isnan(fraction(half, nothing, Estimate(0.5, 0.1)).mean)
-    assert math.isnan(fraction(half, nothing, Estimate(math.nan, 0.1)).mean)
 
 
 def synthetic() -> list[RunRecord]:
@@ -486,6 +475,10 @@ def test_a_table_has_the_right_numbers_the_best_first_and_leaves_no_method_out()
     ppo = next(row for row in rows(synthetic()) if row.method == "ppo")
     assert ppo.fraction == Estimate(0.5, pytest.approx(math.hypot(1.0, 0.5 * 0.5) / 3.0))
     assert ppo.episodes_diverged == pytest.approx(2 / 6)
+    # No fraction of an improvement that there is not.
+    nothing = Estimate(0.5, 0.0)
+    for yardstick in (Estimate(0.5, 0.1), Estimate(math.nan, 0.1)):
+        assert math.isnan(fraction(Estimate(1.5, 0.1), nothing, yardstick).mean)
 
 
 def test_curves_have_a_line_for_each_point_of_each_run():
@@ -497,32 +490,6 @@ def test_curves_have_a_line_for_each_point_of_each_run():
         "seconds,growth,evolution,1,diverged,0.5,50,1,0,0",
         "seconds,growth,evolution,1,diverged,2,200,nan,0,nan",
     ]
-
-
-@pytest.mark.parametrize(
-    ("budgets", "at_once", "said"),
-    [({"seconds": {}}, 3, True), ({"seconds": {}}, 1, False), ({"particle-steps": {}}, 3, False)],
-)
-def test_a_table_says_where_equal_wall_time_was_shared(budgets, at_once, said, tmp_path):
-    made = plan(budgets=budgets, settings={"runs_at_once": at_once})
-    told = write_table(made, synthetic(), tmp_path, "it")
-    assert ("Up to 3 runs at once shared a device" in told) == said
-    assert told in (tmp_path / "comparison.md").read_text("utf-8")
-
-
-def test_every_device_has_a_run_and_none_more_than_another_where_times_are_compared():
-    def scheduled(**changes):
-        """Return how many runs there are at once, and how many of them on a device."""
-        options = CompareOptions(methods=("zero",), **changes)
-        at_once = make_plan(options).settings["runs_at_once"]
-        return jobs_of(options), at_once
-
-    devices = ("cpu", "cpu")
-    assert scheduled(seconds=1.0, devices=devices) == (2, 1)
-    assert scheduled(seconds=1.0, devices=devices, jobs=4) == (4, 2)
-    assert scheduled(particle_steps=1e6, devices=devices, jobs=3) == (3, 2)
-    with pytest.raises(NPAError, match=r"multiple of the number of devices, 2.*give --jobs 4"):
-        scheduled(seconds=1.0, devices=devices, jobs=3)
 
 
 # Pictures
@@ -551,22 +518,23 @@ def test_a_curve_is_the_mean_of_seeds_where_all_of_them_are():
 def test_a_picture_shows_the_end_of_the_episode_and_not_the_next_start(name, device):
     problem, place = make_problem(name, quick=True), str(device)
     still = ZeroPolicy(problem.make_envs(1, device=device))
-    shown = final_picture(problem, still, 3, device=place)
-    assert shown.shape == (SIZE, SIZE, 3)
-    # Nobody moves: the end is the start, of this episode and of no other.
+    start = final_picture(problem, still, 3, device=place)
+    assert start.shape == (SIZE, SIZE, 3)
+    # Nothing moves: the end is the start, of this episode and of no other.
     shorter = dataclasses.replace(problem, episode_steps=1)
-    assert np.array_equal(shown, final_picture(shorter, still, 3, device=place))
-    assert not np.array_equal(shown, final_picture(problem, still, 4, device=place))
-    first, again = (RandomPolicy(problem.make_envs(1, device=device)) for _ in range(2))
+    assert np.array_equal(start, final_picture(shorter, still, 3, device=place))
+    assert not np.array_equal(start, final_picture(problem, still, 4, device=place))
+    policy, again = (RandomPolicy(problem.make_envs(1, device=device)) for _ in range(2))
     keywords = {**problem.keywords, "render_mode": "rgb_array", "render_size": SIZE}
-    longer = dataclasses.replace(problem, keywords=keywords, episode_steps=99)
-    envs = longer.make_envs(1, device=device)
+    envs = dataclasses.replace(problem, keywords=keywords, episode_steps=99).make_envs(
+        1, device=device
+    )
     observation, _ = envs.reset(seed=[3])
     for _ in range(problem.episode_steps):
-        observation, *_ = envs.step(first(observation))
+        observation, *_ = envs.step(policy(observation))
     (last,) = envs.render()
     assert np.array_equal(last, final_picture(problem, again, 3, device=place))
-    assert not np.array_equal(last, shown)
+    assert not np.array_equal(last, start)
 
 
 def test_a_strip_has_a_column_for_each_method_and_room_for_what_failed(tmp_path):
@@ -594,14 +562,6 @@ def quick_words(methods: str, particle_steps: int, options: str) -> list[str]:
         f"compare --quick --tasks morphogenesis2d --seeds 1 --no-progress --methods {methods} "
         f"--particle-steps {particle_steps} --options evolution.{options}"
     ).split()
-
-
-def test_a_quick_comparison_is_of_one_task_and_seed_unless_told_otherwise():
-    plan = make_plan(CompareOptions(quick=True))
-    assert (list(plan.tasks), plan.seeds) == (["morphogenesis2d"], (0,))
-    assert set(plan.methods) == {"gradient", "evolution", "zero"}
-    plan = make_plan(CompareOptions(quick=True, tasks=("mixing",), seeds=2))
-    assert (list(plan.tasks), plan.seeds) == (["mixing"], (0, 1))
 
 
 def test_a_quick_comparison_stops_goes_on_and_refuses_other_settings(tmp_path, capsys):

@@ -18,7 +18,7 @@ from npa_envs.agents.gardening import (
     ScriptedShepherd,
     StillGardener,
 )
-from npa_envs.agents.learning import GARDEN_METHODS, Budget, Problem, methods_for, train
+from npa_envs.agents.learning import Budget, Problem, train
 
 GARDENER, SHEPHERD = "npa/Gardener2DSmall-v0", "npa/Shepherd2DSmall-v0"
 QUICK = {"seed_pool": 2, "grow_steps": 128}
@@ -28,16 +28,6 @@ def make_vec(name, world_count, **keywords):
     return gymnasium.make_vec(
         name, world_count, vectorization_mode="vector_entry_point", **(QUICK | keywords)
     )
-
-
-def earned(envs, policy, steps):
-    """Mean reward of a step."""
-    seen, _ = envs.reset(seed=0)
-    total = 0.0
-    for _ in range(steps):
-        seen, rewards, *_ = envs.step(policy(seen))
-        total += float(np.mean(rewards)) / steps
-    return total
 
 
 @pytest.mark.parametrize(
@@ -50,9 +40,10 @@ def earned(envs, policy, steps):
     ],
 )
 def test_scripts_do_better_than_nobody_and_nobody_than_chance(name, make, keywords):
-    envs = make_vec(name, 2, rule_steps=4, **keywords)
+    envs = make_vec(name, 2, rule_steps=4, max_episode_steps=12, **keywords)
     still, chance, scripted = (
-        earned(envs, policy(envs), 12) for policy in (StillGardener, RandomGardener, make)
+        evaluate_policy(envs, policy(envs), [0, 1]).mean_return / 12
+        for policy in (StillGardener, RandomGardener, make)
     )
     assert scripted > still + 0.1
     assert still > chance
@@ -92,29 +83,10 @@ def test_a_plan_by_the_gradient_is_worth_more_than_the_script_that_it_begins_wit
         envs.step(np.zeros(envs.action_space.shape, np.float32))
     planner, script = GradientGardener(envs, horizon=1, iterations=8), ScriptedGardener(envs)
     planned, scripted = (
-        planner.planned_rewards(policy.act(2)[None], npa_envs.WorldRandom([7, 8])).detach()
+        planner.planned_rewards(policy.act()[None], npa_envs.WorldRandom([7, 8])).detach()
         for policy in (planner, script)
     )
     assert bool((planned > scripted).all())
-
-
-@pytest.mark.slow
-def test_ppo_learns_to_garden_as_it_comes():
-    sb3 = pytest.importorskip("stable_baselines3")
-    model = sb3.PPO("MlpPolicy", gymnasium.make(GARDENER), gamma=0.9, seed=0, device="cpu")
-    model.learn(12_000)
-    envs = gymnasium.make_vec(GARDENER, 8)
-
-    def learned(seen):
-        return model.predict(seen, deterministic=True)[0]
-
-    episodes = [
-        evaluate_policy(envs, policy, seeds=range(1000, 1008))
-        for policy in (StillGardener(envs), learned)
-    ]
-    still, taught = (np.asarray(one.returns) / 32 for one in episodes)
-    error = np.std(taught - still, ddof=1) / np.sqrt(len(still))
-    assert np.mean(taught - still) > max(0.3, 3.0 * error)
 
 
 # Behind the interface of learners
@@ -138,26 +110,20 @@ def learned(method, problem, budget=1, seed=0, **options):
     )
 
 
-def test_a_problem_has_the_settings_that_its_id_is_registered_with():
-    problem = garden()
-    assert methods_for(problem) is GARDEN_METHODS
-    assert problem.config.tools == ("push",)
-    assert problem.make_envs().config == replace(problem.config, output="torch")
-
-
 @pytest.mark.parametrize("name", ["Gardener2DSmall", "Shepherd2DSmall"])
 def test_gardeners_that_learn_nothing_act_in_the_worlds_that_they_are_asked_about(name):
-    problem, found = garden(name), {}
+    problem, pushes = garden(name), {}
+    assert problem.make_envs().config == replace(problem.config, output="torch")
     for method in ("zero", "random", "scripted"):
         trained = learned(method, problem)
         assert (trained.rules, len(trained.log), trained.log[0].particle_steps) == (None, 1, 0)
         envs = problem.make_envs()
         again = evaluate_policy(envs, trained.policy, SEEDS)
         assert again.mean_return == trained.log[0].mean_return
-        found[method] = policy_in(envs, trained.policy)(envs.reset(seed=0)[0]).abs().sum()
-    assert found["zero"] == 0.0
-    assert found["random"] > 0.0
-    assert found["scripted"] > 0.0
+        pushes[method] = policy_in(envs, trained.policy)(envs.reset(seed=0)[0]).abs().sum()
+    assert pushes["zero"] == 0.0
+    assert min(pushes["random"], pushes["scripted"]) > 0.0
+    refused("reads the worlds: call made_for", trained.policy, None)
 
 
 @pytest.mark.parametrize("method", ["sac", "ppo_world"])
@@ -165,7 +131,9 @@ def test_gardeners_that_learn_nothing_act_in_the_worlds_that_they_are_asked_abou
 def test_algorithms_as_they_come_learn_within_their_budget_and_can_be_loaded(
     name, method, tmp_path
 ):
-    baselines = pytest.importorskip("stable_baselines3")
+    pytest.importorskip("stable_baselines3")
+    from npa_envs.agents.learning.sb3 import GardenPolicy
+
     problem = garden(name)
     options = {"learning_starts": 2} if method == "sac" else {"steps": 2, "batch_size": 4}
     trained = learned(method, problem, 6 * STEP, **options)
@@ -174,24 +142,10 @@ def test_algorithms_as_they_come_learn_within_their_budget_and_can_be_loaded(
     action = trained.policy(observation)
     assert action.shape == (2, *problem.make_envs().single_action_space.shape)
     (path,) = trained.save(tmp_path)
-    kind = baselines.SAC if method == "sac" else baselines.PPO
-    trained.policy.model = kind.load(path)
-    assert np.array_equal(trained.policy(observation), action)
-
-
-def test_a_policy_of_another_garden_or_a_file_of_something_else_is_refused(tmp_path):
-    pytest.importorskip("stable_baselines3")
-    from npa_envs.agents.learning.sb3 import GardenPolicy
-
-    problem = garden()
-    (path,) = learned("sac", problem, 1, learning_starts=2).save(tmp_path)
-    seen, _ = problem.make_envs().reset(seed=0)
-    assert GardenPolicy.load(path)(seen).shape[0] == 2
-    seen, _ = garden("Shepherd2DSmall").make_envs().reset(seed=0)
-    refused("of the garden that the policy was trained in", GardenPolicy.load(path), seen)
+    loaded = GardenPolicy.load(path)
+    assert np.array_equal(loaded(observation), action)
+    (other,) = {"Gardener2DSmall", "Shepherd2DSmall"} - {name}
+    observation, _ = garden(other).make_envs().reset(seed=0)
+    refused("of the garden that the policy was trained in", loaded, observation)
     path.write_text("no archive", encoding="utf-8")
-    refused(r"path must be of a file that sac's `save` wrote, got", GardenPolicy.load, path)
-
-
-def test_a_policy_that_learned_nothing_looks_at_worlds():
-    refused("reads the worlds: call made_for", learned("zero", garden()).policy, None)
+    refused("path must be of a file that .*'s `save` wrote, got", GardenPolicy.load, path)

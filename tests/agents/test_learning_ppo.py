@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 import torch.distributed as dist
-from learning_problems import heart
+from learning_problems import heart, wild_rules
 
 from npa_envs.agents import RandomPolicy, evaluate_policy
 from npa_envs.agents.learning import Budget, Problem, RuleSet, ppo, train
@@ -82,33 +82,12 @@ def test_every_form_learns_to_grow_and_colour_particles(form):
         )
 
 
-@pytest.mark.slow
-def test_more_steps_bring_a_return_of_more_than_half_of_what_the_gradient_finds():
-    keywords = dict(HEART.keywords) | {"seed_radius": 0.4, "resolution": 64}
-    longer = replace(HEART, keywords=keywords, episode_steps=32, num_envs=16)
-    trained = train("ppo", longer, Budget(particle_steps=1_500_000), 0, entries=1)
-    assert trained.log[-1].mean_return > 1.2
-
-
 @EVERY_FORM
 def test_every_form_trains_a_rule_for_each_species(form):
     trained = run(form, MIXING, 2 * 16 * 4 * 32)
     for rule in trained.rules:
         assert torch.isfinite(rule.output.weight).all()
         assert rule.output.weight.abs().max() > 0.0
-
-
-def test_what_the_device_s_ppo_exports_is_the_mean_that_it_explores_around(tmp_path):
-    given = learner(MIXING)
-    batch = given.play()
-    given.improve(1.0)
-    given.actor.rules.save(tmp_path)
-    read = RuleSet.load(tmp_path, MIXING)
-    seen = batch.observations[:4]
-    with torch.no_grad():
-        given.actor.log_std.fill_(-30.0)
-        drawn, _ = given.actor.sample(seen)
-        torch.testing.assert_close(read.mean(seen), drawn, rtol=0.0, atol=1e-6)
 
 
 def test_advantages_are_the_sums_of_the_definition_within_episodes():
@@ -173,49 +152,30 @@ def test_likelihoods_are_those_of_gaussians_and_a_world_s_is_their_mean():
     torch.testing.assert_close(world, by_hand.sum(dim=1, keepdim=True) / 32.0)
 
 
-@pytest.fixture
-def world_policy():
-    """Makes the policy of Stable-Baselines3's form, and what its worlds show at first."""
+@pytest.mark.parametrize("problem", [HEART, MIXING], ids=["heart", "mixing"])
+def test_a_world_s_policy_in_stable_baselines_acts_by_its_rules_and_means_over_particles(problem):
     pytest.importorskip("stable_baselines3")
-    from npa_envs.agents.learning.sb3 import WorldRulePolicy
+    from npa_envs.agents.learning.sb3 import KL_FACTOR, WorldRulePolicy, world_kl
     from npa_envs.wrappers import WorldVecEnv
 
-    def make(problem, rules):
-        worlds = WorldVecEnv(problem.make_envs())
-        worlds.seed(3)
-        spaces = (worlds.observation_space, worlds.action_space)
-        return WorldRulePolicy(*spaces, lambda _: 1e-3, rules=rules), worlds.reset()
-
-    return make
-
-
-@pytest.mark.parametrize("problem", [HEART, MIXING], ids=["heart", "mixing"])
-def test_the_deterministic_policy_of_stable_baselines_is_the_exported_rules(problem, world_policy):
-    rules = problem.new_rules(1)
-    with torch.no_grad():
-        for rule in rules:
-            rule.output.weight.mul_(20.0)
-    policy, seen = world_policy(problem, rules)
-    wanted = rules.policy()(seen)
+    rules = wild_rules(problem, factor=20.0)
+    worlds = WorldVecEnv(problem.make_envs())
+    worlds.seed(3)
+    spaces = (worlds.observation_space, worlds.action_space)
+    policy, observation = WorldRulePolicy(*spaces, lambda _: 1e-3, rules=rules), worlds.reset()
+    wanted = rules.policy()(observation)
     assert np.abs(wanted).max() > 0.1
-    np.testing.assert_allclose(policy.predict(seen, deterministic=True)[0], wanted, atol=1e-6)
-
-
-def test_a_world_s_policy_in_stable_baselines_means_over_particles(world_policy):
-    policy, seen = world_policy(HEART, HEART.new_rules(0))
-    seen = torch.from_numpy(seen)
-    action, value, told = policy(seen)
-    normal = torch.distributions.Normal(policy.actor.rules.mean(seen), policy.actor.log_std.exp())
-    torch.testing.assert_close(told, normal.log_prob(action).sum(dim=-1).mean(dim=-1))
-    values, log_prob, _ = policy.evaluate_actions(seen, action.flatten(1))
-    assert value.shape == values.shape == (8, 1)
-    torch.testing.assert_close(log_prob, told)
-
-
-def test_stable_baselines_ends_a_round_at_the_divergence_of_particles():
-    pytest.importorskip("stable_baselines3")
-    from npa_envs.agents.learning.sb3 import KL_FACTOR, world_kl
-
+    np.testing.assert_allclose(
+        policy.predict(observation, deterministic=True)[0], wanted, atol=1e-6
+    )
+    observation = torch.from_numpy(observation)
+    action, value, log_prob = policy(observation)
+    deviation = policy.actor.row_log_std().exp()
+    normal = torch.distributions.Normal(policy.actor.rules.mean(observation), deviation)
+    torch.testing.assert_close(log_prob, normal.log_prob(action).sum(dim=-1).mean(dim=-1))
+    values, again, _ = policy.evaluate_actions(observation, action.flatten(1))
+    assert value.shape == values.shape == (problem.num_envs, 1)
+    torch.testing.assert_close(again, log_prob)
     # A world's log-ratio is close to minus the divergence of its particles.
     assert KL_FACTOR * world_kl(0.02) == pytest.approx(math.expm1(-0.02) + 0.02, rel=0.01)
 
@@ -401,15 +361,10 @@ def test_fine_tuning_does_not_undo_what_rules_can_do(form, taught):
     first, last = run(form, HEART, 6 * ROUND, start=taught).log
     assert first.mean_return > 0.5
     assert last.mean_return > first.mean_return - 3.0 * first.standard_error
-    # They were copied.
+    # They were copied, and stay as they are in the first rounds, in which the critic learns alone.
     assert all(map(torch.equal, taught.parameters(), given))
-
-
-def test_a_critic_that_learns_alone_leaves_the_rules_as_they_are():
-    start = HEART.new_rules(5)
-    for form in ("device", "Stable-Baselines3"):
-        trained = run(form, HEART, 2 * ROUND // 4, start=start, steps=4)
-        assert all(map(torch.equal, trained.rules.parameters(), start.parameters()))
+    rules = run(form, HEART, 2 * ROUND // 4, start=taught, steps=4).rules
+    assert all(map(torch.equal, rules.parameters(), given))
 
 
 @pytest.mark.parametrize(("decay_share", "kept"), [(0.5, 4), (0.25, 6)])

@@ -111,47 +111,39 @@ ROUND = {"ppo": 3 * 4 * 48, "shac": 2 * 4 * 48}
 def kept(method, out, rounds, **given):
     """Learn for some rounds; what is learned, and the particle-steps of the curve's entries."""
     budget, given = Budget(particle_steps=rounds * ROUND[method]), METHODS[method] | given
-    given |= {"evaluation_seeds": range(500, 502), "entries": 2, "out": out}
+    given = {"evaluation_seeds": range(500, 502), "entries": 2, "out": out} | given
     trained = train(method, HEART, budget, 0, **given)
     weights = [weight.flatten().tolist() for weight in trained.rules.parameters()]
     return weights, [entry.particle_steps // ROUND[method] for entry in trained.log]
 
 
-def begun_by_two(method, folder):
-    """Let two processes learn for four rounds; what they have learned."""
-    begun = on_ranks(2, lambda: kept(method, folder / "run", 4), folder)
-    assert begun[0] == begun[1]
-    assert begun[0][1] == [0, 2, 4]
-    return begun[0][0]
-
-
-def test_a_run_that_two_processes_have_begun_goes_on_alone(tmp_path):
-    before = begun_by_two("shac", tmp_path)
-    files = sorted(path.name for path in (tmp_path / "run").iterdir())
-    assert files == [".lock", "checkpoint.pt", "log.jsonl", "rule-0.safetensors"]
-    weights, steps = kept("shac", tmp_path / "run", 8, resume=True)
-    # It has gone on from where it was, with the entries that there were.
-    assert steps == [0, 2, 4, 8]
-    assert weights != before
-    lines = (tmp_path / "run" / "log.jsonl").read_text(encoding="utf-8").splitlines()
-    assert [json.loads(line)["particle_steps"] // ROUND["shac"] for line in lines] == steps
-    rule = load_rule(tmp_path / "run" / "rule-0.safetensors")
-    assert [weight.flatten().tolist() for weight in rule.parameters()] == weights
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("method", METHODS)
-def test_a_run_goes_on_alike_with_any_number_of_processes(method, tmp_path):
-    begun_by_two(method, tmp_path)
+@pytest.mark.parametrize(
+    "method", [pytest.param("ppo", marks=pytest.mark.slow), "shac"], ids=["ppo", "shac"]
+)
+def test_a_run_of_two_processes_goes_on_alike_with_any_number_of_processes(method, tmp_path):
+    run = tmp_path / "run"
+    one, other = on_ranks(2, lambda: kept(method, run, 4), tmp_path)
+    assert one == other
+    assert one[1] == [0, 2, 4]
+    assert sorted(path.name for path in run.iterdir()) == [
+        ".lock", "checkpoint.pt", "log.jsonl", "rule-0.safetensors"
+    ]  # fmt: skip
     ends = []
     for count in (1, 2):
-        copy = shutil.copytree(tmp_path / "run", tmp_path / str(count))
+        copy = shutil.copytree(run, tmp_path / str(count))
         ends += on_ranks(count, lambda out=copy: kept(method, out, 8, resume=True), tmp_path)
-    (one, steps), (two, _), _ = ends
-    assert steps == [0, 2, 4, 8]
     # Within what float32 makes of sums in another order.
-    for ours, theirs in zip(two, one, strict=True):
+    for ours, theirs in zip(ends[1][0], ends[0][0], strict=True):
         assert ours == pytest.approx(theirs, rel=1e-3, abs=1e-5)
+    # A process that has no others draws otherwise.
+    weights, steps = kept(method, run, 8, resume=True)
+    # It has gone on from where it was, with the entries that there were.
+    assert steps == [0, 2, 4, 8]
+    assert weights != one[0]
+    lines = (run / "log.jsonl").read_text(encoding="utf-8").splitlines()
+    assert [json.loads(line)["particle_steps"] // ROUND[method] for line in lines] == steps
+    rule = load_rule(run / "rule-0.safetensors")
+    assert [weight.flatten().tolist() for weight in rule.parameters()] == weights
 
 
 def test_a_run_that_is_asked_to_stop_can_be_resumed(tmp_path, monkeypatch):
@@ -210,15 +202,11 @@ def test_a_folder_with_another_run_is_refused(method, given, message, finished):
 
 
 def test_a_run_goes_on_with_rules_to_begin_with_if_it_began_with_some(tmp_path):
-    start = train("ppo", HEART, Budget(particle_steps=1), 1, **METHODS["ppo"]).rules
-    kept("ppo", tmp_path, 1, start=start)
+    start = HEART.new_rules(3)
+    # Seeds of evaluations are read once.
+    kept("ppo", tmp_path, 1, start=start, evaluation_seeds=iter([500, 501]))
     refused("differs in started", kept, "ppo", tmp_path, 2, resume=True)
     kept("ppo", tmp_path, 2, resume=True, start=start)
-
-
-def test_seeds_of_evaluations_are_asked_for_once(tmp_path):
-    given = METHODS["ppo"] | {"evaluation_seeds": iter(range(500, 502)), "entries": 2}
-    train("ppo", HEART, Budget(particle_steps=ROUND["ppo"]), 0, out=tmp_path, **given)
 
 
 def test_a_checkpoint_that_was_changed_is_refused(finished):
@@ -229,15 +217,6 @@ def test_a_checkpoint_that_was_changed_is_refused(finished):
     for change in (*spoilt, {"modules": modules}):
         save_checkpoint(finished / "checkpoint.pt", content | change)
         refused("must hold all that a run needs", kept, "ppo", finished, 2, resume=True)
-
-
-def test_what_a_killed_run_left_half_written_is_removed_by_the_next_start(finished):
-    half = finished / ".checkpoint.0123456789ab.tmp.pt"
-    mine = finished / ".film.0123456789ab.tmp.mp4"
-    for path in (half, mine):
-        path.write_bytes(b"half")
-    kept("ppo", finished, 2, resume=True)
-    assert (half.exists(), mine.exists()) == (False, True)
 
 
 def test_what_cannot_be_shared_is_refused(tmp_path):

@@ -8,20 +8,7 @@ import numpy as np
 import pytest
 from refusals import refused
 
-from npa_envs.agents.comparison import npa_bench
-from npa_envs.agents.comparison.npa_bench import (
-    SUITES,
-    BenchRow,
-    BenchRun,
-    check_rows,
-    normalised,
-    read_row,
-    read_rows,
-    score,
-    scores_in,
-    write_rows,
-)
-from npa_envs.agents.comparison.plan import Job
+from npa_envs.agents.comparison.npa_bench import SUITES, check_rows, write_rows
 from npa_envs.agents.comparison.run import RunRecord
 from npa_envs.agents.learning import CurvePoint, methods_for
 from npa_envs.cli import main
@@ -31,8 +18,17 @@ from npa_envs.registration import SIZES, SPECIES_SIZES
 
 pytest.importorskip("jsonschema")
 pytest.importorskip("scipy")
+from npa_bench_rows import (
+    BenchRow,
+    BenchRun,
+    normalised,
+    read_row,
+    read_rows,
+    score,
+    scores_in,
+)
 
-SUITE = SUITES["npa-bench-v0"]
+SUITE, SMALL_SUITE = SUITES["npa-bench-v0"], SUITES["npa-bench-small-v0"]
 FIRST = next(iter(SUITE.budgets))
 
 
@@ -90,6 +86,13 @@ def test_a_suite_is_every_method_on_all_that_it_can_learn_within_the_frozen_budg
         assert ("sac" in ran) == (problem.actor == "brushes")
 
 
+def test_the_small_suite_is_all_small_worlds_that_rules_act_in():
+    small = {row.id for row in (*SIZES, *SPECIES_SIZES) if "Small" in row.id}
+    # The yardstick is a gradient, and where one side pays for the other there is none.
+    small.remove("npa/InvasionSmall-v0")
+    assert set(SMALL_SUITE.budgets) == small
+
+
 # Rows
 
 
@@ -104,46 +107,28 @@ def test_rows_come_back_from_their_files(tmp_path):
     assert rows["zero"].runs[0].curve == ((0.0, -1.0), (1000.0, 0.5))
     held = json.loads(first.read_text(encoding="utf-8"))
     assert (held["commit"], held["command"], held["date"]) == ("c0ffee", "it", "2026-01-02")
+    (tmp_path / "again.json").write_bytes(second.read_bytes())
+    refused("second row of 'zero'", read_rows, SUITE, tmp_path)
 
 
-@pytest.fixture
-def _still(tmp_path, monkeypatch):
-    """A method of one's own, in a module of the current folder."""
+def test_a_row_of_ones_own_says_what_was_run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "still.py").write_text(
-        "def train(progress, *, patience=1):\n"
-        "    rules = progress.first_rules()\n"
-        "    progress.start(rules)\n"
-        "    return rules\n",
-        encoding="utf-8",
-    )
-
-
-@pytest.mark.usefixtures("_still")
-def test_a_row_of_ones_own_says_what_was_run(tmp_path):
-    small = SUITES["npa-bench-small-v0"]
+    code = "def train(progress, *, patience=1): progress.start(progress.first_rules())"
+    (tmp_path / "still.py").write_text(code, encoding="utf-8")
     made = plan_of(
-        small.name,
+        SMALL_SUITE.name,
         methods=("zero", "still=still:train", "bold=ppo"),
         options=("bold.credit=marginal", "still.patience=2"),
         tasks=("MixingSmall-v0",),
     )
     assert made.methods == ["zero", "still", "bold"]
     assert {made.facts(job)["method"] for job in made.jobs()} == {"zero", "still:train", "ppo"}
-    write_rows(small, made, records(made), tmp_path, "it")
-    assert read_rows(small, tmp_path)["still"].about == "still:train"
+    write_rows(SMALL_SUITE, made, records(made), tmp_path, "it")
+    rows = read_rows(SMALL_SUITE, tmp_path)
+    assert (rows["still"].about, rows["bold"].about) == ("still:train", "ppo")
     held = json.loads((tmp_path / "bold.json").read_text(encoding="utf-8"))
-    assert (held["about"], held["options"]) == ("ppo", {"credit": "marginal"})
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("_still")
-def test_a_method_of_ones_own_is_compared(tmp_path):
-    words = ["compare", "--quick", "--particle-steps", "100", "--no-progress", "--out", "out"]
-    assert main([*words, "--methods", "still=still:train"]) == 0
-    (path,) = (tmp_path / "out").glob("particle-steps/*/still/seed-0/run.json")
-    run = json.loads(path.read_text(encoding="utf-8"))
-    assert (run["status"], run["facts"]["method"]) == ("done", "still:train")
+    assert held["options"] == {"credit": "marginal"}
+    refused("must be a row of npa-bench-v0", read_rows, SUITE, tmp_path)
 
 
 def test_a_run_that_failed_is_in_no_row_and_one_that_diverged_has_no_returns(tmp_path):
@@ -228,27 +213,6 @@ def test_a_narrower_call_keeps_the_rest_of_a_row(zero_row, tmp_path):
     assert json.loads(path.read_text(encoding="utf-8")) == whole
 
 
-def test_a_row_of_another_suite_is_refused(tmp_path):
-    small = SUITES["npa-bench-small-v0"]
-    made = plan_of(small.name, methods=("zero",))
-    write_rows(small, made, records(made), tmp_path, "it")
-    assert read_rows(small, tmp_path)["zero"].suite is small
-    refused("must be a row of npa-bench-v0", read_rows, SUITE, tmp_path)
-
-
-def test_the_small_suite_is_all_small_worlds_that_rules_act_in():
-    small = {row.id for row in (*SIZES, *SPECIES_SIZES) if "Small" in row.id}
-    # The yardstick is a gradient, and where one side pays for the other there is none.
-    small.remove("npa/InvasionSmall-v0")
-    assert set(SUITES["npa-bench-small-v0"].budgets) == small
-
-
-def test_a_method_has_one_row(zero_row, tmp_path):
-    _, path = zero_row
-    (tmp_path / "again.json").write_bytes(path.read_bytes())
-    refused("second row of 'zero'", read_rows, SUITE, tmp_path)
-
-
 # Scores
 
 
@@ -266,25 +230,15 @@ def test_scores_count_from_nothing_to_the_gradient():
     refused("better than zero", normalised, {**rows, "gradient": rows["zero"]}, "ppo", FIRST)
 
 
-def test_the_middle_of_scores_leaves_out_the_quarters_at_both_ends():
+def test_a_score_is_the_mean_of_the_middle_half_and_its_interval_shrinks_with_more_seeds():
     found = score([np.array([0.0, 1.0, 2.0, 3.0]), np.array([4.0, 5.0, 6.0, 100.0])])
     assert found.middle == 3.5
     assert 1.0 < found.low < found.middle < found.high < 36.0
-    assert score([np.array([0.5, 0.5])]) == (0.5, 0.5, 0.5)
     assert str(score([np.array([0.5, 0.5])])) == "0.50 [0.50, 0.50]"
-
-
-def test_an_interval_shrinks_with_the_number_of_seeds_and_holds_the_mean():
     draws = np.random.default_rng(0).normal(0.6, 0.1, 400)
     few, many = score([draws[:10]]), score([draws])
     assert many.high - many.low < 0.4 * (few.high - few.low)
     assert many.low < 0.6 < many.high
-
-
-def test_the_runs_of_a_task_are_called_by_its_id():
-    assert str(Job("particle-steps", npa_bench.task_name(FIRST), "sac", 3).folder) == (
-        f"particle-steps/{FIRST.removeprefix('npa/')}/sac/seed-3"
-    )
 
 
 @pytest.mark.slow

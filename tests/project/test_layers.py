@@ -76,9 +76,7 @@ LAYERS = {
     "npa_envs.agents": layer(
         19, "torch numpy tqdm gymnasium pettingzoo stable_baselines3 cma", never=INSIDES
     ),
-    "npa_envs.agents.comparison": layer(
-        20, "torch numpy PIL scipy matplotlib jsonschema", never=INSIDES
-    ),
+    "npa_envs.agents.comparison": layer(20, "torch numpy PIL matplotlib", never=INSIDES),
     "npa_envs.agents.search": layer(20, "torch numpy cma ribs", never=INSIDES),
     "npa_envs.web": layer(21, "torch numpy gymnasium PIL starlette uvicorn", never=ORACLES),
     "npa_envs.cli": Layer(
