@@ -81,35 +81,13 @@ def test_numbers_of_other_libraries_survive_in_a_rule(tmp_path):
     assert npa_envs.load_rule(tmp_path / "rule.safetensors").alpha == 0.5
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"update_prob": 0.0}, r"update_prob must lie in \(0, 1\], got 0.0"),
-        ({"update_prob": NAN}, "update_prob"),
-        ({"dt": 0.0}, "dt must be positive"),
-        ({"position_noise": -1.0}, "position_noise"),
-        ({"eps": -0.1}, "eps must be positive"),
-        ({"box": 0.1}, "box sides"),
-        ({"dt": "fast"}, "dt must be a number"),
-        ({"generator": 3}, "generator must be a torch.Generator or a WorldRandom, got int"),
-        ({"memory": "forget"}, "memory must be 'store', 'recompute' or 'minimal'"),
-        *(({"steps": steps}, "steps must be an integer") for steps in (-1, 2.0, True, "3")),
-        ({"s": S[..., :8]}, "the rule's 2 coordinates and 16 channels"),
-        ({"x": X.double(), "s": S.double()}, "share dtype and device"),
-        ({"x": HOLED}, "x must be finite"),
-    ],
-)
-def test_rollouts_name_what_they_refuse(options, message):
-    with pytest.raises(NPAError, match=message):
-        rollout(NPARule(), **{"x": X, "s": S, "steps": 1} | options)
-
-
 def made(function, *given, **usual):
     """A function that makes calls of a function with some arguments, changed by keywords."""
     return lambda **options: lambda: function(*given, **usual | options)
 
 
 rule = made(NPARule)
+rolled = made(rollout, NPARule(), x=X, s=S, steps=1)
 splatted = made(splat, X, S[..., :3], resolution=8, pixel_size=0.2)
 camera = made(orbit, 1, width=4, height=4)
 small = made(gymnasium.make, "npa/Texture-v0", particle_count=16)
@@ -123,6 +101,19 @@ WIDE = NPARule(state_dim=2)
 @pytest.mark.parametrize(
     ("call", "message"),
     [
+        (rolled(update_prob=0.0), r"update_prob must lie in \(0, 1\], got 0.0"),
+        (rolled(update_prob=NAN), "update_prob"),
+        (rolled(dt=0.0), "dt must be positive"),
+        (rolled(position_noise=-1.0), "position_noise"),
+        (rolled(eps=-0.1), "eps must be positive"),
+        (rolled(box=0.1), "box sides"),
+        (rolled(dt="fast"), "dt must be a number"),
+        (rolled(generator=3), "generator must be a torch.Generator or a WorldRandom, got int"),
+        (rolled(memory="forget"), "memory must be 'store', 'recompute' or 'minimal'"),
+        *((rolled(steps=steps), "steps must be an integer") for steps in (-1, 2.0, True, "3")),
+        (rolled(s=S[..., :8]), "the rule's 2 coordinates and 16 channels"),
+        (rolled(x=X.double(), s=S.double()), "share dtype and device"),
+        (rolled(x=HOLED), "x must be finite"),
         (lambda: rollout(3, X, S, 1), "rule must be an NPARule, got int"),
         (lambda: warmup(space_dims=2), r"space_dims must be some of \(2, 3\), got 2"),
         (lambda: warmup(dtypes=[torch.float16]), "dtypes must be some of"),
