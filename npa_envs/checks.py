@@ -63,6 +63,15 @@ def check_floating(name: str, tensor: Any, shape: str = "") -> None:
     check_dense(name, tensor)
 
 
+def check_alike(name: str, tensor: Tensor, other_name: str, other: Tensor) -> None:
+    """Check that two tensors have the same dtype and device."""
+    if tensor.dtype != other.dtype or tensor.device != other.device:
+        raise NPAError(
+            f"{name} and {other_name} must share dtype and device, got {tensor.dtype} on "
+            f"{tensor.device} and {other.dtype} on {other.device}: convert one with .to(other)"
+        )
+
+
 def check_world(x: Tensor, s: Tensor) -> None:
     """Check shapes, dtypes and devices of positions and states."""
     for name, tensor, last in (("x", x, "D"), ("s", s, "C")):
@@ -83,11 +92,7 @@ def check_world(x: Tensor, s: Tensor) -> None:
             f"a world needs at least one particle and one state channel, "
             f"got {tuple(x.shape)} and {tuple(s.shape)}"
         )
-    if x.dtype != s.dtype or x.device != s.device:
-        raise NPAError(
-            f"x and s must share dtype and device, got {x.dtype} on {x.device} and "
-            f"{s.dtype} on {s.device}: convert one with .to(other)"
-        )
+    check_alike("x", x, "s", s)
 
 
 def check_finite_positions(x: Tensor) -> None:

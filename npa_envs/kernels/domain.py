@@ -114,10 +114,12 @@ def domain_types(space_dim: int, scalar: type) -> SimpleNamespace:
 
     @wp.func
     def row_width(domain: Domain, d: int):
+        """Return the number of cells with neighbours of a cell, along one direction."""
         return wp.min(wp.int32(2) * domain.cell_reach + 1, domain.cell_shape[d])
 
     @wp.func
     def wrapped(coordinate: int, count: int):
+        """Return a cell coordinate that is at most one grid size outside, wrapped into the grid."""
         result = coordinate
         if coordinate < 0:
             result = coordinate + count
@@ -187,7 +189,7 @@ def domain_types(space_dim: int, scalar: type) -> SimpleNamespace:
             result[d] = entry[d]
         return result
 
-    functions = [cell_of, cell_index, cell_place, segment_count]
+    functions = [cell_of, cell_index, cell_place, row_width, wrapped, segment_count]
     functions += [segment_cells, minimum_image, periodic_image, position_of]
     return native.named(*functions, vector=vector, particle=particle, Domain=Domain)
 

@@ -205,8 +205,8 @@ def _read_rows_backward(
     if not with_mixing:
         return rows_bar, torch.empty_like(mixing)
     # One matrix product gives all pairs of axes; only the pairs of an axis with itself are summed.
-    seen = rows[:, scalars : scalars + len(mixing) * space_dim]
-    pairs = (seen.T @ total.flatten(1)).view(len(mixing), space_dim, count, space_dim)
+    vectors = rows[:, scalars : scalars + len(mixing) * space_dim]
+    pairs = (vectors.T @ total.flatten(1)).view(len(mixing), space_dim, count, space_dim)
     return rows_bar, pairs.diagonal(dim1=1, dim2=3).sum(dim=-1)
 
 

@@ -90,7 +90,7 @@ def _list_neighbours(plan: KernelPlan, starts: Tensor, particles: Tensor) -> lis
     kernels = density_kernels(plan.space_dim, plan.scalar, plan.on_cpu)
     common = plan.total, particles.device, plan.domain, plan.particle_count, starts, particles
     counts = starts.new_empty(plan.total)
-    launch(kernels.count_neighbours, *common, starts.new_empty(0), counts)
+    launch(kernels.list_neighbours, *common, None, counts, None)
     if is_traced():
         return [starts.new_empty(torch.library.get_ctx().new_dynamic_size()), counts]
     ends = torch.cumsum(counts, 0, dtype=torch.int64)
@@ -98,7 +98,7 @@ def _list_neighbours(plan: KernelPlan, starts: Tensor, particles: Tensor) -> lis
         return []
     neighbours = starts.new_empty(int(ends[-1]))
     ends = ends.to(torch.int32)
-    launch(kernels.list_neighbours, *common, ends, neighbours)
+    launch(kernels.list_neighbours, *common, ends, counts, neighbours)
     return [neighbours, ends]
 
 

@@ -173,8 +173,8 @@ def _warm_views(x: torch.Tensor) -> None:
     cameras = orbit(1, width=16, height=16)
     scales, colours = x.new_ones(x.shape), x.new_zeros(*x.shape[:2], 4, 3)
     turns = x.new_ones(*x.shape[:2], 4)
-    seen = render_gaussians(x, scales, turns, x.new_ones(x.shape[:2]), colours, cameras.to(x))
-    _pull_back(seen.image)
+    pictures = render_gaussians(x, scales, turns, x.new_ones(x.shape[:2]), colours, cameras.to(x))
+    _pull_back(pictures.image)
     corners = torch.zeros(1, 3, dtype=torch.float64, device="cpu")
     nearest_triangles(
         corners[..., None].expand(-1, -1, 2),

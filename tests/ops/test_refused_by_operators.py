@@ -98,8 +98,8 @@ OWN = {"cameras": made(world_to_camera=torch.eye(4).repeat(3, 1, 1, 1))}
     [
         (made, {"world_to_camera": torch.eye(4)}, r"\[V, 4, 4\].*world_to_camera\[None\]"),
         (made, {"world_to_camera": torch.zeros(2, 3, 4)}, r"got \(2, 3, 4\): reshape"),
-        (made, {"world_to_camera": EYES.half()}, "must be a float32 or float64 tensor"),
-        (made, {"world_to_camera": [[1.0]]}, "must be a float32 or float64 tensor, got list"),
+        (made, {"world_to_camera": EYES.half()}, "must be float32 or float64, got torch.float16"),
+        (made, {"world_to_camera": [[1.0]]}, "must be a torch tensor, got list"),
         (made, {"world_to_camera": torch.zeros(2, 4, 4)}, "neither singular.*as camera 0"),
         (made, changed(2, 2, 0.0), "neither singular.*as camera 1"),
         (made, changed(0, 0, 1.1), "nor scaled.*as camera 1"),

@@ -153,6 +153,7 @@ def listed_adjoint(
     types = domain_types(space_dim, scalar)
     vector, Domain = types.vector, types.Domain
     cell_of, periodic_image = types.cell_of, types.periodic_image
+    row_width, wrapped = types.row_width, types.wrapped
     cell_vector = wp.types.vector(space_dim, wp.int32)
     thread_gradient = wp.types.matrix((space_dim, THREAD_CHANNELS), scalar)
     kinds = 1 + space_dim if state_gradient else 1
@@ -218,16 +219,6 @@ def listed_adjoint(
                     store_channels(cotangents, place + (d + 1) * wp.static(parts), pulled[d])
 
     @wp.func
-    def lines_around(domain: Domain, d: int):
-        """Return the number of lines of cells with neighbours, along a direction across lines."""
-        return wp.min(wp.int32(2) * domain.cell_reach + 1, domain.cell_shape[d])
-
-    @wp.func
-    def around(place: int, count: int):
-        """Wrap a cell coordinate that is at most one grid size outside."""
-        return wp.where(place < 0, place + count, wp.where(place < count, place, place - count))
-
-    @wp.func
     def line_of(domain: Domain, cell: cell_vector):
         """Return the index of the line of cells, along the grid's first direction, of a cell."""
         line = cell[1]
@@ -255,12 +246,12 @@ def listed_adjoint(
         if wp.static(space_dim == 3):
             z = wp.int32(wp.uint32(line) / wp.uint32(domain.cell_shape[1]))
             y = line - z * domain.cell_shape[1]
-            lines = lines_around(domain, 1)
+            lines = row_width(domain, 1)
             across = wp.int32(wp.uint32(nearby) / wp.uint32(lines))
             nearby -= across * lines
-            z = around(z - domain.cell_reach + across, domain.cell_shape[wp.static(space_dim - 1)])
+            z = wrapped(z - domain.cell_reach + across, domain.cell_shape[wp.static(space_dim - 1)])
             base = z * domain.cell_shape[1]
-        base = (base + around(y - domain.cell_reach + nearby, domain.cell_shape[1])) * nx
+        base = (base + wrapped(y - domain.cell_reach + nearby, domain.cell_shape[1])) * nx
         return base + first, base + last
 
     @wp.func
@@ -268,15 +259,15 @@ def listed_adjoint(
         """Return the range of columns with neighbours of particles in a range, not wrapped."""
         nx = domain.cell_shape[0]
         width = wp.min(last - first + 2 * domain.cell_reach + 1, nx)
-        begin = wp.where(width < nx, around(first - domain.cell_reach, nx), 0)
+        begin = wp.where(width < nx, wrapped(first - domain.cell_reach, nx), 0)
         return begin, begin + width
 
     @wp.func
     def count_runs(domain: Domain, to_column: int):
         """Return the number of runs of cells around particles on a line, up to a column."""
-        runs = lines_around(domain, 1)
+        runs = row_width(domain, 1)
         if wp.static(space_dim == 3):
-            runs *= lines_around(domain, wp.static(space_dim - 1))
+            runs *= row_width(domain, wp.static(space_dim - 1))
         return wp.where(to_column > domain.cell_shape[0], 2 * runs, runs)
 
     @wp.func

@@ -24,7 +24,7 @@ template <int D, int SCALARS, int PERCEIVED, int MIXED, int CHIRAL> struct Vecto
 
 // Loads of some columns of a warp's rows, for shared memory: all loads come before the first store,
 // which waits for them. Rows beyond the last are zeros.
-template <int ROWS, int COLUMNS> struct RowsOnTheWay {
+template <int ROWS, int COLUMNS> struct RowLoads {
     static constexpr int EACH = (ROWS * COLUMNS + 31) / 32;
     float values[EACH];
 
@@ -61,7 +61,7 @@ __device__ inline void read_vectors(
     const int width = rows.shape[1], out_width = inputs.shape[1];
     const int first = (blockIdx.x * WARPS + warp) * ROWS;
     const int count = max(min(ROWS, rows.shape[0] - first), 0);
-    RowsOnTheWay<ROWS, ENTRIES> seen;
+    RowLoads<ROWS, ENTRIES> seen;
     seen.load(rows.data + (size_t)first * width, width, count, lane);
     for (int i = threadIdx.x; i < Form::WEIGHTS; i += blockDim.x) weights[i] = mixing.data[i];
     for (int i = threadIdx.x; i < MIXED * MIXED; i += blockDim.x) {
@@ -138,9 +138,9 @@ __device__ inline void pull_back_vectors(
     const int stride = gridDim.x * WARPS * ROWS;
     for (int first = (blockIdx.x * WARPS + warp) * ROWS; first < rows.shape[0]; first += stride) {
         const int count = min(ROWS, rows.shape[0] - first);
-        RowsOnTheWay<ROWS, Form::PRODUCTS_END> bars;
-        RowsOnTheWay<ROWS, PERCEIVED * D> seen;
-        RowsOnTheWay<ROWS, VECTORS> vectors;
+        RowLoads<ROWS, Form::PRODUCTS_END> bars;
+        RowLoads<ROWS, PERCEIVED * D> seen;
+        RowLoads<ROWS, VECTORS> vectors;
         bars.load(inputs_bar.data + (size_t)first * in_width, in_width, count, lane);
         seen.load(rows.data + (size_t)first * width + SCALARS, width, count, lane);
         vectors.load(mixed.data + (size_t)first * VECTORS, VECTORS, count, lane);

@@ -119,6 +119,7 @@ def slot_functions(variant: PerceptionVariant, lane_channels: type) -> SimpleNam
 
     @native.func_native(slot_bytes, lanes, CUDA_BLOCK)
     def slot_address() -> wp.uint32: ...
+
     @native.func_native()
     def part_address(states: wp.array[lane_channels], part: int) -> wp.uint64: ...
 

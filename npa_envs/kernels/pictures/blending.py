@@ -371,9 +371,9 @@ def block_kernels(scalar: type) -> SimpleNamespace:
                     x = left - footprint[0]
                     y = top - footprint[1]
                     strength = strength_at(footprint, x, y)
-                    seen = j < stop and strength >= scalar(MIN_ALPHA)
-                    if any_in_warp(seen):
-                        if seen:
+                    is_drawn = j < stop and strength >= scalar(MIN_ALPHA)
+                    if any_in_warp(is_drawn):
+                        if is_drawn:
                             total, through, behind = pull(
                                 footprint, x, y, strength, bar, through, behind
                             )

@@ -419,13 +419,13 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
         opacity_bar = scalar(0.0)
         colour_bar = quad()
         harmonics_bar = harmonics_type()
-        seen = wp.bool(False)
+        is_drawn = wp.bool(False)
         for view in range(frame.view_count):
             image = world * frame.view_count + view
             entry = image * frame.particle_count + i % frame.particle_count
             slot = slots[entry]
             if slot >= 0:
-                seen = wp.bool(True)
+                is_drawn = wp.bool(True)
                 pull = pulls_type()
                 for k in range(slot, slot + counts[entry]):
                     pull += load_pulls(pulls, k)
@@ -484,7 +484,7 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
         means_bar[i] = mean_bar
         scales_bar[i] = scale_bar
         quaternion_bar = quad()
-        if seen:
+        if is_drawn:
             unit_bar = pull_back_rotation(unit, rotation_bar)
             quaternion_bar = inverse * (unit_bar - wp.dot(unit_bar, unit) * unit)
         quaternions_bar[i] = quaternion_bar

@@ -512,9 +512,9 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         centre = vector(footprint[2], footprint[3])
         near = vector(footprint[0], footprint[1])
         slope = scalar(-2.0) * view.falloff * near
-        seen = visible(view, centre)
+        is_drawn = visible(view, centre)
         pulls = pulls_type()
-        if seen:
+        if is_drawn:
             column = wp.int32(centre[0])
             row = wp.int32(centre[1])
             left = wp.max(column - view.radius, 0)
@@ -541,7 +541,7 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         if lane == 0:
             position_bar = vector()
             colour_bar = colour_type()
-            if seen:
+            if is_drawn:
                 # Weights are normalised to sum 1, so the derivative subtracts the mean cotangent.
                 sums = vector()
                 moments = vector()

@@ -26,16 +26,16 @@ def draw_triangles(
     nearness: wp.array2d[wp.float64],
     colours: wp.array[wp.vec3d],
     faces: wp.array[wp.vec3i],
-    seen: wp.array2d[wp.uint8],
+    visible: wp.array2d[wp.uint8],
     # outputs
     nearest: wp.array2d[wp.float64],
     picture: wp.array2d[wp.vec4d],
 ):
-    """Draw all triangles that a camera sees, at every pixel whose centre they cover."""
+    """Draw all triangles visible to a camera, at every pixel whose centre they cover."""
     camera = range_start + wp.tid()
     zero, half = wp.float64(0.0), wp.float64(0.5)
     for face in range(faces.shape[0]):
-        if seen[camera, face] == wp.uint8(0):
+        if visible[camera, face] == wp.uint8(0):
             continue
         corners = faces[face]
         a = place[camera, corners[0]]

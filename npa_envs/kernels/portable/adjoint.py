@@ -266,11 +266,11 @@ def adjoint_kernels(
                         wp.sqrt(squared), domain.inverse_eps, domain.spiky_norm
                     )
                     for g in range(group_count):
-                        own = states[k * group_count + g]
-                        volume_bar += weight * wp.dot(own, blur_bar[row * group_count + g])
+                        own_state = states[k * group_count + g]
+                        volume_bar += weight * wp.dot(own_state, blur_bar[row * group_count + g])
                         if wp.static(state_gradient):
                             volume_bar += wp.dot(
-                                own - states[j * group_count + g],
+                                own_state - states[j * group_count + g],
                                 kernel * gradient_bar[row * group_count + g],
                             )
         density_bar[k] = -volume * volume * volume_bar
@@ -339,19 +339,21 @@ def adjoint_kernels(
                     if own_row >= 0:
                         centre_kernel = density_gradient_bar[own_row]
                     for g in range(group_count):
-                        own = states[k * group_count + g]
-                        seen = states[j * group_count + g]
+                        own_state = states[k * group_count + g]
+                        other_state = states[j * group_count + g]
                         if row >= 0:
-                            as_neighbour += volume * wp.dot(own, blur_bar[row * group_count + g])
+                            as_neighbour += volume * wp.dot(
+                                own_state, blur_bar[row * group_count + g]
+                            )
                             neighbour_kernel += volume * (
-                                gradient_bar[row * group_count + g] * (own - seen)
+                                gradient_bar[row * group_count + g] * (own_state - other_state)
                             )
                         if own_row >= 0:
                             as_centre += other_volume * wp.dot(
-                                seen, blur_bar[own_row * group_count + g]
+                                other_state, blur_bar[own_row * group_count + g]
                             )
                             centre_kernel += other_volume * (
-                                gradient_bar[own_row * group_count + g] * (seen - own)
+                                gradient_bar[own_row * group_count + g] * (other_state - own_state)
                             )
                     pull += pair_pull(domain, offset, squared, as_neighbour, neighbour_kernel)
                     pull -= pair_pull(domain, -offset, squared, as_centre, centre_kernel)

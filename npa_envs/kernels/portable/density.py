@@ -88,10 +88,10 @@ def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespa
                     neighbour = sorted_positions[j]
                     offset = minimum_image(domain, neighbour - position)
                     squared = wp.dot(offset, offset)
-                    seen = squared < domain.squared_eps and j != k
+                    is_near = squared < domain.squared_eps and j != k
                     weight = smoothing(squared, domain.inverse_squared_eps, domain.smoothing_norm)
-                    density += wp.where(seen, weight, scalar(0.0))
-                    if row >= 0 and seen:
+                    density += wp.where(is_near, weight, scalar(0.0))
+                    if row >= 0 and is_near:
                         gradient += spiky_f64(domain, position, neighbour)
                 counted += stop - block
                 if counted >= wp.static(TERMS_PER_SUM):
@@ -107,48 +107,6 @@ def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespa
         if row >= 0:
             density_gradients[k] = gradient
 
-    @wp.func
-    def list_around(
-        domain: Domain,
-        particle_count: int,
-        starts: wp.array[wp.int32],
-        particles: wp.array[particle],
-        k: int,
-        begin: int,
-        neighbours: wp.array[wp.int32],
-    ):
-        """Write neighbours of particle k from index `begin` on, unless the array is empty; return
-        the end."""
-        position = position_of(particles[k])
-        base = (k / particle_count) * domain.cell_count
-        cell = cell_of(domain, position)
-        place = begin
-        for r in range(run_count(domain, cell)):
-            first, end = run(domain, starts, neighbours, base, cell, k, r)
-            for candidate in range(first, end, wp.static(search.stride)):
-                near, count = filter_near(domain, particles, neighbours, position, candidate, end)
-                if neighbours.shape[0] > 0:
-                    for n in range(count):
-                        neighbours[place + n] = near[n]
-                place += count
-        return place
-
-    @in_ranges(PAIRS)
-    @wp.kernel(enable_backward=False, module=module)
-    def count_neighbours(
-        range_start: int,
-        domain: Domain,
-        particle_count: int,
-        starts: wp.array[wp.int32],
-        particles: wp.array[particle],
-        empty: wp.array[wp.int32],
-        # outputs
-        counts: wp.array[wp.int32],
-    ):
-        """Write each particle's number of neighbours, itself included; `empty` has no entries."""
-        k = range_start + wp.tid()
-        counts[k] = list_around(domain, particle_count, starts, particles, k, 0, empty)
-
     @in_ranges(PAIRS)
     @wp.kernel(enable_backward=False, module=module)
     def list_neighbours(
@@ -159,13 +117,29 @@ def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespa
         particles: wp.array[particle],
         ends: wp.array[wp.int32],
         # outputs
+        counts: wp.array[wp.int32],
         neighbours: wp.array[wp.int32],
     ):
-        """Write each particle's neighbours after those of the particle before it."""
-        k = range_start + wp.tid()
-        begin = wp.int32(0)
-        if k > 0:
-            begin = ends[k - 1]
-        list_around(domain, particle_count, starts, particles, k, begin, neighbours)
+        """Write each particle's number of neighbours, itself included.
 
-    return named(compute_density, count_neighbours, list_neighbours)
+        Unless `neighbours` is empty, also write them, after those of the particle before.
+        """
+        k = range_start + wp.tid()
+        position = position_of(particles[k])
+        base = (k / particle_count) * domain.cell_count
+        cell = cell_of(domain, position)
+        begin = wp.int32(0)
+        if k > 0 and neighbours.shape[0] > 0:
+            begin = ends[k - 1]
+        place = begin
+        for r in range(run_count(domain, cell)):
+            first, end = run(domain, starts, neighbours, base, cell, k, r)
+            for candidate in range(first, end, wp.static(search.stride)):
+                near, count = filter_near(domain, particles, neighbours, position, candidate, end)
+                if neighbours.shape[0] > 0:
+                    for n in range(count):
+                        neighbours[place + n] = near[n]
+                place += count
+        counts[k] = place - begin
+
+    return named(compute_density, list_neighbours)

@@ -114,16 +114,16 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         """Move and change the particles that have a row; copy the others."""
         await_earlier()
         # The first threads of a team move one particle each, the others change some channels each.
-        sharers = (state_dim + wp.static(THREAD_CHANNELS - 1)) / wp.static(THREAD_CHANNELS)
+        chunks = (state_dim + wp.static(THREAD_CHANNELS - 1)) / wp.static(THREAD_CHANNELS)
         t = range_start + wp.tid()
-        team = t / (wp.static(TEAM) * (1 + sharers))
-        turn = t - team * (wp.static(TEAM) * (1 + sharers))
-        i = team * wp.static(TEAM) + turn
+        team = t / (wp.static(TEAM) * (1 + chunks))
+        place = t - team * (wp.static(TEAM) * (1 + chunks))
+        i = team * wp.static(TEAM) + place
         first = wp.int32(-1)
-        if turn >= wp.static(TEAM):
-            member = (turn - wp.static(TEAM)) / sharers
+        if place >= wp.static(TEAM):
+            member = (place - wp.static(TEAM)) / chunks
             i = team * wp.static(TEAM) + member
-            first = (turn - wp.static(TEAM) - member * sharers) * wp.static(THREAD_CHANNELS)
+            first = (place - wp.static(TEAM) - member * chunks) * wp.static(THREAD_CHANNELS)
         if i >= positions.shape[0]:
             return
         row = load_integer(row_of, i)
@@ -185,10 +185,10 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         await_earlier()
         allow_next_launch()
         # A thread writes some adjacent columns of a row.
-        sharers = (update_width + wp.static(THREAD_CHANNELS - 1)) / wp.static(THREAD_CHANNELS)
+        chunks = (update_width + wp.static(THREAD_CHANNELS - 1)) / wp.static(THREAD_CHANNELS)
         t = range_start + wp.tid()
-        row = t / sharers
-        first = (t - row * sharers) * wp.static(THREAD_CHANNELS)
+        row = t / chunks
+        first = (t - row * chunks) * wp.static(THREAD_CHANNELS)
         row_begin = row * update_width
         i = load_integer(row_source, row)
         bar = channels()
@@ -252,10 +252,10 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         """Apply the actions of active particles, and mark worlds in which a value was clipped."""
         await_earlier()
         # All loads are issued before any value is used, as the kernel waits for memory.
-        sharers = (state_dim + wp.static(THREAD_CHANNELS - 1)) / wp.static(THREAD_CHANNELS)
+        chunks = (state_dim + wp.static(THREAD_CHANNELS - 1)) / wp.static(THREAD_CHANNELS)
         t = range_start + wp.tid()
-        i = t / sharers
-        sharer = t - i * sharers
+        i = t / chunks
+        chunk = t - i * chunks
         happens = wp.uint8(1)
         if switched != 0:
             happens = enabled[0]
@@ -264,10 +264,10 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
             acting = mask[i]
         # A thread has some adjacent channels of a particle, if it reads and writes them at once, or
         # channels at a constant stride, so that adjacent threads access adjacent numbers.
-        first = sharer
-        stride = sharers
+        first = chunk
+        stride = chunks
         if aligned != 0:
-            first = sharer * wp.static(THREAD_CHANNELS)
+            first = chunk * wp.static(THREAD_CHANNELS)
             stride = wp.int32(1)
         states_begin = i * state_dim
         actions_begin = states_begin
@@ -288,7 +288,7 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         push = vector()
         direction = vector_f64()
         # A particle's first thread also moves it.
-        if sharer == 0:
+        if chunk == 0:
             position = positions[i]
             if noisy != 0:
                 push = noise[i]
@@ -323,7 +323,7 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
                         c = first + k * stride
                         if c < state_dim:
                             states[states_begin + c] = after[k]
-            if sharer == 0:
+            if chunk == 0:
                 if noisy != 0:
                     position += push
                 if moving != 0 and acting != wp.uint8(0):

@@ -18,6 +18,7 @@ from torch import Tensor
 from npa_envs.checks import (
     DTYPES,
     MAX_SIDE,
+    check_alike,
     check_dense,
     check_floating,
     checked_count,
@@ -86,14 +87,8 @@ class Cameras:
 
     def _check_shapes(self) -> None:
         motions, intrinsics = self.world_to_camera, self.intrinsics
-        for name, tensor in (("world_to_camera", motions), ("intrinsics", intrinsics)):
-            if not isinstance(tensor, Tensor) or tensor.dtype not in DTYPES:
-                got = tensor.dtype if isinstance(tensor, Tensor) else type(tensor).__name__
-                raise NPAError(
-                    f"{name} must be a float32 or float64 tensor, got {got}: "
-                    f"convert it with torch.as_tensor(..., dtype=torch.float32)"
-                )
-            check_dense(name, tensor)
+        check_floating("world_to_camera", motions)
+        check_floating("intrinsics", intrinsics)
         if motions.ndim not in (3, 4) or motions.shape[-2:] != (4, 4) or 0 in motions.shape:
             hint = "add a dimension of views with world_to_camera[None]"
             raise NPAError(
@@ -109,12 +104,7 @@ class Cameras:
                 f"intrinsics must hold fx, fy, cx and cy in shape {wanted} for world_to_camera of "
                 f"shape {tuple(motions.shape)}, got {tuple(intrinsics.shape)}"
             )
-        if motions.dtype != intrinsics.dtype or motions.device != intrinsics.device:
-            raise NPAError(
-                f"world_to_camera and intrinsics must share dtype and device, got {motions.dtype} "
-                f"on {motions.device} and {intrinsics.dtype} on {intrinsics.device}: "
-                f"convert one with .to(other)"
-            )
+        check_alike("world_to_camera", motions, "intrinsics", intrinsics)
 
     def _check_numbers(self) -> None:
         motions = self.world_to_camera.detach().flatten(0, -3).double()

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from npa_envs.checks import check_floating, checked_count, checked_number, constant
+from npa_envs.checks import check_alike, check_floating, checked_count, checked_number, constant
 from npa_envs.errors import NPAError, shown
 from npa_envs.kernels.pictures.blending import TILE_PIXELS, block_kernels, tile_kernels
 from npa_envs.kernels.pictures.gaussians import (
@@ -68,11 +68,7 @@ def check_gaussians(
 
 def _check_tensor(name: str, tensor: Tensor, means: Tensor, shape: str) -> None:
     check_floating(name, tensor, shape)
-    if tensor.dtype != means.dtype or tensor.device != means.device:
-        raise NPAError(
-            f"{name} and means must share dtype and device, got {tensor.dtype} on {tensor.device} "
-            f"and {means.dtype} on {means.device}: convert one with .to(other)"
-        )
+    check_alike(name, tensor, "means", means)
 
 
 def check_cameras(
@@ -255,9 +251,9 @@ def _gaussians(
     depths = means.new_empty(images, particles)
     counts = torch.empty(images, particles, dtype=torch.int32, device=means.device)
     flat = scene.flat()
-    seen = (footprints, depths.view(-1), counts.view(-1))
+    projected = (footprints, depths.view(-1), counts.view(-1))
     kernels = gaussian_kernels(scalar_type(means.dtype))
-    arguments = (*flat[:3], opacities.view(-1), *flat[3:], *seen)
+    arguments = (*flat[:3], opacities.view(-1), *flat[3:], *projected)
     launch(kernels.project_gaussians, images * particles, means.device, frame, *arguments)
     pairs = sort_pairs(frame, footprints, depths, counts, pairs_per_particle)
     picture, passing, stops = blend(frame, footprints, pairs, images)

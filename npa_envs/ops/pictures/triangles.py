@@ -14,7 +14,7 @@ def nearest_triangles(
     nearness: Tensor,
     colours: Tensor,
     faces: Tensor,
-    seen: Tensor,
+    visible: Tensor,
     *,
     width: int,
     height: int,
@@ -28,7 +28,7 @@ def nearest_triangles(
         nearness: 1 / depth of the corners [1 / length units], shape [V, K].
         colours: Colours of the corners, shape [K, 3].
         faces: Corners of each triangle, from 0 to K − 1, shape [F, 3].
-        seen: Whether a triangle is visible to a camera, shape [V, F].
+        visible: Whether a triangle is visible to a camera, shape [V, F].
     """
     count = len(place)
     nearest = place.new_zeros(count, height * width)
@@ -43,7 +43,7 @@ def nearest_triangles(
         nearness.contiguous(),
         colours.contiguous(),
         faces.int().contiguous(),
-        seen.to(torch.uint8).contiguous(),
+        visible.to(torch.uint8).contiguous(),
         nearest,
         picture,
     )
