@@ -102,10 +102,10 @@ def test_a_page_records_a_film_and_a_picture(exported):
     page.wait("document.querySelectorAll('#files a').length === 2")
     # The page may not fetch, not even its own files: a film that plays has its width.
     width = page.run(
-        """new Promise((told) => {
+        """new Promise((resolve) => {
           const film = document.createElement("video");
-          film.onloadedmetadata = () => told(film.videoWidth);
-          film.onerror = () => told(0);
+          film.onloadedmetadata = () => resolve(film.videoWidth);
+          film.onerror = () => resolve(0);
           film.src = [...document.querySelectorAll("#files a")]
             .find((link) => link.download.startsWith("film.")).href;
         })"""
@@ -117,8 +117,8 @@ def test_a_page_records_a_film_and_a_picture(exported):
 def test_a_page_may_not_reach_the_network(exported):
     page = exported("gecko", particle_count=64)
     refused = page.run(
-        """new Promise((told) => {
-          addEventListener("securitypolicyviolation", (event) => told(event.effectiveDirective));
+        """new Promise((resolve) => {
+          addEventListener("securitypolicyviolation", (event) => resolve(event.effectiveDirective));
           fetch("http://127.0.0.1:9/").catch(() => null);
         })"""
     )
@@ -148,8 +148,8 @@ def test_solid_and_still_worlds_live_in_a_page(exported, name):
         pytest.importorskip("sklearn")
     page = exported(name, particle_count=None, previews=True, query=f"#{name}", steps=3)
     count = {"duck": 8192, "digits": 512}[name]
-    told = page.run("document.getElementById('step').textContent")
-    assert re.fullmatch(rf"step \d+ · {count} particles", told)
+    text = page.run("document.getElementById('step').textContent")
+    assert re.fullmatch(rf"step \d+ · {count} particles", text)
 
 
 # A graphics card in software: slow, but the shaders are those that any card runs.
@@ -203,12 +203,12 @@ def test_a_step_on_a_graphics_card_is_that_of_python(tmp_path, card_page, kind):
             )  # fmt: skip
     else:
         want_x, want_s = stepped(rules[0], x, s, mask, eps=eps, box=box)
-    told = {
+    fields = {
         "rules": [described(rule) for rule in rules], "x": packed(x), "s": packed(s),
         "species": [0] * count if counts is None else [0] * counts[0] + [1] * counts[1],
         "mask": mask[0].int().tolist(), "eps": eps, "box": box, "densityCounts": counts
     }  # fmt: skip
-    got = page.run(f"{CARD_STEP}({json.dumps(told)})")
+    got = page.run(f"{CARD_STEP}({json.dumps(fields)})")
     assert float((torch.tensor(got["x"]).view_as(want_x) - want_x).abs().max()) < TOLERANCE
     assert float((torch.tensor(got["s"]).view_as(want_s) - want_s).abs().max()) < TOLERANCE
     assert page.complaints == []

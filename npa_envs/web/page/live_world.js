@@ -146,9 +146,9 @@ export class LiveWorld {
       for (let i = 0; i < world.count; i++) {
         let square = 0;
         for (let d = 0; d < dimension; d++) {
-          let part = world.x[i * dimension + d] - before[i * dimension + d];
-          if (box !== null) part -= box[d] * Math.round(part / box[d]);
-          square += part * part;
+          let difference = world.x[i * dimension + d] - before[i * dimension + d];
+          if (box !== null) difference -= box[d] * Math.round(difference / box[d]);
+          square += difference * difference;
         }
         this.travelled[i] = Math.sqrt(square) / longest;
       }
