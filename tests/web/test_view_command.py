@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import socket
-
 import pytest
 import torch
 
@@ -74,8 +72,6 @@ def test_an_environment_gets_the_keywords_that_a_rule_needs():
         (["npa/Texture-v0", "--options", "max_episode_steps=0"], "at least 1, got 0"),
         (["gecko", "--threads", "0"], "threads must be in [1, 256], got 0"),
         (["gecko", "--port", "-1"], "port must be in [0, 65535], got -1"),
-        (["gecko", "--host", "nowhere.invalid"], "host must be an address of this computer"),
-        (["gecko", "--host", ".."], "host must be an address of this computer, got '..'"),
         (["gecko", "--device", "tpu"], "device must name a device"),
         (["gecko", "--seed", "-1"], "seed must be a whole number"),
     ],
@@ -86,7 +82,7 @@ def test_what_is_wrong_is_said_before_anything_is_served(words, error, capsys, t
     assert error in capsys.readouterr().err
 
 
-def test_half_written_rules_and_ports_in_use_are_told(capsys, tmp_path):
+def test_half_written_rules_are_refused(capsys, tmp_path):
     run = tmp_path / "run"
     run.mkdir()
     save_rule(load_rule("gecko"), run / "rule.safetensors")
@@ -97,10 +93,6 @@ def test_half_written_rules_and_ports_in_use_are_told(capsys, tmp_path):
     words = ["--no-browser", "--out", str(tmp_path)]
     assert main(["view", str(run), "--port", "0", *words]) == 2
     assert "this is no safetensors file, or a truncated one" in capsys.readouterr().err
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = str(taken.getsockname()[1])
-        assert main(["view", "gecko", "--port", port, *words]) == 2
-    assert f"port {port} of 127.0.0.1 cannot be bound" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "0.0.0.0"])
