@@ -152,10 +152,10 @@ def test_solid_and_still_worlds_live_in_a_page(exported, name):
     assert re.fullmatch(rf"step \d+ · {count} particles", text)
 
 
-# A graphics card in software: slow, but the shaders are those that any card runs.
-CARD = ("--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader", "--enable-features=Vulkan")
+# A GPU in software: slow, but the shaders are those that any GPU runs.
+GPU_FLAGS = ("--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader", "--enable-features=Vulkan")
 
-CARD_STEP = """(async ({ rules, x, s, species, mask, eps, box, densityCounts }) => {
+GPU_STEP = """(async ({ rules, x, s, species, mask, eps, box, densityCounts }) => {
   const floats = (text) =>
     new Float32Array(Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0)).buffer);
   const kernels = plainKernels();
@@ -167,27 +167,27 @@ CARD_STEP = """(async ({ rules, x, s, species, mask, eps, box, densityCounts }) 
     count: species.length, x: floats(x), s: floats(s), species: Uint8Array.from(species),
   };
   const device = await openDevice();
-  const card = await GpuPhysics.make(
+  const gpu = await GpuPhysics.make(
     device, new Physics(prepared, world.count, kernels));
-  await card.step(world, { eps, box, densityCounts, mask: Uint8Array.from(mask) });
+  await gpu.step(world, { eps, box, densityCounts, mask: Uint8Array.from(mask) });
   return { x: [...world.x], s: [...world.s] };
 })"""
 
 
 @pytest.fixture(scope="module")
-def card_page(tmp_path_factory):
-    with browser(tmp_path_factory.mktemp("card"), *CARD) as opened:
+def gpu_page(tmp_path_factory):
+    with browser(tmp_path_factory.mktemp("gpu"), *GPU_FLAGS) as opened:
         yield opened
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", [*WORLDS, "two species"])
-def test_a_step_on_a_graphics_card_is_that_of_python(tmp_path, card_page, kind):
+def test_a_step_on_a_gpu_is_that_of_python(tmp_path, gpu_page, kind):
     script = joined_modules(["physics.js", "physics_gpu.js"])
     text = f"<!doctype html><script>{script}</script>"
-    (tmp_path / "card.html").write_text(text, encoding="utf-8")
-    page = card_page()
-    page.open((tmp_path / "card.html").as_uri())
+    (tmp_path / "gpu.html").write_text(text, encoding="utf-8")
+    page = gpu_page()
+    page.open((tmp_path / "gpu.html").as_uri())
     page.wait("typeof openDevice === 'function'")
     rules, x, s, eps, box = world_of("gecko" if kind == "two species" else kind)
     count = x.shape[1]
@@ -208,16 +208,16 @@ def test_a_step_on_a_graphics_card_is_that_of_python(tmp_path, card_page, kind):
         "species": [0] * count if counts is None else [0] * counts[0] + [1] * counts[1],
         "mask": mask[0].int().tolist(), "eps": eps, "box": box, "densityCounts": counts
     }  # fmt: skip
-    got = page.run(f"{CARD_STEP}({json.dumps(fields)})")
+    got = page.run(f"{GPU_STEP}({json.dumps(fields)})")
     assert float((torch.tensor(got["x"]).view_as(want_x) - want_x).abs().max()) < TOLERANCE
     assert float((torch.tensor(got["s"]).view_as(want_s) - want_s).abs().max()) < TOLERANCE
     assert page.complaints == []
 
 
 @pytest.mark.slow
-def test_a_page_lives_on_a_graphics_card(exported, card_page):
+def test_a_page_lives_on_a_gpu(exported, gpu_page):
     for engine, name in (("gpu", "WebGPU"), ("auto", ""), ("processor", "WebAssembly")):
-        kind = {"make": card_page, "query": f"?engine={engine}"}
+        kind = {"make": gpu_page, "query": f"?engine={engine}"}
         page = exported("gecko", "heart", particle_count=256, steps=8, **kind)
         page.run(
             "document.page.send({ type: 'brush', tool: 'graft', rule: 'heart', "

@@ -514,7 +514,7 @@ class Page {
 
   draw({ still = false } = {}) {
     const { canvas, frame, world, camera } = this;
-    // More pixels are invisible, and slow without a graphics card.
+    // More pixels are invisible, and slow without a GPU.
     const ratio = Math.min(devicePixelRatio || 1, 1600 / Math.max(canvas.clientWidth, canvas.clientHeight, 1), 2);
     const width = Math.round(canvas.clientWidth * ratio), height = Math.round(canvas.clientHeight * ratio);
     if (!width || !height) return;
