@@ -16,7 +16,7 @@ const text = (array) => Buffer.from(array.buffer, array.byteOffset, array.byteLe
 
 const acts = {
   // One step of rules with given masks.
-  step({ rules, kernels: kind, x, s, species, mask, eps, box, noise, density_counts: densityCounts }) {
+  step({ rules, kernels: kind, x, s, species, mask, eps, box, noise, densityCounts = null }) {
     const { state_dim: channels, space_dim: dimension } = rules[0];
     const kernels = kind === "simd" ? simdKernels(padded(channels), dimension) : plainKernels();
     const prepared = rules.map((rule) => {

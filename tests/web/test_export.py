@@ -11,16 +11,15 @@ from pathlib import Path
 import pytest
 import torch
 from page_worlds import (
+    SPECIES,
     TOLERANCE,
     WORLDS,
     described,
-    grown,
+    example,
     lively,
     packed,
     scattered,
-    stepped,
     unpacked,
-    world_of,
 )
 from torch import Tensor
 
@@ -43,7 +42,6 @@ from npa_envs.web.live import ColouredWorld, Colouring
 from npa_envs.web.rule_world import RuleWorld
 from npa_envs.world.brushes import nearest_image
 from npa_envs.world.rollout import rollout
-from npa_envs.world.species import rollout_species
 
 NODE_SECONDS = 60
 
@@ -76,21 +74,15 @@ def assert_worlds(got, x, s, bound=TOLERANCE):
         assert float((unpacked(got[name], want.shape) - want).abs().max()) < bound
 
 
-@pytest.mark.parametrize("kind", WORLDS)
+@pytest.mark.parametrize("kind", [*WORLDS, *SPECIES])
 def test_a_step_with_a_given_mask_is_that_of_python(run, kind):
-    (rule,), x, s, eps, box = world_of(kind)
-    count = x.shape[1]
-    mask = (torch.rand(1, count, generator=torch.Generator().manual_seed(9)) < 0.5).double()
-    want_x, want_s = stepped(rule, x, s, mask, eps=eps, box=box)
+    fields, s, mask, after = example(kind)
     # The step is no small one.
-    assert float((want_s - s).abs().max()) > 1000 * TOLERANCE
+    assert float((after[1] - s).abs().max()) > 1000 * TOLERANCE
     for kernels, name in (("plain", "JavaScript"), ("simd", "WebAssembly")):
-        got = run(
-            "step", rules=[described(rule)], kernels=kernels, x=packed(x), s=packed(s),
-            species=[0] * count, mask=mask[0].int().tolist(), eps=eps, box=box
-        )  # fmt: skip
+        got = run("step", kernels=kernels, **fields)
         assert got["kernels"] == name
-        assert_worlds(got, want_x, want_s)
+        assert_worlds(got, *after)
         assert torch.equal(unpacked(got["s"], s.shape)[mask == 0], s[mask == 0])
 
 
@@ -108,23 +100,6 @@ def test_a_step_has_the_noise_and_the_groups_of_perception_of_a_rollout(run, lef
     with torch.no_grad():
         want_x, want_s = rollout(rule.double(), x.double(), s.double(), 1, eps=0.1, update_prob=1.0)
     assert_worlds(got, want_x + 0.25, want_s)
-
-
-@pytest.mark.parametrize("density_counts", [None, (200, 100)])
-def test_two_species_step_as_in_python(run, density_counts):
-    rules = [load_rule("gecko"), lively(NPARule(2, 16, 24, alpha=0.3))]
-    x, s = grown("gecko", 300, None)
-    got = run(
-        "step", rules=[described(rule) for rule in rules], kernels="simd", x=packed(x),
-        s=packed(s), species=[0] * 200 + [1] * 100, eps=0.1, box=None,
-        density_counts=density_counts
-    )  # fmt: skip
-    with torch.no_grad():
-        want_x, want_s = rollout_species(
-            [rule.double() for rule in rules], x.double(), s.double(), 1, counts=(200, 100),
-            update_prob=1.0, density_counts=density_counts
-        )  # fmt: skip
-    assert_worlds(got, want_x, want_s)
 
 
 @pytest.fixture(scope="module")

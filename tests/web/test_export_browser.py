@@ -8,11 +8,9 @@ import re
 import pytest
 import torch
 from browser import DESK, PHONE, browser
-from page_worlds import TOLERANCE, WORLDS, described, lively, packed, stepped, world_of
+from page_worlds import SPECIES, TOLERANCE, WORLDS, example
 
-from npa_envs.rule.rule import NPARule
 from npa_envs.web.export import export_web, joined_modules
-from npa_envs.world.species import rollout_species
 
 
 @pytest.fixture
@@ -153,7 +151,11 @@ def test_solid_and_still_worlds_live_in_a_page(exported, name):
 
 
 # A GPU in software: slow, but the shaders are those that any GPU runs.
-GPU_FLAGS = ("--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader", "--enable-features=Vulkan")
+FLAGS = (
+    "--enable-unsafe-webgpu",
+    "--use-webgpu-adapter=swiftshader",
+    "--enable-features=Vulkan",
+)
 
 GPU_STEP = """(async ({ rules, x, s, species, mask, eps, box, densityCounts }) => {
   const floats = (text) =>
@@ -176,12 +178,12 @@ GPU_STEP = """(async ({ rules, x, s, species, mask, eps, box, densityCounts }) =
 
 @pytest.fixture(scope="module")
 def gpu_page(tmp_path_factory):
-    with browser(tmp_path_factory.mktemp("gpu"), *GPU_FLAGS) as opened:
+    with browser(tmp_path_factory.mktemp("gpu"), *FLAGS) as opened:
         yield opened
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", [*WORLDS, "two species"])
+@pytest.mark.parametrize("kind", [*WORLDS, *SPECIES])
 def test_a_step_on_a_gpu_is_that_of_python(tmp_path, gpu_page, kind):
     script = joined_modules(["physics.js", "physics_gpu.js"])
     text = f"<!doctype html><script>{script}</script>"
@@ -189,28 +191,10 @@ def test_a_step_on_a_gpu_is_that_of_python(tmp_path, gpu_page, kind):
     page = gpu_page()
     page.open((tmp_path / "gpu.html").as_uri())
     page.wait("typeof openDevice === 'function'")
-    rules, x, s, eps, box = world_of("gecko" if kind == "two species" else kind)
-    count = x.shape[1]
-    mask = (torch.rand(1, count, generator=torch.Generator().manual_seed(9)) < 0.5).double()
-    counts = None
-    if kind == "two species":
-        rules, counts = [rules[0], lively(NPARule(2, 16, 24, alpha=0.3))], (200, 100)
-        mask = torch.ones(1, count)
-        with torch.no_grad():
-            want_x, want_s = rollout_species(
-                [rule.double() for rule in rules], x.double(), s.double(), 1, counts=counts,
-                update_prob=1.0, density_counts=counts
-            )  # fmt: skip
-    else:
-        want_x, want_s = stepped(rules[0], x, s, mask, eps=eps, box=box)
-    fields = {
-        "rules": [described(rule) for rule in rules], "x": packed(x), "s": packed(s),
-        "species": [0] * count if counts is None else [0] * counts[0] + [1] * counts[1],
-        "mask": mask[0].int().tolist(), "eps": eps, "box": box, "densityCounts": counts
-    }  # fmt: skip
-    got = page.run(f"{GPU_STEP}({json.dumps(fields)})")
-    assert float((torch.tensor(got["x"]).view_as(want_x) - want_x).abs().max()) < TOLERANCE
-    assert float((torch.tensor(got["s"]).view_as(want_s) - want_s).abs().max()) < TOLERANCE
+    step = example(kind)
+    got = page.run(f"{GPU_STEP}({json.dumps(step.fields)})")
+    for name, want in zip("xs", step.after, strict=True):
+        assert float((torch.tensor(got[name]).view_as(want) - want).abs().max()) < TOLERANCE
     assert page.complaints == []
 
 
