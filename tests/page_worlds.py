@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -13,6 +13,7 @@ from npa_envs import reference
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule
 from npa_envs.world.rollout import rollout
+from npa_envs.world.species import rollout_species
 
 TOLERANCE = 1e-4
 """Largest difference of a step from Python's in float64; the worst measured is 2e-6."""
@@ -88,13 +89,51 @@ WORLDS: dict[str, tuple[str | Callable[[], NPARule], int, Box, float]] = {
 }
 
 
-def world_of(kind: str) -> tuple[list[NPARule], Tensor, Tensor, float, Box]:
-    """The rule, the positions, the states, the radius and the box of one of `WORLDS`."""
-    source, count, box, eps = WORLDS[kind]
-    if isinstance(source, str):
-        rule = load_rule(source)
-        if not rule.static:
-            return [rule], *grown(source, count, box), eps, box
+SPECIES: dict[str, Sequence[int] | None] = {
+    "two species": None,
+    "two species, each divided by its own number": (200, 100),
+}
+"""Worlds of a gecko and another rule: the divisors of densities."""
+
+
+class Example(NamedTuple):
+    """A step for engines of pages."""
+
+    fields: dict[str, Any]
+    """Arguments of `step` in run_engine.mjs, as JSON."""
+    s: Tensor
+    """States before the step."""
+    mask: Tensor
+    """1 where a particle is updated, shape [1, N]."""
+    after: tuple[Tensor, Tensor]
+    """Positions and states after the step by Python in float64."""
+
+
+def example(kind: str) -> Example:
+    """Return a step of one of `WORLDS` or `SPECIES`."""
+    source, count, box, eps = WORLDS.get(kind, WORLDS["gecko"])
+    rule = load_rule(source) if isinstance(source, str) else lively(source())
+    if isinstance(source, str) and not rule.static:
+        x, s = grown(source, count, box)
     else:
-        rule = lively(source())
-    return [rule], *scattered(count, rule.space_dim, rule.state_dim, box), eps, box
+        x, s = scattered(count, rule.space_dim, rule.state_dim, box)
+    rules, species, density_counts = [rule], [0] * count, None
+    mask = (torch.rand(1, count, generator=torch.Generator().manual_seed(9)) < 0.5).double()
+    if kind in SPECIES:
+        rules.append(lively(NPARule(2, 16, 24, alpha=0.3)))
+        density_counts, species = SPECIES[kind], [0] * 200 + [1] * 100
+        mask = torch.ones(1, count)
+    fields = {
+        "rules": [described(rule) for rule in rules], "x": packed(x), "s": packed(s),
+        "species": species, "mask": mask[0].int().tolist(), "eps": eps, "box": box,
+        "densityCounts": density_counts,
+    }  # fmt: skip
+    if kind in SPECIES:
+        with torch.no_grad():
+            after = rollout_species(
+                [rule.double() for rule in rules], x.double(), s.double(), 1, counts=(200, 100),
+                update_prob=1.0, density_counts=density_counts,
+            )  # fmt: skip
+    else:
+        after = stepped(rule, x, s, mask, eps=eps, box=box)
+    return Example(fields, s, mask, after)

@@ -53,9 +53,7 @@ def make_environment(
 class EnvironmentWorld(LiveWorld):
     """The world of an environment that a policy runs; `close` closes the environment."""
 
-    def __init__(
-        self, env: Any, policy: Callable[[Any], Any], *, seed: int = 0, title: str | None = None
-    ) -> None:
+    def __init__(self, env: Any, policy: Callable[[Any], Any], *, seed: int = 0) -> None:
         super().__init__(seed)
         self._env, self._inner, self._policy = env, env.unwrapped, policy
         if not hasattr(self._inner, "place_particles"):
@@ -64,7 +62,6 @@ class EnvironmentWorld(LiveWorld):
                 "gymnasium.make('npa/Texture-v0')"
             )
         self._physics = self._inner.worlds.physics
-        self._title = title or (env.spec.id if env.spec is not None else type(env).__name__)
         self._episode, self._ended = 0, ""
         self.reset(self.seed)
 
@@ -86,13 +83,13 @@ class EnvironmentWorld(LiveWorld):
         """Return the event "world"."""
         task = self._inner.task
         return super().describe() | {
-            "title": self._title,
+            "title": self._env.spec.id if self._env.spec is not None else type(self._env).__name__,
             "note": f"episode {self._episode}{self._ended}",
             "dimension": self._physics.space_dim,
             "half_width": task.half_width if self.box is None else 0.5 * min(self.box),
             "spot": 0.7 * float(task.pixel_size),
             "damages": list(DAMAGE_SIZES) if self._physics.moving else ["wipe"],
-            "capabilities": ["step", "reset", "film", "loss"],
+            "capabilities": ["film", "loss"],
         }
 
     def _allowed(self) -> set[str]:

@@ -172,7 +172,7 @@ def page_rule(source: str, *, particle_count: int | None = None) -> dict[str, An
         "name": live.main.name,
         "classes": classes if task.classifies else None,
         "weights": {name: _packed(tensor) for name, tensor in rule.state_dict().items()},
-        "world": world | {"capabilities": ["step", "reset"], "count": live.count, "seed": seed},
+        "world": world | {"capabilities": [], "count": live.count, "seed": seed},
     }
 
 
@@ -199,11 +199,9 @@ def check_browser_rule(rule: NPARule, name: str) -> None:
             raise NPAError(f"a page runs rules {condition}, {shown(name)} {actual}: {hint}")
 
 
-def preview(source: str, *, particle_count: int | None = None, seed: int = 0) -> str:
+def preview(source: str, *, particle_count: int | None = None) -> str:
     """Return a picture of a rule's grown world as a data URL: WebP with transparency."""
-    live = RuleWorld(
-        source, device=torch.device("cpu"), seed=seed, particle_count=particle_count, choices={}
-    )
+    live = RuleWorld(source, device=torch.device("cpu"), particle_count=particle_count, choices={})
     live.speed = PREVIEW_STEPS if live.task.aligned else PREVIEW_STEPS // 2
     live.advance()
     with torch.no_grad():

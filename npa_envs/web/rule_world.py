@@ -164,7 +164,7 @@ class RuleWorld(LiveWorld):
             "others": [name for name in self._choices if self._may_join(name)],
             "species": [live_rule.name for live_rule in self.live_rules],
             "damages": list(DAMAGE_SIZES),
-            "capabilities": ["step", "reset", "film", *([] if self.trained.doubt else ["loss"])],
+            "capabilities": ["film", *([] if self.trained.doubt else ["loss"])],
         }
 
     def handle(self, message: Mapping[str, Any]) -> bool:

@@ -22,15 +22,9 @@ from npa_envs.training.task_of_rule import task_of_rule
 
 FOLDER = Path(__file__).resolve().parent
 
-PARTICLES = {"gecko": 192, "dots": 288, "duck": 160, "digits": 160}
-"""Particles of the stored worlds."""
-
-STEPS = {"gecko": 32, "dots": 32, "duck": 24, "digits": 12}
-"""Steps of the stored worlds from the seed."""
-
-SEEDS = {"gecko": 1, "dots": 5, "duck": 6, "digits": 3}
-"""Seeds of worlds in which rounding stays small: no particle is near a jump of the dynamics."""
-
+WORLDS = {"gecko": (192, 32, 1), "dots": (288, 32, 5), "duck": (160, 24, 6), "digits": (160, 12, 3)}
+"""Particles of the stored worlds, their steps, and seeds with which rounding stays small: no
+particle is near a jump of the dynamics."""
 
 CHECKPOINT_INTERVAL, ITERATIONS = 6, 12
 """Of the runs that are killed."""
@@ -40,7 +34,7 @@ OPTIONS = [
     *("--checkpoint-interval", str(CHECKPOINT_INTERVAL)),
     *("--picture-interval", str(CHECKPOINT_INTERVAL)),
 ]
-"""What they were started with."""
+"""Options of these runs."""
 
 RUNS = {"morphogenesis2d": "unfinished_run", "co_morphogenesis2d": "unfinished_joint_run"}
 """Their folders by task."""
@@ -51,15 +45,15 @@ def grow(name):
     rule = scenes.rule_named(name)
     # As many particles as are stored fill a smaller ball.
     fields = {"seed_radius": 0.25} if rule.space_dim == 3 else {}
-    count = PARTICLES[name]
+    count, steps, seed = WORLDS[name]
     source = str(scenes.KEPT_RULES.get(name, name))
     task = task_of_rule(source, rule, torch.device("cpu"), particle_count=count, **fields).task
     used = {"eps": task.eps, "box": task.box}
     assert used == scenes.RULES[name], f"{name} is run with {used}"
-    generator = torch.Generator().manual_seed(SEEDS[name])
+    generator = torch.Generator().manual_seed(seed)
     x, s, *_ = task.seed(2, generator=generator, device=torch.device("cpu"))
     with torch.no_grad():
-        x, s = npa_envs.rollout(rule, x, s, STEPS[name], generator=generator, **used)
+        x, s = npa_envs.rollout(rule, x, s, steps, generator=generator, **used)
     return {f"world/{name}/x": x.numpy(), f"world/{name}/s": s.numpy()}
 
 

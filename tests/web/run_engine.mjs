@@ -8,7 +8,6 @@ const folder = process.argv[2];
 const load = (name) => import(pathToFileURL(`${folder}/${name}`));
 const { Physics, padded, plainKernels, prepareRule } = await load("physics.js");
 const { simdKernels } = await load("kernels_simd.js");
-const brushes = await load("brushes.js");
 const { LiveWorld } = await load("live_world.js");
 const { Colouring } = await load("colours.js");
 
@@ -17,7 +16,7 @@ const text = (array) => Buffer.from(array.buffer, array.byteOffset, array.byteLe
 
 const acts = {
   // One step of rules with given masks.
-  step({ rules, kernels: kind, x, s, species, mask, eps, box, noise, density_counts: densityCounts, dt }) {
+  step({ rules, kernels: kind, x, s, species, mask, eps, box, noise, densityCounts = null }) {
     const { state_dim: channels, space_dim: dimension } = rules[0];
     const kernels = kind === "simd" ? simdKernels(padded(channels), dimension) : plainKernels();
     const prepared = rules.map((rule) => {
@@ -27,25 +26,9 @@ const acts = {
     const world = { x: floats(x), s: floats(s), species: Uint8Array.from(species), count: species.length };
     const physics = new Physics(prepared, world.count, kernels);
     physics.step(world, {
-      eps, box, dt, densityCounts, mask: mask && Uint8Array.from(mask), noise: noise && floats(noise),
+      eps, box, densityCounts, mask: mask && Uint8Array.from(mask), noise: noise && floats(noise),
     });
     return { x: text(world.x), s: text(world.s), kernels: kernels.name };
-  },
-
-  // A brush on positions and states.
-  brush({ tool: name, dimension, x, s, box, at, move, radius, strength, normal, along }) {
-    x = floats(x);
-    s = floats(s);
-    if (name === "wipe") brushes.wipeState(x, s, dimension, at, radius, box);
-    if (name === "push") brushes.push(x, dimension, at, move, radius, strength, box);
-    if (name === "clump") brushes.clump(x, dimension, at, radius, strength, box);
-    if (name === "cut") brushes.cut(x, dimension, at, normal, radius, along, box);
-    if (name === "inject") {
-      const state = brushes.stateAround(x, s, dimension, move, radius, box);
-      if (state !== null) brushes.inject(x, s, dimension, at, radius, state, strength, box);
-    }
-    const inside = brushes.insideBall(x, dimension, at, radius, box);
-    return { x: text(x), s: text(s), inside };
   },
 
   // Principal components of states, frame after frame.
@@ -87,10 +70,10 @@ const acts = {
 };
 
 for await (const line of createInterface({ input: process.stdin })) {
-  const { act, ...told } = JSON.parse(line);
+  const { act, ...fields } = JSON.parse(line);
   let answer;
   try {
-    answer = await acts[act](told);
+    answer = await acts[act](fields);
   } catch (error) {
     answer = { failed: error.stack };
   }

@@ -11,16 +11,15 @@ from pathlib import Path
 import pytest
 import torch
 from page_worlds import (
+    SPECIES,
     TOLERANCE,
     WORLDS,
     described,
-    grown,
+    example,
     lively,
     packed,
     scattered,
-    stepped,
     unpacked,
-    world_of,
 )
 from torch import Tensor
 
@@ -40,9 +39,9 @@ from npa_envs.web.export import (
     page_text,
 )
 from npa_envs.web.live import ColouredWorld, Colouring
-from npa_envs.world import brushes
+from npa_envs.web.rule_world import RuleWorld
+from npa_envs.world.brushes import nearest_image
 from npa_envs.world.rollout import rollout
-from npa_envs.world.species import rollout_species
 
 NODE_SECONDS = 60
 
@@ -75,97 +74,38 @@ def assert_worlds(got, x, s, bound=TOLERANCE):
         assert float((unpacked(got[name], want.shape) - want).abs().max()) < bound
 
 
-@pytest.mark.parametrize("kind", WORLDS)
+@pytest.mark.parametrize("kind", [*WORLDS, *SPECIES])
 def test_a_step_with_a_given_mask_is_that_of_python(run, kind):
-    (rule,), x, s, eps, box = world_of(kind)
-    count = x.shape[1]
-    mask = (torch.rand(1, count, generator=torch.Generator().manual_seed(9)) < 0.5).double()
-    want_x, want_s = stepped(rule, x, s, mask, eps=eps, box=box)
+    fields, s, mask, after = example(kind)
     # The step is no small one.
-    assert float((want_s - s).abs().max()) > 1000 * TOLERANCE
+    assert float((after[1] - s).abs().max()) > 1000 * TOLERANCE
     for kernels, name in (("plain", "JavaScript"), ("simd", "WebAssembly")):
-        got = run(
-            "step", rules=[described(rule)], kernels=kernels, x=packed(x), s=packed(s),
-            species=[0] * count, mask=mask[0].int().tolist(), eps=eps, box=box
-        )  # fmt: skip
+        got = run("step", kernels=kernels, **fields)
         assert got["kernels"] == name
-        assert_worlds(got, want_x, want_s)
+        assert_worlds(got, *after)
         assert torch.equal(unpacked(got["s"], s.shape)[mask == 0], s[mask == 0])
 
 
 @pytest.mark.parametrize(
     "left_out", ["moment_correction", "state_gradient", "density_gradient", "nothing"]
 )
-def test_a_step_has_the_time_the_noise_and_the_groups_of_perception_of_a_rollout(run, left_out):
+def test_a_step_has_the_noise_and_the_groups_of_perception_of_a_rollout(run, left_out):
     groups = {} if left_out == "nothing" else {left_out: False}
     rule = lively(NPARule(2, 6, 5, alpha=0.8, **groups))
     x, s = scattered(200, 2, 6, None)
     got = run(
         "step", rules=[described(rule)], kernels="simd", x=packed(x), s=packed(s),
-        species=[0] * 200, eps=0.1, box=None, dt=0.5, noise=packed(torch.full_like(x, 0.25))
+        species=[0] * 200, eps=0.1, box=None, noise=packed(torch.full_like(x, 0.25))
     )  # fmt: skip
     with torch.no_grad():
-        want_x, want_s = rollout(
-            rule.double(), x.double(), s.double(), 1, eps=0.1, update_prob=1.0, dt=0.5
-        )
+        want_x, want_s = rollout(rule.double(), x.double(), s.double(), 1, eps=0.1, update_prob=1.0)
     assert_worlds(got, want_x + 0.25, want_s)
-
-
-@pytest.mark.parametrize("density_counts", [None, (200, 100)])
-def test_two_species_step_as_in_python(run, density_counts):
-    rules = [load_rule("gecko"), lively(NPARule(2, 16, 24, alpha=0.3))]
-    x, s = grown("gecko", 300, None)
-    got = run(
-        "step", rules=[described(rule) for rule in rules], kernels="simd", x=packed(x),
-        s=packed(s), species=[0] * 200 + [1] * 100, eps=0.1, box=None,
-        density_counts=density_counts
-    )  # fmt: skip
-    with torch.no_grad():
-        want_x, want_s = rollout_species(
-            [rule.double() for rule in rules], x.double(), s.double(), 1, counts=(200, 100),
-            update_prob=1.0, density_counts=density_counts
-        )  # fmt: skip
-    assert_worlds(got, want_x, want_s)
-
-
-@pytest.mark.parametrize(("dimension", "box"), [(2, None), (2, (0.6, 0.5)), (3, None)])
-@pytest.mark.parametrize("name", ["wipe", "push", "clump", "cut", "cut for ever", "inject"])
-def test_brushes_are_those_of_python(run, name, dimension, box):
-    x, s = scattered(200, dimension, 4, box)
-    at, move = x.new_full((1, dimension), 0.2), x.new_tensor([[0.05, -0.1, 0.2][:dimension]])
-    along = None if name == "cut for ever" else 0.5 * move
-    ball = {"centre": at, "radius": 0.15, "box": box}
-    want_x, want_s = x, s
-    match name.split()[0]:
-        case "wipe":
-            want_s = brushes.wipe_state(x, s, **ball)
-        case "push":
-            want_x = brushes.push(x, move=move, strength=0.7, **ball)
-        case "clump":
-            want_x, _ = brushes.clump(x, s, factor=0.7, **ball)
-        case "inject":
-            state, holds = brushes.state_around(x, s, **(ball | {"centre": move}))
-            assert holds.all()
-            want_s = brushes.inject(x, s, state=state, strength=0.7, **ball)
-        case "cut":
-            want_x, _ = brushes.cut(
-                x, s, centre=at, normal=move.flip(1), gap=0.15, along=along, box=box
-            )
-    got = run(
-        "brush", tool=name.split()[0], dimension=dimension, x=packed(x), s=packed(s), box=box,
-        at=at[0].tolist(), move=move[0].tolist(), radius=0.15, strength=0.7,
-        normal=move.flip(1)[0].tolist(), along=None if along is None else along[0].tolist()
-    )  # fmt: skip
-    assert_worlds(got, want_x, want_s, bound=1e-6)
-    assert not (torch.equal(want_x, x) and torch.equal(want_s, s))
-    inside = brushes.inside_ball(want_x, **ball)[0]
-    assert got["inside"] == inside.nonzero()[:, 0].tolist()
 
 
 @pytest.fixture(scope="module")
 def settings():
-    """What the page hands to its engine: two rules that may live together, and a static one."""
-    counts = {"gecko": 300, "heart": 300, "dots": 200}
+    """Settings of the page's engine: two rules that agree, a periodic and a 3D one."""
+    counts = {"gecko": 300, "heart": 300, "dots": 200, "duck": 300}
     return settings_of(*(page_rule(name, particle_count=n) for name, n in counts.items()))
 
 
@@ -181,8 +121,8 @@ def live(run, settings, *script):
 ADVANCE = {"type": "advance"}
 
 
-def last(told, kind):
-    return next(event for event in reversed(told["events"]) if event["type"] == kind)
+def last(result, kind):
+    return next(event for event in reversed(result["events"]) if event["type"] == kind)
 
 
 def test_a_live_world_moves_and_the_same_seed_gives_the_same_world(run, settings):
@@ -195,33 +135,47 @@ def test_a_live_world_moves_and_the_same_seed_gives_the_same_world(run, settings
     assert live(run, settings, {"type": "reset", "seed": 0}, ADVANCE, ADVANCE)["x"] == first["x"]
 
 
-def test_the_rubber_takes_particles_away_and_the_others_go_on(run, settings):
-    rubber = {"type": "brush", "tool": "remove", "at": [0.1, 0], "radius": 0.08, "strength": 1}
-    before = live(run, settings)
-    after = live(run, settings, {"type": "play", "on": False}, rubber)
-    x = unpacked(before["x"], (300, 2))
-    near = (x - torch.tensor([0.1, 0.0])).norm(dim=-1) <= 0.08
-    assert 0 < int(near.sum()) < 300
-    assert torch.equal(unpacked(after["x"], (-1, 2)), x[~near])
-    assert len(live(run, settings, rubber, ADVANCE)["species"]) == 300 - int(near.sum())
-    everything = dict(rubber, radius=9)
+PAUSE = {"type": "play", "on": False}
+BRUSHES = {
+    "remove": {}, "push": {"move": [0.05, -0.1]}, "clump": {}, "cut": {"move": [0.1, 0.2]},
+    "inject": {"source": [-0.1, 0.1]}, "inject nothing": {"source": [5.0, 5.0]},
+    "graft": {},
+}  # fmt: skip
+
+
+GRAFTED = {"gecko": "heart", "dots": "dots", "duck": "duck"}
+"""A rule that may join the world of each rule; the second one is periodic, the last one 3D."""
+
+
+@pytest.mark.parametrize("name", BRUSHES)
+@pytest.mark.parametrize("rule", GRAFTED)
+def test_brushes_of_a_page_are_those_of_the_viewer(run, settings, rule, name):
+    script = [{"type": "set", "name": "rule", "value": rule}, *[ADVANCE] * 9, PAUSE]
+    message = {"type": "brush", "tool": name.split()[0], "at": [0.1, 0.0], "radius": 0.15}
+    message |= {"strength": 0.4, "move": [0.0, 0.0], "rule": GRAFTED[rule]} | BRUSHES[name]
+    if rule == "duck":
+        vectors = {"at": [0.1, 0.0, 0.0], "move": [0.1, 0.2, -0.1], "source": [-0.1, 0.1, 0.1]}
+        message |= vectors | {"view": [0.6, 0.0, 0.8], "radius": 0.5}
+    before = live(run, settings, *script)
+    after = live(run, settings, *script, message)
+    world = RuleWorld(rule, device=torch.device("cpu"), particle_count=len(before["species"]))
+    x = world.x = unpacked(before["x"], world.x.shape)
+    s = world.s = unpacked(before["s"], world.s.shape)
+    world.handle(message)
+    assert world.counts == [after["species"].count(k) for k in sorted(set(after["species"]))]
+    order = torch.tensor(after["species"]).argsort(stable=True)
+    got_x = unpacked(after["x"], (1, -1, x.shape[2]))[:, order]
+    got_s = unpacked(after["s"], (1, -1, s.shape[2]))[:, order]
+    assert float(nearest_image(got_x - world.x, world.box).abs().max()) < 1e-6
+    assert float((got_s - world.s).abs().max()) < 1e-5
+    same = torch.equal(world.x, x) and torch.equal(world.s, s)
+    unchanged = (("gecko", "inject nothing"), ("dots", "graft"), ("duck", "graft"))
+    assert same == ((rule, name) in unchanged)
+
+
+def test_a_world_without_particles_goes_on(run, settings):
+    everything = {"type": "brush", "tool": "remove", "at": [0, 0], "radius": 9, "strength": 1}
     assert last(live(run, settings, everything, ADVANCE, ADVANCE), "frame")["colours"] == []
-
-
-def test_a_state_is_injected_where_the_pointer_is(run, settings):
-    script = [*[ADVANCE] * 9, {"type": "play", "on": False}]
-    brush = {"type": "brush", "tool": "inject", "at": [0.1, 0], "radius": 0.08, "strength": 1}
-    before, after, none_there = (
-        live(run, settings, *script, *brushes_used)
-        for brushes_used in ([], [brush | {"source": [-0.1, 0]}], [brush | {"source": [5, 5]}])
-    )
-    x, s = unpacked(before["x"], (1, 300, 2)), unpacked(before["s"], (1, 300, 16))
-    state, _ = brushes.state_around(x, s, centre=x.new_tensor([[-0.1, 0.0]]), radius=0.08)
-    ball = {"centre": x.new_tensor([[0.1, 0.0]]), "radius": 0.08}
-    want = brushes.inject(x, s, state=state, strength=0.5, **ball)
-    assert float((unpacked(after["s"], s.shape) - want).abs().max()) < 1e-5
-    assert float((want - s).abs().max()) > 0.01
-    assert none_there["s"] == before["s"]
 
 
 def test_species_are_grafted_and_added_where_rules_agree(run, settings):
@@ -244,11 +198,11 @@ def test_settings_reach_the_world_and_wrong_messages_are_told(run, settings):
     def set_to(name, value):
         return {"type": "set", "name": name, "value": value}
 
-    told = live(run, settings, set_to("eps", 0.15), set_to("speed", 4), ADVANCE)
-    ranges = last(told, "world")["settings"]
+    result = live(run, settings, set_to("eps", 0.15), set_to("speed", 4), ADVANCE)
+    ranges = last(result, "world")["settings"]
     assert (ranges["eps"]["value"], ranges["speed"]["value"]) == (0.15, 4)
-    assert last(told, "frame")["step"] == 4
-    assert told["x"] != live(run, settings, set_to("speed", 4), ADVANCE)["x"]
+    assert last(result, "frame")["step"] == 4
+    assert result["x"] != live(run, settings, set_to("speed", 4), ADVANCE)["x"]
     counted = live(run, settings, set_to("count", 500), ADVANCE)
     assert len(counted["species"]) == 500
     texture = live(run, settings, set_to("rule", "dots"), ADVANCE)
@@ -262,33 +216,36 @@ def test_settings_reach_the_world_and_wrong_messages_are_told(run, settings):
         "eps must lie in [0.04, 0.25], got 9", "no rule is called nobody",
         "nothing to show is called nothing", "no damage is called luck", "no message is called fly"
     ]  # fmt: skip
-    for name in ("wipe", "cut", "clump", "noise"):
-        hurt = live(run, settings, *[ADVANCE] * 3, {"type": "damage", "name": name})
-        whole = live(run, settings, *[ADVANCE] * 3)
-        assert (hurt["x"], hurt["s"]) != (whole["x"], whole["s"])
+    whole = live(run, settings, *[ADVANCE] * 3)
+    x = unpacked(whole["x"], (300, 2))
+    for name, farthest in (("wipe", 0.0), ("cut", 0.05), ("clump", 0.18), ("noise", 0.25)):
+        damaged = live(run, settings, *[ADVANCE] * 3, {"type": "damage", "name": name})
+        moved = (unpacked(damaged["x"], (300, 2)) - x).norm(dim=-1).max()
+        assert 0.5 * farthest <= float(moved) <= farthest + 1e-6
+        assert (damaged["s"] != whole["s"]) == (name == "wipe")
 
 
 @pytest.mark.parametrize(
     "show", ["colours", "density", "components", "species", "speed", "mask", "state 3"]
 )
 def test_particles_have_the_colours_of_the_viewer(run, settings, show):
-    told = live(
+    result = live(
         run, settings, *[ADVANCE] * 8, {"type": "play", "on": False},
         {"type": "set", "name": "show", "value": show}, ADVANCE
     )  # fmt: skip
-    frame = last(told, "frame")
-    x, s = unpacked(told["x"], (1, 300, 2)), unpacked(told["s"], (1, 300, 16))
+    frame = last(result, "frame")
+    x, s = unpacked(result["x"], (1, 300, 2)), unpacked(result["s"], (1, 300, 16))
     rule = load_rule("gecko")
-    seen = ColouredWorld(
-        x, s, rule.colour, 0.1, None, [300], 300, unpacked(told["travelled"], (1, 300)),
-        torch.tensor([told["updated"]]).bool()
+    coloured = ColouredWorld(
+        x, s, rule.colour, 0.1, None, [300], 300, unpacked(result["travelled"], (1, 300)),
+        torch.tensor([result["updated"]]).bool()
     )  # fmt: skip
-    want = torch.from_numpy(Colouring()(show, seen)).int()
+    want = torch.from_numpy(Colouring()(show, coloured)).int()
     got = torch.tensor(frame["colours"]).view(300, 3).int()
     if show == "components":
         # Each of them may have either sign.
-        kept = (got - want).abs().amax(dim=0) <= (255 - got - want).abs().amax(dim=0)
-        got = torch.where(kept, got, 255 - got)
+        same_sign = (got - want).abs().amax(dim=0) <= (255 - got - want).abs().amax(dim=0)
+        got = torch.where(same_sign, got, 255 - got)
     assert float((got - want).abs().max()) <= 1
     assert len(want.unique(dim=0)) > (0 if show == "species" else 1)
 
@@ -308,13 +265,13 @@ def test_read_outs_have_the_colours_of_the_viewer(run, name):
     if name == "digits":
         pytest.importorskip("sklearn")
     rule = page_rule(name) if name == "digits" else page_rule(name, particle_count=300)
-    told = live(run, settings_of(rule), *[ADVANCE] * 6)
-    count = len(told["species"])
-    s = unpacked(told["s"], (1, count, -1))
+    result = live(run, settings_of(rule), *[ADVANCE] * 6)
+    count = len(result["species"])
+    s = unpacked(result["s"], (1, count, -1))
     loaded = load_rule(name)
     with torch.no_grad():
         own = class_colours(loaded.read_out(s)) if name == "digits" else loaded.colour(s)
-    got = torch.tensor(last(told, "frame")["colours"]).view(count, 3)
+    got = torch.tensor(last(result, "frame")["colours"]).view(count, 3)
     assert float((own[0].clamp(0, 1) * 255.0 - got).abs().max()) <= 1.0
     assert len(got.unique(dim=0)) > 20
 

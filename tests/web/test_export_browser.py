@@ -8,11 +8,9 @@ import re
 import pytest
 import torch
 from browser import DESK, PHONE, browser
-from page_worlds import TOLERANCE, WORLDS, described, lively, packed, stepped, world_of
+from page_worlds import SPECIES, TOLERANCE, WORLDS, example
 
-from npa_envs.rule.rule import NPARule
 from npa_envs.web.export import export_web, joined_modules
-from npa_envs.world.species import rollout_species
 
 
 @pytest.fixture
@@ -102,10 +100,10 @@ def test_a_page_records_a_film_and_a_picture(exported):
     page.wait("document.querySelectorAll('#files a').length === 2")
     # The page may not fetch, not even its own files: a film that plays has its width.
     width = page.run(
-        """new Promise((told) => {
+        """new Promise((resolve) => {
           const film = document.createElement("video");
-          film.onloadedmetadata = () => told(film.videoWidth);
-          film.onerror = () => told(0);
+          film.onloadedmetadata = () => resolve(film.videoWidth);
+          film.onerror = () => resolve(0);
           film.src = [...document.querySelectorAll("#files a")]
             .find((link) => link.download.startsWith("film.")).href;
         })"""
@@ -117,8 +115,8 @@ def test_a_page_records_a_film_and_a_picture(exported):
 def test_a_page_may_not_reach_the_network(exported):
     page = exported("gecko", particle_count=64)
     refused = page.run(
-        """new Promise((told) => {
-          addEventListener("securitypolicyviolation", (event) => told(event.effectiveDirective));
+        """new Promise((resolve) => {
+          addEventListener("securitypolicyviolation", (event) => resolve(event.effectiveDirective));
           fetch("http://127.0.0.1:9/").catch(() => null);
         })"""
     )
@@ -148,14 +146,18 @@ def test_solid_and_still_worlds_live_in_a_page(exported, name):
         pytest.importorskip("sklearn")
     page = exported(name, particle_count=None, previews=True, query=f"#{name}", steps=3)
     count = {"duck": 8192, "digits": 512}[name]
-    told = page.run("document.getElementById('step').textContent")
-    assert re.fullmatch(rf"step \d+ · {count} particles", told)
+    text = page.run("document.getElementById('step').textContent")
+    assert re.fullmatch(rf"step \d+ · {count} particles", text)
 
 
-# A graphics card in software: slow, but the shaders are those that any card runs.
-CARD = ("--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader", "--enable-features=Vulkan")
+# A GPU in software: slow, but the shaders are those that any GPU runs.
+FLAGS = (
+    "--enable-unsafe-webgpu",
+    "--use-webgpu-adapter=swiftshader",
+    "--enable-features=Vulkan",
+)
 
-CARD_STEP = """(async ({ rules, x, s, species, mask, eps, box, densityCounts }) => {
+GPU_STEP = """(async ({ rules, x, s, species, mask, eps, box, densityCounts }) => {
   const floats = (text) =>
     new Float32Array(Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0)).buffer);
   const kernels = plainKernels();
@@ -167,57 +169,39 @@ CARD_STEP = """(async ({ rules, x, s, species, mask, eps, box, densityCounts }) 
     count: species.length, x: floats(x), s: floats(s), species: Uint8Array.from(species),
   };
   const device = await openDevice();
-  const card = await GpuPhysics.make(
+  const gpu = await GpuPhysics.make(
     device, new Physics(prepared, world.count, kernels));
-  await card.step(world, { eps, box, densityCounts, mask: Uint8Array.from(mask) });
+  await gpu.step(world, { eps, box, densityCounts, mask: Uint8Array.from(mask) });
   return { x: [...world.x], s: [...world.s] };
 })"""
 
 
 @pytest.fixture(scope="module")
-def card_page(tmp_path_factory):
-    with browser(tmp_path_factory.mktemp("card"), *CARD) as opened:
+def gpu_page(tmp_path_factory):
+    with browser(tmp_path_factory.mktemp("gpu"), *FLAGS) as opened:
         yield opened
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", [*WORLDS, "two species"])
-def test_a_step_on_a_graphics_card_is_that_of_python(tmp_path, card_page, kind):
+@pytest.mark.parametrize("kind", [*WORLDS, *SPECIES])
+def test_a_step_on_a_gpu_is_that_of_python(tmp_path, gpu_page, kind):
     script = joined_modules(["physics.js", "physics_gpu.js"])
     text = f"<!doctype html><script>{script}</script>"
-    (tmp_path / "card.html").write_text(text, encoding="utf-8")
-    page = card_page()
-    page.open((tmp_path / "card.html").as_uri())
+    (tmp_path / "gpu.html").write_text(text, encoding="utf-8")
+    page = gpu_page()
+    page.open((tmp_path / "gpu.html").as_uri())
     page.wait("typeof openDevice === 'function'")
-    rules, x, s, eps, box = world_of("gecko" if kind == "two species" else kind)
-    count = x.shape[1]
-    mask = (torch.rand(1, count, generator=torch.Generator().manual_seed(9)) < 0.5).double()
-    counts = None
-    if kind == "two species":
-        rules, counts = [rules[0], lively(NPARule(2, 16, 24, alpha=0.3))], (200, 100)
-        mask = torch.ones(1, count)
-        with torch.no_grad():
-            want_x, want_s = rollout_species(
-                [rule.double() for rule in rules], x.double(), s.double(), 1, counts=counts,
-                update_prob=1.0, density_counts=counts
-            )  # fmt: skip
-    else:
-        want_x, want_s = stepped(rules[0], x, s, mask, eps=eps, box=box)
-    told = {
-        "rules": [described(rule) for rule in rules], "x": packed(x), "s": packed(s),
-        "species": [0] * count if counts is None else [0] * counts[0] + [1] * counts[1],
-        "mask": mask[0].int().tolist(), "eps": eps, "box": box, "densityCounts": counts
-    }  # fmt: skip
-    got = page.run(f"{CARD_STEP}({json.dumps(told)})")
-    assert float((torch.tensor(got["x"]).view_as(want_x) - want_x).abs().max()) < TOLERANCE
-    assert float((torch.tensor(got["s"]).view_as(want_s) - want_s).abs().max()) < TOLERANCE
+    step = example(kind)
+    got = page.run(f"{GPU_STEP}({json.dumps(step.fields)})")
+    for name, want in zip("xs", step.after, strict=True):
+        assert float((torch.tensor(got[name]).view_as(want) - want).abs().max()) < TOLERANCE
     assert page.complaints == []
 
 
 @pytest.mark.slow
-def test_a_page_lives_on_a_graphics_card(exported, card_page):
+def test_a_page_lives_on_a_gpu(exported, gpu_page):
     for engine, name in (("gpu", "WebGPU"), ("auto", ""), ("processor", "WebAssembly")):
-        kind = {"make": card_page, "query": f"?engine={engine}"}
+        kind = {"make": gpu_page, "query": f"?engine={engine}"}
         page = exported("gecko", "heart", particle_count=256, steps=8, **kind)
         page.run(
             "document.page.send({ type: 'brush', tool: 'graft', rule: 'heart', "

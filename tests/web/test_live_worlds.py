@@ -54,8 +54,8 @@ def advance(world, count):
 def world_of(rule: NPARule, path: Path, device: torch.device, **options) -> RuleWorld:
     """A world of a rule that was trained by the preset `paper` with some options."""
     config = config_to_dict(preset("paper", **options))
-    kept = {name: config[name] for name in config if name not in ("out", "device")}
-    metadata = {"task": "morphogenesis2d", "config": json.dumps(kept)}
+    stored = {name: config[name] for name in config if name not in ("out", "device")}
+    metadata = {"task": "morphogenesis2d", "config": json.dumps(stored)}
     save_rule(rule, path, metadata=metadata)
     return RuleWorld(str(path), device=device)
 
@@ -255,8 +255,8 @@ def test_a_state_is_injected_elsewhere(world):
 
 def test_grafts_follow_the_other_rule(world):
     assert world.handle(brush("graft", rule="heart", radius=0.15))
-    told = world.describe()
-    assert told["species"] == ["gecko", "heart"]
+    description = world.describe()
+    assert description["species"] == ["gecko", "heart"]
     inside = np.linalg.norm(world.frame().positions, axis=1) <= 0.15
     assert world.counts == [COUNT - inside.sum(), inside.sum()]
     # Species after species: those within follow the second.
@@ -314,12 +314,12 @@ def test_settings_change_the_world_and_its_description(world):
 def test_another_rule_is_another_world(world):
     put(world, show="state 15")
     assert put(world, rule="dots")
-    told = world.describe()
-    assert told["rule"] == "dots"
-    assert told["box"] == [2.0, 2.0]
-    assert told["half_width"] == 1.0
-    assert "dots" in told["others"]
-    assert "gecko" not in told["others"]
+    description = world.describe()
+    assert description["rule"] == "dots"
+    assert description["box"] == [2.0, 2.0]
+    assert description["half_width"] == 1.0
+    assert "dots" in description["others"]
+    assert "gecko" not in description["others"]
     with pytest.raises(NPAError, match="gecko cannot live in a world of dots"):
         world.handle(brush("graft", rule="gecko"))
 
@@ -369,12 +369,12 @@ def test_the_loss_is_computed_only_where_it_is_wanted(world):
     ],
 )
 def test_a_wrong_message_is_refused_and_changes_nothing(shared, message, error):
-    x, s, told = shared.x, shared.s, shared.describe()
+    x, s, description = shared.x, shared.s, shared.describe()
     with pytest.raises(NPAError, match=error):
         shared.handle(message)
     assert shared.x is x
     assert shared.s is s
-    assert shared.describe() == told
+    assert shared.describe() == description
 
 
 @pytest.fixture(scope="module")
@@ -387,16 +387,16 @@ def shared():
 @pytest.mark.parametrize("name", shipped_rules())
 def test_every_shipped_rule_can_be_viewed(name, device):
     world = RuleWorld(name, device=device)
-    told = world.describe()
-    assert name in told["others"]
-    for show in (*told["shows"][:6], "state 0"):
+    description = world.describe()
+    assert name in description["others"]
+    for show in (*description["shows"][:6], "state 0"):
         put(world, show=show)
         world.advance()
         frame = world.frame()
-        assert frame.positions.shape == (world.count, told["dimension"])
+        assert frame.positions.shape == (world.count, description["dimension"])
         assert frame.colours.shape == (world.count, 3)
-        middle = np.array(told["centre"])
-        inside = np.abs(frame.positions - middle).max(axis=1) <= 1.1 * told["half_width"]
+        middle = np.array(description["centre"])
+        inside = np.abs(frame.positions - middle).max(axis=1) <= 1.1 * description["half_width"]
         assert inside.mean() > 0.95
     put(world, loss=True)
     assert np.isfinite(world.frame().loss)
@@ -404,10 +404,10 @@ def test_every_shipped_rule_can_be_viewed(name, device):
 
 def test_brushes_work_in_3d(device):
     world = RuleWorld("duck", device=device, particle_count=256)
-    told = {"at": [0.0, 0.0, 0.0], "radius": 0.5}
-    world.handle(brush("push", move=[0.0, 0.0, 0.1], strength=1.0, **told))
-    world.handle(brush("cut", move=[1.0, 0.0, 0.0], view=[0.0, 0.0, 1.0], **told))
-    world.handle(brush("remove", **told))
+    ball = {"at": [0.0, 0.0, 0.0], "radius": 0.5}
+    world.handle(brush("push", move=[0.0, 0.0, 0.1], strength=1.0, **ball))
+    world.handle(brush("cut", move=[1.0, 0.0, 0.0], view=[0.0, 0.0, 1.0], **ball))
+    world.handle(brush("remove", **ball))
     assert float(world.x.norm(dim=-1).min()) > 0.5
     world.advance()
     assert world.frame().positions.shape[1] == 3
@@ -472,8 +472,8 @@ def test_species_have_colours_of_their_own():
 def write_run(folder: Path, name: str = "gecko", rule: NPARule | None = None) -> None:
     folder.mkdir(exist_ok=True)
     metadata = rule_metadata((shipped_rules() | preset_rules())[name])
-    told = {key: metadata[key] for key in ("task", "config") if key in metadata}
-    save_rule(rule or load_rule(name), folder / "rule.safetensors", metadata=told)
+    stored = {key: metadata[key] for key in ("task", "config") if key in metadata}
+    save_rule(rule or load_rule(name), folder / "rule.safetensors", metadata=stored)
     (folder / "config.json").write_text("{}", encoding="utf-8")
     if not (folder / "log.jsonl").exists():
         log(folder, 0, 10)
@@ -513,18 +513,19 @@ def followed(tmp_path) -> RunWorld:
 
 def test_a_run_is_followed(tmp_path, followed):
     world = followed
-    curve, told = world.take_events()
+    curve, description = world.take_events()
     assert (curve["points"], curve["append"]) == ([[k, 1.0 / (k + 1)] for k in range(10)], False)
-    assert (told["note"], told["title"]) == ("a training run, iteration 9", tmp_path.name)
+    assert description["note"] == "a training run, iteration 9"
+    assert description["title"] == tmp_path.name
     assert world.take_events() == []
     world.advance()
     x = world.x
     newer = trained_on("gecko")
     write_run(tmp_path, rule=newer)
     log(tmp_path, 10, 12)
-    curve, told = (event for event in polled(world) if event["type"] != "error")
+    curve, description = (event for event in polled(world) if event["type"] != "error")
     assert (curve["points"], curve["append"]) == ([[10, 1.0 / 11], [11, 1.0 / 12]], True)
-    assert told["note"] == "a training run, iteration 11"
+    assert description["note"] == "a training run, iteration 11"
     assert torch.equal(world.main.rule.hidden.weight, newer.hidden.weight)
     # The world lives on.
     assert world.x is x
@@ -537,9 +538,9 @@ def test_a_run_of_several_rules_is_one_world_of_them(tmp_path):
     folder = tmp_path / "pair"
     shutil.copytree(UNFINISHED, folder)
     world = RunWorld(folder, device=CPU)
-    told = world.describe()
-    assert told["title"] == "pair"
-    assert told["species"] == ["rule-0", "rule-1"]
+    description = world.describe()
+    assert description["title"] == "pair"
+    assert description["species"] == ["rule-0", "rule-1"]
     assert world.counts == [128, 128]
     curve, _ = world.take_events()
     assert len(curve["points"]) > 1
@@ -555,8 +556,8 @@ def test_a_run_of_several_rules_is_one_world_of_them(tmp_path):
     assert torch.equal(world.x, x)
     # A newer checkpoint.
     path = folder / "rule-1.safetensors"
-    told = {name: rule_metadata(path)[name] for name in ("task", "config")}
-    save_rule(rules[0], path, metadata=told)
+    metadata = {name: rule_metadata(path)[name] for name in ("task", "config")}
+    save_rule(rules[0], path, metadata=metadata)
     polled(world)
     assert torch.equal(world.live_rules[1].rule.hidden.weight, rules[0].hidden.weight)
     world.handle({"type": "reset"})
@@ -576,9 +577,9 @@ def test_another_run_in_the_folder_is_another_world(tmp_path, followed):
     polled(world)
     assert world.step == 1
     write_run(tmp_path, "dots")
-    reordered, told = polled(world)
+    reordered, description = polled(world)
     assert reordered == {"type": "reordered"}
-    assert told["box"] == [2.0, 2.0]
+    assert description["box"] == [2.0, 2.0]
     advance(world, 1)
     assert world.frame().step == 1
 
@@ -662,7 +663,7 @@ def test_the_speed_of_a_step_across_an_edge_of_the_box_is_that_of_the_step():
     env = made("npa/Texture-v0", target="dots")
     action = np.zeros(env.action_space.shape, np.float32)
     action[:, 0] = 1.0
-    world = EnvironmentWorld(env, lambda seen: action)
+    world = EnvironmentWorld(env, lambda observation: action)
     x, s = world._inner.particles()
     x[:, 0] = 1.0 - 1e-4
     world._place(x[None], s[None])
@@ -689,10 +690,10 @@ def test_episodes_follow_each_other(episodes):
     assert episodes.frame().step == 2
     assert episodes.take_events() == []
     episodes.advance()
-    curve, told = episodes.take_events()
+    curve, description = episodes.take_events()
     assert curve["name"] == "Return"
     assert curve["points"][0][0] == 1
-    assert told["note"].startswith("episode 2; the last one ended after 3 steps: time limit")
+    assert description["note"].startswith("episode 2; the last one ended after 3 steps: time limit")
     assert episodes.frame().step == 0
     assert not np.array_equal(episodes.frame().positions, first)
     episodes.handle({"type": "reset", "seed": 0})
@@ -733,4 +734,4 @@ def test_environments_are_made_with_a_policy():
             make_environment(name)
     make_environment("npa/Morphogenesis2DSmall-v0")[0].close()
     with pytest.raises(NPAError, match="env must be an environment of npa_envs"):
-        EnvironmentWorld(gymnasium.make("CartPole-v1"), lambda seen: 0)
+        EnvironmentWorld(gymnasium.make("CartPole-v1"), lambda observation: 0)

@@ -18,7 +18,7 @@ const world = {
     { ...usual, name: "push", sends: "motion" }, { ...usual, name: "graft", sends: "place" },
     { ...usual, name: "add", sends: "once" }, { ...usual, name: "cut", sends: "line" },
   ],
-  capabilities: ["film", "step", "reset"],
+  capabilities: ["film"],
 };
 const frame = (step, places = [0, 0, 1, 1]) => ({
   type: "frame", step, positions: new Float32Array(places), colours: new Uint8Array(6),

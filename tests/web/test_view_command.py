@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import socket
-
 import pytest
 import torch
 
@@ -28,7 +26,7 @@ def make(what, **options):
     return world
 
 
-def test_a_rule_a_run_and_an_environment_are_by_species(tmp_path):
+def test_a_rule_a_run_and_an_environment_are_told_apart(tmp_path):
     save_rule(load_rule("gecko"), tmp_path / "rule.safetensors")
     assert type(make("heart")) is RuleWorld
     # A folder with nothing but a rule is that rule.
@@ -74,8 +72,6 @@ def test_an_environment_gets_the_keywords_that_a_rule_needs():
         (["npa/Texture-v0", "--options", "max_episode_steps=0"], "at least 1, got 0"),
         (["gecko", "--threads", "0"], "threads must be in [1, 256], got 0"),
         (["gecko", "--port", "-1"], "port must be in [0, 65535], got -1"),
-        (["gecko", "--host", "nowhere.invalid"], "host must be an address of this computer"),
-        (["gecko", "--host", ".."], "host must be an address of this computer, got '..'"),
         (["gecko", "--device", "tpu"], "device must name a device"),
         (["gecko", "--seed", "-1"], "seed must be a whole number"),
     ],
@@ -86,13 +82,7 @@ def test_what_is_wrong_is_said_before_anything_is_served(words, error, capsys, t
     assert error in capsys.readouterr().err
 
 
-def test_an_unfinished_run_is_refused(tmp_path):
-    (tmp_path / "log.jsonl").write_text("", encoding="utf-8")
-    with pytest.raises(NPAError, match="has not written its rules"):
-        make(tmp_path)
-
-
-def test_half_written_rules_and_ports_in_use_are_told(capsys, tmp_path):
+def test_half_written_rules_are_refused(capsys, tmp_path):
     run = tmp_path / "run"
     run.mkdir()
     save_rule(load_rule("gecko"), run / "rule.safetensors")
@@ -103,10 +93,6 @@ def test_half_written_rules_and_ports_in_use_are_told(capsys, tmp_path):
     words = ["--no-browser", "--out", str(tmp_path)]
     assert main(["view", str(run), "--port", "0", *words]) == 2
     assert "this is no safetensors file, or a truncated one" in capsys.readouterr().err
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = str(taken.getsockname()[1])
-        assert main(["view", "gecko", "--port", port, *words]) == 2
-    assert f"port {port} of 127.0.0.1 cannot be bound" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "0.0.0.0"])
@@ -116,9 +102,9 @@ def test_the_link_is_printed_and_opened(host, capsys, monkeypatch, tmp_path):
     monkeypatch.setattr(command, "open_browser", lambda address: opened.append(address) or False)
     words = ["view", "gecko", "--particle-count", "64", "--host", host, "--port", "0"]
     assert main([*words, "--out", str(tmp_path)]) == 0
-    told = capsys.readouterr().out
-    assert opened[0] in told
-    assert "no browser was found here: open the link in yours" in told
+    output = capsys.readouterr().out
+    assert opened[0] in output
+    assert "no browser was found here: open the link in yours" in output
     (site,) = served
     assert ("?token=" in opened[0]) == (host == "0.0.0.0")
     assert site.token is None or opened[0].endswith(site.token)

@@ -99,11 +99,11 @@ def picture_of(page, path) -> np.ndarray:
 
 def place_of(page, x: float, y: float) -> tuple[float, float]:
     """Where a position is on the page [pixels]."""
-    told = page.run(
+    place = page.run(
         "(() => { const { camera, canvas } = document.page; return camera.project("
         f"[{x}, {y}, 0], canvas.clientWidth, canvas.clientHeight); }})()"
     )
-    return told[0], told[1]
+    return place[0], place[1]
 
 
 def test_the_world_moves_the_brush_removes_and_a_slider_changes_eps(shown, tmp_path):

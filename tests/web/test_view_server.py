@@ -31,7 +31,7 @@ THERE = "ws://lab.example:8765/socket"
 
 
 class Counter:
-    """A live world of two particles that counts its steps, and remembers what it was told."""
+    """A live world of two particles that counts its steps, and remembers its messages."""
 
     def __init__(self) -> None:
         self.playing = True
@@ -216,7 +216,7 @@ def test_the_world_waits_for_a_page_that_does_not_draw(client, worlds):
         reader.receive_bytes()
         time.sleep(0.1)
         assert worlds[0].step == server.FRAMES_AHEAD + 1
-        # What is told meanwhile is done at once, and seen in the next frame.
+        # Messages are applied at once; the next frame shows it.
         reader.send_json({"type": "play", "on": False})
         assert reader.receive_json()["playing"] is False
     assert worlds[0].closed.wait(5)
@@ -284,13 +284,13 @@ def test_the_page_learns_why_there_is_no_world(tmp_path):
 
 
 def test_a_page_that_says_it_has_drawn_more_gets_no_more_ahead(tmp_path):
-    begun, told = threading.Event(), threading.Event()
+    begun, released = threading.Event(), threading.Event()
 
     class Held(Counter):
         def advance(self):
             if self.step == server.FRAMES_AHEAD:
                 begun.set()
-                assert told.wait(60)
+                assert released.wait(60)
             super().advance()
 
     with meet(client_of(server.Site(Held, films=tmp_path))) as reader:
@@ -303,7 +303,7 @@ def test_a_page_that_says_it_has_drawn_more_gets_no_more_ahead(tmp_path):
         frames = 0
         while "text" not in reader.receive():
             frames += 1
-        told.set()
+        released.set()
         while frames < 1 + 2 * server.FRAMES_AHEAD:
             reader.receive_bytes()
             frames += 1
@@ -375,10 +375,10 @@ def test_a_film_that_is_long_enough_ends_by_itself(client, site, monkeypatch):
         reader.send_json({"type": "film", "action": "start"})
         for _ in range(5):
             reader.send_bytes(jpeg())
-        told = [next_event(reader, "film", "file") for _ in range(2)]
-    # The page is told at once that it need send no more; the files may take long.
-    assert told[0] == {"type": "film", "action": "stop"}
-    assert told[1]["type"] == "file"
+        events = [next_event(reader, "film", "file") for _ in range(2)]
+    # The page stops sending at once; the files may take long.
+    assert events[0] == {"type": "film", "action": "stop"}
+    assert events[1]["type"] == "file"
     (film,) = site.films.glob("*.gif")
     with Image.open(film) as frames:
         assert frames.info["duration"] * getattr(frames, "n_frames", 1) <= 120
@@ -459,9 +459,9 @@ def test_more_messages_than_there_is_room_for_are_refused(site):
     # Without a thread that takes them out.
     session = server.ViewerSession.__new__(server.ViewerSession)
     session._inbox = queue.Queue(2)
-    told = []
-    session._send_event = told.append
+    events = []
+    session._send_event = events.append
     for _ in range(4):
         session._enqueue({"type": "brush"})
     assert session._inbox.qsize() == 2
-    assert [event["message"] for event in told] == ["too many messages: some are lost"] * 2
+    assert [event["message"] for event in events] == ["too many messages: some are lost"] * 2

@@ -11,22 +11,22 @@ function forEach(x, dimension, centre, box, visit) {
   for (let i = 0; i < count; i++) {
     let square = 0;
     for (let d = 0; d < dimension; d++) {
-      let part = x[i * dimension + d] - centre[d];
-      if (box !== null) part -= box[d] * Math.round(part / box[d]);
-      offset[d] = part;
-      square += part * part;
+      let difference = x[i * dimension + d] - centre[d];
+      if (box !== null) difference -= box[d] * Math.round(difference / box[d]);
+      offset[d] = difference;
+      square += difference * difference;
     }
     visit(i, offset, square);
   }
 }
 
-// Returns the indices of the particles in a ball.
+// Returns the indices of particles in a ball.
 export function insideBall(x, dimension, centre, radius, box) {
-  const found = [];
+  const indices = [];
   forEach(x, dimension, centre, box, (i, _, square) => {
-    if (Math.sqrt(square) <= radius) found.push(i);
+    if (Math.sqrt(square) <= radius) indices.push(i);
   });
-  return found;
+  return indices;
 }
 
 export function wipeState(x, s, dimension, centre, radius, box) {

@@ -70,23 +70,24 @@ export class Colouring {
     const row = new Float64Array(channels);
     for (const i of known) {
       for (let c = 0; c < channels; c++) row[c] = s[i * channels + c] - mean[c];
-      for (let a = 0; a < channels; a++) for (let b = 0; b <= a; b++) fresh[a * channels + b] += (row[a] * row[b]) / known.length;
+      for (let a = 0; a < channels; a++) {
+        for (let b = 0; b < channels; b++) fresh[a * channels + b] += (row[a] * row[b]) / known.length;
+      }
     }
-    for (let a = 0; a < channels; a++) for (let b = 0; b < a; b++) fresh[b * channels + a] = fresh[a * channels + b];
     if (this.covariance?.length !== fresh.length) {
       this.covariance = fresh.slice();
       this.basis = null;
     }
-    this.covariance = this.covariance.map((kept, k) => BALANCE * kept + (1 - BALANCE) * fresh[k]);
-    const found = eigenvectors(this.covariance, channels).slice(0, 3);
-    found.forEach(({ vector }, k) => {
+    this.covariance = this.covariance.map((average, k) => BALANCE * average + (1 - BALANCE) * fresh[k]);
+    const components = eigenvectors(this.covariance, channels).slice(0, 3);
+    components.forEach(({ vector }, k) => {
       // An eigenvector's sign is arbitrary: colours must not flip between frames.
       if (this.basis?.[k] && product(vector, this.basis[k]) < 0) vector.forEach((part, c) => (vector[c] = -part));
     });
-    this.basis = found.map(({ vector }) => vector);
+    this.basis = components.map(({ vector }) => vector);
     const tint = [0.5, 0.5, 0.5];
     for (let i = 0; i < count; i++) {
-      found.forEach(({ value, vector }, k) => {
+      components.forEach(({ value, vector }, k) => {
         let sum = 0;
         for (let c = 0; c < channels; c++) sum += (s[i * channels + c] - mean[c]) * vector[c];
         tint[k] = 0.5 + (0.22 * sum) / Math.sqrt(Math.max(value, 1e-12));
@@ -95,9 +96,9 @@ export class Colouring {
     }
   }
 
-  onRamp(share) {
+  onRamp(fraction) {
     const last = this.ramp.length / 3 - 1;
-    const entry = 3 * Math.round(last * Math.min(1, Math.max(0, share)));
+    const entry = 3 * Math.round(last * Math.min(1, Math.max(0, fraction)));
     return [this.ramp[entry] / 255, this.ramp[entry + 1] / 255, this.ramp[entry + 2] / 255];
   }
 }
@@ -114,10 +115,10 @@ export class Look {
     this.outputs = outputs === 0 ? this.channels : rule.classes === null ? 3 : outputs;
     if (outputs === 0) return;
     // Only the read-out's outputs that are colours or classes.
-    const kept = this.outputs;
+    const width = this.outputs;
     this.first = kernels.layer(weights["readout.0.weight"], weights["readout.0.bias"], this.channels, hidden);
     this.second = kernels.layer(
-      weights["readout.2.weight"].slice((outputs - kept) * hidden), weights["readout.2.bias"].slice(outputs - kept), hidden, kept,
+      weights["readout.2.weight"].slice((outputs - width) * hidden), weights["readout.2.bias"].slice(outputs - width), hidden, width,
     );
     this.rows = kernels.floats(ROWS_TOGETHER * this.channels);
     this.hidden = kernels.floats(ROWS_TOGETHER * this.first.width);
@@ -222,9 +223,9 @@ function eigenvectors(matrix, size) {
       }
     }
   }
-  const found = Array.from({ length: size }, (_, k) => ({
+  const pairs = Array.from({ length: size }, (_, k) => ({
     value: m[k * size + k],
     vector: Float64Array.from({ length: size }, (_, c) => vectors[c * size + k]),
   }));
-  return found.sort((a, b) => b.value - a.value);
+  return pairs.sort((a, b) => b.value - a.value);
 }

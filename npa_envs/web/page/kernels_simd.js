@@ -116,9 +116,9 @@ function pairsCode(dimension) {
   const names = [
     "probe", "order", "x", "y", "z", "volume", "ranges", "rangesEnd", "width", "place", "a", "kx", "ky", "kz", "out",
     // Local integers.
-    "byte", "end", "count", "found", "at",
+    "byte", "end", "count", "hits", "at",
     // Vectors.
-    "lanes", "dx", "dy", "dz", "squared", "inside", "left", "distance", "share", "front",
+    "lanes", "dx", "dy", "dz", "squared", "inside", "rest", "distance", "factor", "front",
     "xx", "xy", "xz", "yy", "yz", "zz", "sx", "sy", "sz",
     ...PROBE.map((name) => `probe ${name}`),
   ];
@@ -136,31 +136,31 @@ function pairsCode(dimension) {
   const append = (list, code) => store(add(value(list), value("at")), shuffled(code, value("front")));
   const hit = [
     ...put("distance", root(value("squared"))),
-    ...put("left", minus(probed("square"), value("squared"))),
-    ...put("share", minus(probed("eps"), value("distance"))),
-    ...put("share", over(times(probed("slope"), times(value("share"), value("share"))), value("distance"))),
-    ...put("share", times(value("share"), load(add(value("volume"), value("byte"))))),
+    ...put("rest", minus(probed("square"), value("squared"))),
+    ...put("factor", minus(probed("eps"), value("distance"))),
+    ...put("factor", over(times(probed("slope"), times(value("factor"), value("factor"))), value("distance"))),
+    ...put("factor", times(value("factor"), load(add(value("volume"), value("byte"))))),
     // Masks the NaN of the particle itself, and lanes behind the last particle.
-    ...put("share", and(value("share"), and(value("inside"), less(zeros, value("squared"))))),
-    ...axes.flatMap((axis) => put(`s${axis}`, times(value("share"), value(`d${axis}`)))),
+    ...put("factor", and(value("factor"), and(value("inside"), less(zeros, value("squared"))))),
+    ...axes.flatMap((axis) => put(`s${axis}`, times(value("factor"), value(`d${axis}`)))),
     ...axes.flatMap((axis, k) => axes.slice(k).flatMap((other) =>
       put(axis + other, plus(value(axis + other), times(value(`s${axis}`), value(`d${other}`)))))),
-    ...put("front", load(add(value("order"), multiply(value("found"), number(16))))),
+    ...put("front", load(add(value("order"), multiply(value("hits"), number(16))))),
     ...put("at", multiply(value("count"), number(4))),
     ...append("place", timesIntegers(value("lanes"), spreadInteger(value("width")))),
     ...append("a", times(
-      times(probed("weight"), times(value("left"), times(value("left"), value("left")))),
+      times(probed("weight"), times(value("rest"), times(value("rest"), value("rest")))),
       load(add(value("volume"), value("byte"))),
     )),
     ...axes.flatMap((axis) => append(`k${axis}`, value(`s${axis}`))),
-    ...put("count", add(value("count"), ones(value("found")))),
+    ...put("count", add(value("count"), ones(value("hits")))),
   ];
   const four = [
     ...axes.flatMap(offset),
     ...put("squared", sum(axes.map((axis) => times(value(`d${axis}`), value(`d${axis}`))))),
     ...put("inside", and(less(value("squared"), probed("square")), lessIntegers(value("lanes"), spreadInteger(value("end"))))),
-    ...put("found", bits(value("inside"))),
-    ...when(value("found"), hit),
+    ...put("hits", bits(value("inside"))),
+    ...when(value("hits"), hit),
     ...put("byte", add(value("byte"), number(16))),
     ...put("lanes", plusIntegers(value("lanes"), spreadInteger(number(4)))),
   ];
@@ -244,12 +244,12 @@ function assemble(functions) {
   const section = (id, content) => [id, ...unsigned(content.length), ...content];
   const named = Object.entries(functions);
   const [INTEGER, VECTOR] = [0x7f, 0x7b];
-  const types = named.map(([, own]) => [0x60, ...list(new Array(own.parameters).fill([INTEGER])), 0]);
+  const types = named.map(([, body]) => [0x60, ...list(new Array(body.parameters).fill([INTEGER])), 0]);
   const imports = [[...text("page"), ...text("memory"), 0x02, 0x00, ...unsigned(MEMORY_PAGES)]];
   const exported = named.map(([name], index) => [...text(name), 0x00, ...unsigned(index)]);
-  const bodies = named.map(([, own]) => {
-    const locals = list([[...unsigned(own.integers), INTEGER], [...unsigned(own.vectors), VECTOR]]);
-    const body = [...locals, ...own.code, 0x0b];
+  const bodies = named.map(([, { integers, vectors, code }]) => {
+    const locals = list([[...unsigned(integers), INTEGER], [...unsigned(vectors), VECTOR]]);
+    const body = [...locals, ...code, 0x0b];
     return [...unsigned(body.length), ...body];
   });
   return new Uint8Array([

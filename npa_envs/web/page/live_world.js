@@ -146,9 +146,9 @@ export class LiveWorld {
       for (let i = 0; i < world.count; i++) {
         let square = 0;
         for (let d = 0; d < dimension; d++) {
-          let part = world.x[i * dimension + d] - before[i * dimension + d];
-          if (box !== null) part -= box[d] * Math.round(part / box[d]);
-          square += part * part;
+          let difference = world.x[i * dimension + d] - before[i * dimension + d];
+          if (box !== null) difference -= box[d] * Math.round(difference / box[d]);
+          square += difference * difference;
         }
         this.travelled[i] = Math.sqrt(square) / longest;
       }
@@ -358,20 +358,8 @@ function bytesOf(text) {
 // Runs a live world in a worker: answers its messages, and computes frames between them.
 export function serve(scope) {
   const send = (event, transferred = []) => scope.postMessage(event, transferred);
-  const messages = [];
-  const clock = new MessageChannel();
-  let live = null;
-  let busy = false;
-
-  const attempt = async (act) => {
-    try {
-      await act();
-      return true;
-    } catch (error) {
-      send({ type: "error", message: error.message });
-      return false;
-    }
-  };
+  const messages = [], clock = new MessageChannel();
+  let live = null, busy = false;
 
   const apply = async ({ type, settings, ...rest }) => {
     if (type !== "begin") return live.receive({ type, ...rest });
@@ -379,20 +367,20 @@ export function serve(scope) {
     live = new LiveWorld(settings, send, device);
   };
 
-  // One message or one frame after the other, never two at a time.
+  // One message, or one frame where there is none, never two at a time.
   const go = async () => {
     if (busy) return;
     busy = true;
-    while (messages.length > 0) {
-      const message = messages.shift();
-      await attempt(() => apply(message));
-    }
-    if (live?.pending) {
-      // After an error the world is paused.
-      if (!(await attempt(() => live.advance()))) live.playing = live.changed = false;
+    const message = messages.shift();
+    try {
+      if (message !== undefined) await apply(message);
+      else if (live?.pending) await live.advance();
+    } catch (error) {
+      send({ type: "error", message: error.message });
+      // A world that fails is paused.
+      if (message === undefined) live.playing = live.changed = false;
     }
     busy = false;
-    // Messages that have arrived meanwhile come first.
     if (messages.length > 0 || live?.pending) clock.port2.postMessage(null);
   };
 

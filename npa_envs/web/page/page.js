@@ -33,7 +33,7 @@
 //       the rules of the world's particles; settings: {name: {value, low, high, scale?: "log",
 //       whole?: true}}, names: eps, update_prob, noise, count, speed (steps a frame);
 //       tools: [{name, label, icon, sends, takes}], the rows of TOOLS in npa_envs/web/live.py;
-//       capabilities: some of "step", "reset", "film", "loss".
+//       capabilities: some of "film", "loss".
 //       `BLANK` below has the defaults of missing keys.
 //   {type: "frame", step, positions, colours, milliseconds, loss?}
 //       positions: Float32Array, count * dimension; colours: Uint8Array, count * 3 (red, green, blue);
@@ -170,8 +170,6 @@ class Page {
     $("rule-field").hidden = world.rules.length < 2;
     $("other-field").hidden = !world.tools.some(({ takes }) => takes === "rule");
     $("brush").hidden = !world.tools.length;
-    $("one").disabled = !world.capabilities.includes("step");
-    $("reset").disabled = !world.capabilities.includes("reset");
     this.plots.loss.figure.hidden = !world.capabilities.includes("loss");
     this.showTools();
     this.showDamages();
@@ -516,7 +514,7 @@ class Page {
 
   draw({ still = false } = {}) {
     const { canvas, frame, world, camera } = this;
-    // More pixels are invisible, and slow without a graphics card.
+    // More pixels are invisible, and slow without a GPU.
     const ratio = Math.min(devicePixelRatio || 1, 1600 / Math.max(canvas.clientWidth, canvas.clientHeight, 1), 2);
     const width = Math.round(canvas.clientWidth * ratio), height = Math.round(canvas.clientHeight * ratio);
     if (!width || !height) return;

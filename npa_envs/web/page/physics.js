@@ -87,19 +87,19 @@ export function plainKernels() {
         const left = squaredRadius - squared;
         const distance = Math.sqrt(squared);
         const k = squared > 0 ? (slope * (eps - distance) * (eps - distance)) / distance : 0;
-        const share = k * volume[j];
+        const factor = k * volume[j];
         place[count] = j * width;
         a[count] = weight * left * left * left * volume[j];
-        kx[count] = share * dx;
-        ky[count] = share * dy;
-        kz[count] = share * dz;
+        kx[count] = factor * dx;
+        ky[count] = factor * dy;
+        kz[count] = factor * dz;
         count++;
-        xx += share * dx * dx;
-        xy += share * dx * dy;
-        xz += share * dx * dz;
-        yy += share * dy * dy;
-        yz += share * dy * dz;
-        zz += share * dz * dz;
+        xx += factor * dx * dx;
+        xy += factor * dx * dy;
+        xz += factor * dx * dz;
+        yy += factor * dy * dy;
+        yz += factor * dy * dz;
+        zz += factor * dz * dz;
       }
     }
     list.count = count;
@@ -213,13 +213,13 @@ export class Physics {
   //
   // eps: perception radius [length units]; box: sides, or null; mask: Uint8Array, 1 where a particle
   // is updated, or null for all; noise: offsets of positions, or null; densityCounts: divisors of each
-  // rule's densities, by default the particles of the world; dt: dimensionless.
-  step(world, { eps, box = null, mask = null, noise = null, densityCounts = null, dt = 1 }) {
+  // rule's densities, by default the particles of the world.
+  step(world, { eps, box = null, mask = null, noise = null, densityCounts = null }) {
     this.sort(world, eps, box);
     this.computeDensities(world.count, eps);
     for (let number = 0; number < this.rules.length; number++) {
       const divisor = densityCounts === null ? world.count : densityCounts[number];
-      this.advance(world, number, eps, divisor, mask, dt);
+      this.advance(world, number, eps, divisor, mask);
     }
     this.finish(world, noise, box);
   }
@@ -377,7 +377,7 @@ export class Physics {
   }
 
   // Perceives the active particles of one rule, runs its network, and updates them.
-  advance(world, number, eps, divisor, mask, dt) {
+  advance(world, number, eps, divisor, mask) {
     const { order, starts, blockRows, kernels, rows, rowWidth, hidden, updates } = this;
     const rule = this.rules[number];
     const total = this.cells[0] * this.cells[1] * this.cells[2];
@@ -387,7 +387,7 @@ export class Physics {
       kernels.product(rule.hidden, filled, rows, rowWidth, hidden, true);
       kernels.product(rule.output, filled, hidden, rule.hidden.width, updates, false);
       for (let row = 0; row < filled; row++) {
-        this.update(world, rule, order[blockRows[row]], updates, row * rule.output.width, eps, dt);
+        this.update(world, rule, order[blockRows[row]], updates, row * rule.output.width, eps);
       }
       filled = 0;
     };
@@ -439,9 +439,9 @@ export class Physics {
     }
   }
 
-  // x ← x + dt α ε δ / (1 + |δ|), s ← s + dt Δs for one particle, whose δ and Δs begin at `from`; numbers
+  // x ← x + α ε δ / (1 + |δ|), s ← s + Δs for one particle, whose δ and Δs begin at `from`; numbers
   // in the rule's dead zone count as 0.
-  update({ x, s }, rule, particle, updates, from, eps, dt) {
+  update({ x, s }, rule, particle, updates, from, eps) {
     const { dimension, channels } = this;
     if (rule.dead_zone > 0) {
       for (let a = from; a < from + rule.outputs; a++) {
@@ -451,11 +451,11 @@ export class Physics {
     if (!rule.static) {
       let squared = 0;
       for (let d = 0; d < dimension; d++) squared += updates[from + d] ** 2;
-      const share = (dt * rule.alpha * eps) / (1 + Math.sqrt(squared));
-      for (let d = 0; d < dimension; d++) x[particle * dimension + d] += share * updates[from + d];
+      const scale = (rule.alpha * eps) / (1 + Math.sqrt(squared));
+      for (let d = 0; d < dimension; d++) x[particle * dimension + d] += scale * updates[from + d];
       from += dimension;
     }
-    for (let c = 0; c < channels; c++) s[particle * channels + c] += dt * updates[from + c];
+    for (let c = 0; c < channels; c++) s[particle * channels + c] += updates[from + c];
   }
 }
 
@@ -489,7 +489,7 @@ function logScaled(rows, at, dimension, x, y, z) {
 }
 
 // The upper triangle (xx, xy, xz, yy, yz, zz) of the inverse of M, or of its replacement.
-function momentInverse(dimension, [xx, xy, xz, yy, yz, zz], kind) {
+function momentInverse(dimension, [xx, xy, xz, yy, yz, zz], inverse) {
   let determinant, adjugate;
   if (dimension === 2) {
     determinant = xx * yy - xy * xy;
@@ -498,7 +498,7 @@ function momentInverse(dimension, [xx, xy, xz, yy, yz, zz], kind) {
     adjugate = [yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy, xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy];
     determinant = xx * adjugate[0] + xy * adjugate[1] + xz * adjugate[2];
   }
-  if (kind === "smooth") {
+  if (inverse === "smooth") {
     const divisor = determinant * determinant + MOMENT_SOFTENING;
     return adjugate.map((entry, k) => (determinant * entry + MOMENT_SOFTENING * IDENTITY[k]) / divisor);
   }

@@ -179,9 +179,9 @@ export class GpuPhysics {
       const outputs = rule.outputs;
       const module = device.createShaderModule({ code: shaders({ ...rule, width }) });
       const pipeline = (entryPoint) => device.createComputePipeline({ layout: pipelines, compute: { module, entryPoint } });
-      const parts = [rule.weights["hidden.weight"], rule.weights["hidden.bias"], rule.weights["output.weight"]];
-      const weights = buffer(parts.reduce((size, part) => size + part.byteLength, 0), input);
-      parts.reduce((at, part) => (device.queue.writeBuffer(weights, at, part), at + part.byteLength), 0);
+      const matrices = [rule.weights["hidden.weight"], rule.weights["hidden.bias"], rule.weights["output.weight"]];
+      const weights = buffer(matrices.reduce((size, matrix) => size + matrix.byteLength, 0), input);
+      matrices.reduce((at, matrix) => (device.queue.writeBuffer(weights, at, matrix), at + matrix.byteLength), 0);
       const world = buffer(UNIFORM_BYTES, UNIFORM | COPY_DST);
       const active = buffer(4 * capacity, input);
       const updates = buffer(4 * outputs * capacity, STORAGE | COPY_SRC);
@@ -195,7 +195,7 @@ export class GpuPhysics {
     this.packedHome = new Uint32Array(capacity);
   }
 
-  async step(world, { eps, box = null, mask = null, noise = null, densityCounts = null, dt = 1 }) {
+  async step(world, { eps, box = null, mask = null, noise = null, densityCounts = null }) {
     const { physics, device, packedPoints, packedHome } = this;
     const { count } = world;
     physics.sort(world, eps, box);
@@ -215,35 +215,35 @@ export class GpuPhysics {
     const encoder = device.createCommandEncoder();
     const pass = encoder.beginComputePass();
     const running = [];
-    this.species.forEach((own, number) => {
+    this.species.forEach((entry, number) => {
       const active = [];
       for (let k = 0; k < count; k++) {
         if (world.species[order[k]] === number && (mask === null || mask[order[k]] !== 0)) active.push(k);
       }
       const divisor = densityCounts === null ? count : densityCounts[number];
-      write(own.world, uniforms(physics, own.rule, eps, count, active.length, divisor));
-      write(own.active, Uint32Array.from(active));
-      pass.setBindGroup(0, own.group);
+      write(entry.world, uniforms(physics, entry.rule, eps, count, active.length, divisor));
+      write(entry.active, Uint32Array.from(active));
+      pass.setBindGroup(0, entry.group);
       if (number === 0) {
-        pass.setPipeline(own.density);
+        pass.setPipeline(entry.density);
         pass.dispatchWorkgroups(Math.ceil(count / GROUP));
       }
       if (active.length === 0) return;
-      pass.setPipeline(own.advance);
+      pass.setPipeline(entry.advance);
       pass.dispatchWorkgroups(Math.ceil(active.length / GROUP));
-      running.push({ own, active });
+      running.push({ entry, active });
     });
     pass.end();
-    for (const { own, active } of running) {
-      encoder.copyBufferToBuffer(own.updates, 0, own.mapped, 0, 4 * own.rule.outputs * active.length);
+    for (const { entry, active } of running) {
+      encoder.copyBufferToBuffer(entry.updates, 0, entry.mapped, 0, 4 * entry.rule.outputs * active.length);
     }
     device.queue.submit([encoder.finish()]);
-    await Promise.all(running.map(async ({ own, active }) => {
-      const { rule, mapped } = own;
+    await Promise.all(running.map(async ({ entry, active }) => {
+      const { rule, mapped } = entry;
       const size = 4 * rule.outputs * active.length;
       await mapped.mapAsync(GPUMapMode.READ, 0, size);
       const updates = new Float32Array(mapped.getMappedRange(0, size));
-      active.forEach((k, row) => physics.update(world, rule, order[k], updates, row * rule.outputs, eps, dt));
+      active.forEach((k, row) => physics.update(world, rule, order[k], updates, row * rule.outputs, eps));
       mapped.unmap();
     }));
     physics.finish(world, noise, box);
