@@ -383,17 +383,6 @@ def test_what_is_no_checkpoint_is_refused_and_never_run(tmp_path, case):
     assert [path.name for path in tmp_path.iterdir()] == ["checkpoint.pt"]
 
 
-@pytest.mark.parametrize("error", [IndexError, AttributeError, AssertionError, MemoryError])
-def test_whatever_torch_raises_names_the_checkpoint(tmp_path, monkeypatch, error):
-    def fail(*args, **kwargs):
-        raise error("garbage")
-
-    save_checkpoint(tmp_path / "checkpoint.pt", {})
-    monkeypatch.setattr(torch, "load", fail)
-    with pytest.raises(NPAError, match=DAMAGED):
-        load_checkpoint(tmp_path / "checkpoint.pt")
-
-
 def test_a_line_that_does_not_fit_on_the_disk_leaves_the_log_as_it_was(tmp_path):
     resource = pytest.importorskip("resource")
     log = JsonlLog(tmp_path / "log.jsonl")

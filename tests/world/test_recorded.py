@@ -75,45 +75,34 @@ def is_recorded():
 
 @pytest.mark.parametrize("gradients", [False, True])
 @pytest.mark.parametrize(
-    "options",
+    ("form", "options"),
     [
-        {},
-        {"update_prob": 1.0, "box": (1.4, 1.8)},
-        {"position_noise": 0.01, "dt": 0.5},
-        {"detach_positions": False},
-        {"memory": "recompute"},
-        {"memory": "minimal"},
-        {"keep_every": 7},
-        {"keep_every": 1},
-        {"by_world": True, "position_noise": 0.01},
-        {"steps": 1},
-        {"steps": 150},
+        ({}, {}),
+        ({}, {"update_prob": 1.0, "box": (1.4, 1.8)}),
+        ({}, {"position_noise": 0.01, "dt": 0.5}),
+        ({}, {"detach_positions": False}),
+        ({}, {"memory": "recompute"}),
+        ({}, {"memory": "minimal"}),
+        ({}, {"keep_every": 7}),
+        ({}, {"keep_every": 1}),
+        ({}, {"by_world": True, "position_noise": 0.01}),
+        ({}, {"steps": 1}),
+        ({}, {"steps": 150}),
+        ({"dtype": torch.float64}, {}),
+        ({"space_dim": 3}, {}),
+        ({"static": True}, {}),
+        ({"moment_inverse": "smooth"}, {}),
+        ({"equivariant": True, "chiral": True}, {}),
+        ({"dtype": torch.float64, "space_dim": 3, "equivariant": True}, {}),
+        ({"readout_dim": 3, "readout_hidden_dim": 4}, {}),
     ],
     ids=str,
 )
-def test_a_recorded_rollout_is_the_launched_one(options, gradients):
-    rule = make_rule()
+def test_a_recorded_rollout_is_the_launched_one(form, options, gradients):
+    rule = make_rule(**form)
     as_launched(rule, 2, gradients=gradients, **options)
     assert not is_recorded()
     as_launched(rule, 3, gradients=gradients, **options)
-    assert is_recorded()
-
-
-@pytest.mark.parametrize(
-    ("dtype", "space_dim", "options"),
-    [
-        (torch.float64, 2, {}),
-        (torch.float32, 3, {}),
-        (torch.float32, 2, {"static": True}),
-        (torch.float32, 2, {"moment_inverse": "smooth"}),
-        (torch.float32, 2, {"equivariant": True, "chiral": True}),
-        (torch.float64, 3, {"equivariant": True}),
-        (torch.float32, 2, {"readout_dim": 3, "readout_hidden_dim": 4}),
-    ],
-    ids=str,
-)
-def test_every_form_of_rule_is_recorded(dtype, space_dim, options):
-    as_launched(make_rule(space_dim, dtype, **options))
     assert is_recorded()
 
 
@@ -179,8 +168,9 @@ def two_before_one_backward(roll, x, s):
 
 
 def one_after_the_other(roll, x, s):
+    """What is added up in another order is rounded otherwise."""
     middle = roll(x, s, 5)
-    roll(*middle, 5)[1].square().sum().backward()
+    (roll(*middle, 5)[1] * middle[1]).sum().backward()
 
 
 def retained(roll, x, s):
@@ -347,9 +337,3 @@ def test_nothing_leaks_over_ten_thousand_calls_of_changing_shapes():
             taken.append((torch.cuda.memory_allocated(), recorded.recorded_memory(DEVICE)))
     assert taken[1][0] <= taken[0][0] + 2**20
     assert taken[1][1] == taken[0][1]
-
-
-def test_wrong_words_are_refused():
-    x, s = worlds()
-    with pytest.raises(npa_envs.NPAError, match="cuda_graph must be 'auto', True or False"):
-        npa_envs.rollout(make_rule(), x, s, 1, cuda_graph="yes")

@@ -128,21 +128,6 @@ def test_what_draws_from_torchs_own_generator_is_not_recorded_alone():
     torch.randn(10, device=DEVICE)
 
 
-def test_two_rollouts_one_after_the_other_have_the_same_gradients():
-    """What is added up in another order is rounded otherwise."""
-    rule = make_rule()
-    for call in range(5):
-        x, s = worlds(seed=call)
-        found = []
-        for cuda_graph in (False, "auto"):
-            generator = torch.Generator(DEVICE).manual_seed(call)
-            middle = npa_envs.rollout(rule, x, s, 6, generator=generator, cuda_graph=cuda_graph)
-            last = npa_envs.rollout(rule, *middle, 6, generator=generator, cuda_graph=cuda_graph)
-            loss = (last[1] * middle[1]).sum()
-            found.append(torch.autograd.grad(loss, list(rule.parameters())))
-        same(*found)
-
-
 def test_launches_keep_none_of_their_tensors():
     rule = make_rule()
     x, s = worlds(count=8, particles=20_000)

@@ -229,6 +229,7 @@ def with_rule(**options):
         ({"counts": []}, "1 to 64 species, got 0"),
         ({"density_counts": [60]}, r"each of 2 species, got \[60\]: .*=\(20, 40\)"),
         ({"density_counts": [20, 0]}, "one positive number for each of 2 species"),
+        ({"cuda_graph": "yes"}, "cuda_graph must be 'auto', True or False, got 'yes'"),
         ({"memory": "little"}, "'store', 'recompute' or 'minimal', got 'little'"),
         ({"update_prob": [0.5]}, "one for each of 2 species, got 1"),
         ({"update_prob": [0.5, 1.5]}, r"lie in \(0, 1\], got 1\.5"),

@@ -120,8 +120,3 @@ def test_worlds_beyond_the_walls_are_not_at_rest():
 def test_what_walls_cannot_be_is_refused(options, message):
     with pytest.raises(NPAError, match=message):
         rollout(*world(), 1, **options)
-
-
-def test_particles_that_divide_live_in_open_space():
-    with pytest.raises(NPAError, match="box must be None where particles divide"):
-        rollout(*world(divides=True), 1, box=2.0, boundary="reflecting")
