@@ -25,7 +25,6 @@ import io
 import json
 import math
 import pickle
-import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,6 +33,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from npa_envs.checks import check_dense
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.files import check_torch_archive, checked_path, parse_json, write_text
 from npa_envs.rule.rule import NPARule, check_rule
@@ -44,6 +44,9 @@ _DEMO_FREE = {"state_dim", "hidden_dim", "eps0", "alpha", "readout_hidden_dim", 
 
 DEMO_PARTICLE_COUNT = 4096
 """Default number of particles in the web demo."""
+
+MAX_STACKED = 4096
+"""Largest number of rules in a stack."""
 
 _TEXEL = 4
 """Rows of the web demo's weights, stored as RGBA textures, are padded to a multiple of this."""
@@ -82,8 +85,8 @@ class RuleParts:
     weights: dict[str, Tensor]
 
 
-def check_precision(weights: Mapping[str, Tensor]) -> None:
-    """Check that all weights are float32, or all float64."""
+def check_weights(weights: Mapping[str, Tensor]) -> None:
+    """Check that all weights are finite, and float32, or all float64."""
     dtypes = {tensor.dtype for tensor in weights.values()}
     if len(dtypes) != 1 or not dtypes <= {torch.float32, torch.float64}:
         raise NPAError(
@@ -91,10 +94,6 @@ def check_precision(weights: Mapping[str, Tensor]) -> None:
             f"{sorted(str(dtype) for dtype in dtypes)}: convert them, as rule.float() does, and "
             "save the rule again"
         )
-
-
-def check_finite(weights: Mapping[str, Tensor]) -> None:
-    """Check that every weight is finite."""
     for name, tensor in weights.items():
         bad = int((~torch.isfinite(tensor)).sum())
         if bad:
@@ -124,23 +123,24 @@ def read_state_dict(data: bytes) -> RuleParts:
     weights = {known[name]: _matrix(name, state[name]) for name in known if name in state}
     if known is _EQUIVARIANT_NAMES:
         return _equivariant_parts(weights, state)
-    hidden_dim, perception_dim = weights["hidden.weight"].shape
-    update_dim = weights["output.weight"].shape[0]
+    perception_dim, update_dim = weights["hidden.weight"].shape[1], len(weights["output.weight"])
     has_readout = "readout.0.weight" in weights
     channels = weights["readout.0.weight"].shape[1] if has_readout else None
     space_dim, state_dim, static = _infer_dimensions(perception_dim, update_dim, channels)
-    hyper_parameters = {
-        "space_dim": space_dim,
-        "state_dim": state_dim,
-        "hidden_dim": hidden_dim,
-        "eps0": _scalar("eps0", state["eps0"]),
-        "alpha": _scalar("alpha", state["alpha"]),
-        "static": static,
-    }
+    sizes: dict[str, Any] = {"space_dim": space_dim, "state_dim": state_dim, "static": static}
     if has_readout:
-        hyper_parameters["readout_dim"] = weights["readout.2.weight"].shape[0]
-        hyper_parameters["readout_hidden_dim"] = weights["readout.0.weight"].shape[0]
-    return RuleParts(hyper_parameters, weights)
+        sizes["readout_hidden_dim"] = weights["readout.0.weight"].shape[0]
+        sizes["readout_dim"] = weights["readout.2.weight"].shape[0]
+    return _parts(weights, state, **sizes)
+
+
+def _parts(
+    weights: dict[str, Tensor], numbers: Mapping[Any, Any], **hyper_parameters: Any
+) -> RuleParts:
+    """Return a rule's parts with the hyper-parameters that all formats have; `numbers`: radii."""
+    common = {name: _scalar(name, numbers.get(name)) for name in ("eps0", "alpha")}
+    sizes = {"space_dim": _DEMO_SPACE_DIM, "hidden_dim": len(weights["hidden.weight"])}
+    return RuleParts(sizes | common | hyper_parameters, weights)
 
 
 def _equivariant_parts(tensors: Mapping[str, Tensor], numbers: Mapping[Any, Any]) -> RuleParts:
@@ -172,16 +172,7 @@ def _equivariant_parts(tensors: Mapping[str, Tensor], numbers: Mapping[Any, Any]
         "mixing": mixing.contiguous(),
         "steering": tensors["W_out"][:, 0].contiguous(),
     }
-    hyper_parameters = {
-        "space_dim": _DEMO_SPACE_DIM,
-        "state_dim": state_dim,
-        "hidden_dim": hidden_dim + 1,
-        "eps0": _scalar("eps0", numbers.get("eps0")),
-        "alpha": _scalar("alpha", numbers.get("alpha")),
-        "equivariant": True,
-        "mixed_vectors": mixed,
-    }
-    return RuleParts(hyper_parameters, weights)
+    return _parts(weights, numbers, state_dim=state_dim, equivariant=True, mixed_vectors=mixed)
 
 
 def read_demo_json(data: bytes, name: str | None) -> RuleParts:
@@ -209,55 +200,34 @@ def read_demo_json(data: bytes, name: str | None) -> RuleParts:
         "hidden.bias": bias[:hidden_dim].clone(),
         "output.weight": torch.cat([displacement_rows, state_rows]).contiguous(),
     }
-    hyper_parameters = {
-        "space_dim": _DEMO_SPACE_DIM,
-        "state_dim": state_dim,
-        "hidden_dim": hidden_dim,
-        "eps0": _scalar("eps0", entry.get("eps0")),
-        "alpha": _scalar("alpha", entry.get("alpha")),
-    }
-    return RuleParts(hyper_parameters, weights)
+    return _parts(weights, entry, state_dim=state_dim)
 
 
 def _demo_rule(content: Any, name: str | None) -> tuple[Mapping[str, Any], int | None]:
-    """Return the entry of one rule, and its index in a stack, or None without a stack."""
+    """Return the entry of one rule, and its index in a stack, or None without a stack.
+
+    The names of a stack's rules are their indices, from 0.
+    """
+    rules: dict[str, tuple[Mapping[str, Any], int | None]] = {}
     if isinstance(content, dict) and isinstance(content.get("w1.weight"), dict):
-        return content, _index_in_stack(content["w1.weight"], name)
-    names = sorted(content) if isinstance(content, dict) else []
-    if not names or not all(isinstance(content[known], dict) for known in names):
+        shape = content["w1.weight"].get("shape")
+        if isinstance(shape, list) and len(shape) == 3 and shape[0] in range(1, MAX_STACKED + 1):
+            rules = {str(k): (content, k) for k in range(shape[0])}
+    elif isinstance(content, dict) and all(isinstance(entry, dict) for entry in content.values()):
+        rules = {known: (content[known], None) for known in sorted(content)}
+    if not rules:
         raise NPAError(
-            "the JSON file must map names to rules, or be a stack of rules, as the authors' web "
-            "demo has them"
+            "the JSON file must map names to rules, or be a stack of rules whose w1.weight has "
+            "shape [rules, H, inputs], as the authors' web demo has them"
         )
-    if name is None and len(names) > 1:
+    if name is None and len(rules) > 1:
         raise NPAError(
-            f"the file holds several rules: add #name; names: {shown(', '.join(names))[1:-1]}"
+            f"the file holds several rules: add #name; names: {shown(', '.join(rules))[1:-1]}"
         )
-    name = names[0] if name is None else name
-    if name not in content:
-        raise NPAError(f"the file holds no rule {shown(name)}: {suggest(name, names)}")
-    return content[name], None
-
-
-def _index_in_stack(packed: Mapping[str, Any], name: str | None) -> int:
-    """Return the index, from 0, of the rule called `name` in a stack."""
-    shape = packed.get("shape")
-    if not isinstance(shape, list) or len(shape) != 3 or type(shape[0]) is not int or shape[0] < 1:
-        raise NPAError(
-            f"w1.weight of a stack of rules must have shape [rules, H, inputs], got {shown(shape)}"
-        )
-    if name is None and shape[0] > 1:
-        raise NPAError(
-            f"the file is a stack of {shape[0]} rules without names: add #0 to #{shape[0] - 1}"
-        )
-    digits = "0" if name is None else name
-    index = int(digits) if digits.isascii() and digits.isdigit() and len(digits) < 10 else -1
-    if not 0 <= index < shape[0]:
-        raise NPAError(
-            f"the file is a stack of {shape[0]} rules, got #{shown(name)[1:-1]}: give #0 to "
-            f"#{shape[0] - 1}"
-        )
-    return index
+    name = next(iter(rules)) if name is None else name
+    if name not in rules:
+        raise NPAError(f"the file holds no rule {shown(name)}: {suggest(name, rules)}")
+    return rules[name]
 
 
 def _read_equivariant_entry(entry: Mapping[str, Any], index: int | None) -> RuleParts:
@@ -319,7 +289,7 @@ def _demo_entry(name: str, rule: NPARule, particle_count: int) -> dict[str, Any]
             f"{type(rule).__name__} with another network"
         )
     weights = {k: v.detach().cpu().float() for k, v in rule.state_dict().items()}
-    check_finite(weights)
+    check_weights(weights)
     displacement, states = weights["output.weight"].split([rule.space_dim, rule.state_dim])
     return {
         "eps0": _as_float32(rule.eps0),
@@ -365,11 +335,7 @@ def _unpickle(data: bytes) -> Mapping[Any, Any]:
 
 
 def _check_plain(name: str, tensor: Tensor) -> None:
-    if tensor.layout != torch.strided or tensor.is_meta or tensor.is_nested or tensor.is_quantized:
-        raise NPAError(
-            f"{name} must be a dense tensor with data, got a sparse, meta, nested or quantised "
-            "one: export the state dict with plain tensors"
-        )
+    check_dense(name, tensor)
     stored = tensor.untyped_storage().nbytes()
     if tensor.numel() * tensor.element_size() > stored:
         raise NPAError(
@@ -433,10 +399,7 @@ def _scalar(name: str, value: Any) -> float:
 
 
 def _as_float32(number: float) -> float:
-    try:
-        return float(struct.unpack("<f", struct.pack("<f", number))[0])
-    except OverflowError:
-        return math.inf
+    return torch.tensor(number, dtype=torch.float32).item()
 
 
 def _decode(entry: Mapping[str, Any], name: str, rank: int, index: int | None) -> Tensor:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from itertools import pairwise
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -35,11 +36,6 @@ class Codes(nn.Module):
 
     def __init__(self, names: Sequence[str], dim: int, *, encoder: bool = False) -> None:
         super().__init__()
-        if len(set(names)) < len(names) or len(names) > MAX_CODE_COUNT:
-            raise NPAError(
-                f"code_names must be different names, at most {MAX_CODE_COUNT}, got "
-                f"{shown(list(names))}: leave one of each"
-            )
         self.names = tuple(names)
         """Names of the codes, in the order of `table`."""
         table = torch.empty(len(names), dim).uniform_(-1.0, 1.0)
@@ -52,14 +48,6 @@ class Codes(nn.Module):
 
     def __len__(self) -> int:
         return len(self.names)
-
-    def __contains__(self, name: object) -> bool:
-        """Return whether a code has this name."""
-        return name in self.names
-
-    def __iter__(self) -> Iterator[str]:
-        """Iterate over the names."""
-        return iter(self.names)
 
     def __getitem__(self, name: str) -> Tensor:
         """Return the code of a name, shape [K]."""
@@ -97,14 +85,20 @@ def carrying(states: Tensor, code: Tensor) -> Tensor:
     return torch.cat((expanded, states[..., code.shape[-1] :]), dim=-1)
 
 
-def check_names(names: object) -> None:
-    """Check that names of codes are a collection of strings."""
-    given = names if isinstance(names, Collection) and not isinstance(names, str) else None
-    if given is None or not all(isinstance(name, str) for name in given):
+def checked_names(names: Any) -> tuple[str, ...]:
+    """Return names of codes as a tuple, checked: a collection of different strings."""
+    is_list = isinstance(names, Collection) and not isinstance(names, str)
+    if not is_list or not all(isinstance(name, str) for name in names):
         raise NPAError(
             f"code_names must be a list of names, got {shown(names)}: for example ['gecko', "
             "'heart'], or () for a rule without codes"
         )
+    if len(set(names)) < len(names) or len(names) > MAX_CODE_COUNT:
+        raise NPAError(
+            f"code_names must be different names, at most {MAX_CODE_COUNT}, got "
+            f"{shown([*names])}: leave one of each"
+        )
+    return tuple(names)
 
 
 class PictureEncoder(nn.Module):
@@ -114,7 +108,7 @@ class PictureEncoder(nn.Module):
         super().__init__()
         channels = (4, *WIDTHS)
         self.convolutions = nn.ModuleList(
-            nn.Conv2d(given, made, 3, stride=2, padding=1) for given, made in pairwise(channels)
+            nn.Conv2d(before, after, 3, stride=2, padding=1) for before, after in pairwise(channels)
         )
         side = PICTURE_SIDE >> len(WIDTHS)
         self.output = nn.Linear(WIDTHS[-1] * side * side, dim)

@@ -31,8 +31,7 @@ from npa_envs.files import (
 from npa_envs.rule.authors import (
     ZIP_MARK,
     RuleParts,
-    check_finite,
-    check_precision,
+    check_weights,
     read_demo_json,
     read_state_dict,
 )
@@ -181,8 +180,7 @@ def save_rule(
             )
         header[name] = text
     weights = {k: v.detach().cpu().contiguous() for k, v in rule.state_dict().items()}
-    check_precision(weights)
-    check_finite(weights)
+    check_weights(weights)
     header["checksum"] = _checksum(header, weights)
     write_bytes(path, _with_sorted_metadata(serialise(weights, metadata=header)))
 
@@ -242,11 +240,6 @@ def _locate(source: str | Path) -> tuple[Path, str | None]:
     text = str(source)
     known = shipped_rules()
     suffixes = ", ".join(_SUFFIXES)
-    if not text:
-        raise NPAError(
-            "source must be the name of a shipped rule or the path of a file that ends in "
-            f"{suffixes}, got '': names: {', '.join(known)}"
-        )
     named = known | preset_rules()
     if text in named:
         return named[text], None
@@ -263,7 +256,7 @@ def _locate(source: str | Path) -> tuple[Path, str | None]:
     path, inner = (Path(base), name) if mark and base.endswith(".json") else (Path(text), None)
     if path.suffix in _SUFFIXES:
         return path, inner
-    if os.path.exists(path):
+    if os.path.exists(text):
         raise NPAError(f"a rule's file must end in {suffixes}, got {shown(text)}: rename it")
     raise NPAError(
         f"unknown rule {shown(text)}: {suggest(text, known)}; or give the path of a "
@@ -350,7 +343,6 @@ def _assemble(parts: RuleParts) -> NPARule:
             if expected.get(name) != got.get(name)
         )
         raise NPAError(f"the weights must have the hyper-parameters' shapes, got {shown(wrong)}")
-    check_precision(parts.weights)
-    check_finite(parts.weights)
+    check_weights(parts.weights)
     rule.load_state_dict(dict(parts.weights), assign=True)
     return rule.requires_grad_()

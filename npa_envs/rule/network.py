@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -54,22 +54,6 @@ def without_small(update: Tensor, dead_zone: float) -> Tensor:
     return torch.nn.functional.hardshrink(update, dead_zone) if dead_zone > 0.0 else update
 
 
-class Network(Protocol):
-    """Maps rows of perception to updates."""
-
-    @property
-    def row_width(self) -> int:
-        """Columns of a row."""
-
-    @property
-    def update_width(self) -> int:
-        """Columns of an update, A': A, rounded up to a multiple of `FOLD`."""
-
-    def __call__(self, rows: Tensor) -> Tensor:
-        """Map rows [K, row_width], perception z, then 1, then zeros, to updates y, then zeros, [K,
-        A']."""
-
-
 class FoldedRule(NamedTuple):
     """A rule's weights as two matrix products: the bias is a column of the first matrix.
 
@@ -99,18 +83,16 @@ class FoldedRule(NamedTuple):
         return self.output_weight.shape[0]
 
     def __call__(self, rows: Tensor) -> Tensor:
-        """Map rows [K, row_width], perception z, then 1, then zeros, to updates y, then zeros, [K,
-        A']."""
-        return without_small(self._product(rows), self.dead_zone)
-
-    def _product(self, rows: Tensor) -> Tensor:
+        """Map rows [K, row_width], z, then 1, then zeros, to updates y, then zeros, [K, A']."""
+        update: Tensor
         if self.arranged is not None and self.joined is not None:
-            return run_network(rows, self.joined, self.output_weight.shape, self.arranged)
-        if not torch.is_grad_enabled():
+            update = run_network(rows, self.joined, self.output_weight.shape, self.arranged)
+        elif torch.is_grad_enabled():
+            update = _TwoLayers.apply(rows, self.hidden_weight, self.output_weight)  # type: ignore[no-untyped-call]
+        else:
             hidden = torch.relu(rows @ self.hidden_weight.T)
-            return _blocked_product(hidden, self.output_weight)
-        update: Tensor = _TwoLayers.apply(rows, self.hidden_weight, self.output_weight)  # type: ignore[no-untyped-call]
-        return update
+            update = _blocked_product(hidden, self.output_weight)
+        return without_small(update, self.dead_zone)
 
 
 class FoldedInvariants(NamedTuple):
@@ -131,13 +113,16 @@ class FoldedInvariants(NamedTuple):
     """Columns of an update, A': A, rounded up to a multiple of `FOLD`."""
 
     def __call__(self, rows: Tensor) -> Tensor:
-        """Map rows [K, row_width], perception z, then 1, then zeros, to updates y, then zeros, [K,
-        A']."""
+        """Map rows [K, row_width], z, then 1, then zeros, to updates y, then zeros, [K, A']."""
         mixed, inputs = read_rows(rows, self.mixing, self.form, self.products.row_width)
         output = self.products(inputs)
         if len(self.signs) == 0:
             return output
         return steer_rows(output, mixed, self.signs, self.update_width)
+
+
+Network = FoldedRule | FoldedInvariants
+"""Maps rows of perception to updates."""
 
 
 def fold_weights(

@@ -13,6 +13,7 @@ from torch.nn.modules.module import _has_any_global_hook
 
 from npa_envs.checks import (
     MomentInverse,
+    check_positive,
     checked_flag,
     checked_moment_inverse,
     checked_number,
@@ -22,7 +23,7 @@ from npa_envs.checks import (
 )
 from npa_envs.errors import NPAError, shown
 from npa_envs.ops.equivariance import MIXED_VECTORS, VectorForm, invariants, signed_gates, steered
-from npa_envs.rule.codes import Codes, carrying, check_names
+from npa_envs.rule.codes import Codes, carrying, checked_names
 from npa_envs.rule.network import (
     FOLD,
     FoldedInvariants,
@@ -162,8 +163,9 @@ class NPARule(nn.Module):
         self.chiral = checked_flag("chiral", chiral)
         self.divides = checked_flag("divides", divides)
         self.dead_zone = checked_number("dead_zone", dead_zone)
-        check_names(code_names)
-        self._check_parts(len(code_names), checked_flag("encoder", encoder))
+        self.code_names = checked_names(code_names)
+        self.encoder = checked_flag("encoder", encoder)
+        self._check_parts()
 
         self.hidden = nn.Linear(self.input_dim, hidden_dim)
         self.output = nn.Linear(hidden_dim, self.output_dim, bias=False)
@@ -194,83 +196,61 @@ class NPARule(nn.Module):
         """The known codes, or None without `code_dim`."""
 
     def _check_sizes(self) -> None:
-        positive = ("state_dim", "hidden_dim", "mixed_vectors")
-        names = (*positive, "readout_dim", "readout_hidden_dim", "species_count", "code_dim")
-        sizes = {name: getattr(self, name) for name in ("space_dim", *names)}
-        for name, size in sizes.items():
-            if not is_whole(size):
-                raise NPAError(f"{name} must be an integer, got {shown(size)}: try 2")
-        if self.space_dim not in (2, 3):
+        if not is_whole(self.space_dim) or self.space_dim not in (2, 3):
             raise NPAError(f"space_dim must be 2 or 3, got {shown(self.space_dim)}")
-        for name, size in sizes.items():
-            if size > MAX_DIM:
-                raise NPAError(f"{name} must be at most {MAX_DIM}, got {shown(size)}")
-        for name, least in (*((name, 1) for name in positive), ("species_count", 0)):
-            if sizes[name] < least:
-                raise NPAError(f"{name} must be at least {least}, got {shown(sizes[name])}")
-        if self.readout_dim < 0 or (self.readout_dim > 0 and self.readout_hidden_dim < 1):
+        check_positive(self, int, "state_dim", "hidden_dim", "mixed_vectors", at_most=MAX_DIM)
+        others = ("readout_dim", "readout_hidden_dim", "species_count", "code_dim")
+        check_positive(self, int, *others, at_least=0, at_most=MAX_DIM)
+        if self.readout_dim > 0 and self.readout_hidden_dim < 1:
             raise NPAError(
-                f"readout_dim must be 0, or positive with readout_hidden_dim at least 1, "
-                f"got {shown(self.readout_dim)} and {shown(self.readout_hidden_dim)}"
+                "a read-out needs readout_hidden_dim of at least 1, got "
+                f"{self.readout_hidden_dim} with readout_dim={self.readout_dim}"
             )
 
-    def _check_parts(self, name_count: int, encoder: bool) -> None:
+    def _check_parts(self) -> None:
         """Check requirements of the dead zone, equivariance, codes and division."""
-        turning, code_dim, zone = self.equivariant, self.code_dim, self.dead_zone
-        for fails, fault in (
-            (
-                not 0.0 <= zone < math.inf,
+        zone, species_count, code_dim = self.dead_zone, self.species_count, self.code_dim
+        name_count, encoder = len(self.code_names), self.encoder
+        if not 0.0 <= zone < math.inf:
+            raise NPAError(
                 "dead_zone must be a finite number of at least 0 (dimensionless), got "
-                f"{shown(zone)}: try 0.001",
-            ),
-            (
-                zone and turning,
-                "an equivariant rule has no dead zone, whose edges would be directions, got "
-                f"dead_zone={shown(zone)} and equivariant=True: leave one of the two out",
-            ),
-            (
-                self.chiral and not turning,
-                "chiral is for equivariant rules: give equivariant=True as well",
-            ),
-            (
-                self.chiral and self.space_dim != 2,
-                "chiral needs space_dim=2, where vectors can be turned by 90 degrees, got "
-                f"{self.space_dim}: leave it out",
-            ),
-            (
-                turning and self.species_count,
-                "an equivariant rule perceives all species alike, got species_count="
-                f"{self.species_count}: leave one of the two out",
-            ),
-            (
-                turning and not (self.state_gradient or self.density_gradient),
+                f"{shown(zone)}: try 0.001"
+            )
+        if self.equivariant and (zone or species_count or code_dim):
+            raise NPAError(
+                "an equivariant rule has no dead zone, whose edges would be directions, perceives "
+                "all species alike, and has no codes, got equivariant=True with dead_zone="
+                f"{shown(zone)}, species_count={species_count} and code_dim={code_dim}: leave "
+                "these out"
+            )
+        if self.chiral and not (self.equivariant and self.space_dim == 2):
+            raise NPAError(
+                "chiral needs equivariant=True and space_dim=2, where vectors can be turned by 90 "
+                f"degrees, got equivariant={self.equivariant} and space_dim={self.space_dim}: "
+                "leave it out"
+            )
+        if self.equivariant and not (self.state_gradient or self.density_gradient):
+            raise NPAError(
                 "an equivariant rule needs vectors to perceive, got state_gradient=False and "
-                "density_gradient=False: leave one of them out",
-            ),
-            (
-                not 0 <= code_dim < self.state_dim,
+                "density_gradient=False: leave one of them out"
+            )
+        if code_dim >= self.state_dim:
+            raise NPAError(
                 f"code_dim must be at least 0 and below state_dim = {self.state_dim}, got "
-                f"{code_dim}: a code is among the state channels",
-            ),
-            (
-                (code_dim > 0) != (name_count > 0) or (encoder and not code_dim),
+                f"{code_dim}: a code is among the state channels"
+            )
+        if (code_dim > 0) != (name_count > 0) or (encoder and not code_dim):
+            raise NPAError(
                 "code_dim and code_names go together, and an encoder needs both, got code_dim="
                 f"{code_dim}, {name_count} code_names, encoder={encoder}: for example "
-                "code_dim=8, code_names=['gecko', 'heart']",
-            ),
-            (
-                code_dim and turning,
-                "an equivariant rule has no codes, got code_dim and equivariant=True",
-            ),
-            (
-                self.divides and (self.static or self.species_count or code_dim),
+                "code_dim=8, code_names=['gecko', 'heart']"
+            )
+        if self.divides and (self.static or species_count or code_dim):
+            raise NPAError(
                 "rules that divide move their particles, of one species and without codes, got "
-                f"static={self.static}, species_count={self.species_count} and code_dim="
-                f"{code_dim}: leave these out",
-            ),
-        ):
-            if fails:
-                raise NPAError(fault)
+                f"static={self.static}, species_count={species_count} and code_dim={code_dim}: "
+                "leave these out"
+            )
 
     @property
     def vector_form(self) -> VectorForm:
@@ -349,10 +329,10 @@ class NPARule(nn.Module):
         It does not if it is equivariant, has hooks, or there are global hooks, or if a subclass or
         the object itself overrides an attribute of `STEP_PARTS`, a layer, or a layer's `forward`.
         """
-        return not self.equivariant and self._is_unchanged()
+        return not self.equivariant and self.has_network()
 
-    def _is_unchanged(self) -> bool:
-        """Return whether the rule's network is that of `NPARule`."""
+    def has_network(self) -> bool:
+        """Return whether the rule's network is that of `NPARule`: it is plain, or equivariant."""
         names = ("hidden", "output", "fate") if self.divides else ("hidden", "output")
         # `_modules` is faster than attributes of modules.
         layers = [own for own in map(self._modules.get, names) if type(own) is nn.Linear]
@@ -370,14 +350,8 @@ class NPARule(nn.Module):
             and not _has_any_global_hook()  # type: ignore[no-untyped-call]
         )
 
-    def has_network(self) -> bool:
-        """Return whether `network` returns fused weights: the rule is plain, or unchanged
-        equivariant."""
-        return self.is_plain() or (self.equivariant and self._is_unchanged())
-
     def network(self) -> Network | None:
-        """Return fused weights that map rows to updates; None: call the rule as a module
-        instead."""
+        """Return fused weights that map rows to updates; None: call the rule as a module."""
         if self.is_plain():
             return self.folded()
         return self._folded_invariants() if self.has_network() else None
@@ -418,10 +392,8 @@ class NPARule(nn.Module):
     def division_probabilities(self, states: Tensor) -> tuple[Tensor, Tensor]:
         """Return the probabilities that updated particles divide and die, shape [...] each.
 
-        They are the softmax of (a, 0, b), where (a, b) = W s + c and 0 is for neither.
-
-        Args:
-            states: Particle states, dimensionless, shape [..., C], of a rule that divides.
+        For states [..., C] they are the softmax of (a, 0, b), where (a, b) = W s + c and 0 is for
+        neither. The rule must divide.
         """
         dividing, dying = self.fate(states).unbind(dim=-1)
         odds = torch.stack((dividing, torch.zeros_like(dividing), dying), dim=-1)
@@ -429,21 +401,14 @@ class NPARule(nn.Module):
         return divide, die
 
     def read_out(self, states: Tensor) -> Tensor:
-        """Return the outputs of the read-out network, or the states without one.
-
-        Args:
-            states: Particle states, dimensionless, shape [..., C].
-        """
+        """Return the outputs of the read-out for states [..., C]; without one, the states."""
         if self.readout is None:
             return states
         outputs: Tensor = self.readout(states)
         return outputs
 
     def colour(self, states: Tensor) -> Tensor:
-        """Return RGB colours from the last three outputs, dimensionless, unclipped, [..., 3].
-
-        Args:
-            states: Particle states, dimensionless, shape [..., C], C at least 3 without read-out.
+        """Return RGB colours of states [..., C]: the last three outputs, unclipped, [..., 3].
 
         Raises:
             NPAError: There are fewer than three outputs.
@@ -522,13 +487,7 @@ class NPARule(nn.Module):
 
     def hyper_parameters(self) -> dict[str, Any]:
         """Return the arguments of `NPARule` for a rule of the same shape."""
-        codes = self.codes
-        own = {
-            "code_names": () if codes is None else codes.names,
-            "encoder": codes is not None and codes.encoder is not None,
-        }
-        names = HYPER_PARAMETERS
-        return {name: own[name] if name in own else getattr(self, name) for name in names}
+        return {name: getattr(self, name) for name in HYPER_PARAMETERS}
 
 
 HYPER_PARAMETERS = {k: v for k, v in get_type_hints(NPARule.__init__).items() if k != "return"}
@@ -580,15 +539,15 @@ def with_codes(rule: NPARule, untrained: NPARule) -> NPARule:
 
 def dividing(rule: NPARule) -> NPARule:
     """Return a copy of a rule with division, whose weights of division are untrained."""
-    made = NPARule(**rule.hyper_parameters() | {"divides": True}).to(rule.hidden.weight)
-    made.load_state_dict(made.state_dict() | rule.state_dict())
-    return made
+    copied = NPARule(**rule.hyper_parameters() | {"divides": True}).to(rule.hidden.weight)
+    copied.load_state_dict(copied.state_dict() | rule.state_dict())
+    return copied
 
 
 def fate_parameters(rules: nn.Module) -> list[nn.Parameter]:
     """Return the weights of division and death, of one rule or several in a module."""
-    found = (module for module in rules.modules() if isinstance(module, NPARule))
-    return [parameter for rule in found if rule.divides for parameter in rule.fate.parameters()]
+    every = (module for module in rules.modules() if isinstance(module, NPARule))
+    return [parameter for rule in every if rule.divides for parameter in rule.fate.parameters()]
 
 
 def check_rule(rule: Any) -> None:

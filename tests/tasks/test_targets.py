@@ -23,26 +23,8 @@ def disk_picture(mode="RGBA", background=(0, 0, 0, 0), side=200):
     return image
 
 
-def raster(target):
-    """The target's pixels as a boolean grid, first row lowest, with a margin of one."""
-    steps = (target.points - target.points.amin(dim=0)) / target.pixel_size
-    index = steps.round().long().numpy() + 1
-    grid = np.zeros(index.max(axis=0)[::-1] + 2, dtype=bool)
-    grid[index[:, 1], index[:, 0]] = True
-    return grid
-
-
-def spread(grid):
-    wide = grid.copy()
-    wide[1:] |= grid[:-1]
-    wide[:-1] |= grid[1:]
-    wide[:, 1:] |= grid[:, :-1]
-    wide[:, :-1] |= grid[:, 1:]
-    return wide
-
-
 @pytest.mark.parametrize("name", builtin_targets())
-def test_builtin_target_is_one_colourful_piece_on_a_centred_grid(name):
+def test_builtin_target_is_colourful_and_on_a_centred_grid(name):
     target = load_target(name)
     assert abs(target.point_count - 4096) <= 24
     assert target.points.mean(dim=0).abs().max() < 1e-5
@@ -50,30 +32,8 @@ def test_builtin_target_is_one_colourful_piece_on_a_centred_grid(name):
     steps = (target.points - target.points[0]).double() / target.pixel_size
     assert (steps - steps.round()).abs().max() < 1e-3
     assert len(torch.unique(steps.round(), dim=0)) == target.point_count
-    # Its parts are at least three pixels thick.
-    grid = raster(target)
-    opened = spread(~spread(~grid))
-    assert (opened & grid).sum() >= 0.98 * grid.sum()
-    seen = np.zeros_like(grid)
-    seen[tuple(np.argwhere(grid)[0])] = True
-    while (grown := spread(seen) & grid).sum() > seen.sum():
-        seen = grown
-    assert seen.sum() == grid.sum()
-    colours = target.colours
-    assert 0 <= colours.min() <= colours.max() <= 1
-    saturation = colours.amax(dim=1) - colours.amin(dim=1)
-    assert (saturation > 0.4).float().mean() > 0.5
-    assert colours.std(dim=0).max() > 0.15
-
-
-def test_flower_blooms_at_the_top():
-    assert {"gecko", "heart", "letter-a", "ring", "butterfly"} <= set(builtin_targets())
-    assert list(builtin_targets()) == sorted(builtin_targets())
-    target = load_target("flower")
-    red, green, _ = target.colours.T
-    y = target.points[:, 1]
-    assert (red > green)[y > 0.2].float().mean() > 0.9
-    assert (green > red)[y < -0.6].float().mean() > 0.9
+    assert 0 <= target.colours.min() <= target.colours.max() <= 1
+    assert target.colours.std(dim=0).max() > 0.15
 
 
 @pytest.mark.parametrize("point_count", [64, 500, 1024, 4096, 16384])
@@ -99,13 +59,6 @@ def test_top_of_the_picture_has_high_y_and_its_left_low_x(tmp_path, monkeypatch)
     for colour, chosen in ((0, (x > 0.1) & (y > 0.1)), (1, (x < -0.1) & (y > 0.1)), (2, y < -0.1)):
         assert (target.colours[chosen].argmax(dim=1) == colour).all()
     assert target.name == "corners"
-
-
-def test_wide_picture_keeps_its_proportions():
-    target = target_from_image(Image.new("RGBA", (300, 100), RED), name="bar", point_count=1200)
-    width, height = (target.points.amax(dim=0) - target.points.amin(dim=0)) + target.pixel_size
-    assert width / height == pytest.approx(3.0, rel=0.06)
-    assert width == pytest.approx(1.8, abs=1e-4)
 
 
 def encoded(image, kind="PNG", share=1.0):
@@ -144,14 +97,11 @@ def test_pictures_that_are_no_targets_are_clear_errors(tmp_path, case):
         target_from_image(Image.new("RGBA", (0, 5)), name="nothing")
 
 
-def test_colours_of_transparent_pixels_do_not_leak():
+def test_colours_are_means_of_opaque_pixels():
     image = Image.new("RGBA", (400, 400), (255, 0, 255, 0))
     ImageDraw.Draw(image).ellipse((50, 50, 350, 350), fill=(0, 255, 0, 255))
     target = target_from_image(image, name="disk", point_count=700)
     assert (target.colours - torch.tensor([0.0, 1, 0])).abs().max() < 0.02
-
-
-def test_fine_pattern_of_a_large_picture_is_averaged():
     board = (np.indices((1500, 1500)).sum(axis=0) % 2 * 255).astype(np.uint8)
     image = Image.fromarray(np.stack([board] * 3 + [np.full_like(board, 255)], axis=-1))
     target = target_from_image(image, name="board", point_count=2500)
@@ -230,23 +180,17 @@ def test_a_photograph_says_that_its_background_can_be_kept(tmp_path):
     assert load_target("heart", point_count=400, keep_background=True).colours.max() == 1.0
 
 
-def test_background_enclosed_by_the_object_stays(tmp_path):
+def test_the_background_is_what_is_connected_with_the_border(tmp_path):
     image = Image.new("RGB", (100, 100), "white")
     ImageDraw.Draw(image).ellipse((10, 10, 90, 90), fill="white", outline=RED, width=10)
     image.save(tmp_path / "ring.png")
     alpha = np.asarray(read_image(tmp_path / "ring.png"))[..., 3]
-    assert alpha[50, 50] == 255
-    assert alpha[2, 2] == 0
-
-
-def test_background_is_followed_around_corners(tmp_path):
+    assert (alpha[50, 50], alpha[2, 2]) == (255, 0)
     image = Image.new("RGB", (90, 90), "white")
     draw = ImageDraw.Draw(image)
-    for k in range(4):
-        draw.rectangle((10 + 20 * k, 8, 14 + 20 * k, 80), fill=BLUE)
-    draw.rectangle((10, 76, 74, 80), fill=BLUE)
-    draw.rectangle((70, 8, 86, 12), fill=BLUE)
-    draw.rectangle((82, 8, 86, 60), fill=BLUE)
+    combs = [(10 + 20 * k, 8, 14 + 20 * k, 80) for k in range(4)]
+    for box in (*combs, (10, 76, 74, 80), (70, 8, 86, 12), (82, 8, 86, 60)):
+        draw.rectangle(box, fill=BLUE)
     image.save(tmp_path / "maze.png")
     alpha = np.asarray(read_image(tmp_path / "maze.png"))[..., 3]
     assert (alpha[np.asarray(image)[..., 0] == 255] == 0).all()
@@ -269,16 +213,16 @@ def test_picture_is_turned_as_its_exif_says(tmp_path):
     assert read_image(tmp_path / "turned.jpg").size == (40, 80)
 
 
+def test_decompression_bomb_is_a_clear_error(tmp_path, monkeypatch):
+    disk_picture().save(tmp_path / "bomb.png")
+    monkeypatch.setattr(images, "MAX_AREA", 1000)
+    with pytest.raises(NPAError, match="at most 1000 pixels"):
+        load_target(tmp_path / "bomb.png")
+
+
 @pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root reads everything")
 def test_unreadable_picture_is_a_clear_error(tmp_path):
     disk_picture().save(tmp_path / "secret.png")
     (tmp_path / "secret.png").chmod(0)
     with pytest.raises(NPAError, match="permissions"):
         load_target(tmp_path / "secret.png")
-
-
-def test_decompression_bomb_is_a_clear_error(tmp_path, monkeypatch):
-    disk_picture().save(tmp_path / "bomb.png")
-    monkeypatch.setattr(images, "MAX_AREA", 1000)
-    with pytest.raises(NPAError, match="at most 1000 pixels"):
-        load_target(tmp_path / "bomb.png")
