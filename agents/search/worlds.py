@@ -50,7 +50,7 @@ class SearchWorld:
     particle_count: int = 128
     """Particles N."""
     steps: int = 128
-    """Steps from the seed, a multiple of 16."""
+    """Steps from the seed, a multiple of 16; the second half of them is evaluated."""
     world_count: int = 1
     """Worlds of each candidate, B, over which figures are averaged."""
     state_dim: int = 4

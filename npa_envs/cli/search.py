@@ -7,12 +7,13 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Literal
 
+from npa_envs.agents.search.worlds import SearchWorld
 from npa_envs.cli import common
 from npa_envs.errors import NPAError
 
 
 @dataclass(frozen=True, kw_only=True)
-class SearchOptions(common.RunOptions):
+class SearchOptions(common.RunOptions, SearchWorld):
     """Search for rules that differ from each other and stay alive.
 
     An archive keeps the best candidate of each kind: by speed, by how crowded particles stand, and
@@ -27,18 +28,6 @@ class SearchOptions(common.RunOptions):
     alone; chance."""
     budget: float = 2e7
     """Particle-steps of the whole search: candidates times worlds, particles and steps."""
-    particle_count: int = 128
-    """Particles N."""
-    steps: int = 128
-    """Steps from the seed, a multiple of 16; the second half of them is judged."""
-    world_count: int = 1
-    """Worlds that each candidate is tried in; figures are their means."""
-    state_dim: int = 4
-    """State channels, at least 3."""
-    hidden_dim: int = 8
-    """Hidden units of a rule."""
-    eps: float = 0.1
-    """Perception radius [length units]."""
     batch_size: int = 20
     """Candidates that are proposed together."""
     seed: int = 0
@@ -57,7 +46,6 @@ def main(arguments: Sequence[str]) -> int:
     common.check_numbers(options, threads=1)
     from npa_envs.agents.search.atlas import PAGE, figure, page, write_elites
     from npa_envs.agents.search.run import RESULTS, Search
-    from npa_envs.agents.search.worlds import SearchWorld
     from npa_envs.files import write_text
     from npa_envs.measure.plots import write_plots
     from npa_envs.measure.record import time_limit

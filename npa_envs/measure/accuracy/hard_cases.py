@@ -18,12 +18,13 @@ from npa_envs.measure.accuracy.scenes import (
     PRECISIONS,
     SIDE,
     STATE_DIM,
-    PerceptionOutcome,
     Scene,
+    against_reference,
     error_limits,
-    float32_errors,
     functional_weights,
+    not_finite,
     perceived,
+    perception_errors,
     relative_error,
     scenes,
     states_at,
@@ -56,12 +57,10 @@ def scene_checks(seed: int = 0) -> list[Check]:
 
 def _run_scene(scene: Scene, session: CheckSession) -> CheckResult:
     expected = perceived(scene.x, scene.s, scene.box, by_reference=True)
-    figures = {}
+    figures: dict[str, float] = {}
     for name, dtype in PRECISIONS.items():
         x, s = (tensor.to(session.device, dtype) for tensor in (scene.x, scene.s))
-        found = perceived(x, s, scene.box)
-        for what, value, exact in zip(PerceptionOutcome._fields, found, expected, strict=True):
-            figures[f"{what}_{name}"] = relative_error(value, exact)
+        figures |= perception_errors(perceived(x, s, scene.box), expected, name)
     return CheckResult(figures, error_limits(scene.x, scene.s, scene.box, expected))
 
 
@@ -138,13 +137,12 @@ def _run_crowd(space_dim: int, session: CheckSession) -> CheckResult:
     exact = weight.sum(1)
     blur = weight @ (s.detach()[0].double() / rho.double()[:, None])
     # Σ_i of the smoothed states is Σ_j v_j s_j Σ_i W_ij = Σ_j s_j, so its gradient is 1 everywhere.
-    finite = [tensor.isfinite().all() for tensor in (rho, z, by_states)]
     # Sums of N terms of one sign have rounding errors of about √N roundings.
     limit = 4.0 * count**0.5 * 2.0**-24
     return CheckResult(
         {
             "particles": float(count),
-            "not_finite": float(sum(not bool(all_of) for all_of in finite)),
+            "not_finite": not_finite((rho, z, by_states)),
             "density": float(((rho[:sampled].double() - exact) / exact).abs().max()),
             "smoothed": relative_error(z[:, :sampled, 4:8], blur[None]),
             "adjoint": float((by_states.double() - 1.0).abs().max()),
@@ -158,22 +156,20 @@ def _run_nearest(space_dim: int, session: CheckSession) -> CheckResult:
     """A pair is perceived as such from 1e-19 length units on (float32), below it counts as
     coincident; all is finite down to denormal distances."""
     figures: dict[str, float] = {}
-    not_finite = 0
-    holds = 0
+    broken, holds = 0.0, 0
     s = states_at(torch.empty(1, 2, space_dim))
     for power in range(1, 45):
         x = torch.zeros(1, 2, space_dim)
         x[0, 1, 0] = 10.0**-power if power > 1 else 0.5 * EPS
-        found = perceived(x.to(session.device), s.to(session.device, torch.float32), None)
-        expected = perceived(x.double(), s, None, by_reference=True)
-        not_finite += sum(int((~tensor.isfinite()).sum()) for tensor in found)
-        errors = float32_errors(found, expected)
+        outcome, expected = against_reference(x, s, None, session.device)
+        broken += not_finite(outcome)
+        errors = perception_errors(outcome, expected)
         if power % 4 == 0:
             figures[f"z_1e-{power}"] = errors["z_float32"]
             figures[f"positions_1e-{power}"] = errors["positions_float32"]
         if holds == power - 1 and all(error <= LIMITS[name] for name, error in errors.items()):
             holds = power
-    figures |= {"not_finite": float(not_finite), "nearest": 10.0**-holds}
+    figures |= {"not_finite": broken, "nearest": 10.0**-holds}
     limits = {"not_finite": 0.0, "nearest": 1e-19 * (1.0 + 1e-9)}
     return CheckResult(figures, limits, holds=f"float32: from 1e-{holds} on")
 
@@ -188,21 +184,19 @@ def _run_outside(space_dim: int, session: CheckSession) -> CheckResult:
     box = (SIDE,) * space_dim
     figures: dict[str, float] = {}
     limits = {"not_finite": 0.0}
-    not_finite = 0
-    farthest = 0.0
+    broken, farthest = 0.0, 0.0
     for offset in (0.0, 1.0, 10.0, 1e2, 1e3, 1e4, 1e6, 1e12, 1e30):
         x = inside.clone()
         x[:, ::2, 0] += offset
-        found = perceived(x.to(session.device), s.to(session.device), box)
-        not_finite += sum(int((~tensor.isfinite()).sum()) for tensor in found)
+        # The reference has the images of coordinates rounded to float32.
+        outcome, expected = against_reference(x, s, box, session.device)
+        broken += not_finite(outcome)
         if offset <= 1e4:
-            # The images of coordinates rounded to float32.
-            expected = perceived(x.double(), s.double(), box, by_reference=True)
-            figures[f"z_{offset:g}"] = error = relative_error(found.z, expected.z)
+            figures[f"z_{offset:g}"] = error = relative_error(outcome.z, expected.z)
             allowed = error_limits(x.double(), s.double(), box, expected)
             limits[f"z_{offset:g}"] = allowed["z_float32"]
             farthest = offset if error <= 1e-3 else farthest
-    figures["not_finite"] = float(not_finite)
+    figures["not_finite"] = broken
     return CheckResult(
         figures, limits, holds=f"float32: z within 1e-3 up to {farthest:g} sides away"
     )
@@ -245,9 +239,7 @@ def _run_scale(space_dim: int, session: CheckSession) -> CheckResult:
     right = []
     for power in POWERS:
         scaled = s * 10.0**power
-        found = perceived(x, scaled, None)
-        expected = perceived(x.cpu().double(), scaled.cpu().double(), None, by_reference=True)
-        errors = float32_errors(found, expected)
+        errors = perception_errors(*against_reference(x, scaled, None, session.device))
         figures[f"z_1e{power:+d}"] = errors["z_float32"]
         if all(error <= LIMITS[name] for name, error in errors.items()):
             right.append(power)
@@ -303,7 +295,7 @@ def _run_dead(space_dim: int, session: CheckSession) -> CheckResult:
     figures = {
         "x": differing(filled[0], clean[0]),
         "s": differing(filled[1], clean[1]),
-        "not_finite": float(sum((~part.isfinite()).sum() for part in clean)),
+        "not_finite": not_finite(clean),
         "empty_slots": float((~living(clean[1])).sum(dim=1).max()),
     }
     # A few die at any time.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
@@ -18,9 +18,9 @@ from npa_envs.measure.accuracy.scenes import (
     PerceptionOutcome,
     Scene,
     error_limits,
-    float32_errors,
     functional_weights,
     perceived,
+    perception_errors,
     relative_error,
     scenes,
     states_at,
@@ -95,10 +95,10 @@ def _run_norm(name: str, session: CheckSession) -> CheckResult:
     figures: dict[str, float] = {}
     not_finite = 0.0
     for steps in powers_of_two(QUICK_STEPS if session.quick else STEPS):
-        found = outcome(home, session, steps, torch.float32)
-        figures[f"weights_{steps}"] = float(found.by_weights.norm())
-        figures[f"states_{steps}"] = float(found.by_states.norm())
-        for gradient in (found.by_weights, found.by_states):
+        result = outcome(home, session, steps, torch.float32)
+        figures[f"weights_{steps}"] = float(result.by_weights.norm())
+        figures[f"states_{steps}"] = float(result.by_states.norm())
+        for gradient in (result.by_weights, result.by_states):
             not_finite = max(not_finite, float((~gradient.isfinite()).double().mean()))
     return CheckResult(figures | {"not_finite": not_finite}, {"not_finite": 0.0})
 
@@ -190,41 +190,42 @@ def _on(scene: Scene, device: torch.device) -> tuple[Tensor, Tensor]:
     return scene.x.to(device, torch.float32), scene.s.to(device, torch.float32)
 
 
-def _compared(pairs: Iterable[tuple[Scene, PerceptionOutcome, PerceptionOutcome]]) -> CheckResult:
-    """Return the largest distance of pairs of perceptions over the error allowed for one."""
-    shares = {}
-    for scene, found, other in pairs:
+class _Distances:
+    """Distances of two perceptions of the same scenes, over the error allowed for one."""
+
+    def __init__(self) -> None:
+        self.fractions: dict[str, float] = {}
+
+    def add(self, scene: Scene, one: PerceptionOutcome, other: PerceptionOutcome) -> None:
         exact = perceived(scene.x, scene.s, scene.box, by_reference=True)
         allowed = error_limits(scene.x, scene.s, scene.box, exact)
-        errors = [error / allowed[name] for name, error in float32_errors(found, other).items()]
+        errors = [error / allowed[name] for name, error in perception_errors(one, other).items()]
         name = f"{scene.name}/{'open' if scene.box is None else 'periodic'}"
         # max() of a tensor never ignores NaN.
-        shares[name] = float(torch.tensor(errors).max())
-    largest = float(torch.tensor(list(shares.values())).max())
-    wrong = [name for name, share in shares.items() if not share <= TWO_ERRORS]
-    return CheckResult(
-        {"over_allowed_error": largest},
-        {"over_allowed_error": TWO_ERRORS},
-        note=f"too far apart: {', '.join(wrong)}" if wrong else "",
-    )
+        self.fractions[name] = float(torch.tensor(errors).max())
+
+    def result(self) -> CheckResult:
+        wrong = [name for name, value in self.fractions.items() if not value <= TWO_ERRORS]
+        return CheckResult(
+            {"over_allowed_error": float(torch.tensor(list(self.fractions.values())).max())},
+            {"over_allowed_error": TWO_ERRORS},
+            note=f"too far apart: {', '.join(wrong)}" if wrong else "",
+        )
 
 
 @check("precision/order", 2, 3)
 def _run_order(space_dim: int, session: CheckSession) -> CheckResult:
     """Particles in another order perceive the same up to rounding, in every hard scene."""
-
-    def pairs() -> Iterator[tuple[Scene, PerceptionOutcome, PerceptionOutcome]]:
-        for scene in _every_scene(space_dim, session):
-            x, s = _on(scene, session.device)
-            order = torch.randperm(x.shape[1], generator=torch.Generator().manual_seed(7))
-            order = order.to(session.device)
-            weights = functional_weights(x, s)
-            found = perceived(x[:, order], s[:, order], scene.box, weights=weights[:, order])
-            back = order.argsort()
-            found = PerceptionOutcome(*(tensor[:, back] for tensor in found))
-            yield scene, found, perceived(x, s, scene.box, weights=weights)
-
-    return _compared(pairs())
+    distances = _Distances()
+    for scene in _every_scene(space_dim, session):
+        x, s = _on(scene, session.device)
+        order = torch.randperm(x.shape[1], generator=torch.Generator().manual_seed(7))
+        order = order.to(session.device)
+        weights = functional_weights(x, s)
+        moved = perceived(x[:, order], s[:, order], scene.box, weights=weights[:, order])
+        back = PerceptionOutcome(*(tensor[:, order.argsort()] for tensor in moved))
+        distances.add(scene, back, perceived(x, s, scene.box, weights=weights))
+    return distances.result()
 
 
 @check("precision/repeated", 2, 3)
@@ -263,13 +264,15 @@ def _run_devices(session: CheckSession) -> CheckResult:
     if not session.cuda:
         raise Skipped("there is one device only: run it with --device cuda")
 
-    def pairs() -> Iterator[tuple[Scene, PerceptionOutcome, PerceptionOutcome]]:
-        for space_dim in (2, 3):
-            for scene in _every_scene(space_dim, session):
-                found = perceived(*_on(scene, session.device), scene.box)
-                yield scene, found, perceived(*_on(scene, torch.device("cpu")), scene.box)
-
-    return _compared(pairs())
+    distances = _Distances()
+    for space_dim in (2, 3):
+        for scene in _every_scene(space_dim, session):
+            on_cuda, on_cpu = (
+                perceived(*_on(scene, device), scene.box)
+                for device in (session.device, torch.device("cpu"))
+            )
+            distances.add(scene, on_cuda, on_cpu)
+    return distances.result()
 
 
 @check("precision/graph")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -48,9 +48,9 @@ def states_at(x: Tensor) -> Tensor:
 
 def scenes(space_dim: int, *, periodic: bool, seed: int = 0) -> list[Scene]:
     """Return every scene of open space or of a periodic box of side `SIDE`."""
-    made: list[Scene] = []
+    selected: list[Scene] = []
     for name, (summary, make_positions) in POSITIONS.items():
-        generator = torch.Generator().manual_seed(1000 * seed + len(made))
+        generator = torch.Generator().manual_seed(1000 * seed + len(selected))
         only_periodic = name in ("seam", "tight_box")
         if (only_periodic and not periodic) or (name == "far" and periodic):
             continue
@@ -59,8 +59,8 @@ def scenes(space_dim: int, *, periodic: bool, seed: int = 0) -> list[Scene]:
         # Rounded to float32 first, so that both precisions have the same particles.
         x = make_positions(space_dim, generator).float().double()
         side = 2.0 * EPS if name == "tight_box" else SIDE
-        made.append(Scene(name, summary, x, (side,) * space_dim if periodic else None))
-    return made
+        selected.append(Scene(name, summary, x, (side,) * space_dim if periodic else None))
+    return selected
 
 
 def _uniform(space_dim: int, generator: torch.Generator, count: int, side: float = 0.5) -> Tensor:
@@ -218,10 +218,25 @@ def relative_error(value: Tensor, expected: Tensor) -> float:
     return float(errors.max())
 
 
-def float32_errors(found: PerceptionOutcome, expected: PerceptionOutcome) -> dict[str, float]:
-    """Return the relative errors of float32, by the names of `LIMITS`."""
-    pairs = zip(PerceptionOutcome._fields, found, expected, strict=True)
-    return {f"{what}_float32": relative_error(a, b) for what, a, b in pairs}
+def perception_errors(
+    outcome: PerceptionOutcome, expected: PerceptionOutcome, precision: str = "float32"
+) -> dict[str, float]:
+    """Return the relative errors of a perception, by the names of `LIMITS`."""
+    pairs = zip(PerceptionOutcome._fields, outcome, expected, strict=True)
+    return {f"{what}_{precision}": relative_error(a, b) for what, a, b in pairs}
+
+
+def against_reference(
+    x: Tensor, s: Tensor, box: Box, device: torch.device
+) -> tuple[PerceptionOutcome, PerceptionOutcome]:
+    """Return the perception of worlds in float32 on a device, and by the reference in float64."""
+    outcome = perceived(x.to(device, torch.float32), s.to(device, torch.float32), box)
+    return outcome, perceived(x.cpu().double(), s.cpu().double(), box, by_reference=True)
+
+
+def not_finite(tensors: Iterable[Tensor]) -> float:
+    """Return how many elements of tensors are infinite or NaN."""
+    return float(sum(int((~tensor.isfinite()).sum()) for tensor in tensors))
 
 
 def functional_weights(x: Tensor, s: Tensor) -> Tensor:
@@ -234,29 +249,25 @@ def functional_weights(x: Tensor, s: Tensor) -> Tensor:
 def perceived(
     x: Tensor,
     s: Tensor,
-    box: tuple[float, ...] | None,
+    box: Box,
     *,
     by_reference: bool = False,
     weights: Tensor | None = None,
-    given: Callable[[Tensor], Tensor] = torch.clone,
+    changed: Callable[[Tensor], Tensor] = torch.clone,
 ) -> PerceptionOutcome:
     """Return z and its gradients, by the library or the reference.
 
-    `weights` are by default `functional_weights`; `given` is applied to all inputs first.
+    `weights` are by default `functional_weights`; `changed` is applied to all inputs first.
     """
-    x, s = given(x.detach()).requires_grad_(), given(s.detach()).requires_grad_()
-    if by_reference:
-        z = reference.perceive(x, s, EPS, EPS, box, detach_positions=False)
-    else:
-        z = perceive(x, s, EPS, EPS, box, detach_positions=False)
-    weights = given(functional_weights(x, s) if weights is None else weights)
+    x, s = changed(x.detach()).requires_grad_(), changed(s.detach()).requires_grad_()
+    operator = reference.perceive if by_reference else perceive
+    z = operator(x, s, EPS, EPS, box, detach_positions=False)
+    weights = changed(functional_weights(x, s) if weights is None else weights)
     states, positions = torch.autograd.grad((z * weights).sum(), (s, x))
     return PerceptionOutcome(z.detach(), states, positions)
 
 
-def error_limits(
-    x: Tensor, s: Tensor, box: tuple[float, ...] | None, expected: PerceptionOutcome
-) -> dict[str, float]:
+def error_limits(x: Tensor, s: Tensor, box: Box, expected: PerceptionOutcome) -> dict[str, float]:
     """Return the relative errors allowed for a scene, by the names of `LIMITS`.
 
     An error may be as large as the effect of rounding every input four times, which is large where
@@ -266,7 +277,7 @@ def error_limits(
     generator = torch.Generator().manual_seed(4)
     change = 1e-11
 
-    def changed(values: Tensor) -> Tensor:
+    def rounded(values: Tensor) -> Tensor:
         rows = values.flatten(0, 1)
         which = torch.unique(rows, dim=0, return_inverse=True)[1]
         draws = torch.rand(rows.shape, generator=generator, dtype=rows.dtype)[which]
@@ -275,11 +286,9 @@ def error_limits(
 
     limits = dict(LIMITS)
     for _ in range(4):
-        others = perceived(x, s, box, by_reference=True, given=changed)
-        for what, exact, other in zip(PerceptionOutcome._fields, expected, others, strict=True):
-            condition = relative_error(other, exact) / change
-            for name, dtype in PRECISIONS.items():
-                rounding = 0.5 * torch.finfo(dtype).eps
-                key = f"{what}_{name}"
-                limits[key] = max(limits[key], 4.0 * rounding * condition)
+        others = perceived(x, s, box, by_reference=True, changed=rounded)
+        for name, dtype in PRECISIONS.items():
+            rounding = 0.5 * torch.finfo(dtype).eps
+            for key, error in perception_errors(others, expected, name).items():
+                limits[key] = max(limits[key], 4.0 * rounding * (error / change))
     return limits
