@@ -109,7 +109,7 @@ class ScriptedGardener(BrushPolicy):
     def act(self) -> Tensor:
         """Return pushes towards places where worlds have less than the target."""
         worlds, action = self.worlds, self.still()
-        deficit = self._deficit(worlds.x, worlds.s, self.task.middle(worlds.x))
+        deficit = self._deficit(worlds.particles, self.task.middle(worlds.x))
         pull = torch.einsum("bq,pqd->bpd", deficit[..., 0].double(), self._pulls).to(deficit.dtype)
         move = (self._gain * deficit[..., 1:3] + pull).clamp(-1.0, 1.0)
         if self.config.actions == "grid":
@@ -152,7 +152,7 @@ class ScriptedShepherd(BrushPolicy):
     def act(self) -> Tensor:
         """Return pushes towards the goals of the worlds."""
         worlds, action = self.worlds, self.still()
-        achieved = self.task.achieved(worlds.x, worlds.s, worlds.context)
+        achieved = self.task.achieved(worlds.particles, worlds.context)
         missing = (self.task.desired(worlds.context) - achieved)[:, None, :2]
         if self.config.aim == "move":
             direction = missing.expand(-1, len(self._places), -1)
@@ -222,11 +222,11 @@ class GradientGardener(BrushPolicy):
     def planned_rewards(self, plan: Tensor, draws: WorldRandom) -> Tensor:
         """Return the sum of each world's rewards in the steps of a plan, [T, B, K, W], [B]."""
         worlds, task = self.worlds, self.task
-        x, s = worlds.x.detach(), worlds.s.detach()
+        particles = worlds.particles
         random = draws.substream(StreamId.POLICY)
-        total = torch.zeros(x.shape[0], device=x.device)
+        total = torch.zeros(worlds.world_count, device=worlds.device)
         for action in plan:
-            x, s = task.brush_and_roll(x, s, action, random)
-            loss = sum(task.losses(x, s).values())
-            total = total + task.reward(x, s, loss, worlds.context)
+            particles = task.brush_and_roll(particles, action, random)
+            loss = sum(task.losses(particles.x, particles.s).values())
+            total = total + task.reward(particles, loss, worlds.context)
         return total

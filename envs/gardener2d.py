@@ -9,12 +9,12 @@ import torch
 from torch import Tensor
 
 from npa_envs.checks import check_fraction, check_non_negative, check_positive
-from npa_envs.envs.core.task import Start
 from npa_envs.envs.core.vector import vector_class
 from npa_envs.envs.garden.brushes import GardenConfig
-from npa_envs.envs.garden.task import GardenEnv, GardenTask, intact_context, lost_fraction
+from npa_envs.envs.garden.task import GardenEnv, GardenTask
 from npa_envs.tasks.damage import random_particle
 from npa_envs.world.brushes import push, wipe_state
+from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import StreamId, WorldRandom
 
 
@@ -46,7 +46,6 @@ class Gardener2DEnvConfig(GardenConfig):
     """Radius of a blight [length units]."""
 
     def __post_init__(self) -> None:
-        """Check every field."""
         super().__post_init__()
         for name in ("gust_chance", "blight_chance"):
             if getattr(self, name) != 0.0:
@@ -59,10 +58,10 @@ class GardenerTask(GardenTask[Gardener2DEnvConfig]):
     """A picture with gusts and blights."""
 
     config_type = Gardener2DEnvConfig
-    context_count = 2
 
-    def disturb(self, x: Tensor, s: Tensor, random: WorldRandom) -> tuple[Tensor, Tensor]:
+    def disturb(self, particles: Particles, random: WorldRandom) -> Particles:
         """Return worlds after a gust and a blight; their random stream is not the rule's."""
+        x, s, *_ = particles
         config, draws = self.config, random.substream(StreamId.DAMAGE)
         chance, angle = draws.uniform(2), 2.0 * math.pi * draws.uniform(1)
         centre = random_particle(x, draws)
@@ -74,15 +73,11 @@ class GardenerTask(GardenTask[Gardener2DEnvConfig]):
         centre = random_particle(x, draws)
         happens = chance[:, 1] < config.blight_chance
         radius = torch.where(happens, config.blight_radius, -1.0)
-        return x, wipe_state(x, s, centre=centre, radius=radius, box=box)
+        return Particles(x, wipe_state(x, s, centre=centre, radius=radius, box=box))
 
-    def episode_context(self, start: Start, loss: Tensor, random: WorldRandom) -> Tensor:
-        """Return the loss of the intact picture, and its rise if all of it turns grey."""
-        return intact_context(self, start, loss)
-
-    def reward(self, x: Tensor, s: Tensor, loss: Tensor, context: Tensor) -> Tensor:
+    def reward(self, particles: Particles, loss: Tensor, context: Tensor) -> Tensor:
         """Return 1 for worlds as at their start, 0 for worlds as bad as grey, shape [B]."""
-        return (1.0 - lost_fraction(loss, context)).clamp_min(-1.0)
+        return (1.0 - self.lost_fraction(loss, context)).clamp_min(-1.0)
 
 
 class Gardener2DEnv(GardenEnv):

@@ -9,14 +9,14 @@ from typing import Any, ClassVar, TypeVar, get_args
 import torch
 from torch import Tensor
 
-from npa_envs.checks import check_positive
-from npa_envs.envs.core.config import EnvConfig
-from npa_envs.envs.core.task import Start
+from npa_envs.checks import check_field, check_positive
+from npa_envs.envs.core.config import EnvConfig, check_picture_size
 from npa_envs.envs.morphogenesis2d import Morphogenesis2DEnvConfig, PictureEnvTask
 from npa_envs.errors import NPAError, shown
 from npa_envs.rule.files import load_rule, shipped_rules
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.targets.clouds import Split
+from npa_envs.world.particles import Particles, combined
 from npa_envs.world.randomness import StreamId, WorldRandom
 from npa_envs.world.rollout import rollout
 
@@ -31,6 +31,8 @@ FIRST_TEST_SEED = 1_000_000
 @dataclass(frozen=True, kw_only=True)
 class GrownConfig(Morphogenesis2DEnvConfig):
     """Adds the rule that grows the worlds, and the pool of grown worlds."""
+
+    words = EnvConfig.words | {"split": get_args(Split)}
 
     without_rule: ClassVar[str] = ""
     """Alternative to a rule, as the end of an error's message."""
@@ -51,17 +53,13 @@ class GrownConfig(Morphogenesis2DEnvConfig):
     """Steps of the rule from the seed to the grown world, of time step 1 and without noise."""
 
     def __post_init__(self) -> None:
-        """Check every field."""
         super().__post_init__()
         check_positive(self, int, "grow_steps")
-        if self.split not in get_args(Split):
-            raise NPAError(f"split must be 'train' or 'test', got {shown(self.split)}")
         check_positive(self, int, "seed_pool", at_least=0, at_most=FIRST_TEST_SEED)
-        if self.split == "test" and self.seed_pool == 0:
-            raise NPAError(
-                "split must be 'train' where seed_pool=0 grows a new world for each episode: "
-                "evaluate with other seeds of reset, or give seed_pool=4"
-            )
+        has_split = self.split == "train" or self.seed_pool > 0
+        rule = "be 'train' where seed_pool=0 grows a new world for each episode"
+        hint = "evaluate with other seeds of reset, or give seed_pool=4"
+        check_field(self, "split", has_split, rule, hint)
 
 
 Config = TypeVar("Config", bound=GrownConfig)
@@ -71,98 +69,86 @@ class GrownTask(PictureEnvTask[Config]):
     """Pictures that a rule has grown."""
 
     config_type: ClassVar[type[GrownConfig]] = GrownConfig
-
-    def __init__(self, config: Config, device: torch.device) -> None:
-        super().__init__(config, device)
-        self._grown: dict[int, Start] = {}
+    grows = True
 
     @cached_property
     def rule(self) -> NPARule:
         """The rule that grows them."""
-        return _load_rule(self.config, self.device)
+        config, known = self.config, shipped_rules("morphogenesis2d")
+        if config.rule is None and config.target not in known:
+            raise NPAError(
+                "rule must say what grows the worlds, as no shipped rule grows "
+                f"{shown(config.target)} ({', '.join(known)}): give rule='PATH'"
+                f"{config.without_rule}"
+            )
+        rule = load_rule(growing_rule(config), device=self.device)
+        same = {"space_dim": 2, "state_dim": config.state_dim}
+        for name, value in (same | {"static": False, "divides": False, "code_dim": 0}).items():
+            if getattr(rule, name) != value:
+                raise NPAError(
+                    f"rule must have {name}={value} like the world, got {getattr(rule, name)}: "
+                    "choose another rule, or the same state_dim"
+                )
+        return rule
 
     @property
     def first_pool_seed(self) -> int:
         """Seed of the first world of the pool, far from the other split's."""
         return 0 if self.config.split == "train" else FIRST_TEST_SEED
 
-    @property
-    def start_is_short(self) -> bool:
-        """Whether a start takes few operations: not if it grows a world."""
-        return self.config.seed_pool > 0
-
-    def pooled(self, indices: Tensor) -> Start:
-        """Return worlds of the pool; on a CPU each is grown when an episode first starts from it.
-
-        On CUDA this would synchronise.
-        """
-        if self.device.type != "cpu":
-            return super().pooled(indices)
-        wanted = indices.tolist()
-        for index in set(wanted) - self._grown.keys():
-            self._grown[index] = self.made_for_pool([index])
-        worlds = [self._grown[index] for index in wanted]
-        return Start(torch.cat([world.x for world in worlds]), torch.cat([w.s for w in worlds]))
-
     def seed(self, random: WorldRandom) -> tuple[Tensor, Tensor]:
         """Return grown worlds."""
-        x, s = super().seed(random)
-        return grow(self.rule, self.config, x, s, random, dt=1.0, position_noise=0.0)
+        seeds = Particles(*super().seed(random))
+        x, s, *_ = grow(self.rule, self.config, seeds, random, dt=1.0, position_noise=0.0)
+        return x, s
 
 
 def run_rule(
     rule: NPARule,
     config: EnvConfig,
-    x: Tensor,
-    s: Tensor,
+    particles: Particles,
     steps: int,
     random: WorldRandom,
     **changes: Any,
-) -> tuple[Tensor, Tensor]:
+) -> Particles:
     """Return worlds after steps of a rule with an environment's constants.
 
     `changes` replace arguments of `rollout`.
     """
     names = ("eps", "box", "boundary", "update_prob", "dt", "position_noise")
     constants = {name: getattr(config, name) for name in names} | changes
-    stepped: tuple[Tensor, Tensor] = rollout(rule, x, s, steps, generator=random, **constants)
-    return stepped
+    return Particles(*rollout(rule, particles.x, particles.s, steps, generator=random, **constants))
 
 
 def grow(
-    rule: NPARule, config: Any, x: Tensor, s: Tensor, random: WorldRandom, **changes: Any
-) -> tuple[Tensor, Tensor]:
+    rule: NPARule, config: Any, seeds: Particles, random: WorldRandom, **changes: Any
+) -> Particles:
     """Return worlds after `grow_steps` steps of a rule; arguments are those of `run_rule`.
 
     One after the other: a rule's matrix products depend in the last bit on the number of worlds.
     """
     worlds = []
-    for k in range(len(x)):
-        one = slice(k, k + 1)
-        stream = random.take(one).substream(StreamId.GROWTH)
-        worlds.append(run_rule(rule, config, x[one], s[one], config.grow_steps, stream, **changes))
-    grown_x, grown_s = (torch.cat(part) for part in zip(*worlds, strict=True))
-    return grown_x, grown_s
+    for k in range(len(seeds.x)):
+        one, stream = slice(k, k + 1), random.take(slice(k, k + 1)).substream(StreamId.GROWTH)
+        seed = Particles(seeds.x[one], seeds.s[one])
+        worlds.append(run_rule(rule, config, seed, config.grow_steps, stream, **changes))
+    return combined(torch.cat, worlds)
 
 
 def check_rule_driven(config: Any) -> None:
     """Check the fields that configurations of rule-driven worlds share."""
-    if config.resolution % config.picture_size:
-        raise NPAError(
-            f"picture_size must divide resolution = {config.resolution}, got "
-            f"{config.picture_size}: try {config.resolution // 2}"
-        )
+    check_picture_size(config)
     if config.tell_updated:
         raise NPAError("tell_updated must be False, as actions do not belong to particles")
 
 
-def check_runs(rule: NPARule, **wanted: Any) -> None:
+def check_runs(rule: NPARule, **constants: Any) -> None:
     """Check that the worlds' constants are those of the rule that steps them."""
-    for name, given in wanted.items():
+    for name, wanted in constants.items():
         value = getattr(rule, name)
-        if value != given:
+        if value != wanted:
             raise NPAError(
-                f"{name} must be the rule's, {value!r}, got {given!r}: give {name}={value!r}, or "
+                f"{name} must be the rule's, {value!r}, got {wanted!r}: give {name}={value!r}, or "
                 "another rule"
             )
 
@@ -182,26 +168,3 @@ def load_read_out(field: str, name: str, state_dim: int, device: torch.device) -
 def growing_rule(config: GrownConfig) -> str:
     """Return the name or file of the rule that grows a configuration's worlds."""
     return config.rule or FIRST_RULES.get(config.target, config.target)
-
-
-def _load_rule(config: GrownConfig, device: torch.device) -> NPARule:
-    if config.rule is None and config.target not in (known := shipped_rules("morphogenesis2d")):
-        raise NPAError(
-            "rule must say what grows the worlds, as no shipped rule grows "
-            f"{shown(config.target)} ({', '.join(known)}): give rule='PATH'{config.without_rule}"
-        )
-    rule = load_rule(growing_rule(config), device=device)
-    wanted = {
-        "space_dim": 2,
-        "state_dim": config.state_dim,
-        "static": False,
-        "divides": False,
-        "code_dim": 0,
-    }
-    for name, value in wanted.items():
-        if getattr(rule, name) != value:
-            raise NPAError(
-                f"rule must have {name}={value} like the world, got {getattr(rule, name)}: "
-                "choose another rule, or the same state_dim"
-            )
-    return rule

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, TypeVar
 
-import torch
 from torch import Tensor
 
 from npa_envs.checks import check_positive
@@ -30,16 +29,14 @@ class PictureConfig(EnvConfig):
     seed_radius: float = Morphogenesis2DConfig.seed_radius
 
     def __post_init__(self) -> None:
-        """Check every field."""
-        super().__post_init__()
         # The target has as many points as particles.
         check_positive(self, int, "particle_count", at_most=MAX_POINT_COUNT)
-        _ = self.task_config
-        self.check_start_radius(self.seed_radius)
+        super().__post_init__()
+        self.check_seed_radius(self.seed_radius)
 
     @property
     def task_config(self) -> Morphogenesis2DConfig:
-        """Configuration of the training task."""
+        """Configuration of the training task, whose target has as many points as particles."""
         return self.as_config(Morphogenesis2DConfig, target_point_count=self.particle_count)
 
 
@@ -57,16 +54,7 @@ class PictureEnvTask(TargetEnvTask[Config]):
     """A picture to grow, compared by the splat loss of `npa_envs.tasks.morphogenesis2d`."""
 
     config_type: ClassVar[type[PictureConfig]] = Morphogenesis2DEnvConfig
-    task: Morphogenesis2D
-    task_type: ClassVar[type[Morphogenesis2D]] = Morphogenesis2D
-    """Class of the training task."""
-
-    def __init__(self, config: Config, device: torch.device) -> None:
-        super().__init__(config, device)
-        self.task = self._make_task()
-
-    def _make_task(self) -> Morphogenesis2D:
-        return self.task_type(self.config.task_config, device=self.device)
+    training_task: ClassVar[type[Morphogenesis2D]] = Morphogenesis2D
 
     @classmethod
     def extra_bytes(cls, config: Any, world_count: int) -> int:
@@ -79,11 +67,6 @@ class PictureEnvTask(TargetEnvTask[Config]):
         """Return the density error and the weighted colour error of each world."""
         density, colour = self.task.splat_losses(x, s)
         return {"density": density, "colour": self.config.colour_weight * colour}
-
-    @property
-    def pixel_size(self) -> float:
-        """Size of a particle in pictures: the spacing of the target's points."""
-        return self.task.target.pixel_size
 
 
 class Morphogenesis2DEnv(NPAEnv):

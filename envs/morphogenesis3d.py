@@ -8,19 +8,18 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.checks import check_positive
+from npa_envs.checks import check_field, check_positive
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
-from npa_envs.envs.core.task import TURN, TargetEnvTask
+from npa_envs.envs.core.task import EnvTask, TargetEnvTask
 from npa_envs.envs.core.vector import vector_class
 from npa_envs.envs.grown import load_read_out
-from npa_envs.errors import NPAError, shown
 from npa_envs.render import turntable_frames
 from npa_envs.tasks.morphogenesis3d import Morphogenesis3D, Morphogenesis3DConfig
+from npa_envs.world.particles import Particles
 
 PIXEL_BYTES = 200
 """Memory for comparing one pixel of a view, about [bytes]."""
@@ -54,16 +53,11 @@ class Morphogenesis3DEnvConfig(EnvConfig):
     """Opacity of a particle, in (0, 1); with a read-out, its opacity where the read-out is 0."""
 
     def __post_init__(self) -> None:
-        """Check every field."""
-        super().__post_init__()
-        if not isinstance(self.readout, str):
-            raise NPAError(
-                f"readout must be a name or a path, got {shown(self.readout)}: "
-                "for example readout='mushroom'"
-            )
         check_positive(self, int, "view_count")
-        _ = self.task_config
-        self.check_start_radius(self.seed_radius)
+        super().__post_init__()
+        is_text, hint = isinstance(self.readout, str), "for example readout='mushroom'"
+        check_field(self, "readout", is_text, "be a name or a path", hint)
+        self.check_seed_radius(self.seed_radius)
 
     @property
     def task_config(self) -> Morphogenesis3DConfig:
@@ -80,16 +74,16 @@ class SolidTask(TargetEnvTask[Morphogenesis3DEnvConfig]):
     """An object to grow, compared view by view by `npa_envs.tasks.morphogenesis3d`."""
 
     config_type = Morphogenesis3DEnvConfig
-    task: Morphogenesis3D
+    training_task = Morphogenesis3D
     space_dim = 3
+    pixel_size = EnvTask.pixel_size
 
-    def __init__(self, config: Morphogenesis3DEnvConfig, device: torch.device) -> None:
-        super().__init__(config, device)
-        task = Morphogenesis3D(config.task_config, device=device)
-        self._rule = None
-        if config.readout:
-            self._rule = load_read_out("readout", config.readout, config.state_dim, device)
-        self.task = task if self._rule is None else task.for_rule(self._rule)
+    def _make_task(self) -> Morphogenesis3D:
+        task: Morphogenesis3D = super()._make_task()
+        if not self.config.readout:
+            return task
+        state_dim = self.config.state_dim
+        return task.for_rule(load_read_out("readout", self.config.readout, state_dim, self.device))
 
     @classmethod
     def extra_bytes(cls, config: Any, world_count: int) -> int:
@@ -103,21 +97,15 @@ class SolidTask(TargetEnvTask[Morphogenesis3DEnvConfig]):
         """Return the mean absolute difference of each world's views."""
         return {"views": self.task.metric(x, s)}
 
-    def draw(self, x: Tensor, s: Tensor, steps: NDArray[np.int64]) -> NDArray[np.uint8]:
-        """Return a picture of each world; with a read-out, of its Gaussians."""
-        if self._rule is None or self.config.render_style != "particles":
-            return super().draw(x, s, steps)
-        frames = []
-        for k, step in enumerate(steps):
-            views = partial(self.task.views, x[k : k + 1], s[k : k + 1])
-            frames += turntable_frames(
-                views,
-                frame_count=1,
-                resolution=self.config.render_size,
-                azimuth=TURN * float(step),
-                device=self.device,
-            )
-        return np.stack(frames)
+    def draw_particles(
+        self, particles: Particles, style: str, azimuth: float = 0.0
+    ) -> NDArray[np.uint8]:
+        """Return a picture of a world; with a read-out, of its Gaussians."""
+        if not self.config.readout or style != "particles":
+            return super().draw_particles(particles, style, azimuth)
+        views, size = partial(self.task.views, particles.x, particles.s), self.config.render_size
+        view = {"resolution": size, "azimuth": azimuth, "device": self.device}
+        return np.stack([*turntable_frames(views, frame_count=1, **view)])
 
 
 class Morphogenesis3DEnv(NPAEnv):

@@ -196,11 +196,10 @@ def batched(
     """Return many worlds, stepped together on one device; world k is `parallel_env` by itself.
 
     Args:
-        task: As for `parallel_env`.
-        species_count: As for `parallel_env`.
+        task: As `species_count` and `config` for `parallel_env`; device="cuda" and output="torch"
+            keep all arrays on a GPU.
         world_count: Worlds B.
         autoreset_mode: "same-step" or "disabled".
-        config: As for `parallel_env`; device="cuda", output="torch" keep all arrays on a GPU.
 
     Raises:
         NPAError: As `parallel_env`, or the worlds do not fit into memory.
@@ -223,13 +222,7 @@ def env(task: str = "mixing", species_count: int | None = None, **config: Any) -
 
 
 def settings(task: str, species_count: int | None, config: dict[str, Any]) -> dict[str, Any]:
-    """Return all keywords of an environment; given ones replace those of an id.
-
-    Args:
-        task: A task's name, or an id.
-        species_count: Species K; None: those of the id, by default 2.
-        config: The other given keywords.
-    """
+    """Return all keywords for a task's name or an id, whose own keywords `config` replaces."""
     name, keywords = task_settings(task)
     if species_count is not None:
         keywords["species_count"] = species_count

@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from npa_envs.checks import check_flag, check_positive
-from npa_envs.envs.core.config import EnvConfig
+from npa_envs.envs.core.config import EnvConfig, check_picture_size
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.state import OBSERVATION_COPIES
 from npa_envs.envs.core.task import Start
@@ -48,15 +48,10 @@ class Pictures2DEnvConfig(PictureConfig):
     """Pixels on each side of the observed picture; a divisor of `resolution`."""
 
     def __post_init__(self) -> None:
-        """Check every field."""
         super().__post_init__()
         check_flag(self, "observe_target")
         check_positive(self, int, "picture_size")
-        if self.resolution % self.picture_size:
-            raise NPAError(
-                f"picture_size must divide resolution = {self.resolution}, got "
-                f"{self.picture_size}: try {self.resolution}"
-            )
+        check_picture_size(self)
         if not self.targets or not self.test_targets:
             raise NPAError(
                 "targets and test_targets must name a picture each, got "
@@ -90,8 +85,7 @@ class PicturesTask(PictureEnvTask[Pictures2DEnvConfig]):
     """Several pictures to grow, one target in each world."""
 
     config_type = Pictures2DEnvConfig
-    task: ManyPictures
-    task_type = ManyPictures
+    training_task = ManyPictures
 
     def __init__(self, config: Pictures2DEnvConfig, device: torch.device) -> None:
         super().__init__(config, device)
@@ -116,6 +110,12 @@ class PicturesTask(PictureEnvTask[Pictures2DEnvConfig]):
         x, s, _, number = self.task.seed(random.world_count, generator=random, device=self.device)
         # Drops the channels of codes, which only rules of many pictures use.
         return Start(x, s[..., -self.config.state_dim :].contiguous(), goal=number)
+
+    @property
+    def pixel_size(self) -> float:
+        """Size of a particle in pictures: the spacing of the first target's points."""
+        size: float = self.task.target.pixel_size
+        return size
 
     def toward(self, goal: Tensor) -> Self:
         """Return a task whose losses are for worlds of these pictures."""

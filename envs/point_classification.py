@@ -12,13 +12,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs import world_mean
-from npa_envs.checks import check_positive
+from npa_envs.checks import check_field, check_positive
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import Start, TargetEnvTask
 from npa_envs.envs.core.vector import vector_class
 from npa_envs.envs.grown import load_read_out
-from npa_envs.errors import NPAError, shown
 from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
 from npa_envs.tasks.point_classification import (
     PICTURE_MARGIN,
@@ -27,6 +26,7 @@ from npa_envs.tasks.point_classification import (
     class_colours,
 )
 from npa_envs.tasks.targets.clouds import Split
+from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import WorldRandom
 
 Score = Literal["error", "cross_entropy", "accuracy"]
@@ -38,7 +38,7 @@ class PointClassificationEnvConfig(EnvConfig):
 
     task_config_type = PointClassificationConfig
 
-    words = EnvConfig.words | {"score": get_args(Score)}
+    words = EnvConfig.words | {"score": get_args(Score), "split": get_args(Split)}
 
     particle_count: int = PointClassificationConfig.particle_count
     data: str = PointClassificationConfig.data
@@ -65,25 +65,12 @@ class PointClassificationEnvConfig(EnvConfig):
     outputs."""
 
     def __post_init__(self) -> None:
-        """Check every field."""
         super().__post_init__()
-        if self.boundary != "open":
-            raise NPAError(
-                f"boundary must be 'open' for point clouds, got {shown(self.boundary)}: leave it "
-                "out"
-            )
-        if self.split not in get_args(Split):
-            raise NPAError(f"split must be 'train' or 'test', got {shown(self.split)}")
-        if not isinstance(self.rule, str):
-            raise NPAError(f"rule must be the path of a rule as a string, got {shown(self.rule)}")
-        _ = self.task_config
+        is_open, rule = self.boundary == "open", "be 'open' for point clouds"
+        check_field(self, "boundary", is_open, rule, "leave it out")
+        check_field(self, "rule", isinstance(self.rule, str), "be the path of a rule as a string")
         check_positive(self, float, "sharpness")
         check_positive(self, int, "state_dim", at_least=3 if self.rule else self.class_count)
-
-    @property
-    def task_config(self) -> PointClassificationConfig:
-        """Configuration of the training task."""
-        return self.as_config(PointClassificationConfig)
 
 
 class _WorldByWorld(NPARule):
@@ -97,18 +84,19 @@ class PointClassificationTask(TargetEnvTask[PointClassificationEnvConfig]):
     """Clouds of digits, and the error of their particles' outputs."""
 
     config_type = PointClassificationEnvConfig
-    task: PointClassification
     static = True
 
-    def __init__(self, config: PointClassificationEnvConfig, device: torch.device) -> None:
-        super().__init__(config, device)
-        self.task = PointClassification(config.task_config, device=device, split=config.split)
-        if config.rule:
-            given = load_read_out("rule", config.rule, config.state_dim, device)
-            rule = _WorldByWorld(**given.hyper_parameters()).to(device)
-            rule.load_state_dict(given.state_dict())
-            self.task = self.task.for_rule(rule.requires_grad_(False))
-        self._coverage = self.task.clouds.coverage
+    def _make_task(self) -> PointClassification:
+        config, device = self.config, self.device
+        task = PointClassification(config.task_config, device=device, split=config.split)
+        # Reads the data now, as imports by their readers draw from Python's random generator.
+        _ = task.clouds.coverage
+        if not config.rule:
+            return task
+        loaded = load_read_out("rule", config.rule, config.state_dim, device)
+        rule = _WorldByWorld(**loaded.hyper_parameters()).to(device)
+        rule.load_state_dict(loaded.state_dict())
+        return task.for_rule(rule.requires_grad_(False))
 
     def fresh(self, random: WorldRandom) -> Start:
         """Return random clouds with all states zero, and their classes."""
@@ -143,17 +131,16 @@ class PointClassificationTask(TargetEnvTask[PointClassificationEnvConfig]):
             return self.task.cross_entropies(s, self.config.sharpness)
         return self.task.mistakes(s) if self.config.score == "accuracy" else self.task.errors(s)
 
-    def draw(self, x: Tensor, s: Tensor, steps: NDArray[np.int64]) -> NDArray[np.uint8]:
+    def draw(self, particles: Particles, steps: NDArray[np.int64]) -> NDArray[np.uint8]:
         """Return pictures of the unit square with a margin, in the colours of predicted classes."""
-        colours = class_colours(self.task.outputs(s)) - COLOUR_OFFSET
-        return super().draw(
-            MAGNIFICATION * (x - 0.5), torch.cat((s[..., :-3], colours), dim=-1), steps
-        )
+        x, s, *_ = particles
+        s = torch.cat((s[..., :-3], class_colours(self.task.outputs(s)) - COLOUR_OFFSET), dim=-1)
+        return super().draw(Particles(MAGNIFICATION * (x - 0.5), s), steps)
 
     @property
     def pixel_size(self) -> float:
         """Size of a particle in pictures, which show the unit square magnified."""
-        return MAGNIFICATION * self.task.pixel_size
+        return MAGNIFICATION * super().pixel_size
 
 
 MAGNIFICATION = 2.0 / (1.0 + 2.0 * PICTURE_MARGIN)

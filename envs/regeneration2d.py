@@ -14,9 +14,10 @@ from npa_envs.envs.core.task import Start
 from npa_envs.envs.core.vector import vector_class
 from npa_envs.envs.grown import GrownConfig, GrownTask
 from npa_envs.envs.morphogenesis2d import PictureEnvTask
-from npa_envs.errors import NPAError, shown, suggest
+from npa_envs.errors import shown
 from npa_envs.rule.rule import COLOUR_OFFSET
 from npa_envs.tasks.damage import damage_worlds
+from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import StreamId, WorldRandom
 
 RANDOM_DAMAGE = "random"
@@ -38,6 +39,8 @@ PICTURE = "picture"
 @dataclass(frozen=True, kw_only=True)
 class Regeneration2DEnvConfig(GrownConfig):
     """Adds the damage."""
+
+    words = GrownConfig.words | {"damage": (*SIZES, RANDOM_DAMAGE)}
 
     without_rule = f", or rule={shown(PICTURE)} to start from the target's own points"
 
@@ -67,12 +70,7 @@ class Regeneration2DEnvConfig(GrownConfig):
     `success_loss` is given (dimensionless, in (0, 1])."""
 
     def __post_init__(self) -> None:
-        """Check every field."""
         super().__post_init__()
-        kinds = (*SIZES, RANDOM_DAMAGE)
-        if self.damage not in kinds:
-            hint = suggest(self.damage, kinds)
-            raise NPAError(f"damage must be a known kind, got {shown(self.damage)}: {hint}")
         check_fraction(self, "healed_share")
         check_flag(self, "split_damage")
         if self.damage_size is not None:
@@ -91,8 +89,15 @@ class RegenerationTask(GrownTask[Regeneration2DEnvConfig]):
             _ = self.rule
 
     def seed(self, random: WorldRandom) -> tuple[Tensor, Tensor]:
-        """Return grown worlds without damage."""
-        return self._picture_worlds(random) if self._drawn else super().seed(random)
+        """Return grown worlds without damage, or the target's points."""
+        if not self._drawn:
+            return super().seed(random)
+        x, s = PictureEnvTask.seed(self, random)
+        points, colours = self.task.target.points, self.task.target.colours
+        # The numbers of points and particles differ a little: some points repeat or are skipped.
+        chosen = torch.linspace(0, len(points) - 1, x.shape[1], device=x.device).round().long()
+        s[..., -3:] = colours[chosen] - COLOUR_OFFSET
+        return points[chosen].expand_as(x).clone(), s
 
     @property
     def start_is_short(self) -> bool:
@@ -106,32 +111,24 @@ class RegenerationTask(GrownTask[Regeneration2DEnvConfig]):
             random = random.substream(StreamId.TEST)
         kinds = RANDOM_KINDS if self.config.damage == RANDOM_DAMAGE else (self.config.damage,)
         chosen = random.integers(len(kinds), 1, 1)
-        hurt_x, hurt_s = x, s
+        damaged = Particles(x, s)
         for k, kind in enumerate(kinds):
             size = SIZES[kind] if self.config.damage_size is None else self.config.damage_size
             new_x, new_s = damage_worlds(x, s, kind=kind, size=size, generator=random)
             # Each kind changes either positions or states.
             if new_x is not x:
-                hurt_x = torch.where(chosen == k, new_x, hurt_x)
+                damaged = damaged._replace(x=torch.where(chosen == k, new_x, damaged.x))
             if new_s is not s:
-                hurt_s = torch.where(chosen == k, new_s, hurt_s)
+                damaged = damaged._replace(s=torch.where(chosen == k, new_s, damaged.s))
         if threshold is None:
-            whole, hurt = self._loss(x, s), self._loss(hurt_x, hurt_s)
-            healed = whole + (1.0 - self.config.healed_share) * (hurt - whole)
-            never = torch.full_like(whole, -torch.inf)
-            threshold = torch.where(hurt - whole >= MIN_RISE * whole, healed, never)
-        return Start(hurt_x, hurt_s, threshold)
+            intact, loss = self._loss(Particles(x, s)), self._loss(damaged)
+            healed = intact + (1.0 - self.config.healed_share) * (loss - intact)
+            never = torch.full_like(intact, -torch.inf)
+            threshold = torch.where(loss - intact >= MIN_RISE * intact, healed, never)
+        return Start(damaged.x, damaged.s, threshold)
 
-    def _loss(self, x: Tensor, s: Tensor) -> Tensor:
-        return total(torch.stack(list(self.losses(x, s).values())))
-
-    def _picture_worlds(self, random: WorldRandom) -> tuple[Tensor, Tensor]:
-        x, s = PictureEnvTask.seed(self, random)
-        points, colours = self.task.target.points, self.task.target.colours
-        # The numbers of points and particles differ a little: some points repeat or are skipped.
-        chosen = torch.linspace(0, len(points) - 1, x.shape[1], device=x.device).round().long()
-        s[..., -3:] = colours[chosen] - COLOUR_OFFSET
-        return points[chosen].expand_as(x).clone(), s
+    def _loss(self, particles: Particles) -> Tensor:
+        return total(torch.stack(list(self.losses(particles.x, particles.s).values())))
 
 
 class Regeneration2DEnv(NPAEnv):

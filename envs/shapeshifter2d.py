@@ -12,8 +12,8 @@ import torch.nn.functional as F
 from gymnasium.spaces import Box, Discrete, Space
 from torch import Tensor
 
-from npa_envs.checks import check_positive, number_tensor
-from npa_envs.envs.core.base import ParticleSpaces, batch_tensor
+from npa_envs.checks import check_positive
+from npa_envs.envs.core.base import ParticleSpaces, batch_choices, batch_tensor
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import Start
@@ -30,6 +30,7 @@ from npa_envs.tasks.many_pictures import ManyPictures
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2DConfig
 from npa_envs.training.task_of_rule import sources_of_codes
 from npa_envs.world.actions import Physics
+from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import WorldRandom
 
 OBSERVATION_LIMIT = 8.0
@@ -84,7 +85,6 @@ class Shapeshifter2DEnvConfig(PictureConfig):
     seed_radius: float = 0.4
 
     def __post_init__(self) -> None:
-        """Check every field."""
         super().__post_init__()
         check_positive(self, int, "rule_steps", "hold_steps", "grow_steps", "picture_size")
         check_rule_driven(self)
@@ -133,16 +133,10 @@ class CodeForm(ParticleSpaces):
         if not self._chosen:
             code = batch_tensor(action, world_count, (dim,), "K")
             return self._limit * code[:, None].clamp(-1.0, 1.0)
-        batch = () if world_count is None else (world_count,)
-        chosen = number_tensor("action", action)
-        if tuple(chosen.shape) != batch or chosen.is_floating_point():
-            raise NPAError(
-                f"action must be whole numbers of shape {batch}, got {tuple(chosen.shape)} of "
-                f"{chosen.dtype}: see env.action_space"
-            )
+        chosen = batch_choices(action, world_count, (), "")
         if not bool(((chosen >= 0) & (chosen < count)).all()):
             raise NPAError(f"action must be the number of one of {count} codes, from 0 on")
-        return self._table.to(chosen.device)[chosen.long().view(-1, 1)]
+        return self._table.to(chosen.device)[chosen[:, None]]
 
     def actions_of_codes(self) -> Tensor:
         """Return the action of the form "code" for each of the rule's codes, [T, K]."""
@@ -156,36 +150,27 @@ class ShapeshifterTask(RuleDriven, PictureEnvTask[Shapeshifter2DEnvConfig]):
     form_type = CodeForm
     actor = "codes"
     context_count = 1 + GOAL_COUNT
+    grows = True
     task: ManyPictures
 
     def _make_task(self) -> ManyPictures:
         config = self.config
         self.rule, self.codes = rule_of(config, self.device)
         sources = sources_of_codes(config.rule, self.codes)
-        own = config.as_config(
+        task_config = config.as_config(
             Morphogenesis2DConfig,
             target_point_count=config.particle_count,
             targets=tuple(sources.values()),
             state_dim=config.state_dim - self.rule.code_dim,
             code_dim=self.rule.code_dim,
         )
-        return ManyPictures(own, device=self.device)
+        return ManyPictures(task_config, device=self.device)
 
     @classmethod
     def extra_bytes(cls, config: Any, world_count: int) -> int:
         """Return an estimate of the memory of pool and pictures [bytes]."""
         pictures = 32 * world_count * config.resolution**2
         return super().extra_bytes(config, world_count) + int(pictures)
-
-    @property
-    def start_is_short(self) -> bool:
-        """Whether a start takes few operations: not if it grows a world."""
-        return self.config.seed_pool > 0
-
-    @property
-    def pixel_size(self) -> float:
-        """Size of a particle in pictures [length units]."""
-        return self.task.pixel_size
 
     @cached_property
     def blank_losses(self) -> Tensor:
@@ -203,8 +188,8 @@ class ShapeshifterTask(RuleDriven, PictureEnvTask[Shapeshifter2DEnvConfig]):
         """Return grown worlds of random pictures, with another picture as their goal."""
         x, s, _, grown = self.task.seed(random.world_count, generator=random, device=self.device)
         assert grown is not None, "worlds of many pictures have goals"
-        s = self.rule.with_code(s, self.codes.table[grown][:, None])
-        x, s = grow(self.rule, self.config, x, s, random)
+        seeds = Particles(x, self.rule.with_code(s, self.codes.table[grown][:, None]))
+        x, s, *_ = grow(self.rule, self.config, seeds, random)
         return Start(x, s, goal=self._another(grown, random))
 
     def _another(self, goal: Tensor, random: WorldRandom) -> Tensor:
@@ -226,11 +211,11 @@ class ShapeshifterTask(RuleDriven, PictureEnvTask[Shapeshifter2DEnvConfig]):
         self, x: Tensor, s: Tensor, action: Tensor, random: WorldRandom
     ) -> tuple[Tensor, Tensor]:
         """Write an action's codes, [B, 1, K], into all states, run the rule, and return x and s."""
-        config = self.config
-        coded = self.rule.with_code(s, action)
-        return run_rule(self.rule, config, x, coded, config.rule_steps, random)
+        coded = Particles(x, self.rule.with_code(s, action))
+        x, s, *_ = run_rule(self.rule, self.config, coded, self.config.rule_steps, random)
+        return x, s
 
-    def reward(self, x: Tensor, s: Tensor, loss: Tensor, context: Tensor) -> Tensor:
+    def reward(self, particles: Particles, loss: Tensor, context: Tensor) -> Tensor:
         """Return 1 at the goal, 0 for a loss as of an empty picture, shape [B]."""
         blank = self.blank_losses.index_select(0, context[:, 0].long())
         return (1.0 - loss / blank).clamp_min(-1.0)
@@ -241,14 +226,15 @@ class ShapeshifterTask(RuleDriven, PictureEnvTask[Shapeshifter2DEnvConfig]):
         context[:, :1] = context.gather(1, 1 + turn[:, None])
         goal.copy_(context[:, 0].long())
 
-    def context_info(self, x: Tensor, s: Tensor, context: Tensor) -> dict[str, Tensor]:
+    def context_info(self, particles: Particles, context: Tensor) -> dict[str, Tensor]:
         """Return the index of each world's goal, shape [B]."""
         return {"goal": context[:, 0].long()}
 
-    def observe(self, x: Tensor, s: Tensor, loss: Tensor, context: Tensor) -> Tensor:
+    def observe(self, particles: Particles, loss: Tensor, context: Tensor) -> Tensor:
         """Return coarse pictures of worlds and of their goals, shape [B, 8 G²]."""
         goal_task = self.task.toward(context[:, 0].long())
-        both = torch.cat((goal_task.picture(x, s), goal_task.target_picture), dim=-1)
+        picture = goal_task.picture(particles.x, particles.s)
+        both = torch.cat((picture, goal_task.target_picture), dim=-1)
         pixels = self.config.resolution // self.config.picture_size
         coarse = F.avg_pool2d(both.permute(0, 3, 1, 2), pixels).flatten(1)
         return coarse.clamp(-OBSERVATION_LIMIT, OBSERVATION_LIMIT)

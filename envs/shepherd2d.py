@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any, Literal, assert_never, get_args
 
 import numpy as np
 import torch
@@ -13,15 +13,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs import world_mean
-from npa_envs.checks import check_non_negative, check_positive
+from npa_envs.checks import check_field, check_non_negative, check_positive
 from npa_envs.envs.core.base import to_output
 from npa_envs.envs.core.task import Start
 from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.envs.garden.brushes import OBSERVATION_LIMIT, BrushSpaces, GardenConfig, GardenReward
-from npa_envs.envs.garden.task import GardenEnv, GardenTask, intact_context, lost_fraction
-from npa_envs.errors import NPAError
+from npa_envs.envs.garden.task import GardenEnv, GardenTask
 from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.world.actions import Physics
+from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import WorldRandom
 
 Aim = Literal["move", "turn", "reshape"]
@@ -62,12 +62,11 @@ class Shepherd2DEnvConfig(GardenConfig):
     """Weight in the dense reward of the fraction lost beyond `lost_limit` (dimensionless)."""
 
     def __post_init__(self) -> None:
-        """Check every field."""
         super().__post_init__()
         check_positive(self, float, "goal_reach", "tolerance", "lost_limit")
         check_non_negative(self, "reward_weight")
-        if self.aim != "move" and self.goal_reach > 0.9:
-            raise NPAError(f"goal_reach must be at most 0.9 to {self.aim}, got {self.goal_reach}")
+        is_small = self.aim == "move" or self.goal_reach <= 0.9
+        check_field(self, "goal_reach", is_small, f"be at most 0.9 to {self.aim}")
 
 
 class GoalBrushes(BrushSpaces):
@@ -114,32 +113,31 @@ class ShepherdTask(GardenTask[Shepherd2DEnvConfig]):
 
     def episode_context(self, start: Start, loss: Tensor, random: WorldRandom) -> Tensor:
         """Return the intact loss and its rise, the goal, and the creature's first moments."""
-        lies = lie_of(start.x)
-        reach, width = self.config.goal_reach, 2
-        places = uniform_ball(len(loss), 1, width, reach, generator=random, device=self.device)
-        drawn = places[:, 0]
+        moments, reach = moments_of(start.x), self.config.goal_reach
+        drawn = uniform_ball(len(loss), 1, 2, reach, generator=random, device=self.device)[:, 0]
         if self.config.aim == "move":
-            goal = lies[:, :2] + drawn
+            goal = moments[:, :2] + drawn
         elif self.config.aim == "turn":
             goal = direction(drawn[:, :1])
         else:
             goal = 1.0 + drawn
-        return torch.cat((intact_context(self, start, loss), goal, lies), dim=1)
+        return torch.cat((super().episode_context(start, loss, random), goal, moments), dim=1)
 
-    def achieved(self, x: Tensor, s: Tensor, context: Tensor) -> Tensor:
+    def achieved(self, particles: Particles, context: Tensor) -> Tensor:
         """Return the achieved goal: its two values and the lost fraction, shape [B, 3]."""
-        first, now = context[:, 4:], lie_of(x)
+        x, s, *_ = particles
+        first, now = context[:, 4:], moments_of(x)
         if self.config.aim == "move":
-            got, undone = now[:, :2], x
+            values, aligned = now[:, :2], x
         elif self.config.aim == "turn":
-            got = axis_turn(first, now)
-            undone = turned_back(x, now[:, :2], got)
+            values = axis_turn(first, now)
+            aligned = turned_back(x, now[:, :2], values)
         else:
-            got = (now[:, (2, 4)] / first[:, (2, 4)]).sqrt()
+            values = (now[:, (2, 4)] / first[:, (2, 4)]).sqrt()
             middle = now[:, None, :2]
-            undone = middle + (x - middle) / got[:, None]
-        loss = sum(self.losses(undone, s).values(), torch.zeros_like(got[:, 0]))
-        return torch.cat((got, lost_fraction(loss, context)[:, None]), dim=1)
+            aligned = middle + (x - middle) / values[:, None]
+        loss = sum(self.losses(aligned, s).values(), torch.zeros_like(values[:, 0]))
+        return torch.cat((values, self.lost_fraction(loss, context)[:, None]), dim=1)
 
     def desired(self, context: Tensor) -> Tensor:
         """Return the desired goal: its two values and `lost_limit`, shape [B, 3]."""
@@ -149,35 +147,39 @@ class ShepherdTask(GardenTask[Shepherd2DEnvConfig]):
 
     def goal_reward(self, achieved: Tensor, desired: Tensor) -> Tensor:
         """Return the rewards, shape [...], for achieved and desired goals, [..., 3]."""
-        away = (achieved[..., :2] - desired[..., :2]).square().sum(dim=-1).sqrt()
+        distance = (achieved[..., :2] - desired[..., :2]).square().sum(dim=-1).sqrt()
         excess = achieved[..., 2] - desired[..., 2]
-        if self.config.reward == "sparse":
-            return ((away <= self.config.tolerance) & (excess <= 0.0)) * 1.0 - 1.0
-        # No division: CUDA replaces it by a product with the inverse, which rounds differently.
-        nearness = -away * (1.0 / self.config.goal_reach)
-        return nearness - self.config.reward_weight * excess.clamp(min=0.0)
+        match self.config.reward:
+            case "sparse":
+                return ((distance <= self.config.tolerance) & (excess <= 0.0)) * 1.0 - 1.0
+            case "dense":
+                # No division: CUDA replaces it by a product with the inverse, which rounds
+                # differently.
+                nearness = -distance * (1.0 / self.config.goal_reach)
+                return nearness - self.config.reward_weight * excess.clamp(min=0.0)
+            case unknown:
+                assert_never(unknown)
 
-    def reward(self, x: Tensor, s: Tensor, loss: Tensor, context: Tensor) -> Tensor:
+    def reward(self, particles: Particles, loss: Tensor, context: Tensor) -> Tensor:
         """Return rewards, shape [B]."""
-        return self.goal_reward(self.achieved(x, s, context), self.desired(context)).to(
-            torch.float32
-        )
+        achieved = self.achieved(particles, context)
+        return self.goal_reward(achieved, self.desired(context)).to(torch.float32)
 
-    def context_info(self, x: Tensor, s: Tensor, context: Tensor) -> dict[str, Tensor]:
+    def context_info(self, particles: Particles, context: Tensor) -> dict[str, Tensor]:
         """Return whether worlds are intact at their goals, distances, and lost fractions, [B]."""
-        achieved, desired = self.achieved(x, s, context), self.desired(context)
-        away = (achieved - desired)[:, :2].square().sum(dim=1).sqrt()
-        there = (away <= self.config.tolerance) & (achieved[:, 2] <= desired[:, 2])
-        return {"is_success": there, "distance": away, "lost": achieved[:, 2]}
+        achieved, desired = self.achieved(particles, context), self.desired(context)
+        distance = (achieved - desired)[:, :2].square().sum(dim=1).sqrt()
+        success = (distance <= self.config.tolerance) & (achieved[:, 2] <= desired[:, 2])
+        return {"is_success": success, "distance": distance, "lost": achieved[:, 2]}
 
-    def observe(self, x: Tensor, s: Tensor, loss: Tensor, context: Tensor) -> Tensor:
+    def observe(self, particles: Particles, loss: Tensor, context: Tensor) -> Tensor:
         """Return the observation, then the achieved and the desired goal, [B, O + 6]."""
-        observed = super().observe(x, s, loss, context)
-        goals = torch.cat((self.achieved(x, s, context), self.desired(context)), dim=1)
+        observed = super().observe(particles, loss, context)
+        goals = torch.cat((self.achieved(particles, context), self.desired(context)), dim=1)
         return torch.cat((observed, goals.clamp(-OBSERVATION_LIMIT, OBSERVATION_LIMIT)), dim=1)
 
 
-def lie_of(x: Tensor) -> Tensor:
+def moments_of(x: Tensor) -> Tensor:
     """Return mean x, y and, relative to it, the means of x², x y, y², shape [B, 5]."""
     mean = world_mean(x)
     across, up = (x - mean[:, None]).unbind(dim=-1)
@@ -195,8 +197,8 @@ def direction(angle: Tensor) -> Tensor:
 def axis_turn(first: Tensor, now: Tensor) -> Tensor:
     """Return cosine and sine of twice the angle by which the longer axis has turned, [B, 2]."""
 
-    def axis(lie: Tensor) -> tuple[Tensor, Tensor]:
-        across, slant = lie[:, 2] - lie[:, 4], 2.0 * lie[:, 3]
+    def axis(moments: Tensor) -> tuple[Tensor, Tensor]:
+        across, slant = moments[:, 2] - moments[:, 4], 2.0 * moments[:, 3]
         length = (across * across + slant * slant).sqrt().clamp_min(1e-12)
         return across / length, slant / length
 

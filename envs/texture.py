@@ -6,14 +6,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import torch
 from torch import Tensor
 
+from npa_envs.checks import check_field
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import TargetEnvTask
 from npa_envs.envs.core.vector import vector_class
-from npa_envs.errors import NPAError, shown
 from npa_envs.tasks.texture import Texture, TextureConfig
 from npa_envs.world.actions import Boundary
 
@@ -42,30 +41,16 @@ class TextureEnvConfig(EnvConfig):
     density_weight: float = TextureConfig.density_weight
 
     def __post_init__(self) -> None:
-        """Check every field."""
         super().__post_init__()
-        if self.boundary != "periodic":
-            raise NPAError(
-                f"boundary must be 'periodic' for textures, got {shown(self.boundary)}: leave it "
-                "out"
-            )
-        _ = self.task_config
-
-    @property
-    def task_config(self) -> TextureConfig:
-        """Configuration of the training task."""
-        return self.as_config(TextureConfig)
+        is_periodic, rule = self.boundary == "periodic", "be 'periodic' for textures"
+        check_field(self, "boundary", is_periodic, rule, "leave it out")
 
 
 class TextureTask(TargetEnvTask[TextureEnvConfig]):
     """A texture, compared by a loss of `npa_envs.tasks.losses.texture`."""
 
     config_type = TextureEnvConfig
-    task: Texture
-
-    def __init__(self, config: TextureEnvConfig, device: torch.device) -> None:
-        super().__init__(config, device)
-        self.task = Texture(config.task_config, device=device)
+    training_task = Texture
 
     @classmethod
     def extra_bytes(cls, config: Any, world_count: int) -> int:
@@ -79,11 +64,6 @@ class TextureTask(TargetEnvTask[TextureEnvConfig]):
         colour, density = self.task.texture_losses(x, s)
         colour_weight, density_weight = self.task.weights()
         return {"colour": colour_weight * colour, "density": density_weight * density}
-
-    @property
-    def pixel_size(self) -> float:
-        """Size of a particle in pictures, at which the mean density is the target's."""
-        return self.task.pixel_size
 
 
 class TextureEnv(NPAEnv):

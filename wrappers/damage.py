@@ -122,7 +122,7 @@ class DamageEvents(_DamagesWorlds, AnyWrapper):
         observation = self._base.place_particles(x[0], s[0])
         losses = self._base.losses_of(worlds.report.numbers[:, 0].tolist())
         losses["loss_damage"] = info.get("loss_damage", 0.0) + losses["loss"] - before
-        return observation, info | losses | self._base._extras("reset")
+        return observation, info | losses | self._base._extra_info()
 
 
 class VectorDamageEvents(_DamagesWorlds, EpisodeWrapper):
@@ -167,9 +167,7 @@ class VectorDamageEvents(_DamagesWorlds, EpisodeWrapper):
         if "loss_damage" in infos:
             changed["loss_damage"] = changed["loss_damage"] + infos["loss_damage"]
             changed["_loss_damage"] = changed["_loss_damage"] | infos["_loss_damage"]
-        fresh = base._extras("reset", None)
-        changed |= {name: value for name, value in fresh.items() if not name.startswith("_")}
-        return observations, infos | changed
+        return observations, infos | changed | base._returned_values(worlds.extra_info())
 
 
 def _copy(value: Any) -> Any:

@@ -15,8 +15,8 @@ from gymnasium.spaces import Box, Space
 from numpy.typing import NDArray
 from torch import Tensor
 
+from npa_envs.checks import number_tensor
 from npa_envs.envs.core.config import EnvConfig
-from npa_envs.envs.core.rewards import FIRST_PART, LOSS
 from npa_envs.envs.core.task import EnvTask
 from npa_envs.envs.core.worlds import BatchedWorlds
 from npa_envs.errors import NPAError
@@ -24,6 +24,7 @@ from npa_envs.render import Window, show
 from npa_envs.render.display import side_by_side
 from npa_envs.world.actions import Physics
 from npa_envs.world.cuda_graph import to_device_async
+from npa_envs.world.particles import Particles
 
 SHOWN_ACROSS = 4
 """Worlds in a row of the window, at most; it shows at most as many rows."""
@@ -64,10 +65,32 @@ def batch_tensor(
     action: Any, world_count: int | None, shape: tuple[int, ...], letters: str
 ) -> Tensor:
     """Return checked actions of B worlds, or of one (None), float32, shape [B, *shape]."""
-    batch, first = ((), "") if world_count is None else ((world_count,), "B, ")
-    wanted, letters = (*batch, *shape), f"[{first}{letters}] = "
+    wanted, letters = _batch_shape(world_count, shape, letters)
     checked = action_tensor("action", action, wanted, "env.action_space", letters)
     return checked[None] if world_count is None else checked
+
+
+def batch_choices(
+    action: Any, world_count: int | None, shape: tuple[int, ...], letters: str
+) -> Tensor:
+    """Return checked whole numbers of B worlds, or of one (None), int64, shape [B, *shape]."""
+    wanted, letters = _batch_shape(world_count, shape, letters)
+    choices = number_tensor("action", action)
+    if tuple(choices.shape) != wanted or choices.is_floating_point():
+        raise NPAError(
+            f"action must be whole numbers of shape {letters}{wanted}, got "
+            f"{tuple(choices.shape)} of {choices.dtype}: see env.action_space"
+        )
+    return choices.long().view(-1, *shape)
+
+
+def _batch_shape(
+    world_count: int | None, shape: tuple[int, ...], letters: str
+) -> tuple[tuple[int, ...], str]:
+    """Return the shape of actions of B worlds, or of one (None), and its letters for errors."""
+    if world_count is None:
+        return shape, f"[{letters}] = "
+    return (world_count, *shape), f"[{', '.join(filter(None, ('B', letters)))}] = "
 
 
 def action_tensor(
@@ -77,11 +100,11 @@ def action_tensor(
     came = ""
     if not isinstance(action, Tensor):
         try:
-            given = np.asanyarray(action)
-            if given.dtype.kind not in "biufO" or np.ma.is_masked(given):
+            array = np.asanyarray(action)
+            if array.dtype.kind not in "biufO" or np.ma.is_masked(array):
                 raise TypeError("no real numbers, or some that are masked")
             # Torch needs writable arrays.
-            action = torch.from_numpy(np.require(given, np.float32, ("C", "W")))
+            action = torch.from_numpy(np.require(array, np.float32, ("C", "W")))
         except (TypeError, ValueError, OverflowError):
             came = type(action).__name__
             came += f" of {action.dtype}" if isinstance(action, np.ndarray) else ""
@@ -185,26 +208,21 @@ class WorldsEnv(ShownEnv):
         self._show()
         return observation
 
-    def _place(self, x: Any, s: Any, worlds: Tensor, out: Tensor | None = None) -> Tensor:
+    def _place(self, particles: Particles, worlds: Tensor, out: Tensor | None = None) -> Tensor:
         """Replace particles of some worlds, [M]; return all worlds' observations, [B, ...]."""
-        count = self.config.particle_count
-        start = self.worlds.checked_particles(x, s, len(worlds), count)
         with self.worlds.device_context():
-            self.worlds.place(worlds, start)
+            self.worlds.place(worlds, particles)
             observation: Tensor = self.worlds.perceive(out)
         self._show()
         return observation
 
     def losses_of(self, numbers: Any) -> dict[str, Any]:
         """Return the loss and its parts by their names in infos, from the rows of a report."""
-        names = self.worlds.part_names
-        parts = {f"loss_{name}": numbers[FIRST_PART + k] for k, name in enumerate(names)}
-        return {"loss": numbers[LOSS]} | parts
+        return dict(zip(self.worlds.loss_names, numbers[1:], strict=False))
 
     def _improvements(self, numbers: Any) -> dict[str, Any]:
-        names = self.worlds.part_names
-        first = FIRST_PART + len(names)
-        return {f"reward_{name}": numbers[first + k] for k, name in enumerate(names)}
+        names = self.worlds.improvement_names
+        return dict(zip(names, numbers[len(numbers) - len(names) :], strict=True))
 
     def _show(self) -> None:
         self._show_in_window(self.spec.id if self.spec is not None else type(self).__name__)

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.checks import (
+    check_field,
     check_flag,
     check_fraction,
     check_non_negative,
@@ -120,7 +121,6 @@ class WorldConfig:
     """Pixels on each side of a rendered picture."""
 
     def __post_init__(self) -> None:
-        """Check every field."""
         check_positive(self, int, "particle_count", "state_dim")
         check_positive(self, int, "render_size", at_least=8)
         check_positive(self, float, "eps", "eps0", "alpha", "state_scale", "dt", "box_size")
@@ -128,32 +128,23 @@ class WorldConfig:
         check_fraction(self, "update_prob")
         check_non_negative(self, "position_noise")
         for name, words in self.words.items():
-            value = getattr(self, name)
-            if value not in words:
-                known = [word for word in words if word is not None]
-                raise NPAError(
-                    f"{name} must be a known word, got {shown(value)}: {suggest(value, known)}"
-                )
-        if self.boundary == "periodic" and self.box_size < 2.0 * self.eps:
-            raise NPAError(
-                f"box_size must be at least 2 eps = {2.0 * self.eps:g}, got {self.box_size}: "
-                "enlarge the box or perceive at a smaller eps"
-            )
-        if self.boundary != "open" and self.position_limit < 0.5 * self.box_size:
-            raise NPAError(
-                f"position_limit must be at least half of box_size = {self.box_size:g}, got "
-                f"{self.position_limit}: particles would be out of bounds inside the box"
-            )
+            value, known = getattr(self, name), [word for word in words if word is not None]
+            check_field(self, name, value in words, "be a known word", suggest(value, known))
+        fits = self.boundary != "periodic" or self.box_size >= 2.0 * self.eps
+        rule = f"be at least 2 eps = {2.0 * self.eps:g}"
+        check_field(self, "box_size", fits, rule, "enlarge the box or perceive at a smaller eps")
+        fits = self.boundary == "open" or self.position_limit >= 0.5 * self.box_size
+        rule = f"be at least half of box_size = {self.box_size:g}"
+        hint = "particles would be out of bounds inside the box"
+        check_field(self, "position_limit", fits, rule, hint)
         for field in fields(self):
             value = getattr(self, field.name)
             if is_real(value) and value > LARGEST:
                 raise NPAError(f"{field.name} must be at most {LARGEST:g}, got {shown(value)}")
         for name in ("eps", "eps0"):
-            if getattr(self, name) < 1.0 / LARGEST:
-                raise NPAError(
-                    f"{name} must be at least {1.0 / LARGEST:g} length units, got "
-                    f"{getattr(self, name)}: choose another unit of length"
-                )
+            rule = f"be at least {1.0 / LARGEST:g} length units"
+            fits = getattr(self, name) >= 1.0 / LARGEST
+            check_field(self, name, fits, rule, "choose another unit of length")
         if not 1.0 / MAX_RATIO <= self.eps / self.eps0 <= MAX_RATIO:
             raise NPAError(
                 f"eps / eps0 must lie in [{1.0 / MAX_RATIO:g}, {MAX_RATIO:g}], got "
@@ -217,13 +208,11 @@ class WorldConfig:
         shared = {name: getattr(self, name) for name in names if hasattr(self, name)}
         return config_type(**(shared | changes))
 
-    def check_start_radius(self, radius: float) -> None:
+    def check_seed_radius(self, radius: float) -> None:
         """Check that particles that start within a radius are within `position_limit`."""
-        if radius >= self.position_limit:
-            raise NPAError(
-                f"seed_radius must be below position_limit = {self.position_limit:g}, got "
-                f"{radius}: worlds would begin out of bounds"
-            )
+        rule = f"be below position_limit = {self.position_limit:g}"
+        hint = "worlds would begin out of bounds"
+        check_field(self, "seed_radius", radius < self.position_limit, rule, hint)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -269,13 +258,20 @@ class EnvConfig(WorldConfig):
     one."""
 
     def __post_init__(self) -> None:
-        """Check every field; as `WorldConfig`."""
         super().__post_init__()
         check_positive(self, int, "episode_steps")
         check_flag(self, "tell_updated")
         check_positive(self, int, "seed_pool", at_least=0)
         if self.success_loss is not None:
             check_non_negative(self, "success_loss")
+        if self.task_config_type is not None:
+            _ = self.task_config
+
+    @property
+    def task_config(self) -> Any:
+        """Configuration of the training task, which checks its own fields."""
+        assert self.task_config_type is not None, "a class with a training task sets it"
+        return self.as_config(self.task_config_type)
 
     @property
     def target_dim(self) -> int:
@@ -290,13 +286,19 @@ class EnvConfig(WorldConfig):
     @classmethod
     def from_keywords(cls, keywords: dict[str, Any]) -> Self:
         """As `WorldConfig.from_keywords`; refuses `episode_steps` where it would do nothing."""
-        made = super().from_keywords(keywords)
-        if "episode_steps" in keywords and made.reward != "sparse":
+        config = super().from_keywords(keywords)
+        if "episode_steps" in keywords and config.reward != "sparse":
             raise NPAError(
                 "episode_steps serves reward='sparse' alone: for longer or shorter episodes give "
                 "max_episode_steps"
             )
-        return made
+        return config
+
+
+def check_picture_size(config: Any) -> None:
+    """Check that pixels of the observed picture are squares of those of the compared picture."""
+    rule, hint = f"divide resolution = {config.resolution}", f"try {config.resolution // 2}"
+    check_field(config, "picture_size", config.resolution % config.picture_size == 0, rule, hint)
 
 
 def plain(value: Any) -> Any:

@@ -21,12 +21,13 @@ from npa_envs.world.actions import (
     with_mean_reward,
 )
 from npa_envs.world.cuda_graph import makes_plain_tensors, pinned_like
+from npa_envs.world.particles import Particles
 
 FLAGS = ("success", "diverged")
 """Names in `info` of the flags that are no part of what Gymnasium's `step` returns."""
 
-REWARD, LOSS, FIRST_PART = 0, 1, 2
-"""Rows of `StepReport.numbers`: the reward, the loss, and the first of the loss's K parts."""
+FLAG_ROWS = 2 + len(FLAGS) + 1
+"""Rows of flags in a report: terminated, truncated, `FLAGS`, and one that is always True."""
 
 
 def total(parts: Tensor) -> Tensor:
@@ -61,42 +62,86 @@ class StepReport(NamedTuple):
     @classmethod
     def empty(cls, world_count: int, part_count: int, device: torch.device) -> StepReport:
         """Return a report of zeros, of B worlds whose loss has K parts."""
-        rows = 4 * (2 + 2 * part_count) + 3 + len(FLAGS)
+        rows = 4 * (2 + 2 * part_count) + FLAG_ROWS
         buffer = torch.zeros(rows * world_count, dtype=torch.uint8, device=device)
-        report = cls.over(buffer, world_count)
+        report = cls.from_buffer(buffer, world_count)
         report.everyone.fill_(True)
         return report
 
     @classmethod
-    def over(cls, buffer: Tensor, world_count: int) -> StepReport:
+    def from_buffer(cls, buffer: Tensor, world_count: int) -> StepReport:
         """Return a report whose tensors are views of a buffer."""
-        flag_rows = 3 + len(FLAGS)
-        rows = buffer.view(-1, world_count)
-        numbers = buffer[: -flag_rows * world_count].view(torch.float32).view(-1, world_count)
-        flags = rows[-flag_rows:].view(torch.bool)
+        numbers, flags = buffer.view(-1, world_count).tensor_split((-FLAG_ROWS,))
+        numbers = numbers.flatten().view(torch.float32).view(-1, world_count)
+        flags = flags.view(torch.bool)
         return cls(buffer, numbers, flags[:-1], flags[-1])
 
     def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
-        """Pickle the buffer alone: unpickled views would not share its memory."""
-        return StepReport.over, (self.buffer, len(self.everyone))
+        # Unpickled views would not share the buffer's memory.
+        return StepReport.from_buffer, (self.buffer, len(self.everyone))
 
     def copy(self) -> StepReport:
         """Return a copy that later steps do not overwrite."""
-        return self.over(self.buffer.clone(), len(self.everyone))
+        return self.from_buffer(self.buffer.clone(), len(self.everyone))
+
+    @property
+    def reward(self) -> Tensor:
+        """Rewards of the last step, shape [B]."""
+        return self.numbers[0]
+
+    @property
+    def loss(self) -> Tensor:
+        """Losses, shape [B]."""
+        return self.numbers[1]
+
+    @property
+    def parts(self) -> Tensor:
+        """The parts of each loss, shape [K, B]."""
+        return self.numbers[2 : 1 + len(self.numbers) // 2]
+
+    @property
+    def improvements(self) -> Tensor:
+        """How much each part fell in the last step, shape [K, B]."""
+        return self.numbers[1 + len(self.numbers) // 2 :]
+
+
+class ParticleRewards:
+    """Rewards of single particles: the fall of their own losses, or their marginal gains."""
+
+    def __init__(self, particles: Particles, *, by_loss: bool) -> None:
+        self.reward = torch.zeros_like(particles.x[..., 0])
+        """Each particle's reward of the last step, shape [B, N]."""
+        self.loss = torch.zeros_like(self.reward) if by_loss else None
+        """Each particle's loss, shape [B, N]; None for marginal gains."""
+        self._before = particles if by_loss else particles.map(torch.clone)
+
+    def place(self, worlds: Tensor, task: EnvTask[Any], particles: Particles) -> None:
+        """Begin with new particles in some worlds, int64, [M], which have no reward."""
+        self.reward.index_fill_(0, worlds, 0.0)
+        if self.loss is None:
+            self._before.put_(worlds, particles)
+        else:
+            self.loss[worlds] = self._losses(task, particles)
+
+    def gains(self, task: EnvTask[Any], particles: Particles) -> Tensor:
+        """Return each particle's reward of a step, [B, N]; the next step counts from now."""
+        if self.loss is None:
+            gains = task.particle_gains(self._before[:2], particles[:2])
+            gains = checked_tensor(task, "particle_gains", "gains", gains, self.reward.shape)
+            self._before.copy_(particles)
+            return gains
+        losses = self._losses(task, particles)
+        gains = self.loss - losses
+        self.loss.copy_(losses)
+        return gains
+
+    def _losses(self, task: EnvTask[Any], particles: Particles) -> Tensor:
+        losses = task.particle_losses(particles.x, particles.s)
+        return checked_tensor(task, "particle_losses", "losses", losses, particles.x.shape[:2])
 
 
 class RewardedWorlds(WorldState):
-    """B worlds of one task with their losses, rewards and episode ends, in float32.
-
-    Args:
-        task_type: Class of the task, which defines starts and losses.
-        config: The environment's configuration.
-        world_count: Worlds B.
-        episode_steps: Steps after which an episode is truncated; None: never.
-
-    Raises:
-        NPAError: The worlds do not fit into memory.
-    """
+    """B worlds of one task with their losses, rewards and episode ends, in float32."""
 
     def __init__(
         self,
@@ -111,43 +156,45 @@ class RewardedWorlds(WorldState):
         self.task: Any = task_type(config, self.device)
         self.episode_steps = episode_steps
         """Steps after which an episode is truncated; None: never."""
-        x, s, device = self.x, self.s, self.device
 
-        def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
-            return torch.zeros(world_count, *shape, dtype=dtype, device=device)
+        def zeros(dtype: torch.dtype = torch.float32) -> Tensor:
+            return torch.zeros(world_count, dtype=dtype, device=self.device)
 
-        self.elapsed = zeros(dtype=torch.int32)
+        self.elapsed = zeros(torch.int32)
         """Steps since the start of each episode, shape [B]."""
-        self.particle_loss = zeros(count) if config.reward == "particle" else None
-        """Each particle's loss, shape [B, N], with `reward="particle"`."""
-        self.particle_reward = zeros(count) if config.per_particle_reward else None
-        """Each particle's reward of the last step, shape [B, N], where particles have rewards."""
-        self._before = (x.clone(), s.clone()) if config.reward == "marginal" else None
-        self.goal = zeros(dtype=torch.int64)
+        self.particle_rewards: ParticleRewards | None = None
+        """Rewards of single particles, where they have any."""
+        if config.per_particle_reward:
+            by_loss = config.reward == "particle"
+            self.particle_rewards = ParticleRewards(self.particles, by_loss=by_loss)
+        self.goal = zeros(torch.int64)
         """Index of each world's goal, shape [B]; zeros where the task has one goal."""
         self.goal_task: EnvTask[Any] = self.task.toward(self.goal)
         """The task with losses for the worlds' goals."""
         self._start_loss = zeros()
         self._success_loss = zeros()
-        self.diverged = zeros(dtype=torch.uint8)
+        self.diverged = zeros(torch.uint8)
         """1 where a position or state of the world left its bounds in the last step, shape [B]."""
-        self.enabled = torch.ones(1, dtype=torch.uint8, device=device)
+        self.enabled = torch.ones(1, dtype=torch.uint8, device=self.device)
         """0 if the last actions were not finite and so not applied, shape [1]."""
         self.part_names: tuple[str, ...] = ()
         """Names of the parts of the loss, known once worlds have been placed."""
-        self.report = StepReport.empty(world_count, 0, device)
+        self.loss_names: tuple[str, ...] = ()
+        """Names in `info` of the loss and its parts."""
+        self.improvement_names: tuple[str, ...] = ()
+        """Names in `info` of how much each part fell."""
+        self.report = StepReport.empty(world_count, 0, self.device)
         """What a step returns apart from the observation."""
         # Each world's ending, then whether the actions were finite.
-        self._endings = torch.zeros(world_count + 1, dtype=torch.uint8, device=device)
+        self._endings = torch.zeros(world_count + 1, dtype=torch.uint8, device=self.device)
         self._evaluation: EpisodeUpdate | None = None
         self._make_host_copies()
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the state without what the next step makes again, or what cannot be pickled."""
+        # The next step makes these again.
         return self.__dict__ | dict.fromkeys(("_evaluation", "host_endings", "host_numbers"))
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore the state, and make the host's copies again."""
         self.__dict__.update(state)
         self._make_host_copies()
 
@@ -167,10 +214,10 @@ class RewardedWorlds(WorldState):
         `check` raises an error unless all losses are finite, which synchronises with the device.
         """
         self.elapsed.index_fill_(0, worlds, 0)
-        self.place(worlds, start)
+        self.place(worlds, Particles(start.x, start.s, goal=start.goal))
         if check:
             self.check_losses(worlds)
-        self._start_loss[worlds] = self.report.numbers[LOSS][worlds]
+        self._start_loss[worlds] = self.loss[worlds]
         if start.success_loss is None:
             self._success_loss.index_fill_(0, worlds, -torch.inf)
         else:
@@ -178,76 +225,62 @@ class RewardedWorlds(WorldState):
 
     @torch.no_grad()
     @makes_plain_tensors
-    def place(self, worlds: Tensor, start: Start) -> None:
-        """Replace the particles of some worlds, int64, shape [M], without a reward."""
-        x, s = start.x.contiguous(), start.s.contiguous()
-        task = self.task
+    def place(self, worlds: Tensor, placed: Particles) -> None:
+        """Replace the particles of some worlds, int64, shape [M], without a reward.
+
+        Worlds keep their goals if `placed` has none.
+        """
+        task, goal = self.task, placed.goal
+        placed = Particles(placed.x.contiguous(), placed.s.contiguous())
         if self.goal_task is not task:
-            goal = self.goal[worlds] if start.goal is None else start.goal
+            goal = self.goal[worlds] if goal is None else goal
             self.goal.index_copy_(0, worlds, goal)
             task = task.toward(goal)
-        parts = task.losses(x, s)
-        values = torch.stack(checked_losses(task, parts, len(x), self.part_names))
+        parts = task.losses(placed.x, placed.s)
+        values = torch.stack(checked_losses(task, parts, len(placed.x), self.part_names))
         if not self.part_names:
             self.part_names = tuple(parts)
-            self.report = StepReport.empty(len(self.x), len(parts), x.device)
+            self.loss_names = ("loss", *(f"loss_{name}" for name in parts))
+            self.improvement_names = tuple(f"reward_{name}" for name in parts)
+            self.report = StepReport.empty(self.world_count, len(parts), self.device)
             self._make_host_copies()
-        self.x.index_copy_(0, worlds, x)
-        self.s.index_copy_(0, worlds, s)
+        self.particles.put_(worlds, placed)
         zeros = torch.zeros_like(values)
         numbers = torch.cat((zeros[:1], total(values)[None], values, zeros))
         self.report.numbers.index_copy_(1, worlds, numbers)
-        if self.particle_loss is not None:
-            self.particle_loss[worlds] = self._particle_losses(task, x, s)
-        if self._before is not None:
-            for before, placed in zip(self._before, (x, s), strict=True):
-                before.index_copy_(0, worlds, placed)
-        if self.particle_reward is not None:
-            self.particle_reward.index_fill_(0, worlds, 0.0)
+        if self.particle_rewards is not None:
+            self.particle_rewards.place(worlds, task, placed)
         self.report.endings.index_fill_(1, worlds, False)
 
     def evaluate(self) -> None:
         """Write rewards, losses and endings for the current particles into `report`."""
-        task = self.goal_task
+        task, particle_rewards = self.goal_task, self.particle_rewards
         losses = task.losses(self.x, self.s)
         parts = torch.stack(checked_losses(task, losses, len(self.x), self.part_names))
         if self._evaluation is None:
             self._evaluation = self._make_evaluation()
-        if self.particle_reward is None:
+        if particle_rewards is None:
             self._evaluation(parts)
         else:
-            reward, own = self.report.numbers[REWARD], self._particle_gains(task)
-            self._evaluation(parts, (~torch.isfinite(own).all(dim=1)).byte())
-            if self._before is not None:
-                own = with_mean_reward(own, reward)
+            gains = particle_rewards.gains(task, self.particles)
+            self._evaluation(parts, (~torch.isfinite(gains).all(dim=1)).byte())
+            reward = self.report.reward
+            if task.config.reward == "marginal":
+                gains = with_mean_reward(gains, reward)
             # In worlds that left their bounds each particle gets the world's reward.
-            whole = self.diverged.bool() & (task.config.on_divergence != "ignore")
-            own = torch.where(whole[:, None], reward[:, None], own)
-            self.particle_reward.copy_(torch.where(self.enabled.bool(), own, self.particle_reward))
+            by_world = self.diverged.bool() & (task.config.on_divergence != "ignore")
+            gains = torch.where(by_world[:, None], reward[:, None], gains)
+            gains = torch.where(self.enabled.bool(), gains, particle_rewards.reward)
+            particle_rewards.reward.copy_(gains)
+        self.settle_rewards()
         if self.x.is_cuda:
             self.host_endings.copy_(self._endings, non_blocking=True)
-            if len(self.x) == 1:
+            if self.world_count == 1:
                 self.host_numbers.copy_(self.report.numbers, non_blocking=True)
         self.enabled.fill_(1)
 
-    def _particle_gains(self, task: EnvTask[Any]) -> Tensor:
-        """Return each particle's reward of a step, shape [B, N]; the next step counts from now."""
-        now = self.x, self.s
-        if self._before is not None:
-            gains = task.particle_gains(self._before, now)
-            gains = checked_tensor(task, "particle_gains", "gains", gains, self.x.shape[:2])
-            for before, new in zip(self._before, now, strict=True):
-                before.copy_(new)
-            return gains
-        assert self.particle_loss is not None, "particles have rewards by losses or by gains"
-        losses = self._particle_losses(task, *now)
-        gains = self.particle_loss - losses
-        self.particle_loss.copy_(losses)
-        return gains
-
-    def _particle_losses(self, task: EnvTask[Any], x: Tensor, s: Tensor) -> Tensor:
-        losses = task.particle_losses(x, s)
-        return checked_tensor(task, "particle_losses", "losses", losses, x.shape[:2])
+    def settle_rewards(self) -> None:
+        """Overwrite `report.reward` where rewards are not the fall of the loss; by default none."""
 
     def _make_evaluation(self) -> EpisodeUpdate:
         config = self.task.config
@@ -267,39 +300,16 @@ class RewardedWorlds(WorldState):
 
     def check_losses(self, worlds: Tensor) -> None:
         """Check that the losses of some worlds, int64, shape [M], are finite."""
-        end = FIRST_PART + len(self.part_names)
-        numbers = self.report.numbers[FIRST_PART:end, worlds]
-        parts = {
-            f"part {shown(name)}": part for name, part in zip(self.part_names, numbers, strict=True)
-        }
-        check_finite(self.task, "losses", parts)
-        if self.particle_loss is not None:
-            check_finite(self.task, "particle_losses", {"losses": self.particle_loss[worlds]})
-
-    def reward_restorer(self, worlds: Tensor) -> Callable[[], None]:
-        """Return a function that undoes what a restart does to rewards, flags and step counts."""
-        before, elapsed = self.report.copy(), self.elapsed.clone()
-        own = None if self.particle_reward is None else self.particle_reward.clone()
-
-        def restore() -> None:
-            self.elapsed.copy_(elapsed)
-            numbers = self.report.numbers
-            improvements = slice(FIRST_PART + len(self.part_names), None)
-            for rows in (REWARD, improvements):
-                numbers[rows, worlds] = before.numbers[rows, worlds]
-            self.report.endings.copy_(before.endings)
-            if own is not None and self.particle_reward is not None:
-                self.particle_reward.copy_(own)
-            if len(self.x) == 1:
-                # The host reads the numbers of a single world alone; this synchronises.
-                self.host_numbers.copy_(numbers)
-
-        return restore
+        parts = zip(self.part_names, self.report.parts[:, worlds], strict=True)
+        check_finite(self.task, "losses", {f"part {shown(name)}": part for name, part in parts})
+        if self.particle_rewards is not None and self.particle_rewards.loss is not None:
+            losses = self.particle_rewards.loss[worlds]
+            check_finite(self.task, "particle_losses", {"losses": losses})
 
     @property
     def loss(self) -> Tensor:
         """Each world's current loss, shape [B]."""
-        return self.report.numbers[LOSS]
+        return self.report.loss
 
     def extra_info(self) -> dict[str, Tensor]:
         """Return further entries of infos, of resets and steps, shape [B, ...] each."""

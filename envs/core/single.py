@@ -15,7 +15,7 @@ from torch import Tensor
 
 from npa_envs.checks import number_tensor
 from npa_envs.envs.core.base import WorldsEnv
-from npa_envs.envs.core.rewards import REWARD, reason
+from npa_envs.envs.core.rewards import reason
 from npa_envs.envs.core.vector import check_options, plain_seed, rng_keys
 from npa_envs.errors import NPAError
 from npa_envs.world.actions import DIVERGED, SUCCESS, TIME_LIMIT
@@ -132,19 +132,14 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Start an episode.
+        """Start an episode; return the observation, shape [N, P], and the loss with its parts.
 
-        Args:
-            seed: Begin the sequence of episodes of this seed; None: the next episode of the
-                current sequence.
-            options: None or empty, as there are no options.
+        A seed begins its sequence of episodes; None starts the next episode of the current
+        sequence. There are no options.
 
         Raises:
             gymnasium.error.Error: The seed is no integer of at least 0.
             NPAError: An option is given.
-
-        Returns:
-            The observation, shape [N, P], and the loss with its parts.
         """
         seed = plain_seed(seed)
         check_options(options, ())
@@ -157,14 +152,11 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
             self._keyed_from = self.np_random
             keys = rng_keys(None, 1, self.np_random)
         observation = self._begin(self._world, keys)
-        info = self.losses_of(self.worlds.report.numbers[:, 0].tolist()) | self._extras("reset")
-        return self.form.returned(observation[0]), info
+        info = self.losses_of(self.worlds.report.numbers[:, 0].tolist())
+        return self.form.returned(observation[0]), info | self._extra_info()
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Apply an action.
-
-        Args:
-            action: Shape [N, A], in [-1, 1].
+        """Apply an action, shape [N, A], in [-1, 1].
 
         Returns:
             Observation, reward, terminated, truncated (by the step limit of `gymnasium.make`), and
@@ -189,16 +181,14 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
         info |= {"success": bool(ending & SUCCESS), "diverged": diverged}
         if terminated or truncated:
             info["reason"] = reason(ending)
-        if worlds.particle_reward is not None:
-            info["particle_reward"] = self._out(worlds.particle_reward[0].clone())
-        info |= self._extras("reset", "step")
+        info |= self._extra_info() | self._of_world(worlds.step_info())
         if worlds.rewards_last_step_only:
             last = int(worlds.elapsed[0]) == config.episode_steps
             rewarded = terminated or truncated or last
             self._unrewarded_steps = 0 if rewarded else self._unrewarded_steps + 1
         self._show()
         returned = self.form.returned(worlds.host_observation(observation)[0])
-        return returned, numbers[REWARD], terminated, truncated, info
+        return returned, numbers[0], terminated, truncated, info
 
     def render(self) -> NDArray[np.uint8] | None:
         """Return the world's picture, shape [R, R, 3], with the render mode "rgb_array"."""
@@ -216,20 +206,22 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
     def place_particles(self, x: Any, s: Any) -> Any:
         """Replace the particles, without a reward, and return the new observation, shape [N, P].
 
-        Args:
-            x: Positions [length units], shape [N, D].
-            s: States, dimensionless, shape [N, C].
+        Positions have shape [N, D], states [N, C], as those that `particles` returns.
 
         Raises:
             NPAError: A shape is wrong, or a value is not finite or beyond its limit.
         """
         if not self._started:
             raise NPAError("particles need a world: call reset first")
-        x, s = (number_tensor(name, value)[None] for name, value in (("x", x), ("s", s)))
-        return self.form.returned(self._place(x, s, self._world)[0])
+        x, s = number_tensor("x", x)[None], number_tensor("s", s)[None]
+        placed = self.worlds.checked_particles(x, s, 1, self.config.particle_count)
+        return self.form.returned(self._place(placed, self._world)[0])
 
-    def _extras(self, *when: str) -> dict[str, Any]:
-        values = {name: value for own in when for name, value in self.worlds.extras(own).items()}
+    def _extra_info(self) -> dict[str, Any]:
+        """Return the entries of infos that the task adds in every call."""
+        return self._of_world(self.worlds.extra_info())
+
+    def _of_world(self, values: dict[str, Tensor]) -> dict[str, Any]:
         return {
             name: self._out(value[0].clone()) if value.ndim > 1 else value[0].item()
             for name, value in values.items()
@@ -255,8 +247,7 @@ def _step_limit(env: NPAEnv) -> int | None:
     several steps at once, do not count.
     """
     # Gymnasium refuses registered wrappers, which would know the limit, with a vector entry point.
-    limits, frame = [], sys._getframe(1).f_back
-    inner: gymnasium.Env[Any, Any] = env
+    limits, frame, inner = [], sys._getframe(1).f_back, env
     while frame is not None:
         caller = frame.f_locals.get("self")
         if isinstance(caller, gymnasium.Wrapper) and caller.env is inner:

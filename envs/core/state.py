@@ -12,9 +12,10 @@ from torch import Tensor
 
 from npa_envs.checks import number_tensor
 from npa_envs.envs.core.config import WorldConfig
-from npa_envs.envs.core.task import Start, WorldTask
+from npa_envs.envs.core.task import WorldTask
 from npa_envs.errors import DivergedError, NPAError
 from npa_envs.world.actions import Physics
+from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import WorldRandom
 
 OBSERVATION_COPIES = 4
@@ -69,15 +70,15 @@ def check_memory(
 ) -> None:
     """Check that B worlds fit into a device's memory and into the kernels' indices."""
     what = f"{world_count} world(s) of {particle_count} particles"
-    cure = "choose a smaller particle_count or fewer worlds"
+    hint = "choose a smaller particle_count or fewer worlds"
     if world_count * particle_count * (1 + physics.state_dim) > MAX_INDEX:
-        raise NPAError(f"particle_count is too large: {what} exceed 32-bit indices: {cure}")
+        raise NPAError(f"particle_count is too large: {what} exceed 32-bit indices: {hint}")
     needed = needed_bytes(world_count, particle_count, physics, device) + extra_bytes
     free = free_bytes(device)
     if free is not None and needed > free:
         raise NPAError(
             f"particle_count must fit into memory: {what} need about {needed / 2**30:.1f} GiB "
-            f"with pictures and pool, and {device} has {free / 2**30:.1f} GiB free: {cure}"
+            f"with pictures and pool, and {device} has {free / 2**30:.1f} GiB free: {hint}"
         )
 
 
@@ -109,10 +110,11 @@ class WorldState:
         self.physics = physics = config.physics(task_type.space_dim, static=task_type.static)
         """Constants of perception and motion."""
         check_memory(world_count, particle_count, physics, device, extra_bytes)
-        self.x = torch.zeros(world_count, particle_count, physics.space_dim, device=device)
-        """Positions [length units], shape [B, N, D]."""
-        self.s = torch.zeros(world_count, particle_count, physics.state_dim, device=device)
-        """States, dimensionless, shape [B, N, C]."""
+        shape = world_count, particle_count
+        self.x = torch.zeros(*shape, physics.space_dim, device=device)
+        self.s = torch.zeros(*shape, physics.state_dim, device=device)
+        self.particles = Particles(self.x, self.s)
+        """The same two tensors, which are only written in place."""
         keys = torch.zeros(world_count, dtype=torch.int64, device=device)
         self.random = WorldRandom.from_keys(keys)
         """One random stream for each world."""
@@ -128,9 +130,9 @@ class WorldState:
         random.restart()
         return random
 
-    def checked_particles(self, x: Any, s: Any, world_count: int, particle_count: int) -> Start:
-        """Return given particles of M worlds, checked, as float32 on the device."""
-        given, physics = [], self.physics
+    def checked_particles(self, x: Any, s: Any, world_count: int, particle_count: int) -> Particles:
+        """Return particles of M worlds, checked, as float32 on the device."""
+        checked, physics = [], self.physics
         for name, value, width, limit, limit_name in (
             ("x", x, physics.space_dim, physics.limits.position, "position_limit"),
             ("s", s, physics.state_dim, physics.limits.state, "observation_limit"),
@@ -148,8 +150,8 @@ class WorldState:
                     f"{float(tensor.abs().max())}: clip it, or make the environment with a larger "
                     "limit"
                 )
-            given.append(tensor)
-        return Start(*given)
+            checked.append(tensor)
+        return Particles(*checked)
 
     def device_context(self) -> contextlib.AbstractContextManager[Any]:
         """Return a context in which the worlds' device is the current one."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import random
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, NamedTuple, Self, TypeVar
 
 import numpy as np
@@ -17,6 +17,7 @@ from npa_envs.errors import NPAError, shown
 from npa_envs.render import draw_worlds
 from npa_envs.world.actions import marginal_gains
 from npa_envs.world.cuda_graph import recording_lock
+from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import StreamId, WorldRandom
 
 if TYPE_CHECKING:
@@ -53,12 +54,7 @@ class Start(NamedTuple):
 
 
 class WorldTask(Generic[AnyConfig]):
-    """Base class of tasks of one species and of several: constants and pictures.
-
-    Args:
-        config: The environment's configuration.
-        device: The worlds' device.
-    """
+    """Base class of tasks of one species and of several: constants and pictures."""
 
     config_type: ClassVar[type[WorldConfig]] = WorldConfig
     """The configuration's class: its fields are the environment's keywords."""
@@ -93,16 +89,15 @@ class WorldTask(Generic[AnyConfig]):
         return max(1.0, self.open_half_width if box is None else 0.5 * box)
 
     def draw_particles(
-        self, x: Tensor, s: Tensor, style: str, azimuth: float = 0.0
+        self, particles: Particles, style: str, azimuth: float = 0.0
     ) -> NDArray[np.uint8]:
         """Return a picture of each world in one of `STYLES`, shape [B, R, R, 3].
 
-        Positions are x [length units], [B, N, D], states s, [B, N, C]; `azimuth` [degrees] is that
-        of the camera of 3D worlds.
+        `azimuth` [degrees] is that of the camera of 3D worlds.
         """
         return draw_worlds(
-            x,
-            s,
+            particles.x,
+            particles.s,
             style=style,
             resolution=self.config.render_size,
             pixel_size=self.pixel_size,
@@ -120,10 +115,6 @@ class EnvTask(WorldTask[Config]):
     no branch on a tensor's value), and the result for one world must not depend on the others: take
     means over particles or pixels with `npa_envs.world_mean`. In all methods x are positions
     [length units], shape [B, N, D], and s states, dimensionless, shape [B, N, C].
-
-    Args:
-        config: The environment's configuration.
-        device: The worlds' device.
     """
 
     config_type: ClassVar[type[EnvConfig]] = EnvConfig
@@ -137,26 +128,21 @@ class EnvTask(WorldTask[Config]):
 
     def __init__(self, config: Config, device: torch.device) -> None:
         super().__init__(config, device)
-        self._pool: Start | None = None
+        self._pool: Particles | None = None
+        self._pooled: set[int] = set()
         self.target_rows: Tensor | None = None
         """Columns that follow perception in each row, by the world's goal, [K, T]; None: none."""
 
     @classmethod
     def extra_bytes(cls, config: Any, world_count: int) -> int:
-        """Return an estimate of the memory that the task needs beyond the worlds [bytes].
-
-        Args:
-            config: The environment's configuration.
-            world_count: Worlds B.
-        """
+        """Return about how much memory the task needs beyond that of B worlds [bytes]."""
         numbers = config.particle_count * (cls.space_dim + config.state_dim)
         return int(4 * config.seed_pool * numbers)
 
     def seed(self, random: WorldRandom) -> tuple[Tensor, Tensor]:
         """Return fresh worlds: positions [B, N, D] and states [B, N, C].
 
-        Args:
-            random: One stream of random numbers for each world; B is `random.world_count`.
+        `random` has one stream of random numbers for each world; B is `random.world_count`.
         """
         raise NotImplementedError
 
@@ -164,20 +150,19 @@ class EnvTask(WorldTask[Config]):
         """Return fresh worlds, with goals if the task has several; by default those of `seed`."""
         return self._as_start("seed", self.seed(random))
 
-    def _as_start(self, method: str, made: Any) -> Start:
+    def _as_start(self, method: str, result: Any) -> Start:
         """Return the tuple that a method of the task returned as a `Start`."""
-        if not isinstance(made, tuple | list) or not 2 <= len(made) <= len(Start._fields):
+        if not isinstance(result, tuple | list) or not 2 <= len(result) <= len(Start._fields):
             raise NPAError(
                 f"{type(self).__name__}.{method} must return positions and states, got a "
-                f"{type(made).__name__}: return x, s"
+                f"{type(result).__name__}: return x, s"
             )
-        return Start(*made)
+        return Start(*result)
 
     def toward(self, goal: Tensor) -> Self:
         """Return a task whose losses are for worlds of these goals; by default the task itself.
 
-        Args:
-            goal: The worlds' goals, int64, shape [B]; each call of `losses` reads their values.
+        Goals are int64, shape [B]; each call of `losses` reads their values.
         """
         return self
 
@@ -203,11 +188,8 @@ class EnvTask(WorldTask[Config]):
     def particle_gains(self, before: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor]) -> Tensor:
         """Return N times what each particle's action contributed to the fall of the loss, [B, N].
 
-        The default estimates it from the gradient of `losses` by `marginal_gains`.
-
-        Args:
-            before: Positions and states before a step.
-            after: Positions and states after it.
+        `before` and `after` are positions and states around a step. The default estimates it from
+        the gradient of `losses` by `marginal_gains`.
 
         Raises:
             NPAError: The losses have no gradient.
@@ -223,17 +205,16 @@ class EnvTask(WorldTask[Config]):
             )
         return gains
 
+    grows: ClassVar[bool] = False
+    """Whether a rule grows fresh worlds, step by step."""
+
     @property
     def start_is_short(self) -> bool:
         """Whether `start` takes few operations, so that on CUDA it is recorded as a graph."""
-        return True
+        return not self.grows or self.config.seed_pool > 0
 
     def start(self, random: WorldRandom) -> Start:
-        """Return worlds at the beginning of their episodes: fresh ones, or some from the pool.
-
-        Args:
-            random: One stream of random numbers for each world.
-        """
+        """Return worlds at the beginning of their episodes: fresh ones, or some from the pool."""
         if self.config.seed_pool == 0:
             start = self._as_start("fresh", self.fresh(random))
         else:
@@ -249,34 +230,41 @@ class EnvTask(WorldTask[Config]):
         return 0
 
     def pooled(self, indices: Tensor) -> Start:
-        """Return worlds of the pool, which the first call makes.
+        """Return worlds of the pool, by their indices below `seed_pool`, int64, shape [B].
 
-        Args:
-            indices: Positions in the pool, below `seed_pool`, int64, shape [B].
+        On a CPU each is made when it is first needed; on CUDA, where reading the indices would
+        synchronise, the first call makes all of them.
         """
-        if self._pool is None:
-            self._pool = self.made_for_pool(range(self.config.seed_pool))
-        x, s, _, goal = self._pool
-        return Start(x[indices], s[indices], goal=None if goal is None else goal[indices])
+        if self.device.type == "cpu":
+            missing = sorted(set(indices.tolist()) - self._pooled)
+        else:
+            missing = list(range(self.config.seed_pool)) if self._pool is None else []
+        if missing:
+            seeds = [self.first_pool_seed + index for index in missing]
+            # Other streams than those of episodes with these seeds.
+            random = WorldRandom(seeds, device=self.device).substream(StreamId.GROWTH)
+            start = self._as_start("fresh", self.fresh(random))
+            fresh, size = Particles(start.x, start.s, goal=start.goal), self.config.seed_pool
+            if self._pool is None:
+                self._pool = fresh.map(lambda value: value.new_empty(size, *value.shape[1:]))
+            self._pool.put_(torch.tensor(missing, device=self.device), fresh)
+            self._pooled.update(missing)
+        assert self._pool is not None, "the first call makes worlds"
+        taken = self._pool.take(indices)
+        return Start(taken.x, taken.s, goal=taken.goal)
 
-    def made_for_pool(self, indices: Sequence[int]) -> Start:
-        """Make the worlds at some positions in the pool, each from its own seed."""
-        seeds = [self.first_pool_seed + index for index in indices]
-        # Other streams than those of episodes with these seeds.
-        random = WorldRandom(seeds, device=self.device).substream(StreamId.GROWTH)
-        return self._as_start("fresh", self.fresh(random))
-
-    def draw(self, x: Tensor, s: Tensor, steps: NDArray[np.int64]) -> NDArray[np.uint8]:
+    def draw(self, particles: Particles, steps: NDArray[np.int64]) -> NDArray[np.uint8]:
         """Return a picture of each world, shape [B, R, R, 3].
 
         The camera of 3D worlds turns with `steps`, the steps since each world's start, [B].
         """
         style = self.config.render_style
         if self.space_dim == 2:
-            return self.draw_particles(x, s, style)
+            return self.draw_particles(particles, style)
         angles = TURN * steps.astype(float)
         pictures = [
-            self.draw_particles(x[k : k + 1], s[k : k + 1], style, a) for k, a in enumerate(angles)
+            self.draw_particles(particles.map(lambda value, k=k: value[k : k + 1]), style, angle)
+            for k, angle in enumerate(angles)
         ]
         return np.concatenate(pictures)
 
@@ -290,8 +278,22 @@ class EnvTask(WorldTask[Config]):
 class TargetEnvTask(EnvTask[Config]):
     """A task with the targets and losses of a training task of `npa_envs.tasks`."""
 
-    task: Any
-    """The training task."""
+    training_task: ClassVar[type[Any]]
+    """Class of the training task."""
+
+    def __init__(self, config: Config, device: torch.device) -> None:
+        super().__init__(config, device)
+        self.task: Any = self._make_task()
+        """The training task."""
+
+    def _make_task(self) -> Any:
+        return self.training_task(self.config.task_config, device=self.device)
+
+    @property
+    def pixel_size(self) -> float:
+        """Size of a particle in pictures: that of the training task."""
+        size: float = self.task.pixel_size
+        return size
 
     def seed(self, random: WorldRandom) -> tuple[Tensor, Tensor]:
         """Draw initial worlds as the training task does; return positions and states."""
@@ -306,8 +308,8 @@ class TargetEnvTask(EnvTask[Config]):
 
     def particle_losses(self, x: Tensor, s: Tensor) -> Tensor:
         """Return the training task's loss of each particle."""
-        shares: Tensor = self.task.particle_shares(x, s)
-        return shares
+        losses: Tensor = self.task.particle_shares(x, s)
+        return losses
 
 
 # Checks of what tasks return: a mistake in a custom task would silently give wrong rewards.
@@ -315,10 +317,8 @@ class TargetEnvTask(EnvTask[Config]):
 
 def start_method(task: EnvTask[Any]) -> str:
     """Return the name of the method by which a task defines where worlds start, for errors."""
-    own = (
-        name for name in ("start", "fresh") if getattr(type(task), name) != getattr(EnvTask, name)
-    )
-    return next(own, "seed")
+    names = ("start", "fresh")
+    return next((n for n in names if getattr(type(task), n) != getattr(EnvTask, n)), "seed")
 
 
 def check_start(task: EnvTask[Any], start: Start, world_count: int, shapes: Any) -> None:
@@ -396,34 +396,28 @@ def check_finite(task: EnvTask[Any], method: str, parts: Mapping[str, Tensor]) -
             )
 
 
-class GlobalDraws:
-    """States of the global random number generators, from which a task must not draw."""
+def global_draws(device: torch.device) -> dict[str, Any]:
+    """Return the states of the global random generators, from which a task must not draw."""
+    _, key, *rest = np.random.get_state()
+    states: dict[str, Any] = {
+        "torch's": torch.get_rng_state().numpy().tobytes(),
+        "NumPy's": (np.asarray(key).tobytes(), *rest),
+        "Python's": random.getstate(),
+    }
+    if device.type == "cuda":
+        # A capture in another thread replaces this generator for a moment.
+        with recording_lock:
+            states["torch's on CUDA"] = torch.cuda.get_rng_state(device).numpy().tobytes()
+    return states
 
-    def __init__(self, task: EnvTask[Any]) -> None:
-        self._task = task
-        self._before = self._states()
 
-    def check(self, method: str) -> None:
-        """Raise an error if a method of the task has drawn from one since this was made."""
-        now = self._states()
-        moved = [name for name, state in self._before.items() if state != now[name]]
-        if moved:
-            raise NPAError(
-                f"{type(self._task).__name__}.{method} must not draw from global generators, which "
-                f"reset(seed=...) does not seed, got draws from {' and '.join(moved)}: draw from "
-                "the WorldRandom that seed is given, for example random.uniform(...)"
-            )
-
-    def _states(self) -> dict[str, Any]:
-        _, key, *rest = np.random.get_state()
-        states: dict[str, Any] = {
-            "torch's": torch.get_rng_state().numpy().tobytes(),
-            "NumPy's": (np.asarray(key).tobytes(), *rest),
-            "Python's": random.getstate(),
-        }
-        if self._task.device.type == "cuda":
-            # A capture in another thread replaces this generator for a moment.
-            with recording_lock:
-                state = torch.cuda.get_rng_state(self._task.device)
-            states["torch's on CUDA"] = state.numpy().tobytes()
-        return states
+def check_no_draws(task: EnvTask[Any], method: str, before: dict[str, Any]) -> None:
+    """Check that a method of a task has left the global random generators in these states."""
+    now = global_draws(task.device)
+    moved = [name for name, state in before.items() if state != now[name]]
+    if moved:
+        raise NPAError(
+            f"{type(task).__name__}.{method} must not draw from global generators, which "
+            f"reset(seed=...) does not seed, got draws from {' and '.join(moved)}: draw from "
+            "the WorldRandom that seed is given, for example random.uniform(...)"
+        )

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from npa_envs.checks import is_whole, number_tensor
 from npa_envs.envs.core.base import WorldsEnv
-from npa_envs.envs.core.rewards import FLAGS, REWARD, StepReport, reason
+from npa_envs.envs.core.rewards import FLAGS, StepReport, reason
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.world.actions import TIME_LIMIT
 from npa_envs.world.cuda_graph import to_device_async
@@ -83,7 +83,6 @@ class NPAVectorEnv(WorldsEnv, VectorEnv[Any, Any, Any]):
         self.copies = copy
         """Whether returned arrays are new, and not overwritten by the next step."""
         self._buffer: Tensor | None = None
-        self._shared: NDArray[np.float64] | None = None
         self._ended = np.zeros(num_envs, dtype=bool)
 
     @cached_property
@@ -102,16 +101,13 @@ class NPAVectorEnv(WorldsEnv, VectorEnv[Any, Any, Any]):
         seed: int | Sequence[int] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[Any, dict[str, Any]]:
-        """Start episodes.
+        """Start episodes; return all observations, [B, N, P], and the losses with their parts.
 
         Args:
             seed: World k begins the sequence of episodes of seed + k, or of the k-th seed of a
                 list; None: each world starts the next episode of its sequence.
             options: `{"reset_mask": mask}` resets only the worlds where the mask, bool, shape [B],
                 is True; the others do not change.
-
-        Returns:
-            Observations of all worlds, shape [B, N, P], and the losses with their parts.
 
         Raises:
             NPAError: The mask or the seeds have a wrong shape.
@@ -132,22 +128,15 @@ class NPAVectorEnv(WorldsEnv, VectorEnv[Any, Any, Any]):
         which = np.zeros(self.num_envs, dtype=bool)
         which[chosen] = True
         losses = self.losses_of(self._report_rows(self.worlds.report.copy()))
-        infos = masked(losses, self._mask(which)) | self._extras("reset", self._mask(which))
+        extra = self._returned_values(self.worlds.extra_info())
+        infos = masked(losses, self._mask(which)) | masked(extra, self._mask(which))
         return self.form.returned(observation), infos
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """Apply an action to each world.
-
-        Args:
-            actions: Shape [B, N, A], in [-1, 1].
+        """Apply actions, shape [B, N, A], in [-1, 1]; errors are those of `NPAEnv.step`.
 
         Returns:
             Observations [B, N, P], rewards [B], terminations [B], truncations [B], and infos.
-
-        Raises:
-            NPAError: The actions have another shape; the worlds are not changed.
-            DivergedError: An action is not finite, and the worlds are not changed; or a world
-                diverged, and `on_divergence` is "raise".
         """
         if not self._started:
             raise NPAError("step needs worlds: call reset first")
@@ -198,7 +187,7 @@ class NPAVectorEnv(WorldsEnv, VectorEnv[Any, Any, Any]):
             if ended.any():
                 infos |= {"reason": REASONS[endings], "_reason": self._mask(ended)}
         self._show()
-        return self.form.returned(observation), rows[REWARD], flags[0], flags[1], infos
+        return self.form.returned(observation), rows[0], flags[0], flags[1], infos
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Return a picture of each world, shape [R, R, 3], with the render mode "rgb_array"."""
@@ -218,22 +207,16 @@ class NPAVectorEnv(WorldsEnv, VectorEnv[Any, Any, Any]):
     def place_particles(self, x: Any, s: Any, worlds: Any = None) -> Any:
         """Replace particles, without a reward, and return the new observations of all worlds.
 
-        Args:
-            x: Positions [length units], shape [M, N, D].
-            s: States, dimensionless, shape [M, N, C].
-            worlds: Indices of the worlds, without repetition, shape [M]; None: all of them.
-
-        Raises:
-            NPAError: A shape is wrong, a value is not finite or beyond its limit, or `worlds` are
-                no such indices.
+        Positions have shape [M, N, D], states [M, N, C]; `worlds` are the indices of the M worlds,
+        each once, or None for all of them. Errors are those of `NPAEnv.place_particles`.
         """
         if not self._started:
             raise NPAError("particles need worlds: call reset first")
-        if worlds is None:
-            chosen = torch.arange(self.num_envs)
-        else:
-            chosen = world_numbers(worlds, self.num_envs)
-        return self.form.returned(self._place(x, s, chosen.to(self.task.device), self._buffer))
+        everyone = torch.arange(self.num_envs)
+        chosen = everyone if worlds is None else checked_worlds(worlds, self.num_envs)
+        placed = self.worlds.checked_particles(x, s, len(chosen), self.config.particle_count)
+        observation = self._place(placed, chosen.to(self.task.device), self._buffer)
+        return self.form.returned(observation)
 
     def _report(
         self, stepped: NDArray[np.bool_] | None, *, copy: bool
@@ -244,30 +227,18 @@ class NPAVectorEnv(WorldsEnv, VectorEnv[Any, Any, Any]):
         rows, flags = self._report_rows(report), list(self._out(report.endings))
         everyone = self._out(report.everyone if copy else report.everyone.clone())
         which = everyone if stepped is None else self._mask(stepped)
-        infos = masked(self.losses_of(rows), everyone)
-        infos |= self._extras("reset", everyone, copy=copy)
+        of_all = self.losses_of(rows) | self._returned_values(worlds.extra_info(), copy=copy)
         of_step = self._improvements(rows) | dict(zip(FLAGS, flags[2:], strict=True))
-        if worlds.particle_reward is not None:
-            rewards = worlds.particle_reward
-            of_step["particle_reward"] = self._out(rewards.clone() if copy else rewards)
-        infos |= masked(of_step, which) | self._extras("step", which, copy=copy)
-        return rows, flags, infos
+        of_step |= self._returned_values(worlds.step_info(), copy=copy)
+        return rows, flags, masked(of_all, everyone) | masked(of_step, which)
 
-    def _extras(self, when: str, which: Any, *, copy: bool = True) -> dict[str, Any]:
-        extras = self.worlds.extras(when).items()
-        return masked({n: self._out(v.clone() if copy else v) for n, v in extras}, which)
+    def _returned_values(self, values: dict[str, Tensor], *, copy: bool = True) -> dict[str, Any]:
+        return {n: self._out(v.clone() if copy else v) for n, v in values.items()}
 
     def _report_rows(self, report: StepReport) -> list[Any]:
         """Return the rows of a report's numbers: tensors, or arrays of float64 as Gymnasium's."""
         rows = self._out(report.numbers)
-        if isinstance(rows, Tensor):
-            return list(rows)
-        if report is not self.worlds.report:
-            return list(rows.astype(np.float64))
-        if self._shared is None:
-            self._shared = np.empty(rows.shape)
-        self._shared[:] = rows
-        return list(self._shared)
+        return list(rows if isinstance(rows, Tensor) else rows.astype(np.float64))
 
     def _mask(self, mask: NDArray[np.bool_]) -> Any:
         """Return a copy of a mask of worlds in the type that the user chose."""
@@ -307,17 +278,17 @@ def checked_count(name: str, value: Any) -> int:
     return int(value)
 
 
-def checked_mode(given: str | AutoresetMode) -> AutoresetMode:
+def checked_mode(mode: str | AutoresetMode) -> AutoresetMode:
     """Return Gymnasium's mode for a name or a mode."""
-    if isinstance(given, AutoresetMode):
-        return given
-    by_name = AUTORESET_MODES | {mode.value: mode for mode in AutoresetMode}
-    if not isinstance(given, str) or given not in by_name:
+    if isinstance(mode, AutoresetMode):
+        return mode
+    by_name = AUTORESET_MODES | {known.value: known for known in AutoresetMode}
+    if not isinstance(mode, str) or mode not in by_name:
         raise NPAError(
-            f"autoreset_mode must be a known word, got {shown(given)}: "
-            f"{suggest(given, AUTORESET_MODES)}"
+            f"autoreset_mode must be a known word, got {shown(mode)}: "
+            f"{suggest(mode, AUTORESET_MODES)}"
         )
-    return by_name[given]
+    return by_name[mode]
 
 
 def plain_seed(seed: Any) -> Any:
@@ -334,8 +305,8 @@ def check_options(options: Any, known: tuple[str, ...]) -> None:
         )
     for name in options or ():
         if name not in known:
-            cure = suggest(name, known) if known else "a single environment has none"
-            raise NPAError(f"unknown reset option {shown(str(name)[:80])}: {cure}")
+            hint = suggest(name, known) if known else "a single environment has none"
+            raise NPAError(f"unknown reset option {shown(str(name)[:80])}: {hint}")
 
 
 def worlds_to_reset(options: dict[str, Any] | None, world_count: int) -> NDArray[np.int64]:
@@ -344,31 +315,29 @@ def worlds_to_reset(options: dict[str, Any] | None, world_count: int) -> NDArray
     mask = (options or {}).get("reset_mask")
     if mask is None:
         return np.arange(world_count)
-    given = mask.cpu().numpy() if isinstance(mask, Tensor) else np.asarray(mask)
-    if given.dtype != bool or given.shape != (world_count,):
+    mask = mask.cpu().numpy() if isinstance(mask, Tensor) else np.asarray(mask)
+    if mask.dtype != bool or mask.shape != (world_count,):
         raise NPAError(
-            f"reset_mask must be bool of shape [B] = ({world_count},), got {given.dtype} "
-            f"{given.shape}: True for each world to reset"
+            f"reset_mask must be bool of shape [B] = ({world_count},), got {mask.dtype} "
+            f"{mask.shape}: True for each world to reset"
         )
-    if not given.any():
+    if not mask.any():
         raise NPAError("reset_mask must choose at least one world, got none: skip the reset")
-    return np.flatnonzero(given)
+    return np.flatnonzero(mask)
 
 
-def world_numbers(worlds: Any, world_count: int) -> Tensor:
+def checked_worlds(worlds: Any, world_count: int) -> Tensor:
     """Return checked indices of worlds, without repetition, on the CPU, int64, shape [M]."""
-    given = number_tensor("worlds", worlds).cpu()
+    indices = number_tensor("worlds", worlds).cpu()
     # A mask is refused: it would be read as the indices 0 and 1.
-    whole = not given.is_floating_point() and given.dtype != torch.bool
-    if given.ndim == 1 and whole:
-        chosen = given.long()
-        exist = bool(((chosen >= 0) & (chosen < world_count)).all())
-        if exist and len(set(chosen.tolist())) == len(chosen):
-            return chosen
-    raise NPAError(
-        f"worlds must be indices below {world_count}, each once, got {shown(given.tolist())}: "
-        "for example worlds=[0, 2]"
-    )
+    whole = not indices.is_floating_point() and indices.dtype != torch.bool
+    exist = whole and bool(((indices >= 0) & (indices < world_count)).all())
+    if indices.ndim != 1 or not exist or len(indices.unique()) < len(indices):
+        raise NPAError(
+            f"worlds must be indices below {world_count}, each once, got "
+            f"{shown(indices.tolist())}: for example worlds=[0, 2]"
+        )
+    return indices.long()
 
 
 def rng_keys(
@@ -376,19 +345,18 @@ def rng_keys(
 ) -> Tensor:
     """Return the key of each world's random stream, int64, shape [B].
 
-    World k has the key of seed + k, or of the k-th seed of a sequence; None draws keys from the
-    generator.
+    World k has the key of seed + k, or of the k-th seed of a sequence; None: keys are drawn.
     """
     if seed is None:
-        drawn = np_random.integers(2**64, size=world_count, dtype=np.uint64)
-        return torch.from_numpy(drawn.view(np.int64))
+        keys = np_random.integers(2**64, size=world_count, dtype=np.uint64)
+        return torch.from_numpy(keys.view(np.int64))
     if isinstance(seed, int | np.integer):
         seed = [int(seed) + k for k in range(world_count)]
-    cure = f"one whole number, or one for each of {world_count} worlds: give seed=0"
+    rule = f"one whole number, or one for each of {world_count} worlds: give seed=0"
     try:
         seeds = [operator.index(number) for number in seed]
     except TypeError as error:
-        raise NPAError(f"seed must be {cure}, got {shown(seed)}") from error
+        raise NPAError(f"seed must be {rule}, got {shown(seed)}") from error
     if len(seeds) != world_count:
-        raise NPAError(f"seed must be {cure}, got {len(seeds)}")
+        raise NPAError(f"seed must be {rule}, got {len(seeds)}")
     return WorldRandom(seeds).keys

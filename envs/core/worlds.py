@@ -19,10 +19,11 @@ from npa_envs.envs.core.rewards import RewardedWorlds
 from npa_envs.envs.core.state import check_default_dtype, not_finite
 from npa_envs.envs.core.task import (
     EnvTask,
-    GlobalDraws,
     Start,
     check_finite,
+    check_no_draws,
     check_start,
+    global_draws,
     start_method,
 )
 from npa_envs.errors import DivergedError, NPAError
@@ -48,7 +49,7 @@ FEW_PARTICLES = 8192
 
 
 class BatchedWorlds(RewardedWorlds):
-    """B worlds of one task, stepped together; arguments and errors are those of `RewardedWorlds`.
+    """B worlds of one task, stepped together.
 
     Each particle moves and changes its state by its row of an action, and observes what it
     perceives, then the task's `target_rows` for the world's goal. All tensors keep their memory
@@ -80,14 +81,8 @@ class BatchedWorlds(RewardedWorlds):
         self._side_stream = SideStream(self.device) if self.device.type == "cuda" else None
 
     def _prepare_actions(self) -> None:
-        self._actions = Actions(
-            self.x,
-            self.s,
-            self.physics,
-            self.random,
-            enabled=self.enabled,
-            diverged=self.diverged,
-        )
+        flags = {"enabled": self.enabled, "diverged": self.diverged}
+        self._actions = Actions(self.x, self.s, self.physics, self.random, **flags)
         self._draw = GraphedCallable(self._actions.draw, self.device)
 
     def _make_graphs(self) -> None:
@@ -95,7 +90,7 @@ class BatchedWorlds(RewardedWorlds):
         self._step_graph = GraphedCallable(self._act_and_evaluate, self.device)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the state without what the next step makes again."""
+        # The next step makes these again.
         none = dict.fromkeys(("_neighbours", "_perceived", "_host_perceived"))
         return super().__getstate__() | none | {"_host_is_current": False}
 
@@ -118,17 +113,17 @@ class BatchedWorlds(RewardedWorlds):
         check_default_dtype()
         # The first start is not recorded as a graph, so that it can synchronise for checks.
         task, first = self.task, not self.part_names
-        draws, check = GlobalDraws(task) if first else None, first or not self.x.is_cuda
+        draws, check = global_draws(self.device) if first else {}, first or not self.x.is_cuda
         start: Start = task.start(random)
         check_start(task, start, len(worlds), (self.x.shape, self.s.shape))
-        if draws is not None:
-            draws.check(start_method(task))
+        if first:
+            check_no_draws(task, start_method(task), draws)
         if check:
             check_finite(task, start_method(task), {"positions": start.x, "states": start.s})
         self.random.put(worlds, random)
         self.begin(worlds, start, check=check)
-        if draws is not None:
-            draws.check("losses")
+        if first:
+            check_no_draws(task, "losses", draws)
         return start
 
     def _start_and_sort(self, worlds: Tensor) -> NeighbourState:
@@ -168,13 +163,23 @@ class BatchedWorlds(RewardedWorlds):
     def reseed(self, worlds: NDArray[np.int64], observation: Tensor) -> None:
         """Restart the particles of some worlds, [M], within their episodes.
 
-        Rewards and flags of the last step stay. Their rows of the observation, [B, ...], are
+        Rewards, flags and step counts stay. The worlds' rows of the observation, [B, ...], are
         overwritten.
         """
         self._host_is_current = False
-        restore = self.reward_restorer(to_device_async(worlds, self.x.device))
+        index, rewards = to_device_async(worlds, self.device), self.particle_rewards
+        before, elapsed = self.report.copy(), self.elapsed.clone()
+        gains = None if rewards is None else rewards.reward.clone()
         self.restart(worlds, observation)
-        restore()
+        self.elapsed.copy_(elapsed)
+        self.report.reward[index] = before.reward[index]
+        self.report.improvements[:, index] = before.improvements[:, index]
+        self.report.endings.copy_(before.endings)
+        if rewards is not None and gains is not None:
+            rewards.reward.copy_(gains)
+        if self.world_count == 1:
+            # The host reads the numbers of a single world alone; this synchronises.
+            self.host_numbers.copy_(self.report.numbers)
 
     def step(self, action: Tensor, out: Tensor | None = None) -> tuple[NDArray[np.uint8], Tensor]:
         """Apply actions to all worlds; return their endings, [B], and observations, [B, ...].
@@ -261,11 +266,14 @@ class BatchedWorlds(RewardedWorlds):
         if self._side_stream is not None:
             self._side_stream.join()
 
-    def extras(self, when: str) -> dict[str, Tensor]:
-        """Return further entries of infos, [B, ...] each: of every call ("reset"), or of a step."""
-        if when == "reset":
-            return self.extra_info()
-        return {"updated": self._actions.updated()} if self.task.config.tell_updated else {}
+    def step_info(self) -> dict[str, Tensor]:
+        """Return further entries of infos, of steps alone, shape [B, N] each."""
+        rewards, info = self.particle_rewards, {}
+        if rewards is not None:
+            info["particle_reward"] = rewards.reward
+        if self.task.config.tell_updated:
+            info["updated"] = self._actions.updated()
+        return info
 
     def host_observation(self, observation: Tensor) -> Tensor:
         """Return a single world's observation, from the host's copy if that is current."""
@@ -281,13 +289,13 @@ class BatchedWorlds(RewardedWorlds):
         Returns:
             Endings, shape [B], without the flag of divergences that end no episode.
         """
-        way = self.task.config.on_divergence
+        on_divergence = self.task.config.on_divergence
         diverged = endings & DIVERGED != 0
-        if way == "terminate" or not diverged.any():
+        if on_divergence == "terminate" or not diverged.any():
             return endings
-        if way == "raise":
+        if on_divergence == "raise":
             raise DivergedError(self._divergence_message(np.flatnonzero(diverged)))
-        if way == "reset":
+        if on_divergence == "reset":
             # Worlds that are also truncated start their next episode anyway.
             only_diverged = np.flatnonzero(endings == DIVERGED)
             if len(only_diverged):
@@ -296,8 +304,8 @@ class BatchedWorlds(RewardedWorlds):
 
     def pictures(self, count: int) -> NDArray[np.uint8]:
         """Return pictures of the first worlds, uint8, shape [count, R, R, 3]."""
-        steps = self.elapsed[:count].cpu().numpy()
-        pictures: NDArray[np.uint8] = self.task.draw(self.x[:count], self.s[:count], steps)
+        first = self.particles.map(lambda value: value[:count])
+        pictures: NDArray[np.uint8] = self.task.draw(first, self.elapsed[:count].cpu().numpy())
         return pictures
 
     def _divergence_message(self, diverged: NDArray[np.int64]) -> str:
@@ -348,11 +356,11 @@ class GraphedResets:
         self._world_count = world_count
         self._device = device
         self._recorded = recorded and device.type == "cuda"
-        self._chunks: dict[int, _GraphedReset] = {}
+        self._graphs: dict[int, _GraphedReset] = {}
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the state without graphs, which cannot be pickled."""
-        return self.__dict__ | {"_chunks": {}}
+        # Graphs cannot be pickled.
+        return self.__dict__ | {"_graphs": {}}
 
     @makes_plain_tensors
     def __call__(self, worlds: NDArray[np.int64], observation: Tensor) -> None:
@@ -363,26 +371,23 @@ class GraphedResets:
         size = 1
         while size < len(worlds):
             size = min(size * GROWTH, self._world_count)
-        if size not in self._chunks:
-            self._chunks[size] = _GraphedReset(self._start, size, self._device)
-        filled = np.full(size, worlds[-1])
-        filled[: len(worlds)] = worlds
-        self._chunks[size].restart(to_device_async(filled, self._device), observation)
+        if size not in self._graphs:
+            self._graphs[size] = _GraphedReset(self._start, size, self._device)
+        graph, filled = self._graphs[size], np.pad(worlds, (0, size - len(worlds)), mode="edge")
+        graph.worlds.copy_(to_device_async(filled, self._device))
+        graph.replay()
+        graph.neighbours.perceive(observation)
 
 
 class _GraphedReset:
     """The graph of a start of a fixed number of worlds."""
 
+    neighbours: NeighbourState
+
     def __init__(self, start: WeakFunction, size: int, device: torch.device) -> None:
         self._start = start
-        self._index = torch.zeros(size, dtype=torch.int64, device=device)
-        self._replayed = GraphedCallable(self._run, device)
-
-    def restart(self, worlds: Tensor, observation: Tensor) -> None:
-        """Start the next episodes of worlds, as many as the graph serves."""
-        self._index.copy_(worlds)
-        self._replayed()
-        self._neighbours.perceive(observation)
+        self.worlds = torch.zeros(size, dtype=torch.int64, device=device)
+        self.replay = GraphedCallable(self._run, device)
 
     def _run(self) -> None:
-        self._neighbours: NeighbourState = self._start()(self._index)
+        self.neighbours = self._start()(self.worlds)

@@ -11,13 +11,13 @@ from gymnasium.spaces import Box, MultiDiscrete, Space
 from torch import Tensor
 
 from npa_envs import world_mean
-from npa_envs.checks import check_flag, check_positive, is_whole, number_tensor
-from npa_envs.envs.core.base import ParticleSpaces, batch_tensor
-from npa_envs.envs.core.config import EnvConfig
+from npa_envs.checks import check_field, check_flag, check_positive, is_whole
+from npa_envs.envs.core.base import ParticleSpaces, batch_choices, batch_tensor
 from npa_envs.envs.grown import GrownConfig, check_rule_driven
-from npa_envs.errors import NPAError, shown, suggest
+from npa_envs.errors import NPAError, shown
 from npa_envs.world.actions import Physics
 from npa_envs.world.brushes import offsets_from, softness
+from npa_envs.world.particles import Particles
 
 OBSERVATION_LIMIT = 8.0
 """Observations are clipped to plus and minus this (dimensionless, or length units)."""
@@ -37,7 +37,7 @@ TOOLS = ("push", "wipe", "inject", "rate")
 class GardenConfig(GrownConfig):
     """Adds the brushes and the form of observations."""
 
-    words = EnvConfig.words | {
+    words = GrownConfig.words | {
         "reward": get_args(GardenReward),
         "actions": get_args(Actions),
         "observe": get_args(Observe),
@@ -100,39 +100,23 @@ class GardenConfig(GrownConfig):
     """Whether the observed picture also has the target's picture minus its own."""
 
     def __post_init__(self) -> None:
-        """Check every field."""
         super().__post_init__()
         check_positive(self, int, "rule_steps", "brush_count", "strength_count", "picture_size")
         check_positive(self, int, "place_count", at_least=2)
         check_positive(self, float, "brush_radius", "push_length", "place_reach")
         check_rule_driven(self)
-        self._check_tools()
         check_flag(self, "observe_error")
-
-    def _check_tools(self) -> None:
-        given = self.tools
-        if not isinstance(given, tuple) or not given:
-            raise NPAError(f"tools must be some of {TOOLS}, got {shown(given)}: try ('push',)")
-        for tool in given:
-            if tool not in TOOLS:
-                raise NPAError(
-                    f"tools must be some of {TOOLS}, got {shown(tool)}: {suggest(tool, TOOLS)}"
-                )
-        if given != tuple(tool for tool in TOOLS if tool in given):
-            raise NPAError(
-                f"tools must be in the order of {TOOLS}, each once, got {shown(given)}: sort them"
-            )
-        channels, count = self.inject_channels, self.state_dim
+        tools, channels, count = self.tools, self.inject_channels, self.state_dim
+        some = isinstance(tools, tuple) and bool(tools) and all(tool in TOOLS for tool in tools)
+        check_field(self, "tools", some, f"be some of {TOOLS}", "try ('push',)")
+        is_sorted = tools == tuple(tool for tool in TOOLS if tool in tools)
+        check_field(self, "tools", is_sorted, f"be in the order of {TOOLS}, each once", "sort them")
         whole = isinstance(channels, tuple) and bool(channels) and all(map(is_whole, channels))
-        if not whole or len({channel % count for channel in channels}) < len(channels):
-            raise NPAError(
-                f"inject_channels must be different whole numbers, got {shown(channels)}: try (-1,)"
-            )
-        if not all(-count <= channel < count for channel in channels):
-            raise NPAError(
-                f"inject_channels must lie in [{-count}, {count - 1}], got {shown(channels)}: "
-                f"there are {count} channels"
-            )
+        differ = whole and len({channel % count for channel in channels}) == len(channels)
+        check_field(self, "inject_channels", differ, "be different whole numbers", "try (-1,)")
+        exist = all(-count <= channel < count for channel in channels)
+        rule, hint = f"lie in [{-count}, {count - 1}]", f"there are {count} channels"
+        check_field(self, "inject_channels", exist, rule, hint)
 
 
 DIRECTIONS = ((1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1))
@@ -154,11 +138,11 @@ class BrushLayout(NamedTuple):
         """Return the layout for a configuration; only brushes off the grid have place columns."""
         widths = {"place": 0 if config.actions == "grid" else 2}
         widths |= {"push": 2, "wipe": 1, "inject": len(config.inject_channels), "rate": 1}
-        first, found = 0, {}
+        first, columns = 0, {}
         for name, width in widths.items():
-            found[name] = slice(first, first + (width * (name in ("place", *config.tools))))
-            first = found[name].stop
-        return cls(**found, width=first)
+            columns[name] = slice(first, first + (width * (name in ("place", *config.tools))))
+            first = columns[name].stop
+        return cls(**columns, width=first)
 
 
 def grid_places(config: GardenConfig, device: torch.device | None = None) -> Tensor:
@@ -184,14 +168,15 @@ def brush_weights(away: Tensor, config: GardenConfig) -> Tensor:
 
 
 def apply_brushes(
-    x: Tensor, s: Tensor, action: Tensor, middle: Tensor, config: GardenConfig
-) -> tuple[Tensor, Tensor, Tensor | None]:
+    particles: Particles, action: Tensor, middle: Tensor, config: GardenConfig
+) -> tuple[Particles, Tensor | None]:
     """Apply all brushes at once, adding up their effects; differentiable.
 
     Returns:
-        Positions, states, and each particle's rate, the factor of its rule's steps, dimensionless,
-        shape [B, N, 1]; None without the tool "rate".
+        Worlds, and each particle's rate, the factor of its rule's steps, dimensionless, shape
+        [B, N, 1]; None without the tool "rate".
     """
+    x, s, *_ = particles
     columns, action = BrushLayout.of(config), action.clamp(-1.0, 1.0)
     places = action[..., columns.place]
     if config.actions == "grid":
@@ -211,7 +196,7 @@ def apply_brushes(
         index = torch.tensor(channels, device=s.device)
         s = s.index_add(2, index, config.state_scale * total[..., columns.inject])
     rate = (1.0 + total[..., columns.rate]).clamp(0.0, 2.0) if "rate" in config.tools else None
-    return x, s, rate
+    return Particles(x, s), rate
 
 
 def tool_table(config: GardenConfig) -> Tensor:
@@ -219,29 +204,22 @@ def tool_table(config: GardenConfig) -> Tensor:
 
     Nothing; pushes in eight directions; wipe; each channel up and down; rates of 0 and of 2.
     """
-    columns = BrushLayout.of(config)
-    rows = [torch.zeros(columns.width)]
-
-    def add(column: slice, values: tuple[float, ...]) -> None:
-        row = torch.zeros(columns.width)
-        row[column] = torch.tensor(values)
-        rows.append(row)
-
+    columns, choices = BrushLayout.of(config), list[tuple[slice, Tensor]]()
     if "push" in config.tools:
-        for x, y in DIRECTIONS:
-            length = (x * x + y * y) ** 0.5
-            add(columns.push, (x / length, y / length))
+        directions = torch.tensor(DIRECTIONS).float()
+        lengths = directions.square().sum(dim=1, keepdim=True).sqrt()
+        choices += [(columns.push, direction) for direction in directions / lengths]
     if "wipe" in config.tools:
-        add(columns.wipe, (1.0,))
+        choices.append((columns.wipe, torch.ones(1)))
     if "inject" in config.tools:
-        count = len(config.inject_channels)
-        for channel in range(count):
-            for sign in (1.0, -1.0):
-                add(columns.inject, tuple(sign * (k == channel) for k in range(count)))
+        for channel in torch.eye(len(config.inject_channels)):
+            choices += [(columns.inject, channel), (columns.inject, -channel)]
     if "rate" in config.tools:
-        add(columns.rate, (-1.0,))
-        add(columns.rate, (1.0,))
-    return torch.stack(rows)[:, columns.place.stop :]
+        choices += [(columns.rate, -torch.ones(1)), (columns.rate, torch.ones(1))]
+    table = torch.zeros(1 + len(choices), columns.width)
+    for row, (column, values) in zip(table[1:], choices, strict=True):
+        row[column] = values
+    return table[:, columns.place.stop :]
 
 
 class BrushSpaces(ParticleSpaces):
@@ -273,16 +251,8 @@ class BrushSpaces(ParticleSpaces):
         """Return checked actions as rows of brushes, float32, shape [B, K, W]."""
         if self._config.actions != "discrete":
             return batch_tensor(action, world_count, self.rows_shape, "K, W")
-        batch, letters = ((), "") if world_count is None else ((world_count,), "B, ")
         brushes = self._config.brush_count
-        wanted = (*batch, 4 * brushes)
-        chosen = number_tensor("action", action)
-        if tuple(chosen.shape) != wanted or chosen.is_floating_point():
-            raise NPAError(
-                f"action must be whole numbers of shape [{letters}4 K] = {wanted}, got "
-                f"{tuple(chosen.shape)} of {chosen.dtype}: see env.action_space"
-            )
-        chosen = chosen.long().view(-1, brushes, 4)
+        chosen = batch_choices(action, world_count, (4 * brushes,), "4 K").view(-1, brushes, 4)
         highest = torch.tensor(self._choices, device=chosen.device)
         if not bool(((chosen >= 0) & (chosen < highest)).all()):
             raise NPAError(

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs import world_mean
-from npa_envs.envs.core.rewards import REWARD
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.state import not_finite
 from npa_envs.envs.core.task import Start
@@ -31,10 +30,14 @@ from npa_envs.envs.grown import GrownTask, check_runs, run_rule
 from npa_envs.rule.rule import COLOUR_OFFSET
 from npa_envs.tasks.targets.points import PointTarget
 from npa_envs.world.cuda_graph import makes_plain_tensors, to_device_async
+from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import StreamId, WorldRandom
 
 DEFICIT_SCALES = (2.0, 4.0, 4.0, 4.0, 4.0, 4.0)
 """Factors of a place's values, which bring them to about the same size (dimensionless)."""
+
+MIN_RISE = 0.1
+"""Smallest rise of the loss by turning grey, as a fraction of the loss (dimensionless)."""
 
 Config = TypeVar("Config", bound=GardenConfig)
 
@@ -59,10 +62,10 @@ class RuleDrivenWorlds(BatchedWorlds):
             raise not_finite(action)
         diverged = torch.zeros_like(self.diverged, dtype=torch.bool)
         limits = self.physics.limits.position, self.physics.limits.state
-        for own, new, limit in zip((self.x, self.s), self._stepped(action), limits, strict=True):
+        for value, new, limit in zip((self.x, self.s), self._stepped(action), limits, strict=True):
             # NaN is not within any limit.
             diverged |= ~(new.abs() < limit).flatten(1).all(dim=1)
-            own.copy_(torch.nan_to_num(new, nan=0.0).clamp(-limit, limit))
+            value.copy_(torch.nan_to_num(new, nan=0.0).clamp(-limit, limit))
         self.diverged.copy_(diverged)
         self.evaluate()
         if self._side_stream is not None:
@@ -89,7 +92,7 @@ class RuleDrivenWorlds(BatchedWorlds):
     @makes_plain_tensors
     def perceive(self, out: Tensor | None = None) -> Tensor:
         """Return all worlds' current observations, shape [B, O], in `out` if it is given."""
-        observed: Tensor = self.task.observe(self.x, self.s, self.loss, self.context)
+        observed: Tensor = self.task.observe(self.particles, self.loss, self.context)
         return observed if out is None else out.copy_(observed)
 
     def restart(self, worlds: NDArray[np.int64], observation: Tensor) -> None:
@@ -109,10 +112,9 @@ class RuleDrivenWorlds(BatchedWorlds):
         draws = self.random.take(worlds).substream(StreamId.GOAL)
         self.context[worlds] = self.task.episode_context(start, self.loss[worlds], draws)
 
-    def evaluate(self) -> None:
-        """Write rewards, losses and endings for the current particles into `report`."""
-        super().evaluate()
-        reward = self.task.reward(self.x, self.s, self.loss, self.context)
+    def settle_rewards(self) -> None:
+        """Write the task's rewards into the report, then change goals that are due."""
+        reward = self.task.reward(self.particles, self.loss, self.context)
         if self.rewards_last_step_only:
             terminated, truncated = self.report.endings[:2]
             last = terminated | truncated
@@ -120,13 +122,11 @@ class RuleDrivenWorlds(BatchedWorlds):
                 last = last | (self.elapsed == self.task.config.episode_steps)
             reward = torch.where(last, reward, 0.0)
         self.task.next_goals(self.elapsed, self.context, self.goal)
-        self.report.numbers[REWARD].copy_(reward)
-        if self.x.is_cuda and len(self.x) == 1:
-            self.host_numbers.copy_(self.report.numbers, non_blocking=True)
+        self.report.reward.copy_(reward)
 
     def extra_info(self) -> dict[str, Tensor]:
         """Return further entries of infos, shape [B, ...] each."""
-        infos: dict[str, Tensor] = self.task.context_info(self.x, self.s, self.context)
+        infos: dict[str, Tensor] = self.task.context_info(self.particles, self.context)
         return infos
 
 
@@ -137,25 +137,27 @@ class TargetDeficit:
         self.places, self._config = places, config
         self._scale = torch.ones(VALUES_PER_PLACE, device=places.device)
         middle = places.new_zeros(1, 2)
-        wanted = self._weighted(target.points[None], target.colours[None] - COLOUR_OFFSET, middle)
+        whole = Particles(target.points[None], target.colours[None] - COLOUR_OFFSET)
+        wanted = self._weighted(whole, middle)
         # Brushes may be too small to cover any point.
         mean_count = wanted[..., 0].mean().clamp_min(1.0 / len(target.points))
         self._scale = torch.tensor(DEFICIT_SCALES, device=places.device) / mean_count
         self._wanted = self._scale * wanted
 
-    def __call__(self, x: Tensor, s: Tensor, middle: Tensor) -> Tensor:
+    def __call__(self, particles: Particles, middle: Tensor) -> Tensor:
         """Return the target's weighted sums at each place minus the worlds' own, [B, P, 6].
 
         Sums are over particles, dimensionless: of 1, of x and y from the place in brush radii, and
         of red, green and blue. They are multiples of the mean sum of 1 over the target's places,
         times `DEFICIT_SCALES`.
         """
-        return self._wanted - self._weighted(x, s[..., -3:], middle)
+        return self._wanted - self._weighted(particles, middle)
 
-    def _weighted(self, x: Tensor, colour: Tensor, middle: Tensor) -> Tensor:
+    def _weighted(self, particles: Particles, middle: Tensor) -> Tensor:
+        x = particles.x
         away = offsets(x, middle[:, None] + self.places, self._config)
         sides = away / self._config.brush_radius
-        colours = colour[:, None].expand(-1, len(self.places), -1, -1)
+        colours = particles.s[:, None, :, -3:].expand(-1, len(self.places), -1, -1)
         values = torch.cat((torch.ones_like(sides[..., :1]), sides, colours), dim=-1)
         values = values * brush_weights(away, self._config)[..., None]
         mean = world_mean(values.transpose(1, 2).flatten(2))
@@ -177,14 +179,14 @@ class RuleDriven:
         """Return the context that episodes keep from their start, [B, M]; `loss` is theirs, [B]."""
         raise NotImplementedError
 
-    def reward(self, x: Tensor, s: Tensor, loss: Tensor, context: Tensor) -> Tensor:
+    def reward(self, particles: Particles, loss: Tensor, context: Tensor) -> Tensor:
         """Return the rewards of a step, [B], from the losses [B] and the context [B, M]."""
         raise NotImplementedError
 
     def next_goals(self, elapsed: Tensor, context: Tensor, goal: Tensor) -> None:
         """Change goals in place after the rewards of a step, by the steps since the start, [B]."""
 
-    def context_info(self, x: Tensor, s: Tensor, context: Tensor) -> dict[str, Tensor]:
+    def context_info(self, particles: Particles, context: Tensor) -> dict[str, Tensor]:
         """Return further entries of infos, shape [B, ...] each."""
         return {}
 
@@ -195,6 +197,7 @@ class GardenTask(RuleDriven, GrownTask[Config]):
     config_type: ClassVar[type[GardenConfig]] = GardenConfig
     form_type: ClassVar[Any] = BrushSpaces
     actor = "brushes"
+    context_count = 2
 
     def __init__(self, config: Config, device: torch.device) -> None:
         super().__init__(config, device)
@@ -211,96 +214,82 @@ class GardenTask(RuleDriven, GrownTask[Config]):
         return super().extra_bytes(config, world_count) + int(3 * 4 * values * world_count)
 
     def step(
-        self,
-        x: Tensor,
-        s: Tensor,
-        action: Tensor,
-        random: WorldRandom,
-        *,
-        detach_positions: bool = False,
+        self, x: Tensor, s: Tensor, action: Tensor, random: WorldRandom
     ) -> tuple[Tensor, Tensor]:
         """Return worlds after a step of the environment; differentiable."""
-        tended = self.brush_and_roll(x, s, action, random, detach_positions=detach_positions)
-        return self.disturb(*tended, random)
+        rolled = self.brush_and_roll(Particles(x, s), action, random)
+        x, s, *_ = self.disturb(rolled, random)
+        return x, s
 
     def brush_and_roll(
-        self,
-        x: Tensor,
-        s: Tensor,
-        action: Tensor,
-        random: WorldRandom,
-        *,
-        detach_positions: bool = False,
-    ) -> tuple[Tensor, Tensor]:
+        self, particles: Particles, action: Tensor, random: WorldRandom
+    ) -> Particles:
         """Return worlds after the brushes and the rule's steps, before `disturb`."""
-        run = partial(
-            run_rule, self.rule, self.config, random=random, detach_positions=detach_positions
-        )
-        x, s, rate = apply_brushes(x, s, action, self.middle(x), self.config)
+        config = self.config
+        run = partial(run_rule, self.rule, config, random=random, detach_positions=False)
+        middle = self.middle(particles.x)
+        particles, rate = apply_brushes(particles, action, middle, config)
         if rate is None:
-            x, s = run(x, s, self.config.rule_steps)
-        else:
-            for _ in range(self.config.rule_steps):
-                new_x, new_s = run(x, s, 1)
-                x, s = x + rate * (new_x - x), s + rate * (new_s - s)
-        return x, s
+            return run(particles, config.rule_steps)
+        for _ in range(config.rule_steps):
+            x, s, *_ = particles
+            new_x, new_s, *_ = run(particles, 1)
+            particles = Particles(x + rate * (new_x - x), s + rate * (new_s - s))
+        return particles
 
-    def disturb(self, x: Tensor, s: Tensor, random: WorldRandom) -> tuple[Tensor, Tensor]:
+    def disturb(self, particles: Particles, random: WorldRandom) -> Particles:
         """Return worlds after the disturbances at the end of a step; by default none."""
-        return x, s
+        return particles
+
+    def episode_context(self, start: Start, loss: Tensor, random: WorldRandom) -> Tensor:
+        """Return the loss of intact pictures, and its rise if they turn grey, shape [B, 2]."""
+        blank = torch.zeros_like(start.s)
+        grey = sum(self.losses(start.x, blank).values(), torch.zeros_like(loss))
+        # The loss of a picture that did not grow may not rise at all.
+        return torch.stack((loss, (grey - loss).maximum(MIN_RISE * loss)), dim=1)
+
+    def lost_fraction(self, loss: Tensor, context: Tensor) -> Tensor:
+        """Return the fraction of pictures that is lost: 0 if intact, 1 if grey, shape [B]."""
+        return (loss - context[:, 0]) / context[:, 1]
 
     def middle(self, x: Tensor) -> Tensor:
         """Return the origin of brushes' places: the mean position minus the target's, [B, 2]."""
         return world_mean(x) - self.task.target.points.mean(dim=0)
 
-    def observe(self, x: Tensor, s: Tensor, loss: Tensor, context: Tensor) -> Tensor:
+    def observe(self, particles: Particles, loss: Tensor, context: Tensor) -> Tensor:
         """Return observations, shape [B, O], in the form that `observe` names."""
         if self.config.observe == "grid":
-            observed = self.deficit(x, s, self.middle(x))
+            observed = self.deficit(particles, self.middle(particles.x))
+        elif self.config.observe == "moments":
+            observed = self.moments(particles)
         else:
-            observed = self.moments(x, s) if self.config.observe == "moments" else self.coarse(x, s)
+            observed = self.coarse(particles)
         return observed.flatten(1).clamp(-OBSERVATION_LIMIT, OBSERVATION_LIMIT)
 
-    def coarse(self, x: Tensor, s: Tensor) -> Tensor:
+    def coarse(self, particles: Particles) -> Tensor:
         """Return coarse pictures, red, green, blue, density, shape [B, 4, G, G].
 
         A coarse pixel is the mean of pixels of the picture that the loss compares. `observe_error`
         adds four channels: the target's picture minus this one.
         """
-        picture, target = self.task.picture(x, s), self.task.target_picture
+        picture, target = self.task.picture(particles.x, particles.s), self.task.target_picture
         if self.config.observe_error:
             picture = torch.cat((picture, target - picture), dim=-1)
         pixels = self.config.resolution // self.config.picture_size
         return F.avg_pool2d(picture.permute(0, 3, 1, 2), pixels)
 
-    def moments(self, x: Tensor, s: Tensor) -> Tensor:
+    def moments(self, particles: Particles) -> Tensor:
         """Return first and second moments of positions and states, [B, 5 + 3 C].
 
         The mean x, y; then, relative to it, the means of x², x y, y², and of s, x s, y s for each
         channel.
         """
-        mean = world_mean(x)
-        away = x - mean[:, None]
+        s, mean = particles.s, world_mean(particles.x)
+        away = particles.x - mean[:, None]
         across, up = away[..., :1], away[..., 1:]
         seconds = torch.cat((across * across, across * up, up * up), dim=-1)
         values = torch.cat((seconds, s, across * s, up * s), dim=-1)
         return torch.cat((mean, world_mean(values)), dim=-1)
-
-
-MIN_RISE = 0.1
-"""Smallest rise of the loss by turning grey, as a fraction of the loss (dimensionless)."""
-
-
-def intact_context(task: GardenTask[Config], start: Start, loss: Tensor) -> Tensor:
-    """Return the loss of intact pictures, and its rise if they turn grey, shape [B, 2]."""
-    grey = sum(task.losses(start.x, torch.zeros_like(start.s)).values(), torch.zeros_like(loss))
-    # The loss of a picture that did not grow may not rise at all.
-    return torch.stack((loss, (grey - loss).maximum(MIN_RISE * loss)), dim=1)
-
-
-def lost_fraction(loss: Tensor, context: Tensor) -> Tensor:
-    """Return the fraction of pictures that is lost: 0 if intact, 1 if grey, shape [B]."""
-    return (loss - context[:, 0]) / context[:, 1]
 
 
 class GardenEnv(NPAEnv):

@@ -48,17 +48,7 @@ class KnownAgents(pettingzoo.ParallelEnv):  # type: ignore[misc]
 
 
 class CrowdEnv(AgentsEnv, KnownAgents):
-    """One world whose agents are species or particles.
-
-    Args:
-        task: A name from `npa_envs.envs.multi.TASKS`.
-        keywords: Fields of the task's configuration.
-        by_particle: Whether agents are particles; False: species.
-
-    Raises:
-        NPAError: There is no such task, a keyword is unknown or wrong, or the world does not fit
-            into memory.
-    """
+    """One world whose agents are species, or particles with `by_particle`."""
 
     def __init__(self, task: str, keywords: dict[str, Any], *, by_particle: bool) -> None:
         super().__init__(task, keywords, 1, by_particle=by_particle)
@@ -82,10 +72,7 @@ class CrowdEnv(AgentsEnv, KnownAgents):
         return self._by_agent(observation), infos
 
     def step(self, actions: Mapping[str, Any]) -> Outcome:
-        """Apply the actions of all live agents, and remove those that ended from the world.
-
-        Args:
-            actions: One for each live agent, in its action space.
+        """Apply an action of each live agent, and remove agents that ended from the world.
 
         Returns:
             Observations, rewards, terminations, truncations and infos, by the names of the agents
@@ -132,8 +119,8 @@ class CrowdEnv(AgentsEnv, KnownAgents):
 
     def particles(self) -> tuple[Tensor, Tensor]:
         """Return copies of positions [length units], [N now, 2], and states, [N now, C]."""
-        there = self.worlds.population(0)
-        return there.x[0], there.s[0]
+        population = self.worlds.population(0)
+        return population.x[0], population.s[0]
 
     def place_particles(self, x: Any, s: Any) -> dict[str, Any]:
         """Replace the particles of all live agents, without a reward; return the observations.
@@ -149,8 +136,7 @@ class CrowdEnv(AgentsEnv, KnownAgents):
 
     def _update_agents(self) -> None:
         """Set `agents` to those that act next."""
-        played = len(self.possible_agents)
-        self._live = np.flatnonzero(self.worlds.live[0, :played]).tolist()
+        self._live = np.flatnonzero(self.worlds.live[0, : len(self.possible_agents)]).tolist()
         self.agents = [self.possible_agents[k] for k in self._live]
 
     def _with_zeros(self, action: Tensor) -> Tensor:
@@ -190,7 +176,7 @@ def in_turns(parallel: Any, *, clips: bool = False) -> Any:
 
 def register(name: str, module: str, keywords: dict[str, Any]) -> None:
     """Register both kinds of an environment with PettingZoo, unless they are registered."""
-    for kind, function in (("parallel", "parallel_env"), ("aec", "env")):
+    for api, function in (("parallel", "parallel_env"), ("aec", "env")):
         # PettingZoo before 1.27 has no registries.
-        if name not in getattr(pettingzoo, f"{kind}_registry", {name}):
-            pettingzoo.register(kind, name, f"{module}:{function}", kwargs=keywords)
+        if name not in getattr(pettingzoo, f"{api}_registry", {name}):
+            pettingzoo.register(api, name, f"{module}:{function}", kwargs=keywords)

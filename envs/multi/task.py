@@ -14,13 +14,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.checks import check_non_negative, check_positive, is_whole
+from npa_envs.checks import check_field, check_non_negative, check_positive, is_whole
 from npa_envs.envs.core.config import WorldConfig, plain
 from npa_envs.envs.core.task import WorldTask
-from npa_envs.errors import NPAError, shown
+from npa_envs.errors import NPAError
 from npa_envs.render import STYLES
 from npa_envs.rule.rule import COLOUR_OFFSET
 from npa_envs.tasks.seeds import uniform_ball
+from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import WorldRandom
 
 SpeciesReward = Literal["individual", "team"]
@@ -87,7 +88,6 @@ class SpeciesConfig(WorldConfig):
     "states" (hidden channels)."""
 
     def __post_init__(self) -> None:
-        """Check every field; as `WorldConfig`."""
         super().__post_init__()
         check_positive(self, int, "max_cycles")
         check_positive(self, int, "species_count", at_most=MAX_COUNT)
@@ -107,8 +107,8 @@ class SpeciesConfig(WorldConfig):
         """Particles of each species at the start of an episode."""
         if self.particle_counts:
             return self.particle_counts
-        share, rest = divmod(self.particle_count, self.species_count)
-        return tuple(share + int(k < rest) for k in range(self.species_count))
+        even, rest = divmod(self.particle_count, self.species_count)
+        return tuple(even + int(k < rest) for k in range(self.species_count))
 
     @property
     def played_counts(self) -> tuple[int, ...]:
@@ -131,33 +131,32 @@ class SpeciesConfig(WorldConfig):
         return super().from_keywords(keywords)
 
     def _check_counts(self) -> None:
-        given = self.particle_counts
-        whole = isinstance(given, tuple) and all(is_whole(count) for count in given)
-        if given and (not whole or len(given) != self.species_count or min(given) < 1):
-            raise NPAError(
-                f"particle_counts must be {self.species_count} whole numbers of at least 1, one "
-                f"for each of species_count = {self.species_count}, got {shown(given)}: for "
-                f"example particle_counts={(64,) * self.species_count}"
-            )
-        if not given and self.particle_count < self.species_count:
-            raise NPAError(
-                f"particle_count must be at least species_count = {self.species_count}, got "
-                f"{self.particle_count}: each species needs a particle"
-            )
+        counts, species_count = self.particle_counts, self.species_count
+        whole = isinstance(counts, tuple) and all(is_whole(count) for count in counts)
+        fits = not counts or (whole and len(counts) == species_count and min(counts) >= 1)
+        rule = (
+            f"be {species_count} whole numbers of at least 1, one for each of species_count = "
+            f"{species_count}"
+        )
+        hint = f"for example particle_counts={(64,) * species_count}"
+        check_field(self, "particle_counts", fits, rule, hint)
+        enough = bool(counts) or self.particle_count >= species_count
+        rule = f"be at least species_count = {species_count}"
+        check_field(self, "particle_count", enough, rule, "each species needs a particle")
 
     def _check_deaths(self) -> None:
-        rule = (
-            "deaths must be pairs (species, step), each species from 0 to "
-            f"{self.species_count - 1} at most once, each step at least 1"
-        )
-        given = self.deaths
-        pairs = isinstance(given, tuple) and all(
+        deaths, last = self.deaths, self.species_count - 1
+        pairs = isinstance(deaths, tuple) and all(
             isinstance(pair, tuple) and len(pair) == 2 and all(is_whole(k) for k in pair)
-            for pair in given
+            for pair in deaths
         )
-        fits = pairs and all(0 <= k < self.species_count and step > 0 for k, step in given)
-        if not fits or len({k for k, _ in given}) < len(given):
-            raise NPAError(f"{rule}, got {shown(given)}: for example deaths=((1, 50),)")
+        fits = pairs and all(0 <= k <= last and step > 0 for k, step in deaths)
+        fits = fits and len({k for k, _ in deaths}) == len(deaths)
+        rule = (
+            f"be pairs (species, step), each species from 0 to {last} at most once, each step at "
+            "least 1"
+        )
+        check_field(self, "deaths", fits, rule, "for example deaths=((1, 50),)")
 
 
 class Population(NamedTuple):
@@ -191,13 +190,6 @@ class SpeciesTask(WorldTask[Any]):
     """A task of several species, with a loss for each species and each particle.
 
     An agent's reward is the fall of its loss in a step.
-
-    Args:
-        config: The environment's configuration.
-        device: The worlds' device.
-
-    Raises:
-        NPAError: There are too few species.
     """
 
     config_type: ClassVar[type[SpeciesConfig]] = SpeciesConfig
@@ -214,16 +206,13 @@ class SpeciesTask(WorldTask[Any]):
             )
         super().__init__(config, device)
         middle = 0.5 * (config.species_count - 1)
-        places = [config.seed_distance * (k - middle) for k in range(config.species_count)]
+        centres = [config.seed_distance * (k - middle) for k in range(config.species_count)]
+        counts = torch.tensor(config.counts)
         # Copied to the device once, as a copy in each restart would synchronise.
-        self._shift = torch.tensor(places).repeat_interleave(torch.tensor(config.counts)).to(device)
+        self._shift = torch.tensor(centres).repeat_interleave(counts).to(device)
 
     def start(self, random: WorldRandom) -> tuple[Tensor, Tensor]:
-        """Return fresh worlds: each species uniform in a disk of its own, all states zero.
-
-        Returns:
-            Positions [length units], shape [B, N, 2]; states, dimensionless, shape [B, N, C].
-        """
+        """Return positions and states of fresh worlds: a disk of blank particles per species."""
         config = self.config
         shape = random.world_count, sum(config.counts)
         x = uniform_ball(*shape, 2, config.seed_radius, generator=random, device=self.device)
@@ -233,19 +222,13 @@ class SpeciesTask(WorldTask[Any]):
     def losses(self, population: Population) -> Mapping[str, Tensor]:
         """Return the named parts of each species' loss, shape [B, K] each; their sum is its loss.
 
-        The losses of a world must not depend on the others, and nothing may synchronise.
-
-        Args:
-            population: At least one particle; losses of removed species are not read.
+        The losses of a world must not depend on the others, and nothing may synchronise. Losses of
+        removed species are not read.
         """
         raise NotImplementedError
 
     def particle_losses(self, population: Population) -> Mapping[str, Tensor]:
-        """Return the named parts of each particle's loss, shape [B, N] each; their sum is its loss.
-
-        Args:
-            population: At least one particle.
-        """
+        """Return the named parts of each particle's loss, [B, N] each; their sum is its loss."""
         raise NotImplementedError
 
     def played(self, action: Tensor, population: Population, random: WorldRandom) -> Tensor:
@@ -276,9 +259,9 @@ class SpeciesTask(WorldTask[Any]):
         if x.shape[1] == 0:
             return np.full((len(x), config.render_size, config.render_size, 3), 255, np.uint8)
         if config.render_style != SPECIES_STYLE:
-            return self.draw_particles(x, s, config.render_style)
+            return self.draw_particles(Particles(x, s), config.render_style)
         # Hues of the species are evenly spaced.
         hues = [k / config.species_count for k in range(config.species_count)]
         colours = torch.tensor([colorsys.hsv_to_rgb(hue, 0.85, 0.8) for hue in hues]).to(s)
-        own = (colours[population.species] - COLOUR_OFFSET).expand(len(x), -1, -1)
-        return self.draw_particles(x, own, "particles")
+        colours = (colours[population.species] - COLOUR_OFFSET).expand(len(x), -1, -1)
+        return self.draw_particles(Particles(x, colours), "particles")

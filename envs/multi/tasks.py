@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from npa_envs import perceive, world_mean
+from npa_envs.checks import check_field
 from npa_envs.envs.multi.task import Population, SpeciesConfig, SpeciesTask
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.registration import SPECIES, SPECIES_SIZES
@@ -23,15 +24,9 @@ class MixingTask(SpeciesTask):
 
     def losses(self, population: Population) -> Mapping[str, Tensor]:
         """Return the mean of the particle losses of each species."""
+        spans = [population.spans[k] for k in _present(population)]
         return {
-            name: by_species(
-                [
-                    world_mean(loss[:, span, None])[:, 0]
-                    for span in population.spans
-                    if span.stop > span.start
-                ],
-                population,
-            )
+            name: by_species([world_mean(loss[:, span, None])[:, 0] for span in spans], population)
             for name, loss in self.particle_losses(population).items()
         }
 
@@ -40,7 +35,32 @@ class MixingTask(SpeciesTask):
         return {"separation": 1.0 - self._entropy(population)}
 
     def _entropy(self, population: Population) -> Tensor:
-        return local_entropy(population, eps=self.config.eps, box=self.config.periodic_box)
+        """Return the entropy of species around each particle, in [0, 1], shape [B, N].
+
+        The fraction of species k around a particle is f_k = b_k / Σ b, where b are SPH-smoothed
+        tags (1 for a particle of species k, else 0). The entropy is −Σ f_k ln f_k / ln K: 0 with
+        one species in the neighbourhood, 1 with equal parts of all K.
+        """
+        species_count = len(population.counts)
+        indices = torch.arange(species_count, device=population.x.device)
+        tags = (population.species[:, None] == indices).to(population.x)
+        perceived = perceive(
+            population.x,
+            tags.expand(len(population.x), -1, -1).contiguous(),
+            self.config.eps,
+            box=self.config.periodic_box,
+            detach_positions=False,
+            state_gradient=False,
+            moment_correction=False,
+            density_gradient=False,
+        )
+        smoothed = perceived[..., species_count:]
+        fractions = smoothed / smoothed.sum(dim=2, keepdim=True)
+        # At 0 the entropy has no finite derivative, which would give NaN gradients.
+        present = fractions > 0.0
+        terms = torch.where(present, torch.special.entr(torch.where(present, fractions, 1.0)), 0.0)
+        entropy: Tensor = terms.sum(dim=2)
+        return entropy / math.log(species_count)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,35 +80,6 @@ class SegregationTask(MixingTask):
         return {"mixture": self._entropy(population)}
 
 
-def local_entropy(population: Population, *, eps: float, box: float | None) -> Tensor:
-    """Return the entropy of species around each particle, in [0, 1], shape [B, N].
-
-    The fraction of species k around a particle is f_k = b_k / Σ b, where b are SPH-smoothed tags
-    (1 for a particle of species k, else 0). The entropy is −Σ f_k ln f_k / ln K: 0 with one species
-    in the neighbourhood, 1 with equal parts of all K.
-    """
-    species_count = len(population.counts)
-    kinds = torch.arange(species_count, device=population.x.device)
-    tags = (population.species[:, None] == kinds).to(population.x)
-    perceived = perceive(
-        population.x,
-        tags.expand(len(population.x), -1, -1).contiguous(),
-        eps,
-        box=box,
-        detach_positions=False,
-        state_gradient=False,
-        moment_correction=False,
-        density_gradient=False,
-    )
-    smoothed = perceived[..., species_count:]
-    fractions = smoothed / smoothed.sum(dim=2, keepdim=True)
-    # At 0 the entropy has no finite derivative, which would give NaN gradients.
-    there = fractions > 0.0
-    terms = torch.where(there, torch.special.entr(torch.where(there, fractions, 1.0)), 0.0)
-    entropy: Tensor = terms.sum(dim=2)
-    return entropy / math.log(species_count)
-
-
 USUAL = ("gecko", "heart", "butterfly", "flower", "octopus", "ring")
 """Default targets of species 0, 1, ..., repeated."""
 
@@ -105,7 +96,6 @@ class PictureLossConfig(SpeciesConfig):
     render_style: str = "particles"
 
     def __post_init__(self) -> None:
-        """Check every field."""
         super().__post_init__()
         _ = self.task_config()
 
@@ -128,7 +118,6 @@ class OnePictureConfig(PictureLossConfig):
     target: str = Morphogenesis2DConfig.target
 
     def __post_init__(self) -> None:
-        """Check every field."""
         super().__post_init__()
         _ = self.task_config(self.target)
 
@@ -174,16 +163,12 @@ class CoMorphogenesisConfig(PictureLossConfig):
     each other, 2 side by side."""
 
     def __post_init__(self) -> None:
-        """Check every field."""
         super().__post_init__()
-        names = self.targets
+        names, count = self.targets, self.species_count
         named = isinstance(names, tuple) and all(isinstance(n, str) and n for n in names)
-        if names and (not named or len(names) != self.species_count):
-            raise NPAError(
-                f"targets must be {self.species_count} names, emoji or paths, one for each of "
-                f"species_count = {self.species_count}, got {shown(names)}: for example "
-                f"targets={self._usual}"
-            )
+        fits = not names or (named and len(names) == count)
+        rule = f"be {count} names, emoji or paths, one for each of species_count = {count}"
+        check_field(self, "targets", fits, rule, f"for example targets={self._usual}")
 
     @property
     def grown(self) -> tuple[str, ...]:
@@ -231,13 +216,10 @@ class InvasionConfig(OnePictureConfig):
         return self.counts if self.opponent is None else self.counts[:1]
 
     def __post_init__(self) -> None:
-        """Check every field."""
         super().__post_init__()
-        if self.reward != "individual":
-            raise NPAError(
-                f"reward must be 'individual' in invasion, got {shown(self.reward)}: the sum of "
-                "all rewards is zero, so there is nothing to share"
-            )
+        rule = "be 'individual' in invasion"
+        hint = "the sum of all rewards is zero, so there is nothing to share"
+        check_field(self, "reward", self.reward == "individual", rule, hint)
 
 
 class InvasionTask(PictureLossTask):
@@ -251,18 +233,18 @@ class InvasionTask(PictureLossTask):
     def losses(self, population: Population) -> Mapping[str, Tensor]:
         """Return the parts of species 0's splat loss, and minus an equal share for each other."""
         invaders = population.counts[1:]
-        there = max(sum(count > 0 for count in invaders), 1)
+        present = max(sum(count > 0 for count in invaders), 1)
         return {
-            name: torch.stack([loss, *[-loss / there] * len(invaders)], dim=1)
+            name: torch.stack([loss, *[-loss / present] * len(invaders)], dim=1)
             for name, loss in self.picture_parts(0, *population.of(0)).items()
         }
 
     def particle_losses(self, population: Population) -> Mapping[str, Tensor]:
         """Return parts of species 0's splat loss, and minus an equal part for each invader."""
-        own = self.task.particle_shares(*population.of(0))
-        own_count, other_count = own.shape[1], sum(population.counts[1:])
-        part = world_mean(own[..., None])[:, 0] * (-own_count / max(other_count, 1))
-        return {"picture": torch.cat((own, part[:, None].expand(-1, other_count)), dim=1)}
+        losses = self.task.particle_shares(*population.of(0))
+        count, invader_count = losses.shape[1], sum(population.counts[1:])
+        part = world_mean(losses[..., None])[:, 0] * (-count / max(invader_count, 1))
+        return {"picture": torch.cat((losses, part[:, None].expand(-1, invader_count)), dim=1)}
 
     def played(self, action: Tensor, population: Population, random: WorldRandom) -> Tensor:
         """Return the actions of all particles, random ones for an opponent's."""
@@ -320,10 +302,8 @@ def _present(population: Population) -> list[int]:
 
 def by_species(losses: list[Tensor], population: Population) -> Tensor:
     """Return losses of the present species as one tensor, shape [B, K], 0 for the others."""
-    remaining = iter(losses)
-    nothing = population.x.new_zeros(len(population.x))
-    found = [next(remaining) if count else nothing for count in population.counts]
-    return torch.stack(found, dim=1)
+    present, zeros = iter(losses), population.x.new_zeros(len(population.x))
+    return torch.stack([next(present) if n else zeros for n in population.counts], dim=1)
 
 
 TASKS: dict[str, type[SpeciesTask]] = {

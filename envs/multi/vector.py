@@ -60,16 +60,15 @@ class AgentsEnv(ShownEnv):
         word, count = ("particle", sum(played)) if by_particle else ("species", len(played))
         self.possible_agents = [f"{word}_{k}" for k in range(count)]
         """Names of the agents."""
-        limit = worlds.physics.limits.perception
+        physics, limits = worlds.physics, worlds.physics.limits
         self._observation_spaces: dict[str, Box] = {}
         self._action_spaces: dict[str, Box] = {}
         for agent, span in zip(self.possible_agents, worlds.spans[:count], strict=True):
             rows = () if by_particle else (span.stop - span.start,)
-            observed, acted = (*rows, worlds.perception_dim), (*rows, worlds.physics.action_dim)
+            limit, observed = limits.perception, (*rows, worlds.perception_dim)
             self._observation_spaces[agent] = Box(-limit, limit, observed, np.float32)
-            self._action_spaces[agent] = Box(-1.0, 1.0, acted, np.float32)
+            self._action_spaces[agent] = Box(-1.0, 1.0, (*rows, physics.action_dim), np.float32)
         # Position, state, present.
-        limits, physics = worlds.physics.limits, worlds.physics
         high = [limits.position] * physics.space_dim + [limits.state] * physics.state_dim
         upper = np.tile(np.array([*high, 1.0], np.float32), (worlds.particle_count, 1))
         self._state_space = Box(upper * np.array([-1.0] * len(high) + [0.0], np.float32), upper)
@@ -173,22 +172,22 @@ class MultiSpeciesVectorEnv(AgentsEnv):
     @cached_property
     def observation_spaces(self) -> dict[str, Space[Any]]:
         """Spaces of all worlds' observations, [B, N_k, P]; large, so made at the first use."""
-        spaces = self.single_observation_spaces
-        return {agent: batch_space(space, self.world_count) for agent, space in spaces.items()}
+        return self._batched(self.single_observation_spaces)
 
     @cached_property
     def action_spaces(self) -> dict[str, Space[Any]]:
         """Spaces of all worlds' actions, [B, N_k, A]; large, so made at the first use."""
-        spaces = self.single_action_spaces
+        return self._batched(self.single_action_spaces)
+
+    def _batched(self, spaces: dict[str, Box]) -> dict[str, Space[Any]]:
         return {agent: batch_space(space, self.world_count) for agent, space in spaces.items()}
 
     def reset(
         self, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[ByAgent, Infos]:
-        """Start episodes with all species; arguments are those of `NPAVectorEnv.reset`.
+        """Start episodes with all species; return observations and infos of all worlds.
 
-        Returns:
-            Observations of all worlds, and infos: losses with their parts, and live flags.
+        Arguments are those of `NPAVectorEnv.reset`.
         """
         chosen = worlds_to_reset(options, self.world_count)
         if not self._started and len(chosen) < self.world_count:
@@ -198,10 +197,7 @@ class MultiSpeciesVectorEnv(AgentsEnv):
         return self._rows(observation), self._infos(worlds.agent_returns.numbers(), worlds.live)
 
     def step(self, actions: Mapping[str, Any]) -> BatchOutcome:
-        """Apply every species' actions in all worlds.
-
-        Args:
-            actions: For each species, shape [B, N_k, A], in [-1, 1].
+        """Apply every species' actions, shape [B, N_k, A], in [-1, 1], in all worlds.
 
         Returns:
             Observations, rewards (float32), terminations, truncations and infos.
@@ -215,10 +211,10 @@ class MultiSpeciesVectorEnv(AgentsEnv):
         if not self._started:
             raise NPAError("step needs worlds: call reset first")
         worlds = self.worlds
-        if not worlds.open.all():
+        if not worlds.running.all():
             raise NPAError(
-                f"the episodes of worlds {np.flatnonzero(~worlds.open).tolist()} are over: reset "
-                "them with reset(options={'reset_mask': ...})"
+                f"the episodes of worlds {np.flatnonzero(~worlds.running).tolist()} are over: "
+                "reset them with reset(options={'reset_mask': ...})"
             )
         shapes = [(self.world_count, *space.shape) for space in self.single_action_spaces.values()]
         with worlds.device_context():
@@ -226,7 +222,7 @@ class MultiSpeciesVectorEnv(AgentsEnv):
             rest = worlds.particle_count - action.shape[1]
             outcome = worlds.step(F.pad(action, (0, 0, 0, rest)) if rest else action)
             observation, final = outcome.observation, None
-            over = np.flatnonzero(~worlds.open)
+            over = np.flatnonzero(~worlds.running)
             if len(over) and self.autoreset_mode is AutoresetMode.SAME_STEP:
                 final = self._rows(observation), over
                 first, index = worlds.start(over), to_device_async(over, worlds.device)

@@ -33,6 +33,7 @@ from npa_envs.world.cuda_graph import (
     to_device_async,
 )
 from npa_envs.world.divergence import MAX_REPORT
+from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import WorldRandom
 
 Parts = dict[str, Tensor]
@@ -88,7 +89,7 @@ class AgentReturns:
         self._parts = self._before = zeros[None]
         self._at_start = self._carried = zeros
 
-    def open(self, parts: Parts, worlds: Tensor) -> None:
+    def begin(self, parts: Parts, worlds: Tensor) -> None:
         """Begin episodes in some worlds, int64, [M], by parts of all agents there, [M, A] each."""
         opened = _stacked(parts)
         if not self.part_names:
@@ -108,14 +109,14 @@ class AgentReturns:
         self._carried = self._carried + (loss - self.loss)
         self.loss = loss
 
-    def step_rewards(self, parts: Parts, live: Tensor, escaped: Tensor) -> Tensor:
+    def step_rewards(self, parts: Parts, live: Tensor, diverged: Tensor) -> Tensor:
         """Store the losses after a step; return rewards, 0 if not live, float64, [B, A]."""
         now = _stacked(parts)
         loss = total(now)
         # Leaving the world must not be rewarded, even if an empty picture is better than the start;
         # nor may it undo what a death added without a reward.
         least = self._at_start + self._carried.clamp_min(0.0)
-        loss = torch.where(escaped, torch.maximum(loss, least), loss)
+        loss = torch.where(diverged, torch.maximum(loss, least), loss)
         rewards = torch.where(live, self.loss - loss, 0.0)
         if self._team:
             agents_per_live = live.shape[1] / live.sum(dim=1).clamp_min(1)
@@ -126,16 +127,13 @@ class AgentReturns:
 
     def numbers(self) -> dict[str, Tensor]:
         """Return the entries of `info` about losses, float64, shape [B, A] each."""
-        parts = {
-            f"loss_{name}": part for name, part in zip(self.part_names, self._parts, strict=True)
-        }
-        return {"loss": self.loss} | parts
+        names = (f"loss_{name}" for name in self.part_names)
+        return {"loss": self.loss} | dict(zip(names, self._parts, strict=True))
 
     def step_numbers(self) -> dict[str, Tensor]:
         """Return the entries of `numbers`, and the fall of each part in the step."""
-        falls = self._before - self._parts
-        named = {f"reward_{name}": fall for name, fall in zip(self.part_names, falls, strict=True)}
-        return self.numbers() | named
+        names = (f"reward_{name}" for name in self.part_names)
+        return self.numbers() | dict(zip(names, self._before - self._parts, strict=True))
 
 
 def _stacked(parts: Parts) -> Tensor:
@@ -146,13 +144,8 @@ class SpeciesWorlds(WorldState):
     """B worlds of a task with their agents; particles are sorted by species.
 
     Removed particles are not computed. Worlds with the same remaining particles are stepped
-    together, as a `Cohort`: the whole batch as long as no agent has been removed.
-
-    Args:
-        task: A name from `npa_envs.envs.multi.TASKS`.
-        keywords: Fields of the task's configuration.
-        world_count: Worlds B.
-        by_particle: Whether agents are particles; False: species.
+    together, as a `Cohort`: the whole batch as long as no agent has been removed. Agents are
+    species, or particles with `by_particle`.
 
     Raises:
         NPAError: There is no such task, a keyword is unknown or wrong, or the worlds do not fit
@@ -163,17 +156,17 @@ class SpeciesWorlds(WorldState):
     def __init__(
         self, task: str, keywords: dict[str, Any], world_count: int, *, by_particle: bool
     ) -> None:
-        found = task_type(task)
-        self.config = config = found.config_type.from_keywords(keywords)
+        task_class = task_type(task)
+        self.config = config = task_class.config_type.from_keywords(keywords)
         count, appended = sum(config.counts), 0
         if config.perception == "per_species":
             # Density and density gradient of each species.
-            appended = config.species_count * (1 + found.space_dim)
+            appended = config.species_count * (1 + task_class.space_dim)
         by_species = 4 * OBSERVATION_COPIES * world_count * count * appended
-        super().__init__(config, found, world_count, count, by_species)
+        super().__init__(config, task_class, world_count, count, by_species)
         self.perception_dim = self.physics.perception_dim + appended
         """Columns of perception: P, and K (1 + D) more with per-species perception."""
-        self.task = found(config, self.device)
+        self.task = task_class(config, self.device)
         self.by_particle = by_particle
         self.species = np.repeat(np.arange(config.species_count), config.counts)
         """Species of each particle at the start of an episode, int64, shape [N]."""
@@ -187,34 +180,34 @@ class SpeciesWorlds(WorldState):
         """Species of each agent, int64, shape [A]."""
         self.live = np.zeros((world_count, len(sizes)), dtype=bool)
         """Whether each agent acts in the next step, shape [B, A]."""
-        self.there = np.zeros_like(self.live)
+        self.present = np.zeros_like(self.live)
         """Whether each agent's particles are in its world, shape [B, A]."""
-        self.open = np.zeros(world_count, dtype=bool)
+        self.running = np.zeros(world_count, dtype=bool)
         """Whether each world's episode goes on; the others are not stepped, shape [B]."""
         self.elapsed = np.zeros(world_count, dtype=np.int64)
         """Steps since the start of each episode, shape [B]."""
-        device, team = self.device, config.reward == "team"
-        kinds = to_device_async(self.agent_species, device)
-        self.agent_returns = AgentReturns(self.task, kinds, world_count, team=team)
+        device = self.device
+        agent_species = to_device_async(self.agent_species, device)
+        team = config.reward == "team"
+        self.agent_returns = AgentReturns(self.task, agent_species, world_count, team=team)
         """The agents' losses and rewards."""
         self._owner = to_device_async(self.owner, device)
         deaths = dict(config.deaths)
         self._last_step = np.array([deaths.get(int(k), 0) for k in self.agent_species])
         self._side_stream = SideStream(device) if device.type == "cuda" else None
-        self._host_left = torch.zeros(
+        self._host_diverged = torch.zeros(
             self.live.shape, dtype=torch.bool, device="cpu", pin_memory=device.type == "cuda"
         )
-        everyone, worlds = np.arange(count), np.arange(world_count)
         # Its graphs are kept on CUDA: worlds return to it when their next episodes start.
-        parts = self.task, self.physics, self.owner, by_particle
-        self._whole = Cohort(*parts, worlds, everyone, self.x, self.s, self.random)
+        everything = np.arange(world_count), np.arange(count), self.particles, self.random
+        self._whole = Cohort(self.task, self.physics, self.owner, by_particle, *everything)
         self._cohorts: list[Cohort] | None = None
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore the state, and pin the host's memory again."""
+        # Pickled memory is not pinned.
         self.__dict__.update(state)
         if self._side_stream is not None:
-            self._host_left = self._host_left.pin_memory()
+            self._host_diverged = self._host_diverged.pin_memory()
 
     @torch.no_grad()
     @makes_plain_tensors
@@ -230,11 +223,11 @@ class SpeciesWorlds(WorldState):
         self.random.put(index, random)
         self.x.index_copy_(0, index, x)
         self.s.index_copy_(0, index, s)
-        self.live[worlds] = self.there[worlds] = self.open[worlds] = True
+        self.live[worlds] = self.present[worlds] = self.running[worlds] = True
         self.elapsed[worlds] = 0
         population = self._whole.population._replace(x=x.contiguous(), s=s)
         parts, perceived = self._whole.measured(population), self._whole.perceived(population)
-        self.agent_returns.open(parts, index)
+        self.agent_returns.begin(parts, index)
         return perceived
 
     @torch.no_grad()
@@ -250,27 +243,28 @@ class SpeciesWorlds(WorldState):
         Raises:
             DivergedError: An agent is out of bounds, and `on_divergence` is "raise".
         """
-        acted, left = self.live.copy(), torch.zeros_like(self._host_left, device=self.device)
+        acted = self.live.copy()
+        diverged = torch.zeros_like(self._host_diverged, device=self.device)
         for cohort in self.cohorts:
-            cohort.act(action if cohort is self._whole else action[cohort.places])
+            cohort.act(action if cohort is self._whole else action[cohort.indices])
             if self.config.on_divergence != "ignore":
-                left.index_copy_(0, cohort.worlds, cohort.gone)
-        self.elapsed[self.open] += 1
-        self._host_left.copy_(left, non_blocking=True)
+                diverged.index_copy_(0, cohort.worlds, cohort.diverged)
+        self.elapsed[self.running] += 1
+        self._host_diverged.copy_(diverged, non_blocking=True)
         if self._side_stream is not None:
             self._side_stream.mark()
-        live = to_device_async(acted, self.device)
-        rewards = self.agent_returns.step_rewards(self.measured(stepped=True), live, left & live)
+        live, parts = to_device_async(acted, self.device), self.measured(stepped=True)
+        rewards = self.agent_returns.step_rewards(parts, live, diverged & live)
         numbers = self.agent_returns.step_numbers()
         observation = self.perceived(stepped=True)
-        # The device continues while the host reads who left.
+        # The device continues while the host reads who diverged.
         if self._side_stream is not None:
             self._side_stream.wait()
-        escaped = self._host_left.numpy() & acted
-        if self.config.on_divergence == "raise" and escaped.any():
-            raise DivergedError(self._report(escaped))
-        endings = self._endings(escaped)
-        truncated = self.open & (self.elapsed >= self.config.max_cycles)
+        diverged_agents = self._host_diverged.numpy() & acted
+        if self.config.on_divergence == "raise" and diverged_agents.any():
+            raise DivergedError(self._divergence_message(diverged_agents))
+        endings = self._endings(diverged_agents)
+        truncated = self.running & (self.elapsed >= self.config.max_cycles)
         self.live &= endings == 0
         if endings.any():
             observation = self._without_ended(endings, observation)
@@ -283,35 +277,35 @@ class SpeciesWorlds(WorldState):
     def perceived(self, *, stepped: bool = False) -> Tensor:
         """Return what particles perceive, shape [B, N, P]; zeros where they or their world ended.
 
-        `stepped`: the particles are as the last step left them, so that its neighbours are used.
+        `stepped`: the particles are as after the last step, so that its neighbours are used.
         """
         if self.cohorts == [self._whole]:
             return self._whole.perceived(stepped=stepped)
         perceived = self.x.new_zeros(self.world_count, self.particle_count, self.perception_dim)
         for cohort in self.cohorts:
-            perceived[cohort.places] = cohort.perceived(stepped=stepped)
+            perceived[cohort.indices] = cohort.perceived(stepped=stepped)
         return perceived
 
     def measured(self, *, stepped: bool = False) -> dict[str, Tensor]:
         """Return the parts of every agent's loss, float32, [B, A] each; 0 for agents that ended."""
-        found: dict[str, Tensor] = {}
+        parts: dict[str, Tensor] = {}
         for cohort in self.cohorts:
             for name, part in (cohort.parts if stepped else cohort.measured()).items():
-                if name not in found:
-                    found[name] = part.new_zeros(self.live.shape)
-                found[name].index_copy_(0, cohort.worlds, part)
-        return found
+                if name not in parts:
+                    parts[name] = part.new_zeros(self.live.shape)
+                parts[name].index_copy_(0, cohort.worlds, part)
+        return parts
 
     @torch.no_grad()
     @makes_plain_tensors
     def place(self, x: Any, s: Any) -> Tensor:
         """Replace a single world's particles without a reward; return perception, [1, N, P]."""
         (cohort,) = self.cohorts
-        there = cohort.population
+        population = cohort.population
         x, s = number_tensor("x", x)[None], number_tensor("s", s)[None]
-        placed = self.checked_particles(x, s, 1, there.x.shape[1])
-        there.x.copy_(placed.x)
-        there.s.copy_(placed.s)
+        placed = self.checked_particles(x, s, 1, population.x.shape[1])
+        population.x.copy_(placed.x)
+        population.s.copy_(placed.s)
         return self._carry_over()
 
     def _carry_over(self) -> Tensor:
@@ -323,19 +317,19 @@ class SpeciesWorlds(WorldState):
     def population(self, world: int) -> Population:
         """Return the particles that are in a world."""
         self._collect()
-        columns = np.flatnonzero(self.there[world][self.owner])
+        columns = np.flatnonzero(self.present[world][self.owner])
         index = to_device_async(columns, self.device)
-        x, s = self.x[world : world + 1, index], self.s[world : world + 1, index]
-        return population_of(x, s, self.species[columns], self.config.species_count)
+        particles = self.particles.map(lambda value: value[world : world + 1, index])
+        return population_of(particles, self.species[columns], self.config.species_count)
 
     @torch.no_grad()
     @makes_plain_tensors
     def state(self) -> Tensor:
         """Return [position; state; 1] of each particle, zeros if removed, [B, N, 2 + C + 1]."""
         self._collect()
-        there = to_device_async(self.there[:, self.owner], self.device)[..., None]
-        rows = torch.cat((self.x, self.s, there.float()), dim=-1)
-        return torch.where(there, rows, 0.0)
+        present = to_device_async(self.present[:, self.owner], self.device)[..., None]
+        rows = torch.cat((self.x, self.s, present.float()), dim=-1)
+        return torch.where(present, rows, 0.0)
 
     def pictures(self, count: int) -> NDArray[np.uint8]:
         """Return pictures of the first worlds, uint8, shape [count, R, R, 3]."""
@@ -343,17 +337,17 @@ class SpeciesWorlds(WorldState):
 
     def _close_deserted(self) -> None:
         """Stop stepping worlds without live agents until they start again."""
-        deserted = self.open & ~self.live.any(axis=1)
+        deserted = self.running & ~self.live.any(axis=1)
         if deserted.any():
             self._disband()
-            self.open &= ~deserted
+            self.running &= ~deserted
 
-    def _endings(self, left: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    def _endings(self, diverged: NDArray[np.bool_]) -> NDArray[np.uint8]:
         """Return the cause that terminates each agent's episode in this step, 0: none, [B, A]."""
         live = self.live
         endings = np.zeros(live.shape, dtype=np.uint8)
         endings[live & (self._last_step == self.elapsed[:, None])] = REMOVED
-        endings[live & left] = LEFT
+        endings[live & diverged] = LEFT
         staying = live & (endings == 0)
         for world in np.flatnonzero((live & ~staying).any(axis=1)):
             present = self.agent_species[staying[world]]
@@ -362,16 +356,16 @@ class SpeciesWorlds(WorldState):
                 endings[world, staying[world]] = ALONE
         return endings
 
-    def _report(self, escaped: NDArray[np.bool_]) -> str:
+    def _divergence_message(self, diverged: NDArray[np.bool_]) -> str:
         """Return the message of the error for agents out of bounds, shape [B, A]."""
         limits, word = self.physics.limits, "particle" if self.by_particle else "species"
-        places = np.argwhere(escaped)
-        names = [f"{word}_{agent} of world {world}" for world, agent in places[:MAX_REPORT]]
-        more = f" and {len(places) - len(names)} more" if len(places) > len(names) else ""
+        indices = np.argwhere(diverged)
+        names = [f"{word}_{agent} of world {world}" for world, agent in indices[:MAX_REPORT]]
+        more = f" and {len(indices) - len(names)} more" if len(indices) > len(names) else ""
         return (
             f"agents must have a particle within position_limit = {limits.position:g} and "
             f"observation_limit = {limits.state:g}, but {', '.join(names)}{more} had none "
-            f"after step {int(self.elapsed[places[0, 0]])}: take smaller actions, raise the "
+            f"after step {int(self.elapsed[indices[0, 0]])}: take smaller actions, raise the "
             "limits, or choose on_divergence='terminate'"
         )
 
@@ -379,12 +373,12 @@ class SpeciesWorlds(WorldState):
         """Remove particles of agents that ended; return what the others perceive then."""
         self._close_deserted()
         self._disband()
-        self.there &= (endings != REMOVED) & (endings != LEFT)
-        if not self.open.any():
+        self.present &= (endings != REMOVED) & (endings != LEFT)
+        if not self.running.any():
             return observation
         # A death changes the losses of others; this is not rewarded.
         perceived = self._carry_over()
-        stays = (endings == 0) & self.open[:, None]
+        stays = (endings == 0) & self.running[:, None]
         where = to_device_async(stays, self.device)[:, self._owner, None]
         return torch.where(where, perceived, observation)
 
@@ -392,7 +386,7 @@ class SpeciesWorlds(WorldState):
     def cohorts(self) -> list[Cohort]:
         """The worlds whose episodes go on, grouped by their remaining particles."""
         if self._cohorts is None:
-            if self.open.all() and self.there.all():
+            if self.running.all() and self.present.all():
                 self._cohorts = [self._whole]
             else:
                 self._cohorts = self._gathered()
@@ -400,18 +394,18 @@ class SpeciesWorlds(WorldState):
 
     @makes_plain_tensors
     def _gathered(self) -> list[Cohort]:
-        going_on = np.flatnonzero(self.open & self.there.any(axis=1))
-        if not len(going_on):
+        running = np.flatnonzero(self.running & self.present.any(axis=1))
+        if not len(running):
             return []
-        groups, group_of = np.unique(self.there[going_on], axis=0, return_inverse=True)
+        groups, group_of = np.unique(self.present[running], axis=0, return_inverse=True)
         cohorts, parts = [], (self.task, self.physics, self.owner, self.by_particle)
-        for k, there in enumerate(groups):
-            worlds = going_on[group_of.reshape(-1) == k]
-            columns = np.flatnonzero(there[self.owner])
+        for k, present in enumerate(groups):
+            worlds = running[group_of.reshape(-1) == k]
+            columns = np.flatnonzero(present[self.owner])
             index = to_device_async(worlds, self.device)
-            places = index[:, None], to_device_async(columns, self.device)
-            x, s, random = self.x[places], self.s[places], self.random.take(index)
-            cohorts.append(Cohort(*parts, worlds, columns, x, s, random))
+            indices = index[:, None], to_device_async(columns, self.device)
+            particles = Particles(self.x[indices], self.s[indices])
+            cohorts.append(Cohort(*parts, worlds, columns, particles, self.random.take(index)))
         return cohorts
 
     def _disband(self) -> None:
@@ -423,8 +417,8 @@ class SpeciesWorlds(WorldState):
         """Copy the cohorts' particles to the batch."""
         for cohort in self._cohorts or ():
             if cohort is not self._whole:
-                self.x[cohort.places] = cohort.population.x
-                self.s[cohort.places] = cohort.population.s
+                self.x[cohort.indices] = cohort.population.x
+                self.s[cohort.indices] = cohort.population.s
                 self.random.put(cohort.worlds, cohort.random)
 
 
@@ -442,40 +436,35 @@ class Cohort:
         by_particle: bool,
         worlds: NDArray[np.int64],
         columns: NDArray[np.int64],
-        x: Tensor,
-        s: Tensor,
+        particles: Particles,
         random: WorldRandom,
     ) -> None:
-        device, config = x.device, task.config
+        device, config = particles.x.device, task.config
         self._task, self._physics, self._by_particle = task, physics, by_particle
         self.random = random
         self.worlds = to_device_async(worlds, device)
         self._columns = to_device_async(columns, device)
-        self.places = self.worlds[:, None], self._columns
+        self.indices = self.worlds[:, None], self._columns
         """Index of the particles in tensors of the batch, [B, N, ...]."""
-        kind = np.repeat(np.arange(config.species_count), config.counts)[columns]
-        self.population = population_of(x, s, kind, config.species_count)
+        species = np.repeat(np.arange(config.species_count), config.counts)[columns]
+        self.population = population_of(particles, species, config.species_count)
         """The particles."""
         self.parts: dict[str, Tensor] = {}
         """Parts of every agent's loss after the last step, shape [M, A] each."""
         self._agent_count = int(owner[-1]) + 1
-        self.gone = torch.zeros(len(worlds), self._agent_count, dtype=torch.bool, device=device)
+        self.diverged = torch.zeros(len(worlds), self._agent_count, dtype=torch.bool, device=device)
         """Which agents have no particle within bounds after the last step, shape [M, A]."""
         self._owners = to_device_async(owner[columns], device)
         self._neighbours: NeighbourState | None = None
-        self._actions = Actions(
-            x,
-            s,
-            physics,
-            random,
-            enabled=torch.ones(1, dtype=torch.uint8, device=device),
-            diverged=torch.zeros(len(worlds), dtype=torch.uint8, device=device),
-        )
+        enabled = torch.ones(1, dtype=torch.uint8, device=device)
+        diverged = torch.zeros(len(worlds), dtype=torch.uint8, device=device)
+        x, s, *_ = particles
+        self._actions = Actions(x, s, physics, random, enabled=enabled, diverged=diverged)
         self._draw = GraphedCallable(self._actions.draw, device)
         self._evaluate_graph = GraphedCallable(self._evaluate, device)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the state without neighbours, which cannot be pickled."""
+        # Neighbours cannot be pickled.
         return self.__dict__ | {"_neighbours": None}
 
     def act(self, action: Tensor) -> None:
@@ -493,11 +482,12 @@ class Cohort:
         population = population or self.population
         if not self._by_particle:
             return dict(self._task.losses(population))
-        found = {}
-        for name, loss in self._task.particle_losses(population).items():
-            found[name] = loss.new_zeros(len(loss), self._agent_count)
-            found[name].index_copy_(1, self._columns, loss)
-        return found
+        losses = self._task.particle_losses(population)
+        shape = len(population.x), self._agent_count
+        return {
+            name: loss.new_zeros(shape).index_copy_(1, self._columns, loss)
+            for name, loss in losses.items()
+        }
 
     def perceived(self, population: Population | None = None, *, stepped: bool = False) -> Tensor:
         """Return what particles perceive, shape [M, N now, P].
@@ -519,12 +509,15 @@ class Cohort:
             inside &= (x.abs() < physics.limits.position).all(dim=-1)
         # Sums of ones are exact in any order.
         count = torch.zeros(len(inside), self._agent_count, device=inside.device)
-        self.gone = count.index_add_(1, self._owners, inside.float()) == 0.0
+        self.diverged = count.index_add_(1, self._owners, inside.float()) == 0.0
         self.parts = self.measured()
         self._neighbours = build_neighbours(x, s, physics)
 
 
-def population_of(x: Tensor, s: Tensor, kind: NDArray[np.int64], species_count: int) -> Population:
-    """Return particles whose species are `kind`, [N], as a population."""
-    counts = np.bincount(kind, minlength=species_count).tolist()
-    return Population(x, s, tuple(counts), to_device_async(kind, x.device))
+def population_of(
+    particles: Particles, species: NDArray[np.int64], species_count: int
+) -> Population:
+    """Return particles of these species, [N], as a population."""
+    counts = tuple(np.bincount(species, minlength=species_count).tolist())
+    index = to_device_async(species, particles.x.device)
+    return Population(particles.x, particles.s, counts, index)

@@ -56,7 +56,7 @@ OF_ONE = {
     functools.partial(make_vec, IDS[0]): [({"world_count": 0}, "num_envs must be")],
     functools.partial(make, IDS[1]): [
         ({"seed_radius": 6.0}, "seed_radius must be below position_limit"),
-        ({"damage": "burn"}, "damage must be a known kind"),
+        ({"damage": "burn"}, "damage must be a known word"),
         ({"target": "geko"}, "target must be a built-in "),
         ({"target": "ring", "rule": None}, r"rule must say what .*\(butterfly, .*, octopus\)"),
         ({"state_dim": 8, "rule": None}, "rule must have state_dim=8"),
@@ -66,7 +66,7 @@ OF_ONE = {
             {"split": "test", "rule": None, "seed_pool": 0},
             "be 'train' where seed_pool=0",
         ),
-        ({"seed_pool": 1, "split": "eval"}, "split must be 'train' or 'test', got 'eval'"),
+        ({"seed_pool": 1, "split": "eval"}, "split must be a known word, got 'eval'"),
         # The millionth world is where those of the test split begin.
         ({"seed_pool": 1_000_001}, "seed_pool must be at most 1000000, got 1000001"),
     ],
@@ -79,7 +79,7 @@ OF_ONE = {
     functools.partial(make, POINTS): [
         ({"data": "mnisd"}, "data must be a known data set or a folder.*did you mean 'mnist'"),
         ({"boundary": "periodic"}, "boundary must be 'open' for"),
-        ({"split": "half"}, "split must be 'train' or 'test'"),
+        ({"split": "half"}, "split must be a known word, got 'half'"),
         ({"state_dim": 9}, "state_dim must be a whole number of at"),
         ({"rule": "gecko"}, "rule must be a rule with a read-out of state_dim"),
         ({"class_count": 9}, "class_count must be more than the"),

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 from crowds import still
-from gymnasium.vector import AutoresetMode
 from refusals import refused
 from small_envs import IDS, assert_batch_of_singles, assert_same, begun, make, make_vec
 
@@ -91,19 +90,6 @@ def test_action_of_a_restarting_world_may_be_anything():
     envs.step(action * np.nan)
     with pytest.raises(DivergedError, match="action must be finite"):
         envs.step(action * np.nan)
-
-
-def test_reset_mode_is_declared_twice():
-    for word, mode in (
-        ("same-step", AutoresetMode.SAME_STEP),
-        ("next-step", AutoresetMode.NEXT_STEP),
-        ("disabled", AutoresetMode.DISABLED),
-        (AutoresetMode.DISABLED, AutoresetMode.DISABLED),
-    ):
-        envs = make_vec(IDS[0], 2, autoreset_mode=word)
-        assert envs.metadata["autoreset_mode"] is mode
-        assert envs.autoreset_mode is mode
-    assert type(envs).metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
 
 
 @every_id

