@@ -304,16 +304,18 @@ def turntable_frames(
     *,
     frame_count: int = 60,
     resolution: int = 256,
+    elevation: float = 20.0,
     azimuth: float = 0.0,
     background: Background = "white",
     device: str | torch.device = "cpu",
 ) -> list[NDArray[np.uint8]]:
-    """Return pictures of a world from cameras on a circle around it, 20 degrees above the horizon.
+    """Return pictures of a world from cameras on a circle around it.
 
     Args:
         views: Returns pictures of V cameras: colours times alpha, and alpha, [1, V, H, W, 4].
         frame_count: Pictures of one turn.
         resolution: Pixels along each side.
+        elevation: Angle of the cameras above the horizon [degrees].
         azimuth: Angle of the first camera around the vertical axis [degrees].
         background: As of `to_uint8`.
         device: The world's device.
@@ -328,7 +330,7 @@ def turntable_frames(
         for k in range(frame_count):
             angle = azimuth + 360.0 * k / frame_count
             cameras = orbit(
-                1, 20.0, DISTANCE, ANGLE, width=resolution, height=resolution, azimuth=angle
+                1, elevation, DISTANCE, ANGLE, width=resolution, height=resolution, azimuth=angle
             )
             picture = views(cameras.to(torch.device(device)))[0, 0]
             frames.append(to_uint8(picture.flip(0), background))
