@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import base64
-import contextlib
 import importlib
 import math
 import os
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -133,12 +132,6 @@ def _spacing(x: Tensor) -> float:
 
 # A window on the screen, which needs pygame.
 
-_SETTINGS = {
-    "PYGAME_HIDE_SUPPORT_PROMPT": "1",
-    # SDL would turn SIGTERM into a QUIT event of the window.
-    "SDL_NO_SIGNAL_HANDLERS": "1",
-}
-
 _NO_SCREEN = ("offscreen", "dummy")
 """SDL's drivers without a screen, which `SDL_VIDEODRIVER` may select."""
 
@@ -221,8 +214,7 @@ class Window:
         """Open the window; return None, or the reason why there is no screen."""
         display = self._pygame.display
         try:
-            with _settings():
-                display.init()
+            display.init()
             driver = display.get_driver()
             if driver not in _NO_SCREEN or os.environ.get("SDL_VIDEODRIVER") == driver:
                 self._surface = display.set_mode(self.size)
@@ -236,8 +228,11 @@ class Window:
 
 
 def _import_pygame() -> Any:
+    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+    # SDL would turn SIGTERM into a QUIT event of the window.
+    os.environ.setdefault("SDL_NO_SIGNAL_HANDLERS", "1")
     try:
-        with _settings(), warnings.catch_warnings():
+        with warnings.catch_warnings():
             # pygame's use of setuptools is deprecated.
             warnings.simplefilter("ignore")
             return importlib.import_module("pygame")
@@ -246,15 +241,3 @@ def _import_pygame() -> Any:
             f"a window needs pygame, which is not installed ({error}): "
             "pip install 'npa-envs[human]', or use render_mode='rgb_array'"
         ) from error
-
-
-@contextlib.contextmanager
-def _settings() -> Iterator[None]:
-    """Set pygame's environment variables within the block, unless the user has set them."""
-    missing = {name: value for name, value in _SETTINGS.items() if name not in os.environ}
-    os.environ.update(missing)
-    try:
-        yield
-    finally:
-        for name in missing:
-            os.environ.pop(name, None)

@@ -2,7 +2,6 @@
 
 import contextlib
 import importlib
-import importlib.util
 import math
 import re
 import sys
@@ -31,7 +30,6 @@ from npa_envs.training import TASKS as TRAINED
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
-OWN = DOCS / "own_environment.md"
 TEXTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.rglob("*.md"))]
 
 every_text = pytest.mark.parametrize("path", TEXTS, ids=lambda p: p.relative_to(ROOT).as_posix())
@@ -248,33 +246,25 @@ def test_the_page_lists_tasks_with_their_ids(name):
 # The page about an own environment.
 
 
-@pytest.fixture(scope="module")
-def ring(tmp_path_factory):
-    """The module that the page about own environments shows."""
-    path = tmp_path_factory.mktemp("own") / "ring.py"
-    path.write_text(code_blocks("own_environment")[0], encoding="utf-8")
-    spec = importlib.util.spec_from_file_location("ring", path)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["ring"] = module
-    spec.loader.exec_module(module)
-    yield module
-    gym.registry.pop("my/Ring-v0")
-    del sys.modules["ring"]
-
-
-def test_the_own_environment_passes_the_check_of_gymnasium(ring, monkeypatch, recwarn):
+def test_the_own_environment_passes_gymnasiums_check_and_learns(
+    folder, monkeypatch, recwarn, capsys
+):
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    check_env(gym.make("my/Ring-v0", particle_count=64).unwrapped)
-    assert [str(warning.message) for warning in recwarn] == []
-    with pytest.raises(npa_envs.NPAError, match="did you mean 'ring_radius'"):
-        gym.make("my/Ring-v0", ringradius=0.3)
-
-
-def test_the_other_code_about_own_environments_runs_and_learns(ring, monkeypatch, capsys):
-    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    names = {"gym": gym}
-    for k in range(1, len(code_blocks("own_environment"))):
-        run_code("own_environment", names=names, blocks=slice(k, k + 1))
+    monkeypatch.syspath_prepend(folder)
+    blocks = code_blocks("own_environment")
+    (folder / "ring.py").write_text(blocks[0], encoding="utf-8")
+    importlib.import_module("ring")
+    try:
+        check_env(gym.make("my/Ring-v0", particle_count=64).unwrapped)
+        assert [str(warning.message) for warning in recwarn] == []
+        with pytest.raises(npa_envs.NPAError, match="did you mean 'ring_radius'"):
+            gym.make("my/Ring-v0", ringradius=0.3)
+        names = {"gym": gym}
+        for k in range(1, len(blocks)):
+            run_code("own_environment", names=names, blocks=slice(k, k + 1))
+    finally:
+        gym.registry.pop("my/Ring-v0")
+        del sys.modules["ring"]
     first, last = map(float, capsys.readouterr().out.split(" -> "))
     assert last < 0.5 * first
 

@@ -167,27 +167,19 @@ def test_every_source_file_keeps_to_the_layers(path: Path) -> None:
 
 
 WRONG = [
-    ("npa_envs.kernels.portable.sort", "import torch"),
     ("npa_envs.kernels.portable.sort", "from npa_envs.ops import perceive"),
-    ("npa_envs.reference", "import warp as wp"),
     ("npa_envs.rule.rule", "import warp"),
     ("npa_envs.world.rollout", "def f():\n    import warp"),
-    ("npa_envs.world.rollout", "from npa_envs.kernels import domain"),
     ("npa_envs.ops.new", "from npa_envs.reference import splat"),
     ("npa_envs.world.rollout", "from ..tasks import targets"),
-    ("npa_envs.tasks.new", "from npa_envs.training import trainer"),
-    ("npa_envs.tasks.new", "import matplotlib.pyplot"),
     ("npa_envs.training.new", "import importlib\nimportlib.import_module('warp')"),
-    ("npa_envs.training.new", "import npa_envs"),
     ("npa_envs.envs.new", "from npa_envs.ops.pictures.splat import splat"),
     ("npa_envs.envs.new", "from ..kernels import domain"),
-    ("npa_envs.envs.new", "import stable_baselines3"),
     ("npa_envs.unheard_of", ""),
 ]
 RIGHT = [
     ("npa_envs.kernels.portable.sort", "import math\nimport warp as wp\nfrom . import domain"),
     ("npa_envs.ops.launch", "import torch\nimport warp\nfrom npa_envs.kernels import domain"),
-    ("npa_envs.envs.new", "import gymnasium\nfrom npa_envs import tasks, world"),
     ("npa_envs.agents.new", "import npa_envs\nfrom npa_envs.envs import new"),
 ]
 

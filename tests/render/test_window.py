@@ -81,14 +81,6 @@ def test_a_new_window_takes_the_place_of_the_old_one(screen):
     new.close()
 
 
-def test_the_environment_is_left_as_it_was(screen, monkeypatch):
-    for name in ("PYGAME_HIDE_SUPPORT_PROMPT", "SDL_NO_SIGNAL_HANDLERS"):
-        monkeypatch.delenv(name, raising=False)
-    before = dict(os.environ)
-    Window("a world", 32).close()
-    assert dict(os.environ) == before
-
-
 @pytest.mark.parametrize("driver", ["not a driver", None])
 def test_without_a_screen_it_warns_once_and_does_nothing(monkeypatch, driver):
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER"):
