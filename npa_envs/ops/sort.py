@@ -22,14 +22,7 @@ from npa_envs.ops.backend import (
     multiprocessor_count,
     rollout_listing,
 )
-from npa_envs.ops.launch import (
-    aligned,
-    channel_width,
-    is_aligned,
-    is_recorded,
-    launch,
-    scalar_type,
-)
+from npa_envs.ops.launch import aligned, channel_width, is_aligned, is_recorded, launch, scalar_type
 from npa_envs.ops.physics import Physics
 
 MAX_INDEX = 2**31 - 1
