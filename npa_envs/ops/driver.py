@@ -117,17 +117,9 @@ class DriverLaunch:
         self._addresses = addresses
         early = _Attribute(PROGRAMMATIC_STREAM_SERIALIZATION)
         early.value.flag = 1
+        shared_bytes = launch.hooks.forward_smem_bytes
         self._config = _Config(
-            1,
-            1,
-            1,
-            self._block,
-            1,
-            1,
-            launch.hooks.forward_smem_bytes,
-            None,
-            ctypes.pointer(early),
-            0,
+            1, 1, 1, self._block, 1, 1, shared_bytes, None, ctypes.pointer(early), 0
         )
         self._place = ctypes.byref(self._config)
 

@@ -22,14 +22,7 @@ from npa_envs.ops.backend import (
     multiprocessor_count,
     rollout_listing,
 )
-from npa_envs.ops.launch import (
-    aligned,
-    channel_width,
-    is_aligned,
-    is_recorded,
-    launch,
-    scalar_type,
-)
+from npa_envs.ops.launch import aligned, channel_width, is_aligned, is_recorded, launch, scalar_type
 from npa_envs.ops.physics import Physics
 
 MAX_INDEX = 2**31 - 1
@@ -244,7 +237,6 @@ def sort_worlds(
         plan.domain,
         x,
         mask,
-        int(plan.masked),
         plan.particle_count,
         plan.active_offset,
         cell,
@@ -252,17 +244,7 @@ def sort_worlds(
         counts,
     )
     starts = torch.cumsum(counts, 0, dtype=torch.int32)
-    launch(
-        kernels.place_by_arrival,
-        total,
-        device,
-        mask,
-        int(plan.masked),
-        cell,
-        arrival,
-        starts,
-        arrived,
-    )
+    launch(kernels.place_by_arrival, total, device, mask, cell, arrival, starts, arrived)
 
     ordered = _empty_worlds(plan, x, s is not None, with_rows, starts)
     on_cuda = plan.runs("sort", aligned=False) == "cuda"
@@ -333,7 +315,6 @@ def _sort_by_threads(
         plan.domain,
         x,
         mask,
-        int(plan.masked),
         plan.particle_count,
         plan.state_dim,
         plan.group_count,
@@ -370,7 +351,6 @@ def _sort_by_blocks(
         1 if s is None else plan.group_count * plan.width // THREAD_CHANNELS,
         int(plan.state_dim % THREAD_CHANNELS == 0),
         s,
-        int(plan.masked),
         mask,
         *plan.row_numbers,
         *ordered,

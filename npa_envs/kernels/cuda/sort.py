@@ -135,7 +135,6 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
         parts: int,
         aligned: int,
         states: wp.array[scalar],
-        masked: int,
         mask: wp.array[wp.uint8],
         active_offset: int,
         row_base: int,
@@ -161,6 +160,7 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
         lane = thread_of_block()
         first_particle = world * particle_count
         first_cell = world * domain.cell_count
+        masked = mask.shape[0] > 0
         ahead = positions_ahead()
         acting = flags_ahead()
         for turn in range(wp.static(turns)):
@@ -169,10 +169,10 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
             for d in range(wp.static(space_dim)):
                 ahead[turn, d] = position[d]
             acting[turn] = wp.int32(1)
-            if masked != 0:
+            if masked:
                 acting[turn] = wp.int32(mask[first_particle + i])
         earlier = wp.int32(0)
-        if masked != 0:
+        if masked:
             earlier = count_active(mask, first_particle)
         elif lane == 0:
             earlier = first_particle
@@ -194,7 +194,7 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
         for cell in range(from_cell + lane, to_cell, wp.static(block)):
             start = start_of(memory, cell)
             store_integer(starts, first_cell + cell, first_particle + start[0])
-            if masked != 0:
+            if masked:
                 store_integer(starts, active_offset + first_cell + cell, row_base + start[1])
         is_last_world = first_particle + particle_count == positions.shape[0]
         if lane == 0 and slice_number == 0 and is_last_world:

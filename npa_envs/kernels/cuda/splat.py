@@ -55,7 +55,6 @@ def sort_small_splats(capacity: int) -> wp.Kernel:
         positions: wp.array[vector],
         states: wp.array2d[scalar],
         shift: scalar,
-        centred: int,
         goal: wp.array[vector],
         # outputs
         starts: wp.array[wp.int32],
@@ -69,13 +68,13 @@ def sort_small_splats(capacity: int) -> wp.Kernel:
         lane = thread_of_block()
         first_particle = world * particle_count
         mean = vector()
-        if centred != 0:
+        if goal.shape[0] > 0:
             mean = mean_of_world(positions, first_particle, particle_count)
         memory = block_memory()
         clear_counts(memory, view.cell_count, wp.int32(0))
         for i in range(lane, particle_count, wp.static(block)):
             position = load_vector(positions, first_particle + i)
-            place = pixel_place(view, position, centred, mean, goal)
+            place = pixel_place(view, position, mean, goal)
             arrive(memory, i, cell_of_centre(view, patch_centre(place)), False)
         add_up_counts(memory, view.cell_count)
         first_cell = world * view.cell_count
@@ -103,7 +102,7 @@ def sort_small_splats(capacity: int) -> wp.Kernel:
                 target = ranked_at(memory, k, view.cell_count - 1)[0]
                 if target >= begin and target < end:
                     i = first_particle + member_at(memory, k)
-                    place = pixel_place(view, load_vector(positions, i), centred, mean, goal)
+                    place = pixel_place(view, load_vector(positions, i), mean, goal)
                     target += first_particle
                     store_footprint(footprints, target, footprint_of(view, place, i, states, shift))
                     store_integer(source, target, i)

@@ -168,7 +168,7 @@ __device__ inline float density_of_tile(
     const wp::array_t<wp::vec_t<2, float>>& sorted_positions, int base, int first, int k,
     bool inside, int row, const wp::array_t<wp::int16>& lists, const wp::array_t<int>& list_lengths)
 {
-    static_assert(SIZE == TILE && MIN_SIDE == MIN_TILED_BOX, "as in tiles.py");
+    static_assert(SIZE == TILE && MIN_SIDE == MIN_TILED_BOX, "as in density.py");
     __shared__ TileMemory<CAPACITY> memory;
     const int lane = threadIdx.x & 31, part = lane & (TILE_LANES - 1);
     const float2* positions = reinterpret_cast<const float2*>(sorted_positions.data);

@@ -145,12 +145,10 @@ def splat_functions(scalar: type) -> SimpleNamespace:
         return fast_exp2(offset * (slope - falloff * offset))
 
     @wp.func
-    def pixel_place(
-        view: View, position: vector, centred: int, mean: vector, goal: wp.array[vector]
-    ):
-        """Return a particle's position in pixels; `centred`: its world's mean is at the goal."""
+    def pixel_place(view: View, position: vector, mean: vector, goal: wp.array[vector]):
+        """Return a particle's position in pixels; if there is a goal, its world's mean is there."""
         moved = position
-        if centred != 0:
+        if goal.shape[0] > 0:
             moved = (position - mean) + goal[0]
         return vector(
             (moved[0] - view.low) * view.pixels_per_length,
@@ -319,24 +317,18 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
 
     @wp.func
     def place_in_world(
-        view: View,
-        position: vector,
-        centred: int,
-        means: wp.array[vector],
-        goal: wp.array[vector],
-        world: int,
+        view: View, position: vector, means: wp.array[vector], goal: wp.array[vector], world: int
     ):
         mean = vector()
-        if centred != 0:
+        if goal.shape[0] > 0:
             mean = means[world]
-        return pixel_place(view, position, centred, mean, goal)
+        return pixel_place(view, position, mean, goal)
 
     @wp.kernel(enable_backward=False, module=module)
     def count_splats(
         view: View,
         particle_count: int,
         positions: wp.array[vector],
-        centred: int,
         means: wp.array[vector],
         goal: wp.array[vector],
         # outputs
@@ -349,7 +341,7 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         await_earlier()
         i = wp.tid()
         world = i / particle_count
-        place = place_in_world(view, positions[i], centred, means, goal, world)
+        place = place_in_world(view, positions[i], means, goal, world)
         index = world * view.cell_count + cell_of_centre(view, patch_centre(place))
         cell[i] = index
         arrival[i] = wp.atomic_add(counts, index + 1, 1)
@@ -374,7 +366,6 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         positions: wp.array[vector],
         states: wp.array2d[scalar],
         shift: scalar,
-        centred: int,
         means: wp.array[vector],
         goal: wp.array[vector],
         cell: wp.array[wp.int32],
@@ -390,7 +381,7 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         i = arrived[k]
         c = cell[i]
         world = i / particle_count
-        place = place_in_world(view, positions[i], centred, means, goal, world)
+        place = place_in_world(view, positions[i], means, goal, world)
         footprint = footprint_of(view, place, i, states, shift)
         begin = starts[c]
         target = k
@@ -455,7 +446,6 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         positions: wp.array[vector],
         states: wp.array2d[scalar],
         shift: scalar,
-        centred: int,
         means: wp.array[vector],
         goal: wp.array[vector],
         scratch: wp.array2d[scalar],
@@ -468,7 +458,7 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         """Draw a world, particle after particle; for devices with few threads."""
         world = range_start + wp.tid()
         for i in range(world * particle_count, (world + 1) * particle_count):
-            place = place_in_world(view, positions[i], centred, means, goal, world)
+            place = place_in_world(view, positions[i], means, goal, world)
             footprint = footprint_of(view, place, i, states, shift)
             footprints[i] = footprint
             source[i] = i

@@ -34,7 +34,6 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
         domain: Domain,
         positions: wp.array[vector],
         mask: wp.array[wp.uint8],
-        masked: int,
         particle_count: int,
         active_offset: int,
         # outputs
@@ -49,13 +48,12 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
         index += cell_index(domain, cell_of(domain, positions[i]))
         cell[i] = index
         arrival[i] = wp.atomic_add(counts, index + 1, 1)
-        if masked != 0 and mask[i] != wp.uint8(0):
+        if mask.shape[0] > 0 and mask[i] != wp.uint8(0):
             wp.atomic_add(counts, active_offset + index + 1, 1)
 
     @wp.kernel(enable_backward=False, module=module)
     def place_by_arrival(
         mask: wp.array[wp.uint8],
-        masked: int,
         cell: wp.array[wp.int32],
         arrival: wp.array[wp.int32],
         starts: wp.array[wp.int32],
@@ -69,7 +67,7 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
         await_earlier()
         i = wp.tid()
         entry = 2 * i
-        if masked == 0 or mask[i] != wp.uint8(0):
+        if mask.shape[0] == 0 or mask[i] != wp.uint8(0):
             entry += 1
         c = load_integer(cell, i)
         place = load_integer(starts, c) + load_integer(arrival, i)
@@ -138,7 +136,6 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
         domain: Domain,
         positions: wp.array[vector],
         mask: wp.array[wp.uint8],
-        masked: int,
         particle_count: int,
         state_dim: int,
         group_count: int,
@@ -169,18 +166,19 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
         first_cell = world * domain.cell_count
         end_cell = first_cell + domain.cell_count
         first_row = row_base
-        if masked != 0:
+        masked = mask.shape[0] > 0
+        if masked:
             for i in range(first):
                 first_row += wp.int32(mask[i])
         for c in range(first_cell, end_cell):
             starts[c] = 0
-            if masked != 0:
+            if masked:
                 starts[active_offset + c] = 0
         for i in range(first, end):
             c = first_cell + cell_index(domain, cell_of(domain, positions[i]))
             cell[i] = c
             starts[c] = starts[c] + 1
-            if masked != 0:
+            if masked:
                 starts[active_offset + c] = starts[active_offset + c] + wp.int32(mask[i])
         place = first
         row = first_row
@@ -188,12 +186,12 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
             count = starts[c]
             starts[c] = place
             place += count
-            if masked != 0:
+            if masked:
                 count = starts[active_offset + c]
                 starts[active_offset + c] = row
                 row += count
         if end == positions.shape[0]:
-            starts[starts.shape[0] - 1] = wp.where(masked != 0, row, place)
+            starts[starts.shape[0] - 1] = wp.where(masked, row, place)
 
         # Each start is increased with every particle placed, up to the next cell's start.
         for i in range(first, end):
@@ -204,7 +202,7 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
             sorted_cell[place] = c
             sorted_positions[place] = positions[i]
             row = place
-            if masked != 0:
+            if masked:
                 row = starts[active_offset + c] - row_base
                 active = wp.int32(mask[i])
                 starts[active_offset + c] = row + row_base + active
@@ -222,10 +220,10 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
         for back in range(end_cell - first_cell - 1):
             c = end_cell - 1 - back
             starts[c] = starts[c - 1]
-            if masked != 0:
+            if masked:
                 starts[active_offset + c] = starts[active_offset + c - 1]
         starts[first_cell] = first
-        if masked != 0:
+        if masked:
             starts[active_offset + first_cell] = first_row
 
     return named(count_cells, place_by_arrival, order_particles, sort_worlds)

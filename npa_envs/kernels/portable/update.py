@@ -234,11 +234,8 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         moving: int,
         position_limit: scalar,
         state_limit: scalar,
-        masked: int,
         mask: wp.array[wp.uint8],
-        noisy: int,
         noise: wp.array[vector],
-        switched: int,
         enabled: wp.array[wp.uint8],
         state_dim: int,
         aligned: int,
@@ -257,10 +254,10 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         i = t / chunks
         chunk = t - i * chunks
         happens = wp.uint8(1)
-        if switched != 0:
+        if enabled.shape[0] > 0:
             happens = enabled[0]
         acting = wp.uint8(1)
-        if masked != 0:
+        if mask.shape[0] > 0:
             acting = mask[i]
         # A thread has some adjacent channels of a particle, if it reads and writes them at once, or
         # channels at a constant stride, so that adjacent threads access adjacent numbers.
@@ -290,7 +287,7 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         # A particle's first thread also moves it.
         if chunk == 0:
             position = positions[i]
-            if noisy != 0:
+            if noise.shape[0] > 0:
                 push = noise[i]
             if moving != 0:
                 for d in range(wp.static(space_dim)):
@@ -324,7 +321,7 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
                         if c < state_dim:
                             states[states_begin + c] = after[k]
             if chunk == 0:
-                if noisy != 0:
+                if noise.shape[0] > 0:
                     position += push
                 if moving != 0 and acting != wp.uint8(0):
                     length = wp.length(direction)

@@ -61,14 +61,13 @@ class Splats(NamedTuple):
         """Arguments of kernels: particles of a world, positions, states, shift."""
         return self.x.shape[1], self.x.view(-1, 2), self.states.view(self.total, -1), self.shift
 
-    def aim(self) -> tuple[int, Tensor | None]:
-        """Arguments of kernels: whether worlds are moved, and the goal."""
-        return (0, None) if self.goal is None else (1, self.goal.view(1, 2))
+    def aim(self) -> Tensor | None:
+        """Argument of kernels: the goal, or None where worlds are not moved."""
+        return None if self.goal is None else self.goal.view(1, 2)
 
-    def places(self) -> tuple[Any, ...]:
-        """Arguments of kernels for moving worlds: whether they are moved, means, goal."""
-        moved, goal = self.aim()
-        return moved, world_mean(self.x) if moved else None, goal
+    def places(self) -> tuple[Tensor | None, Tensor | None]:
+        """Arguments of kernels for moving worlds: means and goal."""
+        return None if self.goal is None else world_mean(self.x), self.aim()
 
 
 def splat_lanes(device: torch.device) -> int:
@@ -116,7 +115,7 @@ def sort_splats(splats: Splats, view: Any) -> tuple[Tensor, Tensor, Tensor]:
             view,
             slices,
             *splats.contents(),
-            *splats.aim(),
+            splats.aim(),
             starts,
             footprints,
             source,
