@@ -33,6 +33,7 @@ from npa_envs.web.live import (
 )
 from npa_envs.world.brushes import inside_ball, removed, wipe_state
 from npa_envs.world.division import living
+from npa_envs.world.particles import Particles
 from npa_envs.world.rollout import at_rest, rollout
 from npa_envs.world.species import AGREEMENTS, rollout_species
 
@@ -273,11 +274,11 @@ class RuleWorld(LiveWorld):
             )  # fmt: skip
         return path_length
 
-    def _particles(self) -> tuple[Tensor, Tensor]:
-        return self.x, self.s
+    def _particles(self) -> Particles:
+        return Particles(self.x, self.s)
 
-    def _place(self, x: Tensor, s: Tensor) -> None:
-        self.x, self.s = x, s
+    def _place(self, particles: Particles) -> None:
+        self.x, self.s = particles.x, particles.s
 
     def _coloured(self) -> ColouredWorld:
         x, s, travelled, updated = self.x, self.s, self._travelled, self._updated
