@@ -36,7 +36,7 @@ FRAME = "document.page.frame"
 @contextlib.contextmanager
 def served(rule: str, folder: Path, device: str) -> Iterator[str]:
     """Serve a rule and yield the page's address."""
-    command = [sys.executable, "-m", "npa_envs.cli", "view", rule, "--no-browser", "--port", "0"]
+    command = [sys.executable, "-m", "npa_envs", "view", rule, "--no-browser", "--port", "0"]
     command += ["--out", str(folder / "films"), "--device", device]
     with subprocess.Popen(command, stdout=subprocess.PIPE, encoding="utf-8") as server:
         assert server.stdout is not None

@@ -21,6 +21,7 @@ from npa_envs.ops import species_fields
 from npa_envs.render.colours import GOLDEN_ANGLE, STATE_CHROMA, STATE_GAIN, ramp, srgb
 from npa_envs.tasks.damage import check_damage, damage_worlds
 from npa_envs.world.brushes import clump, cut, inject, push, state_around
+from npa_envs.world.particles import Particles
 
 MAX_STEPS = 64
 """Most steps between two frames."""
@@ -161,7 +162,7 @@ class LiveWorld(ABC):
             case "set":
                 return self._set(str(message.get("name")), message.get("value"))
             case "brush":
-                return self._brush(Touch.read(message, self._particles()[0]))
+                return self._brush(Touch.read(message, self._particles().x))
             case "damage":
                 check_damage(name := message.get("name"))
                 self._damage(str(name))
@@ -211,11 +212,11 @@ class LiveWorld(ABC):
     def _run(self, steps: int) -> None: ...
 
     @abstractmethod
-    def _particles(self) -> tuple[Tensor, Tensor]:
-        """Return positions [1, N, D] and states [1, N, C]."""
+    def _particles(self) -> Particles:
+        """Return the world as a batch of one."""
 
     @abstractmethod
-    def _place(self, x: Tensor, s: Tensor) -> None:
+    def _place(self, particles: Particles) -> None:
         """Replace positions and states."""
 
     @abstractmethod
@@ -232,11 +233,12 @@ class LiveWorld(ABC):
     def _shows(self) -> list[str]: ...
 
     def _damage(self, name: str) -> None:
-        self._place(*damage_worlds(*self._particles(), kind=name))
+        particles = self._particles()
+        self._place(Particles(*damage_worlds(particles.x, particles.s, kind=name)))
 
     def _brush(self, touch: Touch) -> bool:
         """Apply a brush, and return whether `describe` has changed."""
-        self._place(*brushed(*self._particles(), touch, self.box))
+        self._place(brushed(self._particles(), touch, self.box))
         return False
 
     def _set(self, name: str, value: Any) -> bool:
@@ -305,31 +307,28 @@ class Touch(NamedTuple):
         )
 
 
-def brushed(
-    x: Tensor, s: Tensor, touch: Touch, box: tuple[float, ...] | None
-) -> tuple[Tensor, Tensor]:
-    """Return x and s after push, clump, cut or inject, which keep all particles."""
+def brushed(particles: Particles, touch: Touch, box: tuple[float, ...] | None) -> Particles:
+    """Return particles after push, clump, cut or inject, which keep their number."""
+    x, s = particles.x, particles.s
+    disk: dict[str, Any] = {"radius": touch.radius, "box": box}
     match touch.tool:
         case "push":
-            moved = push(
-                x, centre=touch.at, move=touch.move, radius=touch.radius, box=box,
-                strength=min(1.0, MIN_PUSH + touch.strength),
-            )  # fmt: skip
-            return moved, s
+            strength = min(1.0, MIN_PUSH + touch.strength)
+            return Particles(
+                push(x, centre=touch.at, move=touch.move, strength=strength, **disk), s
+            )
         case "clump":
             factor = CLUMP_RATE * touch.strength
-            return clump(x, s, centre=touch.at, radius=touch.radius, factor=factor, box=box)
+            return Particles(*clump(x, s, centre=touch.at, factor=factor, **disk))
         case "cut":
             half = 0.5 * touch.move
-            return cut(
-                x, s, centre=touch.at + half, normal=_normal(touch), along=half,
-                gap=touch.radius, box=box,
-            )  # fmt: skip
+            line: dict[str, Any] = {"centre": touch.at + half, "normal": _normal(touch)}
+            return Particles(*cut(x, s, along=half, gap=touch.radius, box=box, **line))
         case "inject":
-            disk: dict[str, Any] = {"radius": touch.radius, "box": box}
             state, exists = state_around(x, s, centre=touch.source, **disk)
-            strength = INJECT_RATE * touch.strength * exists.to(x.dtype)
-            return x, inject(x, s, centre=touch.at, state=state, strength=strength, **disk)
+            weight = INJECT_RATE * touch.strength * exists.to(x.dtype)
+            s = inject(x, s, centre=touch.at, state=state, strength=weight, **disk)
+            return Particles(x, s)
     raise NPAError(
         f"this world keeps its particles, so that the brush {shown(touch.tool)} does nothing: take "
         "push, clump, cut or inject"

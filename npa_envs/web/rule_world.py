@@ -33,6 +33,7 @@ from npa_envs.web.live import (
 )
 from npa_envs.world.brushes import inside_ball, removed, wipe_state
 from npa_envs.world.division import living
+from npa_envs.world.particles import Particles
 from npa_envs.world.rollout import at_rest, rollout
 from npa_envs.world.species import AGREEMENTS, rollout_species
 
@@ -182,13 +183,13 @@ class RuleWorld(LiveWorld):
 
     def _may_join(self, name: str) -> bool:
         """Return whether particles of another rule can be put into this world."""
-        own = self.main.rule
+        main = self.main.rule
         try:
             other = self._live_rule(name).rule
         except NPAError:
             return False
-        alike = all(getattr(other, field) == getattr(own, field) for field in AGREEMENTS)
-        return alike and not (other.divides or own.divides)
+        agree = all(getattr(other, field) == getattr(main, field) for field in AGREEMENTS)
+        return agree and not (other.divides or main.divides)
 
     def _ranges(self) -> dict[str, Range]:
         eps0, box = self.main.rule.eps0, self.box
@@ -210,9 +211,9 @@ class RuleWorld(LiveWorld):
         if name == "rule":
             self._plant(value)
         elif name == "count" and name in self._ranges():
-            number = self._ranges()[name].checked(name, value)
-            if number != self.count:
-                self.trained = self._trained(self.main.name, int(number))
+            count = int(self._ranges()[name].checked(name, value))
+            if count != self.count:
+                self.trained = self._trained(self.main.name, count)
                 self.reset(self.seed)
         else:
             return super()._set(name, value)
@@ -253,8 +254,8 @@ class RuleWorld(LiveWorld):
 
     def _is_unchanged(self) -> bool:
         """Return whether no brush has added or removed particles or rules."""
-        parts = [(live_rule.count, live_rule.divisor) for live_rule in self.live_rules]
-        return parts == [(self.count, self.count)]
+        species = [(live_rule.count, live_rule.divisor) for live_rule in self.live_rules]
+        return species == [(self.count, self.count)]
 
     def _rollout(self, steps: int, options: Mapping[str, Any]) -> Tensor:
         """Run steps and return the path length of each particle."""
@@ -273,11 +274,11 @@ class RuleWorld(LiveWorld):
             )  # fmt: skip
         return path_length
 
-    def _particles(self) -> tuple[Tensor, Tensor]:
-        return self.x, self.s
+    def _particles(self) -> Particles:
+        return Particles(self.x, self.s)
 
-    def _place(self, x: Tensor, s: Tensor) -> None:
-        self.x, self.s = x, s
+    def _place(self, particles: Particles) -> None:
+        self.x, self.s = particles.x, particles.s
 
     def _coloured(self) -> ColouredWorld:
         x, s, travelled, updated = self.x, self.s, self._travelled, self._updated

@@ -60,7 +60,7 @@ def grow(name):
 def run_and_kill(task, folder):
     """Write the folder of a run that was killed between two checkpoints."""
     with tempfile.TemporaryDirectory() as place:
-        command = [sys.executable, "-m", "npa_envs.cli", "train", task, *OPTIONS]
+        command = [sys.executable, "-m", "npa_envs", "train", task, *OPTIONS]
         process = subprocess.Popen([*command, "--out", "run"], cwd=place)
         log = Path(place) / "run" / "log.jsonl"
         while process.poll() is None:

@@ -23,6 +23,7 @@ from npa_envs.web.environment_world import EnvironmentWorld, make_environment
 from npa_envs.web.live import ColouredWorld, Colouring, signed_colours, species_colours
 from npa_envs.web.rule_world import RuleWorld, RunWorld
 from npa_envs.world.division import living
+from npa_envs.world.particles import Particles
 
 CPU = torch.device("cpu")
 COUNT = 96
@@ -666,7 +667,7 @@ def test_the_speed_of_a_step_across_an_edge_of_the_box_is_that_of_the_step():
     world = EnvironmentWorld(env, lambda observation: action)
     x, s = world._inner.particles()
     x[:, 0] = 1.0 - 1e-4
-    world._place(x[None], s[None])
+    world._place(Particles(x[None], s[None]))
     put(world, show="speed")
     world.advance()
     after = world._inner.particles()[0]
@@ -709,7 +710,7 @@ def test_hands_reach_into_environments(episodes):
     assert not np.array_equal(episodes.frame().positions, after)
     x, states = episodes._inner.particles()
     states[:, 0] = x[:, 0]
-    episodes._place(x[None], states[None])
+    episodes._place(Particles(x[None], states[None]))
     episodes.handle(brush("inject", source=[0.1, 0.0], radius=0.2, strength=1.0))
     assert not torch.equal(episodes._inner.particles()[1], states)
     with pytest.raises(NPAError, match="keeps its particles, so that the brush 'remove'"):

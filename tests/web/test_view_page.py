@@ -236,7 +236,7 @@ def test_a_3d_world_turns_under_the_pointer(shown, painter, tmp_path):
 
 @pytest.mark.slow
 def test_the_command_prints_its_link_and_ends_by_ctrl_c(new_page, tmp_path):
-    command = [sys.executable, "-m", "npa_envs.cli", "view", "heart", "--particle-count", "128"]
+    command = [sys.executable, "-m", "npa_envs", "view", "heart", "--particle-count", "128"]
     command += ["--no-browser", "--port", "0", "--out", str(tmp_path)]
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, encoding="utf-8"
