@@ -8,6 +8,7 @@ from typing import Any, Self
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.checks import (
@@ -297,7 +298,7 @@ class ViewSchedule:
         index = random.choice(self._view_count, len(self.index), replace=False).astype(np.int64)
         backgrounds = random.random(self.backgrounds.shape, dtype=np.float32)
         sigma = config.blur_sigma * max(0.0, 1.0 - iteration / config.blur_iterations)
-        values = index, backgrounds, np.array(sigma, dtype=np.float32)
+        values: tuple[NDArray[Any], ...] = index, backgrounds, np.array(sigma, dtype=np.float32)
         for tensor, value in zip((self.index, self.backgrounds, self.sigma), values, strict=True):
             tensor.copy_(to_device_async(value, tensor.device))
 

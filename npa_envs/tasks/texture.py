@@ -22,9 +22,9 @@ from npa_envs.ops import periodic_splat
 from npa_envs.rule.rule import COLOUR_OFFSET
 from npa_envs.tasks.base import ParticleTask, TaskConfig, path_lengths, shares_of_loss
 from npa_envs.tasks.damage import random_particle
+from npa_envs.tasks.losses.pieces import LossOptions
 from npa_envs.tasks.losses.texture import (
     DEFAULT_LOSS,
-    LossOptions,
     TextureLoss,
     check_loss_name,
     is_joint,

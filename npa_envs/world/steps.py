@@ -190,7 +190,7 @@ class RuleStep(Step):
         total = row_count(mask, x, physics.update_prob) if rows is None else len(rows.row_source)
         huge = total > ROWS_KEPT and not torch.is_grad_enabled() and self.static is None
         if huge and not torch.compiler.is_compiling():
-            update, active = updates_in_parts(x, s, physics, mask, network, total, width)
+            update, active = updates_in_parts(x, s, physics, mask, network.__call__, total, width)
         else:
             perception, active = perceive_rows(
                 x.detach() if self.detach_positions else x,

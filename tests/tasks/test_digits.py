@@ -119,19 +119,20 @@ def test_points_lie_on_the_ink_and_the_first_row_is_the_highest():
 
 
 def test_coverage_is_the_share_of_the_unit_square(tmp_path):
-    cpu = torch.device("cpu")
-    for name, shape in (("square", (12, 12)), ("wide", (3, 12)), ("high", (12, 6))):
-        folder = tmp_path / name
-        folder.mkdir()
-        images, label = np.full((2, *shape), 255, np.uint8), np.arange(2, dtype=np.uint8)
-        (folder / "train-images-idx3-ubyte").write_bytes(idx(images))
-        (folder / "train-labels-idx1-ubyte").write_bytes(idx(label))
-        clouds = load_clouds(str(folder), "train", 20, device=cpu)
-        assert clouds.coverage == shape[0] * shape[1] / 144
+    images = (pictures(COUNTS["train"], 0)[0] / 255.0).astype(np.float32)
+    cases = {shape: np.ones((2, *shape), np.float32) for shape in ((12, 12), (3, 12), (12, 6))}
     # In a square picture it is the share of the picture, to the last bit.
-    images, _ = pictures(COUNTS["train"], 0)
-    clouds = load_clouds(str(write_idx(tmp_path / "idx")), "train", 20, device=cpu)
-    assert clouds.coverage == sample_ink((images / 255.0).astype(np.float32), 20)[1]
+    for number, ink in enumerate((*cases.values(), images)):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        label = np.arange(len(ink), dtype=np.uint8)
+        (folder / "train-images-idx3-ubyte").write_bytes(idx((255 * ink).round().astype(np.uint8)))
+        (folder / "train-labels-idx1-ubyte").write_bytes(idx(label))
+        clouds = load_clouds(str(folder), "train", 20, device=torch.device("cpu"))
+        height, width = ink.shape[1:]
+        square = height * width / max(height, width) ** 2
+        assert clouds.coverage == sample_ink(ink, 20)[1] * square
+        assert (clouds.coverage == square) == (ink is not images)
 
 
 def test_points_are_spread_evenly():
@@ -155,15 +156,13 @@ def test_a_cloud_does_not_depend_on_the_others_nor_on_the_device(device, monkeyp
 
 def test_turned_clouds_keep_their_distances_and_their_middle():
     x = torch.rand(40, 9, 2, dtype=torch.float64)
-    generator = torch.Generator().manual_seed(1)
-    turned = varied(x, rotation=30.0, stretch=0.0, jitter=0.0, generator=generator)
+    turned = varied(x, 30.0, 0.0, 0.0, torch.Generator().manual_seed(1))
     torch.testing.assert_close(torch.cdist(turned, turned), torch.cdist(x, x))
     torch.testing.assert_close((turned - 0.5).norm(dim=-1), (x - 0.5).norm(dim=-1))
     angles = [torch.atan2(*(cloud - 0.5)[:, 0].T.flip(0)) for cloud in (turned, x)]
     turn = torch.rad2deg(torch.remainder(angles[0] - angles[1] + torch.pi, 2 * torch.pi)) - 180
-    assert turn.abs().max() <= 30.0
-    assert turn.min() < -15.0
-    assert turn.max() > 15.0
+    assert -30.0 <= turn.min() < -15.0
+    assert 15.0 < turn.max() <= 30.0
 
 
 def test_stretched_clouds_are_linear_and_shaken_ones_are_off_by_a_little():

@@ -60,43 +60,22 @@ def test_pictures_change_with_life_as_if_particles_were_taken_away():
 
 
 def test_damage_takes_about_half_of_the_particles_and_never_the_last():
-    task, none = make_task(damage_radius=0.1), make_task(damage_radius=0.0)
-    x, s = (value.repeat(50, 1, 1) for value in half_alive(task))
-    after = task.damage(Particles(x, s), torch.Generator().manual_seed(0))[1]
+    x, s = (value.repeat(50, 1, 1) for value in half_alive(make_task()))
+
+    def damaged(s, radius=0.1):
+        task = make_task(damage_radius=radius)
+        return task.damage(Particles(x, s), torch.Generator().manual_seed(0)).s
+
+    after = damaged(s)
     gone = living(s) & ~living(after)
     # Of 3200, with a standard deviation of 28; wherever they are.
     assert abs(int(gone.sum()) - 1600) < 120
     assert 20 < int(gone[:, :32].sum(dim=0).min()) < int(gone[:, :32].sum(dim=0).max()) < 80
     assert torch.equal(after[~gone], s[~gone])
     assert not after[gone].any()
-    assert torch.equal(none.damage(Particles(x, s), torch.Generator().manual_seed(0))[1], s)
+    assert torch.equal(damaged(s, radius=0.0), s)
     s[:, 1:] = 0.0
-    assert torch.equal(task.damage(Particles(x, s), torch.Generator().manual_seed(0))[1], s)
-
-
-def trained(tmp_path, iterations=4, **fields):
-    """The rule after a few iterations."""
-    options = {
-        "particle_count": 32, "target_point_count": 32, "steps": (12, 13), "pool_size": 4,
-        "world_count": 2, "learning_rate": 1e-3, "schedule": "milestones", "iterations": 1000,
-        "weight_decay": 0.0, "picture_interval": 0, "tensorboard": False,
-    } | fields  # fmt: skip
-    config = preset("tiny", "morphogenesis2d", division=True, out=tmp_path, **options)
-    trainer = Trainer(Morphogenesis2D(config.task), config, task_name="morphogenesis2d")
-    for _ in range(iterations):
-        trainer.iterate()
-    return trainer.rule
-
-
-def test_rest_says_nothing_of_fates(tmp_path, monkeypatch):
-    monkeypatch.setattr(optimiser, "FATE_RATE", 1.0)
-    # Old worlds are to rest, but what is born in them is no unrest; pictures do not count.
-    rest = {"stillness_weight": 1.0, "max_age_range": (12, 48), "stillness_min_age": 12}
-    rest["damage_share"] = 0.0
-    rule = trained(tmp_path, 8, splat_weight=0.0, drift_weight=0.0, **rest)
-    assert rule.divides
-    assert rule.fate.bias.tolist() == list(FIRST_FATES)
-    assert rule.output.weight.any()
+    assert torch.equal(damaged(s), s)
 
 
 def test_births_are_no_unrest(tmp_path):
@@ -123,11 +102,18 @@ def test_births_are_no_unrest(tmp_path):
 
 
 def test_fates_learn_at_their_share_of_the_learning_rate(tmp_path, monkeypatch):
+    options = {
+        "particle_count": 32, "target_point_count": 32, "steps": (12, 13), "pool_size": 4,
+        "learning_rate": 1e-3, "picture_interval": 0,
+    }  # fmt: skip
     changes = []
     for rate in (1.0, 0.01):
         monkeypatch.setattr(optimiser, "FATE_RATE", rate)
-        rule = trained(tmp_path / str(rate), 1)
-        changes.append((rule.fate.bias - torch.tensor(FIRST_FATES)).abs().max().item())
+        folder = tmp_path / str(rate)
+        config = preset("tiny", "morphogenesis2d", division=True, out=folder, **options)
+        trainer = Trainer(Morphogenesis2D(config.task), config, task_name="morphogenesis2d")
+        trainer.iterate()
+        changes.append((trainer.rule.fate.bias - torch.tensor(FIRST_FATES)).abs().max().item())
     # AdamW's first step is the learning rate.
     assert changes[0] == pytest.approx(1e-3, rel=0.01)
     assert changes[1] == pytest.approx(1e-5, rel=0.05)

@@ -235,7 +235,8 @@ def _views(path: Path, resolution: int, count: int) -> Views:
     except NPAError as error:
         raise NPAError(f"cannot read {file} as JSON: {error}") from error
     content = content if isinstance(content, dict) else {}
-    angle, frames = content.get("camera_angle_x"), content.get("frames")
+    angle: Any = content.get("camera_angle_x")
+    frames = content.get("frames")
     if not is_real(angle) or not 0.0 < angle < math.pi:
         raise NPAError(
             f"camera_angle_x in {file} must be an angle between 0 and pi radians, "
