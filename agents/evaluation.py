@@ -85,9 +85,10 @@ def evaluate_policy(env: Any, policy: Callable[[Any], Any], seeds: Iterable[int]
     run = _run_single if single else _run
     batches = [seeds[k : k + count] for k in range(0, len(seeds), count)]
     results = [run(env, policy, [*batch, *batch[-1:] * (count - len(batch))]) for batch in batches]
-    columns = [np.concatenate(column)[: len(seeds)] for column in zip(*results, strict=True)]
-    *numbers, endings = columns
-    return Episodes(*numbers, tuple(endings.tolist()))
+    returns, start_losses, final_losses, steps, endings = (
+        np.concatenate(column)[: len(seeds)] for column in zip(*results, strict=True)
+    )
+    return Episodes(returns, start_losses, final_losses, steps, tuple(endings.tolist()))
 
 
 def checked_seeds(name: str, seeds: Iterable[int]) -> list[int]:

@@ -171,7 +171,7 @@ class ScriptedShepherd(BrushPolicy):
 class GradientGardener(BrushPolicy):
     """Plan by the gradient of rewards through brushes, rule and picture.
 
-    In each step it simulates the worlds for `horizon` steps, with random masks of its own and
+    In each step it simulates the worlds for `horizon` steps, with separate random masks and
     without damage, and improves the actions by Adam, starting from those of `ScriptedGardener` or
     `ScriptedShepherd`. It takes the first step of the best plan.
 

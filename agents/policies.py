@@ -186,10 +186,8 @@ class Policy:
         """Return the actions of agents that observe [P] or [N_k, P] or [B, N_k, P]."""
         if not observations:
             return {}
-        rows = {
-            agent: torch.atleast_2d(torch.as_tensor(values))
-            for agent, values in observations.items()
-        }
+        rows = {agent: torch.as_tensor(values) for agent, values in observations.items()}
+        rows = {agent: part if part.ndim > 1 else part[None] for agent, part in rows.items()}
         spans = self._spans({agent: values.shape[-2] for agent, values in rows.items()})
         first = next(iter(rows.values()))
         count = max(span.stop for span in spans.values())

@@ -213,7 +213,7 @@ def _stored_row(
         if facts.get(name) != value:
             raise NPAError(
                 f"{str(path)!r} must have the {name} {shown(value)} for runs to be added, got "
-                f"{shown(facts.get(name))}: {hint}, or give the method a name of its own"
+                f"{shown(facts.get(name))}: {hint}, or give the method another name"
             )
     return row
 

@@ -250,7 +250,7 @@ def curve(records: Sequence[RunRecord], across: Callable[[CurvePoint], float]) -
     for record in [record for record in records if record.status == "done"] or records:
         points = [(across(p), p.mean_return) for p in record.curve if np.isfinite(p.mean_return)]
         if points:
-            lines.append(tuple(zip(*points, strict=True)))
+            lines.append(np.array(points).T)
     if not lines:
         return None
     first, last = max(line[0][0] for line in lines), min(line[0][-1] for line in lines)
@@ -323,7 +323,7 @@ def write_strips(records: Sequence[RunRecord], folder: Path) -> list[Path]:
         for seed, method in itertools.product(sorted({seed for seed, _ in runs}), methods):
             run = runs.get((seed, method))
             frames.append(np.full((SIZE, SIZE, 3), 255, np.uint8))
-            result = "not run" if run is None else run.status
+            result: str = "not run" if run is None else run.status
             if run is not None and run.status == "done":
                 result = f"loss {run.mean_loss:.3f}"
             if run is not None and (path := folder / run.job.folder / PICTURE).exists():

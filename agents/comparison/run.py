@@ -114,12 +114,9 @@ class RunRequest:
 
     job: Job
     facts: dict[str, Any]
-    threads: int = 1
     command: str = ""
     teacher: str = ""
     """Folder of the run whose rules are cloned, if any."""
-    lasts: bool = False
-    """Whether the process waits for another request afterwards."""
 
     @classmethod
     def read(cls, folder: Path) -> RunRequest:
@@ -146,7 +143,6 @@ def run(folder: Path, device: str) -> None:
     Errors are recorded, so that other runs can continue.
     """
     request = RunRequest.read(folder)
-    torch.set_num_threads(request.threads)
     begin = time.perf_counter()
     curve: list[CurvePoint] = []
     status: Status = "done"
@@ -229,19 +225,17 @@ def main(folder: Path) -> None:
     # Loads the method's libraries. Errors are raised again, and recorded, by `run`.
     with contextlib.suppress(Exception):
         method_options(request.facts["method"])
-    lasts = request.lasts
-    run(folder, lines.get())
-    while lasts:
-        folder = Path(json.loads(lines.get()))
+    while True:
+        run(folder, lines.get())
         for stream in (sys.stdout, sys.stderr):
             stream.flush()
-        with (folder / OUTPUT).open("wb") as output:
-            for number in (1, 2):
-                os.dup2(output.fileno(), number)
-        run(folder, lines.get())
         # Free the memory of a run for the next one.
         gc.collect()
         torch.cuda.empty_cache()
+        folder = Path(json.loads(lines.get()))
+        with (folder / OUTPUT).open("wb") as output:
+            for number in (1, 2):
+                os.dup2(output.fileno(), number)
 
 
 # The parent process. The start of a process (libraries, a GPU's context, kernels) takes longer than
@@ -266,8 +260,7 @@ class _Process(Child):
     @property
     def over(self) -> bool:
         """Whether the run has ended."""
-        recorded = self.request.lasts and (self.folder / RECORD).exists()
-        return recorded or self.process.poll() is not None
+        return (self.folder / RECORD).exists() or self.process.poll() is not None
 
     def go(self, device: str) -> None:
         """Start the run on a device."""
@@ -344,14 +337,16 @@ def run_jobs(
             if teacher not in ahead:
                 waiting.remove(job)
                 taught = "" if teacher is None else str(folder / teacher.folder)
-                last = lasts(plan, job)
-                request = RunRequest(job, plan.facts(job), places.threads, command, taught, last)
-                return _start(request, folder, idle)
+                request = RunRequest(job, plan.facts(job), command, taught)
+                return _start(request, folder, places.threads, idle if lasts(plan, job) else [])
         return None
 
     def finished(one: _Process) -> None:
+        again = lasts(plan, one.request.job)
+        if not again:
+            one.process.communicate()
         record = _finish(one, folder)
-        if one.request.lasts and record.status in MEASURED and one.process.poll() is None:
+        if again and record.status in MEASURED and one.process.poll() is None:
             idle.append(one.process)
         else:
             one.process.communicate()
@@ -375,19 +370,21 @@ def run_jobs(
             process.communicate()
 
 
-def _start(request: RunRequest, folder: Path, idle: list[subprocess.Popen[bytes]]) -> _Process:
+def _start(
+    request: RunRequest, folder: Path, threads: int, idle: list[subprocess.Popen[bytes]]
+) -> _Process:
     """Return the process of a run, an idle or a new one, which waits for its device."""
     target = folder / request.job.folder
     part = target.parent / f".{target.name}.{secrets.token_hex(4)}"
     part.mkdir(parents=True)
     write_record(part / REQUEST, asdict(request))
-    if request.lasts and idle:
+    if idle:
         # The process opens this file itself, unless it dies before.
         (part / OUTPUT).touch()
         process = idle.pop()
         _send(process, json.dumps(str(part)))
         return _Process(request, part, process)
-    environment = os.environ | {"OMP_NUM_THREADS": str(request.threads)}
+    environment = os.environ | {"OMP_NUM_THREADS": str(threads)}
     with (part / OUTPUT).open("wb") as output:
         process = subprocess.Popen(
             [*PROGRAM, str(part)],
@@ -402,8 +399,6 @@ def _start(request: RunRequest, folder: Path, idle: list[subprocess.Popen[bytes]
 def _finish(one: _Process, folder: Path) -> RunRecord:
     """Move the results of an ended run into its folder, and return its record."""
     request = one.request
-    if not request.lasts:
-        one.process.communicate()
     record = RunRecord.read(one.folder, request.facts)
     if record is None:
         code = one.process.returncode

@@ -15,7 +15,7 @@ from npa_envs.checks import check_fraction, check_positive, is_real
 from npa_envs.errors import NPAError, shown
 
 STORED_STEPS = 64
-"""Last steps of all worlds that are learned from, if they are not collected all at once."""
+"""Last steps of all worlds that are learned from, or `collect_steps` if that is more."""
 
 VARIANCE_FLOOR = 1e-8
 """Added to the variance of the teacher's actions, which may be 0."""

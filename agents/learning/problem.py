@@ -1,6 +1,6 @@
 """Problems to learn: an environment with its keywords, its worlds, and the seeds of runs.
 
-Each run has seeds of its own for its worlds; evaluations have others.
+Each run has other seeds for its worlds, and evaluations have others again.
 """
 
 from __future__ import annotations
@@ -63,11 +63,11 @@ RowRewards = Literal["particle", "marginal"]
 ROW_REWARDS = get_args(RowRewards)
 
 ELSEWHERE = {
-    "num_envs": "it is a field of Problem",
-    "world_count": "set the field num_envs of Problem",
-    "max_episode_steps": "set the field episode_steps of Problem",
-    "max_cycles": "set the field episode_steps of Problem",
-    "episode_steps": "it is a field of Problem",
+    **dict.fromkeys(("num_envs", "world_count"), "set the field num_envs of Problem"),
+    **dict.fromkeys(
+        ("max_episode_steps", "max_cycles", "episode_steps"),
+        "set the field episode_steps of Problem",
+    ),
     "device": "it is given to train and make_envs",
     "output": "learners are given tensors",
     "autoreset_mode": "learners' worlds restart in the step that ends their episodes",

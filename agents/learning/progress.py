@@ -117,11 +117,10 @@ class Progress:
     With a default process group of torch, all processes use the clock of rank 0, each evaluates the
     same episodes, and rank 0 reports and writes.
 
-    Args are those of `npa_envs.agents.learning.train`, but for:
-
     Args:
         initial: Rules to begin with, which are copied; None: new ones.
         run: Settings of the run, of JSON's types, which must be equal when it is resumed.
+        others: As of `npa_envs.agents.learning.train`.
 
     Raises:
         NPAError: Seeds are missing or wrong, or the number of entries is not positive. Or as for
@@ -345,9 +344,9 @@ class Progress:
             if not self.ranks.first:
                 return
             curve = [asdict(entry) for entry in self.log]
-            counts = {"iteration": self._run.iteration, "particle_steps": self.particle_steps}
-            counts |= {"part": self._part, "seconds": self._agreed_seconds}
-            self._run.keep({"learner": self._settings, "curve": curve, **counts, **state})
+            state |= {"learner": self._settings, "curve": curve, "iteration": self._run.iteration}
+            state |= {"part": self._part, "seconds": self._agreed_seconds}
+            self._run.keep(state | {"particle_steps": self.particle_steps})
             rules.save(folder.path)
             lines = [" ".join(json_text(line).split()) for line in curve]
             write_text(folder.log, "\n".join(lines) + "\n")

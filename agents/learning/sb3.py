@@ -10,7 +10,7 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 from gymnasium.spaces import Dict, Space
@@ -105,7 +105,8 @@ def train(progress: Progress, options: WorldOptions = DEFAULTS) -> RuleSet:
         device=device,
     )
     policy: Any = model.policy
-    return callback.learn(model, policy.actor.rules)
+    rules: RuleSet = policy.actor.rules
+    return callback.learn(model, rules)
 
 
 def world_kl(particle_kl: float) -> float:
@@ -252,11 +253,14 @@ class GardenOptions:
     """Discount of a reward one step later (dimensionless)."""
     learning_rate: float = 3e-4
     """Adam's learning rate."""
+    counts: ClassVar[tuple[str, ...]] = ()
+    """Names of the fields that are whole numbers."""
 
     def __post_init__(self) -> None:
         """Check every field; raises NPAError."""
         check_fraction(self, "gamma")
         check_positive(self, float, "learning_rate")
+        check_positive(self, int, *self.counts)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -265,11 +269,7 @@ class SACOptions(GardenOptions):
 
     learning_starts: int = 1000
     """Steps of worlds before the first gradient step."""
-
-    def __post_init__(self) -> None:
-        """Check every field; raises NPAError."""
-        super().__post_init__()
-        check_positive(self, int, "learning_starts")
+    counts = ("learning_starts",)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -280,12 +280,7 @@ class GardenPPOOptions(GardenOptions):
     """Steps of each world in a round."""
     batch_size: int = 64
     """Steps of worlds in a minibatch, at least 2."""
-
-    def __post_init__(self) -> None:
-        """Check every field; raises NPAError."""
-        super().__post_init__()
-        check_positive(self, int, "steps")
-        check_positive(self, int, "batch_size", at_least=2)
+    counts = ("steps", "batch_size")
 
 
 SAC_DEFAULTS, GARDEN_PPO_DEFAULTS = SACOptions(), GardenPPOOptions()
@@ -302,9 +297,12 @@ def train_garden_ppo(
     progress: Progress, options: GardenPPOOptions = GARDEN_PPO_DEFAULTS
 ) -> GardenPolicy:
     """Return the policy that PPO (Schulman et al., arXiv 1707.06347) finds within a budget."""
-    if options.steps * progress.problem.num_envs < 2:
-        raise NPAError("steps must be at least 2 in a single world, got 1: give steps=32")
     size = options.batch_size
+    if min(options.steps * progress.problem.num_envs, size) < 2:
+        raise NPAError(
+            "a round and a minibatch must have at least 2 steps of worlds, got "
+            f"steps={options.steps} and batch_size={size}: give steps=32 and batch_size=64"
+        )
     return _garden_policy(PPO, progress, options, n_steps=options.steps, batch_size=size)
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -54,7 +55,7 @@ def import_ribs() -> Any:
 def make_archive(weight_count: int, axes: tuple[Axis, ...], seed: int = 0) -> Any:
     """Return an empty `ribs.archives.GridArchive` of candidates with `weight_count` weights.
 
-    Only qualities above 0 are kept: other worlds are dead or blew up. Elites are drawn by the seed.
+    Only qualities above 0 are kept: other worlds are dead or diverged. Elites are drawn by `seed`.
     """
     return import_ribs().archives.GridArchive(
         solution_dim=weight_count,
@@ -67,23 +68,20 @@ def make_archive(weight_count: int, axes: tuple[Axis, ...], seed: int = 0) -> An
     )
 
 
-class RandomProposals:
+class RandomEmitter:
     """Random candidates, whose standard deviations of weights are log-uniform."""
 
     def __init__(self, archive: Any, batch_size: int, seed: int) -> None:
-        self._archive = archive
+        self.solution_dim: int = archive.solution_dim
         self._batch_size = batch_size
         self._draws = np.random.default_rng(seed)
-        self._last: Numbers = np.empty((0, archive.solution_dim))
 
     def ask(self) -> Numbers:
         """Return candidates, shape [K, W]."""
-        self._last = drawn(self._draws, self._batch_size, self._archive.solution_dim)
-        return self._last
+        return drawn(self._draws, self._batch_size, self.solution_dim)
 
-    def tell(self, objective: Numbers, measures: Numbers) -> None:
-        """Add the last candidates to the archive."""
-        self._archive.add(self._last, objective, measures)
+    def tell(self, *_: Any, **results: Any) -> None:
+        """Ignore the results."""
 
 
 def drawn(draws: np.random.Generator, count: int, weight_count: int) -> Numbers:
@@ -93,52 +91,43 @@ def drawn(draws: np.random.Generator, count: int, weight_count: int) -> Numbers:
 
 
 def _map_elites(archive: Any, batch_size: int, seed: int) -> Any:
-    emitter = import_ribs().emitters.GaussianEmitter(
+    return import_ribs().emitters.GaussianEmitter(
         archive,
         sigma=MUTATION,
         initial_solutions=drawn(np.random.default_rng(seed), batch_size, archive.solution_dim),
         batch_size=batch_size,
         seed=seed,
     )
-    return _scheduler(archive, emitter)
 
 
-def _evolution(ranker: str, restart_rule: str) -> Callable[[Any, int, int], Any]:
-    def make(archive: Any, batch_size: int, seed: int) -> Any:
-        ribs = import_ribs()
-        from cma.sigma_adaptation import CMAAdaptSigmaCSA
+def _evolution(ranker: str, restart_rule: str, archive: Any, batch_size: int, seed: int) -> Any:
+    ribs = import_ribs()
+    from cma.sigma_adaptation import CMAAdaptSigmaCSA
 
-        # For more than 300 weights cma's default depends on the order of candidates, which pyribs
-        # changes.
-        options = {"CMA_diagonal": True, "AdaptSigma": CMAAdaptSigmaCSA}
-        emitter = ribs.emitters.EvolutionStrategyEmitter(
-            archive,
-            x0=np.zeros(archive.solution_dim),
-            sigma0=FIRST_STEP,
-            ranker=ranker,
-            restart_rule=restart_rule,
-            es="pycma_es",
-            es_kwargs={"opts": options},
-            batch_size=batch_size,
-            seed=seed,
-        )
-        return _scheduler(archive, emitter)
-
-    return make
-
-
-def _scheduler(archive: Any, emitter: Any) -> Any:
-    return import_ribs().schedulers.Scheduler(archive, [emitter])
+    # For more than 300 weights cma's default depends on the order of candidates, which pyribs
+    # changes.
+    options = {"CMA_diagonal": True, "AdaptSigma": CMAAdaptSigmaCSA}
+    return ribs.emitters.EvolutionStrategyEmitter(
+        archive,
+        x0=np.zeros(archive.solution_dim),
+        sigma0=FIRST_STEP,
+        ranker=ranker,
+        restart_rule=restart_rule,
+        es="pycma_es",
+        es_kwargs={"opts": options},
+        batch_size=batch_size,
+        seed=seed,
+    )
 
 
 METHODS: Mapping[str, Callable[[Any, int, int], Any]] = {
     "map-elites": _map_elites,
-    "cma-me": _evolution("2imp", "no_improvement"),
-    "cma-es": _evolution("obj", "basic"),
-    "random": RandomProposals,
+    "cma-me": partial(_evolution, "2imp", "no_improvement"),
+    "cma-es": partial(_evolution, "obj", "basic"),
+    "random": RandomEmitter,
 }
-"""Functions that make a scheduler, as of pyribs, from an archive, a batch size and a seed: `ask`
-returns candidates [K, W], `tell` takes their qualities and descriptors and fills the archive.
+"""Functions that make an emitter of pyribs, whose `ask` returns candidates [K, W], from an archive,
+a batch size and a seed.
 
 `map-elites` mutates random elites. `cma-me` (arXiv 1912.02400) is CMA-ES that ranks new cells
 before better elites. `cma-es` ranks by quality only. Both adapt a diagonal covariance. `random`
@@ -247,7 +236,8 @@ class Search:
         self._batches: list[Batch] = []
         self.archive = make_archive(self.candidates.weight_count, self.axes, seed)
         """The elites, a `ribs.archives.GridArchive`."""
-        self._proposals = METHODS[method](self.archive, batch_size, seed)
+        emitter = METHODS[method](self.archive, batch_size, seed)
+        self._proposals = import_ribs().schedulers.Scheduler(self.archive, [emitter])
         self._replay()
 
     @property

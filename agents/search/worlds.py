@@ -190,11 +190,15 @@ class Candidates:
         x, s, path = rollout(RuleStack(self._rule, weights), x, s, world.steps, **options)
         travelled = (path[-1] - path[late - 1]).mean(dim=1) / ((SNAPSHOTS - late) * every)
         speeds = travelled.view(count, -1).mean(dim=1) / world.eps
-        later = Particles(x, s).map(lambda values: values[late:].unflatten(1, (count, -1)))
+        later = Particles(x, s).map(
+            lambda values: values[late:].view(SNAPSHOTS - late, count, -1, *values.shape[2:])
+        )
         found: list[Found | None] = []
         for k in range(count):
-            own = later.map(lambda values, k=k: values[:, k])
-            quality = float(quality_of(own)) if all(v.isfinite().all() for v in own[:2]) else 0.0
+            own = Particles(later.x[:, k], later.s[:, k])
+            quality = (
+                float(quality_of(own)) if all(v.isfinite().all() for v in own.tensors()) else 0.0
+            )
             if quality > 0.0:
                 crowding, mixing = self.crowding_and_mixing(own.map(lambda v: v.flatten(0, 1)))
                 found.append(Found(quality, (float(speeds[k]), crowding, mixing)))
@@ -223,7 +227,7 @@ def quality_of(worlds: Particles) -> Tensor:
     training penalises. alive = twice the standard deviation over the T times of a particle's colour
     channels, averaged: 1 if each flickers between 0 and 1.
     """
-    excess = [(values - values.clamp(-1.0, 1.0)).abs().mean() for values in worlds[:2]]
+    excess = [(values - values.clamp(-1.0, 1.0)).abs().mean() for values in worlds.tensors()]
     alive = 2.0 * _colours(worlds).std(dim=0, correction=0).mean()
     return alive / (1.0 + excess[0] + excess[1])
 

@@ -209,7 +209,10 @@ REFUSED = {
         ({"method": "gradient", "problem": INVASION}, "gradients .* each other's expense"),
         ({"method": "gradient", "problem": DYING}, "gradients must keep all particles"),
         ({"method": "evolution", "problem": problem(env_id=GARDEN)}, "known word, got 'evolution'"),
-        ({"method": "ppo_world", "problem": ALONE, "steps": 1}, "at least 2 in a single world"),
+        (
+            {"method": "ppo_world", "problem": ALONE, "steps": 1},
+            "at least 2 steps of worlds",
+        ),
         (
             {"method": "ppo_world", "problem": heart(num_envs=1), "steps": 4},
             "minibatches must have at",

@@ -63,7 +63,7 @@ while True:
     }}
     (folder / "part").write_text(json.dumps(record))
     os.replace(folder / "part", folder / "run.json")
-    line = sys.stdin.readline() if request["lasts"] else ""
+    line = sys.stdin.readline()
     if not line: break
     folder = Path(json.loads(line))
 """
