@@ -314,9 +314,8 @@ def brushed(particles: Particles, touch: Touch, box: tuple[float, ...] | None) -
     match touch.tool:
         case "push":
             strength = min(1.0, MIN_PUSH + touch.strength)
-            return Particles(
-                push(x, centre=touch.at, move=touch.move, strength=strength, **disk), s
-            )
+            x = push(x, centre=touch.at, move=touch.move, strength=strength, **disk)
+            return Particles(x, s)
         case "clump":
             factor = CLUMP_RATE * touch.strength
             return Particles(*clump(x, s, centre=touch.at, factor=factor, **disk))

@@ -46,7 +46,7 @@ def grow(name):
     # As many particles as are stored fill a smaller ball.
     fields = {"seed_radius": 0.25} if rule.space_dim == 3 else {}
     count, steps, seed = WORLDS[name]
-    source = str(scenes.KEPT_RULES.get(name, name))
+    source = str(scenes.FORMER_RULES.get(name, name))
     task = task_of_rule(source, rule, torch.device("cpu"), particle_count=count, **fields).task
     used = {"eps": task.eps, "box": task.box}
     assert used == scenes.RULES[name], f"{name} is run with {used}"

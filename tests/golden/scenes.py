@@ -28,19 +28,19 @@ RULES = {
 }
 """Shipped rules with the radius [length units] and the box of the task of each."""
 
-KEPT_RULES = {
+FORMER_RULES = {
     "dots": GOLDEN.with_name("dots.safetensors"),
     "duck": "duck-v0",
     "gecko": "gecko-v0",
     "heart": "heart-first",
 }
-"""Rules that are no longer shipped as they were when their worlds were stored."""
+"""The former versions of rules that have changed since their worlds were stored."""
 
 DTYPES = {"f32": torch.float32, "f64": torch.float64}
 
 
-def kept(values, limit=512):
-    """Return an array as it is, or where it is larger than a limit every so-manyth number of it."""
+def thinned(values, limit=512):
+    """Return an array, or evenly spaced numbers of it if it is larger than a limit."""
     array = values.detach().numpy() if isinstance(values, Tensor) else np.asarray(values)
     if array.size <= limit:
         return array.copy()
@@ -62,7 +62,7 @@ def functional(*tensors):
 
 def rule_named(name, dtype=torch.float32):
     """Return the rule whose world is stored under a name."""
-    return npa_envs.load_rule(KEPT_RULES.get(name, name)).to(dtype)
+    return npa_envs.load_rule(FORMER_RULES.get(name, name)).to(dtype)
 
 
 def stored_world(name, dtype):
@@ -82,7 +82,7 @@ def random_world(seed, particle_count, sides, channels, dtype):
 
 
 def watched(x, s):
-    """Return positions and states that gradients are taken by."""
+    """Return positions and states that require gradients."""
     return x.detach().requires_grad_(), s.detach().requires_grad_()
 
 
@@ -93,7 +93,7 @@ def gradients(loss, x, s, *rules):
         prefix = f"rule{k}." if len(rules) > 1 else ""
         named |= {prefix + name: parameter for name, parameter in rule.named_parameters()}
     got = torch.autograd.grad(loss, list(named.values()), allow_unused=True)
-    return {f"grad/{n}": kept(g) for n, g in zip(named, got, strict=True) if g is not None}
+    return {f"grad/{n}": thinned(g) for n, g in zip(named, got, strict=True) if g is not None}
 
 
 def by_precision(scene):
@@ -118,7 +118,7 @@ def grown(dtype, name, steps):
     options = {"generator": npa_envs.WorldRandom([7, 8]), "return_path_length": True}
     x, s, path = npa_envs.rollout(rule, x, s, steps, **options, **RULES[name])
     found = {"x": x, "s": s, "path": path, "outputs": rule.read_out(s), "colour": rule.colour(s)}
-    return {name: kept(tensor) for name, tensor in found.items()}
+    return {name: thinned(tensor) for name, tensor in found.items()}
 
 
 @by_precision
@@ -131,7 +131,7 @@ def differentiated(dtype, name, steps, **options):
     loss = functional(after_x, after_s, rule.read_out(after_s))
     if path.requires_grad:
         loss = loss + functional(path)
-    results = {"x": kept(after_x), "s": kept(after_s), "path": kept(path)}
+    results = {"x": thinned(after_x), "s": thinned(after_s), "path": thinned(path)}
     return results | gradients(loss, x, s, rule)
 
 
@@ -145,7 +145,7 @@ def untrained(dtype, space_dim, box, **parts):
     after = npa_envs.rollout(rule, x, s, 3, eps=0.25, box=box, **options)
     one = npa_envs.step(rule, x.detach(), s.detach(), eps=0.25, box=box, update_prob=1.0)
     results = {"x": after[0], "s": after[1], "step/x": one[0], "step/s": one[1]}
-    results = {name: kept(tensor) for name, tensor in results.items()}
+    results = {name: thinned(tensor) for name, tensor in results.items()}
     return results | gradients(functional(*after), x, s, rule)
 
 
@@ -162,14 +162,14 @@ def perceived(dtype, sides, periodic):
     for inverse in ("threshold", "smooth"):
         fields = npa_envs.perception_fields(x, s, eps, box, moment_inverse=inverse)
         names = fields._fields if inverse == "threshold" else ("grad1",)
-        results |= {f"{inverse}/{n}": kept(getattr(fields, n), 400) for n in names}
+        results |= {f"{inverse}/{n}": thinned(getattr(fields, n), 400) for n in names}
         own, options = watched(x, s), {"detach_positions": False, "moment_inverse": inverse}
         z = npa_envs.perceive(*own, eps, 0.8 * eps, box, **options)
-        found = {"z": kept(z)} | gradients(functional(z), *own)
+        found = {"z": thinned(z)} | gradients(functional(z), *own)
         results |= {f"{inverse}/{name}": array for name, array in found.items()}
-    results["detached/z"] = kept(npa_envs.perceive(x, s, eps, box=box, state_gradient=False))
-    results["plain/z"] = kept(npa_envs.perceive(x, s, eps, box=box, moment_correction=False))
-    return results | {"mean": kept(npa_envs.world_mean(s))}
+    results["detached/z"] = thinned(npa_envs.perceive(x, s, eps, box=box, state_gradient=False))
+    results["plain/z"] = thinned(npa_envs.perceive(x, s, eps, box=box, moment_correction=False))
+    return results | {"mean": thinned(npa_envs.world_mean(s))}
 
 
 @by_precision
@@ -178,9 +178,9 @@ def perceived_by_species(dtype, sides, periodic):
     x, s = watched(*random_world(31, 120, sides, 4, dtype))
     box, counts = sides if periodic else None, (60, 47, 13)
     fields = npa_envs.species_fields(x.detach(), counts, eps=0.3, box=box)
-    results = {name: kept(getattr(fields, name)) for name in fields._fields}
+    results = {name: thinned(getattr(fields, name)) for name in fields._fields}
     z = npa_envs.perceive_species(x, s, counts, 0.3, 0.25, box, detach_positions=False)
-    return results | {"z": kept(z)} | gradients(functional(z), x, s)
+    return results | {"z": thinned(z)} | gradients(functional(z), x, s)
 
 
 # Rollouts of several rules.
@@ -198,7 +198,7 @@ def together(dtype, perception, box, steps, **options):
     options |= {"counts": counts, "eps": 0.25, "box": box, "perception": perception}
     options |= {"generator": npa_envs.WorldRandom([5, 9]), "return_path_length": True}
     after = npa_envs.rollout_species(rules, x, s, steps, **options)
-    results = {n: kept(a) for n, a in zip(("x", "s", "path"), after, strict=True)}
+    results = {n: thinned(a) for n, a in zip(("x", "s", "path"), after, strict=True)}
     return results | gradients(functional(*after), x, s, *rules)
 
 
@@ -212,7 +212,7 @@ def shipped_together(dtype):
     options = {"counts": counts, "density_counts": counts, "update_prob": (0.5, 0.8)}
     generator = torch.Generator().manual_seed(2)
     after = npa_envs.rollout_species(rules, x, s, 4, generator=generator, **options)
-    return {"x": kept(after[0]), "s": kept(after[1])}
+    return {"x": thinned(after[0]), "s": thinned(after[1])}
 
 
 # Environments.
@@ -246,7 +246,7 @@ def actions(generator, space):
 
 
 def floats(info):
-    """Return the numbers among what is told besides, by name in order."""
+    """Return the losses and rewards of an info, by name in order."""
     return [info[name] for name in sorted(info) if name.startswith(("loss", "reward_"))]
 
 
@@ -270,16 +270,16 @@ def episode(name, steps=12, **keywords):
             observation, info = env.reset()
             observations.append(observation)
     results = {
-        "observations": kept(np.stack(observations), 1100),
+        "observations": thinned(np.stack(observations), 1100),
         "reset": losses,
         "reports": np.stack(reports),
         "ends": np.array(ends),
         "picture": np.asarray(env.render()),
     }
     if shares:
-        results["shares"] = kept(np.stack(shares))
+        results["shares"] = thinned(np.stack(shares))
     particles = zip("xs", env.unwrapped.particles(), strict=True)
-    results |= {part: kept(tensor) for part, tensor in particles}
+    results |= {part: thinned(tensor) for part, tensor in particles}
     env.close()
     return results
 
@@ -314,10 +314,10 @@ def crowd(module, task, **keywords):
         reports.append(np.array(report, np.float32).ravel())
         ends.append(np.array([[terminated[a], truncated[a]] for a in chosen]).ravel())
     results = {
-        "observations": kept(np.concatenate(seen), 1100),
+        "observations": thinned(np.concatenate(seen), 1100),
         "reports": np.concatenate(reports),
         "ends": np.concatenate(ends),
-        "state": kept(env.state()),
+        "state": thinned(env.state()),
         "picture": np.asarray(env.render()),
     }
     env.close()

@@ -45,7 +45,7 @@ TRAINED = ("morphogenesis2d", "co_morphogenesis2d", "morphogenesis3d", "texture"
 
 
 def flat(value, name, into):
-    """Put what a scene returned under names."""
+    """Store all arrays of a result under names."""
     if isinstance(value, dict):
         for key, part in value.items():
             flat(part, f"{name}/{key}", into)

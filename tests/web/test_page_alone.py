@@ -89,6 +89,17 @@ def test_each_brush_sends_its_messages_at_its_time(run):
     }
 
 
+def test_the_key_f_shows_the_whole_world(run):
+    centre, zoom = run("""
+        listen(frame(1, [4, 0, 6, 2]));
+        page.camera.zoom = 9;
+        page.key({ key: "f", target: { matches: () => false }, preventDefault() {} });
+        return [page.camera.centre, page.camera.zoom];
+    """)
+    assert centre == [5, 1, 0]
+    assert math.isclose(zoom, 1.1 / 1.15)
+
+
 def test_a_film_that_is_ready_leaves_the_next_recording_alone(run):
     recording, button, pressed = run("""
         page.record(true);

@@ -163,21 +163,6 @@ def test_every_tool_and_every_show_works(shown):
     assert page.run("document.getElementById('message').hidden")
 
 
-def test_a_world_that_is_out_of_sight_is_found(shown):
-    page, _ = shown()
-    pause(page)
-    page.run("document.page.camera.centre = [50, 0, 0]; document.page.camera.zoom = 9")
-    assert place_of(page, *positions(page).mean(axis=0))[0] < 0
-    page.run("document.body.dispatchEvent(new KeyboardEvent('keydown', {key: 'f', bubbles: true}))")
-    places = np.array([place_of(page, x, y) for x, y in positions(page)[::16]])
-    width, height = page.run(
-        "[document.page.canvas.clientWidth, document.page.canvas.clientHeight]"
-    )
-    inside = (places > 0).all(axis=1) & (places < [width, height]).all(axis=1)
-    assert inside.mean() > 0.9
-    assert np.ptp(places[:, 1]) > 0.5 * height
-
-
 @pytest.mark.slow
 def test_a_recording_yields_a_film_and_a_snapshot_a_picture(shown, tmp_path):
     page, _ = shown()

@@ -162,7 +162,11 @@ export class GpuPhysics {
     this.physics = physics;
     const { capacity, width, dimension, rules } = physics;
     const { STORAGE, UNIFORM, COPY_DST, COPY_SRC, MAP_READ } = GPUBufferUsage;
-    const buffer = (size, usage) => device.createBuffer({ size: 16 * Math.ceil(size / 16), usage });
+    this.buffers = [];
+    const buffer = (size, usage) => {
+      this.buffers.push(device.createBuffer({ size: 16 * Math.ceil(size / 16), usage }));
+      return this.buffers.at(-1);
+    };
     const input = STORAGE | COPY_DST;
     this.points = buffer(16 * capacity, input);
     this.home = buffer(4 * capacity, input);
@@ -250,10 +254,7 @@ export class GpuPhysics {
   }
 
   close() {
-    for (const buffer of [this.points, this.home, this.starts, this.states, this.fields]) buffer.destroy();
-    for (const { world, active, updates, mapped, weights } of this.species) {
-      for (const buffer of [world, active, updates, mapped, weights]) buffer.destroy();
-    }
+    for (const buffer of this.buffers) buffer.destroy();
   }
 }
 
