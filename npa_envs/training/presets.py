@@ -301,42 +301,42 @@ def _field_types(config: Any) -> dict[str, Any]:
 
 def _replaced(name: str, present: Any, fields: Mapping[str, Any]) -> Any:
     """Return the dataclass `present`, called `name` in errors, with fields replaced."""
-    kinds = _field_types(present)
+    field_types = _field_types(present)
     for field in fields:
-        if field not in kinds:
+        if field not in field_types:
             raise NPAError(
-                f"unknown field '{name}.{shown(str(field))[1:-1]}': {suggest(field, kinds)}"
+                f"unknown field '{name}.{shown(str(field))[1:-1]}': {suggest(field, field_types)}"
             )
-    changes = {k: _convert(k, v, kinds[k], getattr(present, k)) for k, v in fields.items()}
+    changes = {k: _convert(k, v, field_types[k], getattr(present, k)) for k, v in fields.items()}
     return dataclasses.replace(present, **changes)
 
 
-def _convert(name: str, value: Any, kind: Any, present: Any) -> Any:
+def _convert(name: str, value: Any, cls: Any, present: Any) -> Any:
     """Return a value of a file as the field's type; the dataclass checks ranges."""
-    origin = typing.get_origin(kind)
+    origin = typing.get_origin(cls)
     if origin is typing.Literal:
         return value
     if origin in (typing.Union, types.UnionType):
-        inner = [option for option in typing.get_args(kind) if option is not type(None)]
+        inner = [option for option in typing.get_args(cls) if option is not type(None)]
         return None if value is None else _convert(name, value, inner[0], present)
     if origin is tuple:
         if not isinstance(value, list | tuple):
             raise NPAError(f"{name} must be a list, got {shown(value)}: for example {name}: [1, 2]")
-        item = typing.get_args(kind)[0]
+        item = typing.get_args(cls)[0]
         before = present if isinstance(present, tuple) and present else (None,)
         return tuple(
             _convert(f"{name}[{k}]", entry, item, before[min(k, len(before) - 1)])
             for k, entry in enumerate(value)
         )
-    if dataclasses.is_dataclass(kind) and isinstance(value, Mapping):
+    if dataclasses.is_dataclass(cls) and isinstance(value, Mapping):
         return _replaced(name, present, value)
-    if kind is Path and isinstance(value, str | Path):
+    if cls is Path and isinstance(value, str | Path):
         return Path(value)
-    if kind is float and not isinstance(value, bool):
+    if cls is float and not isinstance(value, bool):
         try:
             return float(value)
         except (TypeError, ValueError, OverflowError, RuntimeError):
             pass
-    elif isinstance(value, kind) and (kind is bool or not isinstance(value, bool)):
+    elif isinstance(value, cls) and (cls is bool or not isinstance(value, bool)):
         return value
-    raise NPAError(f"{name} must be of type {kind.__name__}, got {shown(value)}")
+    raise NPAError(f"{name} must be of type {cls.__name__}, got {shown(value)}")

@@ -110,37 +110,32 @@ class Ranks:
         """Return rank 0's value on all processes."""
         if not self.together:
             return value
-        given = [value]
+        values = [value]
         with self._lost_process_error():
-            dist.broadcast_object_list(given)
-        return given[0]
+            dist.broadcast_object_list(values)
+        return values[0]
 
     def any(self, flag: bool) -> bool:
         """Return whether the flag is set on any process."""
         if not self.together:
             return flag
-        largest = torch.tensor(int(flag))
-        with self._lost_process_error():
-            dist.all_reduce(largest, op=dist.ReduceOp.MAX)
-        return bool(largest)
+        return bool(self._all_reduce(torch.tensor(int(flag)), "MAX"))
 
-    def agree_to_stop(self, asked: bool, iteration: int) -> bool:
-        """Return whether to stop before an iteration, because any process was asked to."""
+    def agree_to_stop(self, requested: bool, iteration: int) -> bool:
+        """Return whether to stop before an iteration, because any process was requested to."""
         if not self.together:
-            return asked
+            return requested
         if self._checked_at is not None and self._checked_at[0] < iteration < self._next_check:
             return False
         now, took = time.monotonic(), math.inf
         if self._checked_at is not None and iteration > self._checked_at[0]:
             took = (now - self._checked_at[1]) / (iteration - self._checked_at[0])
         # The launcher stops its processes; if it was killed, they stop by themselves.
-        wanted = asked or os.getppid() != self._parent
-        answer = torch.tensor([float(wanted), took], dtype=torch.float64)
-        with self._lost_process_error():
-            dist.all_reduce(answer, op=dist.ReduceOp.MAX)
-        interval = min(max(int(AGREE_SECONDS / max(float(answer[1]), 1e-9)), 1), AGREE_INTERVAL)
+        stop = requested or os.getppid() != self._parent
+        largest = self._all_reduce(torch.tensor([float(stop), took], dtype=torch.float64), "MAX")
+        interval = min(max(int(AGREE_SECONDS / max(float(largest[1]), 1e-9)), 1), AGREE_INTERVAL)
         self._checked_at, self._next_check = (iteration, now), iteration + interval
-        return bool(answer[0])
+        return bool(largest[0])
 
     def reduce(self, means: Sequence[Tensor], total: Tensor | None = None) -> None:
         """Replace tensors by their means, and `total` by its sum, over all processes, in place.
@@ -152,16 +147,13 @@ class Ranks:
         parts = [mean.reshape(-1) for mean in means]
         if total is not None:
             parts.append(total.reshape(1).to(means[0]))
-        flat = torch.cat(parts)
-        with self._lost_process_error():
-            dist.all_reduce(flat)
+        flat = self._all_reduce(torch.cat(parts))
         if total is not None:
             total.copy_(flat[-1])
         flat /= self.count
-        first = 0
-        for mean in means:
-            mean.copy_(flat[first : first + mean.numel()].view(mean.shape))
-            first += mean.numel()
+        reduced = torch.split(flat, [len(part) for part in parts])
+        for mean, values in zip(means, reduced, strict=False):
+            mean.copy_(values.view(mean.shape))
 
     def mean(self, value: Tensor) -> Tensor:
         """Return the mean of a tensor over all processes; all of them must call it."""
@@ -174,10 +166,7 @@ class Ranks:
         if self.count == 1:
             return
         own = torch.cat([tensor.detach().reshape(-1).double().cpu() for tensor in tensors])
-        low, high = own.clone(), own.clone()
-        with self._lost_process_error():
-            dist.all_reduce(low, op=dist.ReduceOp.MIN)
-            dist.all_reduce(high, op=dist.ReduceOp.MAX)
+        low, high = (self._all_reduce(own.clone(), op) for op in ("MIN", "MAX"))
         differing = int((low != high).sum())
         if differing:
             raise NPAError(
@@ -186,6 +175,12 @@ class Ranks:
                 "checkpoint is intact; resume it, and look for a faulty device or for processes "
                 "with different versions of a library"
             )
+
+    def _all_reduce(self, tensor: Tensor, op: str = "SUM") -> Tensor:
+        """Reduce a tensor over all processes, in place, and return it."""
+        with self._lost_process_error():
+            dist.all_reduce(tensor, op=getattr(dist.ReduceOp, op))
+        return tensor
 
     @contextlib.contextmanager
     def _lost_process_error(self) -> Iterator[None]:
@@ -250,19 +245,17 @@ class RunRandomness:
             masks=streams(2, batch, of_batch),
         )
 
+    def _sources(self) -> dict[str, Randomness]:
+        return {"schedule": self.schedule, "worlds": self.worlds, "masks": self.masks}
+
     def state_dict(self) -> dict[str, Tensor]:
         """Return the states of all generators, for a checkpoint."""
-        named = {"schedule": self.schedule, "worlds": self.worlds, "masks": self.masks}
-        return {
-            name: source.get_state()
-            for name, source in named.items()
-            if isinstance(source, torch.Generator)
-        }
+        sources = self._sources().items()
+        return {name: own.get_state() for name, own in sources if isinstance(own, torch.Generator)}
 
     def load_state_dict(self, states: Mapping[str, Tensor], iteration: int) -> None:
         """Restore what `state_dict` returned after `iteration`."""
-        self.schedule.set_state(states["schedule"])
-        for name, source in (("worlds", self.worlds), ("masks", self.masks)):
+        for name, source in self._sources().items():
             if isinstance(source, torch.Generator):
                 source.set_state(states[name])
             else:

@@ -128,8 +128,8 @@ class Run:
             begin()
             stopped = False
             while not stopped and not over():
-                asked = stop.is_set() or late()
-                stopped = self._ranks.agree_to_stop(asked, self.iteration)
+                requested = stop.is_set() or late()
+                stopped = self._ranks.agree_to_stop(requested, self.iteration)
                 if not stopped:
                     step()
             end(stopped)
@@ -170,9 +170,9 @@ def stop_flag(*, patient: bool = False) -> Iterator[threading.Event]:
     Args:
         patient: Ignore all later signals: torchrun forwards those that a terminal has sent already.
     """
-    asked = threading.Event()
+    requested = threading.Event()
     if threading.current_thread() is not threading.main_thread():
-        yield asked
+        yield requested
         return
     previous: dict[signal.Signals, Any] = {}
     first = 0.0
@@ -183,9 +183,9 @@ def stop_flag(*, patient: bool = False) -> Iterator[threading.Event]:
 
     def stop(number: int, frame: FrameType | None) -> None:
         nonlocal first
-        if not asked.is_set():
+        if not requested.is_set():
             first = time.monotonic()
-            asked.set()
+            requested.set()
             if not patient:
                 print("\nstopping after this iteration; once more to stop at once", file=sys.stderr)
         elif not patient and time.monotonic() - first > ONE_REQUEST:
@@ -195,7 +195,7 @@ def stop_flag(*, patient: bool = False) -> Iterator[threading.Event]:
     for number in (signal.SIGINT, signal.SIGTERM):
         previous[number] = signal.signal(number, stop)
     try:
-        yield asked
+        yield requested
     finally:
         restore()
 

@@ -139,8 +139,10 @@ def tasks_of_codes(
 ) -> list[Morphogenesis2D]:
     """Return the task of each picture that a rule has a code for, in order."""
     names = () if rule.codes is None else rule.codes.names
-    found = [task_of_rule(source, rule, device, **(fields | {"target": name})) for name in names]
-    return [cast(Morphogenesis2D, trained.task) for trained in found]
+    return [
+        cast(Morphogenesis2D, task_of_rule(source, rule, device, **fields | {"target": name}).task)
+        for name in names
+    ]
 
 
 def _world_of(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:

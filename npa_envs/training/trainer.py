@@ -297,8 +297,8 @@ class Trainer:
 
     def _make_rule(self, generator: torch.Generator, saved: dict[str, Any] | None) -> NPARule:
         """Return the initial rule, or one with the hyper-parameters of a checkpoint."""
-        made = self.task.make_rule(generator)
-        return initial_rule(self.config, made) if saved is None else rule_like(saved)
+        untrained = self.task.make_rule(generator)
+        return initial_rule(self.config, untrained) if saved is None else rule_like(saved)
 
     def _due(self, interval: int) -> bool:
         return interval > 0 and self.iteration % interval == 0
@@ -440,19 +440,19 @@ def initial_rule(config: TrainConfig[Any], untrained: NPARule) -> NPARule:
         rule = dividing(rule)
     wrong = differing_fields(rule, untrained)
     if rule.codes is not None and untrained.codes is not None:
-        had, wanted = rule.codes.names, untrained.codes.names
-        if had != wanted:
+        names, expected = rule.codes.names, untrained.codes.names
+        if names != expected:
             raise NPAError(
                 f"initial_rule must have codes of the run's targets, in their order, but "
-                f"{shown(source)} has those of {shown(', '.join(had))}, not of "
-                f"{shown(', '.join(wanted))}: give these targets, or start from a rule without "
+                f"{shown(source)} has those of {shown(', '.join(names))}, not of "
+                f"{shown(', '.join(expected))}: give these targets, or start from a rule without "
                 "codes, or from random weights (initial_rule='')"
             )
     if wrong:
-        given, asked = rule.hyper_parameters(), untrained.hyper_parameters()
+        theirs, ours = rule.hyper_parameters(), untrained.hyper_parameters()
         differences = [
             f"{'eps0, the eps it learned at' if name == 'eps0' else name} "
-            f"({shown(given.get(name))}, here {shown(asked.get(name))})"
+            f"({shown(theirs.get(name))}, here {shown(ours.get(name))})"
             for name in wrong
         ]
         raise NPAError(
@@ -497,7 +497,7 @@ class _JointTrainer(Trainer):
         sources: tuple[str, ...] = getattr(config, "initial_rules", ())
         if rules is None and sources and not resume:
             rules = [load_rule(source) for source in sources]
-        self._given, counts = rules, task.config.counts
+        self._initial_rules, counts = rules, task.config.counts
 
         def rollout(
             rule: NPARule, x: Tensor, s: Tensor, steps: int, /, **options: Unpack[TrainingOptions]
@@ -518,25 +518,25 @@ class _JointTrainer(Trainer):
 
     def _make_rule(self, generator: torch.Generator, saved: dict[str, Any] | None) -> NPARule:
         # The trainer uses its rule only as a module with hyper-parameters.
-        made = cast(CoMorphogenesis2D, self.task).make_rules(generator)
-        for rule in made:
+        untrained = cast(CoMorphogenesis2D, self.task).make_rules(generator)
+        for rule in untrained:
             take_options(rule, self.config)
         if saved is not None:
-            self._given = [rule_like(own) for own in saved.get("rules", ())]
+            self._initial_rules = [rule_like(own) for own in saved.get("rules", ())]
         frozen: tuple[int, ...] = getattr(self.config, "frozen", ())
-        if self._given is None:
+        if self._initial_rules is None:
             if frozen:
                 raise NPAError(
                     f"frozen must name rules that were trained before, got {frozen} without "
                     "initial_rules: give one for each species"
                 )
-            return cast(NPARule, JointRules(made))
-        if len(self._given) != len(made):
+            return cast(NPARule, JointRules(untrained))
+        rules = copy.deepcopy(list(self._initial_rules))
+        if len(rules) != len(untrained):
             raise NPAError(
-                f"rules must be one for each of {len(made)} species, got {len(self._given)}"
+                f"rules must be one for each of {len(untrained)} species, got {len(rules)}"
             )
-        rules = copy.deepcopy(list(self._given))
-        for number, (rule, own) in enumerate(zip(rules, made, strict=True)):
+        for number, (rule, own) in enumerate(zip(rules, untrained, strict=True)):
             if rule.moment_inverse == "threshold":
                 rule.moment_inverse = self.config.moment_inverse
             own.dead_zone = rule.dead_zone
@@ -546,11 +546,11 @@ class _JointTrainer(Trainer):
                     f"rules must have the shape of their species, but rule {number} differs in "
                     f"{', '.join(wrong)}: change those fields of species {number}"
                 )
+        if frozen and max(frozen) >= len(rules):
+            raise NPAError(
+                f"frozen must name species from 0 to {len(rules) - 1}, got {shown(max(frozen))}"
+            )
         for number in frozen:
-            if number >= len(rules):
-                raise NPAError(
-                    f"frozen must name species from 0 to {len(rules) - 1}, got {shown(number)}"
-                )
             rules[number].requires_grad_(False)
         if not any(p.requires_grad for rule in rules for p in rule.parameters()):
             raise NPAError("frozen must leave a rule that learns, got all of them: leave one out")
