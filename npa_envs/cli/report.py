@@ -35,7 +35,6 @@ from npa_envs.measure.record import (
 from npa_envs.render.world_film import SCREEN, film_world, write_3d_world
 from npa_envs.rule.files import load_rule
 from npa_envs.tasks.damage import DamageEvent
-from npa_envs.tasks.texture import Texture
 from npa_envs.training.task_of_rule import task_for_film, task_of_rule, tasks_of_codes
 
 if TYPE_CHECKING:
@@ -86,7 +85,7 @@ def write_report(
     clouds = task.classifies
     checkpoints = (CLOUD_CHECKPOINTS if clouds else CHECKPOINTS)[: None if thorough else 5]
     count = 8 if thorough else 2
-    judge = TextureJudge(task) if isinstance(task, Texture) else None
+    judge = TextureJudge(task) if task.has_judge else None
     not_filmed = ""
     with common.StepBar(None, show=progress) as bar:
         tables = tables_of(

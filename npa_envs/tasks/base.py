@@ -106,6 +106,9 @@ class ParticleTask(Generic[ConfigT]):
     has_views: bool = False
     """Whether the task has `views`, `view_psnr` and `gaussians`: pictures from several cameras."""
 
+    has_judge: bool = False
+    """Whether pictures of the task are compared by `npa_envs.measure.judge.TextureJudge`."""
+
     classifies: bool = False
     """Whether static particles output class scores of their point cloud."""
 
@@ -392,11 +395,11 @@ class GrowthTask(ParticleTask[GrowthConfigT]):
     def penalties(self, worlds: Particles) -> dict[str, tuple[float, Tensor]]:
         """Return terms for motion, overflow, positions outside of [-1, 1]^D, and motion there."""
         config, bounded = self.config, self.bounded(worlds.x)
-        terms = {"motion": (config.motion_weight, path_lengths(worlds).mean())}
+        terms = {"motion": (config.motion_weight, distances_moved(worlds).mean())}
         terms |= super().penalties(worlds)
         terms["bound"] = config.bound_weight, (bounded - bounded.clamp(-1.0, 1.0)).abs().mean()
         if config.escape_weight > 0.0:
-            terms["stray"] = config.escape_weight, escape_motion(bounded, path_lengths(worlds))
+            terms["stray"] = config.escape_weight, escape_motion(bounded, distances_moved(worlds))
         return terms
 
     def bounded(self, x: Tensor) -> Tensor:
@@ -404,7 +407,7 @@ class GrowthTask(ParticleTask[GrowthConfigT]):
         return x
 
 
-def path_lengths(worlds: Particles) -> Tensor:
+def distances_moved(worlds: Particles) -> Tensor:
     """Return the path lengths of worlds that a loss compares [length units], shape [B, N]."""
     assert worlds.path_length is not None, "worlds are the end of a rollout"
     return worlds.path_length

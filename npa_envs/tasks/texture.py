@@ -20,7 +20,7 @@ from npa_envs.checks import (
 from npa_envs.errors import NPAError
 from npa_envs.ops import periodic_splat
 from npa_envs.rule.rule import COLOUR_OFFSET
-from npa_envs.tasks.base import ParticleTask, TaskConfig, path_lengths, shares_of_loss
+from npa_envs.tasks.base import ParticleTask, TaskConfig, distances_moved, shares_of_loss
 from npa_envs.tasks.damage import random_particle
 from npa_envs.tasks.losses.pieces import LossOptions
 from npa_envs.tasks.losses.texture import (
@@ -131,6 +131,7 @@ DRAWINGS = 16
 class Texture(ParticleTask[TextureConfig]):
     """The texture task of arXiv 2601.16096, with its loss."""
 
+    has_judge = True
     _resized_with = ("target",)
 
     def __init__(
@@ -266,7 +267,7 @@ class Texture(ParticleTask[TextureConfig]):
 
     def penalties(self, worlds: Particles) -> dict[str, tuple[float, Tensor]]:
         """Return motion and overflow."""
-        motion = self.config.motion_weight, path_lengths(worlds).mean()
+        motion = self.config.motion_weight, distances_moved(worlds).mean()
         return {"motion": motion, **super().penalties(worlds)}
 
     def splat(self, x: Tensor, colour: Tensor) -> Tensor:

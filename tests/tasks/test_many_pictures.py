@@ -124,11 +124,10 @@ def test_training_changes_codes_and_keeps_them_with_their_worlds(encoder):
 
 def test_a_rule_that_is_kept_has_the_codes_of_its_own_encoder(tmp_path):
     config = preset("tiny", **SMALL, targets=TARGETS, encoder=True, out=tmp_path, iterations=3)
-    rule = train(config, progress=False).rule
-    told = load_rule(tmp_path / "rule.safetensors").codes
-    read = rule.codes.encode(ManyPictures(config.task)._target_pictures)
-    assert torch.allclose(rule.codes.table, read, atol=1e-6)
-    assert torch.equal(told.table, rule.codes.table)
+    codes = train(config, progress=False).rule.codes
+    pictures = ManyPictures(config.task)._target_pictures
+    assert torch.allclose(codes.table, codes.encode(pictures), atol=1e-6)
+    assert torch.equal(load_rule(tmp_path / "rule.safetensors").codes.table, codes.table)
 
 
 def test_an_encoder_reads_the_pictures_once_in_an_iteration(monkeypatch):

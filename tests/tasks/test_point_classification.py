@@ -54,13 +54,13 @@ def random(seed=0, device="cpu"):
 
 
 def test_pictures_have_room_around_the_ink():
-    config = PointClassificationConfig(particle_count=64, resolution=32)
-    task = PointClassification(config)
+    task = PointClassification(PointClassificationConfig(particle_count=64, resolution=32))
     x, s, *_ = task.seed(32, generator=random())
     assert float(x.amax()) > 0.99
     density = task.picture(x, s)[..., 3]
-    edges = torch.cat((density[:, 0], density[:, -1], density[:, :, 0], density[:, :, -1]), dim=1)
-    assert float(edges.amax()) < 0.4 < float(density.amax())
+    inner = density[:, 1:-1, 1:-1]
+    edges = torch.nn.functional.pad(torch.zeros_like(inner), (1, 1, 1, 1), value=1.0) * density
+    assert float(edges.amax()) < 0.4 < float(inner.amax())
 
 
 def test_worlds_are_clouds_of_their_class_with_blank_states(task, device):
@@ -73,14 +73,13 @@ def test_worlds_are_clouds_of_their_class_with_blank_states(task, device):
 
 def test_test_clouds_are_others_and_never_varied(folder):
     config = PointClassificationConfig(data=folder, rotation=90.0, jitter=0.1, **SMALL)
-    train_task = PointClassification(config)
-    test_task = train_task.on("test")
-    assert len(train_task.clouds.label) == 36
-    assert len(test_task.clouds.label) == 18
-    x, *_ = test_task.seed(5, generator=random())
-    assert all((test_task.clouds.x == cloud).flatten(1).all(1).any() for cloud in x)
-    x, *_ = train_task.seed(5, generator=random())
-    assert not any((train_task.clouds.x == cloud).flatten(1).all(1).any() for cloud in x)
+    task = PointClassification(config)
+    for split, count in (("train", 36), ("test", 18)):
+        own = task.on(split)
+        assert len(own.clouds.label) == count
+        x, *_ = own.seed(5, generator=random())
+        is_cloud = [bool((own.clouds.x == cloud).flatten(1).all(1).any()) for cloud in x]
+        assert is_cloud == [split == "test"] * 5
 
 
 def test_loss_is_the_error_to_the_class_and_the_overflow(task, device):
@@ -118,20 +117,18 @@ def test_without_read_out_the_last_channels_are_the_classes(task, device):
         task.outputs(s[..., :2])
 
 
-def test_majority_counts_votes_and_breaks_ties_by_certainty():
+def test_majority_counts_votes_and_colours_are_of_the_class():
     votes = torch.tensor([[0, 1, 1, 2], [0, 0, 2, 2], [2, 2, 0, 0]])
     outputs = torch.nn.functional.one_hot(votes, 3).float()
+    # Ties are broken by certainty.
     outputs[0, 0, 0] = 50.0
-    outputs[1, 3, 2] = 1.5
-    outputs[2, 2, 0] = 1.5
+    outputs[1, 3, 2] = outputs[2, 2, 0] = 1.5
     assert majority(outputs).tolist() == [1, 2, 0]
-
-
-def test_colours_are_of_the_class_and_grey_where_undecided():
     outputs = torch.tensor([[[0.0, 1.0, 0.2], [0.0, 0.0, 0.0], [0.1, 0.2, 0.5]]])
-    colours = class_colours(outputs)[0]
     half = [(a + b) / 2 for a, b in zip(PALETTE[2], UNDECIDED, strict=True)]
-    torch.testing.assert_close(colours, torch.tensor([PALETTE[1], UNDECIDED, half]))
+    torch.testing.assert_close(
+        class_colours(outputs)[0], torch.tensor([PALETTE[1], UNDECIDED, half])
+    )
 
 
 def cycle_of(folder, tmp_path, **fields):
@@ -270,8 +267,8 @@ def test_a_static_rule_of_no_known_task_is_refused(task, tmp_path, capsys):
     path = tmp_path / "rule.safetensors"
     save_rule(task.make_rule(random()), path)
     assert main(["evaluate", str(path), "--no-progress"]) != 0
-    told = "runs moving rules in the 2D worlds of morphogenesis2d, got space_dim=2, static=True"
-    assert told in capsys.readouterr().err
+    message = "runs moving rules in the 2D worlds of morphogenesis2d, got space_dim=2, static=True"
+    assert message in capsys.readouterr().err
 
 
 def test_the_paper_recipe_runs_on_files_of_mnists_format(folder, tmp_path):
