@@ -99,7 +99,7 @@ def rollout_call(
     """
     network = workload.rule(x.device, **(rule or {}))
     generator = torch.Generator(x.device).manual_seed(1)
-    given = {"eps": workload.eps, "update_prob": workload.update_prob, **options}
+    kwargs = {"eps": workload.eps, "update_prob": workload.update_prob, **options}
     draws = torch.Generator(x.device).manual_seed(2)
     weights = [
         torch.randn(worlds.shape, generator=draws, device=x.device)
@@ -108,7 +108,7 @@ def rollout_call(
 
     def run() -> None:
         with torch.set_grad_enabled(train or gradients):
-            worlds = roll(network, x, s, workload.steps, generator=generator, **given)
+            worlds = roll(network, x, s, workload.steps, generator=generator, **kwargs)
             if train:
                 terms = [(a * b).sum() for a, b in zip(worlds, weights, strict=True)]
                 torch.autograd.grad(terms[0] + terms[1], list(network.parameters()))
