@@ -337,14 +337,14 @@ def _species_row(
     alone, species = make(), make(roll=roll_one_species)
     # A ratio of nearly 1 needs more readings than other tables.
     repeats = 3 * session.repeats
-    compared = compare(alone, species, session.device, repeats=repeats, graph=graph)
+    first, second, ratio = compare(alone, species, session.device, repeats=repeats, graph=graph)
     return OneSpeciesRow(
         workload.name,
         "training" if train else "inference",
         "graph" if graph else "eager",
-        compared.first.divided(workload.steps),
-        compared.second.divided(workload.steps),
-        compared.ratio,
+        first.divided(workload.steps),
+        second.divided(workload.steps),
+        ratio,
     )
 
 
