@@ -64,13 +64,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # Read when torch is loaded. On a busy machine, threads that wait in busy loops make every
     # operation several times as slow.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-    given = list(sys.argv[1:] if arguments is None else arguments)
+    words = list(sys.argv[1:] if arguments is None else arguments)
     for stream in (sys.stdout, sys.stderr):
         # Terminals without UTF-8 show "?" for letters that are missing.
         if isinstance(stream, io.TextIOWrapper) and stream.encoding.lower() != "utf-8":
             stream.reconfigure(errors="replace")
     try:
-        return _dispatch(given)
+        return _dispatch(words)
     except NPAError as error:
         print(f"npa-envs: error: {' '.join(str(error).split())}", file=sys.stderr)
         return USAGE_ERROR

@@ -73,8 +73,8 @@ def main(arguments: Sequence[str]) -> int:
             *sizes, state_dim=options.state_dim, update_prob=options.update_prob
         )
         dtype = getattr(torch, options.dtype)
-        given: dict[str, Any] = {"periodic": options.periodic, "gradients": options.gradients}
-        print(explain(workload, device, dtype, **given))
+        kwargs: dict[str, Any] = {"periodic": options.periodic, "gradients": options.gradients}
+        print(explain(workload, device, dtype, **kwargs))
         return 0
     folder = None if options.out is None else common.writable_folder(options.out)
     if options.plots:

@@ -290,12 +290,12 @@ def resolve_run(arguments: Sequence[str], out_of: Callable[[Sequence[str]], Path
     return resolved
 
 
-def chosen_names(kind: str, names: Sequence[str], known: Iterable[str]) -> list[str]:
+def chosen_names(noun: str, names: Sequence[str], known: Iterable[str]) -> list[str]:
     """Return `names` in the order of `known`; all known ones if `names` is empty."""
     known = list(known)
     for name in names:
         if name not in known:
-            raise NPAError(f"unknown {kind} {name!r}: {suggest(name, known)}")
+            raise NPAError(f"unknown {noun} {name!r}: {suggest(name, known)}")
     return [name for name in known if not names or name in names]
 
 

@@ -258,7 +258,7 @@ def _method_options(
 ) -> dict[str, dict[str, Any]]:
     from npa_envs.agents.learning import method_options
 
-    found: dict[str, dict[str, Any]] = {}
+    options_of: dict[str, dict[str, Any]] = {}
     for word in arguments:
         name, mark, value = word.partition("=")
         method, dot, option = name.partition(".")
@@ -272,8 +272,10 @@ def _method_options(
             known = method_options(own.get(method, method))
         if option not in known:
             raise NPAError(f"unknown option {option!r} in {word!r}: {suggest(option, known)}")
-        found.setdefault(method, {}).update(common.named_values("options", [f"{option}={value}"]))
-    return found
+        options_of.setdefault(method, {}).update(
+            common.named_values("options", [f"{option}={value}"])
+        )
+    return options_of
 
 
 def _jobs(options: CompareOptions) -> int:

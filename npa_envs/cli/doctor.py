@@ -127,19 +127,19 @@ def _torch_devices() -> list[DoctorLine]:
     if not torch.cuda.is_available():
         return [*lines, _no_cuda(torch.version.cuda)]
     for index in range(torch.cuda.device_count()):
-        card = torch.cuda.get_device_properties(index)
+        gpu = torch.cuda.get_device_properties(index)
         text = (
-            f"{card.name}, {card.total_memory / 2**30:.0f} GiB, compute capability "
-            f"{card.major}.{card.minor}, CUDA {torch.version.cuda}"
+            f"{gpu.name}, {gpu.total_memory / 2**30:.0f} GiB, compute capability "
+            f"{gpu.major}.{gpu.minor}, CUDA {torch.version.cuda}"
         )
         fix = "slow: the faster kernels need compute capability 8.0 (Ampere) or newer"
-        slow = (card.major, card.minor) < (8, 0)
+        slow = (gpu.major, gpu.minor) < (8, 0)
         lines.append(DoctorLine(f"cuda:{index}", text, fix if slow else None, optional=True))
     return lines
 
 
 def _no_cuda(built: str | None) -> DoctorLine:
-    """Return why torch, built for this version of CUDA or for none, uses no card."""
+    """Return why torch, built for this version of CUDA or for none, uses no GPU."""
     query = ("nvidia-smi", "--query-gpu=name,driver_version", "--format=csv,noheader")
     try:
         listed = subprocess.run(
@@ -148,7 +148,7 @@ def _no_cuda(built: str | None) -> DoctorLine:
         name, _, driver = listed.stdout.splitlines()[0].rpartition(", ")
     except (OSError, subprocess.SubprocessError, IndexError):
         fix = "slow for large worlds: use the presets fast and tiny, which are made for CPUs"
-        return DoctorLine("cuda", "no NVIDIA card, or no driver for it", fix, optional=True)
+        return DoctorLine("cuda", "no NVIDIA GPU, or no driver for it", fix, optional=True)
     oldest = OLDEST_DRIVERS.get(int((built or "0").partition(".")[0]), 0)
     if built is None:
         why = "this torch is a build for CPUs alone"
@@ -158,7 +158,7 @@ def _no_cuda(built: str | None) -> DoctorLine:
         fix = f"install NVIDIA's driver {oldest} or newer, or a torch for an older CUDA"
     elif (hidden := os.environ.get("CUDA_VISIBLE_DEVICES")) is not None:
         why = f"CUDA_VISIBLE_DEVICES is '{hidden}'"
-        fix = "unset CUDA_VISIBLE_DEVICES, or name the card there"
+        fix = "unset CUDA_VISIBLE_DEVICES, or name the GPU there"
     else:
         why = f"torch cannot use it (driver {driver})"
         fix = 'see what python -c "import torch; torch.zeros(1).cuda()" says; often a reboot helps'

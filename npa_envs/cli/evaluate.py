@@ -58,7 +58,7 @@ def main(arguments: Sequence[str]) -> int:
     device = options.checked_device()
     rule = load_rule(options.rule, device=device).float()
     seeds = range(options.first_seed, options.first_seed + options.seed_count)
-    given: dict[str, Any] = {"seeds": seeds, "device": device}
+    kwargs: dict[str, Any] = {"seeds": seeds, "device": device}
     tables: dict[str, Sequence[Any]]
     if rule.codes is not None and options.target is None:
         if options.healing or options.judge:
@@ -67,10 +67,10 @@ def main(arguments: Sequence[str]) -> int:
                 f"{len(rule.codes)}: give --target {shown(rule.codes.names[0])}"
             )
         tasks = tasks_of_codes(options.rule, rule, device, **options.world)
-        given["checkpoints"] = options.checkpoints or quality.PICTURE_CHECKPOINTS
+        kwargs["checkpoints"] = options.checkpoints or quality.PICTURE_CHECKPOINTS
         with common.StepBar(None, show=options.progress) as bar:
-            found = quality.picture_rows(rule, tasks, progress=bar.advance, **given)
-        tables = {"pictures": found}
+            rows = quality.picture_rows(rule, tasks, progress=bar.advance, **kwargs)
+        tables = {"pictures": rows}
         metric = tasks[0].metric_name
         what = f"{len(tasks)} pictures, {options.seed_count} worlds each"
         metric_words = f"{metric}, shuffled: with the code of the next picture"
@@ -83,20 +83,20 @@ def main(arguments: Sequence[str]) -> int:
                 f"cannot measure {options.rule!r}: {trained.doubt}: "
                 "give --target, a built-in name or a picture"
             )
-        given["checkpoints"] = options.checkpoints
-        given["judge"] = TextureJudge(task) if options.judge else None
-        given["changed"] = task.classifies or options.healing
-        total = None if given["changed"] else max(checkpoints)
+        kwargs["checkpoints"] = options.checkpoints
+        kwargs["judge"] = TextureJudge(task) if options.judge else None
+        kwargs["changed"] = task.classifies or options.healing
+        total = None if kwargs["changed"] else max(checkpoints)
         with common.StepBar(total, show=options.progress) as bar:
-            tables = quality.tables_of(rule, task, progress=bar.advance, **given)
+            tables = quality.tables_of(rule, task, progress=bar.advance, **kwargs)
         what, metric = f"{options.seed_count} worlds", task.metric_name
         if task.classifies:
             clouds = cast("PointClassification", task)
             what = f"{len(clouds.clouds.label)} {clouds.split} clouds"
         metric_words = metric
     print(f"{options.rule}: {what}, loss: {metric_words}")
-    for name, rows in tables.items():
-        print(table_text(rows, missing=UNMEASURED if name == "growth" else "never"))
+    for name, table in tables.items():
+        print(table_text(table, missing=UNMEASURED if name == "growth" else "never"))
     if options.json is not None:
         write_text(options.json, tables_json(tables, metric=metric))
         print(f"wrote {options.json}")

@@ -47,16 +47,16 @@ def main(arguments: Sequence[str]) -> int:
     """Measure, print and write."""
     options = common.parse_options(RobustnessOptions, "robustness", arguments)
     from npa_envs.files import write_text
-    from npa_envs.measure.accuracy.endurance import rule_names, task_name
+    from npa_envs.measure.accuracy.endurance import task_name
     from npa_envs.measure.plots import write_plots
     from npa_envs.measure.record import measured_facts, time_limit, without_folders
     from npa_envs.measure.robustness import study
     from npa_envs.measure.robustness.trials import PLANS, RuleTrial, quick_plan
-    from npa_envs.rule.files import load_rule, rule_digest
+    from npa_envs.rule.files import load_rule, rule_digest, shipped_rules
 
     common.check_numbers(options, seed_count=1, first_seed=0, most_particles=1, threads=1)
     enough = time_limit(options.max_seconds)
-    sources = common.named_rules(options.rules or rule_names())
+    sources = common.named_rules(options.rules or shipped_rules())
     names = list(sources)
     if options.quick and not options.rules:
         # One of each task.

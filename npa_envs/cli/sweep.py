@@ -175,8 +175,8 @@ def combinations(
     from npa_envs.training import TASKS
 
     if not common or common[0] not in TASKS:
-        cure = suggest(common[0], TASKS) if common else ", ".join(TASKS)
-        raise NPAError(f"the arguments after -- must begin with a task of npa-envs train: {cure}")
+        hint = suggest(common[0], TASKS) if common else ", ".join(TASKS)
+        raise NPAError(f"the arguments after -- must begin with a task of npa-envs train: {hint}")
     used = [_option(word.partition("=")[0]) for word in common if word.startswith("--")]
     values: dict[str, list[str]] = {}
     for word in over:

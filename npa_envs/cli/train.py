@@ -15,7 +15,7 @@ import torch.distributed as dist
 import tyro
 
 from npa_envs.cli import INTERRUPTED, common
-from npa_envs.cli.report import Training, write_report
+from npa_envs.cli.training_report import Training, write_report
 from npa_envs.errors import NPAError, shown
 from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2DConfig
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2DConfig
@@ -189,8 +189,8 @@ def parse(
         launch = _without(TrainOptions(**shared), set(COMMON) - shared.keys())
         task = _without(defaults.task, shared, whole=whole)
         training = _without(replace(defaults, task=task), shared, whole=whole)
-        kinds = [("common", type(launch)), ("training", type(training))]
-        command = make_dataclass("Command", kinds, frozen=True)
+        groups = [("common", type(launch)), ("training", type(training))]
+        command = make_dataclass("Command", groups, frozen=True)
         parsed: Any = common.parse_options(
             command,
             f"train {task_name}",
@@ -213,17 +213,17 @@ def _without(source: Any, names: Iterable[str], *, whole: bool = True) -> Any:
 
     Unless `whole`, fields that are not in `SHOWN` are hidden too.
     """
-    kind: Any = type(source)
+    cls: Any = type(source)
     fixed: Any = tyro.conf.Fixed
     hidden: Any = tyro.conf.Suppress
-    hints = get_type_hints(kind, include_extras=True)
+    hints = get_type_hints(cls, include_extras=True)
     changed = {} if whole else {name: hidden[hints[name]] for name in hints.keys() - SHOWN}
     changed |= {name: fixed[hints[name]] for name in names if name in hints}
     if "task" in hints:
         changed["task"] = type(source.task)
-    options = [(name, own, field(default=getattr(source, name))) for name, own in changed.items()]
-    base = kind[changed["task"]] if getattr(kind, "__parameters__", ()) else kind
-    narrow = make_dataclass(kind.__name__, options, bases=(base,), frozen=True, kw_only=True)
+    options = [(name, hint, field(default=getattr(source, name))) for name, hint in changed.items()]
+    base = cls[changed["task"]] if getattr(cls, "__parameters__", ()) else cls
+    narrow = make_dataclass(cls.__name__, options, bases=(base,), frozen=True, kw_only=True)
     return _of_type(narrow, source)
 
 
@@ -279,19 +279,16 @@ def _flat(
     base: JointTrainConfig[CoMorphogenesis2DConfig], task: CoMorphogenesis2DConfig, number: int
 ) -> JointOptions:
     """Return the options of a configuration, with the fields of species `number`."""
-    targets = tuple(config.target for config in task.species)
-    options = _of_type(
-        SpeciesOptions, task.species[number], targets=targets, distance=task.distance
-    )
+    others = {"targets": tuple(own.target for own in task.species), "distance": task.distance}
+    options = _of_type(SpeciesOptions, task.species[number], **others)
     flat: JointOptions = _of_type(JointOptions, base, task=options)
     return flat
 
 
-def _of_type(kind: Any, source: Any, **others: Any) -> Any:
-    """Return a dataclass of the type `kind` with the fields of `source`, and others."""
-    own = {field.name for field in fields(kind)}
-    same = {f.name: getattr(source, f.name) for f in fields(source) if f.name in own}
-    return kind(**same | others)
+def _of_type(cls: Any, source: Any, **others: Any) -> Any:
+    """Return a dataclass of a type with the fields of `source`, and others."""
+    names = {field.name for field in fields(cls)} & {field.name for field in fields(source)}
+    return cls(**{name: getattr(source, name) for name in names} | others)
 
 
 # The run
@@ -392,11 +389,14 @@ def run(
             command += ("--processes", str(ranks.count)) if ranks.count > 1 else ()
         seconds = result.record.get("seconds", 0.0)
         training = Training(task_name, command, result.iteration, seconds)
-        device = check_device(config.device)
         for rule in rules:
             try:
                 card, scores = write_report(
-                    rule, folder.report, training, device, progress=options.progress
+                    rule,
+                    folder.report,
+                    training,
+                    check_device(config.device),
+                    progress=options.progress,
                 )
                 print(f"  report      {card}: {scores}")
             except NPAError as error:
@@ -450,9 +450,7 @@ def announcement(
 ) -> tuple[str, str]:
     """Return two lines: a run's targets, and its size and expected time."""
     species = _species(config)
-    goals: list[str] = []
-    for own in species:
-        goals += getattr(own, "targets", ()) or (own.goal_text,)
+    goals = [goal for own in species for goal in getattr(own, "targets", ()) or (own.goal_text,)]
     particles = " and ".join(str(own.particle_count) for own in species)
     named = options.preset or default_preset(task_name, config.device)
     source = f"preset {named}" if options.config is None else str(options.config)
@@ -467,9 +465,7 @@ def announcement(
         time = f"about {common.duration(expected)} on an idle CPU"
     if options.max_seconds is not None:
         time += f", at most {common.duration(options.max_seconds)}"
-    where = config.device
-    if process_count > 1:
-        where = f"{process_count} processes ({config.device})"
+    where = config.device if process_count == 1 else f"{process_count} processes ({config.device})"
     return (
         f"{task_name}: learns {' and '.join(goals)} ({'goes on' if options.resume else source})",
         f"{config.total_iterations} iterations, each of {config.world_count} worlds of "

@@ -101,10 +101,10 @@ def world_maker(options: ViewOptions, device: torch.device) -> Callable[[], Live
         keywords = common.named_values("options", options.options)
         for name in RESERVED:
             if name in keywords:
-                said = name in ("device", "policy")
-                cure = f"say --{name} {keywords[name]}" if said else "leave it out"
+                is_option = name in ("device", "policy")
+                hint = f"say --{name} {keywords[name]}" if is_option else "leave it out"
                 raise NPAError(
-                    f"options must leave {name} to the command, got {name}={keywords[name]}: {cure}"
+                    f"options must leave {name} to the command, got {name}={keywords[name]}: {hint}"
                 )
         keywords = {"particle_count": options.particle_count} | keywords
 

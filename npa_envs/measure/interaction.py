@@ -375,17 +375,19 @@ def _draw(
 
     ticks = {"ticks": [0.25, 0.5, 1.0, 2.0, 4.0], "format": "%g"}
     changes = LogNorm(1.0 / MAX_CHANGE, MAX_CHANGE)
-    matrices = (
+    matrices: tuple[tuple[str, str, str, Any, dict[str, Any]], ...] = (
         ("change", "loss together / alone", "RdBu_r", changes, ticks),
         ("mixing", "mixing index", "viridis", Normalize(0.0, 1.0), {}),
     )
     width, height = 1.6 + 0.6 * len(across_values), 1.6 + 0.5 * len(down_values)
     figure, grid = new_figure(len(groups), 2, (2 * width + 2.0, height * len(groups)))
     for (title, rows), panels in zip(groups.items(), grid, strict=True):
-        found = {(getattr(row, down), getattr(row, across)): row for row in rows}
-        cells = [[found.get((first, second)) for second in across_values] for first in down_values]
+        by_values = {(getattr(row, down), getattr(row, across)): row for row in rows}
+        cells = [
+            [by_values.get((first, second)) for second in across_values] for first in down_values
+        ]
         for panel, (what, name, colours, norm, bar) in zip(panels, matrices, strict=True):
-            values = [[row and getattr(row, what) for row in line] for line in cells]
+            values: Any = [[row and getattr(row, what) for row in line] for line in cells]
             notes = [[_interval(row, what) for row in line] for line in cells]
             scale = draw_matrix(
                 panel,

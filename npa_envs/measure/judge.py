@@ -117,13 +117,13 @@ class TextureJudge:
         return JudgeRow(step, each.mean().item(), each.max().item(), patches, spectra, colours)
 
     def _distances(self, images: Tensor) -> Tensor:
-        found = []
+        distances = []
         for image in images[:, None]:
             patches = (self._projections(image, True) - self._patches).square().mean()
             spectra = (self._amplitudes(image) - self._spectra).square().sum()
             colours = (self._counts(image, True).sqrt() - self._colours.sqrt()).square().sum()
-            found.append(torch.stack((patches, spectra, colours)))
-        return torch.stack(found)
+            distances.append(torch.stack((patches, spectra, colours)))
+        return torch.stack(distances)
 
     def _projections(self, image: Tensor, wrap: bool) -> Tensor:
         """Return the quantiles of the patches' projections, [DIRECTIONS, R²]."""

@@ -326,7 +326,7 @@ def _cloud_means(
     """Return means over all clouds; `figures` yields rows of figures [B] of a batch of indices."""
     count = len(task.clouds.label)
     sums = torch.zeros((), dtype=torch.float64)
-    for index in torch.arange(count, device=task.clouds.x.device).split(BATCH):
+    for index in torch.split(torch.arange(count, device=task.clouds.x.device), BATCH):
         rows = [[figure.double().sum() for figure in row] for row in figures(index)]
         sums = sums + torch.stack([torch.stack(row) for row in rows]).cpu()
     means: list[list[float]] = (sums / count).tolist()
@@ -415,7 +415,8 @@ class RuleRunner:
         progress: Callable[[int], None] | None = None,
         **changed: Any,
     ) -> None:
-        self.rule, self.task, self.generator = rule, task, generator
+        self.rule, self.task = rule, task
+        self.generator: Any = generator
         self._progress = progress
         self._options = task.rollout_options | changed
 
@@ -540,7 +541,8 @@ def grown(
             batch.append(now)
     shape = len(tasks), len(seeds)
     return [
-        combined(torch.cat, batch).map(lambda part: part.unflatten(0, shape)) for batch in batches
+        combined(torch.cat, batch).map(lambda part: part.view(*shape, *part.shape[1:]))
+        for batch in batches
     ]
 
 

@@ -55,9 +55,9 @@ class Record(Generic[Row]):
     def read(self) -> Self:
         """Read the rows of the file, if it exists, and return this record."""
         if self.path is not None:
-            make, command = self.parse, self.command
-            found = read_record(self.path, self.facts, make, command=command, key=self.key)
-            self.rows += found or []
+            parse, command = self.parse, self.command
+            rows = read_record(self.path, self.facts, parse, command=command, key=self.key)
+            self.rows += rows or []
         return self
 
     def add(self, *rows: Row) -> None:
@@ -83,32 +83,32 @@ def write_record(path: Path, content: Any) -> None:
 def read_record(
     path: Path,
     facts: Mapping[str, Any],
-    make: Callable[[dict[str, Any]], Content],
+    parse: Callable[[dict[str, Any]], Content],
     *,
     command: str,
     key: str = "facts",
 ) -> Content | None:
-    """Return `make` of the JSON object in a file; None if the file does not exist.
+    """Return `parse` of the JSON object in a file; None if the file does not exist.
 
     Raises an NPAError, which names `command`, if the file's facts under `key` differ from `facts`.
     """
     if not os.path.exists(path):
         return None
-    cure = "remove it, or choose another folder with --out"
+    hint = "remove it, or choose another folder with --out"
     try:
         held = read_json(path, limit=64 * 2**20)
         before = dict(held[key])
-        record = make(held)
+        record = parse(held)
     except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
         raise NPAError(
             f"{str(path)!r} must be a record of npa-envs {command}, but cannot be read "
-            f"({shown(error)}): {cure}"
+            f"({shown(error)}): {hint}"
         ) from error
     for name, value in plain_numbers(facts).items():
         if before.get(name) != value:
             raise NPAError(
                 f"{str(path)!r} has figures of other settings: {name} was "
-                f"{shown(before.get(name))}, now {shown(value)}: {cure}"
+                f"{shown(before.get(name))}, now {shown(value)}: {hint}"
             )
     return record
 
@@ -178,8 +178,8 @@ def installed_version(name: str) -> str | None:
 
 def versions() -> dict[str, str | None]:
     """Return versions of Python and of `LIBRARIES`; None: not installed."""
-    found = {name: installed_version(name) for name in LIBRARIES}
-    return {"python": platform.python_version(), **found}
+    libraries = {name: installed_version(name) for name in LIBRARIES}
+    return {"python": platform.python_version(), **libraries}
 
 
 def current_commit() -> str:

@@ -18,7 +18,7 @@ from PIL import Image
 
 from npa_envs.cli import COMMANDS, demo, doctor, main
 from npa_envs.cli.common import examples_of, torch_threads
-from npa_envs.cli.train import announcement, parse, starting_configuration, thread_count
+from npa_envs.cli.train import announcement, parse_run, starting_configuration, thread_count
 from npa_envs.errors import NPAError
 from npa_envs.render.world_film import WorldFilm, film_world
 from npa_envs.rule.files import load_rule, save_rule
@@ -289,17 +289,6 @@ def test_train_says_what_it_learns_and_writes_a_rule_that_loads(tmp_path, capsys
     assert (target[..., 0] > target[..., 2] + 50).mean() > 0.1
 
 
-def test_a_configuration_file_goes_over_the_preset_and_options_over_the_file(tmp_path):
-    path = tmp_path / "run.yaml"
-    path.write_text("learning_rate: 0.125\nparticle_count: 77\nseed: 5\n", encoding="utf-8")
-    words = ["--config", str(path), "--preset", "tiny", "--seed", "6", "--eps", "0.25"]
-    base = starting_configuration("morphogenesis2d", words)
-    _, config = parse("morphogenesis2d", base, words)
-    assert (config.learning_rate, config.seed) == (0.125, 6)
-    assert (config.task.particle_count, config.task.eps) == (77, 0.25)
-    assert config.iterations == 40
-
-
 @pytest.mark.parametrize(
     ("words", "name"),
     [
@@ -314,18 +303,18 @@ def test_a_configuration_file_goes_over_the_preset_and_options_over_the_file(tmp
 )
 def test_runs_that_name_no_preset_take_the_best_one_on_cuda_and_the_fast_one_elsewhere(words, name):
     task, *rest = words.split()
-    base = starting_configuration(task, rest)
-    assert base == preset(name, task)
-    options, config = parse(task, base, rest)
+    assert starting_configuration(task, rest) == preset(name, task)
+    options, config = parse_run(task, rest)
     assert announcement(task, options, config)[0].endswith(f"(preset {name})")
 
 
-def test_a_configuration_file_may_name_its_preset_and_the_command_line_another(tmp_path, capsys):
+def test_a_configuration_file_goes_over_the_preset_and_options_over_the_file(tmp_path, capsys):
     path = tmp_path / "run.yaml"
-    path.write_text("preset: tiny\nseed: 5\n", encoding="utf-8")
+    path.write_text("preset: tiny\nlearning_rate: 0.125\nparticle_count: 77\nseed: 5\n", "utf-8")
     words = ["--config", str(path)]
-    config = starting_configuration("morphogenesis2d", words)
-    assert (config.iterations, config.seed) == (40, 5)
+    _, config = parse_run("morphogenesis2d", [*words, "--seed", "6", "--eps", "0.25"])
+    assert (config.iterations, config.learning_rate, config.seed) == (40, 0.125, 6)
+    assert (config.task.particle_count, config.task.eps) == (77, 0.25)
     config = starting_configuration("morphogenesis2d", [*words, "--preset", "fast"])
     assert (config.iterations, config.seed) == (preset("fast").iterations, 5)
     path.write_text("preset: tinny\n", encoding="utf-8")
@@ -360,17 +349,6 @@ def test_the_folder_of_a_run_stands_for_its_rule(command, trained, tmp_path, cap
     message = error_of(capsys, [command, str(tmp_path)])
     assert "must hold the rule.safetensors of a run" in message
     assert "rule-0.safetensors" in message
-
-
-def test_a_quick_encounter_is_of_two_rules(tmp_path, capsys, monkeypatch):
-    from npa_envs.cli import interact
-
-    for name, value in {"steps": 2, "seed_count": 1, "particle_count": 64}.items():
-        monkeypatch.setitem(interact.QUICK, name, value)
-    assert main(["interact", "--quick", "--no-progress", "--out", str(tmp_path)]) == 0
-    held = json.loads((tmp_path / "interactions.json").read_text(encoding="utf-8"))
-    assert (len(held["settings"]["seeds"]), held["settings"]["particle_count"]) == (1, 64)
-    assert len(held["rows"]) == 2 * 2 * 2
 
 
 MISTAKES = [
@@ -544,18 +522,6 @@ def test_filmstrip_shows_growth_damage_and_the_end(steps, every, damages, shown)
     frames, captions = film.strip()
     assert captions == [f"step {caption.replace('!', ': !')}" for caption in shown]
     assert len(frames) == len(shown)
-
-
-def test_evaluate_prints_a_row_for_each_checkpoint(rule, tmp_path, capsys):
-    words = ["evaluate", rule, "--checkpoints", "2", "5", "--json"]
-    words += [str(tmp_path / "table.json"), "--seed-count", "3", "--no-progress"]
-    assert main(words) == 0
-    text = capsys.readouterr().out
-    rows = json.loads((tmp_path / "table.json").read_text(encoding="utf-8"))["growth"]
-    assert [row["step"] for row in rows] == [2, 5]
-    for row in rows:
-        assert row["loss_worst"] >= row["loss"] > 0
-        assert re.search(rf"^ *{row['step']} ", text, re.MULTILINE)
 
 
 @pytest.mark.parametrize("config", ["{", "null", "[]", '{"colour": 3}', '{"state_dim": "many"}'])

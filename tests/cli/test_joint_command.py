@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from npa_envs.cli import main
-from npa_envs.cli.train import parse, starting_configuration
+from npa_envs.cli.train import parse_run
 from npa_envs.errors import NPAError
 from npa_envs.rule.files import load_rule, rule_metadata
 from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2DConfig
@@ -19,8 +19,7 @@ TINY += ["--iterations", "4"]
 
 
 def parsed(*words):
-    base = starting_configuration("co_morphogenesis2d", words)
-    return parse("co_morphogenesis2d", base, words)[1]
+    return parse_run("co_morphogenesis2d", words)[1]
 
 
 def test_options_are_those_of_all_species():

@@ -45,12 +45,6 @@ def test_a_run_begins_and_goes_on_with_the_same_words(tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_two_processes_share_a_run(tmp_path, capfd):
-    assert learned(tmp_path, 2, "--processes", "2") == (0, [0, 1, 2])
-    assert capfd.readouterr().out.count("return") == 3
-
-
-@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs Linux's /proc")
 def test_a_killed_process_ends_a_run_and_a_signal_stops_it(tmp_path):
     words = [*WORDS, "--particle-steps", "1e9", "--seconds", "60", "--entries", "60"]

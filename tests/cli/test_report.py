@@ -10,7 +10,8 @@ import pytest
 from PIL import Image
 from small_digits import write_idx
 
-from npa_envs.cli import main, report
+from npa_envs.cli import main
+from npa_envs.cli import training_report as report
 from npa_envs.errors import MissingDependencyError
 from npa_envs.measure.quality import evaluate
 from npa_envs.render import world_film

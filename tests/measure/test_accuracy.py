@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 import torch
 
-from npa_envs import reference
 from npa_envs.cli import main
 from npa_envs.cli.common import named_rules
 from npa_envs.errors import NPAError
@@ -16,7 +15,7 @@ from npa_envs.measure import accuracy
 from npa_envs.measure.accuracy import all_checks, endurance, hard_cases, numerics, suite
 from npa_envs.measure.accuracy import scenes as places
 from npa_envs.measure.accuracy.endurance import habitat
-from npa_envs.measure.accuracy.scenes import EPS, scenes, threshold_scenes
+from npa_envs.measure.accuracy.scenes import scenes
 from npa_envs.measure.accuracy.suite import (
     GROUPS,
     Check,
@@ -215,20 +214,6 @@ def test_no_limit_is_more_than_a_scene_asks_for():
                 assert limits.keys() == places.LIMITS.keys()
                 for name, limit in limits.items():
                     assert places.LIMITS[name] <= limit < 1e-2, (scene.name, name)
-
-
-def test_scenes_are_where_their_names_say():
-    found = {scene.name: scene for scene in scenes(2, periodic=False)}
-    distances = (found["at_eps"].x[0, 4:] - found["at_eps"].x[0, :4]).norm(dim=-1) / EPS
-    assert distances.tolist() == [0.5, 1.0 - 2.0**-20, 1.0, 1.0 + 2.0**-20]
-    assert (found["coincident"].x == found["coincident"].x[:, :1]).all()
-    assert float(found["touching"].x[0, 1].norm()) == pytest.approx(1e-12, rel=1e-6)
-    for scene in found.values():
-        assert torch.equal(scene.x, scene.x.float().double())
-    x, offsets = threshold_scenes(2, 1e-3)
-    s = torch.zeros(*x.shape[:2], 1).double()
-    found_det = torch.linalg.det(reference.fields(x, s, EPS).moment[:, 0])
-    torch.testing.assert_close(found_det, 1e-3 * (1.0 + offsets), rtol=1e-6, atol=0.0)
 
 
 @pytest.mark.parametrize(

@@ -8,13 +8,11 @@ from pathlib import Path
 import alternatives
 import pytest
 import torch
-from precisions import PRECISIONS
 from strategies import STRATEGIES
 
 from npa_envs import reference
 from npa_envs.errors import NPAError
-from npa_envs.measure.plots import png
-from npa_envs.measure.speed.timing import Timing, Workload
+from npa_envs.measure.speed.timing import Workload
 from npa_envs.world.rollout import rollout
 
 TINY = Workload(2, 2, 150, 2, hidden_dim=16, eps=0.2)
@@ -24,10 +22,6 @@ FORWARD = 1e-5
 
 def session(**options) -> alternatives.Alternatives:
     return alternatives.Alternatives(torch.device("cpu"), repeats=1, small=True, **options)
-
-
-def timing(median: float) -> Timing:
-    return Timing(median, median, median)
 
 
 @pytest.mark.parametrize("space_dim", [2, 3])
@@ -59,32 +53,6 @@ def test_steps_composed_in_torch_are_those_of_the_library_with_the_same_masks():
         torch.testing.assert_close(value, expected, rtol=1e-10, atol=1e-10)
 
 
-def test_a_precision_keeps_weights_and_rounds_what_it_says():
-    rule = alternatives.gecko(1, 64, torch.device("cpu")).rule
-    generator = torch.Generator().manual_seed(0)
-    z = torch.randn(40, rule.perception_dim, generator=generator)
-    s = torch.randn(2, 3, 4, generator=generator)
-    expected = rule(z).detach()
-    for name, precision in PRECISIONS.items():
-        own = precision.rule(rule)
-        assert own.hidden.weight.dtype == precision.dtype
-        assert torch.equal(own.output.weight.float(), rule.output.weight)
-        value = own(z.to(precision.dtype)).detach()
-        assert value.dtype == precision.dtype
-        error = float((value - expected).norm() / expected.norm())
-        assert (1e-4 < error < 2e-2) if name == "mixed" else (error < 1e-6)
-        rounded = s.bfloat16().float() if name == "bf16_storage" else s
-        assert torch.equal(precision.kept(s), rounded)
-    rule.dead_zone = 1e6
-    assert not any(own.rule(rule)(z.to(own.dtype)).any() for own in PRECISIONS.values())
-    # The fused path does not see torch's switch.
-    assert not PRECISIONS["tf32"].rule(rule).is_plain()
-    before = torch.backends.cuda.matmul.allow_tf32
-    with PRECISIONS["tf32"].active():
-        assert torch.backends.cuda.matmul.allow_tf32
-    assert torch.backends.cuda.matmul.allow_tf32 == before
-
-
 def test_perception_in_float32_errs_little_and_the_reference_not_at_all():
     here = session()
     rows = alternatives.perception_rows(here, TINY)
@@ -103,22 +71,6 @@ def test_perception_in_float32_errs_little_and_the_reference_not_at_all():
     assert 1e-5 < short.perception < 1e-2
     left = {entry.what for entry in here.left_out}
     assert {"tf32", "perception in mixed", "plain, float32, 2D (2, 150)"} <= left
-
-
-def rollout_row(**values) -> alternatives.RolloutRow:
-    numbers = dict.fromkeys(("x_1", "s_1", "x_8", "s_8", "x_64", "s_64"), 1e-6)
-    usual = {"strategy": "library", "precision": "float32", "particles": 10, **numbers}
-    usual |= {"step_us": timing(3.0), "training_us": None, "peak_mib": None}
-    return alternatives.RolloutRow(**usual | {"weights": None, "psnr_512": math.nan} | values)
-
-
-def test_pictures_are_drawn_of_what_was_measured():
-    pytest.importorskip("matplotlib")
-    tables = {
-        "perceptions": alternatives.perception_rows(session(), Workload(2, 1, 60, 1)),
-        "rollouts": [rollout_row(), rollout_row(precision="mixed", s_8=1e-3)],
-    }
-    assert png(alternatives.draw_fronts(**tables)).startswith(b"\x89PNG")
 
 
 def stored(tmp_path: Path, **values: float) -> Path:

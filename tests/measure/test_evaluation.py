@@ -1,6 +1,5 @@
 """The numbers by which a rule is judged."""
 
-import json
 import math
 from dataclasses import astuple
 
@@ -10,8 +9,7 @@ from circle_task import PARTICLE_COUNT, STATE_DIM, CircleTask
 
 import npa_envs.measure.quality
 from npa_envs.errors import NPAError
-from npa_envs.measure.quality import EvaluationRow, HealingRow, evaluate, healing, psnr
-from npa_envs.measure.record import table_text, tables_json
+from npa_envs.measure.quality import evaluate, healing, psnr
 from npa_envs.rule.rule import NPARule
 
 
@@ -134,13 +132,3 @@ def test_wiped_disk_blanks_states_of_the_grown_world(monkeypatch):
 def test_wrong_arguments_are_named(measured, options, rule):
     with pytest.raises(NPAError, match=rule):
         measured(make_rule(0.0), CircleTask(), **options)
-
-
-def test_tables_as_json_can_be_read_back():
-    row = EvaluationRow(64, 0.125, 0.25, math.inf, 31.4159, 0, 1.5)
-    hurt = HealingRow("cut", 0.1, 0.2, None, 1, 2, 0.3)
-    assert "never" in table_text([hurt])
-    held = json.loads(tables_json({"growth": [row], "healing": [hurt]}, metric="loss"))
-    (back,) = held["growth"]
-    assert (back["step"], back["psnr"], back["psnr_worst"]) == (64, None, 31.4159)
-    assert (held["healing"][0]["steps_to_heal"], held["metric"]) == (None, "loss")

@@ -10,7 +10,7 @@ import torch
 
 from npa_envs.errors import NPAError
 from npa_envs.measure import record
-from npa_envs.measure.plots import number_plainly, write_plots
+from npa_envs.measure.plots import write_plots
 
 RESULTS = Path(__file__).resolve().parents[2] / "benchmarks" / "results"
 FACTS = {"commit": "0", "seeds": (1, 2)}
@@ -108,19 +108,3 @@ def test_plots_without_matplotlib_name_the_extra(tmp_path, monkeypatch):
     (told,) = write_plots(lambda: pytest.fail("drawn"), tmp_path / "*.png", "curves")
     assert told.startswith("no curves: ")
     assert "pip install 'npa-envs[bench]'" in told
-
-
-@pytest.mark.parametrize(
-    ("low", "high", "marks"),
-    [(0.1, 1.0, ["0.1", "0.2", "0.5", "1"]), (1.0, 1000.0, ["1", "10", "100", "1k"])],
-)
-def test_axes_of_few_decades_are_marked_within_them(low, high, marks):
-    pytest.importorskip("matplotlib")
-    from matplotlib.figure import Figure
-
-    panel = Figure().subplots()
-    panel.set(yscale="log", ylim=(0.99 * low, 1.01 * high))
-    number_plainly(panel.yaxis)
-    places, labels = panel.get_yticks(), panel.yaxis.get_major_formatter().format_ticks
-    assert labels([place for place in places if low <= place <= high]) == marks
-    assert not panel.get_yticks(minor=True).size

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from npa_envs.cli import main
-from npa_envs.measure.accuracy.endurance import rule_names, task_name
+from npa_envs.measure.accuracy.endurance import task_name
 from npa_envs.measure.robustness import study, trials
 from npa_envs.measure.robustness.trials import (
     BLOB_DISTANCE,
@@ -160,8 +160,8 @@ def test_a_course_counts_its_seeds():
     assert (course.recovered(), course.median_step(), course.within_at_end()) == (3, 16, 2)
     assert course.ratios(-1) == [1.0, 1.0, 2.0, 2.0]
     others = [dataclasses.replace(course, damage=name) for name in (trials.CONTROL, "side")]
-    assert study.recovered_share([record(course, *others)], ["wipe", "cut"]) == (3, 2, 4)
-    assert study.recovered_share([record(course, *others)], trials.DAMAGES) == (6, 4, 8)
+    assert study.recovered_counts([record(course, *others)], ["wipe", "cut"]) == (3, 2, 4)
+    assert study.recovered_counts([record(course, *others)], trials.DAMAGES) == (6, 4, 8)
 
 
 def record(*found: trials.LossCurve, **changed) -> study.RuleRecord:
@@ -348,7 +348,7 @@ def test_plans_are_whole_chunks_and_hold_what_was_trained():
 
 def test_stored_records_give_the_stored_tables():
     folder = Path(__file__).resolve().parents[2] / "benchmarks" / "results" / "robustness_h200"
-    places = [folder / f"robustness_{name}.json" for name in rule_names()]
+    places = [folder / f"robustness_{name}.json" for name in files.shipped_rules()]
     held = {path: json.loads(path.read_text("utf-8")) for path in places if path.exists()}
     records = [study.RuleRecord(content["facts"], path).read() for path, content in held.items()]
     assert len(records) == len(list(folder.glob("*.json"))) == 15

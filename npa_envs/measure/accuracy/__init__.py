@@ -7,9 +7,9 @@ from functools import partial
 
 # These two modules register their checks.
 from npa_envs.measure.accuracy import numerics  # noqa: F401
-from npa_envs.measure.accuracy.endurance import rule_names
 from npa_envs.measure.accuracy.hard_cases import scene_checks
 from npa_envs.measure.accuracy.suite import CHECKS, GROUPS, RULE_CHECKS, Check
+from npa_envs.rule.files import shipped_rules
 
 
 def all_checks(
@@ -23,7 +23,7 @@ def all_checks(
     few = ("gecko", "dots") if quick else ("gecko", "dots", "digits", "duck")
     rule_checks = [
         Check(f"{one.name}/{name}", one.expected, partial(one.run, source), source)
-        for group, names in {"time": rule_names(), "gradients": few}.items()
+        for group, names in {"time": list(shipped_rules()), "gradients": few}.items()
         for name, source in (rules or dict(zip(names, names, strict=True))).items()
         for one in RULE_CHECKS
         if one.group == group

@@ -9,7 +9,7 @@ import torch
 from npa_envs.errors import NPAError
 from npa_envs.measure.accuracy.suite import RULE_CHECKS, CheckResult, CheckSession, check
 from npa_envs.measure.quality import RuleRunner
-from npa_envs.rule.files import load_rule, rule_file, rule_metadata, shipped_rules
+from npa_envs.rule.files import load_rule, rule_file, rule_metadata
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Task
 from npa_envs.training.task_of_rule import task_of_rule, trained_config
@@ -32,11 +32,6 @@ class Habitat(NamedTuple):
     rule: NPARule
     task: Task
     worlds: Particles
-
-
-def rule_names() -> list[str]:
-    """Return the names of the shipped rules."""
-    return list(shipped_rules())
 
 
 def task_name(rule: str) -> str:
@@ -65,8 +60,8 @@ def habitat(
         # Farthest point sampling of clouds is slow.
         most = QUICK_CLOUD if task_name(name) == "point_classification" else QUICK_PARTICLES
         count = max(1, round(particles * (min(count, most) if session.quick else count)))
-        found = task_of_rule(name, rule, session.device, particle_count=count, **fields)
-        session.cache[name, particles] = rule, found.task
+        trained = task_of_rule(name, rule, session.device, particle_count=count, **fields)
+        session.cache[name, particles] = rule, trained.task
     rule, task = session.cache[name, particles]
     x, s, _, goal = task.seed(world_count, generator=session.generator(), device=session.device)
     return Habitat(rule, task.toward(goal), Particles(x.float(), s.float(), goal=goal))
@@ -146,22 +141,22 @@ def _run(name: str, session: CheckSession) -> CheckResult:
     centroid = home.worlds.x.mean(1)
     note = ""
     for step, worlds in runner.at(marks, home.worlds):
-        found = measured(energy_runner, worlds)
+        current = measured(energy_runner, worlds)
         x = worlds.x
-        if not first and not found["not_finite"]:
-            first, centroid = dict(found), x.mean(1)
-        if not found["not_finite"]:
+        if not first and not current["not_finite"]:
+            first, centroid = dict(current), x.mean(1)
+        if not current["not_finite"]:
             if open_space:
-                found["drift"] = float((x.mean(1) - centroid).norm(dim=-1).max())
+                current["drift"] = float((x.mean(1) - centroid).norm(dim=-1).max())
             for key, unit in (("extent", "extent"), ("energy", "energy"), ("drift", "extent")):
-                if key in found:
+                if key in current:
                     # In a world at rest the rest is rounding.
-                    found[key] /= max(first[unit], 1e-12)
-        for key, value in found.items():
+                    current[key] /= max(first[unit], 1e-12)
+        for key, value in current.items():
             figures[key] = max(value, figures.get(key, 0.0))
-        over = [key for key, limit in limits.items() if not found.get(key, 0.0) <= limit]
+        over = [key for key, limit in limits.items() if not current.get(key, 0.0) <= limit]
         if over and not note:
             note = f"{', '.join(over)} above the bound at step {step}"
-        if found["not_finite"]:
+        if current["not_finite"]:
             break
     return CheckResult(figures, limits, note=note)

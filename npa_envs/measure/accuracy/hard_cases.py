@@ -313,10 +313,10 @@ def _run_gradient(session: CheckSession) -> CheckResult:
     broken[WORLD, PARTICLE, 0] = math.nan
     clean = perceived(x, s, None, weights=weights)
     weights[WORLD, PARTICLE + 1] = math.nan
-    found = perceived(x, broken, None, weights=weights)
+    result = perceived(x, broken, None, weights=weights)
     figures = {
-        "states": differing(found.states[others], clean.states[others]),
-        "positions": differing(found.positions[others], clean.positions[others]),
+        "states": differing(result.states[others], clean.states[others]),
+        "positions": differing(result.positions[others], clean.positions[others]),
     }
     return CheckResult(figures, dict.fromkeys(figures, 0.0))
 
@@ -340,14 +340,14 @@ def _run_nan_state(session: CheckSession) -> CheckResult:
     """NaN in one state spreads in its own world only; other worlds' rollouts keep every bit."""
     (x, s), (clean_x, clean_s) = _broken_rollout(session)
     others = torch.arange(WORLD_COUNT, device=x.device) != WORLD
-    lost = (~s[WORLD].isfinite()).any(-1) | (~x[WORLD].isfinite()).any(-1)
+    broken = (~s[WORLD].isfinite()).any(-1) | (~x[WORLD].isfinite()).any(-1)
     away = (clean_x[WORLD] - clean_x[WORLD, PARTICLE]).norm(dim=-1) > (2 * STEPS) * EPS
     figures = {
         "other_worlds_x": differing(x[others], clean_x[others]),
         "other_worlds_s": differing(s[others], clean_s[others]),
-        "out_of_reach": float((lost & away).sum()),
-        "not_found": float(not bool(lost.any())),
-        "lost_particles": float(lost.sum()),
+        "out_of_reach": float((broken & away).sum()),
+        "not_found": float(not bool(broken.any())),
+        "lost_particles": float(broken.sum()),
     }
     return CheckResult(figures, dict.fromkeys(list(figures)[:4], 0.0))
 

@@ -114,9 +114,9 @@ def _run_float32(name: str, session: CheckSession) -> CheckResult:
     figures: dict[str, float] = {}
     usable = dict.fromkeys(RolloutOutcome._fields, 0)
     for steps in counts:
-        found = outcome(home, session, steps, torch.float32)
+        single = outcome(home, session, steps, torch.float32)
         exact = outcome(home, session, steps, torch.float64)
-        for what, value, right in zip(RolloutOutcome._fields, found, exact, strict=True):
+        for what, value, right in zip(RolloutOutcome._fields, single, exact, strict=True):
             figures[f"{what}_{steps}"] = error = relative_error(value, right)
             if error <= 1e-2 and usable[what] in (0, steps // 2):
                 usable[what] = steps
@@ -165,9 +165,9 @@ def _difference(scene: Scene, session: CheckSession, what: str) -> float:
     # Second derivatives jump at ε, which causes an error in proportion to `change`.
     change = 1e-7
     quotient = float(at(change) - at(-change)) / (2.0 * change)
-    given = (s if what == "states" else x).clone().requires_grad_()
-    value = functional(x, given) if what == "states" else functional(given, s)
-    (gradient,) = torch.autograd.grad(value, given)
+    varied = (s if what == "states" else x).clone().requires_grad_()
+    value = functional(x, varied) if what == "states" else functional(varied, s)
+    (gradient,) = torch.autograd.grad(value, varied)
     slope = float((gradient * along).sum())
     # The terms may cancel, so the error is relative to the sum of their absolute values.
     size = float((gradient * along).abs().sum())

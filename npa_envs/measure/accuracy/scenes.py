@@ -174,10 +174,10 @@ def threshold_scenes(space_dim: int, threshold: float) -> tuple[Tensor, Tensor]:
     low, high = torch.zeros_like(offsets), torch.full_like(offsets, 0.4 * EPS)
     for _ in range(50):
         worlds[:, -1, -1] = 0.5 * (low + high)
-        found = torch.linalg.det(reference.fields(worlds, s, EPS).moment[:, 0])
-        low = torch.where(found < wanted, worlds[:, -1, -1], low)
-        high = torch.where(found < wanted, high, worlds[:, -1, -1])
-    torch.testing.assert_close(found, wanted, rtol=1e-9, atol=0.0)
+        determinants = torch.linalg.det(reference.fields(worlds, s, EPS).moment[:, 0])
+        low = torch.where(determinants < wanted, worlds[:, -1, -1], low)
+        high = torch.where(determinants < wanted, high, worlds[:, -1, -1])
+    torch.testing.assert_close(determinants, wanted, rtol=1e-9, atol=0.0)
     return worlds.float().double(), offsets
 
 

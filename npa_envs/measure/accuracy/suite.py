@@ -209,8 +209,10 @@ class StressRecord(Record[CheckResult]):
 
     def counts(self) -> dict[str, int]:
         """Return the number of checks with each verdict."""
-        found = [entry.verdict for entry in self.rows]
-        return {verdict: found.count(verdict) for verdict in ("pass", "range", "fail", "skipped")}
+        verdicts = [entry.verdict for entry in self.rows]
+        return {
+            verdict: verdicts.count(verdict) for verdict in ("pass", "range", "fail", "skipped")
+        }
 
     def failed(self) -> list[CheckResult]:
         """Return the entries of the checks that failed."""
@@ -227,12 +229,12 @@ class StressRecord(Record[CheckResult]):
         """Return a table of each group, and the expectations of the checks that failed."""
         parts = []
         for entries in self.by_group().values():
-            found = [entry.holds or entry.worst() or entry.note for entry in entries]
-            width = max(map(len, found))
+            texts = [entry.holds or entry.worst() or entry.note for entry in entries]
+            width = max(map(len, texts))
             lines = [["check", "verdict", "seconds", "found"]]
-            for entry, words in zip(entries, found, strict=True):
+            for entry, text in zip(entries, texts, strict=True):
                 seconds = f"{round(entry.seconds, 2):.4g}"
-                lines.append([entry.name, entry.verdict, seconds, words.ljust(width)])
+                lines.append([entry.name, entry.verdict, seconds, text.ljust(width)])
             parts.append("\n".join(aligned(lines)))
         parts += [
             f"{entry.name} failed: {entry.worst() or entry.note}\n  expected: {entry.expected}"

@@ -202,26 +202,26 @@ def where_it_works(record: RuleRecord, condition: str) -> str:
 
     It works if all seeds are finite and the mean loss is at most `WORKS` times the trained one.
     """
-    found = record.of(condition)
-    if not found:
+    measured = record.of(condition)
+    if not measured:
         return ""
     # The ratio of a value that was left out is NaN, so a range ends before it.
-    ratios = [ratio(response.mean(), record.trained().mean()) for response in found]
+    ratios = [ratio(response.mean(), record.trained().mean()) for response in measured]
     trained = trained_value(condition, record.about["update_prob"])
     if isinstance(trained, str):
-        pairs = zip(found, ratios, strict=True)
+        pairs = zip(measured, ratios, strict=True)
         works = [str(response.value) for response, value in pairs if value <= WORKS]
         text = ", ".join(works) or f"not from {trained}"
     else:
-        text = working_range([float(r.value) for r in found], ratios, trained)
-    left_out = [short(response.value) for response in found if not response.losses]
+        text = working_range([float(r.value) for r in measured], ratios, trained)
+    left_out = [short(response.value) for response in measured if not response.losses]
     return text + (f" (not measured: {', '.join(left_out)})" if left_out else "")
 
 
 def working_range(values: Sequence[float], ratios: Sequence[float], trained: float) -> str:
     """Return the range of values around the trained one at which a rule works, as text.
 
-    Values increase; ratios are the loss at each over the trained one, NaN if a seed is lost.
+    Values increase; ratios are the loss at each over the trained one, NaN if a seed has diverged.
     """
     works = [value <= WORKS for value in ratios]
     low = high = min(range(len(values)), key=lambda k: abs(values[k] - trained))
@@ -240,14 +240,14 @@ def working_range(values: Sequence[float], ratios: Sequence[float], trained: flo
 # Tables in Markdown
 
 
-SHARES = {
+DAMAGE_GROUPS = {
     "what rules are asked to heal": [d.name for d in DAMAGES.values() if not d.beyond],
     "what is beyond that": [d.name for d in DAMAGES.values() if d.beyond],
 }
 """Damages whose recovered seeds are counted together, without the control."""
 
 
-def recovered_share(
+def recovered_counts(
     records: Iterable[RuleRecord], damages: Collection[str]
 ) -> tuple[int, int, int]:
     """Return the seeds of all rules that recovered, that are recovered at the end, and all."""
@@ -272,8 +272,8 @@ def tables(records: Sequence[RuleRecord]) -> str:
     for condition, summary in CONDITIONS.items():
         if table := _by_value(records, condition):
             parts.append(f"Loss over that as trained, by {summary}:\n\n{table}")
-    for summary, damages in SHARES.items():
-        recovered, at_end, total = recovered_share(records, damages)
+    for summary, damages in DAMAGE_GROUPS.items():
+        recovered, at_end, total = recovered_counts(records, damages)
         if total:
             parts.append(
                 f"Recovered of {summary} ({', '.join(damages)}): {recovered} of {total} "
@@ -284,8 +284,8 @@ def tables(records: Sequence[RuleRecord]) -> str:
 
 
 def _time(curve: LossCurve) -> str:
-    step, share = curve.median_step(), f"{curve.recovered()}/{len(curve.losses)}"
-    return share if step is None else f"{share}, {step:g}"
+    step, recovered = curve.median_step(), f"{curve.recovered()}/{len(curve.losses)}"
+    return recovered if step is None else f"{recovered}, {step:g}"
 
 
 def _size(curve: LossCurve) -> str:
@@ -305,8 +305,8 @@ def _by_damage(records: Sequence[RuleRecord], cell: Callable[[LossCurve], str]) 
     names = [name for name in (CONTROL, *DAMAGES) if name in done]
     rows = []
     for record in records:
-        found = {curve.damage: curve for curve in record.curves}
-        rows.append([record.rule, *(cell(found[n]) if n in found else NONE for n in names)])
+        curves = {curve.damage: curve for curve in record.curves}
+        rows.append([record.rule, *(cell(curves[n]) if n in curves else NONE for n in names)])
     return markdown_table(["rule", *names], rows)
 
 
@@ -315,9 +315,9 @@ def _by_value(records: Sequence[RuleRecord], condition: str) -> str:
     values = list(dict.fromkeys(r.value for record in records for r in record.of(condition)))
     rows = []
     for record in records:
-        found = {response.value: response for response in record.of(condition)}
-        if found:
-            cells = [_change(record, found.get(value)) for value in values]
+        responses_by_value = {response.value: response for response in record.of(condition)}
+        if responses_by_value:
+            cells = [_change(record, responses_by_value.get(value)) for value in values]
             rows.append([record.rule, short(record.trained().mean()), *cells])
     return markdown_table(["rule", "loss as trained", *map(short, values)], rows) if rows else ""
 
@@ -379,9 +379,11 @@ def _draw_curves(panel: Any, record: RuleRecord) -> None:
 
 def _draw_responses(panel: Any, record: RuleRecord, condition: str) -> None:
     """Draw losses by the values of a condition."""
-    found = [response for response in record.of(condition) if response.losses]
-    values = [float(response.value) for response in found]
-    _draw_seeds(panel, values, [response.losses for response in found], "C0", CONDITIONS[condition])
+    measured = [response for response in record.of(condition) if response.losses]
+    values = [float(response.value) for response in measured]
+    _draw_seeds(
+        panel, values, [response.losses for response in measured], "C0", CONDITIONS[condition]
+    )
     trained = sorted(record.trained().losses)
     panel.axhline(trained[len(trained) // 2], color="black", lw=0.7, ls=":")
     panel.set(xscale="log", yscale="log")
@@ -395,10 +397,10 @@ def _draw_seeds(
     panel: Any, across: Sequence[float], columns: Sequence[Sequence[float]], colour: str, name: str
 ) -> None:
     """Draw the median of the seeds and a band from least to most; NaN makes gaps."""
-    lost = [any(map(math.isnan, column)) for column in columns]
+    diverged = [any(map(math.isnan, column)) for column in columns]
     # The upper median of an even number.
     low, middle, high = (
-        [math.nan if gone else sorted(c)[k] for c, gone in zip(columns, lost, strict=True)]
+        [math.nan if flag else sorted(c)[k] for c, flag in zip(columns, diverged, strict=True)]
         for k in (0, len(columns[0]) // 2, -1)
     )
     draw_band(panel, across, (low, middle, high), colour, name, marker=".", ms=3, lw=1)

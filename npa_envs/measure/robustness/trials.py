@@ -243,7 +243,7 @@ class RuleTrial:
         """Yield each task and the indices of its worlds, of whole copies of all worlds."""
         pictures = self._pictures.repeat(len(x) // self.world_count)
         tasks = self.tasks_of(x.shape[1])
-        for k in pictures.unique().tolist():
+        for k in sorted(set(pictures.tolist())):
             yield tasks[k], (pictures == k).nonzero()[:, 0]
 
     def coded(self, x: Tensor, s: Tensor) -> Tensor:
@@ -301,7 +301,7 @@ class RuleTrial:
         size = max(1, LOSS_PARTICLES // worlds.x.shape[1])
         losses = worlds.x.new_empty(len(worlds.x))
         for task, index in self._by_task(worlds.x):
-            for some in index.split(size):
+            for some in torch.split(index, size):
                 x, s, _, goal = worlds.take(some)
                 losses[some] = task.toward(goal).trial_metric(x, s)
         return losses

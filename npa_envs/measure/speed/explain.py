@@ -51,7 +51,7 @@ def kernel_rows(session: TimingSession, workloads: Sequence[Workload]) -> list[K
                 run()
                 torch.cuda.synchronize(session.device)
             name = f"{workload.name} {'training' if train else 'inference'}"
-            found = [
+            kernels = [
                 KernelRow(
                     name,
                     round(entry.self_device_time_total / workload.steps, 2),
@@ -61,9 +61,9 @@ def kernel_rows(session: TimingSession, workloads: Sequence[Workload]) -> list[K
                 for entry in profiler.key_averages()
                 if entry.device_type == DeviceType.CUDA
             ]
-            found.sort(key=lambda row: -row.us)
-            least = 0.005 * sum(row.us for row in found)
-            rows += [row for row in found if row.us >= least]
+            kernels.sort(key=lambda row: -row.us)
+            least = 0.005 * sum(row.us for row in kernels)
+            rows += [row for row in kernels if row.us >= least]
             session.progress(1)
     return rows
 

@@ -119,7 +119,8 @@ class PublicRow:
 def _public_row(session: TimingSession, workload: Workload) -> PublicRow:
     x, s = workload.worlds(session.device)
     timings = []
-    for options in ({}, {"cuda_graph": False}):
+    calls: tuple[dict[str, Any], ...] = ({}, {"cuda_graph": False})
+    for options in calls:
         for train in (False, True):
             run, _ = rollout_call(workload, x, s, train=train, **options)
             timing = timed_calls(run, session.device, warm=3, repeats=session.repeats)
@@ -275,9 +276,9 @@ def skip_rows(session: TimingSession) -> list[SkipRow]:
     x, s = workload.worlds(session.device)
 
     def cost(options: dict[str, Any]) -> Timing:
-        given: dict[str, Any] = {"steps": workload.steps} | options
-        rolled = replace(workload, steps=given.pop("steps"))
-        run, generator = rollout_call(rolled, x, s, **given)
+        kwargs: dict[str, Any] = {"steps": workload.steps} | options
+        rolled = replace(workload, steps=kwargs.pop("steps"))
+        run, generator = rollout_call(rolled, x, s, **kwargs)
         return session.cost(run, generator=generator).time.divided(rolled.steps)
 
     def row(left_out: str, condition: str, *options: dict[str, Any]) -> SkipRow:
@@ -336,14 +337,14 @@ def _species_row(
     alone, species = make(), make(roll=roll_one_species)
     # A ratio of nearly 1 needs more readings than other tables.
     repeats = 3 * session.repeats
-    compared = compare(alone, species, session.device, repeats=repeats, graph=graph)
+    first, second, ratio = compare(alone, species, session.device, repeats=repeats, graph=graph)
     return OneSpeciesRow(
         workload.name,
         "training" if train else "inference",
         "graph" if graph else "eager",
-        compared.first.divided(workload.steps),
-        compared.second.divided(workload.steps),
-        compared.ratio,
+        first.divided(workload.steps),
+        second.divided(workload.steps),
+        ratio,
     )
 
 
@@ -459,9 +460,9 @@ def _draw_scaling(table: Sequence[ScalingRow], what: str) -> Any:
     for name, panel in zip(AXES, panels, strict=True):
         rows = [row for row in table if row.axis == name]
         for field, label in (("infer", "inference"), ("train", "training")):
-            found = [getattr(row, f"{field}_{unit}") for row in rows]
+            cells = [getattr(row, f"{field}_{unit}") for row in rows]
             # Missing values make gaps.
-            values = [cell.median if isinstance(cell, Timing) else cell for cell in found]
+            values = [cell.median if isinstance(cell, Timing) else cell for cell in cells]
             panel.plot([row.value for row in rows], values, marker="o", ms=4, label=label)
         panel.set(xscale="log", yscale="log", xlabel=AXES[name])
         panel.set_ylabel("time of a step [µs]" if what == "time" else "peak memory [MiB]")

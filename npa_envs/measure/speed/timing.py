@@ -99,7 +99,7 @@ def rollout_call(
     """
     network = workload.rule(x.device, **(rule or {}))
     generator = torch.Generator(x.device).manual_seed(1)
-    given = {"eps": workload.eps, "update_prob": workload.update_prob, **options}
+    kwargs = {"eps": workload.eps, "update_prob": workload.update_prob, **options}
     draws = torch.Generator(x.device).manual_seed(2)
     weights = [
         torch.randn(worlds.shape, generator=draws, device=x.device)
@@ -108,7 +108,7 @@ def rollout_call(
 
     def run() -> None:
         with torch.set_grad_enabled(train or gradients):
-            worlds = roll(network, x, s, workload.steps, generator=generator, **given)
+            worlds = roll(network, x, s, workload.steps, generator=generator, **kwargs)
             if train:
                 terms = [(a * b).sum() for a, b in zip(worlds, weights, strict=True)]
                 torch.autograd.grad(terms[0] + terms[1], list(network.parameters()))
@@ -151,15 +151,6 @@ class Cost:
     peak_mib: float | None
 
 
-@dataclass(frozen=True)
-class Comparison:
-    """Times of two calls, read in turn, and the median of the ratios second / first."""
-
-    first: Timing
-    second: Timing
-    ratio: float
-
-
 def synchronize(device: torch.device) -> None:
     """Wait for all work of a device, if it is CUDA."""
     if device.type == "cuda":
@@ -168,10 +159,11 @@ def synchronize(device: torch.device) -> None:
 
 def compare(
     first: Sampled, second: Sampled, device: torch.device, *, repeats: int, graph: bool = True
-) -> Comparison:
+) -> tuple[Timing, Timing, float]:
     """Time two calls in `repeats` pairs, whose order alternates, under the same conditions.
 
-    On CUDA, `graph` times replays of CUDA graphs.
+    Returns both times, and the median of the ratios second / first. On CUDA, `graph` times replays
+    of CUDA graphs.
     """
     runs: list[Callable[[], object]] = []
     for run, generator in (first, second):
@@ -186,7 +178,7 @@ def compare(
         for which in (0, 1) if number % 2 == 0 else (1, 0):
             readings[which].append(_reading(runs[which], device, calls) * 1e6)
     ratio = statistics.median(b / a for a, b in zip(*readings, strict=True))
-    return Comparison(_summary(readings[0]), _summary(readings[1]), ratio)
+    return _summary(readings[0]), _summary(readings[1]), ratio
 
 
 def timed_calls(

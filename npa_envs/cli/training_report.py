@@ -1,4 +1,4 @@
-"""The report of a training run in its folder: figures, a film and a card of the rule."""
+"""The report that `npa-envs train` ends with: figures, a film and a card of the rule."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def write_report(
     thorough = device.type == "cuda"
     clouds = task.classifies
     checkpoints = (CLOUD_CHECKPOINTS if clouds else CHECKPOINTS)[: None if thorough else 5]
-    count = 8 if thorough else 2
+    seeds = range(FIRST_SEED, FIRST_SEED + (8 if thorough else 2))
     judge = TextureJudge(task) if task.has_judge else None
     not_filmed = ""
     with common.StepBar(None, show=progress) as bar:
@@ -92,7 +92,7 @@ def write_report(
             rule,
             task,
             checkpoints=checkpoints,
-            seeds=range(FIRST_SEED, FIRST_SEED + count),
+            seeds=seeds,
             changed=thorough and (clouds or task.aligned),
             device=device,
             progress=bar.advance,
@@ -117,13 +117,11 @@ def write_report(
         except MissingDependencyError as error:
             not_filmed = f"; not all films: {error}"
     if len(tasks := tasks_of_codes(str(path), rule, device)) > 1:
-        seeds = range(FIRST_SEED, FIRST_SEED + count)
         tables["pictures"] = picture_rows(rule, tasks, seeds=seeds, device=device)
     command = f"npa-envs evaluate {shlex.quote(str(path))} --device {device.type}"
     if not clouds:
-        command += f" --seed-count {count} --checkpoints {' '.join(map(str, checkpoints))}"
-        command += " --healing" if "healing" in tables else ""
-        command += " --judge" if judge else ""
+        command += f" --seed-count {len(seeds)} --checkpoints {' '.join(map(str, checkpoints))}"
+        command += " --healing" * ("healing" in tables) + " --judge" * (judge is not None)
     facts = {"command": command, "commit": current_commit(), "date": date.today().isoformat()}
     facts |= {"machine": machine(device), "metric": task.metric_name}
     text = tables_json(tables, **facts)
@@ -151,23 +149,23 @@ def _card(
     config = task.config
     goal = getattr(config, "data", config.goal_text)
     others = "" if rule.codes is None else f", one of {len(rule.codes)} pictures"
-    space = (
-        "open space" if task.box is None else f"periodic box of {' x '.join(map(str, task.box))}"
-    )
+    box = task.box
+    space = "open space" if box is None else f"periodic box of {' x '.join(map(str, box))}"
     moves = "static" if rule.static else f"α {rule.alpha:g}"
-    wide, narrow = rule.hidden.weight.shape[1], rule.output.weight.shape[0]
-    read_out = f", read-out to {rule.readout_dim}" if rule.readout_dim else ""
-    used = versions()
     world = f"N {config.particle_count}, C {rule.state_dim}, ε {task.eps:g}, {moves}"
-    zone = f", dead zone {rule.dead_zone:g}" if rule.dead_zone else ""
-    sizes = f"{wide} → {rule.hidden_dim} → {narrow}{read_out}, {rule.weight_count} weights{zone}"
+    wide, narrow = rule.hidden.weight.shape[1], rule.output.weight.shape[0]
+    sizes = f"{wide} → {rule.hidden_dim} → {narrow}"
+    sizes += f", read-out to {rule.readout_dim}" if rule.readout_dim else ""
+    sizes += f", {rule.weight_count} weights"
+    sizes += f", dead zone {rule.dead_zone:g}" if rule.dead_zone else ""
+    used = versions()
     rows = [
         ("task", f"{rule.space_dim}D, {space}, {world}, p {task.update_prob:g}"),
         ("network", sizes),
         ("format", "safetensors with all hyper-parameters in its metadata"),
         ("machine", f"{facts['machine']}, torch {used['torch']}, warp-lang {used['warp-lang']}"),
         ("date", facts["date"]),
-    ]  # fmt: skip
+    ]
     parts = [
         f"# {Path(goal).stem}",
         f"A rule of the task `{training.task_name}` for `{goal}`{others}.",
