@@ -135,21 +135,21 @@ def check_same_run(
 ) -> None:
     """Check that a checkpoint belongs to the run that is to be resumed."""
     # The entries that are needed before the run is built.
-    needed = [(name, content.get(name), kind) for name, kind in NEEDED.items()]
+    needed = [(name, content.get(name), cls) for name, cls in NEEDED.items()]
     if isinstance(content.get("config"), dict):
         needed.append(("config.task", content["config"].get("task"), dict))
     # Seconds may be an int.
     wrong = [
         name
-        for name, value, kind in needed
-        if not isinstance(value, (int, float) if kind is float else kind)
+        for name, value, cls in needed
+        if not isinstance(value, (int, float) if cls is float else cls)
     ]
     if not wrong and not _is_plain(content["config"]):
         wrong = ["config"]
     if wrong:
         raise unusable_checkpoint(path, f"{', '.join(wrong)} is missing or of a wrong type")
-    numbers = {name: kind() for name, kind in NEEDED.items() if kind in (int, float)}
-    check_content(content, numbers, path)
+    zeros = {name: cls() for name, cls in NEEDED.items() if cls in (int, float)}
+    check_content(content, zeros, path)
     check_task(content, task_name, path)
     theirs = _flat(content["config"])
     ours = _flat(config_to_dict(config))
@@ -202,8 +202,8 @@ def _wrong(name: str, value: Any, like: Any) -> Iterator[str]:
             yield from _wrong(f"{name}.{key}", value[key], like[key])
     elif isinstance(like, Tensor):
         if not isinstance(value, Tensor) or _kind(value) != _kind(like):
-            came = f"of {_kind(value)}" if isinstance(value, Tensor) else type(value).__name__
-            yield f"{name} must be a tensor of {_kind(like)}, got {came}"
+            got = f"of {_kind(value)}" if isinstance(value, Tensor) else type(value).__name__
+            yield f"{name} must be a tensor of {_kind(like)}, got {got}"
         elif not bool(torch.isfinite(value).all()):
             yield f"{name} must be finite"
         elif name.rpartition(".")[2] in NOT_NEGATIVE and bool((value < 0).any()):

@@ -231,18 +231,16 @@ class LossMeter:
         device = iteration.terms.device
         # One tensor, so that one copy transfers all of them; float64, in which long sums keep their
         # digits and integers are exact.
-        numbers = torch.zeros(len(iteration.terms) + 3, dtype=torch.float64, device=device)
-        self._numbers = numbers
-        self._sums, self._replaced, self._bad = numbers[:-3], numbers[-3], numbers[-2:]
+        totals = torch.zeros(len(iteration.terms) + 3, dtype=torch.float64, device=device)
+        self._totals = totals
+        self._sums, self._replaced, self._bad = totals[:-3], totals[-3], totals[-2:]
         self._bad[0] = NONE_YET
         self._now = torch.zeros_like(self._bad)
         self._snapshot = {name: value.clone() for name, value in self._observed().items()}
         self._count = 0
         self._step_sum = 0
         on_cuda = device.type == "cuda"
-        self._sent = torch.zeros(
-            numbers.shape, dtype=numbers.dtype, device="cpu", pin_memory=on_cuda
-        )
+        self._sent = torch.zeros(totals.shape, dtype=totals.dtype, device="cpu", pin_memory=on_cuda)
         self._sent_counts = (0, 0)
         self._arrival = torch.cuda.Event() if on_cuda else None  # type: ignore[no-untyped-call]
 
@@ -267,11 +265,11 @@ class LossMeter:
 
     def send(self) -> None:
         """Start to copy the interval's statistics to the host, and begin the next interval."""
-        self._sent.copy_(self._numbers, non_blocking=True)
+        self._sent.copy_(self._totals, non_blocking=True)
         if self._arrival is not None:
-            self._arrival.record(torch.cuda.current_stream(self._numbers.device))
+            self._arrival.record(torch.cuda.current_stream(self._totals.device))
         self._sent_counts = self._count, self._step_sum
-        self._numbers[:-2].zero_()
+        self._totals[:-2].zero_()
         self._count = 0
         self._step_sum = 0
 

@@ -40,13 +40,13 @@ def layer_weights(rules: nn.Module) -> list[Tensor]:
     Biases, codes and the weights of division are left out.
     """
     fates = set(map(id, fate_parameters(rules)))
-    found: list[Tensor] = []
+    weights: list[Tensor] = []
     for module in rules.modules():
         if isinstance(module, nn.Linear):
-            found.append(module.weight)
+            weights.append(module.weight)
         elif isinstance(module, NPARule) and module.equivariant:
-            found.append(module.mixing)
-    return [weight for weight in found if id(weight) not in fates]
+            weights.append(module.mixing)
+    return [weight for weight in weights if id(weight) not in fates]
 
 
 class RuleOptimiser:
@@ -101,33 +101,34 @@ class RuleOptimiser:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore what `state_dict` returned."""
         moments = state["state"]
-        for optimiser, numbers in self._optimisers:
-            own = {at: moments[number] for at, number in enumerate(numbers) if number in moments}
+        for optimiser, indices in self._optimisers:
+            own = {at: moments[index] for at, index in enumerate(indices) if index in moments}
             load_moments(optimiser, own)
 
     def _fresh(self, parameters: list[nn.Parameter]) -> list[tuple[Optimizer, list[int]]]:
         """Return new optimisers, each with the indices of its parameters."""
-        decay, made = self._config.weight_decay, list[tuple[Optimizer, list[int]]]()
-        numbers = [number for number, own in enumerate(self._orthogonal) if own]
-        if numbers:
+        decay = self._config.weight_decay
+        optimisers: list[tuple[Optimizer, list[int]]] = []
+        indices = [index for index, orthogonal in enumerate(self._orthogonal) if orthogonal]
+        if indices:
             # Steps of AdamW's length, so that one learning rate serves both.
             muon = torch.optim.Muon(
-                [parameters[number] for number in numbers],
+                [parameters[index] for index in indices],
                 weight_decay=decay,
                 momentum=MUON_MOMENTUM,
                 adjust_lr_fn="match_rms_adamw",
             )
-            made.append((muon, numbers))
-        numbers = [number for number, own in enumerate(self._orthogonal) if not own]
-        if numbers:
+            optimisers.append((muon, indices))
+        indices = [index for index, orthogonal in enumerate(self._orthogonal) if not orthogonal]
+        if indices:
             groups = [
-                {"rate_factor": factor, "params": [parameters[number] for number in run]}
-                for factor, run in itertools.groupby(numbers, self._rate_factors.__getitem__)
+                {"rate_factor": factor, "params": [parameters[index] for index in group]}
+                for factor, group in itertools.groupby(indices, self._rate_factors.__getitem__)
             ]
             # One kernel for all parameters; a loop is as fast on a CPU.
-            fused = parameters[0].is_cuda
-            made.append((torch.optim.AdamW(groups, weight_decay=decay, fused=fused), numbers))
-        return made
+            adamw = torch.optim.AdamW(groups, weight_decay=decay, fused=parameters[0].is_cuda)
+            optimisers.append((adamw, indices))
+        return optimisers
 
 
 def load_moments(optimiser: Optimizer, state: dict[int, Any]) -> None:
@@ -139,7 +140,7 @@ def load_moments(optimiser: Optimizer, state: dict[int, Any]) -> None:
 def _moments(optimisers: list[tuple[Optimizer, list[int]]]) -> dict[int, dict[str, Tensor]]:
     """Return the states of all parameters, by index."""
     return {
-        numbers[at]: state
-        for optimiser, numbers in optimisers
+        indices[at]: state
+        for optimiser, indices in optimisers
         for at, state in optimiser.state_dict()["state"].items()
     }

@@ -419,8 +419,7 @@ def take_options(rule: NPARule, config: TrainConfig[Any]) -> None:
 
 
 def initial_rule(config: TrainConfig[Any], untrained: NPARule) -> NPARule:
-    """Return the rule that a run starts from, with the hyper-parameters of the task's untrained
-    one.
+    """Return the rule that a run starts from, in the form of the task's untrained one.
 
     A rule without division or codes may initialise one with them. An equivariant rule has no dead
     zone, and starts from random weights where the configuration names one of `preset_rules`, which

@@ -92,9 +92,10 @@ class Actions(PreparedActions):
         x, _, mask, noise, _, diverged = self._worlds
         diverged.zero_()
         drawn = draw_step(x, self._physics, self._random)
-        for own, new in zip((mask, noise), drawn[:2], strict=True):
-            if own is not None and new is not None:
-                own.copy_(new)
+        if mask is not None and drawn.mask is not None:
+            mask.copy_(drawn.mask)
+        if noise is not None and drawn.noise is not None:
+            noise.copy_(drawn.noise)
 
     def updated(self) -> Tensor:
         """Return which particles the last draw updates, bool, shape [B, N]."""
@@ -118,8 +119,7 @@ def marginal_gains(
     `losses` maps positions and states to the named parts of each world's loss, shape [B] each. The
     result is None if no gradient flows from them to positions or states.
     """
-    moved = wrapped(after[0] - before[0], box)
-    changed = after[1] - before[1]
+    moved, changed = wrapped(after[0] - before[0], box), after[1] - before[1]
     with torch.enable_grad():
         x = wrapped(after[0] - 0.5 * moved, box).requires_grad_()
         s = (after[1] - 0.5 * changed).requires_grad_()

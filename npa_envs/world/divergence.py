@@ -78,17 +78,17 @@ def describe_divergence(x: Tensor, s: Tensor, *, limit: float = RUNAWAY) -> str:
     worlds = (flags.non_finite | flags.runaway).nonzero()[:, 0].tolist()
     lines = []
     for world in worlds[:MAX_REPORT]:
-        numbers = torch.cat((x[world], s[world]), dim=1).cpu()
-        bad = ~numbers.isfinite()
+        values = torch.cat((x[world], s[world]), dim=1).cpu()
+        bad = ~values.isfinite()
         beyond = ""
         if not bool(bad.any()):
-            bad = numbers.abs() > limit
+            bad = values.abs() > limit
             beyond = f", beyond {limit:g}"
         particle, entry = bad.nonzero()[0].tolist()
         number, particles = int(bad.sum()), int(bad.any(dim=1).sum())
         lines.append(
             f"world {world}: {term_name(entry, x.shape[2])} of particle {particle} is "
-            f"{numbers[particle, entry].item():g}{beyond} ({number} such "
+            f"{values[particle, entry].item():g}{beyond} ({number} such "
             f"number{'s' * (number > 1)} in {particles} particle{'s' * (particles > 1)})"
         )
     if len(worlds) > MAX_REPORT:
@@ -116,19 +116,19 @@ class DivergenceWatch:
         self._everyone = torch.arange(world_count, device=x.device)
         self._first = torch.full_like(self._everyone, -1)
         self._particle = torch.zeros_like(self._everyone)
-        self._numbers = x.new_zeros(world_count, self._space_dim + s.shape[2])
+        self._values = x.new_zeros(world_count, self._space_dim + s.shape[2])
         self.look(worlds)
 
     @torch.no_grad()
     def look(self, worlds: Particles) -> None:
         """Check the worlds after a step."""
-        numbers = torch.cat((worlds.x.detach(), worlds.s.detach()), dim=2)
-        bad = ~numbers.isfinite().all(dim=2)
+        values = torch.cat((worlds.x.detach(), worlds.s.detach()), dim=2)
+        bad = ~values.isfinite().all(dim=2)
         particle = bad.byte().argmax(dim=1)
         rose = bad[self._everyone, particle] & (self._first < 0)
         self._first.masked_fill_(rose, self._looks)
         self._particle = torch.where(rose, particle, self._particle)
-        self._numbers = torch.where(rose[:, None], numbers[self._everyone, particle], self._numbers)
+        self._values = torch.where(rose[:, None], values[self._everyone, particle], self._values)
         self._looks += 1
 
     def raise_diverged(self) -> None:
@@ -139,12 +139,12 @@ class DivergenceWatch:
             return
         lines = []
         for step, world in worlds[:MAX_REPORT]:
-            numbers = self._numbers[world].cpu()
-            entry = int((~numbers.isfinite()).nonzero()[0])
+            values = self._values[world].cpu()
+            entry = int((~values.isfinite()).nonzero()[0])
             when = f"in step {step}" if step > 0 else "before the first step"
             lines.append(
                 f"world {world}: {term_name(entry, self._space_dim)} of particle "
-                f"{int(self._particle[world])} was {numbers[entry].item():g} {when}"
+                f"{int(self._particle[world])} was {values[entry].item():g} {when}"
             )
         if len(worlds) > MAX_REPORT:
             lines.append(f"and {len(worlds) - MAX_REPORT} more worlds")

@@ -49,8 +49,8 @@ def parked(x: Tensor, alive: Tensor, eps: float) -> Tensor:
     while side**space_dim < count:
         side *= 2
     slot = torch.arange(count, device=x.device)
-    place = torch.stack([slot // side**d % side for d in range(space_dim)], dim=-1)
-    far = eps * (PARKING_DISTANCE + PARKING_GAP * place.to(x.dtype))
+    cell = torch.stack([slot // side**d % side for d in range(space_dim)], dim=-1)
+    far = eps * (PARKING_DISTANCE + PARKING_GAP * cell.to(x.dtype))
     return torch.where(alive[..., None], x, far)
 
 
@@ -115,8 +115,8 @@ def divided(
     x = torch.where(born[..., None], children_x, x - half_way)
     alive = stays | born
     # Dead slots get the mean of the living. If none lives, all are at the origin.
-    share = alive[..., None].to(x.dtype)
-    middle = world_mean(x * share) / world_mean(share).clamp_min(0.5 / count)
+    weight = alive[..., None].to(x.dtype)
+    middle = world_mean(x * weight) / world_mean(weight).clamp_min(0.5 / count)
     x = torch.where(alive[..., None], x, middle[:, None])
     others = [torch.where(stays.view(*stays.shape, *[1] * (v.ndim - 2)), v, 0.0) for v in others]
     return Particles(x, s, *others)._replace(goal=particles.goal)

@@ -111,7 +111,7 @@ class RolloutSpec(NamedTuple):
         particles = step.enter(particles)
         keep_every = self.keep_every
         interval = STORED_INTERVAL[self.memory] if torch.is_grad_enabled() else 1
-        kept: list[Particles] = []
+        trajectory: list[Particles] = []
         # During a capture torch's random state cannot be read, and draws belong to the graph.
         recorded = particles.x.is_cuda and torch.cuda.is_current_stream_capturing()
         with_modules = not all(rule.has_network() for rule in rules)
@@ -139,13 +139,16 @@ class RolloutSpec(NamedTuple):
                 if watch is not None:
                     watch.look(step.leave(particles.map(Tensor.detach)))
                 if keep_every is not None and (number + 1) % keep_every == 0:
-                    kept.append(step.leave(particles))
+                    trajectory.append(step.leave(particles))
             if recomputed is not None:
                 recomputed.store_versions()
             if self.steps == 0:
                 # The caller may write to the results.
                 particles = particles.map(torch.clone)
-            particles = step.leave(particles) if keep_every is None else combined(torch.stack, kept)
+            if keep_every is None:
+                particles = step.leave(particles)
+            else:
+                particles = combined(torch.stack, trajectory)
         if watch is not None:
             watch.raise_diverged()
         return particles
@@ -343,7 +346,7 @@ class TapedSteps:
     ) -> list[Particles]:
         """Step worlds once with each mask; return copies at the given interval."""
         self._buffers[0].copy_(particles)
-        kept: list[Particles] = []
+        trajectory: list[Particles] = []
         for number, mask in enumerate(masks):
             step = self._steps[number % 2]
             count = len(step.rows)
@@ -356,8 +359,8 @@ class TapedSteps:
             step.tape.move(step.slots, updates)
             step.tape.replay(step.split)
             if (number + 1) % every == 0:
-                kept.append(self._buffers[(number + 1) % 2].map(torch.clone))
-        return kept
+                trajectory.append(self._buffers[(number + 1) % 2].map(torch.clone))
+        return trajectory
 
 
 _kinds = CallKinds()
@@ -406,7 +409,7 @@ def run_taped(
     masks = (draws.mask for draws in step.draw(x, steps, source))
     try:
         with torch.autocast("cpu", enabled=False):
-            kept = taped.run(step.network, particles, masks, keep_every or steps)
+            trajectory = taped.run(step.network, particles, masks, keep_every or steps)
     finally:
         kind.free.append(taped)
-    return kept[0] if keep_every is None else combined(torch.stack, kept)
+    return trajectory[0] if keep_every is None else combined(torch.stack, trajectory)

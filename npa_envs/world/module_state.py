@@ -25,13 +25,14 @@ OF_EVERY_MODULE = frozenset(vars(nn.Module()))
 
 def rule_tensors(rule: nn.Module, device: torch.device) -> list[Tensor]:
     """Return all tensors of a rule on a device, once each: parameters, buffers and attributes."""
-    found: dict[int, Tensor] = {}
-    for module in rule.modules():
-        for values in (module._parameters, module._buffers, vars(module)):
-            for value in values.values():
-                if isinstance(value, Tensor) and value.device == device:
-                    found.setdefault(id(value), value)
-    return list(found.values())
+    tensors = {
+        id(value): value
+        for module in rule.modules()
+        for values in (module._parameters, module._buffers, vars(module))
+        for value in values.values()
+        if isinstance(value, Tensor) and value.device == device
+    }
+    return list(tensors.values())
 
 
 def rule_settings(rule: nn.Module, device: torch.device) -> dict[str, Hashable]:

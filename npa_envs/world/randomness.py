@@ -134,11 +134,7 @@ class WorldRandom:
         self._draw_count = 0
 
     def take(self, worlds: Tensor | slice) -> WorldRandom:
-        """Return a copy of the streams of some worlds, in the same state.
-
-        Args:
-            worlds: Indices of the worlds, int64, shape [K], or a slice.
-        """
+        """Return a copy of the streams of some worlds: indices, int64, shape [K], or a slice."""
         copy = WorldRandom.__new__(WorldRandom)
         copy.keys = self.keys[worlds].clone()
         copy.episodes = self.episodes[worlds].clone()
@@ -167,11 +163,8 @@ class WorldRandom:
         """Write the keys, episodes and steps of other streams into some worlds, in place.
 
         All worlds share the index of the next draw in a step. So from the next `advance` on, draws
-        equal those of the other streams; until then no number is drawn twice.
-
-        Args:
-            worlds: Indices of the worlds, int64, shape [K], or a slice.
-            other: Streams of K worlds.
+        equal those of the other streams; until then no number is drawn twice. `worlds` are K
+        indices, int64, or a slice.
         """
         self.keys[worlds] = other.keys
         self.episodes[worlds] = other.episodes
@@ -179,12 +172,7 @@ class WorldRandom:
         self._draw_count = max(self._draw_count, other._draw_count)
 
     def sync_with(self, other: WorldRandom, steps: int) -> None:
-        """Take over the state of other streams that began as copies of these, in place.
-
-        Args:
-            other: Streams of the same number of worlds.
-            steps: Number of steps by which they are ahead.
-        """
+        """Take over the state of `other`, which began as a copy and is `steps` ahead, in place."""
         self.steps += steps
         self._draw_count = other._draw_count
 
@@ -212,7 +200,6 @@ class WorldRandom:
 
         Args:
             probability: Probability of a one, in [0, 1], rounded to a multiple of 2^-32.
-            shape: Shape of each world's numbers.
 
         Raises:
             NPAError: The probability is not in [0, 1], or as `uniform`.
@@ -227,7 +214,6 @@ class WorldRandom:
 
         Args:
             high: One more than the largest, from 1 to 2^63 - 1.
-            shape: Shape of each world's numbers.
 
         Raises:
             NPAError: `high` is out of range, or as `uniform`.

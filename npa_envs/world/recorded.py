@@ -88,13 +88,13 @@ rule_form: Callable[[NPARule], Hashable] = operator.attrgetter(
 
 def _form(rule: NPARule, plain: bool) -> tuple[Hashable, list[Tensor]]:
     """Return a rule's settings that a recording depends on, and its weights."""
-    if not plain:
-        device = rule.hidden.weight.device
-        settings = tuple(rule_settings(rule, device).items())
-        deterministic = torch.are_deterministic_algorithms_enabled()
-        return (weakref.ref(rule), settings, deterministic), rule_tensors(rule, device)
-    weights = rule.network_weights()
-    return (rule_form(rule), *[_memory_form(weight) for weight in weights]), weights
+    if plain:
+        weights = rule.network_weights()
+        return (rule_form(rule), *map(_memory_form, weights)), weights
+    device = rule.hidden.weight.device
+    settings = tuple(rule_settings(rule, device).items())
+    deterministic = torch.are_deterministic_algorithms_enabled()
+    return (weakref.ref(rule), settings, deterministic), rule_tensors(rule, device)
 
 
 def _memory_form(tensor: Tensor) -> Hashable:

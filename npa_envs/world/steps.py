@@ -425,9 +425,9 @@ def _rows_of_species(
     active = row >= 0
     if row.is_cuda:
         capacity = own.capacity(row_of.shape[0])
-        place = active.cumsum(0) - 1
-        place = torch.where(active & (place < capacity), place, capacity)
-        particle = everyone.new_zeros(capacity + 1).scatter(0, place, everyone)[:capacity]
+        rank = active.cumsum(0) - 1
+        rank = torch.where(active & (rank < capacity), rank, capacity)
+        particle = everyone.new_zeros(capacity + 1).scatter(0, rank, everyone)[:capacity]
         filled = torch.arange(capacity, device=row.device) < active.sum()
         return torch.where(filled, row[particle], row_count), particle
     particle = active.nonzero()[:, 0]
