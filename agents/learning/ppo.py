@@ -187,16 +187,16 @@ class PPOLearner:
         self._weight_sums: Tensor = self._within_kl.new_zeros(count, 2)
         self._kl_sums = self._within_kl.new_zeros(2)
         # Means over processes are taken between graphs.
-        graph = partial(GraphedCallable, device=device)
-        self._graphed_draw_actions = graph(self._draw_actions, generator=registered(self.random))
-        self._graphed_find_values = graph(self._find_values)
-        self._graphed_find_advantages = graph(self._find_advantages, recorded=not ranks.together)
-        graph = partial(
-            graph, pool=torch.cuda.graph_pool_handle() if device.type == "cuda" else None
-        )
-        self._graphed_sum_weights = graph(self._sum_weights)
-        self._graphed_find_gradients = [graph(self._find_gradients) for _ in range(count)]
-        self._graphed_step = graph(self._step)
+        graphed = partial(GraphedCallable, device=device)
+        self._graphed_draw_actions = graphed(self._draw_actions, generator=registered(self.random))
+        self._graphed_find_values = graphed(self._find_values)
+        self._graphed_find_advantages = graphed(self._find_advantages, recorded=not ranks.together)
+        pool = torch.cuda.graph_pool_handle() if device.type == "cuda" else None
+        self._graphed_sum_weights = graphed(self._sum_weights, pool=pool)
+        self._graphed_find_gradients = [
+            graphed(self._find_gradients, pool=pool) for _ in range(count)
+        ]
+        self._graphed_step = graphed(self._step, pool=pool)
 
     def resume(self, iteration: int, part: int) -> None:
         """Resume after `iteration` rounds, for the `part`-th time, in new worlds."""

@@ -202,7 +202,6 @@ class Progress:
                 there.
             DivergedError: A weight of the rules is not finite, or an action.
         """
-        this = self._run
 
         def begin() -> None:
             self.start(rules)
@@ -210,7 +209,7 @@ class Progress:
 
         def step() -> None:
             self.advance(iteration())
-            this.iteration += 1
+            self._run.iteration += 1
             if self.look(rules):
                 self._save(rules, learner)
 
@@ -222,12 +221,12 @@ class Progress:
             self.look(rules, force=True)
             self._save(rules, learner)
 
-        with this.held(begin=True):
-            content, this.content = this.content, None
+        with self._run.held(begin=True):
+            content, self._run.content = self._run.content, None
             if content is not None:
                 assert learner is not None, "methods whose runs are kept are learners"
                 self._restore(learner, content)
-            this.go(step, begin=begin, over=lambda: self.over, end=end)
+            self._run.go(step, begin=begin, over=lambda: self.over, end=end)
         return rules
 
     def start(self, actor: RuleSet | Callable[[Any], Any]) -> None:
