@@ -100,10 +100,10 @@ class PicturesTask(PictureEnvTask[Pictures2DEnvConfig]):
         self._number = everyone[:1]
 
     @classmethod
-    def extra_bytes(cls, config: Any, world_count: int) -> int:
-        """Return an estimate of the memory of pool, pictures and columns of targets [bytes]."""
-        numbers = OBSERVATION_COPIES * world_count * config.particle_count * config.target_dim
-        return super().extra_bytes(config, world_count) + int(4 * numbers)
+    def bytes_per_world(cls, config: Any) -> int:
+        """Return about how much memory a world's picture and columns of its target take [bytes]."""
+        numbers = OBSERVATION_COPIES * config.particle_count * config.target_dim
+        return super().bytes_per_world(config) + 4 * int(numbers)
 
     def fresh(self, random: WorldRandom) -> Start:
         """Return the training task's initial worlds, and the indices of their pictures."""

@@ -84,6 +84,7 @@ class PointClassificationTask(TargetEnvTask[PointClassificationEnvConfig]):
     """Clouds of digits, and the error of their particles' outputs."""
 
     config_type = PointClassificationEnvConfig
+    task: PointClassification
     static = True
 
     def _make_task(self) -> PointClassification:

@@ -23,11 +23,7 @@ from npa_envs.world.actions import TIME_LIMIT
 from npa_envs.world.cuda_graph import to_device_async
 from npa_envs.world.randomness import WorldRandom
 
-AUTORESET_MODES = {
-    "same-step": AutoresetMode.SAME_STEP,
-    "next-step": AutoresetMode.NEXT_STEP,
-    "disabled": AutoresetMode.DISABLED,
-}
+AUTORESET_MODES = {mode.name.lower().replace("_", "-"): mode for mode in AutoresetMode}
 """Gymnasium's modes by the names that `autoreset_mode` takes."""
 
 REASONS = np.array([reason(ending) for ending in range(2 * TIME_LIMIT)], dtype=object)
@@ -332,7 +328,7 @@ def checked_worlds(worlds: Any, world_count: int) -> Tensor:
     # A mask is refused: it would be read as the indices 0 and 1.
     whole = not indices.is_floating_point() and indices.dtype != torch.bool
     exist = whole and bool(((indices >= 0) & (indices < world_count)).all())
-    if indices.ndim != 1 or not exist or len(indices.unique()) < len(indices):
+    if indices.ndim != 1 or not exist or len(set(indices.tolist())) < len(indices):
         raise NPAError(
             f"worlds must be indices below {world_count}, each once, got "
             f"{shown(indices.tolist())}: for example worlds=[0, 2]"
