@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Self, get_args
+from typing import Any, get_args
 
 import torch
 import torch.nn.functional as F
@@ -85,6 +85,7 @@ class PicturesTask(PictureEnvTask[Pictures2DEnvConfig]):
     """Several pictures to grow, one target in each world."""
 
     config_type = Pictures2DEnvConfig
+    task: ManyPictures
     training_task = ManyPictures
 
     def __init__(self, config: Pictures2DEnvConfig, device: torch.device) -> None:
@@ -97,7 +98,6 @@ class PicturesTask(PictureEnvTask[Pictures2DEnvConfig]):
         limit = config.observation_limit
         if config.observe_target:
             self.target_rows = small.flatten(1).clamp(-limit, limit)
-        self._number = everyone[:1]
 
     @classmethod
     def bytes_per_world(cls, config: Any) -> int:
@@ -114,18 +114,11 @@ class PicturesTask(PictureEnvTask[Pictures2DEnvConfig]):
     @property
     def pixel_size(self) -> float:
         """Size of a particle in pictures: the spacing of the first target's points."""
-        size: float = self.task.target.pixel_size
-        return size
-
-    def toward(self, goal: Tensor) -> Self:
-        """Return a task whose losses are for worlds of these pictures."""
-        goal_task = super().toward(goal)
-        goal_task._number = goal
-        return goal_task
+        return self.task.target.pixel_size
 
     def extra_info(self, s: Tensor) -> dict[str, Tensor]:
         """Return the index of each world's picture, int64, shape [B]."""
-        return {"target": self._number.clone()}
+        return {"target": self.task.goal.clone()}
 
 
 class Pictures2DEnv(NPAEnv):

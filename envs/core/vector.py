@@ -110,9 +110,7 @@ class NPAVectorEnv(WorldsEnv, VectorEnv[Any, Any, Any]):
         """
         seed = plain_seed(seed)
         super().reset(seed=seed if isinstance(seed, int) else None)
-        chosen = worlds_to_reset(options, self.num_envs)
-        if not self._started and len(chosen) < self.num_envs:
-            raise NPAError("reset_mask needs worlds that have started: reset all of them first")
+        chosen = worlds_to_reset(options, self.num_envs, started=self._started)
         keys = None
         if seed is not None or not self._started:
             keys = rng_keys(seed, self.num_envs, self.np_random)[chosen]
@@ -305,7 +303,9 @@ def check_options(options: Any, known: tuple[str, ...]) -> None:
             raise NPAError(f"unknown reset option {shown(str(name)[:80])}: {hint}")
 
 
-def worlds_to_reset(options: dict[str, Any] | None, world_count: int) -> NDArray[np.int64]:
+def worlds_to_reset(
+    options: dict[str, Any] | None, world_count: int, *, started: bool = True
+) -> NDArray[np.int64]:
     """Return the indices of the worlds that `reset_mask` chooses, all without a mask."""
     check_options(options, ("reset_mask",))
     mask = (options or {}).get("reset_mask")
@@ -319,6 +319,8 @@ def worlds_to_reset(options: dict[str, Any] | None, world_count: int) -> NDArray
         )
     if not mask.any():
         raise NPAError("reset_mask must choose at least one world, got none: skip the reset")
+    if not started and not mask.all():
+        raise NPAError("reset_mask needs worlds that have started: reset all of them first")
     return np.flatnonzero(mask)
 
 
