@@ -32,7 +32,6 @@ class BrushPolicy:
                 f"env must be a garden with actions='grid' or 'free', got "
                 f"{type(self.task).__name__}: make it with gymnasium.make('npa/Gardener2D-v0')"
             )
-        self._observation_dims = inner.form.observation_ndim
         self.config = self.task.config
         self.columns = BrushLayout.of(self.config)
         self.shape = inner.form.rows_shape
@@ -45,7 +44,7 @@ class BrushPolicy:
         """
         array = observation["observation"] if isinstance(observation, dict) else observation
         action = self.act()
-        action = action if array.ndim > self._observation_dims else action[0]
+        action = action if array.ndim > 1 else action[0]
         return action if isinstance(array, Tensor) else action.cpu().numpy()
 
     def act(self) -> Tensor:

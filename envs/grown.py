@@ -142,15 +142,12 @@ def check_rule_driven(config: Any) -> None:
         raise NPAError("tell_updated must be False, as actions do not belong to particles")
 
 
-def check_runs(rule: NPARule, **constants: Any) -> None:
-    """Check that the worlds' constants are those of the rule that steps them."""
-    for name, wanted in constants.items():
+def check_runs(rule: NPARule, config: EnvConfig, *names: str) -> None:
+    """Check that these fields are those of the rule that steps the worlds."""
+    for name in names:
         value = getattr(rule, name)
-        if value != wanted:
-            raise NPAError(
-                f"{name} must be the rule's, {value!r}, got {wanted!r}: give {name}={value!r}, or "
-                "another rule"
-            )
+        is_same, hint = getattr(config, name) == value, f"give {name}={value!r}, or another rule"
+        check_field(config, name, is_same, f"be the rule's, {value!r}", hint)
 
 
 def load_read_out(field: str, name: str, state_dim: int, device: torch.device) -> NPARule:

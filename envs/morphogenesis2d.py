@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, TypeVar
+from typing import ClassVar, TypeVar
 
 from torch import Tensor
 
@@ -54,14 +54,9 @@ class PictureEnvTask(TargetEnvTask[Config]):
     """A picture to grow, compared by the splat loss of `npa_envs.tasks.morphogenesis2d`."""
 
     config_type: ClassVar[type[PictureConfig]] = Morphogenesis2DEnvConfig
+    task: Morphogenesis2D
     training_task: ClassVar[type[Morphogenesis2D]] = Morphogenesis2D
-
-    @classmethod
-    def extra_bytes(cls, config: Any, world_count: int) -> int:
-        """Return an estimate of the memory of pool and pictures [bytes]."""
-        copies = 4 if config.per_particle_reward else 1
-        pictures = 16 * copies * world_count * config.resolution**2
-        return super().extra_bytes(config, world_count) + int(pictures)
+    pixel_bytes = 16
 
     def losses(self, x: Tensor, s: Tensor) -> Mapping[str, Tensor]:
         """Return the density error and the weighted colour error of each world."""

@@ -86,12 +86,10 @@ class SolidTask(TargetEnvTask[Morphogenesis3DEnvConfig]):
         return task.for_rule(load_read_out("readout", self.config.readout, state_dim, self.device))
 
     @classmethod
-    def extra_bytes(cls, config: Any, world_count: int) -> int:
-        """Return an estimate of the memory of pool and views [bytes]."""
+    def bytes_per_world(cls, config: Any) -> int:
+        """Return about how much memory a world's views take [bytes]."""
         view = PIXEL_BYTES * config.resolution**2 + PARTICLE_BYTES * config.particle_count
-        copies = 2 if config.per_particle_reward else 1
-        views = copies * world_count * config.view_count * view
-        return super().extra_bytes(config, world_count) + int(views)
+        return int(view * config.view_count * (2 if config.per_particle_reward else 1))
 
     def losses(self, x: Tensor, s: Tensor) -> Mapping[str, Tensor]:
         """Return the mean absolute difference of each world's views."""
@@ -103,9 +101,14 @@ class SolidTask(TargetEnvTask[Morphogenesis3DEnvConfig]):
         """Return a picture of a world; with a read-out, of its Gaussians."""
         if not self.config.readout or style != "particles":
             return super().draw_particles(particles, style, azimuth)
-        views, size = partial(self.task.views, particles.x, particles.s), self.config.render_size
-        view = {"resolution": size, "azimuth": azimuth, "device": self.device}
-        return np.stack([*turntable_frames(views, frame_count=1, **view)])
+        frames = turntable_frames(
+            partial(self.task.views, particles.x, particles.s),
+            frame_count=1,
+            resolution=self.config.render_size,
+            azimuth=azimuth,
+            device=self.device,
+        )
+        return np.stack(frames)
 
 
 class Morphogenesis3DEnv(NPAEnv):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Self, get_args
+from typing import Any, get_args
 
 import torch
 import torch.nn.functional as F
@@ -85,6 +85,7 @@ class PicturesTask(PictureEnvTask[Pictures2DEnvConfig]):
     """Several pictures to grow, one target in each world."""
 
     config_type = Pictures2DEnvConfig
+    task: ManyPictures
     training_task = ManyPictures
 
     def __init__(self, config: Pictures2DEnvConfig, device: torch.device) -> None:
@@ -97,13 +98,12 @@ class PicturesTask(PictureEnvTask[Pictures2DEnvConfig]):
         limit = config.observation_limit
         if config.observe_target:
             self.target_rows = small.flatten(1).clamp(-limit, limit)
-        self._number = everyone[:1]
 
     @classmethod
-    def extra_bytes(cls, config: Any, world_count: int) -> int:
-        """Return an estimate of the memory of pool, pictures and columns of targets [bytes]."""
-        numbers = OBSERVATION_COPIES * world_count * config.particle_count * config.target_dim
-        return super().extra_bytes(config, world_count) + int(4 * numbers)
+    def bytes_per_world(cls, config: Any) -> int:
+        """Return about how much memory a world's picture and columns of its target take [bytes]."""
+        numbers = OBSERVATION_COPIES * config.particle_count * config.target_dim
+        return super().bytes_per_world(config) + 4 * int(numbers)
 
     def fresh(self, random: WorldRandom) -> Start:
         """Return the training task's initial worlds, and the indices of their pictures."""
@@ -114,18 +114,11 @@ class PicturesTask(PictureEnvTask[Pictures2DEnvConfig]):
     @property
     def pixel_size(self) -> float:
         """Size of a particle in pictures: the spacing of the first target's points."""
-        size: float = self.task.target.pixel_size
-        return size
-
-    def toward(self, goal: Tensor) -> Self:
-        """Return a task whose losses are for worlds of these pictures."""
-        goal_task = super().toward(goal)
-        goal_task._number = goal
-        return goal_task
+        return self.task.target.pixel_size
 
     def extra_info(self, s: Tensor) -> dict[str, Tensor]:
         """Return the index of each world's picture, int64, shape [B]."""
-        return {"target": self._number.clone()}
+        return {"target": self.task.goal.clone()}
 
 
 class Pictures2DEnv(NPAEnv):

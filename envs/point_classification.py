@@ -84,6 +84,7 @@ class PointClassificationTask(TargetEnvTask[PointClassificationEnvConfig]):
     """Clouds of digits, and the error of their particles' outputs."""
 
     config_type = PointClassificationEnvConfig
+    task: PointClassification
     static = True
 
     def _make_task(self) -> PointClassification:
@@ -117,13 +118,10 @@ class PointClassificationTask(TargetEnvTask[PointClassificationEnvConfig]):
         """Return the fall of each particle's loss, which no other particle's action changes."""
         return self.particle_losses(*before) - self.particle_losses(*after)
 
-    def accuracy(self, s: Tensor) -> Tensor:
-        """Return the fraction of particles whose largest output is of the world's class, [B]."""
-        return 1.0 - world_mean(self.task.mistakes(s)[..., None])[:, 0]
-
     def extra_info(self, s: Tensor) -> dict[str, Tensor]:
-        """Return each world's class, int64, and accuracy, shape [B] each."""
-        return {"label": self.task.goal.clone(), "accuracy": self.accuracy(s)}
+        """Return each world's class, int64, and the fraction of right particles, [B] each."""
+        wrong = world_mean(self.task.mistakes(s)[..., None])[:, 0]
+        return {"label": self.task.goal.clone(), "accuracy": 1.0 - wrong}
 
     def _scores(self, s: Tensor) -> Tensor:
         """Return the loss of each particle's outputs, [B, N]."""

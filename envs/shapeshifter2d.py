@@ -98,15 +98,7 @@ def rule_of(config: Shapeshifter2DEnvConfig, device: torch.device) -> tuple[NPAR
             f"rule must be one of two pictures or more, got {config.rule!r}: train one with "
             "npa-envs train morphogenesis2d --targets gecko heart"
         )
-    check_runs(
-        rule,
-        space_dim=2,
-        state_dim=config.state_dim,
-        static=False,
-        alpha=config.alpha,
-        eps0=config.eps0,
-        moment_inverse=config.moment_inverse,
-    )
+    check_runs(rule, config, "state_dim", "alpha", "eps0", "moment_inverse")
     return rule, rule.codes
 
 
@@ -151,6 +143,7 @@ class ShapeshifterTask(RuleDriven, PictureEnvTask[Shapeshifter2DEnvConfig]):
     actor = "codes"
     context_count = 1 + GOAL_COUNT
     grows = True
+    pixel_bytes = 48
     task: ManyPictures
 
     def _make_task(self) -> ManyPictures:
@@ -165,12 +158,6 @@ class ShapeshifterTask(RuleDriven, PictureEnvTask[Shapeshifter2DEnvConfig]):
             code_dim=self.rule.code_dim,
         )
         return ManyPictures(task_config, device=self.device)
-
-    @classmethod
-    def extra_bytes(cls, config: Any, world_count: int) -> int:
-        """Return an estimate of the memory of pool and pictures [bytes]."""
-        pictures = 32 * world_count * config.resolution**2
-        return super().extra_bytes(config, world_count) + int(pictures)
 
     @cached_property
     def blank_losses(self) -> Tensor:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 from torch import Tensor
 
@@ -15,9 +14,6 @@ from npa_envs.envs.core.task import TargetEnvTask
 from npa_envs.envs.core.vector import vector_class
 from npa_envs.tasks.texture import Texture, TextureConfig
 from npa_envs.world.actions import Boundary
-
-LOSS_BYTES = 4000
-"""About what comparing one pixel of a picture needs [bytes]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,13 +47,7 @@ class TextureTask(TargetEnvTask[TextureEnvConfig]):
 
     config_type = TextureEnvConfig
     training_task = Texture
-
-    @classmethod
-    def extra_bytes(cls, config: Any, world_count: int) -> int:
-        """Return an estimate of the memory of pool and loss [bytes]."""
-        copies = 4 if config.per_particle_reward else 1
-        pictures = LOSS_BYTES * copies * world_count * config.resolution**2
-        return super().extra_bytes(config, world_count) + int(pictures)
+    pixel_bytes = 4000
 
     def losses(self, x: Tensor, s: Tensor) -> Mapping[str, Tensor]:
         """Return the weighted losses of each world's colour image and of its density image."""

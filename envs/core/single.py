@@ -247,7 +247,8 @@ def _step_limit(env: NPAEnv) -> int | None:
     several steps at once, do not count.
     """
     # Gymnasium refuses registered wrappers, which would know the limit, with a vector entry point.
-    limits, frame, inner = [], sys._getframe(1).f_back, env
+    limits, frame = [], sys._getframe(1).f_back
+    inner: gymnasium.Env[Any, Any] = env
     while frame is not None:
         caller = frame.f_locals.get("self")
         if isinstance(caller, gymnasium.Wrapper) and caller.env is inner:

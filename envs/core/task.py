@@ -126,6 +126,9 @@ class EnvTask(WorldTask[Config]):
     form_type: ClassVar[type[ParticleSpaces] | None] = None
     """Class of the spaces; None: `ParticleSpaces`, a row for each particle."""
 
+    grows: ClassVar[bool] = False
+    """Whether a rule grows fresh worlds, step by step."""
+
     def __init__(self, config: Config, device: torch.device) -> None:
         super().__init__(config, device)
         self._pool: Particles | None = None
@@ -137,7 +140,12 @@ class EnvTask(WorldTask[Config]):
     def extra_bytes(cls, config: Any, world_count: int) -> int:
         """Return about how much memory the task needs beyond that of B worlds [bytes]."""
         numbers = config.particle_count * (cls.space_dim + config.state_dim)
-        return int(4 * config.seed_pool * numbers)
+        return int(4 * config.seed_pool * numbers) + world_count * cls.bytes_per_world(config)
+
+    @classmethod
+    def bytes_per_world(cls, config: Any) -> int:
+        """Return about how much of this memory each world needs [bytes]; by default none."""
+        return 0
 
     def seed(self, random: WorldRandom) -> tuple[Tensor, Tensor]:
         """Return fresh worlds: positions [B, N, D] and states [B, N, C].
@@ -205,9 +213,6 @@ class EnvTask(WorldTask[Config]):
             )
         return gains
 
-    grows: ClassVar[bool] = False
-    """Whether a rule grows fresh worlds, step by step."""
-
     @property
     def start_is_short(self) -> bool:
         """Whether `start` takes few operations, so that on CUDA it is recorded as a graph."""
@@ -261,10 +266,9 @@ class EnvTask(WorldTask[Config]):
         style = self.config.render_style
         if self.space_dim == 2:
             return self.draw_particles(particles, style)
-        angles = TURN * steps.astype(float)
+        worlds = zip(torch.split(particles.x, 1), torch.split(particles.s, 1), steps, strict=True)
         pictures = [
-            self.draw_particles(particles.map(lambda value, k=k: value[k : k + 1]), style, angle)
-            for k, angle in enumerate(angles)
+            self.draw_particles(Particles(x, s), style, TURN * float(step)) for x, s, step in worlds
         ]
         return np.concatenate(pictures)
 
@@ -278,16 +282,27 @@ class EnvTask(WorldTask[Config]):
 class TargetEnvTask(EnvTask[Config]):
     """A task with the targets and losses of a training task of `npa_envs.tasks`."""
 
+    task: Any
+    """The training task."""
+
     training_task: ClassVar[type[Any]]
     """Class of the training task."""
 
+    pixel_bytes: ClassVar[int] = 0
+    """About how much memory comparing one pixel of a world's picture takes [bytes]."""
+
     def __init__(self, config: Config, device: torch.device) -> None:
         super().__init__(config, device)
-        self.task: Any = self._make_task()
-        """The training task."""
+        self.task = self._make_task()
 
     def _make_task(self) -> Any:
         return self.training_task(self.config.task_config, device=self.device)
+
+    @classmethod
+    def bytes_per_world(cls, config: Any) -> int:
+        """Return about how much memory comparing a world takes [bytes]."""
+        copies = 4 if config.per_particle_reward else 1
+        return copies * cls.pixel_bytes * int(getattr(config, "resolution", 0)) ** 2
 
     @property
     def pixel_size(self) -> float:

@@ -23,11 +23,7 @@ from npa_envs.world.actions import TIME_LIMIT
 from npa_envs.world.cuda_graph import to_device_async
 from npa_envs.world.randomness import WorldRandom
 
-AUTORESET_MODES = {
-    "same-step": AutoresetMode.SAME_STEP,
-    "next-step": AutoresetMode.NEXT_STEP,
-    "disabled": AutoresetMode.DISABLED,
-}
+AUTORESET_MODES = {mode.name.lower().replace("_", "-"): mode for mode in AutoresetMode}
 """Gymnasium's modes by the names that `autoreset_mode` takes."""
 
 REASONS = np.array([reason(ending) for ending in range(2 * TIME_LIMIT)], dtype=object)
@@ -114,9 +110,7 @@ class NPAVectorEnv(WorldsEnv, VectorEnv[Any, Any, Any]):
         """
         seed = plain_seed(seed)
         super().reset(seed=seed if isinstance(seed, int) else None)
-        chosen = worlds_to_reset(options, self.num_envs)
-        if not self._started and len(chosen) < self.num_envs:
-            raise NPAError("reset_mask needs worlds that have started: reset all of them first")
+        chosen = worlds_to_reset(options, self.num_envs, started=self._started)
         keys = None
         if seed is not None or not self._started:
             keys = rng_keys(seed, self.num_envs, self.np_random)[chosen]
@@ -309,7 +303,9 @@ def check_options(options: Any, known: tuple[str, ...]) -> None:
             raise NPAError(f"unknown reset option {shown(str(name)[:80])}: {hint}")
 
 
-def worlds_to_reset(options: dict[str, Any] | None, world_count: int) -> NDArray[np.int64]:
+def worlds_to_reset(
+    options: dict[str, Any] | None, world_count: int, *, started: bool = True
+) -> NDArray[np.int64]:
     """Return the indices of the worlds that `reset_mask` chooses, all without a mask."""
     check_options(options, ("reset_mask",))
     mask = (options or {}).get("reset_mask")
@@ -323,6 +319,8 @@ def worlds_to_reset(options: dict[str, Any] | None, world_count: int) -> NDArray
         )
     if not mask.any():
         raise NPAError("reset_mask must choose at least one world, got none: skip the reset")
+    if not started and not mask.all():
+        raise NPAError("reset_mask needs worlds that have started: reset all of them first")
     return np.flatnonzero(mask)
 
 
@@ -332,7 +330,7 @@ def checked_worlds(worlds: Any, world_count: int) -> Tensor:
     # A mask is refused: it would be read as the indices 0 and 1.
     whole = not indices.is_floating_point() and indices.dtype != torch.bool
     exist = whole and bool(((indices >= 0) & (indices < world_count)).all())
-    if indices.ndim != 1 or not exist or len(indices.unique()) < len(indices):
+    if indices.ndim != 1 or not exist or len(set(indices.tolist())) < len(indices):
         raise NPAError(
             f"worlds must be indices below {world_count}, each once, got "
             f"{shown(indices.tolist())}: for example worlds=[0, 2]"

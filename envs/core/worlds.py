@@ -222,13 +222,13 @@ class BatchedWorlds(RewardedWorlds):
             assert self._side_stream is not None, "CUDA has a side stream"
             assert self._perceived is not None, "the graph writes it"
             self._side_stream.mark()
-            if self._target is not None:
-                rows = self._with_target(self._perceived, self.goal)
-                return rows if out is None else out.copy_(rows)
+            rows = self._with_target(self._perceived, self.goal)
             self._host_is_current = self._host_perceived is not None
             if out is not None:
-                return out.copy_(self._perceived)
-            return self._perceived if self._host_is_current else self._perceived.clone()
+                return out.copy_(rows)
+            # The next step overwrites what the graph writes.
+            is_shared = rows is self._perceived and not self._host_is_current
+            return rows.clone() if is_shared else rows
         self._draw()
         self._actions.apply(action)
         self._evaluate_graph()
@@ -268,9 +268,9 @@ class BatchedWorlds(RewardedWorlds):
 
     def step_info(self) -> dict[str, Tensor]:
         """Return further entries of infos, of steps alone, shape [B, N] each."""
-        rewards, info = self.particle_rewards, {}
-        if rewards is not None:
-            info["particle_reward"] = rewards.reward
+        info: dict[str, Tensor] = {}
+        if self.particle_rewards is not None:
+            info["particle_reward"] = self.particle_rewards.reward
         if self.task.config.tell_updated:
             info["updated"] = self._actions.updated()
         return info

@@ -233,10 +233,8 @@ class BrushSpaces(ParticleSpaces):
             "picture": (8 if config.observe_error else 4) * config.picture_size**2,
             "moments": 5 + 3 * config.state_dim,
         }
-        space = Box(-OBSERVATION_LIMIT, OBSERVATION_LIMIT, (counts[config.observe],), np.float32)
-        self.observation_space: Space[Any] = space
-        self.observation_ndim = len(space.shape)
-        """Dimensions of one world's observation."""
+        limit, shape = OBSERVATION_LIMIT, (counts[config.observe],)
+        self.observation_space: Space[Any] = Box(-limit, limit, shape, np.float32)
         on_grid = config.actions == "grid"
         count = config.place_count**2 if on_grid else config.brush_count
         self.rows_shape = (count, BrushLayout.of(config).width)
@@ -259,10 +257,6 @@ class BrushSpaces(ParticleSpaces):
                 f"action must choose below {self._choices} for each brush (place across and up, "
                 f"tool, strength), got numbers up to {shown(int(chosen.abs().max()))}"
             )
-        return self._rows(chosen)
-
-    def _rows(self, chosen: Tensor) -> Tensor:
-        """Return the rows of brushes for discrete choices, shape [B, K, W]."""
         config, tools = self._config, self._tools.to(chosen.device)
         across, up = chosen[..., 0], chosen[..., 1]
         places = grid_places(config, chosen.device)[up * config.place_count + across]

@@ -201,17 +201,16 @@ class GardenTask(RuleDriven, GrownTask[Config]):
 
     def __init__(self, config: Config, device: torch.device) -> None:
         super().__init__(config, device)
-        constants = {"eps0": config.eps0, "moment_inverse": config.moment_inverse}
-        check_runs(self.rule, alpha=config.alpha, **constants)
+        check_runs(self.rule, config, "alpha", "eps0", "moment_inverse")
         self.rule.requires_grad_(False)
         self.deficit = TargetDeficit(grid_places(config, device), self.task.target, config)
         """Difference between the target and worlds at the places of the grid."""
 
     @classmethod
-    def extra_bytes(cls, config: Any, world_count: int) -> int:
-        """Return an estimate of the memory of pool, pictures and brushes [bytes]."""
+    def bytes_per_world(cls, config: Any) -> int:
+        """Return about how much memory a world's picture and brushes take [bytes]."""
         values = VALUES_PER_PLACE * config.place_count**2 * config.particle_count
-        return super().extra_bytes(config, world_count) + int(3 * 4 * values * world_count)
+        return super().bytes_per_world(config) + 3 * 4 * int(values)
 
     def step(
         self, x: Tensor, s: Tensor, action: Tensor, random: WorldRandom

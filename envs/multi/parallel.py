@@ -95,18 +95,18 @@ class CrowdEnv(AgentsEnv, KnownAgents):
         action = joined_actions(actions, acted, shapes, worlds.device)
         with worlds.device_context():
             outcome = worlds.step(self._with_zeros(action))
-        ended, truncated = outcome.endings[0] > 0, bool(outcome.truncated[0])
-        infos = self._infos(outcome.numbers)
-        for k, agent in zip(live, acted, strict=True):
-            if ended[k] or truncated:
-                infos[agent]["reason"] = outcome.reasons[0, k]
+        infos, reasons = self._infos(outcome.numbers), outcome.reasons[0]
         observations = self._by_agent(outcome.observation)
-        all_rewards = outcome.rewards[0].tolist()
-        rewards = {agent: all_rewards[k] for k, agent in zip(live, acted, strict=True)}
-        terminations = {agent: bool(ended[k]) for k, agent in zip(live, acted, strict=True)}
+        all_rewards, endings = outcome.rewards[0].tolist(), outcome.endings[0].tolist()
+        rewards, terminations = {}, {}
+        for k, agent in zip(live, acted, strict=True):
+            rewards[agent], terminations[agent] = all_rewards[k], endings[k] > 0
+            if reasons[k] is not None:
+                infos[agent]["reason"] = reasons[k]
+        truncations = dict.fromkeys(acted, bool(outcome.truncated[0]))
         self._update_agents()
         self._show()
-        return observations, rewards, terminations, dict.fromkeys(acted, truncated), infos
+        return observations, rewards, terminations, truncations, infos
 
     def state(self) -> Any:
         """Return the full state of the world, for central critics; see `state_space`."""

@@ -189,9 +189,7 @@ class MultiSpeciesVectorEnv(AgentsEnv):
 
         Arguments are those of `NPAVectorEnv.reset`.
         """
-        chosen = worlds_to_reset(options, self.world_count)
-        if not self._started and len(chosen) < self.world_count:
-            raise NPAError("reset_mask needs worlds that have started: reset all of them first")
+        chosen = worlds_to_reset(options, self.world_count, started=self._started)
         first = int(seed) if isinstance(seed, int | np.integer) else None
         observation, worlds = self._start(chosen, seed, first), self.worlds
         return self._rows(observation), self._infos(worlds.agent_returns.numbers(), worlds.live)

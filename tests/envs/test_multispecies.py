@@ -320,33 +320,19 @@ pytestmark = pytest.mark.filterwarnings("ignore::UserWarning:pettingzoo")
 KINDS = {"species": (multispecies_v0, small), "particle": (particles_v0, few)}
 """Modules by what their agents are called, and keywords of small worlds."""
 
-every_task = pytest.mark.parametrize("task", TASKS)
 every_kind = pytest.mark.parametrize("kind", KINDS)
 
 
 @every_kind
-@every_task
-def test_passes_the_api_tests(task, kind, capsys):
+@pytest.mark.parametrize("task", TASKS)
+def test_passes_all_tests_of_pettingzoo(task, kind, capsys, recwarn):
     module, keywords = KINDS[kind]
-    deadly = keywords(task, deaths=((1, 3),))
+    given, deadly = keywords(task), keywords(task, deaths=((1, 3),))
     parallel_api_test(module.parallel_env(**deadly), num_cycles=8)
     api_test(module.env(**deadly), num_cycles=8)
-    api_test(module.raw_env(**keywords(task)), num_cycles=8)
-
-
-@every_kind
-@every_task
-def test_passes_the_seed_tests(task, kind):
-    module, keywords = KINDS[kind]
-    parallel_seed_test(lambda: module.parallel_env(**keywords(task)), num_cycles=5)
-    seed_test(lambda: module.env(**keywords(task)), num_cycles=5)
-
-
-@every_kind
-@every_task
-def test_passes_the_render_state_and_max_cycles_tests(task, kind, recwarn):
-    module, keywords = KINDS[kind]
-    given = keywords(task)
+    api_test(module.raw_env(**given), num_cycles=8)
+    parallel_seed_test(lambda: module.parallel_env(**given), num_cycles=5)
+    seed_test(lambda: module.env(**given), num_cycles=5)
     render_test(lambda **mode: module.env(**given, **mode))
     state_test(module.env(**given), module.parallel_env(**given), num_cycles=3)
     max_cycles_test(module_of(module, **given))
