@@ -33,7 +33,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from npa_envs.checks import check_dense
+from npa_envs.checks import check_dense, checked_finite
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.files import check_torch_archive, checked_path, parse_json, write_text
 from npa_envs.rule.rule import NPARule, check_rule
@@ -382,15 +382,7 @@ def _scalar(name: str, value: Any) -> float:
     """Return a number as the shortest decimal that rounds to it in float32."""
     if isinstance(value, Tensor):
         _check_plain(name, value)
-        value = value.item() if value.numel() == 1 else value
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise NPAError(f"{name} must be a finite number, got {shown(value)}")
-    try:
-        number = float(value)
-    except OverflowError:
-        number = math.inf
-    if not math.isfinite(number):
-        raise NPAError(f"{name} must be a finite number, got {shown(value)}")
+    number = checked_finite(name, value)
     for digits in range(1, 10):
         rounded = float(f"{number:.{digits}g}")
         if _as_float32(rounded) == number:

@@ -106,18 +106,25 @@ def test_equivariant_rules_have_none(tmp_path):
     assert initial_rule(config, NPARule(equivariant=True)).dead_zone == 0.0
 
 
-@pytest.mark.parametrize("begun", [0.0, 0.5])
-def test_training_gives_its_rule_the_zone(tmp_path, begun):
+@pytest.mark.parametrize(
+    ("field", "begun", "chosen"),
+    [
+        ("dead_zone", 0.0, 0.01),
+        ("dead_zone", 0.5, 0.01),
+        ("moment_inverse", "threshold", "smooth"),
+    ],
+)
+def test_training_gives_its_rule_the_zone_and_the_inverse(tmp_path, field, begun, chosen):
     untrained = CircleTask().make_rule(torch.Generator())
-    initial = NPARule(**untrained.hyper_parameters() | {"dead_zone": begun})
+    initial = NPARule(**untrained.hyper_parameters() | {field: begun})
     npa_envs.save_rule(initial, tmp_path / "rule.safetensors")
-    fields = {"dead_zone": 0.01, "initial_rule": str(tmp_path / "rule.safetensors")}
+    fields = {field: chosen, "initial_rule": str(tmp_path / "rule.safetensors")}
     config = circle_config(tmp_path / "run", iterations=2, **fields)
     rule = initial_rule(config, untrained)
-    assert rule.dead_zone == 0.01
+    assert getattr(rule, field) == chosen
     assert torch.equal(rule.hidden.weight, initial.hidden.weight)
     train(config)
-    assert npa_envs.load_rule(tmp_path / "run" / "rule.safetensors").dead_zone == 0.01
+    assert getattr(npa_envs.load_rule(tmp_path / "run"), field) == chosen
     assert load_config(tmp_path / "run" / "config.json", circle_config(tmp_path)) == config
 
 

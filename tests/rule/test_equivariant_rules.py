@@ -294,7 +294,7 @@ BAD_ENTRIES = {
     "few inputs": (lambda e: e.update({"w1.weight": ones(5, 8)}), "must have"),
     "no channels": (lambda e: e.update(W_hidden=ones(1, 8)), "must have the"),
     "NaN": (lambda e: e.update({"w1.bias": pack(np.full(5, np.nan))}), "finite"),
-    "no radius": (lambda e: e.pop("eps0"), "eps0 must be a finite number, got None"),
+    "no radius": (lambda e: e.pop("eps0"), "eps0 must be a number, got None"),
 }
 
 

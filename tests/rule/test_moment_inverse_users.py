@@ -8,13 +8,11 @@ import numpy as np
 import pytest
 import torch
 from circle_task import CircleTask, circle_config
-from training_runs import train
 from worlds import relative_error
 
 import npa_envs
 from npa_envs.agents import RulePolicy
 from npa_envs.envs import multispecies_v0
-from npa_envs.training import load_config
 from npa_envs.training.trainer import initial_rule
 
 
@@ -26,15 +24,6 @@ def test_the_choice_is_saved_with_a_rule(tmp_path):
     path.write_bytes(path.read_bytes().replace(b'\\"smooth\\"', b'\\"smoosh\\"'))
     with pytest.raises(npa_envs.NPAError, match="got 'smoosh'"):
         npa_envs.load_rule(path)
-
-
-def test_training_gives_its_rule_the_choice(tmp_path):
-    config = circle_config(tmp_path / "run", iterations=2, moment_inverse="smooth")
-    train(config)
-    assert npa_envs.load_rule(tmp_path / "run" / "rule.safetensors").moment_inverse == "smooth"
-    assert load_config(tmp_path / "run" / "config.json", circle_config(tmp_path)) == config
-    with pytest.raises(npa_envs.NPAError, match="moment_inverse must be one of threshold, smooth"):
-        circle_config(tmp_path, moment_inverse="soft")
 
 
 @pytest.mark.parametrize("trained", ["threshold", "smooth"])

@@ -48,18 +48,16 @@ def task_of(name, config, device="cpu"):
 @pytest.mark.parametrize("name", NAMES)
 def test_a_world_is_seeded_and_measured_alone_as_in_a_batch(tiny, name):
     task = task_of(name, tiny(name))
-    cpu = torch.device("cpu")
-    x, s, _, goal = task.seed(3, generator=WorldRandom([5, 6, 7]), device=cpu)
-    alone, *_ = task.seed(1, generator=WorldRandom([6]), device=cpu)
-    assert torch.equal(x[1:2], alone)
-    assert not s.any()
-    s = 0.3 * torch.randn(s.shape, generator=torch.Generator().manual_seed(0))
-    together = task.toward(goal).metric(x, s)
+    seeds = task.seed(3, generator=WorldRandom([5, 6, 7]))
+    assert torch.equal(seeds.x[1:2], task.seed(1, generator=WorldRandom([6])).x)
+    assert not seeds.s.any()
+    s = 0.3 * torch.randn(seeds.s.shape, generator=torch.Generator().manual_seed(0))
+    together = task.toward(seeds.goal).metric(seeds.x, s)
     for k in range(3):
-        aimed = task.toward(None if goal is None else goal[k : k + 1])
-        assert torch.equal(aimed.metric(x[k : k + 1], s[k : k + 1]), together[k : k + 1])
+        one = seeds._replace(s=s).take(torch.tensor([k]))
+        assert torch.equal(task.toward(one.goal).metric(one.x, one.s), together[k : k + 1])
     with pytest.raises(NPAError, match="path_length must have shape"):
-        task.toward(goal).loss(x, s, torch.zeros(1, 7))
+        task.toward(seeds.goal).loss(seeds.x, s, torch.zeros(1, 7))
 
 
 def worlds(task, world_count, dtype=torch.float64):
@@ -305,14 +303,13 @@ def test_iterations_never_wait_for_the_device(tiny, name, fields):
 @pytest.mark.gpu
 @pytest.mark.parametrize(("name", "fields"), VARIANTS)
 def test_losses_and_gradients_on_cuda_are_those_on_the_cpu(tiny, name, fields):
-    if name == "texture":
-        fields = {**fields, "resolution": 128}
-    config, found = tiny(name, particle_count=2000, **fields), []
+    fields = fields | ({"resolution": 128} if name == "texture" else {})
+    config, results = tiny(name, particle_count=2000, **fields), []
     for device in ("cpu", "cuda"):
         task = task_of(name, config, device)
         x, s = (t.to(device).requires_grad_() for t in worlds(task, 2))
         value, _ = task.loss(x, s, torch.zeros_like(x[..., 0]))
-        found.append([t.detach().cpu() for t in (value, *torch.autograd.grad(value, (x, s)))])
+        results.append([t.detach().cpu() for t in (value, *torch.autograd.grad(value, (x, s)))])
     # Sorted numbers that are equal up to rounding may change places.
-    for on_cpu, on_cuda in zip(*found, strict=True):
+    for on_cpu, on_cuda in zip(*results, strict=True):
         assert float((on_cpu - on_cuda).norm() / on_cpu.norm()) < 1e-6
