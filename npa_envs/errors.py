@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import reprlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 
 SHOWN_LENGTH = 200
 """Largest number of characters of a value in an error, about."""
@@ -37,6 +38,15 @@ class UnknownKeywordError(NPAError, TypeError):
 
 class MissingDependencyError(NPAError, ImportError):
     """An optional dependency is not installed; the message has the command that installs it."""
+
+
+@contextlib.contextmanager
+def importing(library: str, purpose: str, hint: str) -> Iterator[None]:
+    """Raise MissingDependencyError with a hint if an import of a library in the block fails."""
+    try:
+        yield
+    except ImportError as error:
+        raise MissingDependencyError(f"{purpose} needs {library} ({error}): {hint}") from error
 
 
 def shown(value: object) -> str:

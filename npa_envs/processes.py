@@ -28,7 +28,7 @@ STOPPING = ("SIGINT", "SIGTERM", "SIGHUP")
 
 
 @dataclass(frozen=True)
-class Places:
+class Slots:
     """The slots in which processes run."""
 
     devices: Sequence[str]
@@ -74,7 +74,7 @@ SomeChild = TypeVar("SomeChild", bound=Child)
 def run_children(
     start: Callable[[Sequence[SomeChild]], SomeChild | None],
     finished: Callable[[SomeChild], None],
-    places: Places,
+    slots: Slots,
     *,
     ahead: bool,
     max_seconds: float = math.inf,
@@ -83,7 +83,7 @@ def run_children(
 
     All are asked to end before the first is waited for; a second signal ends them at once. `start`
     gets the children that are not over, and returns the next one, or None if none is left or can
-    begin yet. With `ahead`, up to `places.jobs` more children start early and wait for their turn.
+    begin yet. With `ahead`, up to `slots.jobs` more children start early and wait for their turn.
     """
     ready, running = deque[SomeChild](), dict[int, SomeChild]()
     until = time.monotonic() + max_seconds
@@ -98,17 +98,17 @@ def run_children(
                 interruption.check()
                 while ready and time.monotonic() >= until:
                     _end([ready.pop()])
-                for number in range(places.jobs):
+                for number in range(slots.jobs):
                     one = None
                     if number not in running:
                         one = ready.popleft() if ready else next_child()
                     if one is not None:
                         running[number] = one
-                        one.go(places.device(number))
+                        one.go(slots.device(number))
                         interruption.check()
                 if not running:
                     return
-                while ahead and len(ready) < places.jobs and (one := next_child()) is not None:
+                while ahead and len(ready) < slots.jobs and (one := next_child()) is not None:
                     ready.append(one)
                     interruption.check()
                 for number, one in list(running.items()):

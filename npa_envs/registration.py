@@ -52,12 +52,13 @@ GARDENS = (Registration("Gardener2D", 32), Registration("Shepherd2D", 32))
 CODED = (Registration("Shapeshifter2D", 64),)
 """Environments in which a rule of many pictures runs the particles and actions are codes."""
 
-_GUSTS = {"push_length": 0.1, "gust_chance": 0.5, "gust_radius": 0.6, "blight_chance": 0.25}
-
 SMALL = (
-    Registration("Gardener2D", 32, "Small", particle_count=256, **_GUSTS),
+    Registration(
+        "Gardener2D", 32, "Small", particle_count=256, push_length=0.1, gust_chance=0.5,
+        gust_radius=0.6, blight_chance=0.25,
+    ),
     Registration("Shepherd2D", 32, "Small", particle_count=256),
-)
+)  # fmt: skip
 """Gardens with few particles; their settings never change under the same version."""
 
 
@@ -129,46 +130,36 @@ SPECIES = {
 
 
 _PERCEIVED: Mapping[str, Any] = {"perception": "per_species", "max_cycles": 32}
-_SPECIES: Mapping[str, Mapping[str, Any]] = {
-    "Small": {**_FEW, "species_count": 2, "eps0": 0.2, **_PERCEIVED},
-    "Large": {"particle_count": 4096, "max_cycles": 256},
-}
-_PICTURES: Mapping[str, Mapping[str, Any]] = {
-    "Small": {
-        **_SPECIES["Small"], "colour_weight": 20.0, "resolution": 32, "seed_radius": 0.3,
-    },
-    "Large": {**_SPECIES["Large"], "resolution": 128},
+_SMALL_SPECIES: Mapping[str, Any] = {**_FEW, "species_count": 2, "eps0": 0.2, **_PERCEIVED}
+_SMALL_PICTURES: Mapping[str, Any] = {
+    **_SMALL_SPECIES, "colour_weight": 20.0, "resolution": 32, "seed_radius": 0.3,
 }  # fmt: skip
-_INVASIONS: Mapping[str, Mapping[str, Any]] = {
-    "Small": {
-        "particle_counts": (64, 32), **_STATES, "eps": 0.2, **_PERCEIVED, "colour_weight": 20.0,
-        "seed_radius": 0.4, "target": "ring", "opponent": "random",
-    },
-    "Large": {
-        "particle_counts": (3072, 1024), "max_cycles": 256, "resolution": 128,
-        "opponent": "random",
-    },
-}  # fmt: skip
-_TARGETS: Mapping[str, Mapping[str, Any]] = {
-    "CoMorphogenesisSmall": {"targets": ("heart", "ring")},
-    "SymbiosisSmall": {"target": "flower"},
-}
+_LARGE_SPECIES: Mapping[str, Any] = {"particle_count": 4096, "max_cycles": 256}
 
-SPECIES_SIZES = tuple(
-    SpeciesRegistration(
-        f"npa/{name}{size}-v0",
-        SPECIES[f"npa/{name}-v0"],
-        MappingProxyType({**keywords[size], **_TARGETS.get(f"{name}{size}", {})}),
-    )
-    for size in ("Small", "Large")
-    for name, keywords in (
-        ("Mixing", _SPECIES),
-        ("Segregation", _SPECIES),
-        ("CoMorphogenesis", _PICTURES),
-        ("Symbiosis", _PICTURES),
-        ("Invasion", _INVASIONS),
-    )
-)
+
+def _sized(name: str, size: str, **keywords: Any) -> SpeciesRegistration:
+    task = SPECIES[f"npa/{name}-v0"]
+    return SpeciesRegistration(f"npa/{name}{size}-v0", task, MappingProxyType(keywords))
+
+
+SPECIES_SIZES = (
+    _sized("Mixing", "Small", **_SMALL_SPECIES),
+    _sized("Segregation", "Small", **_SMALL_SPECIES),
+    _sized("CoMorphogenesis", "Small", **_SMALL_PICTURES, targets=("heart", "ring")),
+    _sized("Symbiosis", "Small", **_SMALL_PICTURES, target="flower"),
+    _sized(
+        "Invasion", "Small", particle_counts=(64, 32), **_STATES, eps=0.2, **_PERCEIVED,
+        colour_weight=20.0, seed_radius=0.4, target="ring", opponent="random",
+    ),
+    _sized("Mixing", "Large", **_LARGE_SPECIES),
+    _sized("Segregation", "Large", **_LARGE_SPECIES),
+    _sized("CoMorphogenesis", "Large", **_LARGE_SPECIES, resolution=128),
+    _sized("Symbiosis", "Large", **_LARGE_SPECIES, resolution=128),
+    _sized(
+        "Invasion", "Large", particle_counts=(3072, 1024), max_cycles=256, resolution=128,
+        opponent="random",
+    ),
+)  # fmt: skip
 """Variants of the tasks of several species. The opponent of an invasion is fixed."""
 
 

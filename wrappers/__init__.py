@@ -8,36 +8,26 @@ import pkgutil
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from npa_envs.wrappers.damage import DamageEvents, VectorDamageEvents
+    from npa_envs.wrappers.damage import DamageEvents as DamageEvents
+    from npa_envs.wrappers.damage import VectorDamageEvents as VectorDamageEvents
     from npa_envs.wrappers.numeric_infos import NumericInfos as NumericInfos
-    from npa_envs.wrappers.particle_rows import ParticleRows
+    from npa_envs.wrappers.particle_rows import ParticleRows as ParticleRows
     from npa_envs.wrappers.rsl_rl import RslRlParticleEnv as RslRlParticleEnv
     from npa_envs.wrappers.sb3 import ParticleVecEnv as ParticleVecEnv
     from npa_envs.wrappers.sb3 import RowPolicy as RowPolicy
     from npa_envs.wrappers.sb3 import SpeciesVecEnv as SpeciesVecEnv
     from npa_envs.wrappers.sb3 import WorldVecEnv as WorldVecEnv
-    from npa_envs.wrappers.species_tags import SpeciesTags, VectorSpeciesTags
+    from npa_envs.wrappers.species_tags import SpeciesTags as SpeciesTags
+    from npa_envs.wrappers.species_tags import VectorSpeciesTags as VectorSpeciesTags
+    from npa_envs.wrappers.statistics import NormalizePerception as NormalizePerception
+    from npa_envs.wrappers.statistics import TorchNormalizeObservation as TorchNormalizeObservation
+    from npa_envs.wrappers.statistics import TorchNormalizeReward as TorchNormalizeReward
     from npa_envs.wrappers.statistics import (
-        NormalizePerception,
-        TorchNormalizeObservation,
-        TorchNormalizeReward,
-        TorchRecordEpisodeStatistics,
-        VectorNormalizePerception,
+        TorchRecordEpisodeStatistics as TorchRecordEpisodeStatistics,
     )
+    from npa_envs.wrappers.statistics import VectorNormalizePerception as VectorNormalizePerception
     from npa_envs.wrappers.torchrl import NPATorchRLEnv as NPATorchRLEnv
 
-__all__ = [
-    "DamageEvents",
-    "NormalizePerception",
-    "ParticleRows",
-    "SpeciesTags",
-    "TorchNormalizeObservation",
-    "TorchNormalizeReward",
-    "TorchRecordEpisodeStatistics",
-    "VectorDamageEvents",
-    "VectorNormalizePerception",
-    "VectorSpeciesTags",
-]
 # Not in `__all__`, as a star import must not need optional libraries.
 ON_REQUEST = {
     "NPATorchRLEnv": "torchrl",
@@ -48,7 +38,7 @@ ON_REQUEST = {
     "SpeciesVecEnv": "sb3",
     "WorldVecEnv": "sb3",
 }
-MODULES = ON_REQUEST | {
+MODULES = {
     "DamageEvents": "damage",
     "NormalizePerception": "statistics",
     "ParticleRows": "particle_rows",
@@ -60,12 +50,14 @@ MODULES = ON_REQUEST | {
     "VectorNormalizePerception": "statistics",
     "VectorSpeciesTags": "species_tags",
 }
+__all__ = [*MODULES]
 
 
 def __getattr__(name: str) -> Any:
-    if name not in MODULES:
+    module = MODULES.get(name) or ON_REQUEST.get(name)
+    if module is None:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return pkgutil.resolve_name(f"{__name__}.{MODULES[name]}:{name}")
+    return pkgutil.resolve_name(f"{__name__}.{module}:{name}")
 
 
 def __dir__() -> list[str]:

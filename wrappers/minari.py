@@ -6,7 +6,6 @@ default `~/.minari/datasets`.
 
 from __future__ import annotations
 
-import contextlib
 import os
 import re
 import secrets
@@ -16,6 +15,7 @@ from collections.abc import Callable, Iterator, Sequence
 from copy import deepcopy
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import gymnasium
 import numpy as np
@@ -23,19 +23,15 @@ import torch
 from gymnasium.envs.registration import EnvSpec
 from torch import Tensor
 
-from npa_envs.errors import MissingDependencyError, NPAError, shown
+from npa_envs.errors import NPAError, importing, shown
 from npa_envs.wrappers.base import as_tensor, autoreset_mode, check_same_step, vector_env
 
-try:
+with importing("Minari", "a dataset of episodes", "pip install 'npa-envs[minari]'"):
     import h5py  # noqa: F401
     import minari
     from minari.data_collector import EpisodeBuffer
     from minari.namespace import create_namespace, list_local_namespaces
     from minari.storage import get_dataset_path
-except ImportError as error:
-    raise MissingDependencyError(
-        "datasets of episodes need Minari: pip install 'npa-envs[minari]'"
-    ) from error
 
 ROOT = "MINARI_DATASETS_PATH"
 """Environment variable with the folder of all datasets."""
@@ -167,7 +163,7 @@ def write_dataset(
     part = root / f".{secrets.token_hex(6)}"
     try:
         part.mkdir()
-        with _datasets_in(part), warnings.catch_warnings():
+        with mock.patch.dict(os.environ, {ROOT: str(part)}), warnings.catch_warnings():
             # Minari warns about missing authors, addresses and links to code.
             warnings.simplefilter("ignore", UserWarning)
             dataset = minari.create_dataset_from_buffers(
@@ -194,20 +190,6 @@ def write_dataset(
     finally:
         shutil.rmtree(part, ignore_errors=True)
     return target
-
-
-@contextlib.contextmanager
-def _datasets_in(folder: Path) -> Iterator[None]:
-    """Set the folder of Minari's datasets within a block."""
-    before = os.environ.get(ROOT)
-    os.environ[ROOT] = str(folder)
-    try:
-        yield
-    finally:
-        if before is None:
-            del os.environ[ROOT]
-        else:
-            os.environ[ROOT] = before
 
 
 def spec_of(env_id: str, keywords: dict[str, Any], episode_steps: int) -> EnvSpec:

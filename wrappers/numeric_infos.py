@@ -5,14 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from npa_envs.errors import MissingDependencyError
+from npa_envs.errors import importing
 
-try:
+with importing("PettingZoo", "NumericInfos", "pip install 'npa-envs[envs]'"):
     from pettingzoo.utils.wrappers import BaseParallelWrapper
-except ImportError as error:
-    raise MissingDependencyError(
-        "NumericInfos needs PettingZoo: pip install 'npa-envs[envs]'"
-    ) from error
 
 Infos = dict[str, dict[str, Any]]
 

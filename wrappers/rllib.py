@@ -12,24 +12,15 @@ from gymnasium.wrappers.vector import FlattenObservation, TransformAction
 
 from npa_envs.envs import multispecies_v0, particles_v0
 from npa_envs.envs.core.vector import checked_count
-from npa_envs.errors import MissingDependencyError, NPAError, shown, suggest
-from npa_envs.registration import (
-    ALL,
-    CODED,
-    GARDEN_IDS,
-    SPECIES_SIZES,
-)
+from npa_envs.errors import NPAError, importing, shown, suggest
+from npa_envs.registration import ALL, CODED, GARDEN_IDS, SPECIES_SIZES
 from npa_envs.wrappers.base import AnyVectorEnv, vector_env
 from npa_envs.wrappers.particle_rows import ParticleRows
 
-try:
+with importing("Ray", "training with RLlib", "pip install 'npa-envs[rllib]'"):
     from ray.rllib.algorithms.ppo import PPOConfig
     from ray.rllib.env.wrappers.pettingzoo_env import ParallelPettingZooEnv
     from ray.tune.registry import register_env
-except ImportError as error:
-    raise MissingDependencyError(
-        f"training with RLlib needs Ray ({error}): pip install 'npa-envs[rllib]'"
-    ) from error
 
 MAKERS = {
     name: (module.parallel_env, task)
@@ -48,10 +39,10 @@ WHOLE_IDS = frozenset((*GARDEN_IDS, *(row.id for row in CODED)))
 def _rows(name: str, keywords: dict[str, Any]) -> AnyVectorEnv:
     """Make the worlds of an id for `num_envs` rows, as a creator for RLlib."""
     fields = dict(keywords)
-    count = fields.pop("num_envs")
+    row_count = fields.pop("num_envs")
     if name in WHOLE_IDS:
-        return _flat(_worlds(name, count, fields))
-    return ParticleRows(_worlds(name, count // fields["particle_count"], fields))
+        return _flat(_worlds(name, row_count, fields))
+    return ParticleRows(_worlds(name, row_count // fields["particle_count"], fields))
 
 
 def _worlds(name: str, count: int, fields: dict[str, Any]) -> AnyVectorEnv:

@@ -7,7 +7,7 @@ from typing import Any, NoReturn
 import torch
 from torch import Tensor
 
-from npa_envs.errors import MissingDependencyError, NPAError
+from npa_envs.errors import NPAError, importing
 from npa_envs.wrappers.base import (
     AnyVectorEnv,
     ParticleRowsBase,
@@ -16,13 +16,9 @@ from npa_envs.wrappers.base import (
     torch_env,
 )
 
-try:
+with importing("RSL-RL", "RslRlParticleEnv", "pip install 'npa-envs[rslrl]'"):
     from rsl_rl.env import VecEnv
     from tensordict import TensorDict
-except ImportError as error:
-    raise MissingDependencyError(
-        f"RslRlParticleEnv needs RSL-RL ({error}): pip install 'npa-envs[rslrl]'"
-    ) from error
 
 
 class RslRlParticleEnv(ParticleRowsBase, VecEnv):  # type: ignore[misc]

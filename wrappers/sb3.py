@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.envs.multi.vector import MultiSpeciesVectorEnv
-from npa_envs.errors import MissingDependencyError, NPAError, shown, suggest
+from npa_envs.errors import NPAError, importing, shown, suggest
 from npa_envs.wrappers.base import (
     MAKE_VECTOR,
     AnyVectorEnv,
@@ -27,12 +27,8 @@ from npa_envs.wrappers.base import (
     vector_env,
 )
 
-try:
+with importing("Stable-Baselines3", "a VecEnv", "pip install 'npa-envs[sb3]'"):
     from stable_baselines3.common.vec_env import VecEnv
-except ImportError as error:
-    raise MissingDependencyError(
-        "particles as rows need Stable-Baselines3: pip install 'npa-envs[sb3]'"
-    ) from error
 
 
 RowSteps = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]

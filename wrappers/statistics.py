@@ -18,7 +18,7 @@ from gymnasium.spaces import Box
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.checks import is_real, is_whole
+from npa_envs.checks import check_count, checked_positive, is_real
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.world.actions import Physics
 from npa_envs.wrappers.base import (
@@ -94,7 +94,8 @@ class _NormalizesPerception(WrapperBase):
     def __init__(
         self, env: Any, *, clip: float = 10.0, epsilon: float = 1e-8, training: bool = True
     ) -> None:
-        self.clip, self.epsilon = above_zero("clip", clip), above_zero("epsilon", epsilon)
+        self.clip = checked_positive("clip", clip)
+        self.epsilon = checked_positive("epsilon", epsilon)
         if not isinstance(training, bool | np.bool_):
             raise NPAError(f"training must be True or False, got {shown(training)}")
         super().__init__(env, clip=self.clip, epsilon=self.epsilon, training=training)
@@ -230,18 +231,14 @@ class TorchRecordEpisodeStatistics(_SumsRewards):
         stats_key: The key in `infos`.
 
     Raises:
-        NPAError: `env` is no vector environment, or `buffer_length` no whole number of at least 1.
+        NPAError: `env` is no vector environment, or `buffer_length` no integer of at least 1.
     """
 
     def __init__(
         self, env: AnyVectorEnv, buffer_length: int = 100, stats_key: str = "episode"
     ) -> None:
         super().__init__(env)
-        if not is_whole(buffer_length) or not 1 <= buffer_length < 2**31:
-            raise NPAError(
-                "buffer_length must be a whole number of at least 1 and below 2^31, got "
-                f"{shown(buffer_length)}"
-            )
+        check_count("buffer_length", buffer_length, at_most=2**31 - 1)
         self._key = stats_key
         self.episode_count = 0
         """Episodes that have ended."""
@@ -306,7 +303,7 @@ class TorchNormalizeObservation(VectorObservations):
 
     def __init__(self, env: AnyVectorEnv, epsilon: float = 1e-8) -> None:
         super().__init__(env)
-        self.epsilon = above_zero("epsilon", epsilon)
+        self.epsilon = checked_positive("epsilon", epsilon)
         shape = env.single_observation_space.shape
         assert shape is not None, "only arrays can be normalised"
         self.single_observation_space = Box(-np.inf, np.inf, shape, np.float32)
@@ -345,7 +342,7 @@ class TorchNormalizeReward(_SumsRewards):
         super().__init__(env)
         if not is_real(gamma) or not 0.0 <= gamma <= 1.0:
             raise NPAError(f"gamma must lie in [0, 1], got {shown(gamma)}: try 0.99")
-        self.gamma, self.epsilon = gamma, above_zero("epsilon", epsilon)
+        self.gamma, self.epsilon = gamma, checked_positive("epsilon", epsilon)
         self.return_rms = RunningMoments()
         """Running mean and variance of the discounted return."""
         self.update_running_mean = True
@@ -374,10 +371,3 @@ def check_tensor(values: Any, wrapper: str) -> None:
             f"{wrapper} needs torch tensors, got {type(values).__name__}: make the environment "
             f"with output='torch', or use gymnasium.wrappers.vector.{wrapper.removeprefix('Torch')}"
         )
-
-
-def above_zero(name: str, value: float) -> float:
-    """Return the argument of this name, checked: finite and greater than 0."""
-    if not is_real(value) or value <= 0:
-        raise NPAError(f"{name} must be a finite number greater than 0, got {shown(value)}")
-    return float(value)

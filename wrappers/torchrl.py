@@ -8,17 +8,13 @@ import torch
 from gymnasium.spaces import Box
 from torch import Tensor
 
-from npa_envs.errors import MissingDependencyError, NPAError
+from npa_envs.errors import NPAError, importing
 from npa_envs.wrappers.base import AnyVectorEnv, autoreset_mode, check_autoreset, torch_env
 
-try:
+with importing("TorchRL", "NPATorchRLEnv", "pip install 'npa-envs[torchrl]'"):
     from tensordict import TensorDict, TensorDictBase
     from torchrl.data import Bounded, Categorical, Composite, Unbounded
     from torchrl.envs import EnvBase
-except ImportError as error:
-    raise MissingDependencyError(
-        f"NPATorchRLEnv needs TorchRL ({error}): pip install 'npa-envs[torchrl]'"
-    ) from error
 
 
 class NPATorchRLEnv(EnvBase):  # type: ignore[misc]

@@ -38,7 +38,7 @@ from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.learning.progress import Budget, CurvePoint
 from npa_envs.errors import DivergedError, NPAError
 from npa_envs.measure.record import number, read_record, write_record
-from npa_envs.processes import Child, Places, run_children
+from npa_envs.processes import Child, Slots, run_children
 from npa_envs.render import write_png
 
 Status = Literal["done", "diverged", "failed"]
@@ -303,7 +303,7 @@ def run_jobs(
     plan: ComparisonPlan,
     jobs: Sequence[Job],
     folder: Path,
-    places: Places,
+    slots: Slots,
     *,
     command: str = "",
     max_seconds: float = math.inf,
@@ -338,7 +338,7 @@ def run_jobs(
                 waiting.remove(job)
                 taught = "" if teacher is None else str(folder / teacher.folder)
                 request = RunRequest(job, plan.facts(job), command, taught)
-                return _start(request, folder, places.threads, idle if lasts(plan, job) else [])
+                return _start(request, folder, slots.threads, idle if lasts(plan, job) else [])
         return None
 
     def finished(one: _Process) -> None:
@@ -361,8 +361,8 @@ def run_jobs(
         run_children(
             start,
             finished,
-            places,
-            ahead=places.ahead and not all(lasts(plan, job) for job in jobs),
+            slots,
+            ahead=slots.ahead and not all(lasts(plan, job) for job in jobs),
             max_seconds=max_seconds,
         )
     finally:

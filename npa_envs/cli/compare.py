@@ -87,7 +87,7 @@ def main(arguments: Sequence[str]) -> int:
     from npa_envs.agents.comparison.report import write_pictures, write_table
     from npa_envs.agents.comparison.run import held_records, run_jobs
     from npa_envs.measure.record import without_folders
-    from npa_envs.processes import Places
+    from npa_envs.processes import Slots
 
     command = shlex.join(["npa-envs", "compare", *without_folders(arguments, "--out")])
     plan = make_plan(options)
@@ -108,13 +108,13 @@ def main(arguments: Sequence[str]) -> int:
         write_table(plan, whole(), folder, command)
         bar.advance(1)
 
-    places = Places((options.devices or (options.device,)), _jobs(options), options.threads)
+    slots = Slots((options.devices or (options.device,)), _jobs(options), options.threads)
     with common.StepBar(len(missing), show=options.progress, unit="run") as bar:
         run_jobs(
             plan,
             missing,
             folder,
-            places,
+            slots,
             command=command,
             max_seconds=options.max_seconds,
             written=written,
@@ -295,16 +295,16 @@ def _settings(options: CompareOptions) -> dict[str, Any]:
     from npa_envs.devices import check_device
     from npa_envs.measure.record import installed_version, machine, measured_facts
 
-    places = [check_device(name) for name in (options.devices or (options.device,))]
-    kinds = {(place.type, machine(place)) for place in places}
+    devices = [check_device(name) for name in (options.devices or (options.device,))]
+    kinds = {(device.type, machine(device)) for device in devices}
     if len(kinds) > 1:
         raise NPAError(
             f"devices must be of one kind, as times are compared, got {sorted(kinds)}: choose some"
         )
     facts = measured_facts(
-        places[0],
+        devices[0],
         options.commit,
-        runs_at_once=-(-_jobs(options) // len(places)),
+        runs_at_once=-(-_jobs(options) // len(devices)),
         threads=options.threads,
     )
     facts["versions"] |= {name: installed_version(name) for name in ("stable-baselines3", "cma")}

@@ -19,7 +19,7 @@ from npa_envs.cli import common
 from npa_envs.errors import NPAError, suggest
 from npa_envs.files import read_json, write_text
 from npa_envs.measure.record import NONE, markdown_table, read_record, write_record
-from npa_envs.processes import Child, Places, part_of, run_children
+from npa_envs.processes import Child, Slots, part_of, run_children
 
 RECORD, OUTPUT, TABLE = "run.json", "output.txt", "sweep.md"
 """Files: record and output of a run, and the table of all runs."""
@@ -135,7 +135,7 @@ def main(arguments: Sequence[str]) -> int:
     runs = combinations(options.over, given[split + 1 :], folder, options.threads)
     mine = part_of(runs, options.part, lambda run: run.folder.name)
     waiting = [run for run in mine if not run.done]
-    places = Places(options.devices, options.jobs or len(options.devices), options.threads)
+    slots = Slots(options.devices, options.jobs or len(options.devices), options.threads)
     again = "runs are left: call again with the same arguments"
     with common.StepBar(len(waiting), show=options.progress, unit="run") as bar:
 
@@ -148,7 +148,7 @@ def main(arguments: Sequence[str]) -> int:
             run_children(
                 lambda _: waiting.pop(0) if waiting else None,
                 finished,
-                places,
+                slots,
                 ahead=False,
                 max_seconds=options.max_seconds,
             )

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.checks import checked_side
-from npa_envs.errors import MissingDependencyError, NPAError, shown
+from npa_envs.errors import NPAError, importing, shown
 from npa_envs.render.film import Frame, check_rate, checked_frames, encode_frame, encode_webp
 from npa_envs.render.worlds import draw_worlds
 
@@ -231,13 +231,9 @@ def _import_pygame() -> Any:
     os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
     # SDL would turn SIGTERM into a QUIT event of the window.
     os.environ.setdefault("SDL_NO_SIGNAL_HANDLERS", "1")
-    try:
-        with warnings.catch_warnings():
-            # pygame's use of setuptools is deprecated.
-            warnings.simplefilter("ignore")
-            return importlib.import_module("pygame")
-    except ImportError as error:
-        raise MissingDependencyError(
-            f"a window needs pygame, which is not installed ({error}): "
-            "pip install 'npa-envs[human]', or use render_mode='rgb_array'"
-        ) from error
+    hint = "pip install 'npa-envs[human]', or use render_mode='rgb_array'"
+    with importing("pygame", "a window", hint), warnings.catch_warnings():
+        # pygame's use of setuptools is deprecated.
+        warnings.simplefilter("ignore")
+        pygame = importlib.import_module("pygame")
+    return pygame

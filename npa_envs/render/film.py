@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import io
 import math
 import struct
@@ -16,8 +15,8 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from npa_envs.checks import checked_count, checked_finite, entries, is_real, is_whole
-from npa_envs.errors import MissingDependencyError, NPAError, shown
+from npa_envs.checks import check_count, checked_count, checked_finite, entries, is_real
+from npa_envs.errors import NPAError, importing, shown
 from npa_envs.files import atomic_path, write_bytes
 from npa_envs.ops import Cameras, orbit
 from npa_envs.render.colours import Background, background_colour, to_uint8
@@ -135,7 +134,10 @@ def write_mp4(path: str | Path, frames: Iterable[Frame], fps: float = 25) -> Non
     """
     pictures = checked_frames(frames)
     check_rate(fps)
-    imageio, ffmpeg = _import_imageio()
+    hint = "pip install 'imageio[ffmpeg]', or write a GIF"
+    with importing("imageio with ffmpeg", "an MP4 file", hint):
+        import imageio.v2 as imageio
+        import imageio_ffmpeg
     height, width, _ = pictures[0].shape
     padding = ((0, height % 2), (0, width % 2), (0, 0))
     with atomic_path(path) as temporary:
@@ -146,7 +148,13 @@ def write_mp4(path: str | Path, frames: Iterable[Frame], fps: float = 25) -> Non
         ) as writer:  # fmt: skip
             for picture in pictures:
                 writer.append_data(np.pad(picture, padding, mode="edge"))
-        _check_film(temporary, len(pictures), ffmpeg)
+        # The writer does not report failures of the encoder, for example on a full disk.
+        try:
+            count, _ = imageio_ffmpeg.count_frames_and_secs(str(temporary))
+        except RuntimeError as error:
+            raise OSError(f"the encoder left a broken film: {error}") from error
+        if count != len(pictures):
+            raise OSError(f"the encoder wrote {count} of {len(pictures)} frames")
 
 
 def write_filmstrip(
@@ -169,8 +177,7 @@ def write_filmstrip(
     count = len(pictures)
     captions = [] if captions is None else _checked_captions(captions, count)
     across = min(count, 8) if columns is None else columns
-    if not is_whole(across) or across < 1:
-        raise NPAError(f"columns must be an integer of at least 1, got {shown(columns)}: try 4")
+    check_count("columns", across, ": try 4")
     across = min(across, count)
     height, width, _ = pictures[0].shape
     font = _caption_font(captions, width)
@@ -266,26 +273,6 @@ def _shared_palette(pictures: list[Frame]) -> tuple[Image.Image, Frame, int]:
     entry = len(colours) // 3
     palette.putpalette([*colours, *(int(v) for v in background)])
     return palette, background, entry
-
-
-def _import_imageio() -> tuple[Any, Any]:
-    try:
-        return importlib.import_module("imageio.v2"), importlib.import_module("imageio_ffmpeg")
-    except ImportError as error:
-        raise MissingDependencyError(
-            f"an MP4 file needs imageio with ffmpeg, which is not installed ({error}): "
-            "pip install 'imageio[ffmpeg]', or write a GIF"
-        ) from error
-
-
-def _check_film(path: Path, frame_count: int, ffmpeg: Any) -> None:
-    # The writer does not report failures of the encoder, for example on a full disk.
-    try:
-        written, _ = ffmpeg.count_frames_and_secs(str(path))
-    except RuntimeError as error:
-        raise OSError(f"the encoder left a broken film: {error}") from error
-    if written != frame_count:
-        raise OSError(f"the encoder wrote {written} of {frame_count} frames")
 
 
 def _caption_font(

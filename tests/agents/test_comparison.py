@@ -41,7 +41,7 @@ from npa_envs.agents.learning import METHODS, CurvePoint, Problem, RuleSet
 from npa_envs.cli import main
 from npa_envs.cli.compare import CompareOptions, make_plan
 from npa_envs.cli.compare import _jobs as jobs_of
-from npa_envs.processes import Places
+from npa_envs.processes import Slots
 from npa_envs.render import write_png
 
 FACTS = {"problem": {}, "budget": 1.0, "options": {}, "episodes": 2}
@@ -112,8 +112,8 @@ def child(monkeypatch):
 def ran(made, folder, *devices, jobs=1, **given) -> list[RunRecord]:
     """Run all jobs of a plan; return their records in the order in which they ended."""
     seen: list[RunRecord] = []
-    places = Places(devices or ("cpu",), jobs)
-    run_jobs(made, made.jobs(), folder, places, written=seen.append, **given)
+    slots = Slots(devices or ("cpu",), jobs)
+    run_jobs(made, made.jobs(), folder, slots, written=seen.append, **given)
     return seen
 
 
@@ -298,7 +298,7 @@ def test_a_run_is_the_same_whatever_its_process_did_before(tmp_path, monkeypatch
         CompareOptions(quick=True, particle_steps=3e4, tasks=("mixing",), methods=methods)
     )
     jobs = [*reversed(made.jobs()[2:]), *made.jobs()[:2]]
-    run_jobs(made, jobs, tmp_path / "one", Places(("cpu",)))
+    run_jobs(made, jobs, tmp_path / "one", Slots(("cpu",)))
     monkeypatch.setattr(one_run, "lasts", lambda plan, job: False)
     ran(made, tmp_path / "each")
     found, alone = (held_records(made, tmp_path / name) for name in ("one", "each"))
@@ -354,8 +354,8 @@ def test_a_process_that_dies_is_recorded_the_others_go_on_and_it_is_run_again(
         seen.append(one)
         ends.append(time.perf_counter())
 
-    places = Places(("cuda" if waiting else "cpu",))
-    run_jobs(made, made.jobs(), tmp_path, places, written=written)
+    slots = Slots(("cuda" if waiting else "cpu",))
+    run_jobs(made, made.jobs(), tmp_path, slots, written=written)
     assert [one.status for one in seen] == ["done", "failed", "done"]
     lost = seen[1]
     assert lost.error == "its process ended with code 3: out of luck"
@@ -364,7 +364,7 @@ def test_a_process_that_dies_is_recorded_the_others_go_on_and_it_is_run_again(
     assert list(held_records(made, tmp_path)) == [seen[0].job, seen[2].job]
     assert RunRecord.read(tmp_path / lost.job.folder, made.facts(lost.job)) == lost
     child("")
-    run_jobs(made, [lost.job], tmp_path, Places(("cpu",)))
+    run_jobs(made, [lost.job], tmp_path, Slots(("cpu",)))
     assert list(held_records(made, tmp_path)) == made.jobs()
 
 
@@ -381,7 +381,7 @@ def test_an_interrupted_comparison_ends_its_processes_and_goes_on_where_it_was(
 
     begin = time.perf_counter()
     with pytest.raises(KeyboardInterrupt):
-        run_jobs(made, made.jobs(), tmp_path, Places((device,), jobs=2), written=interrupt)
+        run_jobs(made, made.jobs(), tmp_path, Slots((device,), jobs=2), written=interrupt)
     assert len(pids(tmp_path)) >= 2
     assert not any(map(is_alive, pids(tmp_path)))
     assert time.perf_counter() - begin < 300.0

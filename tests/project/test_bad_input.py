@@ -81,17 +81,17 @@ def test_numbers_of_other_libraries_survive_in_a_rule(tmp_path):
     assert npa_envs.load_rule(tmp_path / "rule.safetensors").alpha == 0.5
 
 
-def made(function, *given, **usual):
+def calls(function, *args, **defaults):
     """A function that makes calls of a function with some arguments, changed by keywords."""
-    return lambda **options: lambda: function(*given, **usual | options)
+    return lambda **options: lambda: function(*args, **defaults | options)
 
 
-rule = made(NPARule)
-rolled = made(rollout, NPARule(), x=X, s=S, steps=1)
-splatted = made(splat, X, S[..., :3], resolution=8, pixel_size=0.2)
-camera = made(orbit, 1, width=4, height=4)
-small = made(gymnasium.make, "npa/Texture-v0", particle_count=16)
-damaged = made(damage_worlds, X, S, kind="wipe")
+rule = calls(NPARule)
+rolled = calls(rollout, NPARule(), x=X, s=S, steps=1)
+splatted = calls(splat, X, S[..., :3], resolution=8, pixel_size=0.2)
+camera = calls(orbit, 1, width=4, height=4)
+small = calls(gymnasium.make, "npa/Texture-v0", particle_count=16)
+damaged = calls(damage_worlds, X, S, kind="wipe")
 crowd = multispecies_v0.parallel_env
 PROBLEM = Problem(env_id="npa/Morphogenesis2DSmall-v0", episode_steps=4)
 SPARSE, META = X.to_sparse(), X.to("meta")
@@ -145,10 +145,13 @@ WIDE = NPARule(state_dim=2)
         (lambda: export_web("gecko", "p.html"), "sources must be a list of rules, got 'gecko'"),
         (lambda: export_web([NPARule()], "p.html"), "names or files of rules, got a NPARule"),
         (lambda: export_web(["gecko"], "p.html", title=3), "title must be text"),
-        (lambda: wipe_state(X, S, centre=(0.0, 0.0), radius=0.2), "centre must be a tensor"),
+        (
+            lambda: wipe_state(X, S, centre=(0.0, 0.0), radius=0.2),
+            "centre must have shape",
+        ),
         (
             lambda: inject(X, S, centre=X[:, 0], radius=0.2, state=0.5, strength=1.0),
-            "state must be a tensor",
+            "state must have shape",
         ),
         (lambda: RowPolicy("model.zip"), "model must be one of Stable-Baselines3"),
         (

@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple, TypeVar
+from unittest import mock
 
 import pytest
 
@@ -25,13 +26,9 @@ IMAGES = (".png", ".gif", ".webp", ".jpg", ".svg", ".mp4")
 
 
 def files(*folders: str, suffixes: tuple[str, ...] = (".py",)) -> list[Path]:
-    """Return files below folders, but for those that running makes."""
-    found = [path for folder in folders for path in (ROOT / folder).rglob("*")]
-    return sorted(
-        path
-        for path in found
-        if path.suffix in suffixes and path.is_file() and "__pycache__" not in path.parts
-    )
+    """Return files below folders."""
+    paths = [path for folder in folders for path in (ROOT / folder).rglob("*")]
+    return sorted(path for path in paths if path.suffix in suffixes and path.is_file())
 
 
 def lines(paths: list[Path]) -> int:
@@ -48,20 +45,19 @@ def trees() -> dict[Path, ast.Module]:
     return {path: ast.parse(path.read_text("utf-8")) for path in files(*PACKAGES)}
 
 
-def nodes(kind: type[Node]) -> Iterator[tuple[Path, Node]]:
-    """Yield all nodes of a kind, with their files."""
+def nodes(cls: type[Node]) -> Iterator[tuple[Path, Node]]:
+    """Yield all nodes of a class, with their files."""
     for path, tree in trees().items():
-        yield from ((path, node) for node in ast.walk(tree) if isinstance(node, kind))
+        yield from ((path, node) for node in ast.walk(tree) if isinstance(node, cls))
 
 
 def functions_of_x_and_s() -> int:
     """Count functions that take positions and states side by side."""
-    count = 0
-    for _, function in nodes(ast.FunctionDef):
-        given = function.args
-        names = {arg.arg for arg in (*given.posonlyargs, *given.args, *given.kwonlyargs)}
-        count += {"x", "s"} <= names
-    return count
+    all_arguments = (function.args for _, function in nodes(ast.FunctionDef))
+    return sum(
+        {"x", "s"} <= {arg.arg for arg in (*args.posonlyargs, *args.args, *args.kwonlyargs)}
+        for args in all_arguments
+    )
 
 
 def files_of_path_length() -> int:
@@ -70,43 +66,40 @@ def files_of_path_length() -> int:
 
 def task_classes() -> set[str]:
     """Return the names of tasks, of their configurations and of protocols that some tasks have."""
-    found: set[str] = set()
+    names: set[str] = set()
     classes = [
         node for path, node in nodes(ast.ClassDef) if path.parent == ROOT / "npa_envs" / "tasks"
     ]
     for _ in range(4):
-        found |= {
+        names |= {
             node.name
             for node in classes
-            if node.name.endswith(("Task", "Config")) or names_of(node.bases) & found
+            if node.name.endswith(("Task", "Config")) or names_of(node.bases) & names
         }
-    return found
+    return names
 
 
-def names_of(parts: list[ast.expr]) -> set[str]:
+def names_of(expressions: list[ast.expr]) -> set[str]:
     """Return all names in expressions."""
-    return {n.id for part in parts for n in ast.walk(part) if isinstance(n, ast.Name)}
+    nodes = (node for expression in expressions for node in ast.walk(expression))
+    return {node.id for node in nodes if isinstance(node, ast.Name)}
 
 
 def isinstance_on_tasks() -> int:
     """Count places outside of tasks that ask which task one is."""
-    wanted, count = task_classes(), 0
+    classes, count = task_classes(), 0
     for path, call in nodes(ast.Call):
         inside = path.is_relative_to(ROOT / "npa_envs" / "tasks")
         if not inside and getattr(call.func, "id", "") in ("isinstance", "issubclass"):
-            count += bool(names_of(call.args[1:]) & wanted)
+            count += bool(names_of(call.args[1:]) & classes)
     return count
 
 
 def classes_named_twice() -> int:
     """Count names that several classes of modules have."""
-    named = Counter(
-        node.name
-        for tree in trees().values()
-        for node in tree.body
-        if isinstance(node, ast.ClassDef)
-    )
-    return sum(count > 1 for count in named.values())
+    bodies = (node for tree in trees().values() for node in tree.body)
+    counts = Counter(node.name for node in bodies if isinstance(node, ast.ClassDef))
+    return sum(count > 1 for count in counts.values())
 
 
 def places_that_draw_masks() -> int:
@@ -126,18 +119,16 @@ def options_of_train() -> int:
     """Count the options of `npa-envs train morphogenesis2d`, each once."""
     from npa_envs.cli import main
 
-    text, columns = io.StringIO(), os.environ.get("COLUMNS")
+    text = io.StringIO()
     # So narrow that options stand below each other, at the begin of a line.
-    os.environ["COLUMNS"] = "60"
-    try:
-        with contextlib.redirect_stdout(text), contextlib.suppress(SystemExit):
-            main(["train", "morphogenesis2d", "--help-all"])
-    finally:
-        os.environ.pop("COLUMNS")
-        if columns is not None:
-            os.environ["COLUMNS"] = columns
-    named = re.findall(r"(?m)^. (--[a-z][a-z0-9-]*)", text.getvalue())
-    return len(set(named) - {"--help"})
+    with (
+        mock.patch.dict(os.environ, COLUMNS="60"),
+        contextlib.redirect_stdout(text),
+        contextlib.suppress(SystemExit),
+    ):
+        main(["train", "morphogenesis2d", "--help-all"])
+    options = re.findall(r"(?m)^. (--[a-z][a-z0-9-]*)", text.getvalue())
+    return len(set(options) - {"--help"})
 
 
 class Budget(NamedTuple):

@@ -11,6 +11,7 @@ from types import ModuleType
 from typing import NamedTuple
 
 import gymnasium as gym
+import imageio.v3 as imageio
 import numpy as np
 import pytest
 import torch
@@ -19,6 +20,7 @@ from crowds import small as small_crowd
 from gymnasium.utils.env_checker import check_env
 from PIL import Image
 from small_envs import make
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import npa_envs
 from npa_envs.agents.learning import Budget, train
@@ -108,28 +110,19 @@ def test_the_reference_of_commands_has_every_command_and_task():
     assert sorted(asked) == sorted([*COMMANDS, *(f"train {name}" for name in TRAINED)])
 
 
-def commands_of_pages() -> dict[tuple[str, ...], set[str]]:
-    """Return the options that blocks of shell give to each command, by command and task."""
-    asked: dict[tuple[str, ...], set[str]] = {}
-    texts = "\n".join(path.read_text(encoding="utf-8") for path in TEXTS)
-    for block in re.findall(r"^ *```(?:sh|bash)\n(.*?)^ *```", texts, re.M | re.S):
-        for line in re.sub(r"\\\n", " ", block).splitlines():
-            # What follows `--` is for the runs of a sweep.
-            words = re.sub(r"#.*| > .*| -- .*", "", line).replace(".venv/bin/", "").split()
-            if words[:1] != ["npa-envs"] or len(words) < 2 or words[1].startswith("-"):
-                continue
-            command = tuple(words[1:3]) if words[1] == "train" else (words[1],)
-            names = {word.partition("=")[0] for word in words if word.startswith("-")}
-            asked.setdefault(command, set()).update(names)
-    return asked
-
-
 def test_commands_in_blocks_of_shell_have_the_options_that_they_are_given(capsys):
-    asked = commands_of_pages()
-    assert len(asked) > 12
-    for command, options in asked.items():
-        if "TASK" in command:
-            continue
+    texts = "\n".join(path.read_text(encoding="utf-8") for path in TEXTS)
+    blocks = re.findall(r"^ *```(?:sh|bash)\n(.*?)^ *```", texts, re.M | re.S)
+    used: dict[tuple[str, ...], set[str]] = {}
+    for line in re.sub(r"\\\n", " ", "".join(blocks)).splitlines():
+        # What follows `--` is for the runs of a sweep.
+        words = re.sub(r"#.*| > .*| -- .*", "", line).replace(".venv/bin/", "").split()
+        if words[:1] == ["npa-envs"] and not words[1].startswith("-") and "TASK" not in words:
+            command = tuple(words[1:3]) if words[1] == "train" else (words[1],)
+            options = {word.partition("=")[0] for word in words if word.startswith("-")}
+            used[command] = used.get(command, set()) | options
+    assert len(used) > 12
+    for command, options in used.items():
         with contextlib.suppress(SystemExit):
             main([*command, "--help-all" if len(command) > 1 else "--help"])
         listed = set(re.findall(r"(?<![\w-])--?[\w-]+", capsys.readouterr().out))
@@ -276,12 +269,39 @@ class Program(NamedTuple):
     """What is changed in a page's code so that it takes little time, and what is true after it."""
 
     checks: tuple[str, ...]
-    """Expressions of the code's names, and of `printed` and `folder`."""
+    """Expressions of the code's names, and of `printed`, its `labels` and `folder`."""
     changes: tuple[tuple[str, str], ...] = ()
     blocks: slice = slice(None)
+    library: str = "torch"
+    """A library that it needs."""
 
 
 PROGRAMS = {
+    "first_minutes": Program(("x.shape == (1, 1024, 2)",)),
+    "gpu": Program(
+        ("x.shape == (2, 256, 2)", "isinstance(observations, torch.Tensor)"),
+        (("8, 4096", "2, 256"), ("steps=64", "steps=2"), ("num_envs=64", "num_envs=2")),
+        slice(2),
+    ),
+    "gpu: learning": Program(
+        (
+            "labels == ['zero', 'ppo', 'gradient', \"ppo, begun with the gradient's rule\"]",
+            "(folder / 'runs' / 'ppo' / 'rule-0.safetensors').is_file()",
+            "(folder / 'runs' / 'gradient' / 'rule-0.safetensors').is_file()",
+        ),
+        (
+            *(("[13]0_000_000", "500"), ("episode_steps=48", "episode_steps=2")),
+            *(("particle_count=512", "particle_count=16"), ("num_envs=32", "num_envs=2")),
+        ),
+        slice(2, None),
+        "stable_baselines3",
+    ),
+    "learning: PPO": Program(
+        ("labels == ['ppo'] * 3 + ['ppo_world'] * 3",),
+        (("500_000", "1_000"),),
+        slice(1, 2),
+        "stable_baselines3",
+    ),
     "training": Program(("printed.startswith('random: ')",)),
     "textures": Program(("printed.count('tensor([') == 2",)),
     "point_classification": Program(
@@ -340,9 +360,12 @@ PROGRAMS = {
 
 @pytest.mark.parametrize("page", PROGRAMS)
 def test_the_code_of_a_page_runs(page, folder, capsys):
-    checks, changes, blocks = PROGRAMS[page]
-    names = run_code(page, *changes, blocks=blocks)
-    names |= {"printed": capsys.readouterr().out, "folder": folder, "text_of": text_of}
+    checks, changes, blocks, library = PROGRAMS[page]
+    pytest.importorskip(library)
+    names = run_code(page.partition(":")[0], *changes, blocks=blocks)
+    printed = capsys.readouterr().out
+    names |= {"printed": printed, "folder": folder, "text_of": text_of}
+    names["labels"] = re.findall(r"^([\w, ']+): ", printed, re.MULTILINE)
     assert [check for check in checks if not eval(check, names)] == []
 
 
@@ -380,17 +403,6 @@ def test_ppo_beats_random_actions_by_three_standard_errors_in_five_minutes(capsy
     assert mean == pytest.approx(printed_returns(text_of("tutorial"))["RowPolicy"][0], abs=0.2)
 
 
-def test_the_program_for_a_graphics_card_runs_on_any_device(folder, capsys):
-    pytest.importorskip("stable_baselines3")
-    smaller = ("[13]0_000_000", "500"), ("episode_steps=48", "episode_steps=2")
-    fewer = ("particle_count=512", "particle_count=16"), ("num_envs=32", "num_envs=2")
-    run_code("gpu", *smaller, *fewer, blocks=slice(-1, None))
-    methods = re.findall(r"^([\w, ']+): -?[\d.]+", capsys.readouterr().out, re.MULTILINE)
-    assert methods == ["zero", "ppo", "gradient", "ppo, begun with the gradient's rule"]
-    for method in ("ppo", "gradient"):
-        assert (folder / "runs" / method / "rule-0.safetensors").is_file()
-
-
 @pytest.mark.slow
 def test_the_code_about_the_search_runs():
     pytest.importorskip("ribs", reason="the extra search is not installed")
@@ -420,15 +432,6 @@ def test_the_code_about_datasets_runs(folder, monkeypatch):
     assert names["clone"].rules is not None
 
 
-def test_the_code_of_the_first_minutes_and_about_graphics_cards_runs():
-    names = run_code("first_minutes")
-    assert names["x"].shape == (1, 1024, 2)
-    changes = ("8, 4096", "2, 256"), ("steps=64", "steps=2"), ("num_envs=64", "num_envs=2")
-    run_code("gpu", *changes, names=names, blocks=slice(2))
-    assert names["x"].shape == (2, 256, 2)
-    assert isinstance(names["observations"], torch.Tensor)
-
-
 def test_the_code_about_learning_runs(folder, monkeypatch, capsys):
     # Less learning: tested is that it runs, and what needs no learning.
     names = run_code("learning", ("00_000", "0_000"), blocks=slice(1))
@@ -444,13 +447,6 @@ def test_the_code_about_learning_runs(folder, monkeypatch, capsys):
     budget = Budget(particle_steps=2000)
     trained = train("mine:train", names["problem"], budget, 0, noise=0.2, entries=1)
     assert [entry.particle_steps for entry in trained.log] == [0, 2000]
-
-
-def test_the_code_about_ppo_runs(capsys):
-    pytest.importorskip("stable_baselines3")
-    run_code("learning", ("500_000", "1_000"), blocks=slice(1, 2))
-    printed = capsys.readouterr().out.splitlines()
-    assert [line.split(":")[0] for line in printed] == ["ppo"] * 3 + ["ppo_world"] * 3
 
 
 @pytest.fixture
@@ -492,6 +488,88 @@ def test_the_tutorial_of_gardeners_runs(folder, capsys):
     assert (folder / "gardener.webp").stat().st_size > 1000
     assert names["model"].num_timesteps >= 34
     assert names["shepherd"].num_timesteps == 34
+
+
+# Other libraries: each program runs as it stands there, and learns.
+
+RANDOM, RANDOM_ERROR = 0.143, 0.018
+"""Return of random actions in the worlds of the tutorial, by its table."""
+
+foreign = pytest.mark.filterwarnings(
+    "ignore::DeprecationWarning", "ignore::FutureWarning", "ignore::UserWarning"
+)
+
+
+def run_integration(number: int, library: str, *changes: tuple[str, str]) -> None:
+    """Run one program of docs/integrations.md, if there is the library."""
+    pytest.importorskip(library)
+    run_code("integrations", *changes, blocks=slice(number, number + 1))
+
+
+@foreign
+def test_callbacks_logs_and_films_of_stable_baselines3(folder):
+    pytest.importorskip("moviepy")
+    run_integration(0, "stable_baselines3")
+    load = importlib.import_module("stable_baselines3").PPO.load
+    assert load(folder / "runs/rl_model_16384_steps.zip").num_timesteps == 16384
+    assert load(folder / "runs/best_model.zip").num_timesteps in (8192, 16384)
+    log = EventAccumulator(str(folder / "runs/PPO_1")).Reload()
+    assert [event.value for event in log.Scalars("eval/mean_ep_length")] == [16.0, 16.0]
+    rewards = log.Scalars("rollout/ep_rew_mean")
+    assert [event.step for event in rewards] == [4096, 8192, 12288, 16384]
+    (film,) = (folder / "runs").glob("*.mp4")
+    assert len(imageio.imread(film)) in (17, 18)
+
+
+@foreign
+def test_weights_and_biases_follows_the_logs(folder, monkeypatch):
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    run_integration(1, "wandb")
+    (record,) = (folder / "wandb").glob("offline-run-*/*.wandb")
+    assert b"rollout/ep_rew_mean" in record.read_bytes()
+
+
+@foreign
+def test_films_of_gymnasium(folder):
+    run_integration(2, "moviepy")
+    for name, side in (("one", 256), ("four", 512)):
+        film = imageio.imread(next((folder / "films" / name).glob("*.mp4")))
+        # The first picture and 24 steps; moviepy 1.0.3 may show the last one twice.
+        assert len(film) in (25, 26)
+        assert film.shape[1:] == (side, side, 3)
+        assert abs(film[-1].astype(float) - film[0]).mean() > 1.0
+
+
+@foreign
+@pytest.mark.parametrize(
+    ("label", "number", "library"), [("TorchRL", 3, "torchrl"), ("RSL-RL", 4, "rsl_rl")]
+)
+@pytest.mark.parametrize("rounds", [1, pytest.param(60, marks=pytest.mark.slow)])
+def test_particles_learn_to_act_for_their_world(label, number, library, rounds, capsys):
+    run_integration(number, library, ("(?m)^rounds(.*) = 60", rf"rounds\1 = {rounds}"))
+    row = rf"^{label}: (-?[\d.]+) ± ([\d.]+)$"
+    ((mean, error),) = re.findall(row, capsys.readouterr().out, re.MULTILINE)
+    assert float(error) < 0.05
+    if rounds == 60:
+        assert float(mean) > RANDOM + 10.0 * (RANDOM_ERROR + float(error))
+        ((on_page, _),) = re.findall(row, text_of("integrations"), re.MULTILINE)
+        assert float(mean) == pytest.approx(float(on_page), abs=0.3)
+
+
+@foreign
+@pytest.mark.slow
+def test_rllib_learns(capsys):
+    ray = pytest.importorskip("ray")
+    ray.init(num_cpus=1, include_dashboard=False, log_to_driver=False, logging_level="ERROR")
+    try:
+        run_integration(5, "ray", ("rounds = 60", "rounds = 30"))
+    finally:
+        ray.shutdown()
+    (mean,) = re.findall(r"^RLlib: (-?[\d.]+)$", capsys.readouterr().out, re.MULTILINE)
+    assert float(mean) > 3.0 * RANDOM
+
+
+# Living worlds, and all pages.
 
 
 def test_the_code_about_stability_runs():

@@ -3,6 +3,7 @@
 import gzip
 import json
 import os
+import re
 import subprocess
 import sys
 import tracemalloc
@@ -11,14 +12,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from PIL import EpsImagePlugin, Image
 
 from npa_envs import NPAError, NPARule, load_rule, save_rule
-from npa_envs.errors import shown
 from npa_envs.measure.record import read_record
+from npa_envs.runtime import kernel_cache_folder, quiet_warp
 from npa_envs.tasks.losses.texture import load_vgg_weights
 from npa_envs.tasks.targets.clouds import load_pictures, read_idx
 from npa_envs.tasks.targets.images import open_image
@@ -139,35 +139,6 @@ MERGES = "\n".join(
 )
 
 
-def test_what_came_is_shown_in_200_characters():
-    nested: Any = ["lol"] * 9
-    for _ in range(30):
-        nested = [nested] * 9
-    for value in (nested, 10**5000, "x" * 10**6, ValueError("x" * 10**6), np.zeros(10**6)):
-        assert len(shown(value)) < 220
-    assert shown("a") == "'a'"
-    assert shown((1, 2.5, None)) == "(1, 2.5, None)"
-    assert shown(10**5000) == "<int>"
-
-
-def write_scene(folder: Path, **changes: Any) -> None:
-    frame = {"file_path": "./a", "transform_matrix": torch.eye(4).tolist()}
-    scene = {"camera_angle_x": 0.7, "frames": [frame | changes.pop("frame", {})]} | changes
-    for name in ("transforms_train.json", "transforms_test.json"):
-        (folder / name).write_text(json.dumps(scene), encoding="utf-8")
-    Image.new("RGBA", (8, 8), (255, 0, 0, 255)).save(folder / "a.png")
-
-
-def ply(corners: list[list[float]], face: list[int]) -> bytes:
-    head = (
-        f"ply\nformat ascii 1.0\nelement vertex {len(corners)}\nproperty double x\n"
-        "property double y\nproperty double z\nelement face 1\n"
-        "property list uchar int vertex_indices\nend_header\n"
-    )
-    rows = [" ".join(map(repr, corner)) for corner in corners]
-    return (head + "\n".join([*rows, " ".join(map(str, (len(face), *face)))]) + "\n").encode()
-
-
 TRIANGLE = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
 
 
@@ -181,39 +152,28 @@ def test_a_mesh_that_covers_no_pixel_gives_empty_views(tmp_path):
     assert (views.training.pictures == 0.0).all()
 
 
-USE_KERNELS = """
-import torch, npa_envs
-try:
-    npa_envs.perceive(torch.rand(1, 2, 2), torch.rand(1, 2, 1), 0.1)
-except npa_envs.NPAError as error:
-    assert "WARP_CACHE_PATH" in str(error), error
-    print(error)
-"""
-
-
-def test_a_kernel_cache_that_cannot_be_made_names_the_folder_and_the_cure(tmp_path):
-    (tmp_path / "file").touch()
-    environment = os.environ | {"WARP_CACHE_PATH": str(tmp_path / "file")}
-    command = [sys.executable, "-c", USE_KERNELS]
-    said = subprocess.check_output(command, env=environment, text=True, encoding="utf-8")
-    assert str(tmp_path / "file") in said
-    assert "remove it" in said
-
-
 @pytest.mark.parametrize(
     "error", [RuntimeError("Failed to load CPU module 'a'"), PermissionError(13, "no"), OSError()]
 )
-def test_a_damaged_kernel_cache_names_the_folder_and_the_cure(error):
-    from npa_envs.runtime import kernel_cache_folder, quiet_warp
-
+def test_a_damaged_kernel_cache_names_the_folder_and_the_hint(error):
     with pytest.raises(NPAError, match=str(kernel_cache_folder())), quiet_warp():
         raise error
     with pytest.raises(RuntimeError, match="another"), quiet_warp():
         raise RuntimeError("another")
 
 
-# Small inputs that are refused, briefly.
+def test_a_kernel_cache_that_cannot_be_made_is_named_with_its_hint(tmp_path):
+    (tmp_path / "file").touch()
+    program = (
+        "import torch, npa_envs\nnpa_envs.perceive(torch.rand(1, 2, 2), torch.rand(1, 2, 1), 0.1)"
+    )
+    environment = os.environ | {"WARP_CACHE_PATH": str(tmp_path / "file")}
+    command = [sys.executable, "-c", program]
+    done = subprocess.run(command, env=environment, capture_output=True, encoding="utf-8")
+    assert re.search(rf"NPAError: .*{tmp_path / 'file'}.*remove it.*WARP_CACHE_PATH", done.stderr)
 
+
+# Small inputs that are refused, briefly.
 
 RED = (255, 0, 0, 255)
 
@@ -260,21 +220,32 @@ def text(suffix, content, read=configure):
     return load
 
 
-def scene(**changes):
+def scene(frame=(), **changes):
     def load(folder):
-        (folder / "scene").mkdir()
-        write_scene(folder / "scene", **changes)
-        write_scene(folder)
+        view = {"file_path": "./a", "transform_matrix": torch.eye(4).tolist()} | dict(frame)
+        content = json.dumps({"camera_angle_x": 0.7, "frames": [view]} | changes)
+        # The files that a path out of the scene's folder leads to exist as well.
+        for place in (folder, folder / "scene"):
+            place.mkdir(exist_ok=True)
+            Image.new("RGBA", (8, 8), RED).save(place / "a.png")
+            for name in ("transforms_train.json", "transforms_test.json"):
+                (place / name).write_text(content, encoding="utf-8")
         return load_views(folder / "scene", resolution=8)
 
     return load
 
 
 def mesh(points, face):
+    head = (
+        f"ply\nformat ascii 1.0\nelement vertex {len(points)}\nproperty double x\n"
+        "property double y\nproperty double z\nelement face 1\n"
+        "property list uchar int vertex_indices\nend_header\n"
+    )
+    rows = [" ".join(map(repr, row)) for row in (*points, (len(face), *face))]
+
     def load(folder):
         pytest.importorskip("trimesh")
-        (folder / "mesh.ply").write_bytes(ply(points, face))
-        return load_mesh(folder / "mesh.ply")
+        return text(".ply", head + "\n".join(rows) + "\n", load_mesh)(folder)
 
     return load
 

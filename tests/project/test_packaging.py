@@ -19,10 +19,15 @@ ROOT = Path(__file__).resolve().parents[2]
 SHIPPED = ("pyproject.toml", "MANIFEST.in", "README.md", "LICENSE", "npa_envs", *MAPPED_PACKAGES)
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 IGNORE = shutil.ignore_patterns("__pycache__", "*.egg-info")
-PRINT_FILES = (
-    "import npa_envs, npa_envs.envs, npa_envs.wrappers, npa_envs.agents\n"
-    "for m in (npa_envs, npa_envs.envs, npa_envs.wrappers, npa_envs.agents): print(m.__file__)\n"
-)
+PRINT_FILES = """
+import sys
+# Of the working folder, then of an argument, then what is installed. -I would hide the first one,
+# and -S the installed torch.
+sys.meta_path = [finder for finder in sys.meta_path if "editable" not in repr(finder)]
+sys.path.insert(1, sys.argv[1])
+import npa_envs, npa_envs.envs, npa_envs.wrappers, npa_envs.agents
+for module in (npa_envs, npa_envs.envs, npa_envs.wrappers, npa_envs.agents): print(module.__file__)
+"""
 
 
 def copy_sources(destination: Path) -> Path:
@@ -33,20 +38,6 @@ def copy_sources(destination: Path) -> Path:
         else:
             shutil.copy(ROOT / name, destination)
     return destination
-
-
-def run_python(cwd: Path, program: str, *, search: Path) -> list[str]:
-    """Run a program in a Python that finds its folder first, then `search`, then what is installed.
-
-    -I would hide the working folder and -S the installed torch, so the path is set by hand.
-    """
-    prelude = f"""
-import sys
-sys.meta_path = [f for f in sys.meta_path if 'editable' not in repr(f)]
-sys.path.insert(1, {str(search)!r})
-"""
-    command = [sys.executable, "-c", prelude + program]
-    return subprocess.check_output(command, cwd=cwd, text=True, encoding="utf-8").splitlines()
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +57,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_wheel_holds_every_source_file_the_rules_and_the_license(site: Path) -> None:
     sources = [p for kind in ("*.py", "*.cuh") for p in (ROOT / "npa_envs").rglob(kind)]
-    for folder in ("rule/shipped", "rule/initial", "web/page"):
+    for folder in ("rule/shipped", "rule/initial", "tasks/targets/drawings", "web/page"):
         sources += (ROOT / "npa_envs" / folder).glob("*.*")
     kinds = ("*.py", "*.schema.json")
     mapped = [p for name in MAPPED_PACKAGES for k in kinds for p in (ROOT / name).rglob(k)]
@@ -101,10 +92,12 @@ def test_the_source_archive_holds_the_package_and_no_tests(tmp_path: Path, site:
 def test_all_packages_are_found_in_one_place(site: Path, tmp_path: Path, installed: bool) -> None:
     """A checkout's own come first in its root, even after a plain install."""
     place = site / "npa_envs" if installed else copy_sources(tmp_path / "checkout")
-    files = run_python(tmp_path if installed else place, PRINT_FILES, search=site)
-    first = place if installed else place / "npa_envs"
-    names = [first, place / "envs", place / "wrappers", place / "agents"]
-    assert files == [str(name / "__init__.py") for name in names]
+    folders = [place if installed else place / "npa_envs"]
+    folders += [place / name for name in ("envs", "wrappers", "agents")]
+    command = [sys.executable, "-c", PRINT_FILES, str(site)]
+    folder = tmp_path if installed else place
+    printed = subprocess.check_output(command, cwd=folder, text=True, encoding="utf-8")
+    assert printed.splitlines() == [str(path / "__init__.py") for path in folders]
 
 
 def test_folders_called_envs_in_site_packages_are_not_taken_for_ours(tmp_path: Path) -> None:

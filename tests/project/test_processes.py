@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from npa_envs.processes import Child, Places, run_children
+from npa_envs.processes import Child, Slots, run_children
 
 SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
 
@@ -54,7 +54,7 @@ def run(*children, jobs=2, ahead=False):
     run_children(
         lambda _: waiting.pop(0) if waiting else None,
         lambda one: finished.append(one.name),
-        Places(("cpu",), jobs),
+        Slots(("cpu",), jobs),
         ahead=ahead,
     )
     return finished

@@ -1,8 +1,13 @@
-"""What notebooks show of worlds, environments and rules."""
+"""What notebooks show of worlds, environments and rules, and a window on a screen."""
 
 import base64
 import io
+import os
 import re
+import subprocess
+import sys
+import time
+import warnings
 
 import gymnasium as gym
 import numpy as np
@@ -13,7 +18,7 @@ from PIL import Image
 
 import npa_envs
 from npa_envs.envs import multispecies_v0
-from npa_envs.render import draw_worlds, show_worlds, write_webp
+from npa_envs.render import Window, draw_worlds, show_worlds, write_webp
 
 SIZE = 24
 
@@ -59,9 +64,9 @@ def test_particles_that_stand_apart_are_drawn_as_large_as_they_stand_apart():
     side = torch.linspace(-0.5, 0.5, 11)
     x = torch.cartesian_prod(side, side)[None]
     s = torch.zeros(1, 121, 8)
-    given = show_worlds(x, s, resolution=SIZE, pixel_size=0.1).frames[0]
-    found = show_worlds(x, s, resolution=SIZE).frames[0]
-    assert np.abs(given.astype(float) - found).mean() < 10
+    expected = show_worlds(x, s, resolution=SIZE, pixel_size=0.1).frames[0]
+    measured = show_worlds(x, s, resolution=SIZE).frames[0]
+    assert np.abs(expected.astype(float) - measured).mean() < 10
 
 
 def test_a_webp_repeats_and_keeps_its_rate(tmp_path):
@@ -103,3 +108,113 @@ def test_a_rule_shows_what_it_is():
     still = npa_envs.load_rule("digits")._repr_html_()
     assert "moves" not in still
     assert "<th>read-out</th><td>10 outputs</td>" in still
+
+
+# A window
+
+
+@pytest.fixture
+def screen(monkeypatch):
+    """pygame, with SDL's driver without a screen, asked for by name."""
+    pygame = pytest.importorskip("pygame")
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    yield pygame
+    pygame.display.quit()
+
+
+FRAME = np.zeros((20, 20, 3), np.uint8)
+FRAME[:10, 10:] = (200, 100, 50)
+
+
+def test_a_frame_appears_as_it_is_and_one_of_another_size_fills_the_window(screen):
+    def shown_on(window):
+        window.show(FRAME)
+        return screen.surfarray.array3d(screen.display.get_surface()).swapaxes(0, 1)
+
+    np.testing.assert_array_equal(shown_on(Window("a world", 20)), FRAME)
+    assert screen.display.get_caption()[0] == "a world"
+    shown = shown_on(Window("a world", np.int64(60)))
+    assert shown.shape == (60, 60, 3)
+    assert (shown[:25, 35:] == (200, 100, 50)).all()
+    assert (shown[35:] == 0).all()
+
+
+def test_frames_come_no_faster_than_the_rate(screen):
+    window = Window("a world", 32, fps=40)
+    window.show(FRAME)
+    start = time.perf_counter()
+    for _ in range(8):
+        window.show(FRAME)
+    assert time.perf_counter() - start > 0.8 * 8 / 40
+
+
+@pytest.mark.parametrize(
+    "shut",
+    [
+        lambda _, pygame: pygame.event.post(pygame.event.Event(pygame.QUIT)),
+        lambda _, pygame: pygame.display.quit(),
+        lambda window, _: window.close(),
+    ],
+    ids=["a click on the cross", "another library", "its owner"],
+)
+def test_a_window_that_was_shut_stays_closed(screen, shut):
+    window = Window("a world", 32)
+    window.show(FRAME)
+    assert not window.closed
+    shut(window, screen)
+    window.show(FRAME)
+    assert window.closed
+    assert not screen.display.get_init()
+    window.show(FRAME)
+    window.close()
+
+
+def test_a_new_window_takes_the_place_of_the_old_one(screen):
+    old = Window("old", 32)
+    new = Window("new", 48)
+    assert old.closed
+    old.close()
+    old.show(FRAME)
+    new.show(FRAME)
+    assert screen.display.get_surface().get_size() == (48, 48)
+    new.close()
+
+
+@pytest.mark.parametrize("driver", ["not a driver", None])
+def test_without_a_screen_it_warns_once_and_does_nothing(monkeypatch, driver):
+    pytest.importorskip("pygame")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER"):
+        monkeypatch.delenv(name, raising=False)
+    if driver is not None:
+        monkeypatch.setenv("SDL_VIDEODRIVER", driver)
+    elif sys.platform != "linux" or os.path.exists("/dev/dri"):
+        pytest.skip("there may be a screen")
+    with pytest.warns(UserWarning, match="there is no screen") as caught:
+        window = Window("a world", 32, fps=0.1)
+    assert len(caught) == 1
+    assert caught[0].filename == __file__
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        start = time.perf_counter()
+        for _ in range(5):
+            window.show(FRAME)
+        # A window that waits takes 40 s.
+        assert time.perf_counter() - start < 20.0
+        assert not window.closed
+        window.close()
+        window.close()
+
+
+def test_pygame_starts_with_the_first_window_and_without_a_banner():
+    pytest.importorskip("pygame")
+    code = (
+        "import os, sys, npa_envs.render as render\n"
+        # Gymnasium, where it was imported, hides the banner as well.
+        "os.environ.pop('PYGAME_HIDE_SUPPORT_PROMPT', None)\n"
+        "assert 'pygame' not in sys.modules\n"
+        "render.Window('a world', 32).close()\n"
+        "assert 'pygame' in sys.modules\n"
+    )
+    environment = {**os.environ, "SDL_VIDEODRIVER": "dummy"}
+    command = [sys.executable, "-W", "error", "-c", code]
+    assert subprocess.check_output(command, env=environment) == b""

@@ -41,14 +41,14 @@ def drawn(x=X, s=S, **options):
     return lambda _: draw_worlds(x, s, **{"resolution": 32, "pixel_size": 0.1} | options)
 
 
-def strip(*given, **options):
-    return lambda folder: write_filmstrip(folder / "strip.png", FILM, *given, **options)
+def strip(*args, **options):
+    return lambda folder: write_filmstrip(folder / "strip.png", FILM, *args, **options)
 
 
-def window(*given, **options):
+def window(*args, **options):
     def make(_):
         pytest.importorskip("pygame")
-        return Window("a world", *given, **options)
+        return Window("a world", *args, **options)
 
     return make
 

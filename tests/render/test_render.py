@@ -57,14 +57,6 @@ def test_a_pixel_is_shown_over_its_background(pixel, background, shown):
     assert (to_uint8(picture, background) == shown).all()
 
 
-def test_first_row_of_the_shown_picture_is_the_highest_y():
-    picture = torch.zeros(2, 4, 4, 4)
-    picture[1, 0, 2] = torch.tensor([1.0, 0.0, 0.0, 1.0])
-    expected = np.full((2, 4, 4, 3), 255)
-    expected[1, 3, 2] = (255, 0, 0)
-    np.testing.assert_array_equal(to_uint8(picture), expected)
-
-
 def test_a_png_is_exact_and_a_jpeg_is_smaller_and_nearly_exact(tmp_path):
     axis = np.linspace(0, 6, 96)
     wave = 127.5 + 120 * np.sin(axis[:, None, None] + axis[:, None] * [1.0, 1.1, 1.2])
@@ -99,9 +91,9 @@ def test_gif_shows_what_stands_still_the_same_in_every_frame(tmp_path):
     still = np.stack([*np.meshgrid(ramp, ramp), np.zeros((64, 64), np.uint8)], -1)
     frames = [np.concatenate((still, frame), axis=1) for frame in film(5, height=64)]
     write_gif(tmp_path / "still.gif", frames)
-    found = read_film(tmp_path / "still.gif")
-    for shown in found[1:]:
-        np.testing.assert_array_equal(shown[:, :64], found[0][:, :64])
+    pictures = read_film(tmp_path / "still.gif")
+    for shown in pictures[1:]:
+        np.testing.assert_array_equal(shown[:, :64], pictures[0][:, :64])
 
 
 @pytest.mark.parametrize("fps", [7, 25, 30, 50])
@@ -122,11 +114,11 @@ def test_mp4_holds_every_frame_at_an_even_size(tmp_path, height, width):
     frames = film(9, height, width)
     write_mp4(tmp_path / "film.mp4", frames, fps=10)
     with imageio.get_reader(tmp_path / "film.mp4") as reader:
-        found = list(reader.iter_data())
+        pictures = list(reader.iter_data())
         assert reader.get_meta_data()["fps"] == pytest.approx(10)
-    assert len(found) == 9
-    assert found[0].shape == (height + height % 2, width + width % 2, 3)
-    for shown, frame in zip(found, frames, strict=True):
+    assert len(pictures) == 9
+    assert pictures[0].shape == (height + height % 2, width + width % 2, 3)
+    for shown, frame in zip(pictures, frames, strict=True):
         assert np.abs(shown[:height, :width].astype(int) - frame).mean() < 4
 
 
@@ -195,9 +187,9 @@ def test_disk_that_fills_up_is_a_clear_error_and_keeps_the_old_file(tmp_path):
     for path in words[1::2]:
         Path(path).write_bytes(b"old")
     program = [sys.executable, "-c", FILE_SIZE_LIMIT, *words]
-    _, *told = subprocess.check_output(program, text=True, encoding="utf-8").split("refused: ")
-    assert len(told) == len(WRITERS)
-    for text, path in zip(told, words[1::2], strict=True):
+    _, *messages = subprocess.check_output(program, text=True, encoding="utf-8").split("refused: ")
+    assert len(messages) == len(WRITERS)
+    for text, path in zip(messages, words[1::2], strict=True):
         assert text.startswith(f"cannot write '{path}'")
         assert Path(path).read_bytes() == b"old"
     assert sorted(os.listdir(tmp_path)) == sorted(name for _, name in WRITERS)

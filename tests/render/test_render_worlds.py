@@ -91,9 +91,9 @@ def test_particles_that_are_not_finite_are_left_out(style, space_dim):
     broken[0, ::3, 0] = float("nan")
     broken[1, ::3, -1] = float("inf")
     broken[2, ::3, 0] = -1e38
-    kept = [k for k in range(70) if k % 3]
+    whole = [k for k in range(70) if k % 3]
     seen = draw_worlds(broken, s, style=style, **VIEW)
-    expected = draw_worlds(x[:, kept], s[:, kept], style=style, **VIEW).astype(int)
+    expected = draw_worlds(x[:, whole], s[:, whole], style=style, **VIEW).astype(int)
     # The layers of 3D colours are cut elsewhere where particles are missing.
     layered = space_dim == 3 and style != "density"
     assert np.abs(seen - expected).mean() <= (1.0 if layered else 0.0)
@@ -105,8 +105,8 @@ def test_particles_that_are_not_finite_are_left_out(style, space_dim):
 @pytest.mark.parametrize("style", ["particles", "states"])
 def test_particles_of_states_that_are_not_finite_are_left_out_where_states_show(style):
     x, s = random_worlds()
-    kept = [k for k in range(70) if k % 3 != 1]
-    expected = draw_worlds(x[:, kept], s[:, kept], style=style, **VIEW)
+    whole = [k for k in range(70) if k % 3 != 1]
+    expected = draw_worlds(x[:, whole], s[:, whole], style=style, **VIEW)
     for value in (float("inf"), float("nan")):
         s[:, 1::3, -1] = value
         np.testing.assert_array_equal(draw_worlds(x, s, style=style, **VIEW), expected)
@@ -139,8 +139,8 @@ def test_y_points_up_and_x_to_the_right(style, z):
 
 
 def test_density_one_is_the_middle_of_the_ramp_and_crowding_its_end():
-    places = torch.arange(-1.5, 1.5, 0.1)
-    x = torch.cartesian_prod(places, places)[None]
+    axis = torch.arange(-1.5, 1.5, 0.1)
+    x = torch.cartesian_prod(axis, axis)[None]
     s = torch.zeros(1, x.shape[1], 2)
     once = middle(draw_worlds(x, s, style="density", pixel_size=0.1))[0]
     table = ramp((1.0, 1.0, 1.0)).astype(int)
@@ -234,11 +234,11 @@ def test_the_ramp_is_even_to_the_eye(background, sign):
 
 
 def test_oklab_has_its_published_values_and_an_inverse():
-    given = torch.tensor([[1.0, 1.0, 1.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    rgb = torch.tensor([[1.0, 1.0, 1.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
     published = torch.tensor(
         [[1.0, 0.0, 0.0], [0.628, 0.2249, 0.1258], [0.452, -0.0325, -0.3115]], dtype=torch.float64
     )
-    torch.testing.assert_close(oklab(given), published, rtol=0, atol=1e-3)
+    torch.testing.assert_close(oklab(rgb), published, rtol=0, atol=1e-3)
     colours = torch.rand(50, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     torch.testing.assert_close(srgb(oklab(colours)), colours, rtol=0, atol=1e-5)
 

@@ -161,7 +161,7 @@ def test_rllib_knows_every_id():
 
 
 @pytest.mark.parametrize(
-    ("name", "given", "message"),
+    ("name", "keywords", "message"),
     [
         ("npa/Texure-v0", {}, "name must be a known id, got 'npa/Texure-v0': did you mean"),
         ("npa/Texture-v0", {"world_count": 0}, "world_count must be a whole number of at least 1"),
@@ -169,8 +169,8 @@ def test_rllib_knows_every_id():
         ("npa/Morphogenesis2D-v0", {"targets": "heart"}, "did you mean 'target'"),
     ],
 )
-def test_rllib_rows_need_a_known_id_and_right_keywords(name, given, message):
+def test_rllib_rows_need_a_known_id_and_right_keywords(name, keywords, message):
     pytest.importorskip("ray.rllib")
     from npa_envs.wrappers.rllib import rllib_rows_config
 
-    refused(message, rllib_rows_config, name, **given)
+    refused(message, rllib_rows_config, name, **keywords)

@@ -33,8 +33,8 @@ def living(name):
     return gym.make_vec(f"npa/{name}-v0", num_envs=2, autoreset_mode="next-step")
 
 
-def started(wrapper, *given, **named):
-    env = wrapper(*given, **named)
+def started(wrapper, *args, **kwargs):
+    env = wrapper(*args, **kwargs)
     env.reset()
     return env
 
@@ -60,7 +60,7 @@ REFUSALS = [
     (lambda: DamageEvents(gym.make("CartPole-v1"), "3:cut"), "environment of npa_envs"),
     (lambda: DamageEvents(NormalizePerception(single()), "3:cut"), "put DamageEvents under the wr"),
     (lambda: VectorDamageEvents(VectorNormalizePerception(batched()), "3:cut"), "put VectorDam"),
-    (lambda: NormalizePerception(single(), clip=0.0), "clip must be a finite number"),
+    (lambda: NormalizePerception(single(), clip=0.0), "clip must be positive and finite"),
     (lambda: NormalizePerception(single(), epsilon=-1.0), "epsilon must be"),
     (lambda: NormalizePerception(batched()), "use VectorNormalizePerception"),
     (lambda: VectorNormalizePerception(single()), "use NormalizePerception"),
@@ -100,8 +100,8 @@ def still(observations):
 
 
 def species(**keywords):
-    given = {"particle_counts": (3, 5), **keywords}
-    return multispecies_v0.batched(world_count=2, **small("mixing", **given))
+    fields = {"particle_counts": (3, 5), **keywords}
+    return multispecies_v0.batched(world_count=2, **small("mixing", **fields))
 
 
 OTHER = {"others": {"species_1": still}}
@@ -160,7 +160,7 @@ GROWTH, GARDEN = "npa/Morphogenesis2D-v0", "npa/Gardener2DSmall-v0"
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "message"),
     [
         ("npa/Morphogenesis2D-v1", "did you mean 'npa/Morphogenesis2D-v0'"),
         ("npa/Mixing-v0", "must be of one species"),
@@ -174,7 +174,7 @@ GROWTH, GARDEN = "npa/Morphogenesis2D-v0", "npa/Gardener2DSmall-v0"
         (f"{GARDEN} --episodes 1 --dataset ../heart-first", "must be an id"),
     ],
 )
-def test_what_cannot_be_recorded_is_told(words, told, capsys):
+def test_what_cannot_be_recorded_is_named(words, message, capsys):
     pytest.importorskip("minari")
     assert main(["record", "--dataset", "npa/test-v0", *words.split()]) == 2
-    assert told in capsys.readouterr().err
+    assert message in capsys.readouterr().err

@@ -12,6 +12,7 @@ from wrapped_envs import ACTIONS, STEPS, policy
 
 from npa_envs.envs import multispecies_v0, particles_v0
 from npa_envs.wrappers import VectorNormalizePerception, VectorSpeciesTags
+from npa_envs.wrappers.base import as_tensor
 
 sb3 = pytest.importorskip("stable_baselines3")
 from stable_baselines3.common.monitor import Monitor  # noqa: E402
@@ -76,9 +77,9 @@ def test_rows_of_finished_worlds_alone_have_infos_and_a_terminal_observation():
 @pytest.mark.parametrize("output", ["numpy", "torch"])
 @pytest.mark.parametrize("name", ["npa/Gardener2DSmall-v0", "npa/Shepherd2DSmall-v0"])
 def test_living_worlds_are_rows_too_and_their_dictionaries_are_kept(name, output):
-    given = {"grow_steps": 4, "rule_steps": 1, "seed_pool": 1, "max_episode_steps": 2}
+    fields = {"grow_steps": 4, "rule_steps": 1, "seed_pool": 1, "max_episode_steps": 2}
     envs = [
-        gym.make_vec(name, 3, vectorization_mode="vector_entry_point", output=way, **given)
+        gym.make_vec(name, 3, vectorization_mode="vector_entry_point", output=way, **fields)
         for way in (output, "numpy")
     ]
     rows, plain = WorldVecEnv(envs[0]), envs[1]
@@ -89,14 +90,14 @@ def test_living_worlds_are_rows_too_and_their_dictionaries_are_kept(name, output
     for _ in range(5):
         actions = plain.action_space.sample()
         seen, paid, done, infos = rows.step(actions)
-        wanted, rewards, _, late, told = plain.step(actions)
+        wanted, rewards, _, late, vector_infos = plain.step(actions)
         assert_same(seen, wanted)
         np.testing.assert_allclose(paid, rewards, rtol=1e-6)
         assert done.tolist() == late.tolist()
         for k in np.flatnonzero(done):
             assert infos[k]["TimeLimit.truncated"] is True
-            assert_same(infos[k]["terminal_observation"], told["final_obs"][k])
-            final = told["final_info"]
+            assert_same(infos[k]["terminal_observation"], vector_infos["final_obs"][k])
+            final = vector_infos["final_info"]
             assert infos[k]["is_success"] == final.get("is_success", final["success"])[k]
 
 
@@ -119,11 +120,11 @@ def test_tensors_give_the_same_rows_as_arrays_and_none_is_overwritten():
         way, copies = [seen], [seen.copy()]
         for _ in range(STEPS + 2):
             seen, rewards, done, infos = rows.step(policy(seen))
-            given = [seen, rewards, done]
+            arrays = [seen, rewards, done]
             if done.any():
-                given.append(np.stack([info["terminal_observation"] for info in infos]))
-            way += given
-            copies += [array.copy() for array in given]
+                arrays.append(np.stack([info["terminal_observation"] for info in infos]))
+            way += arrays
+            copies += [array.copy() for array in arrays]
         assert_same(way, copies)
         ways.append(way)
     assert_same(*ways)
@@ -147,8 +148,8 @@ def test_the_shared_info_cannot_be_written_to():
         lambda info: info.__setitem__("a", 1),
     ):
         refused("shared by all such rows", write, infos[5])
-    own = infos[5].copy()
-    own["a"] = 1
+    copy = infos[5].copy()
+    copy["a"] = 1
     assert infos[6] == {}
 
 
@@ -186,91 +187,77 @@ def batch(task="mixing", world_count=2, **keywords):
     return multispecies_v0.batched(world_count=world_count, **small(task, **keywords))
 
 
-def by_hand(observations, names, tags=None):
-    """Rows of some species, world by world."""
+COUNTS = {"species_0": 3, "species_1": 5}
+OTHERS = np.full((2, 5, 18), 0.25, np.float32)
+
+
+def by_hand(observations, names):
+    """Rows of some species, world by world, with tags if all are rows."""
     worlds = []
     for k in range(2):
         for number, name in enumerate(names):
             rows = observations[name][k]
-            if tags:
-                rows = np.hstack((rows, np.tile(np.eye(tags)[number], (len(rows), 1))))
-            worlds.append(rows)
+            tags = np.tile(np.eye(2)[number], (len(rows), 1))
+            worlds.append(rows if len(names) == 1 else np.hstack((rows, tags)))
     return np.concatenate(worlds).astype(np.float32)
 
 
+@pytest.mark.parametrize("names", [["species_0", "species_1"], ["species_0"]])
 @pytest.mark.parametrize("output", ["numpy", "torch"])
-def test_rows_are_the_particles_of_all_species_with_tags(output, device):
-    given = DEADLY | {"device": str(device)}
-    rows, envs = SpeciesVecEnv(batch(**given, output=output)), batch(**given)
-    assert rows.num_envs == 16
-    assert rows.observation_space.shape == (68,)
-    assert rows.seed(3) == [3] * 8 + [4] * 8
+def test_rows_are_the_particles_of_species_and_others_act_by_policies(names, output, device):
+    seen_by_others = []
+
+    def other(observations):
+        seen_by_others.append(np.asarray(as_tensor(observations).cpu()))
+        return OTHERS if output == "numpy" else torch.from_numpy(OTHERS).to(device)
+
+    fields = DEADLY | {"device": str(device)}
+    others = {"species_1": other} if len(names) == 1 else None
+    rows, envs = SpeciesVecEnv(batch(**fields, output=output), others=others), batch(**fields)
+    count = sum(COUNTS[name] for name in names)
+    assert rows.num_envs == 2 * count
+    assert rows.observation_space.shape == (68 if len(names) == 2 else 66,)
+    assert rows.seed(3) == [3] * count + [4] * count
     seen = rows.reset()
     observations, _ = envs.reset(seed=3)
-    counts = {"species_0": 3, "species_1": 5}
-    names = list(counts)
-    assert np.array_equal(seen, by_hand(observations, names, tags=2))
+    assert np.array_equal(seen, by_hand(observations, names))
     assert all(rows.observation_space.contains(row) for row in seen)
     generator = np.random.default_rng(0)
-    dead = np.tile([True] * 3 + [False] * 5, 2)
+    # Species 0 ends in the second of four steps.
+    dead = np.tile([True] * 3 + [False] * (count - 3), 2)
     for step in range(1, 9):
-        actions = generator.uniform(-1, 1, (16, 18)).astype(np.float32)
+        actions = generator.uniform(-1, 1, (2 * count, 18)).astype(np.float32)
+        previous = observations
         seen, paid, done, infos = rows.step(actions)
-        by_world = actions.reshape(2, 8, 18)
-        observations, rewards, *_, vector_infos = envs.step(
-            {"species_0": by_world[:, :3], "species_1": by_world[:, 3:]}
-        )
-        expected = np.concatenate(
-            [np.repeat(rewards[name][k], n) for k in range(2) for name, n in counts.items()]
-        )
-        assert np.array_equal(paid, expected)
-        shown = by_hand(observations, names, tags=2)
+        by_world = actions.reshape(2, count, 18)
+        acting = {"species_0": by_world[:, :3], "species_1": by_world[:, 3:]}
+        acting |= {} if others is None else {"species_1": OTHERS}
+        observations, rewards, *_, vector_infos = envs.step(acting)
+        if others is not None:
+            assert np.array_equal(seen_by_others[-1], previous["species_1"])
+        expected = [np.repeat(rewards[name][k], COUNTS[name]) for k in range(2) for name in names]
+        assert np.array_equal(paid, np.concatenate(expected))
+        shown = by_hand(observations, names)
         if step % 4 in (2, 3):
             shown[dead] = 0.0
         if step % 4 == 3:
             assert not paid[dead].any()
         assert np.array_equal(seen, shown)
-        ends = {2: dead, 0: np.ones(16, bool)}.get(step % 4, np.zeros(16, bool))
+        ends = {2: dead, 0: np.ones(2 * count, bool)}.get(step % 4, np.zeros(2 * count, bool))
         assert np.array_equal(done, ends)
         assert [bool(info) for info in infos] == ends.tolist()
+        last = infos[count + 1].get("terminal_observation")
         if step % 4 == 2:
             assert infos[0]["TimeLimit.truncated"] is False
-            assert np.array_equal(
-                infos[9]["terminal_observation"][:66], observations["species_0"][1, 1]
-            )
+            assert np.array_equal(last[:66], observations["species_0"][1, 1])
         if step % 4 == 0:
-            last = vector_infos["species_1"]["final_obs"]
-            assert infos[3]["TimeLimit.truncated"] is True
+            final = vector_infos["species_0"]["final_obs"]
             assert infos[0]["TimeLimit.truncated"] is False
-            assert np.array_equal(infos[15]["terminal_observation"][:66], last[1, 4])
-
-
-def test_others_act_by_their_policies():
-    asked = []
-
-    def other(observations):
-        asked.append(observations)
-        return np.full((2, 5, 18), 0.25, np.float32)
-
-    rows = SpeciesVecEnv(batch(**DEADLY), others={"species_1": other})
-    envs = batch(**DEADLY)
-    assert rows.num_envs == 6
-    assert rows.observation_space.shape == (66,)
-    rows.seed(5)
-    seen = rows.reset()
-    observations, _ = envs.reset(seed=5)
-    actions = np.random.default_rng(0).uniform(-1, 1, (6, 18)).astype(np.float32)
-    for step in range(6):
-        expected = by_hand(observations, ["species_0"])
-        # Species 0 ends in the second of four steps.
-        assert np.array_equal(seen, expected if step % 4 < 2 else 0.0 * expected)
-        previous = observations
-        seen, paid, *_ = rows.step(actions)
-        others = np.full((2, 5, 18), 0.25, np.float32)
-        acting = {"species_0": actions.reshape(2, 3, 18), "species_1": others}
-        observations, rewards, *_ = envs.step(acting)
-        assert np.array_equal(asked[-1], previous["species_1"])
-        assert np.array_equal(paid, np.repeat(rewards["species_0"], 3))
+            assert np.array_equal(last[:66], final[1, 1])
+        if step % 4 == 0 and others is None:
+            final = vector_infos["species_1"]["final_obs"]
+            assert infos[3]["TimeLimit.truncated"] is True
+            assert np.array_equal(infos[15]["terminal_observation"][:66], final[1, 4])
 
 
 def test_supersuit_trains_on_particles():

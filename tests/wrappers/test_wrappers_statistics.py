@@ -114,15 +114,15 @@ def test_a_reset_of_one_world_counts_only_what_it_perceives(each, output):
 def test_an_environment_made_from_the_spec_is_wrapped_alike(keywords):
     env = NormalizePerception(single(), **keywords)
     spec = gym.envs.registration.EnvSpec.from_json(env.spec.to_json())
-    made = gym.make(spec)
-    assert isinstance(made, NormalizePerception)
-    assert made.training is keywords.get("training", True)
+    rebuilt = gym.make(spec)
+    assert isinstance(rebuilt, NormalizePerception)
+    assert rebuilt.training is keywords.get("training", True)
     first, _ = env.reset(seed=1)
-    np.testing.assert_array_equal(made.reset(seed=1)[0], first)
+    np.testing.assert_array_equal(rebuilt.reset(seed=1)[0], first)
     for _ in range(3):
         action = policy(first)
         first, *_ = env.step(action)
-        np.testing.assert_array_equal(made.step(action)[0], first)
+        np.testing.assert_array_equal(rebuilt.step(action)[0], first)
     assert np.abs(first).max() <= keywords.get("clip", 10.0)
 
 
