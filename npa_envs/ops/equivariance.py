@@ -51,6 +51,12 @@ class VectorForm(NamedTuple):
     chiral: bool
     """Whether the rule distinguishes left from right."""
 
+    @classmethod
+    def of(cls, numbers: list[int]) -> VectorForm:
+        """Return the form whose fields are these numbers, as in a torch operator."""
+        space_dim, scalars, perceived, mixed, chiral = numbers
+        return cls(space_dim, scalars, perceived, mixed, bool(chiral))
+
     @property
     def perception_dim(self) -> int:
         """Length of the perception vector."""
@@ -111,8 +117,8 @@ def _kernels(like: Tensor, space_dim: int) -> Any:
     return equivariance_kernels(space_dim, scalar_type(like.dtype))
 
 
-def _is_for_warps(like: Tensor, form: tuple[int, int, int, int, bool]) -> bool:
-    """Return whether the CUDA kernels support a `VectorForm`, as a tuple, for such a tensor."""
+def _is_for_warps(like: Tensor, form: VectorForm) -> bool:
+    """Return whether the CUDA kernels support a form, for such a tensor."""
     return choose("vectors", KernelRequest(like.device, like.dtype, vectors=form)).name == "cuda"
 
 
@@ -128,30 +134,20 @@ def _launch_blocks(kernel: Any, blocks: int, warps: int, *tensors: Tensor) -> No
 
 @custom_op("npa::read_rows")
 def _read_rows(
-    rows: Tensor, mixing: Tensor, width: int, space_dim: int, scalars: int, chiral: bool
+    rows: Tensor, mixing: Tensor, width: int, form_numbers: list[int]
 ) -> tuple[Tensor, Tensor]:
-    perceived, count = map(int, mixing.shape)
-    mixed = rows.new_empty(rows.shape[0], count, space_dim)
+    form = VectorForm.of(form_numbers)
+    mixed = rows.new_empty(rows.shape[0], form.mixed, form.space_dim)
     inputs = rows.new_empty(rows.shape[0], width)
-    device, form = rows.device, (space_dim, scalars, perceived, count, chiral)
     if _is_for_warps(rows, form):
-        blocks = -(-rows.shape[0] // (rows_of_warp(count) * READ_WARPS))
+        blocks = -(-rows.shape[0] // (rows_of_warp(form.mixed) * READ_WARPS))
         kernel = row_kernels(*form).read_rows
         _launch_blocks(kernel, blocks, READ_WARPS, rows, mixing, mixed, inputs)
         return mixed, inputs
-    kernels = _kernels(rows, space_dim)
-    launch(kernels.mix_vectors, rows.shape[0] * count, device, scalars, rows, mixing, mixed)
-    launch(
-        kernels.write_inputs,
-        rows.shape[0] * count,
-        device,
-        scalars,
-        scalars + perceived * space_dim,
-        int(chiral),
-        rows,
-        mixed,
-        inputs,
-    )
+    kernels, threads = _kernels(rows, form.space_dim), rows.shape[0] * form.mixed
+    launch(kernels.mix_vectors, threads, rows.device, form.scalars, rows, mixing, mixed)
+    sizes = form.scalars, form.perception_dim, int(form.chiral)
+    launch(kernels.write_inputs, threads, rows.device, *sizes, rows, mixed, inputs)
     return mixed, inputs
 
 
@@ -162,12 +158,11 @@ def _read_rows_backward(
     mixed: Tensor,
     mixed_bar: Tensor,
     inputs_bar: Tensor,
-    scalars: int,
-    chiral: bool,
+    form_numbers: list[int],
     with_mixing: bool,
 ) -> tuple[Tensor, Tensor]:
-    row_count, count, space_dim = mixed.shape[0], *map(int, mixed.shape[1:])
-    device, form = rows.device, (space_dim, scalars, int(mixing.shape[0]), count, chiral)
+    form, row_count, device = VectorForm.of(form_numbers), mixed.shape[0], rows.device
+    space_dim, scalars, perceived, count, chiral = form
     rows_bar = torch.empty_like(rows)
     if _is_for_warps(rows, form):
         blocks = -(-row_count // (rows_of_warp(count) * PULL_WARPS))
@@ -181,32 +176,15 @@ def _read_rows_backward(
             _launch_blocks(mixing_sum(), columns, MIXING_SUM_WARPS, partial_sums, mixing_bar)
         return rows_bar, mixing_bar
     kernels, total = _kernels(mixed, space_dim), torch.empty_like(mixed)
-    launch(
-        kernels.pull_back_products,
-        row_count * count,
-        device,
-        scalars,
-        int(chiral),
-        mixed,
-        inputs_bar,
-        mixed_bar,
-        total,
-    )
-    launch(
-        kernels.pull_back_rows,
-        row_count * len(mixing),
-        device,
-        scalars,
-        mixing,
-        inputs_bar,
-        total,
-        rows_bar,
-    )
+    bars = mixed, inputs_bar, mixed_bar, total
+    launch(kernels.pull_back_products, row_count * count, device, scalars, int(chiral), *bars)
+    pulled = mixing, inputs_bar, total, rows_bar
+    launch(kernels.pull_back_rows, row_count * perceived, device, scalars, *pulled)
     if not with_mixing:
         return rows_bar, torch.empty_like(mixing)
     # One matrix product gives all pairs of axes; only the pairs of an axis with itself are summed.
-    vectors = rows[:, scalars : scalars + len(mixing) * space_dim]
-    pairs = (vectors.T @ total.flatten(1)).view(len(mixing), space_dim, count, space_dim)
+    vectors = rows[:, scalars : form.perception_dim]
+    pairs = (vectors.T @ total.flatten(1)).view(perceived, space_dim, count, space_dim)
     return rows_bar, pairs.diagonal(dim1=1, dim2=3).sum(dim=-1)
 
 
@@ -215,7 +193,7 @@ def _steers_by_warps(mixed: Tensor, gate_count: int) -> tuple[int, int, bool] | 
     count, space_dim = map(int, mixed.shape[1:])
     chiral = gate_count > count
     # Steering needs no shared memory, so it runs wherever the smallest rows fit.
-    least = (space_dim, 0, 1, count, chiral)
+    least = VectorForm(space_dim, 0, 1, count, chiral)
     return (space_dim, count, chiral) if _is_for_warps(mixed, least) else None
 
 
@@ -256,10 +234,8 @@ class _ReadRows(torch.autograd.Function):
     def forward(
         ctx: Any, rows: Tensor, mixing: Tensor, width: int, form: VectorForm
     ) -> tuple[Tensor, Tensor]:
-        outputs: tuple[Tensor, Tensor] = _read_rows(
-            rows, mixing, width, form.space_dim, form.scalars, form.chiral
-        )
-        ctx.form = form
+        ctx.form_numbers = [*map(int, form)]
+        outputs: tuple[Tensor, Tensor] = _read_rows(rows, mixing, width, ctx.form_numbers)
         ctx.save_for_backward(rows, mixing, outputs[0])
         return outputs
 
@@ -267,17 +243,9 @@ class _ReadRows(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, mixed_bar: Tensor, inputs_bar: Tensor) -> tuple[Tensor | None, ...]:
         rows, mixing, mixed = ctx.saved_tensors
-        form: VectorForm = ctx.form
-        rows_bar, mixing_bar = _read_rows_backward(
-            rows,
-            mixing,
-            mixed,
-            mixed_bar.contiguous(),
-            inputs_bar.contiguous(),
-            form.scalars,
-            form.chiral,
-            ctx.needs_input_grad[1],
-        )
+        bars = mixed_bar.contiguous(), inputs_bar.contiguous()
+        options = ctx.form_numbers, ctx.needs_input_grad[1]
+        rows_bar, mixing_bar = _read_rows_backward(rows, mixing, mixed, *bars, *options)
         return rows_bar, mixing_bar if ctx.needs_input_grad[1] else None, None, None
 
 
@@ -305,7 +273,7 @@ def read_rows(rows: Tensor, mixing: Tensor, form: VectorForm, width: int) -> tup
     """
     tensors = rows.contiguous(), mixing.contiguous()
     if not (torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)):
-        return _read_rows(*tensors, width, form.space_dim, form.scalars, form.chiral)
+        return _read_rows(*tensors, width, [*map(int, form)])
     outputs: tuple[Tensor, Tensor] = _ReadRows.apply(*tensors, width, form)  # type: ignore[no-untyped-call]
     return outputs
 

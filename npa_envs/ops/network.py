@@ -119,7 +119,9 @@ def _run_network(
 ) -> tuple[Tensor, Tensor]:
     """Run `two_layer_kernel` on rows [K, width]; mode "note" also returns the ReLU masks."""
     steps, tiles = -(-int(rows.shape[1]) // 16), -(-out_width // 8)
-    signs = _empty_signs(rows, unit_count, mode)
+    # The ReLU masks of hidden units.
+    words = 4 * -(-unit_count // SIGN_UNITS) if mode == "note" else 0
+    signs = rows.new_empty(rows.shape[0], words, dtype=torch.int32)
     output = rows.new_empty(rows.shape[0], out_width)
     warps = -(-rows.shape[0] // ROW_GROUP)
     launch(
@@ -134,12 +136,6 @@ def _run_network(
         block_dim=LAYER_BLOCK,
     )
     return output, signs
-
-
-def _empty_signs(rows: Tensor, unit_count: int, mode: str) -> Tensor:
-    """Return memory for the ReLU masks of hidden units, empty where the mode needs none."""
-    words = 4 * -(-unit_count // SIGN_UNITS) if mode == "note" else 0
-    return rows.new_empty(rows.shape[0], words, dtype=torch.int32)
 
 
 @custom_op("npa::network_weight_gradients")

@@ -2,7 +2,7 @@
 
 #include <algorithm>
 
-#include "warp_on_cpu.h"
+#include "cuda_on_cpu.h"
 
 #include "errors.cuh"
 
@@ -15,7 +15,7 @@ int check(int tile_count, int limit)
     for (int& count : candidates) count = std::rand() % limit - 1;
     candidates[3] = candidates[5] = -1;
     candidates[4] = 0;
-    warp::run([&] {
+    block::run(32, [&] {
         npa::rank_tiles<CAPACITY>(tile_count, candidates[threadIdx.x]);
         if (int(threadIdx.x) < tile_count) {
             const wp::vec_t<2, int> ranked = npa::ranked_tile<CAPACITY>(threadIdx.x);

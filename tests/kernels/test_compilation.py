@@ -22,8 +22,8 @@ from npa_envs.kernels.cuda.splat import sort_small_splats
 from npa_envs.kernels.pictures.blending import block_kernels
 from npa_envs.kernels.pictures.errors import gather_errors
 from npa_envs.kernels.portable.episodes import update_episodes
-from npa_envs.ops import warmup
 from npa_envs.ops.launch import launched
+from npa_envs.world.warmup import warmup
 
 
 def perception(*switches: Any, **more: Any) -> wp.Kernel:

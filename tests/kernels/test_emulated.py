@@ -1,4 +1,4 @@
-"""CUDA kernels of equivariant rules, emulated by threads of a CPU, against the portable ones."""
+"""CUDA C++, run on a CPU by the threads of a block in turn."""
 
 import re
 import shutil
@@ -10,60 +10,56 @@ import pytest
 import torch
 from worlds import relative_error
 
+from npa_envs.kernels import native
 from npa_envs.kernels.cuda import equivariance as cuda
 from npa_envs.ops.equivariance import VectorForm, read_rows, steer_rows
 
-KERNELS = Path(cuda.__file__).parent
+HERE = Path(__file__).parent
+KERNELS = Path(native.__file__).parent
 
-PROGRAM = """
-#include "{emulation}"
-#include "{kernels}"
-namespace npa {{
-{sum}
-}}
 
-int main()
-{{
-    std::FILE* file = std::fopen("in", "rb");
-    Table rows({count}, {width}), mixing(1, {weights}), mixed(1, {vectors});
-    Table mixed_bar(1, {vectors}), inputs({count}, {in_width}), inputs_bar({count}, {in_width});
-    Table rows_bar({count}, {width}), sums({blocks}, {weights}), mixing_bar(1, {weights});
-    Table output({count}, {out_width}), signs(1, {gates}), update({count}, {up_width});
-    Table update_bar({count}, {up_width}), output_bar({count}, {out_width}), pulled(1, {vectors});
-    for (Table* table :
-         {{&rows, &mixing, &mixed_bar, &inputs_bar, &output, &signs, &update_bar}}) {{
-        table->read(file);
-    }}
-    std::fclose(file);
-    launch({read_blocks}, {read_warps} * 32, [&] {{
-        npa::read_vectors<{form}, {read_warps}, {rows}>(
-            rows.array, mixing.array, mixed.array, inputs.array);
-    }});
-    launch({blocks}, {pull_warps} * 32, [&] {{
-        npa::pull_back_vectors<{form}, {pull_warps}, {rows}>(
-            rows.array, mixing.array, mixed.array, mixed_bar.array, inputs_bar.array,
-            rows_bar.array, sums.array);
-    }});
-    launch(({weights} + 31) / 32, {sum_warps} * 32, [&] {{
-        npa::add_partial_sums<{sum_warps}>(sums.array, mixing_bar.array);
-    }});
-    launch({steer_blocks}, {steer_warps} * 32, [&] {{
-        npa::steer_by_gates<{steering}, {steer_warps}, {steered}>(
-            output.array, mixed.array, signs.array, update.array);
-    }});
-    launch({steer_blocks}, {steer_warps} * 32, [&] {{
-        npa::pull_back_gates<{steering}, {steer_warps}, {steered}>(
-            output.array, mixed.array, signs.array, update_bar.array, output_bar.array,
-            pulled.array);
-    }});
-    file = std::fopen("out", "wb");
-    for (const Table* table :
-         {{&mixed, &inputs, &rows_bar, &mixing_bar, &update, &output_bar, &pulled}}) {{
-        table->write(file);
-    }}
-    std::fclose(file);
-}}
-"""
+def text_of(name):
+    return (KERNELS / name).read_text(encoding="utf-8")
+
+
+def function_of(text, name):
+    """The definition of a function, with the template before it."""
+    head = rf"(?:template <[^>]*>\s)?__device__ inline \w+ {name}\([^{{]*?\)\s*"
+    return re.search(head + r"(?:\{[^\n]*\}\n|\{\n.*?\n\}\n)", text, re.S)[0]
+
+
+def printed_by(source, folder, includes):
+    """Return what a program of this folder prints, which runs in another folder."""
+    compiler = shutil.which("g++")
+    if compiler is None:
+        pytest.skip("needs g++")
+    options = ["-std=c++20", "-O1", "-w", *(f"-I{path}" for path in (HERE, folder, includes))]
+    command = [compiler, *options, "-o", "program", str(HERE / source)]
+    subprocess.run(command, cwd=folder, check=True)
+    program = [str(folder / "program")]
+    result = subprocess.run(
+        program, cwd=folder, capture_output=True, timeout=300, encoding="utf-8", check=False
+    )
+    assert result.returncode == 0, result.stdout
+    return result.stdout
+
+
+def test_tiles_of_pictures_are_ranked_by_their_candidates(tmp_path):
+    assert printed_by("ranks_on_cpu.cpp", tmp_path, KERNELS / "pictures") == "0 wrong\n"
+
+
+def test_tiles_find_all_neighbours_of_all_particles(tmp_path):
+    tiles = text_of("cuda/tiles.cuh")
+    fetch, wait = function_of(tiles, "fetch"), function_of(tiles, "await_fetched")
+    tiles = tiles.replace(fetch, fetch.split("{")[0] + "{ *to = *from; }\n")
+    tiles = tiles.replace(wait, wait.split("{")[0] + "{}\n")
+    mathematics = text_of("mathematics.cuh")
+    needed = [function_of(mathematics, name) for name in ("falloff_within", "smoothing")]
+    needed.append(function_of(text_of("access.cuh"), "sum_up_to"))
+    head = "namespace npa {\n" + "\n".join(needed) + "}\nusing std::fmaf;\n"
+    (tmp_path / "native.h").write_text(head + tiles, encoding="utf-8")
+    printed = printed_by("tiles_on_cpu.cpp", tmp_path, KERNELS)
+    assert printed == "720 worlds, 0 particles wrong\n"
 
 
 def fourfold(number):
@@ -71,7 +67,6 @@ def fourfold(number):
     return number + -number % 4
 
 
-@pytest.mark.skipif(shutil.which("g++") is None, reason="no C++ compiler is here")
 @pytest.mark.parametrize(
     ("form", "count"),
     [
@@ -80,68 +75,55 @@ def fourfold(number):
         (VectorForm(2, 6, 3, 33, chiral=True), 9),
     ],
 )
-def test_kernels_of_warps_do_what_the_portable_ones_do(form, count, tmp_path):
+def test_vectors_of_rows_are_what_the_portable_kernels_make_of_them(form, count, tmp_path):
     assert cuda.fits_block(*form)
     gates, channels, rows_of_warp = form.gate_count, 5, cuda.rows_of_warp(form.mixed)
     widths = [form.perception_dim + 1, form.input_dim + 1, gates + channels]
     width, in_width, out_width, up_width = map(fourfold, [*widths, form.space_dim + channels])
     vectors = count, form.mixed, form.space_dim
     generator = torch.Generator().manual_seed(1)
-    given = [
+    inputs = [
         torch.randn(*shape, generator=generator)
         for shape in (
             (count, width), (form.perceived, form.mixed), vectors, (count, in_width),
             (count, out_width), (gates,), (count, up_width),
         )
     ]  # fmt: skip
-    given[5] = given[5].sign()
-    (tmp_path / "in").write_bytes(b"".join(value.numpy().tobytes() for value in given))
-    source = (KERNELS / "network.cuh").read_text(encoding="utf-8")
-    (adding,) = re.findall(
-        r"template <int WARPS>\n__device__ inline void add_partial_sums.*?\n}\n", source, re.DOTALL
-    )
-    shape = f"{form.space_dim}, {form.scalars}, {form.perceived}, {form.mixed}, {int(form.chiral)}"
-    program = PROGRAM.format(
-        emulation=Path(__file__).with_name("emulation.hpp"),
-        kernels=KERNELS / "equivariance.cuh",
-        sum=adding,
-        count=count,
-        width=width,
-        in_width=in_width,
-        out_width=out_width,
-        up_width=up_width,
-        gates=gates,
-        weights=form.perceived * form.mixed,
-        vectors=count * form.mixed * form.space_dim,
-        form=shape,
-        steering=f"{form.space_dim}, {form.mixed}, {int(form.chiral)}",
-        rows=rows_of_warp,
-        # Fewer than have all rows, so that warps come back for more.
-        blocks=1,
-        read_blocks=-(-count // (rows_of_warp * cuda.READ_WARPS)),
-        steer_blocks=-(-count // (cuda.STEERED_ROWS * cuda.STEER_WARPS)),
-        read_warps=cuda.READ_WARPS,
-        pull_warps=cuda.PULL_WARPS,
-        sum_warps=cuda.MIXING_SUM_WARPS,
-        steer_warps=cuda.STEER_WARPS,
-        steered=cuda.STEERED_ROWS,
-    )
-    (tmp_path / "program.cpp").write_text(program, encoding="utf-8")
-    compiler = ["g++", "-std=c++20", "-O1", "-pthread", "program.cpp", "-o", "program"]
-    subprocess.run(compiler, cwd=tmp_path, check=True)
-    subprocess.run(["./program"], cwd=tmp_path, check=True, timeout=300)
+    inputs[5] = inputs[5].sign()
+    (tmp_path / "in").write_bytes(b"".join(value.numpy().tobytes() for value in inputs))
+    sizes = {
+        "COUNT": count,
+        "WIDTH": width,
+        "IN_WIDTH": in_width,
+        "OUT_WIDTH": out_width,
+        "UP_WIDTH": up_width,
+        "GATES": gates,
+        "WEIGHTS": form.perceived * form.mixed,
+        "VECTORS": count * form.mixed * form.space_dim,
+        "FORM": ", ".join(str(int(size)) for size in form),
+        "STEERING": f"{form.space_dim}, {form.mixed}, {int(form.chiral)}",
+        "ROWS": rows_of_warp,
+        "READ_BLOCKS": -(-count // (rows_of_warp * cuda.READ_WARPS)),
+        "STEER_BLOCKS": -(-count // (cuda.STEERED_ROWS * cuda.STEER_WARPS)),
+        "SUM_WARPS": cuda.MIXING_SUM_WARPS,
+    }
+    sizes |= {n: getattr(cuda, n) for n in ("READ_WARPS", "PULL_WARPS", "STEER_WARPS")}
+    sizes["STEERED_ROWS"] = cuda.STEERED_ROWS
+    defined = "".join(f"#define {name} {value}\n" for name, value in sizes.items())
+    (tmp_path / "sizes.h").write_text(defined, encoding="utf-8")
+    adding = function_of(text_of("cuda/network.cuh"), "add_partial_sums")
+    (tmp_path / "sums.h").write_text(f"namespace npa {{\n{adding}}}\n", encoding="utf-8")
+    printed_by("vectors_on_cpu.cpp", tmp_path, KERNELS / "cuda")
 
-    rows, mixing, mixed_bar, inputs_bar, output, signs, update_bar = (v.double() for v in given)
+    rows, mixing, mixed_bar, inputs_bar, output, signs, update_bar = (v.double() for v in inputs)
     for leaf in (rows, mixing, output):
         leaf.requires_grad_()
-    mixed, inputs = read_rows(rows, mixing, form, in_width)
-    pulls = torch.autograd.grad((mixed, inputs), (rows, mixing), (mixed_bar, inputs_bar))
-    seen = mixed.detach().requires_grad_()
-    update = steer_rows(output, seen, signs, up_width)
-    steering = torch.autograd.grad(update, (output, seen), update_bar)
-    expected = [mixed, inputs, *pulls, update, *steering]
-    found = np.fromfile(tmp_path / "out", np.float32)
-    assert len(found) == sum(value.numel() for value in expected)
-    for theirs in expected:
-        ours, found = found[: theirs.numel()], found[theirs.numel() :]
-        assert relative_error(torch.from_numpy(ours.copy()).view(theirs.shape), theirs) < 1e-6
+    results = read_rows(rows, mixing, form, in_width)
+    pulls = torch.autograd.grad(results, (rows, mixing), (mixed_bar, inputs_bar))
+    mixed = results[0].detach().requires_grad_()
+    update = steer_rows(output, mixed, signs, up_width)
+    steering = torch.autograd.grad(update, (output, mixed), update_bar)
+    expected = [*results, *pulls, update, *steering]
+    values = torch.from_numpy(np.fromfile(tmp_path / "out", np.float32))
+    for value, answer in zip(values.split([a.numel() for a in expected]), expected, strict=True):
+        assert relative_error(value.view(answer.shape), answer) < 1e-6

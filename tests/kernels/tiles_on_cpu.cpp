@@ -3,7 +3,7 @@
 #include <algorithm>
 #include <numeric>
 
-#include "warp_on_cpu.h"
+#include "cuda_on_cpu.h"
 
 #include "native.h"  // the native code, with plain copies instead of `cp.async`: test_tiles.py writes it
 
@@ -77,7 +77,7 @@ int check(int count, int worlds, float half_x, float half_y, float spread, Bad k
     auto* vectors = reinterpret_cast<wp::vec_t<2, float>*>(positions.data());
     for (int world = 0; world < worlds; ++world) {
         for (int first = world * count; first < (world + 1) * count; first += 8) {
-            warp::run([&] {
+            block::run(32, [&] {
                 const int own = first + threadIdx.x / 4;
                 const bool inside = own < (world + 1) * count;
                 const int k = inside ? own : first;

@@ -11,14 +11,18 @@ import pytest
 import torch
 from torch.autograd import forward_ad
 from torch.testing._internal.two_tensor import TwoTensor
-from worlds import assert_same, random_world
+from worlds import assert_same, random_world, tensors
 from worlds import lively_rule as made_rule
 
 import npa_envs
 from npa_envs import reference
+from npa_envs.ops import launch as threads
 from npa_envs.ops import orbit, render_gaussians, splat
+from npa_envs.ops.launch import even_ranges, run_together
+from npa_envs.ops.perceive import build_neighbours
+from npa_envs.ops.physics import Limits, Physics
 from npa_envs.ops.pictures.losses import picture_losses
-from npa_envs.world.brushes import push
+from npa_envs.ops.update import ActedWorlds, PreparedActions
 
 lively_rule = functools.cache(made_rule)
 """A rule cannot be made within a function of torch.func."""
@@ -68,8 +72,8 @@ def test_memory_graphs_and_streams_change_nothing(name, device):
     assert_same(outcome(name, *strided), expected)
     leaf = s.clone().requires_grad_()
     value = OPERATORS[name](x, leaf)
-    # The cotangent of a sum has strides of zero; this one has none.
-    cotangent = torch.ones_like(value).contiguous()
+    # The cotangent of a sum has strides of zero; this one has none, and begins anywhere in memory.
+    cotangent = torch.ones(value.numel() + 1, device=device)[1:].view_as(value)
     for _ in range(2):
         bars = torch.autograd.grad(value, leaf, cotangent, retain_graph=True)
         assert_same((value.detach(), *bars), expected)
@@ -157,7 +161,8 @@ def states_of_own_network(x, s):
 def own_rule(device):
     class Own(npa_envs.NPARule):
         def forward(self, perception):
-            return 2.0 * super().forward(perception)
+            # No product: torch's own may depend on its number of threads.
+            return 2.0 * perception[..., : self.update_dim]
 
         def step(self, x, s):
             return npa_envs.step(self, x, s)[1]
@@ -195,6 +200,68 @@ def test_a_tangent_is_refused(name, gradients, device):
                 continue
             with pytest.raises(npa_envs.NPAError, match=TANGENT):
                 EVERYTHING[name](*given)
+
+
+def acted_and_observed(x, s):
+    """Return worlds after two actions, and what they observe then; launches are recorded."""
+    x, s = x.detach().clone(), s.detach().clone()
+    diverged, enabled = torch.zeros(len(x), dtype=torch.uint8), torch.ones(1, dtype=torch.uint8)
+    limits = Limits(perception=1.0, position=0.6, state=10.0)
+    physics = Physics(3, 5, 0.3, 0.3, max_displacement=0.1, limits=limits)
+    actions = PreparedActions(ActedWorlds(x, s, None, None, enabled, diverged), physics)
+    for k in range(2):
+        actions(torch.cat((x, s), dim=-1).roll(k, dims=1))
+    neighbours = build_neighbours(x, s, physics)
+    first = neighbours.perceive()
+    return x, s, diverged, first, neighbours.perceive(torch.empty_like(first))
+
+
+WITHOUT_PRODUCTS = (
+    "perception, by positions",
+    "perception of species",
+    "fields",
+    "a rollout of an own network",
+    "a picture",
+    "a picture of Gaussians",
+    "losses of a picture",
+)
+
+
+@pytest.mark.parametrize("name", [*WITHOUT_PRODUCTS, "actions and observation"])
+@pytest.mark.parametrize("world_count", [1, 12])
+def test_results_are_the_same_bits_for_every_number_of_threads(name, world_count, monkeypatch):
+    cuts = []
+
+    def counted(calls):
+        cuts.append(len(calls))
+        run_together(calls)
+
+    monkeypatch.setattr(threads, "even_ranges", lambda count, _: even_ranges(count, 1))
+    monkeypatch.setattr(threads, "run_together", counted)
+    worlds = random_world(world_count, 31, 3, 5, dtype=torch.float32, device="cpu")
+    worlds = [value.requires_grad_() for value in worlds]
+
+    def results():
+        torch.manual_seed(0)
+        values = tensors(
+            (EVERYTHING | {"actions and observation": acted_and_observed})[name](*worlds)
+        )
+        if not values[0].requires_grad:
+            return values
+        return values, torch.autograd.grad(values[0].square().sum(), worlds, allow_unused=True)
+
+    default = torch.get_num_threads()
+    try:
+        torch.set_num_threads(1)
+        expected = results()
+        assert not cuts
+        for thread_count in (2, 3):
+            cuts.clear()
+            torch.set_num_threads(thread_count)
+            assert_same(results(), expected)
+            assert world_count == 1 or max(cuts) == thread_count * threads.RANGES_PER_THREAD
+    finally:
+        torch.set_num_threads(default)
 
 
 @pytest.mark.parametrize("name", ["perception", "a rollout", "a picture", "a mean"])
@@ -247,39 +314,31 @@ def test_a_batch_of_cotangents_is_refused(name, device):
     assert float(gradient.abs().max()) > 0.0
 
 
-def test_jacobians_are_right_or_refused(device):
+def test_jacobians_are_right_or_refused_and_the_reference_has_them_all(device):
     x, s = world(device, torch.float64)
     x, s = x[:, :4], s[:, :4, :2]
 
     def perceived(s):
         return npa_envs.perceive(x, s, 0.8)
 
+    def referred(s):
+        return reference.perceive(x, s, 0.8, 0.8)
+
     jacobian = torch.autograd.functional.jacobian
-    expected = jacobian(lambda s: reference.perceive(x, s, 0.8, 0.8), s)
-    torch.testing.assert_close(jacobian(perceived, s), expected, rtol=1e-9, atol=1e-11)
+    expected = jacobian(referred, s)
+    for found in (
+        jacobian(perceived, s),
+        jacobian(referred, s, strategy="forward-mode", vectorize=True),
+        jacobian(referred, s, vectorize=True),
+        torch.func.jacfwd(referred)(s),
+        torch.func.jacrev(referred)(s),
+    ):
+        torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-11)
+    assert torch.func.hessian(lambda s: referred(s).sum())(s).any()
     with pytest.raises(npa_envs.NPAError, match=TANGENT):
         jacobian(perceived, s, strategy="forward-mode", vectorize=True)
     with pytest.raises(npa_envs.NPAError, match="is_grads_batched must be False"):
         jacobian(perceived, s, vectorize=True)
-
-
-def test_the_reference_that_the_errors_name_has_them_all():
-    x, s = world("cpu", torch.float64)
-    x, s = x[:, :4], s[:, :4, :2]
-
-    def perceived(s):
-        return reference.perceive(x, s, 0.8, 0.8)
-
-    jacobian = torch.autograd.functional.jacobian
-    expected = jacobian(perceived, s)
-    for found in (
-        jacobian(perceived, s, strategy="forward-mode", vectorize=True),
-        jacobian(perceived, s, vectorize=True),
-        torch.func.jacfwd(perceived)(s),
-        torch.func.jacrev(perceived)(s),
-    ):
-        torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-11)
-    assert torch.func.hessian(lambda s: perceived(s).sum())(s).any()
 
 
 class Rollout(torch.nn.Module):
@@ -292,35 +351,28 @@ class Rollout(torch.nn.Module):
 
 
 @pytest.mark.parametrize("plain", [True, False])
-@pytest.mark.parametrize("how", ["functional call", "attribute"])
-def test_a_rule_whose_weights_carry_tangents_is_refused(plain, how, device):
+@pytest.mark.parametrize("how", ["functional call", "attribute", "states"])
+def test_prepared_rollouts_refuse_tangents_of_weights_and_states(plain, how, device):
     x, s = world(device)
     rule = copy.deepcopy(own_rule(device))
     if plain:
         rule = made_rule(device, torch.float32, 3, 5)
     model, weight = Rollout(rule), rule.output.weight.detach()
     with torch.no_grad(), forward_ad.dual_level():
+        # The third call of a kind makes steps prepared by the first two.
+        for _ in range(4):
+            model(x, s)
         dual = forward_ad.make_dual(weight, torch.ones_like(weight))
-        given = {"rule.output.weight": dual} if how == "functional call" else {}
+        weights = {"rule.output.weight": dual} if how == "functional call" else {}
         if how == "attribute":
             del rule.output.weight
             rule.output.weight = dual
-        # The third call of a kind makes steps prepared by the first two.
+        elif how == "states":
+            s = forward_ad.make_dual(s, torch.ones_like(s))
         for _ in range(4):
-            with pytest.raises(npa_envs.NPAError, match="rule" + TANGENT):
-                torch.func.functional_call(model, given, (x, s))
-
-
-def test_prepared_steps_refuse_tangents_as_launched_ones_do(device):
-    x, s = world(device)
-    rule = lively_rule(device, torch.float32, 3, 5)
-    with torch.no_grad(), forward_ad.dual_level():
-        plain = [npa_envs.rollout(rule, x, s, 3, update_prob=1.0) for _ in range(4)]
-        dual = forward_ad.make_dual(s, torch.ones_like(s))
-        for _ in range(4):
-            with pytest.raises(npa_envs.NPAError, match="s" + TANGENT):
-                npa_envs.rollout(rule, x, dual, 3, update_prob=1.0)
-        assert_same(npa_envs.rollout(rule, x, s, 3, update_prob=1.0), plain[0])
+            name = "s" if how == "states" else "rule"
+            with pytest.raises(npa_envs.NPAError, match=name + TANGENT):
+                torch.func.functional_call(model, weights, (x, s))
 
 
 def test_a_tangent_that_an_own_network_makes_is_refused(device):
@@ -335,12 +387,3 @@ def test_a_tangent_that_an_own_network_makes_is_refused(device):
     raises = pytest.raises(npa_envs.NPAError, match="update" + TANGENT)
     with torch.no_grad(), forward_ad.dual_level(), raises:
         npa_envs.rollout(rule, x, s, 2)
-
-
-def test_brushes_have_forward_derivatives():
-    x, _ = world("cpu")
-    with forward_ad.dual_level():
-        dual = forward_ad.make_dual(x, torch.ones_like(x))
-        zero = x.new_zeros(1, 3)
-        moved = push(dual, centre=zero, move=zero, radius=0.1)
-        torch.testing.assert_close(forward_ad.unpack_dual(moved).tangent, torch.ones_like(x))

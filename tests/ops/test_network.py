@@ -21,6 +21,9 @@ SIZES = [
     (2, 4, 32, False),
     (2, 24, 512, False),
     (3, 24, 128, False),
+    # Too narrow and too wide for the fused kernels.
+    (2, 16, 24, False),
+    (2, 16, 544, False),
 ]
 
 
@@ -76,7 +79,7 @@ def needs_cuda(device):
 def test_network_and_its_gradients_equal_float64(sizes, row_count, device):
     rule = trained_like_rule(device, *sizes)
     folded = rule.folded()
-    assert (folded.arranged is not None) == (device.type == "cuda")
+    assert (folded.arranged is not None) == (device.type == "cuda" and sizes[2] not in (24, 544))
     rows = random_rows(rule, folded, row_count)
     inputs = (rows, folded.hidden_weight, folded.output_weight)
     cotangent = torch.randn(row_count, folded.output_weight.shape[0], device=device)
@@ -162,17 +165,6 @@ def test_rows_of_zeros_give_zeros_and_no_gradient(folded, device):
     grads = torch.autograd.grad(update.sum(), (rows, *folded[:2]), retain_graph=True)
     assert not update.any()
     assert not any(grad.any() for grad in grads)
-
-
-@pytest.mark.parametrize("hidden_dim", [24, 544])
-def test_other_sizes_use_plain_products(hidden_dim, device):
-    rule = trained_like_rule(device, hidden_dim=hidden_dim)
-    folded = rule.folded()
-    assert folded.arranged is None
-    rows = random_rows(rule, folded, 20)
-    expected = plain_update(rows, folded.hidden_weight, folded.output_weight)
-    torch.testing.assert_close(folded(rows), expected)
-    assert trained_like_rule(device).double().folded().arranged is None
 
 
 def test_a_compiled_network_equals_the_eager_one(rule, device):

@@ -7,7 +7,6 @@ import torch
 from worlds import assert_same, tensors
 
 from npa_envs import WorldRandom
-from npa_envs.ops.pictures import losses as pictures
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 
 ERRORS = {torch.float32: 3e-6, torch.float64: 1e-13}
@@ -56,16 +55,6 @@ def test_nothing_depends_on_the_run_the_batch_or_the_memory(worlds):
             alone = function(x[world : world + 1].clone(), s[world : world + 1].clone())
             for value, expected in zip(tensors(alone), tensors(together), strict=True):
                 assert torch.equal(value[0], expected[world])
-
-
-def test_it_does_not_matter_how_many_tiles_a_block_serves(worlds, monkeypatch):
-    task, x, s = worlds
-    if x.device.type != "cuda":
-        pytest.skip("blocks gather tiles on CUDA devices only")
-    losses = task.splat_losses(x, s)
-    for count in (32, 64, 128):
-        monkeypatch.setattr(pictures, "block_tiles", lambda *sizes, count=count: count)
-        assert_same(task.splat_losses(x, s), losses)
 
 
 def test_errors_are_what_their_formula_says_and_losses_are_their_means(worlds):

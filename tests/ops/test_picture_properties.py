@@ -19,44 +19,54 @@ PICTURE_BOUND = 200
 
 
 @dataclass(frozen=True)
-class Picture:
-    """2D worlds and how they are drawn."""
+class Drawing:
+    """Worlds and how they are drawn."""
 
-    x: Tensor
-    colour: Tensor
+    particles: tuple[Tensor, ...]
+    """What particles are, shape [B, N, ...] each."""
+    cotangent: Tensor
+
+    def ordered(self, order):
+        return replace(self, particles=tuple(value[:, order] for value in self.particles))
+
+    def alone(self, k):
+        particles = tuple(value[k : k + 1] for value in self.particles)
+        return replace(self, particles=particles, cotangent=self.cotangent[k : k + 1])
+
+
+@dataclass(frozen=True)
+class Picture(Drawing):
+    """2D worlds, positions and colours, and their window."""
+
     resolution: int
     pixel_size: float
     sigma: float
     lo: float
     hi: float
     periodic: bool
-    cotangent: Tensor
+
+    @property
+    def x(self):
+        return self.particles[0]
 
     def drawn(self):
         """Return the pictures, and the gradients of a sum of them by what particles are."""
-        x, colour = self.x.clone().requires_grad_(), self.colour.clone().requires_grad_()
+        leaves = [value.clone().requires_grad_() for value in self.particles]
         picture = (periodic_splat if self.periodic else splat)(
-            x, colour, resolution=self.resolution, pixel_size=self.pixel_size, sigma=self.sigma,
+            *leaves, resolution=self.resolution, pixel_size=self.pixel_size, sigma=self.sigma,
             lo=self.lo, hi=self.hi,
         )  # fmt: skip
-        return [picture.detach()], torch.autograd.grad(picture, (x, colour), self.cotangent)
-
-    def ordered(self, order):
-        return replace(self, x=self.x[:, order], colour=self.colour[:, order])
-
-    def alone(self, k):
-        only = {name: getattr(self, name)[k : k + 1] for name in ("x", "colour", "cotangent")}
-        return replace(self, **only)
+        return [picture.detach()], torch.autograd.grad(picture, leaves, self.cotangent)
 
     def scaled(self, factor):
-        lengths = ("x", "pixel_size", "lo", "hi")
-        return replace(self, **{name: getattr(self, name) * factor for name in lengths})
+        lengths = {name: getattr(self, name) * factor for name in ("pixel_size", "lo", "hi")}
+        return replace(self, particles=(self.x * factor, self.particles[1]), **lengths)
 
     @property
     def allowed(self):
         """How far rounding may move a pixel."""
         peak = (self.resolution * self.pixel_size / (self.hi - self.lo)) ** 2
-        largest = float(self.colour.abs().max().clamp(min=1.0))
+        largest = float(self.particles[1].abs().max().clamp(min=1.0))
         return PICTURE_BOUND * UNIT[self.x.dtype] * self.x.shape[1] * peak * largest
 
     @property
@@ -84,15 +94,14 @@ def pictures(draw, device, *, dtypes=tuple(UNIT)):
         shape[0], resolution, resolution, 4, generator=generator, dtype=torch.float64
     )
     return Picture(
-        x=x.to(device, dtype),
-        colour=colour.to(device, dtype),
+        (x.to(device, dtype), colour.to(device, dtype)),
+        cotangent.to(device, dtype),
         resolution=resolution,
         pixel_size=draw(st.sampled_from((0.5, 1.0, 1.7))) * (hi - lo) / resolution,
         sigma=draw(st.sampled_from((0.5, 1.0, 2.0))),
         lo=lo,
         hi=hi,
         periodic=draw(st.booleans()),
-        cotangent=cotangent.to(device, dtype),
     )
 
 
@@ -104,7 +113,7 @@ def test_periodic_pictures_turn_with_their_particles(drawn):
     cotangent = p.cotangent.new_ones(p.x.shape[0], side, side, 4)
     p = replace(p, periodic=True, resolution=side, cotangent=cotangent)
     shift = p.x.new_tensor(pixels) * ((p.hi - p.lo) / side)
-    (moved,), _ = replace(p, x=p.x + shift).drawn()
+    (moved,), _ = replace(p, particles=(p.x + shift, p.particles[1])).drawn()
     # Places are rounded where they are far from the first pixel.
     far = 1.0 + float((p.x.abs().max() + shift.abs().max()) * p.steepness)
     (picture,), _ = p.drawn()
@@ -112,37 +121,26 @@ def test_periodic_pictures_turn_with_their_particles(drawn):
 
 
 @dataclass(frozen=True)
-class Scene:
-    """3D worlds and how they are seen."""
+class Scene(Drawing):
+    """3D worlds, of means, scales, quaternions, opacities and colours, and how they are seen."""
 
-    gaussians: tuple[Tensor, ...]
-    """Means, scales, quaternions, opacities, colours."""
     cameras: Cameras
-    cotangent: Tensor
     allowed: float = 0.0
     """How far rounding may move a pixel: Gaussians are drawn in the order of their depths."""
 
     def drawn(self):
         """Return image and alpha, and the gradients of a sum of the image."""
-        leaves = [tensor.clone().requires_grad_() for tensor in self.gaussians]
+        leaves = [tensor.clone().requires_grad_() for tensor in self.particles]
         found = render_gaussians(*leaves, self.cameras)
         bars = torch.autograd.grad(found.image, leaves, self.cotangent)
         return [found.image.detach(), found.alpha.detach()], bars
-
-    def ordered(self, order):
-        return replace(self, gaussians=tuple(part[:, order] for part in self.gaussians))
-
-    def alone(self, k):
-        parts = tuple(part[k : k + 1] for part in self.gaussians)
-        return replace(self, gaussians=parts, cotangent=self.cotangent[k : k + 1])
 
     def scaled(self, factor):
         motions = self.cameras.world_to_camera.clone()
         motions[..., :3, 3] *= factor
         cameras = replace(self.cameras, world_to_camera=motions, near=self.cameras.near * factor)
-        means, scales, *rest = self.gaussians
-        gaussians = (means * factor, scales * factor, *rest)
-        return replace(self, gaussians=gaussians, cameras=cameras)
+        means, scales, *others = self.particles
+        return replace(self, particles=(means * factor, scales * factor, *others), cameras=cameras)
 
 
 @st.composite
@@ -169,7 +167,7 @@ def scenes(draw, device):
     cameras = orbit(views, elevation, radius, fov, width=width, height=height)
     cotangent = normal(lead[0], views, height, width, channels[-1])
     made = tuple(tensor.to(device, dtype) for tensor in gaussians)
-    return Scene(made, cameras.to(device), cotangent.to(device, dtype))
+    return Scene(made, cotangent.to(device, dtype), cameras.to(device))
 
 
 def both(device):

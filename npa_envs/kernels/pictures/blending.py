@@ -250,10 +250,7 @@ def tile_kernels(scalar: type) -> SimpleNamespace:
 
 @cached_under_lock()
 def block_kernels(scalar: type) -> SimpleNamespace:
-    """Return the kernels of one scalar type in which a block serves a tile; for CUDA.
-
-    Drawing also runs on a CPU.
-    """
+    """Return the kernels of one scalar type in which a block serves a tile; for CUDA."""
     types = gaussian_types(scalar)
     Frame, quad, footprint_type, pulls_type = types.Frame, types.quad, types.footprint, types.pulls
     functions = blending_functions(scalar)
