@@ -32,10 +32,10 @@ DESK, PHONE = (1280, 800), (390, 844)
 def chromium() -> str:
     """Return where Chromium is; skip the test where there is none."""
     names = ("chromium", "chromium-browser", "google-chrome", "chrome")
-    found = next(filter(None, map(shutil.which, names)), None)
-    if found is None:
+    path = next(filter(None, map(shutil.which, names)), None)
+    if path is None:
         pytest.skip("needs Chromium: apt-get install chromium")
-    return found
+    return path
 
 
 class Page:
@@ -61,21 +61,23 @@ class Page:
             if message.get("id") == number:
                 assert "error" not in message, message["error"]
                 return message["result"]
-            self._note(message)
+            self._collect_complaints(message)
 
-    def _note(self, message: dict[str, Any]) -> None:
-        told = message.get("params", {})
+    def _collect_complaints(self, message: dict[str, Any]) -> None:
+        params = message.get("params", {})
         match message.get("method"):
             case "Runtime.exceptionThrown":
-                details = told["exceptionDetails"]
+                details = params["exceptionDetails"]
                 text = details.get("exception", {}).get("description", details["text"])
                 self.complaints.append(text)
-            case "Runtime.consoleAPICalled" if told["type"] in ("error", "warning"):
-                self.complaints.append(" ".join(str(a.get("value")) for a in told["args"]))
-            case "Log.entryAdded" if told["entry"]["level"] == "error":
-                self.complaints.append(told["entry"]["text"] + " " + told["entry"].get("url", ""))
-            case "Network.loadingFailed" if not told.get("canceled"):
-                self.complaints.append(f"not loaded: {told['errorText']}")
+            case "Runtime.consoleAPICalled" if params["type"] in ("error", "warning"):
+                self.complaints.append(" ".join(str(a.get("value")) for a in params["args"]))
+            case "Log.entryAdded" if params["entry"]["level"] == "error":
+                self.complaints.append(
+                    params["entry"]["text"] + " " + params["entry"].get("url", "")
+                )
+            case "Network.loadingFailed" if not params.get("canceled"):
+                self.complaints.append(f"not loaded: {params['errorText']}")
 
     def open(self, address: str, size: tuple[int, int] = DESK, *, light: bool = False) -> None:
         """Show an address on a screen of some size [pixels]; the smaller one is a phone's."""
@@ -107,17 +109,17 @@ class Page:
             time.sleep(0.05)
         raise AssertionError(f"never true: {script}; the page says {self.complaints}")
 
-    def drag(self, places: list[tuple[float, float]]) -> None:
-        """Press the mouse at the first place on the page [pixels], move on, and let go."""
-        given = {"button": "left", "buttons": 1, "clickCount": 1}
-        kinds = ["mousePressed", *["mouseMoved"] * (len(places) - 1), "mouseReleased"]
-        for kind, (x, y) in zip(kinds, [*places, places[-1]], strict=True):
-            self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, **given)
+    def drag(self, points: list[tuple[float, float]]) -> None:
+        """Press the mouse at the first point on the page [pixels], move on, and let go."""
+        button = {"button": "left", "buttons": 1, "clickCount": 1}
+        kinds = ["mousePressed", *["mouseMoved"] * (len(points) - 1), "mouseReleased"]
+        for kind, (x, y) in zip(kinds, [*points, points[-1]], strict=True):
+            self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, **button)
             time.sleep(0.03)
 
-    def touch(self, places: list[tuple[float, float]]) -> None:
-        """Touch the first place on the page [pixels], move on, and let go."""
-        for k, (x, y) in enumerate(places):
+    def touch(self, points: list[tuple[float, float]]) -> None:
+        """Touch the first point on the page [pixels], move on, and let go."""
+        for k, (x, y) in enumerate(points):
             kind = "touchStart" if k == 0 else "touchMove"
             self.call("Input.dispatchTouchEvent", type=kind, touchPoints=[{"x": x, "y": y}])
             time.sleep(0.03)
@@ -138,18 +140,18 @@ def browser(folder: Path, *flags: str) -> Iterator[Callable[[], Page]]:
     command = [chromium(), *FLAGS, *flags, f"--user-data-dir={folder}", "about:blank"]
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
         try:
-            told = folder / "DevToolsActivePort"
+            port_file = folder / "DevToolsActivePort"
             end = time.monotonic() + 60
-            while not (told.is_file() and told.read_text(encoding="utf-8").count("\n")):
+            while not (port_file.is_file() and port_file.read_text(encoding="utf-8").count("\n")):
                 assert process.poll() is None, "Chromium did not start"
                 assert time.monotonic() < end, "Chromium does not answer"
                 time.sleep(0.05)
-            base = f"http://127.0.0.1:{told.read_text('utf-8').split()[0]}"
+            base = f"http://127.0.0.1:{port_file.read_text('utf-8').split()[0]}"
             pages = []
 
             def new_page() -> Page:
-                asked = urllib.request.Request(f"{base}/json/new?about:blank", method="PUT")
-                with urllib.request.urlopen(asked, timeout=30) as answer:
+                request = urllib.request.Request(f"{base}/json/new?about:blank", method="PUT")
+                with urllib.request.urlopen(request, timeout=30) as answer:
                     pages.append(Page(json.load(answer)["webSocketDebuggerUrl"]))
                 return pages[-1]
 

@@ -1,16 +1,13 @@
 """A toy task for the trainer's tests: particles learn to walk to a circle, without any kernels."""
 
-from typing import Literal
-
 import torch
 from torch import Tensor
 
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import ParticleTask
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2DConfig
-from npa_envs.training import TrainConfig
+from npa_envs.training import TrainConfig, override
 from npa_envs.world.particles import Particles
-from npa_envs.world.rollout import Memory
 
 PARTICLE_COUNT = 12
 STATE_DIM = 3
@@ -76,14 +73,11 @@ def plain_rollout(
     x: Tensor,
     s: Tensor,
     steps: int,
-    /,
     *,
     eps: float,
-    box: tuple[float, ...] | None,
     update_prob: float,
-    memory: Memory,
     generator: torch.Generator,
-    return_path_length: Literal[True],
+    **options: object,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Particles that see nothing but their own position and state."""
     path_length = torch.zeros_like(x[..., 0])
@@ -100,8 +94,6 @@ def plain_rollout(
 
 def circle_config(out: object, **fields: object) -> TrainConfig[Morphogenesis2DConfig]:
     """A run of a second or less; `fields` as for `override`."""
-    from npa_envs.training import override
-
     base = TrainConfig(
         task=Morphogenesis2DConfig(),
         iterations=6,

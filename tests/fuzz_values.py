@@ -1,9 +1,7 @@
-"""Fuzz test: wrong and extreme arguments, and the targets that take them."""
+"""Wrong and extreme arguments, for tests that call at random."""
 
-import dataclasses
 import math
 import random
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -31,27 +29,6 @@ EXTREME: tuple[Any, ...] = (
 
 ENDLESS = ("steps", "frame_count", "max_cycles", "frames")
 """Arguments whose large values are legal, and take long."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Target:
-    """Something public that can be called."""
-
-    function: Callable[..., Any]
-    legal: Callable[[random.Random], dict[str, Any]]
-    """Returns legal arguments."""
-    weight: float = 1.0
-    """How often it is called."""
-    documented: tuple[type[BaseException], ...] = ()
-    """Exceptions that its documentation names besides `NPAError`."""
-
-
-def read_file(read: Callable[[Path], Any], name: str, content: bytes) -> None:
-    """Read a file of this name and content."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / name
-        path.write_bytes(content)
-        read(path)
 
 
 def wrong(draw: random.Random, name: str, legal: Any) -> Any:

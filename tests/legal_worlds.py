@@ -60,24 +60,33 @@ class World:
         generator = torch.Generator().manual_seed(self.seed)
         return torch.randperm(self.shape[1], generator=generator).to(self.x.device)
 
+    def shift(self) -> Tensor:
+        """Return a shift by which no coordinate is rounded, shape [D]."""
+        return ((self.normal(self.shape[2]) / GRID).round() * GRID).clamp(-4.0, 4.0)
+
+    @property
+    def factor(self) -> float:
+        """A power of two by which nothing over- or underflows."""
+        return 2.0 ** (self.seed % 13 - 6)
+
     def split(self, count: int) -> list[int]:
         """Return how the particles fall into species."""
         total = self.shape[1]
         first = 1 + self.seed % max(1, total - 1)
         return [first, total - first] if count == 2 and total > first else [total]
 
-    def scaled(self, factor: float) -> World:
-        """Return the worlds with all lengths times a factor, except the radius of training."""
-        box = None if self.box is None else tuple(side * factor for side in self.box)
-        return replace(self, x=self.x * factor, eps=self.eps * factor, box=box)
+    def scaled(self) -> World:
+        """Return the worlds with all lengths times `factor`, except the radius of training."""
+        box = None if self.box is None else tuple(side * self.factor for side in self.box)
+        return replace(self, x=self.x * self.factor, eps=self.eps * self.factor, box=box)
 
     def ordered(self, order: Tensor) -> World:
         """Return the worlds with their particles in another order."""
         return replace(self, x=self.x[:, order], s=self.s[:, order])
 
-    def moved(self, shift: Tensor) -> World:
-        """Return the worlds with all positions moved."""
-        return replace(self, x=self.x + shift.to(self.x))
+    def moved(self) -> World:
+        """Return the worlds with all positions moved by `shift`."""
+        return replace(self, x=self.x + self.shift())
 
     def alone(self, k: int) -> World:
         """Return world k as a batch of one."""
@@ -120,17 +129,6 @@ def worlds(draw, device, *, dtypes=tuple(UNIT)):
     s = size * torch.randn(shape, generator=generator, dtype=torch.float64)
     eps0 = eps * draw(st.sampled_from((0.5, 1.0, 3.0)))
     return World((units * GRID).to(device, dtype), s.to(device, dtype), eps, eps0, box, seed)
-
-
-def shifts(world: World) -> st.SearchStrategy[Tensor]:
-    """Return a strategy of shifts by which no coordinate is rounded, shape [D]."""
-    units = st.tuples(*[st.integers(-(2**12), 2**12)] * world.shape[2])
-    return units.map(lambda drawn: torch.tensor(drawn, dtype=torch.float64) * GRID)
-
-
-def scales() -> st.SearchStrategy[float]:
-    """Return a strategy of powers of two by which nothing over- or underflows."""
-    return st.integers(-6, 6).map(lambda power: 2.0**power)
 
 
 def clear_of_threshold(world: World) -> None:
@@ -228,22 +226,3 @@ def every(strategy):
         return run
 
     return decorate
-
-
-def some(**options):
-    """Return `worlds` as a function of the device."""
-    return lambda device: worlds(device, **options)
-
-
-def with_shift(**options):
-    """Return worlds with a shift that rounds nothing, as a function of the device."""
-
-    def strategy(device):
-        return worlds(device, **options).flatmap(lambda w: st.tuples(st.just(w), shifts(w)))
-
-    return strategy
-
-
-def with_scale(**options):
-    """Return worlds with a power of two, as a function of the device."""
-    return lambda device: st.tuples(worlds(device, **options), scales())

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from npa_envs import reference
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule
 from npa_envs.world.rollout import rollout
@@ -55,25 +55,6 @@ def lively(rule: NPARule) -> NPARule:
     for parameter in rule.parameters():
         parameter.data.normal_(0.0, 0.3)
     return rule
-
-
-def stepped(
-    rule: NPARule, x: Tensor, s: Tensor, mask: Tensor, *, eps: float, box: Box
-) -> tuple[Tensor, Tensor]:
-    """One step in float64 by `npa_envs.reference`."""
-    rule, x, s = rule.double(), x.double(), s.double()
-    z = reference.perceive(x, s, eps, rule.eps0, box, moment_inverse=rule.moment_inverse)
-    with torch.no_grad():
-        update = rule(z)
-    moved = torch.zeros_like(x)
-    if not rule.static:
-        moved, update = update.split([rule.space_dim, rule.state_dim], dim=-1)
-        moved = rule.alpha * eps * moved / (1.0 + moved.norm(dim=-1, keepdim=True))
-    x, s = x + mask[..., None] * moved, s + mask[..., None] * update
-    if box is not None:
-        sides = torch.tensor(box, dtype=x.dtype)
-        x = x - sides * torch.floor(x / sides + 0.5)
-    return x, s
 
 
 WORLDS: dict[str, tuple[str | Callable[[], NPARule], int, Box, float]] = {
@@ -128,12 +109,12 @@ def example(kind: str) -> Example:
         "species": species, "mask": mask[0].int().tolist(), "eps": eps, "box": box,
         "densityCounts": density_counts,
     }  # fmt: skip
-    if kind in SPECIES:
-        with torch.no_grad():
-            after = rollout_species(
-                [rule.double() for rule in rules], x.double(), s.double(), 1, counts=(200, 100),
-                update_prob=1.0, density_counts=density_counts,
-            )  # fmt: skip
-    else:
-        after = stepped(rule, x, s, mask, eps=eps, box=box)
+    exact = [rule.double() for rule in rules]
+    run = partial(rollout_species, exact, counts=(200, 100), density_counts=density_counts)
+    if kind not in SPECIES:
+        run = partial(rollout, exact[0])
+    with torch.no_grad():
+        stepped = run(x=x.double(), s=s.double(), steps=1, eps=eps, box=box, update_prob=1.0)
+    before, updated = (x.double(), s.double()), mask[..., None] == 1
+    after = tuple(torch.where(updated, *pair) for pair in zip(stepped, before, strict=True))
     return Example(fields, s, mask, after)

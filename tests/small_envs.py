@@ -49,18 +49,17 @@ def begun(*envs: Any, seed: int = 0) -> Any:
     return envs if len(envs) > 1 else envs[0]
 
 
-def assert_same(left: Any, right: Any, where: str = "") -> None:
+def assert_same(left: Any, right: Any) -> None:
     """Compare what steps and resets return, bit for bit: tuples and dicts of arrays or tensors."""
     if isinstance(left, dict):
-        assert left.keys() == right.keys(), where
-        for key, value in left.items():
-            assert_same(value, right[key], f"{where}.{key}")
-    elif isinstance(left, tuple | list) or (isinstance(left, np.ndarray) and left.dtype == "O"):
-        for k, (value, other) in enumerate(zip(left, right, strict=True)):
-            assert_same(value, other, f"{where}[{k}]")
+        assert left.keys() == right.keys()
+        left, right = list(left.values()), [right[key] for key in left]
+    if isinstance(left, tuple | list) or (isinstance(left, np.ndarray) and left.dtype == "O"):
+        for pair in zip(left, right, strict=True):
+            assert_same(*pair)
     else:
         arrays = [v.cpu().numpy() if isinstance(v, torch.Tensor) else v for v in (left, right)]
-        assert np.array_equal(*arrays), where
+        assert np.array_equal(*arrays)
 
 
 def world_of(batched: Any, k: int) -> Any:

@@ -1,8 +1,8 @@
 """Is what the library computes bit for bit what it was at a commit? Run by `make golden-check`.
 
 The file `commit` beside this one names the reference: it is checked out into a temporary folder,
-both trees run `wide.py` at the same time, each its own where the reference has one, and all arrays
-are compared. Other words on the command line: a beginning of scenes' names, to run only those.
+both trees run their own `wide.py` at the same time, and all arrays are compared. Other words on the
+command line: a beginning of scenes' names, to run only those.
 """
 
 import os
@@ -26,12 +26,14 @@ ACCEPTED = {
 """Beginnings of names of arrays that may differ, or be there on one side alone, and why."""
 
 
-def start(tree, script, out, only):
-    """Run a script of scenes by the library of a tree."""
-    paths = os.pathsep.join(map(str, (tree, tree / "tests" / "golden")))
+def start(tree, folder, only):
+    """Run the scenes of a tree; they are written to `out.npz` in a folder."""
+    folder.mkdir()
+    paths = os.pathsep.join(map(str, (tree, tree / "tests", tree / "tests" / "golden")))
     variables = os.environ | {"PYTHONPATH": paths, "OMP_NUM_THREADS": "1", "COLUMNS": "200"}
-    command = [sys.executable, "-P", "-W", "ignore", str(script), str(out), only]
-    return subprocess.Popen(command, cwd=out.parent, env=variables)
+    script = str(tree / "tests" / "golden" / "wide.py")
+    command = [sys.executable, "-P", "-W", "ignore", script, str(folder / "out.npz"), only]
+    return subprocess.Popen(command, cwd=folder, env=variables)
 
 
 def difference(left, right):
@@ -47,6 +49,12 @@ def difference(left, right):
         return f"{int((left != right).sum())} of {left.size} flags"
     error = np.abs(left.astype(np.float64) - right.astype(np.float64))
     return f"by up to {np.nanmax(error):.3g}, where the largest is {np.nanmax(np.abs(right)):.3g}"
+
+
+def read(path):
+    """Return the arrays of a tree by name."""
+    with np.load(path) as file:
+        return {key.replace("|", "/"): file[key] for key in file.files}
 
 
 def compare(new, old):
@@ -73,21 +81,12 @@ def main(only=""):
         git = ["git", "-C", str(ROOT), "worktree"]
         subprocess.run([*git, "add", "--quiet", "--detach", str(tree), commit], check=True)
         try:
-            own = tree / "tests" / "golden" / "wide.py"
-            sides = {
-                "new": (ROOT, HERE / "wide.py"),
-                "old": (tree, own if own.is_file() else HERE / "wide.py"),
-            }
-            for name in sides:
-                (folder / name).mkdir()
-            runs = [start(*side, folder / name / "out.npz", only) for name, side in sides.items()]
+            sides = {"new": ROOT, "old": tree}
+            runs = [start(side, folder / name, only) for name, side in sides.items()]
             codes = [run.wait() for run in runs]
             if any(codes):
                 return 2
-            new, old = ({}, {})
-            for name, arrays in (("new", new), ("old", old)):
-                with np.load(folder / name / "out.npz") as file:
-                    arrays |= {key.replace("|", "/"): file[key] for key in file.files}
+            new, old = (read(folder / name / "out.npz") for name in sides)
         finally:
             subprocess.run([*git, "remove", "--force", str(tree)], check=True)
     found = compare(new, old)

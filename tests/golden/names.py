@@ -1,10 +1,10 @@
 """What is public besides numbers: names, ids, commands with their options, documented imports."""
 
 import contextlib
-import functools
 import importlib
 import inspect
 import io
+import pkgutil
 import re
 
 import gymnasium
@@ -76,14 +76,9 @@ def documented(folder):
 
 def is_there(name):
     """Return whether a dotted name can be imported."""
-    parts = name.split(".")
-    for size in range(len(parts), 0, -1):
-        with contextlib.suppress(ImportError):
-            module = importlib.import_module(".".join(parts[:size]))
-            with contextlib.suppress(AttributeError):
-                functools.reduce(getattr, parts[size:], module)
-                return True
-            return False
+    with contextlib.suppress(ImportError, AttributeError):
+        pkgutil.resolve_name(name)
+        return True
     return False
 
 

@@ -9,8 +9,9 @@ import math
 from functools import partial
 from pathlib import Path
 
-import gymnasium
+import crowds
 import numpy as np
+import small_envs
 import torch
 from torch import Tensor
 
@@ -217,28 +218,6 @@ def shipped_together(dtype):
 
 # Environments.
 
-SMALL = {
-    "particle_count": 64,
-    "eps": 0.3,
-    "resolution": 16,
-    "render_size": 24,
-    "render_mode": "rgb_array",
-}
-
-OWN = {
-    "npa/Regeneration2D-v0": {"rule": "picture", "seed_pool": 4, "split_damage": False},
-    "npa/PointClassification-v0": {"resolution": None},
-    "npa/Morphogenesis3D-v0": {"seed_radius": 0.2, "view_count": 2, "target": "doughnut"},
-}
-
-
-def small(name, **keywords):
-    """Return keywords of a small environment; None stands for a field that it does not have."""
-    fields = SMALL | {"target": "ring"} | OWN.get(name, {}) | keywords
-    if "Classification" in name or "Texture" in name:
-        fields.pop("target", None)
-    return {key: value for key, value in fields.items() if value is not None}
-
 
 def actions(generator, space):
     """Return random small actions of a space."""
@@ -252,7 +231,7 @@ def floats(info):
 
 def episode(name, steps=12, **keywords):
     """An episode of one environment by seeded actions."""
-    env = gymnasium.make(name, **small(name, **keywords))
+    env = small_envs.make(name, particle_count=64, render_mode="rgb_array", **keywords)
     generator = np.random.default_rng(12)
     observation, info = env.reset(seed=5)
     losses = np.array([floats(info)], np.float32)
@@ -287,19 +266,12 @@ def episode(name, steps=12, **keywords):
 # Environments of several species.
 
 
-def few(task, **keywords):
-    """Return keywords of a small world of several species."""
-    fields = {"eps": 0.3, "max_cycles": 10, "render_size": 24}
-    if "particle_counts" not in keywords:
-        fields["particle_count"] = 48
-    if task in ("co_morphogenesis", "invasion", "symbiosis"):
-        fields["resolution"] = 16
-    return {"task": task, "render_mode": "rgb_array"} | fields | keywords
-
-
 def crowd(module, task, **keywords):
     """An episode of several agents, all at once, by seeded actions."""
-    env = module.parallel_env(**few(task, **keywords))
+    if "particle_counts" not in keywords:
+        keywords = {"particle_count": 48} | keywords
+    fields = crowds.small(task, max_cycles=10, render_mode="rgb_array", **keywords)
+    env = module.parallel_env(**fields)
     generator = np.random.default_rng(14)
     observations, infos = env.reset(seed=5)
     seen, ends = [], []
@@ -385,14 +357,18 @@ SCENES = {
         together, "per_species", None, 4, position_noise=NOISE, memory="recompute"
     ),
     "species-shipped": shipped_together,
-    "env-morphogenesis": partial(episode, MORPHOGENESIS),
+    "env-morphogenesis": partial(episode, MORPHOGENESIS, target="ring"),
     "env-morphogenesis-periodic": partial(
-        episode, MORPHOGENESIS, 6, boundary="periodic", moment_inverse="smooth", reward="particle"
+        episode, MORPHOGENESIS, 6, target="ring", boundary="periodic", moment_inverse="smooth",
+        reward="particle",
     ),
     "env-morphogenesis-noise": partial(
-        episode, MORPHOGENESIS, 6, position_noise=0.01, render_style="states", seed_pool=3
+        episode, MORPHOGENESIS, 6, target="ring", position_noise=0.01, render_style="states",
+        seed_pool=3,
     ),
-    "env-regeneration": partial(episode, REGENERATION),
+    "env-regeneration": partial(
+        episode, REGENERATION, target="ring", seed_pool=4, split_damage=False
+    ),
     "env-texture": partial(episode, TEXTURE, 8),
     "env-texture-shares": partial(episode, TEXTURE, 4, reward="particle"),
     "env-points": partial(episode, POINTS),
@@ -407,7 +383,7 @@ SCENES = {
     "crowd-particles-mixing": partial(crowd, particles_v0, "mixing", particle_count=12),
     "crowd-particles-invasion": partial(crowd, particles_v0, "invasion", particle_count=12),
     "randomness": randomness,
-}
+}  # fmt: skip
 """All scenes by name."""
 
 

@@ -11,15 +11,18 @@ import gc
 import io
 import json
 import os
+import re
 import sys
 import tempfile
 import time
 from functools import partial
 from pathlib import Path
 
+import crowds
 import gymnasium
 import numpy as np
 import scenes as golden
+import small_envs
 import torch
 
 import npa_envs
@@ -31,15 +34,6 @@ from npa_envs.tasks.damage import damage_worlds
 from npa_envs.training.task_of_rule import task_of_rule
 from npa_envs.world import brushes
 
-SMALL = {"particle_count": 61, "eps": 0.3, "resolution": 16, "render_size": 24}
-OWN = {
-    "Pictures2D": {"targets": ("heart", "ring"), "test_targets": ("letter-a",)},
-    "Regeneration2D": {"rule": "picture"},
-    "PointClassification": {"resolution": None},
-    "Morphogenesis3D": {"seed_radius": 0.2, "view_count": 2, "target": "doughnut"},
-}
-GARDEN = {"eps": 0.2, "picture_size": 8, "seed_pool": 2, "grow_steps": 4, "rule_steps": 2}
-SPECIES_TASKS = ("mixing", "segregation", "co_morphogenesis", "invasion", "symbiosis")
 TRAINED = ("morphogenesis2d", "co_morphogenesis2d", "morphogenesis3d", "texture")
 """Tasks of `npa-envs train` besides `point_classification`, whose data are drawn elsewhere."""
 
@@ -145,10 +139,8 @@ def fields_of(name):
     """Return keywords of a small environment."""
     if "Shapeshifter" in name:
         return {"particle_count": 61}
-    if "Gardener" in name or "Shepherd" in name:
-        return GARDEN | {"particle_count": 61, "resolution": 16, "render_size": 24}
-    own = next((fields for word, fields in OWN.items() if word in name), {})
-    return {key: value for key, value in (SMALL | own).items() if value is not None}
+    pool = {"seed_pool": 2} if "Gardener" in name or "Shepherd" in name else {}
+    return small_envs.small(re.sub(r"(Small|Large)-", "-", name), **pool)
 
 
 def drawn(random, space):
@@ -196,9 +188,7 @@ def of_agents(env):
 
 def of_species(task, kind):
     """Several species: a world, a batch, or each particle an agent."""
-    fields = {"task": task, "eps": 0.3, "particle_count": 48, "max_cycles": 5}
-    if task in ("co_morphogenesis", "invasion", "symbiosis"):
-        fields["resolution"] = 16
+    fields = crowds.small(task, particle_count=48, max_cycles=5)
     if kind == "parallel":
         return of_agents(multispecies_v0.parallel_env(**fields))
     if kind == "batch":
@@ -208,7 +198,7 @@ def of_species(task, kind):
 
 def two_gardeners():
     """The keeper and the raider of one garden."""
-    fields = GARDEN | {"particle_count": 61, "resolution": 16, "max_cycles": 5}
+    fields = small_envs.small("npa/Gardener2D-v0", seed_pool=2, max_cycles=5)
     return of_agents(gardeners_v0.parallel_env(**fields))
 
 
@@ -304,7 +294,7 @@ def scenes():
         "kind": {name: partial(of_kind, name) for name in KINDS},
         "env": {name: partial(of_environment, name, None) for name in names},
         "batch": {name: partial(of_environment, name, 2) for name in names},
-        "species": {f"{t}/{k}": partial(of_species, t, k) for t in SPECIES_TASKS for k in kinds},
+        "species": {f"{t}/{k}": partial(of_species, t, k) for t in crowds.TASKS for k in kinds},
         "train": {
             **{task: partial(of_training, task) for task in TRAINED},
             "points": partial(of_training, "point_classification", "--data", "digits"),

@@ -4,22 +4,23 @@ The quick run draws the same few examples each time; the thorough one (marked sl
 and prints what reproduces a failure.
 """
 
+import functools
+
 import torch
 from legal_worlds import (
     allowances,
     clear_of_threshold,
     every,
     perception_allowance,
-    some,
-    with_scale,
-    with_shift,
     within,
+    worlds,
 )
 from worlds import assert_same
 
 import npa_envs
 
-DOUBLE = (torch.float64,)
+double_worlds = functools.partial(worlds, dtypes=(torch.float64,))
+
 GRADIENT_BOUND = 1e-12
 """Largest error of float64 gradients over their largest number, or over 1 (worst seen 3e-15)."""
 ROLLOUT_BOUND = 1e-10
@@ -85,7 +86,7 @@ def assert_moved(w, moved, order=slice(None)):
         alike(gradients(moved, cotangent[:, order]), expected, GRADIENT_BOUND)
 
 
-@every(some())
+@every(worlds)
 def test_fields_perception_and_gradients_follow_the_order_of_particles(w):
     clear_of_threshold(w)
     order = w.permutation()
@@ -95,26 +96,24 @@ def test_fields_perception_and_gradients_follow_the_order_of_particles(w):
     assert_moved(w, moved, order)
 
 
-@every(with_shift())
-def test_perception_and_gradients_do_not_depend_on_the_place(drawn):
-    w, shift = drawn
+@every(worlds)
+def test_perception_and_gradients_do_not_depend_on_the_place(w):
     clear_of_threshold(w)
-    assert_moved(w, w.moved(shift))
+    assert_moved(w, w.moved())
 
 
-@every(with_scale())
-def test_fields_scale_with_lengths_bit_for_bit(drawn):
+@every(worlds)
+def test_fields_scale_with_lengths_bit_for_bit(w):
     """ρ as 1 / length^D, ∇s as 1 / length, ∇ρ as 1 / length^(D+1); s̄ and M not at all."""
-    w, factor = drawn
     dim = w.shape[2]
     powers = (-dim, 0, -1, 0, -1, -1 - dim)
-    for value, answer, power in zip(fields_of(w.scaled(factor)), fields_of(w), powers, strict=True):
-        assert torch.equal(value, answer * factor**power)
+    for value, answer, power in zip(fields_of(w.scaled()), fields_of(w), powers, strict=True):
+        assert torch.equal(value, answer * w.factor**power)
     # Perceived at a larger radius than it was trained at, a larger world looks the same.
-    assert torch.equal(perceive(w.scaled(factor)), perceive(w))
+    assert torch.equal(perceive(w.scaled()), perceive(w))
 
 
-@every(some())
+@every(worlds)
 def test_a_batch_perceives_as_its_worlds_do(w):
     z = perceive(w)
     cotangent = w.normal(*z.shape)
@@ -125,7 +124,7 @@ def test_a_batch_perceives_as_its_worlds_do(w):
         assert_same([value[0] for value in found], [value[k] for value in together])
 
 
-@every(some(dtypes=DOUBLE))
+@every(double_worlds)
 def test_a_rollout_follows_the_order_of_particles(w):
     clear_of_threshold(w)
     rule, order = rule_of(w), w.permutation()
@@ -133,28 +132,26 @@ def test_a_rollout_follows_the_order_of_particles(w):
     assert_near(w, run(w.ordered(order), rule, 1, update_prob=1.0), expected)
 
 
-@every(with_shift(dtypes=DOUBLE))
-def test_a_rollout_does_not_depend_on_the_place(drawn):
-    w, shift = drawn
+@every(double_worlds)
+def test_a_rollout_does_not_depend_on_the_place(w):
     clear_of_threshold(w)
     rule, options = rule_of(w), {"steps": 1, "position_noise": 0.1 * w.eps}
     x, s = run(w, rule, generator=streams(w), **options)
-    moved = run(w.moved(shift), rule, generator=streams(w), **options)
-    assert_near(w, moved, (x + shift.to(x), s))
+    moved = run(w.moved(), rule, generator=streams(w), **options)
+    assert_near(w, moved, (x + w.shift().to(x), s))
 
 
-@every(with_scale())
-def test_a_rollout_does_not_depend_on_the_unit_of_length(drawn):
-    w, factor = drawn
+@every(worlds)
+def test_a_rollout_does_not_depend_on_the_unit_of_length(w):
     rule = rule_of(w, static=w.seed % 3 == 0)
     results = []
-    for world in (w, w.scaled(factor)):
+    for world in (w, w.scaled()):
         results.append(run(world, rule, generator=streams(w), position_noise=0.1 * world.eps))
     (x, s), (scaled_x, scaled_s) = results
-    assert_same((scaled_x, scaled_s), (x * factor, s))
+    assert_same((scaled_x, scaled_s), (x * w.factor, s))
 
 
-@every(some(dtypes=DOUBLE))
+@every(double_worlds)
 def test_a_world_goes_in_a_batch_as_it_goes_alone(w):
     """Up to rounding: a product of matrices may round rows otherwise where there are more."""
     clear_of_threshold(w)
@@ -165,7 +162,7 @@ def test_a_world_goes_in_a_batch_as_it_goes_alone(w):
         assert_near(w, alone, [value[k : k + 1] for value in together])
 
 
-@every(some())
+@every(worlds)
 def test_species_have_a_share_of_the_fields_in_any_order_and_company(w):
     counts, fields, allowed = w.split(2), fields_of(w), allowances(w)
     shares = npa_envs.species_fields(w.x, counts, eps=w.eps, box=w.box)
@@ -181,9 +178,8 @@ def test_species_have_a_share_of_the_fields_in_any_order_and_company(w):
         assert_same([value[0] for value in alone], [value[k] for value in shares])
 
 
-@every(with_scale(dtypes=DOUBLE))
-def test_species_go_their_way_in_any_order_and_unit_of_length(drawn):
-    w, factor = drawn
+@every(double_worlds)
+def test_species_go_their_way_in_any_order_and_unit_of_length(w):
     clear_of_threshold(w)
     counts = w.split(2)
     rules = [rule_of(w, number) for number in range(len(counts))]

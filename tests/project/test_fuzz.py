@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from fuzz_engine import ENGINE
-from fuzz_outer import OUTER
+from fuzz_targets import TARGETS
 from fuzz_values import wrong
 
 from npa_envs import NPAError
@@ -25,13 +24,6 @@ PATIENCE = 30.0
 """No call takes more of the processor's time [s]; other programs' does not count."""
 
 
-TARGETS = ENGINE | OUTER
-"""What is called, by name."""
-
-FIXED = ("method", "kind", "maker", "field", "id")
-"""Arguments that belong to the test, not to what is tested."""
-
-
 def call(seed: int) -> tuple[str, dict[str, Any]]:
     """Return the name of a target and arguments of which one to three are wrong."""
     draw = random.Random(seed)
@@ -39,11 +31,7 @@ def call(seed: int) -> tuple[str, dict[str, Any]]:
     names = list(TARGETS)
     (name,) = draw.choices(names, [TARGETS[n].weight for n in names])
     arguments = TARGETS[name].legal(draw)
-    own = {"name"} if name in ("wrappers", "agents", "TrainConfig") else set()
-    own |= {"task"} if name == "TrainConfig" else set()
-    free = [a for a in arguments if a not in FIXED and a not in own and a != "words"]
-    if name in ("load_rule of a file", "load_config", "damaged files", "npa-envs"):
-        free = []
+    free = [argument for argument in arguments if argument not in TARGETS[name].constant]
     for argument in draw.sample(free, min(len(free), draw.choice((0, 1, 1, 1, 2, 3)))):
         arguments[argument] = wrong(draw, argument, arguments[argument])
     if arguments.get("rule", "") is None:
