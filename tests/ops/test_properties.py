@@ -191,8 +191,8 @@ def test_species_go_their_way_in_any_order_and_unit_of_length(w):
             )
 
     x, s = go(w, w.x, w.s)
-    larger = w.scaled(factor)
-    assert_same(go(larger, larger.x, larger.s), (x * factor, s))
+    larger = w.scaled()
+    assert_same(go(larger, larger.x, larger.s), (x * w.factor, s))
     ends = torch.arange(w.shape[1], device=w.x.device).split(counts)
     order = torch.cat([part.flip(0) for part in ends])
     assert_near(w, go(w, w.x[:, order], w.s[:, order]), (x[:, order], s[:, order]))
