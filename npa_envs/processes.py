@@ -38,10 +38,6 @@ class Slots:
     threads: int = 1
     """CPU threads of each process."""
 
-    def device(self, number: int) -> str:
-        """Return the device of slot `number`, below `jobs`."""
-        return self.devices[number % len(self.devices)]
-
     @property
     def ahead(self) -> bool:
         """Whether the next process starts early, during a run: not on CPUs, which it would slow."""
@@ -104,7 +100,7 @@ def run_children(
                         one = ready.popleft() if ready else next_child()
                     if one is not None:
                         running[number] = one
-                        one.go(slots.device(number))
+                        one.go(slots.devices[number % len(slots.devices)])
                         interruption.check()
                 if not running:
                     return

@@ -1,4 +1,4 @@
-"""A check that a call raises `NPAError` with a certain message."""
+"""Calls that raise `NPAError`, and a check of the message."""
 
 from collections.abc import Callable
 from typing import Any
@@ -12,3 +12,8 @@ def refused(message: str, call: Callable[..., Any], *given: Any, **named: Any) -
     """Check that a call raises `NPAError` with words that match."""
     with pytest.raises(NPAError, match=message):
         call(*given, **named)
+
+
+def calls(function: Callable[..., Any], *args: Any, **defaults: Any) -> Callable[..., Any]:
+    """Return a function that makes calls of a function with some arguments, changed by keywords."""
+    return lambda **options: lambda: function(*args, **defaults | options)

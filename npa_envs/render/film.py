@@ -28,9 +28,6 @@ Frame = NDArray[np.uint8]
 GIF_HIGHEST_RATE = 50
 """Largest number of frames a second of a GIF in players."""
 
-GIF_LONGEST = 655.35
-"""Longest duration of a GIF's frame [s]."""
-
 _PALETTE_SAMPLE = 2**20
 _MARGIN = 8
 
@@ -87,10 +84,10 @@ def write_gif(path: str | Path, frames: Iterable[Frame], fps: float = 25) -> Non
                 duration=durations, loop=0, optimize=False, disposal=1,
             )  # fmt: skip
         except (OverflowError, struct.error) as error:
-            # Pillow merges equal frames into one, whose time has 16 bits.
+            # Pillow merges equal frames into one, whose time [1/100 s] has 16 bits.
             raise NPAError(
-                f"frames may be alike for at most {GIF_LONGEST:.0f} s in a GIF, got more at "
-                f"fps={fps:g}: raise fps, or leave some of them out"
+                f"frames may be alike for at most 655 s in a GIF, got more at fps={fps:g}: "
+                "raise fps, or leave some of them out"
             ) from error
 
 

@@ -4,6 +4,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from refusals import calls
 
 import npa_envs
 from npa_envs import (
@@ -80,11 +81,6 @@ def test_numbers_of_other_libraries_survive_in_a_rule(tmp_path):
     assert all(torch.isfinite(t).all() for t in rollout(rule, X, S, np.int64(2)))
     save_rule(rule, tmp_path / "rule.safetensors")
     assert npa_envs.load_rule(tmp_path / "rule.safetensors").alpha == 0.5
-
-
-def calls(function, *args, **defaults):
-    """A function that makes calls of a function with some arguments, changed by keywords."""
-    return lambda **options: lambda: function(*args, **defaults | options)
 
 
 rule = calls(NPARule)

@@ -7,7 +7,6 @@ import re
 import sys
 import time
 from pathlib import Path
-from types import ModuleType
 from typing import NamedTuple
 
 import gymnasium as gym
@@ -53,15 +52,6 @@ def code_blocks(page: str) -> list[str]:
     return re.findall(r"^```python\n(.*?)^```", text_of(page), re.MULTILINE | re.DOTALL)
 
 
-def script(name: str) -> ModuleType:
-    """Import a script of docs/."""
-    sys.path.insert(0, str(DOCS))
-    try:
-        return importlib.import_module(name)
-    finally:
-        sys.path.remove(str(DOCS))
-
-
 def run_code(page: str, *changes: tuple[str, str], names=None, blocks=slice(None)) -> dict:
     """Run blocks of a page, with changes by regular expressions, and return its names."""
     code = "\n".join(code_blocks(page)[blocks])
@@ -96,7 +86,7 @@ def test_made_pages_are_current(name, capsys):
     if name == "npa_bench_page":
         pytest.importorskip("jsonschema")
         pytest.importorskip("scipy")
-    status = script(f"build_{name}").main(["--check"])
+    status = importlib.import_module(f"build_{name}").main(["--check"])
     assert status == 0, capsys.readouterr().err
 
 
@@ -105,9 +95,9 @@ def test_made_pages_are_current(name, capsys):
 
 def test_the_reference_of_commands_has_every_command_and_task():
     text = text_of("commands")
-    asked = re.findall(r"^```\{command-help\} (.+)$", text, re.MULTILINE)
-    assert asked == re.findall(r"^##+ (.+)$", text, re.MULTILINE)
-    assert sorted(asked) == sorted([*COMMANDS, *(f"train {name}" for name in TRAINED)])
+    helped = re.findall(r"^```\{command-help\} (.+)$", text, re.MULTILINE)
+    assert helped == re.findall(r"^##+ (.+)$", text, re.MULTILINE)
+    assert sorted(helped) == sorted([*COMMANDS, *(f"train {name}" for name in TRAINED)])
 
 
 def test_commands_in_blocks_of_shell_have_the_options_that_they_are_given(capsys):
@@ -117,7 +107,7 @@ def test_commands_in_blocks_of_shell_have_the_options_that_they_are_given(capsys
     for line in re.sub(r"\\\n", " ", "".join(blocks)).splitlines():
         # What follows `--` is for the runs of a sweep.
         words = re.sub(r"#.*| > .*| -- .*", "", line).replace(".venv/bin/", "").split()
-        if words[:1] == ["npa-envs"] and not words[1].startswith("-") and "TASK" not in words:
+        if words[:1] == ["npa-envs"] and words[1:2] and words[1][0] != "-" and "TASK" not in words:
             command = tuple(words[1:3]) if words[1] == "train" else (words[1],)
             options = {word.partition("=")[0] for word in words if word.startswith("-")}
             used[command] = used.get(command, set()) | options

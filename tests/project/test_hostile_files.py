@@ -52,36 +52,23 @@ READERS: dict[str, tuple[str, Callable[[Path], Any]]] = {
 """What reads files, and their suffix."""
 
 
-@pytest.mark.skipif(not hasattr(os, "openpty"), reason="no terminals here")
+@pytest.mark.skipif(not Path("/dev/ptmx").exists(), reason="no terminals here")
 @pytest.mark.parametrize("reader", READERS)
-@pytest.mark.parametrize("device", ["/dev/zero", "/dev/random", "terminal", "pipe"])
+@pytest.mark.parametrize("device", ["/dev/zero", "/dev/random", "/dev/ptmx", "pipe"])
 def test_a_device_is_refused_at_once(tmp_path, reader, device):
     suffix, read = READERS[reader]
-    path, ends = tmp_path / f"device{suffix}", ()
-    if device == "pipe":
-        os.mkfifo(path)
-    elif device == "terminal":
-        # Nobody types: to read from it would block.
-        ends = os.openpty()
-        path.symlink_to(os.ttyname(ends[1]))
-    else:
-        path.symlink_to(device)
-    try:
-        with pytest.raises(NPAError, match="pipe or a device"):
-            read(path)
-    finally:
-        for end in ends:
-            os.close(end)
+    path = tmp_path / f"device{suffix}"
+    # To read from a pipe or a terminal would block.
+    os.mkfifo(path) if device == "pipe" else path.symlink_to(device)
+    with pytest.raises(NPAError, match="pipe or a device"):
+        read(path)
 
 
-@pytest.mark.parametrize("reader", READERS)
+# A first run finds no record.
+@pytest.mark.parametrize("reader", [reader for reader in READERS if reader != "record"])
 @pytest.mark.parametrize("name", ["a\0b", "x" * 300, "~\0", "\ud800"])
 def test_names_that_no_file_has_are_refused(tmp_path, reader, name):
     suffix, read = READERS[reader]
-    if reader == "record":
-        # A first run finds none.
-        assert read(tmp_path / name) is None
-        return
     with pytest.raises(NPAError) as caught:
         read(tmp_path / f"{name}{suffix}")
     assert len(str(caught.value)) < 1200

@@ -10,10 +10,7 @@ from npa_envs.envs import multispecies_v0, particles_v0
 from npa_envs.registration import ALL, SPECIES_SIZES
 from npa_envs.wrappers import NumericInfos
 
-pytestmark = [
-    pytest.mark.filterwarnings("ignore::DeprecationWarning"),
-    pytest.mark.filterwarnings("ignore::UserWarning"),
-]
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::UserWarning")
 DEATH = {"deaths": ((1, 3),), "max_cycles": 6}
 
 
@@ -32,19 +29,17 @@ def test_numeric_infos_have_the_same_entries_at_reset_and_in_every_step():
 
 
 @pytest.mark.parametrize(
-    ("module", "keywords"),
+    ("module", "keywords", "each"),
     [
-        (multispecies_v0, {"particle_counts": (6, 6)}),
-        (multispecies_v0, {"particle_counts": (6, 6)} | DEATH),
-        (multispecies_v0, {"particle_counts": (5, 7), "each": True}),
-        (particles_v0, {"particle_count": 9} | DEATH),
+        (multispecies_v0, {"particle_counts": (6, 6)}, False),
+        (multispecies_v0, {"particle_counts": (6, 6)} | DEATH, False),
+        (multispecies_v0, {"particle_counts": (5, 7)}, True),
+        (particles_v0, {"particle_count": 9} | DEATH, False),
     ],
 )
-def test_torchrl_finds_the_specs_right_and_rolls_out(module, keywords):
+def test_torchrl_finds_the_specs_right_and_rolls_out(module, keywords, each):
     torchrl = pytest.importorskip("torchrl.envs")
-    keywords = dict(keywords)
-    groups = {"group_map": torchrl.MarlGroupMapType.ONE_GROUP_PER_AGENT}
-    groups = groups if keywords.pop("each", False) else {}
+    groups = {"group_map": torchrl.MarlGroupMapType.ONE_GROUP_PER_AGENT} if each else {}
     fields = small("mixing", **keywords)
     env = torchrl.PettingZooWrapper(
         NumericInfos(module.parallel_env(**fields)), use_mask="deaths" in keywords, **groups

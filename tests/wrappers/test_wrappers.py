@@ -7,7 +7,6 @@ import torch
 from gymnasium import wrappers
 from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers import vector
-from gymnasium.wrappers.vector import DictInfoToList, RecordEpisodeStatistics
 from small_envs import assert_batch_of_singles, assert_same, begun
 from wrapped_envs import ACTIONS, STEPS, batched, policy, single
 
@@ -145,8 +144,8 @@ def test_infos_and_goals_of_a_damaged_garden_are_those_after_the_damage():
     observation, *_, info = env.step(env.action_space.sample())
     assert info["loss_damage"] > 0.0
     assert info["lost"] == pytest.approx(float(observation["achieved_goal"][2]), rel=1e-5)
-    vector = gym.make_vec("npa/Shepherd2DSmall-v0", num_envs=2, **keywords)
-    envs = begun(VectorDamageEvents(vector, "1:clump:0.6"))
+    worlds = gym.make_vec("npa/Shepherd2DSmall-v0", num_envs=2, **keywords)
+    envs = begun(VectorDamageEvents(worlds, "1:clump:0.6"))
     envs.action_space.seed(0)
     observations, *_, infos = envs.step(envs.action_space.sample())
     lost = observations["achieved_goal"][:, 2]
@@ -245,12 +244,12 @@ def test_rows_are_the_particles_of_the_worlds_in_order(reward, output):
 
 
 def test_gymnasiums_wrappers_lie_over_rows_and_close_them():
-    rows = begun(RecordEpisodeStatistics(ParticleRows(worlds_of())))
+    rows = begun(vector.RecordEpisodeStatistics(ParticleRows(worlds_of())))
     for _ in range(STEPS):
         *_, infos = rows.step(np.zeros((128, ACTIONS), np.float32))
     assert infos["episode"]["l"].tolist() == [STEPS] * 128
     envs = worlds_of()
-    listed = DictInfoToList(ParticleRows(envs))
+    listed = vector.DictInfoToList(ParticleRows(envs))
     assert listed.reset(seed=0)[1] == [{}] * 128
     assert not envs.closed
     listed.close()

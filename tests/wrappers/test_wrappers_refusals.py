@@ -68,6 +68,13 @@ REFUSALS = [
     (lambda: NormalizePerception(FlattenObservation(single())), "normalise before other wrappers"),
     (lambda: NormalizePerception(single()).load_state_dict({}), "missing statistic"),
     (lambda: NormalizePerception(single()).load_state_dict(STATE), r"shape \(49,\), got \(3,\)"),
+    *(
+        (
+            lambda cls=cls: started(cls, batched()).step(np.zeros((3, 64, ACTIONS), np.float32)),
+            f"vector.{cls.__name__.removeprefix('Torch')}",
+        )
+        for cls in (TorchRecordEpisodeStatistics, TorchNormalizeObservation, TorchNormalizeReward)
+    ),
     (lambda: TorchRecordEpisodeStatistics(batched(), 0), "buffer_length must be"),
     (lambda: TorchNormalizeObservation(batched(), epsilon=0.0), "epsilon must be"),
     (lambda: TorchNormalizeReward(batched(), gamma=1.5), r"gamma must lie in \[0, 1\]"),
@@ -139,16 +146,6 @@ SB3_REFUSALS = [
 def test_a_mistake_with_rows_of_stable_baselines_is_named(call, message):
     pytest.importorskip("stable_baselines3")
     refused(message, call, npa_envs.wrappers)
-
-
-@pytest.mark.parametrize(
-    "wrapper", [TorchRecordEpisodeStatistics, TorchNormalizeObservation, TorchNormalizeReward]
-)
-def test_numpy_environments_are_sent_to_gymnasium(wrapper):
-    def use():
-        started(wrapper, batched()).step(np.zeros((3, 64, ACTIONS), np.float32))
-
-    refused(f"vector.{wrapper.__name__.removeprefix('Torch')}", use)
 
 
 def test_an_unknown_wrapper_is_an_attribute_error():

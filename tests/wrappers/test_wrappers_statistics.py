@@ -4,9 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from gymnasium.wrappers.vector import (
-    RecordEpisodeStatistics,
-)
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from small_envs import begun
 from wrapped_envs import ACTIONS, STEPS, batched, policy, single
 

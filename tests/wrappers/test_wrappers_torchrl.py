@@ -15,11 +15,9 @@ from torchrl.collectors import Collector  # noqa: E402
 
 from npa_envs.wrappers import NPATorchRLEnv, VectorNormalizePerception  # noqa: E402
 
-pytestmark = [
-    pytest.mark.filterwarnings("ignore::DeprecationWarning"),
-    pytest.mark.filterwarnings("ignore::FutureWarning"),
-    pytest.mark.filterwarnings("ignore::UserWarning"),
-]
+pytestmark = pytest.mark.filterwarnings(
+    "ignore::DeprecationWarning", "ignore::FutureWarning", "ignore::UserWarning"
+)
 IDS = ["npa/Morphogenesis2D-v0", "npa/Regeneration2D-v0", "npa/PointClassification-v0"]
 TORCH = {"output": "torch", "autoreset_mode": "disabled"}
 ACTING = TensorDictModule(policy, ["observation"], ["action"])
