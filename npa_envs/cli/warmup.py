@@ -26,8 +26,8 @@ def main(arguments: Sequence[str]) -> int:
     options = common.parse_options(WarmupOptions, "warmup", arguments)
     import torch
 
+    from npa_envs.ops import warmup
     from npa_envs.runtime import kernel_cache_folder
-    from npa_envs.world.warmup import warmup
 
     if not options.space_dims or not options.dtypes or not set(options.space_dims) <= {2, 3}:
         raise NPAError(

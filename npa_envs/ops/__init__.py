@@ -6,6 +6,7 @@ from npa_envs.ops.pictures.gaussians import GaussianPictures, render_gaussians
 from npa_envs.ops.pictures.splat import periodic_splat, splat
 from npa_envs.ops.species import SpeciesFields, perceive_species, species_fields
 from npa_envs.ops.update import apply_actions
+from npa_envs.ops.warmup import warmup
 from npa_envs.ops.world_mean import world_mean
 
 __all__ = [
@@ -24,5 +25,6 @@ __all__ = [
     "render_gaussians",
     "species_fields",
     "splat",
+    "warmup",
     "world_mean",
 ]

@@ -19,20 +19,20 @@ def draw(
     episodes: Tensor,
     steps: Tensor,
     number: int,
-    kind: str,
+    distribution: str,
     count: int,
     dtype: torch.dtype,
     bound: int,
 ) -> Tensor:
     """Return random numbers of each world, [B, count]; `number` is the draw's index in its step.
 
-    Kinds are "uniform" in [0, 1), with 24 or 53 random bits; standard "normal", always finite;
-    "bernoulli", ones with a probability of bound / `WORD_COUNT`; and "integers" in [0, bound).
+    Distributions are "uniform" in [0, 1), with 24 or 53 random bits; standard "normal", always
+    finite; "bernoulli", ones with a probability of bound / `WORD_COUNT`; "integers" in [0, bound).
     """
     values = keys.new_empty(keys.shape[0], count, dtype=dtype)
     if values.numel() == 0:
         return values
-    kernel, per_thread = draw_kernel(kind, scalar_type(dtype))
+    kernel, per_thread = draw_kernel(distribution, scalar_type(dtype))
     size = values.shape[0], -(-count // per_thread)
     launch(kernel, size, keys.device, bound, number, keys, episodes, steps, values)
     return values

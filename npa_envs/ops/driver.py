@@ -96,9 +96,9 @@ def _follows_kernel(stream: int) -> bool:
         return False
     if count.value != 1:
         return False
-    kind = ctypes.c_int(-1)
-    failed = driver.cuGraphNodeGetType(ctypes.c_void_p(nodes[0]), ctypes.byref(kind))
-    return not failed and kind.value == KERNEL_NODE
+    node_type = ctypes.c_int(-1)
+    failed = driver.cuGraphNodeGetType(ctypes.c_void_p(nodes[0]), ctypes.byref(node_type))
+    return not failed and node_type.value == KERNEL_NODE
 
 
 class DriverLaunch:

@@ -141,8 +141,9 @@ def _description(tensor: Tensor, array_type: Any) -> Any:
 
 def _type_of(argument: Any) -> Any:
     """Return the type of a kernel's argument: a `wp.array` also for `wp.array2d[...]`."""
-    kind = argument.type
-    return wp.array(dtype=kind.dtype, ndim=kind.ndim) if hasattr(kind, "ndim") else kind
+    declared = argument.type
+    is_array = hasattr(declared, "ndim")
+    return wp.array(dtype=declared.dtype, ndim=declared.ndim) if is_array else declared
 
 
 class _StructArgument:
@@ -176,8 +177,8 @@ class _Arguments:
         where = warp_device(device)
         types = [_type_of(argument) for argument in kernel.adj.args]
         values = [
-            _description(value, kind) if isinstance(value, Tensor) else value
-            for value, kind in zip(arguments, types, strict=True)
+            _description(value, declared) if isinstance(value, Tensor) else value
+            for value, declared in zip(arguments, types, strict=True)
         ]
         with kernel_lock, quiet_warp(), _first_load(kernel, device):
             self._launch = wp.launch(
@@ -211,10 +212,10 @@ class _Arguments:
             self._launch.params_addr = self._addresses
             self._driven = DriverLaunch(self._launch, device, self._addresses)
 
-    def _setter(self, name: str, kind: Any, value: Any) -> Any:
+    def _setter(self, name: str, declared: Any, value: Any) -> Any:
         """Return the function that sets an argument; None for a number or vector, set directly."""
-        if isinstance(kind, wp.array):
-            return _ArrayArgument(getattr(self._memory, name), kind).set
+        if isinstance(declared, wp.array):
+            return _ArrayArgument(getattr(self._memory, name), declared).set
         if hasattr(value, "__ctype__"):
             return _StructArgument(getattr(self._memory, name)).set
         return None
@@ -228,8 +229,8 @@ class _Arguments:
             value = arguments[k]
             if value != last[k]:
                 last[k] = value
-                kind = self._launch.kernel.adj.args[k].type
-                number = kind(*value) if isinstance(value, tuple) else value
+                declared = self._launch.kernel.adj.args[k].type
+                number = declared(*value) if isinstance(value, tuple) else value
                 setattr(self._memory, self._names[k], number)
 
     def set_address(self, index: int, tensor: Tensor) -> None:

@@ -402,9 +402,9 @@ def _gather_by_tiles(plan: KernelPlan, saved: SavedPerception, bar: Tensor) -> T
     )
     # The kernel multiplies by one norm; cotangents of smoothed states get the ratio of norms first.
     norm = plan.domain.spiky_norm if state_gradient else plan.domain.smoothing_norm
-    kinds = 1 + plan.space_dim * state_gradient
+    sum_count = 1 + plan.space_dim * state_gradient
     entries = plan.row_capacity * plan.group_count + 1
-    cotangents = bar.new_empty(entries * kinds * plan.width // THREAD_CHANNELS, THREAD_CHANNELS)
+    cotangents = bar.new_empty(entries * sum_count * plan.width // THREAD_CHANNELS, THREAD_CHANNELS)
     launch(
         kernels.unscale_cotangents,
         entries * plan.width // THREAD_CHANNELS,

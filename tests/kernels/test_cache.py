@@ -1,11 +1,11 @@
 """The cache of compiled kernels, shared by processes that start together."""
 
-import multiprocessing
 import os
 
 import pytest
 import torch
 import warp as wp
+from processes import on_ranks
 
 from npa_envs.ops.launch import launch
 from npa_envs.runtime import start_warp
@@ -16,40 +16,29 @@ def double(values: wp.array(dtype=wp.float32)):
     values[wp.tid()] *= 2.0
 
 
-def load_and_launch(barrier, pipe):
-    compiled = 0
-    compile_module = wp.Module._compile
+def compile_and_launch():
+    """Return how many modules this process compiles for a launch, and the launch's results."""
+    compile_module, compiled = wp.Module._compile, []
 
     def counted(*arguments, **options):
-        nonlocal compiled
-        fresh = compile_module(*arguments, **options)
-        compiled += bool(fresh)
-        return fresh
+        compiled.append(compile_module(*arguments, **options))
+        return compiled[-1]
 
     wp.Module._compile = counted
     values = torch.ones(3)
-    barrier.wait()
     launch(double, 3, torch.device("cpu"), values)
-    pipe.send((compiled, values.tolist()))
-    os._exit(0)
+    return sum(map(bool, compiled)), values.tolist()
 
 
 @pytest.mark.skipif(os.name != "posix", reason="needs locks of files and fork")
 def test_of_four_processes_that_start_together_one_compiles(tmp_path, monkeypatch):
     start_warp()
-    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
-    context = multiprocessing.get_context("fork")
-    barrier = context.Barrier(4)
-    pipes = [context.Pipe(duplex=False) for _ in range(4)]
-    made = [context.Process(target=load_and_launch, args=(barrier, w)) for _, w in pipes]
-    for process in made:
-        process.start()
-    results = [reader.recv() for reader, _ in pipes]
-    for process in made:
-        process.join()
-    assert sorted(compiled for compiled, _ in results) == [0, 0, 0, 1]
-    assert [values for _, values in results] == [[2.0, 2.0, 2.0]] * 4
-    assert len(list(tmp_path.glob("*.lock"))) == 1
+    cache = tmp_path / "cache"
+    cache.mkdir()
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(cache))
+    results = on_ranks(4, compile_and_launch, tmp_path)
+    assert sorted(results) == [(count, [2.0, 2.0, 2.0]) for count in (0, 0, 0, 1)]
+    assert len(list(cache.glob("*.lock"))) == 1
 
 
 def test_a_cache_without_room_for_locks_is_used_all_the_same(tmp_path, monkeypatch):

@@ -22,8 +22,8 @@ from npa_envs.kernels.cuda.splat import sort_small_splats
 from npa_envs.kernels.pictures.blending import block_kernels
 from npa_envs.kernels.pictures.errors import gather_errors
 from npa_envs.kernels.portable.episodes import update_episodes
+from npa_envs.ops import warmup
 from npa_envs.ops.launch import launched
-from npa_envs.world.warmup import warmup
 
 
 def perception(*switches: Any, **more: Any) -> wp.Kernel:
@@ -73,8 +73,8 @@ def test_cuda_kernels_compile(name: str, tmp_path: Path) -> None:
 
 def test_every_source_file_is_read() -> None:
     folder = Path(native.__file__).parent
-    found = {path.relative_to(folder).as_posix() for path in folder.rglob("*.cuh")}
-    assert found == {*native.BOTH_DEVICES, *native.CUDA_ONLY}
+    files = {path.relative_to(folder).as_posix() for path in folder.rglob("*.cuh")}
+    assert files == {*native.BOTH_DEVICES, *native.CUDA_ONLY}
 
 
 TURING = 75

@@ -77,9 +77,9 @@ def test_particles_follow_the_formula(masked, noisy, moving, world, dtype):
     mask = random_mask(x, 0.5 if masked else 1.0)
     noise = 0.01 * torch.randn_like(x) if noisy else None
     idle = mask == 0
-    given = torch.where(idle[..., None], torch.nan, action)
+    actions = torch.where(idle[..., None], torch.nan, action)
     options = {"noise": noise, "moving": moving}
-    *moved, diverged = applied(given, x, s, mask=mask if masked else None, **options)
+    *moved, diverged = applied(actions, x, s, mask=mask if masked else None, **options)
     assert_near(moved, formula(action, x, s, mask, **options), dtype)
     assert diverged.tolist() == [0] * B
     resting = x if noise is None else x + noise

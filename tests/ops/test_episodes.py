@@ -40,23 +40,23 @@ def worlds(device):
     }
 
 
-def expected(rules, given):
+def expected(rules, arguments):
     """Numbers, flags and endings after a step."""
-    parts, fled = given["parts"], given["diverged"].bool()
+    parts, fled = arguments["parts"], arguments["diverged"].bool()
     lost = fled & (rules.on_divergence != "ignore")
     ended = fled & (rules.on_divergence == "terminate")
     loss = parts[0] + parts[1] + parts[2]
-    loss = torch.where(lost, torch.maximum(loss, given["first_loss"]), loss)
-    step = given["elapsed"] + 1
-    success = (loss <= given["success_loss"]) & ~lost
+    loss = torch.where(lost, torch.maximum(loss, arguments["first_loss"]), loss)
+    step = arguments["elapsed"] + 1
+    success = (loss <= arguments["success_loss"]) & ~lost
     late = step >= rules.last_step if rules.last_step else torch.zeros_like(fled)
-    improvement = given["numbers"][1] - loss
+    improvement = arguments["numbers"][1] - loss
     reward = improvement
     if rules.rewarded_step is not None:
         reward = torch.where(success | ended | (step == rules.rewarded_step), -loss, 0.0)
-    fallen = given["numbers"][2 : 2 + PARTS] - parts
+    fallen = arguments["numbers"][2 : 2 + PARTS] - parts
     flags = torch.stack((success | ended, late, success, fled))
-    unfit = ~improvement.isfinite() | (given["broken"].bool() & ~lost)
+    unfit = ~improvement.isfinite() | (arguments["broken"].bool() & ~lost)
     bits = SUCCESS * success.int() + DIVERGED * fled.int() + TIME_LIMIT * late.int()
     return torch.cat((reward[None], loss[None], parts, fallen)), flags, bits + NOT_FINITE * unfit
 
@@ -73,23 +73,23 @@ def expected(rules, given):
     ],
 )
 def test_worlds_are_judged_as_torch_would(rules, happened, device):
-    given = worlds(device)
-    before = {name: value.clone() for name, value in given.items()}
+    arguments = worlds(device)
+    before = {name: value.clone() for name, value in arguments.items()}
     endings = torch.zeros(B + 1, dtype=torch.uint8, device=device)
     judge = EpisodeUpdate(
         rules,
         enabled=torch.full((1,), happened, dtype=torch.uint8, device=device),
         endings=endings,
-        **{name: given[name] for name in given.keys() - {"parts", "broken"}},
+        **{name: arguments[name] for name in arguments.keys() - {"parts", "broken"}},
     )
-    judge(given["parts"], given["broken"])
+    judge(arguments["parts"], arguments["broken"])
     if happened:
         numbers, flags, bits = expected(rules, before)
-        assert torch.equal(given["elapsed"], before["elapsed"] + 1)
+        assert torch.equal(arguments["elapsed"], before["elapsed"] + 1)
     else:
         numbers, flags, bits = before["numbers"], before["flags"], torch.zeros_like(endings[:-1])
-        assert torch.equal(given["elapsed"], before["elapsed"])
-    assert torch.equal(given["numbers"].nan_to_num(7.5), numbers.nan_to_num(7.5))
-    assert torch.equal(given["flags"], flags)
+        assert torch.equal(arguments["elapsed"], before["elapsed"])
+    assert torch.equal(arguments["numbers"].nan_to_num(7.5), numbers.nan_to_num(7.5))
+    assert torch.equal(arguments["flags"], flags)
     assert torch.equal(endings[:-1], bits.byte())
     assert bool(endings[-1]) == happened

@@ -26,5 +26,5 @@ def test_tensors_with_and_without_strides_take_turns(device):
     expected = drawn(keys, episodes, episodes)
     assert len(expected.unique()) == expected.numel()
     for chosen in SELECTIONS * 2:
-        found = drawn(keys[chosen], episodes[chosen], episodes[chosen].contiguous())
-        assert torch.equal(found, expected[chosen])
+        results = drawn(keys[chosen], episodes[chosen], episodes[chosen].contiguous())
+        assert torch.equal(results, expected[chosen])

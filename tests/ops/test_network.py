@@ -84,10 +84,10 @@ def test_network_and_its_gradients_equal_float64(sizes, row_count, device):
     inputs = (rows, folded.hidden_weight, folded.output_weight)
     cotangent = torch.randn(row_count, folded.output_weight.shape[0], device=device)
     cotangent *= 10.0 ** torch.linspace(-4.0, 2.0, row_count, device=device)[:, None]
-    got = pulled_back(lambda x, *w: fold_weights(*w)(x), inputs, cotangent)
+    actual = pulled_back(lambda x, *w: fold_weights(*w)(x), inputs, cotangent)
     wide = [value.double() for value in inputs]
     want = pulled_back(plain_update, wide, cotangent.double())
-    for value, answer, tolerance in zip(got, want, TOLERANCES, strict=True):
+    for value, answer, tolerance in zip(actual, want, TOLERANCES, strict=True):
         assert relative_error(value, answer) < tolerance
 
 
@@ -143,9 +143,9 @@ def test_weights_folded_without_gradients_still_have_them(rule):
     with torch.no_grad():
         weights = rule.folded()
     rows = random_rows(rule, weights, 100).requires_grad_()
-    (got,) = torch.autograd.grad(weights(rows).sum(), rows)
+    (actual,) = torch.autograd.grad(weights(rows).sum(), rows)
     (want,) = torch.autograd.grad(rule.folded()(rows).sum(), rows)
-    assert torch.equal(got, want)
+    assert torch.equal(actual, want)
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
@@ -175,6 +175,6 @@ def test_a_compiled_network_equals_the_eager_one(rule, device):
         return rule.folded()(rows).square().sum()
 
     compiled = torch.compile(squares, backend="aot_eager", fullgraph=True)
-    got = torch.autograd.grad(compiled(rows), list(rule.parameters()))
+    actual = torch.autograd.grad(compiled(rows), list(rule.parameters()))
     want = torch.autograd.grad(squares(rows), list(rule.parameters()))
-    assert_same(got, want)
+    assert_same(actual, want)

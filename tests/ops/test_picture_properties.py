@@ -131,9 +131,9 @@ class Scene(Drawing):
     def drawn(self):
         """Return image and alpha, and the gradients of a sum of the image."""
         leaves = [tensor.clone().requires_grad_() for tensor in self.particles]
-        found = render_gaussians(*leaves, self.cameras)
-        bars = torch.autograd.grad(found.image, leaves, self.cotangent)
-        return [found.image.detach(), found.alpha.detach()], bars
+        results = render_gaussians(*leaves, self.cameras)
+        bars = torch.autograd.grad(results.image, leaves, self.cotangent)
+        return [results.image.detach(), results.alpha.detach()], bars
 
     def scaled(self, factor):
         motions = self.cameras.world_to_camera.clone()

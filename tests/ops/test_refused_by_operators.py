@@ -53,33 +53,37 @@ def lens(*numbers):
 
 
 def acting(**change):
-    given = {"action": torch.zeros(2, 4, 6), "x": torch.zeros(2, 4, 2), "s": torch.zeros(2, 4, 4)}
-    given |= {"diverged": torch.zeros(2, dtype=torch.uint8), "mask": None, "noise": None}
+    kwargs = {
+        "action": torch.zeros(2, 4, 6),
+        "x": torch.zeros(2, 4, 2),
+        "s": torch.zeros(2, 4, 4),
+    }
+    kwargs |= {"diverged": torch.zeros(2, dtype=torch.uint8), "mask": None, "noise": None}
     limits = Limits(1.0, position=50.0, state=20.0)
-    given |= {"physics": Physics(2, 4, 1.0, 1.0, max_displacement=0.1, limits=limits)}
-    apply_actions(**given | {"enabled": None} | change)
+    kwargs |= {"physics": Physics(2, 4, 1.0, 1.0, max_displacement=0.1, limits=limits)}
+    apply_actions(**kwargs | {"enabled": None} | change)
 
 
 def seeing(**change):
-    given = {"means": torch.zeros(1, 2, 3), "scales": torch.full((1, 2, 3), 0.1)}
-    given |= {"quaternions": torch.ones(1, 2, 4), "opacities": torch.ones(1, 2)}
-    given |= {"colours": torch.zeros(1, 2, 3), "cameras": orbit(1, width=8, height=8)}
-    render_gaussians(**given | change)
+    kwargs = {"means": torch.zeros(1, 2, 3), "scales": torch.full((1, 2, 3), 0.1)}
+    kwargs |= {"quaternions": torch.ones(1, 2, 4), "opacities": torch.ones(1, 2)}
+    kwargs |= {"colours": torch.zeros(1, 2, 3), "cameras": orbit(1, width=8, height=8)}
+    render_gaussians(**kwargs | change)
 
 
 def drawing(**change):
     for draw in (splat, periodic_splat):
-        given = {"x": torch.zeros(1, 2, 2), "colour": torch.zeros(1, 2, 3), "resolution": 24}
+        kwargs = {"x": torch.zeros(1, 2, 2), "colour": torch.zeros(1, 2, 3), "resolution": 24}
         with pytest.raises(NPAError) as caught:
-            draw(**given | {"pixel_size": 0.11} | change)
+            draw(**kwargs | {"pixel_size": 0.11} | change)
     raise caught.value
 
 
 def judging(**change):
-    given = {"x": torch.zeros(1, 2, 2), "states": torch.zeros(1, 2, 4)}
-    given |= {"target": torch.zeros(8, 8, 4), "goal": torch.zeros(2)} | change
-    worlds = [given.pop(name) for name in ("x", "states", "target")]
-    picture_losses(*worlds, **{"shift": 0.5, "pixel_size": 0.1} | given)
+    kwargs = {"x": torch.zeros(1, 2, 2), "states": torch.zeros(1, 2, 4)}
+    kwargs |= {"target": torch.zeros(8, 8, 4), "goal": torch.zeros(2)} | change
+    worlds = [kwargs.pop(name) for name in ("x", "states", "target")]
+    picture_losses(*worlds, **{"shift": 0.5, "pixel_size": 0.1} | kwargs)
 
 
 def perceiving(word):

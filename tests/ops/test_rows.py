@@ -96,6 +96,8 @@ PLACED = {
     "a line": (203, None, lambda x, _: x * x.new_tensor((20.0, 1e-3))),
     "another line": (203, None, lambda x, _: x * x.new_tensor((1e-3, 20.0))),
     "a wide world": (203, None, lambda x, _: x * 30.0),
+    # Too large to be sorted by a block on CUDA, or by a thread of a CPU.
+    "a large world": (5000, None, lambda x, _: x * 4.0),
     "many lines": (1000, None, lambda x, _: x * x.new_tensor((16.0, 2.0))),
     "a point": (200, None, lambda x, _: torch.full_like(x, 0.3)),
 }

@@ -49,21 +49,21 @@ def random_triangles(width, height):
 
 def test_each_pixel_shows_the_nearest_triangle():
     width, height = 11, 7
-    given = random_triangles(width, height)
-    found = nearest_triangles(*given, width=width, height=height)
-    expected = brute_force(*given, width, height)
-    assert len(found[..., :3].flatten(0, 2).unique(dim=0)) > 50
-    torch.testing.assert_close(found, expected, rtol=1e-6, atol=1e-6)
+    arguments = random_triangles(width, height)
+    results = nearest_triangles(*arguments, width=width, height=height)
+    expected = brute_force(*arguments, width, height)
+    assert len(results[..., :3].flatten(0, 2).unique(dim=0)) > 50
+    torch.testing.assert_close(results, expected, rtol=1e-6, atol=1e-6)
     # Turned round, a triangle looks the same.
-    place, nearness, colours, faces, seen = given
+    place, nearness, colours, faces, seen = arguments
     again = nearest_triangles(
         place, nearness, colours, faces.flip(1), seen, width=width, height=height
     )
-    torch.testing.assert_close(again, found, rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(again, results, rtol=1e-9, atol=1e-9)
 
 
 def test_triangles_without_area_and_cameras_that_see_none_leave_pictures_empty():
     place, nearness, colours, faces, seen = random_triangles(4, 4)
     for flat, visible in ((place[:, :1].expand_as(place), seen), (place, seen & False)):
-        found = nearest_triangles(flat, nearness, colours, faces, visible, width=4, height=4)
-        assert not found.any()
+        results = nearest_triangles(flat, nearness, colours, faces, visible, width=4, height=4)
+        assert not results.any()

@@ -40,12 +40,6 @@ def test_gradients_are_right_to_the_second_order(device):
     assert torch.autograd.gradgradcheck(lambda v: world_mean(v) ** 2, values)
 
 
-def test_it_can_be_compiled(device):
-    values = numbers(3, 33, 2, dtype=torch.float32, device=device)
-    compiled = torch.compile(lambda v: world_mean(v) * 2.0, backend="aot_eager", fullgraph=True)
-    assert torch.equal(compiled(values), world_mean(values) * 2.0)
-
-
 def test_means_of_a_batch_are_right_after_a_single_world_of_any_stride(device):
     """A first dimension of 1 says nothing of where the next world would be."""
     values = torch.rand(2, 37, 3, generator=torch.Generator().manual_seed(0)).to(device)

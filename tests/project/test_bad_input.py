@@ -21,7 +21,7 @@ from npa_envs.agents.learning import Budget, Problem
 from npa_envs.agents.learning import train as learn
 from npa_envs.envs import multispecies_v0
 from npa_envs.measure.quality import scores
-from npa_envs.ops import orbit, periodic_splat, splat
+from npa_envs.ops import orbit, periodic_splat, splat, warmup
 from npa_envs.render import write_gif
 from npa_envs.tasks.damage import damage_worlds, parse_damage
 from npa_envs.tasks.seeds import uniform_ball, uniform_box
@@ -29,7 +29,6 @@ from npa_envs.tasks.texture import TextureConfig
 from npa_envs.training import preset, train
 from npa_envs.web.export import export_web
 from npa_envs.world.brushes import inject, wipe_state
-from npa_envs.world.warmup import warmup
 from npa_envs.wrappers import RowPolicy, TorchNormalizeReward
 
 X, X3, S = torch.zeros(1, 4, 2), torch.zeros(1, 4, 3), torch.zeros(1, 4, 16)

@@ -14,9 +14,8 @@ from worlds import (
 )
 
 import npa_envs
-from npa_envs.ops import launch
+from npa_envs.ops import launch, warmup
 from npa_envs.world.execute import MIN_STATIC
-from npa_envs.world.warmup import warmup
 
 STEPS = 5
 

@@ -1,4 +1,4 @@
-"""Splats of small worlds on CUDA: a block sorts those of a world, in one launch instead of seven.
+"""Splats of small worlds on CUDA: a block sorts those of a world, in one launch.
 
 The same footprints in the same order as in `pictures/splat.py`. The block also computes its world's
 mean. If worlds are few, several blocks sort the same world, and each writes a slice.

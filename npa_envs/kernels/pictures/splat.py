@@ -7,8 +7,9 @@ the picture. They are products of a row's weight and a column's.
 On CUDA n threads gather a tile of pixels: each sums every n-th particle around the tile, and gets a
 row of the sums. Particles are sorted by cells, the tiles that contain their patch's centre, with an
 origin r pixels before the picture: the particles that cover tiles along a row of cells are then one
-contiguous run. Small worlds are sorted by `kernels/cuda/splat.py`. On a CPU a thread draws a world,
-particle by particle. Either way the order of a pixel's sum depends only on its own world.
+contiguous run. Small worlds are sorted by `kernels/cuda/splat.py`, large ones by torch. On a CPU a
+thread draws a world, particle by particle. Either way the order of a pixel's sum depends only on
+its own world.
 """
 
 import math

@@ -1,0 +1,188 @@
+"""Compilation of kernels before they are needed."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable
+from typing import Any
+
+import torch
+
+from npa_envs.checks import DTYPES, entries
+from npa_envs.devices import check_device
+from npa_envs.errors import NPAError, shown
+from npa_envs.ops.backend import SHARED_WORLD
+from npa_envs.ops.draws import draw
+from npa_envs.ops.episodes import EpisodeRules, EpisodeUpdate
+from npa_envs.ops.equivariance import MIXED_VECTORS, VectorForm, read_rows, steer_rows
+from npa_envs.ops.network import arrange_weights, run_network
+from npa_envs.ops.perceive import build_neighbours, perceive, perceive_rows
+from npa_envs.ops.physics import Limits, Physics
+from npa_envs.ops.pictures.cameras import orbit
+from npa_envs.ops.pictures.gaussians import render_gaussians
+from npa_envs.ops.pictures.losses import picture_losses
+from npa_envs.ops.pictures.splat import splat
+from npa_envs.ops.pictures.triangles import nearest_triangles
+from npa_envs.ops.static import prepare_static, static_rows
+from npa_envs.ops.update import ActedWorlds, PreparedActions, update_particles
+from npa_envs.ops.world_mean import world_mean
+
+
+def warmup(
+    device: str | torch.device = "cpu",
+    *,
+    space_dims: Iterable[int] = (2,),
+    dtypes: Iterable[torch.dtype] = (torch.float32,),
+    state_dim: int = 16,
+) -> None:
+    """Compile and load every kernel that worlds of these kinds need; cached on disk by Warp.
+
+    Args:
+        device: Device to compile for.
+        space_dims: Space dimensions, 2 or 3 each.
+        dtypes: `torch.float32`, `torch.float64` or both.
+        state_dim: State channels C; kernels serve groups of 4, 8 or 16 channels.
+
+    Raises:
+        NPAError: There is no such device, or no such kernels.
+    """
+    device = check_device(device)
+    space_dims = _chosen("space_dims", space_dims, (2, 3))
+    dtypes = _chosen("dtypes", dtypes, DTYPES)
+    keys = torch.zeros(1, dtype=torch.int64, device=device)
+    counts = torch.zeros(1, dtype=torch.int32, device=device)
+    streams = keys, counts, counts, 0
+    draw(*streams, "bernoulli", 1, torch.uint8, 1)
+    draw(*streams, "integers", 1, torch.int64, 2)
+    _warm_judgement(counts)
+    for dtype in dtypes:
+        draw(*streams, "uniform", 1, dtype, 0)
+        draw(*streams, "normal", 1, dtype, 0)
+        world_mean(torch.zeros(1, 1, 1, dtype=dtype, device=device))
+        for space_dim in space_dims:
+            x = torch.zeros(1, 2, space_dim, dtype=dtype, device=device, requires_grad=True)
+            s = torch.zeros(1, 2, state_dim, dtype=dtype, device=device, requires_grad=True)
+            _pull_back(perceive(x, s, 0.1, detach_positions=False))
+            limits = Limits(1.0, 1.0, 1.0, 1.0)
+            physics = Physics(space_dim, state_dim, 0.1, 0.1, max_displacement=0.1, limits=limits)
+            # Small, medium and large worlds run different kernels.
+            for count in (2, SHARED_WORLD, SHARED_WORLD + 1):
+                worlds = [value.detach()[:, :1].expand(-1, count, -1) for value in (x, s)]
+                build_neighbours(*worlds, physics).perceive()
+                _warm_steps(*worlds, physics)
+                if space_dim == 2:
+                    target, middle = x.new_zeros(8, 8, 4), x.new_zeros(2)
+                    picture_losses(*worlds, target, goal=middle, shift=0.0, pixel_size=0.1)
+            _warm_static(x, s, physics)
+            _warm_network(x, physics)
+            _warm_invariants(x, state_dim)
+            _warm_actions(x, s, physics)
+            if space_dim == 2:
+                _pull_back(splat(x, x.new_zeros(1, 2, 3), resolution=8, pixel_size=0.1))
+            else:
+                _warm_views(x)
+
+
+def _chosen(name: str, value: Any, known: tuple[Any, ...]) -> list[Any]:
+    """Return the values given, one or several, after checking that each is known."""
+    chosen = entries(value)
+    if not chosen or not all(value in known for value in chosen):
+        raise NPAError(f"{name} must be some of {known}, got {shown(value)}: name one or both")
+    return chosen
+
+
+def _warm_judgement(elapsed: torch.Tensor) -> None:
+    number, flag = elapsed.float(), elapsed.byte()
+    judge = EpisodeUpdate(
+        EpisodeRules(None, None, "terminate"),
+        enabled=flag,
+        diverged=flag,
+        first_loss=number,
+        success_loss=number,
+        elapsed=elapsed.clone(),
+        numbers=number.new_zeros(4, 1),
+        flags=flag.new_zeros(4, 1, dtype=torch.bool),
+        endings=flag.new_zeros(2),
+    )
+    judge(number[None])
+
+
+def _warm_steps(x: torch.Tensor, s: torch.Tensor, physics: Physics) -> None:
+    """Run perception and update as in rollouts, of all particles and of those in a mask."""
+    size = {"row_capacity": x.shape[1], "row_width": physics.perception_dim + 1}
+    every = torch.ones(x.shape[:2], dtype=torch.uint8, device=x.device)
+    for mask, gradients in itertools.product((None, every), (False, True)):
+        worlds = x, s.clone().requires_grad_(gradients)
+        rows, maps = perceive_rows(*worlds, physics, mask=mask, **size)
+        path_length = x.new_zeros(x.shape[:2])
+        update = rows[:, : physics.action_dim]
+        _, states, _ = update_particles(update, *worlds, path_length, maps, physics)
+        if gradients:
+            _pull_back(states)
+
+
+def _warm_static(x: torch.Tensor, s: torch.Tensor, physics: Physics) -> None:
+    """Run perception of static worlds, of all particles and of those in a mask."""
+    static = prepare_static(x, physics)
+    mask = torch.ones(x.shape[:2], dtype=torch.uint8, device=x.device)
+    size = {"row_capacity": x.shape[1], "row_width": physics.perception_dim + 1}
+    for active in (None, *static_rows(static, x.detach(), [mask], x.shape[1])):
+        rows, _ = perceive_rows(x, s, physics, mask=None, static=static, static_rows=active, **size)
+        _pull_back(rows)
+
+
+def _warm_network(x: torch.Tensor, physics: Physics) -> None:
+    """Run the fused network where it supports the sizes, with and without displacements."""
+    width = physics.perception_dim + 1
+    for out in (physics.action_dim, physics.state_dim):
+        shapes = (1, width + -width % 4), (128, width + -width % 4), (out + -out % 4, 128)
+        rows, hidden, update = (x.new_zeros(shape).requires_grad_() for shape in shapes)
+        for gradients in (False, True):
+            with torch.set_grad_enabled(gradients):
+                arranged = arrange_weights(hidden, update)
+                if arranged is not None:
+                    weights = torch.cat((hidden.flatten(), update.flatten()))
+                    updates = run_network(rows, weights, update.shape, arranged)
+        if arranged is not None:
+            _pull_back(updates)
+
+
+def _warm_invariants(x: torch.Tensor, state_dim: int) -> None:
+    """Run the vector kernels of equivariant rules."""
+    space_dim = x.shape[2]
+    for chiral in (False, True)[: 4 - space_dim]:
+        form = VectorForm(space_dim, 2 * state_dim, state_dim + 1, MIXED_VECTORS, chiral)
+        rows = x.new_zeros(1, form.perception_dim + 1).requires_grad_()
+        mixing = x.new_zeros(form.perceived, form.mixed).requires_grad_()
+        mixed, inputs = read_rows(rows, mixing, form, form.input_dim + 1)
+        signs = x.new_ones(form.gate_count)
+        _pull_back(steer_rows(inputs, mixed, signs, form.input_dim))
+
+
+def _warm_views(x: torch.Tensor) -> None:
+    """Draw worlds, and meshes as targets, by cameras."""
+    cameras = orbit(1, width=16, height=16)
+    scales, colours = x.new_ones(x.shape), x.new_zeros(*x.shape[:2], 4, 3)
+    turns = x.new_ones(*x.shape[:2], 4)
+    pictures = render_gaussians(x, scales, turns, x.new_ones(x.shape[:2]), colours, cameras.to(x))
+    _pull_back(pictures.image)
+    corners = torch.zeros(1, 3, dtype=torch.float64, device="cpu")
+    nearest_triangles(
+        corners[..., None].expand(-1, -1, 2),
+        corners,
+        corners[0, :, None].expand(-1, 3),
+        torch.arange(3, device="cpu")[None],
+        corners[:, :1] == 0.0,
+        width=1,
+        height=1,
+    )
+
+
+def _warm_actions(x: torch.Tensor, s: torch.Tensor, physics: Physics) -> None:
+    enabled, diverged = torch.ones(2, 1, dtype=torch.uint8, device=x.device)
+    worlds = ActedWorlds(x.detach().clone(), s.detach().clone(), None, None, enabled, diverged)
+    PreparedActions(worlds, physics)(x.new_zeros(*x.shape[:2], physics.action_dim))
+
+
+def _pull_back(value: torch.Tensor) -> None:
+    torch.autograd.backward(value.sum())
