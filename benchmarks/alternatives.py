@@ -826,10 +826,9 @@ def main() -> int:
         suite="alternatives",
         command=facts["command"],
         commit=facts["commit"],
-        device=device,
         threads=arguments.threads,
+        session=session,
         tables=tables,
-        left_out=session.left_out,
     )
     print(report.text())
     print("\ntimes faster:", *(f"  {name}: {value:.3g}" for name, value in held.items()), sep="\n")

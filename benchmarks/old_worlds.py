@@ -16,7 +16,7 @@ import torch.nn.functional as F
 from recipe_arms import SEEDS
 from torch import Tensor
 
-from npa_envs.measure.accuracy import endurance as long_runs
+from npa_envs.measure.accuracy import rule_checks as long_runs
 from npa_envs.measure.quality import RuleRunner, healing
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule

@@ -47,7 +47,7 @@ from side_by_side import iterate_together, on, stream_of
 
 from npa_envs.errors import NPAError
 from npa_envs.files import write_bytes
-from npa_envs.measure.accuracy import endurance
+from npa_envs.measure.accuracy import rule_checks
 from npa_envs.measure.plots import new_figure, number_plainly, png
 from npa_envs.measure.quality import RuleRunner, evaluate, healing
 from npa_envs.measure.record import machine, write_record
@@ -423,7 +423,7 @@ def main() -> None:
         own.add_argument("--pictures", type=Path, required=True, help="folder of PNG files")
         own.add_argument("--device", default="cpu")
         own.add_argument("--preset", default="paper", help="what the world is like")
-    long.add_argument("--steps", type=int, default=endurance.STEPS)
+    long.add_argument("--steps", type=int, default=rule_checks.STEPS)
     heal.add_argument("--count", type=int, default=32, help="seeds")
     heal.add_argument(
         "--steps", type=int, nargs=2, default=[1024, 500], help="before and after the damage"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -88,22 +87,15 @@ def main(arguments: Sequence[str]) -> int:
             enough=record.time_limit(options.max_seconds),
         )
         tables = suites.SUITES[name](session)
-    report = suites.BenchReport(
-        suite=name,
-        command=shlex.join(["npa-envs", "bench", *arguments]),
-        commit=options.commit or record.current_commit(),
-        device=device,
-        threads=options.threads,
-        tables=tables,
-        left_out=session.left_out,
-    )
+    command = record.command_text("bench", arguments)
+    commit = options.commit or record.current_commit()
+    report = suites.BenchReport(name, command, commit, options.threads, session, tables)
     print(report.text())
     if folder is not None:
         path = folder / f"{name}_{device.type}.json"
         write_text(path, report.json())
-        done = [f"wrote {path}"]
+        print(f"wrote {path}")
         if options.plots:
-            place = path.with_name(f"{path.stem}_*.png")
-            done += plots.write_plots(lambda: suites.pictures(tables), place, "plots")
-        print("\n".join(done))
+            pictures = path.with_name(f"{path.stem}_*.png")
+            print(*plots.write_plots(lambda: suites.pictures(tables), pictures, "plots"), sep="\n")
     return 0

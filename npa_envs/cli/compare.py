@@ -7,7 +7,6 @@ import itertools
 import json
 import math
 import re
-import shlex
 import sys
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -86,10 +85,10 @@ def main(arguments: Sequence[str]) -> int:
     from npa_envs.agents.comparison.npa_bench import SUITES, check_rows, write_rows
     from npa_envs.agents.comparison.report import write_pictures, write_table
     from npa_envs.agents.comparison.run import held_records, run_jobs
-    from npa_envs.measure.record import without_folders
+    from npa_envs.measure.record import command_text
     from npa_envs.processes import Slots
 
-    command = shlex.join(["npa-envs", "compare", *without_folders(arguments, "--out")])
+    command = command_text("compare", arguments, "--out")
     plan = make_plan(options)
     folder = common.writable_folder(options.out)
     # Read before any run, so that a record of other settings is refused at once.
@@ -205,8 +204,8 @@ def _budgets(options: CompareOptions) -> dict[Axis, float]:
     seconds, steps = options.seconds, options.particle_steps
     if options.quick and steps is None and seconds is None:
         steps = QUICK_STEPS
-    given: dict[Axis, float | None] = {"seconds": seconds, "particle-steps": steps}
-    budgets = {axis: value for axis, value in given.items() if value is not None}
+    limits: dict[Axis, float | None] = {"seconds": seconds, "particle-steps": steps}
+    budgets = {axis: limit for axis, limit in limits.items() if limit is not None}
     if not budgets:
         raise NPAError(
             "a comparison needs a budget: give --seconds 60, --particle-steps 1e8 or both"

@@ -15,9 +15,6 @@ from typing import NamedTuple
 EXTRAS = ("envs", "sb3", "human", "view", "bench", "evolution", "points", "meshes", "minari")
 """The extras of `all`."""
 
-OLDEST_DRIVERS = {12: 525, 13: 580}
-"""First NVIDIA driver that supports each version of CUDA (NVIDIA, CUDA Compatibility)."""
-
 
 @dataclass(frozen=True)
 class DoctorOptions:
@@ -66,14 +63,7 @@ def examine() -> list[DoctorLine]:
         DoctorLine("python", f"{platform.python_version()} ({sys.executable})"),
         DoctorLine("system", f"{system}, {os.cpu_count()} cores"),
     ]
-    for check in (
-        _packages,
-        _torch_devices,
-        _warp_devices,
-        _kernel_cache,
-        _films_and_screen,
-        _emoji_font,
-    ):
+    for check in (_packages, _torch_devices, _warp_devices, _kernel_cache, _films_and_screen):
         try:
             lines += check()
         except Exception as error:
@@ -149,19 +139,18 @@ def _no_cuda(built: str | None) -> DoctorLine:
     except (OSError, subprocess.SubprocessError, IndexError):
         fix = "slow for large worlds: use the presets fast and tiny, which are made for CPUs"
         return DoctorLine("cuda", "no NVIDIA GPU, or no driver for it", fix, optional=True)
-    oldest = OLDEST_DRIVERS.get(int((built or "0").partition(".")[0]), 0)
     if built is None:
         why = "this torch is a build for CPUs alone"
         fix = "pip uninstall torch, then install its CUDA build: https://pytorch.org/get-started"
-    elif _numbers(driver) < (oldest,):
-        why = f"driver {driver} is too old for CUDA {built}"
-        fix = f"install NVIDIA's driver {oldest} or newer, or a torch for an older CUDA"
     elif (hidden := os.environ.get("CUDA_VISIBLE_DEVICES")) is not None:
         why = f"CUDA_VISIBLE_DEVICES is '{hidden}'"
         fix = "unset CUDA_VISIBLE_DEVICES, or name the GPU there"
     else:
-        why = f"torch cannot use it (driver {driver})"
-        fix = 'see what python -c "import torch; torch.zeros(1).cuda()" says; often a reboot helps'
+        why = f"torch, built for CUDA {built}, cannot use it (driver {driver})"
+        fix = (
+            'see what python -c "import torch; torch.zeros(1).cuda()" says; often a newer driver '
+            "or a reboot helps"
+        )
     return DoctorLine("cuda", f"{name} is idle: {why}", fix)
 
 
@@ -203,15 +192,6 @@ def _films_and_screen() -> list[DoctorLine]:
     )
     text = "found" if screen else "none"
     return [ffmpeg, DoctorLine("screen", text, None if screen else fix, optional=True)]
-
-
-def _emoji_font() -> list[DoctorLine]:
-    from npa_envs.tasks.targets.emoji import find_emoji_fonts
-
-    fonts = find_emoji_fonts()
-    fix = "for emoji as targets: apt install fonts-noto-color-emoji"
-    text = str(fonts[0].path) if fonts else "none"
-    return [DoctorLine("emoji font", text, None if fonts else fix, optional=True)]
 
 
 def has_screen() -> bool:

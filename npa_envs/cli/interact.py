@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -20,9 +20,9 @@ from npa_envs.measure.interaction import (
     InteractionSettings,
     RuleUnderTest,
     heat_map,
-    phase_diagram,
 )
 from npa_envs.measure.plots import write_plots
+from npa_envs.measure.record import table_text
 from npa_envs.render import write_filmstrip
 from npa_envs.rule.files import load_rule, rule_digest, shipped_rules
 from npa_envs.training.task_of_rule import task_of_rule
@@ -47,8 +47,7 @@ class InteractOptions(common.RunOptions, InteractionSettings):
     loss on its own particles, together and alone; how much both mix; how far its centroid moves.
     "cooperates": the loss falls by more than the margin; "disrupted": it rises by more; "mixes":
     the mixing index is 0.25 or more. Densities of each rule are divided by its own particles. The
-    folder gets a JSON file, a heat map, a filmstrip of each pair, and phase diagrams if there are
-    several ratios or radii. A stopped run continues.
+    folder gets a JSON file, a heat map, and a filmstrip of each pair. A stopped run continues.
     """
 
     rules: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RULE")] = ()
@@ -80,9 +79,8 @@ def main(arguments: Sequence[str]) -> int:
             f"rules must be two or more without itself, got {rules[0].name}: name another one, "
             "or leave out --no-itself"
         )
-    settings = {own.name: getattr(options, own.name) for own in fields(InteractionSettings)}
     with common.StepBar(None, show=options.progress) as bar:
-        encounters = Encounters(rules, InteractionSettings(**settings), bar.advance)
+        encounters = Encounters(rules, options, bar.advance)
         folder = common.writable_folder(options.out)
         record = InteractionRecord(_facts(encounters, rules), folder / "interactions.json").read()
         done = {(row.rule, row.beside) for row in record.rows}
@@ -96,30 +94,19 @@ def main(arguments: Sequence[str]) -> int:
             write_filmstrip(strip, list(frames.values()), list(frames), columns=columns)
             record.add(*rows)
 
-    def phases() -> dict[str, bytes]:
-        return {
-            name: phase_diagram(
-                [row for row in record.rows if (row.rule, row.beside) == (a.name, b.name)]
-            )
-            for name, (a, b) in pairs.items()
-        }
-
-    print(record.table())
+    print(table_text(record.rows))
     print(f"wrote {record.path} and a filmstrip of each pair")
-    plots = write_plots(
-        lambda: {"": heat_map(record.rows)}, folder / "interactions.png", "heat map"
-    )
-    if len(options.ratios) > 1 or len(options.eps_factors) > 1:
-        plots += write_plots(phases, folder / "phases-*.png", "phase diagrams")
-    print("\n".join(plots))
+    path = folder / "interactions.png"
+    print("\n".join(write_plots(lambda: {"": heat_map(record.rows)}, path, "heat map")))
     return 0
 
 
 def _facts(encounters: Encounters, rules: Sequence[RuleUnderTest]) -> dict[str, Any]:
     """Return what the figures depend on."""
-    facts = asdict(encounters.settings)
+    settings = encounters.settings
+    facts = {f.name: getattr(settings, f.name) for f in fields(InteractionSettings)}
     del facts["first_seed"], facts["seed_count"]
-    facts |= {"seeds": encounters.settings.seeds, "particle_count": encounters.particle_count}
+    facts |= {"seeds": settings.seeds, "particle_count": encounters.particle_count}
     weights = {rule.name: rule_digest(rule.rule) for rule in rules}
     return {**plain_numbers(facts), "rules": weights}
 

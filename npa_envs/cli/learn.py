@@ -114,9 +114,9 @@ def run(options: LearnOptions, ranks: Ranks) -> int:
                 flush=True,
             )
 
-    given = common.named_values("options", options.options)
+    kwargs = common.named_values("options", options.options)
     if options.method == "shac" and options.worlds is not None:
-        given.setdefault("world_count", options.worlds)
+        kwargs.setdefault("world_count", options.worlds)
     stopped: list[bool] = []
     budget = Budget(seconds=options.seconds, particle_steps=None if steps is None else int(steps))
     train(
@@ -132,7 +132,7 @@ def run(options: LearnOptions, ranks: Ranks) -> int:
         out=options.out,
         resume=options.resume,
         overwrite=options.overwrite,
-        **given,
+        **kwargs,
     )
     if ranks.first:
         end = "stopped; the same arguments with --resume continue" if stopped else "finished"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shlex
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -53,7 +52,7 @@ def main(arguments: Sequence[str]) -> int:
     options = common.parse_options(RecordOptions, "record", arguments)
     common.check_numbers(options, episodes=1, worlds=1)
     from npa_envs.agents.evaluation import policy_in
-    from npa_envs.measure.record import without_folders
+    from npa_envs.measure.record import command_text
     from npa_envs.wrappers.minari import ROOT, record_episodes, spec_of, write_dataset
 
     problem = problem_of(options)
@@ -76,7 +75,7 @@ def main(arguments: Sequence[str]) -> int:
             spec_of(problem.env_id, dict(problem.keywords), problem.episode_steps),
             episodes(),
             algorithm=options.policy,
-            description=shlex.join(["npa-envs", "record", *without_folders(arguments, "--root")]),
+            description=command_text("record", arguments, "--root"),
         )
     print(f"{options.episodes} episodes, mean return {sum(returns) / len(returns):.3f}: {folder}")
     return 0

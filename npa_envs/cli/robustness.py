@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -47,9 +46,9 @@ def main(arguments: Sequence[str]) -> int:
     """Measure, print and write."""
     options = common.parse_options(RobustnessOptions, "robustness", arguments)
     from npa_envs.files import write_text
-    from npa_envs.measure.accuracy.endurance import task_name
+    from npa_envs.measure.accuracy.rule_checks import task_name
     from npa_envs.measure.plots import write_plots
-    from npa_envs.measure.record import measured_facts, time_limit, without_folders
+    from npa_envs.measure.record import command_text, measured_facts, time_limit
     from npa_envs.measure.robustness import study
     from npa_envs.measure.robustness.trials import PLANS, RuleTrial, quick_plan
     from npa_envs.rule.files import load_rule, rule_digest, shipped_rules
@@ -78,7 +77,7 @@ def main(arguments: Sequence[str]) -> int:
             folder and folder / f"robustness_{name}.json",
             rule=name,
             done=False,
-            command=shlex.join(["npa-envs", "robustness", *without_folders(arguments, "--out")]),
+            command=command_text("robustness", arguments, "--out"),
         ).read()
     with common.measuring(options, len(names), "rule") as bar:
         for name, record in records.items():

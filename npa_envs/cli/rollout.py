@@ -41,20 +41,6 @@ class RolloutCommand(common.RuleOptions):
     seed: int = 0
     """Randomness, 0 to 2^63 - 1; the same seed gives the same film."""
 
-    def __post_init__(self) -> None:
-        """Check the numbers; raises NPAError."""
-        for name in ("steps", "every"):
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise NPAError(f"{name} must be at least 1, got {value}")
-        if not 0 <= self.seed < 2**63:
-            raise NPAError(f"seed must be in [0, 2^63), got {self.seed}: try 0")
-        from npa_envs.render.colours import background_colour
-        from npa_envs.render.film import GIF_HIGHEST_RATE, check_rate
-
-        check_rate(self.fps, highest=GIF_HIGHEST_RATE)
-        background_colour(self.background)
-
 
 def main(arguments: Sequence[str]) -> int:
     """Grow, film and write; return 0."""
@@ -62,6 +48,8 @@ def main(arguments: Sequence[str]) -> int:
     import torch
 
     from npa_envs.measure.quality import measure
+    from npa_envs.render.colours import background_colour
+    from npa_envs.render.film import GIF_HIGHEST_RATE, check_rate
     from npa_envs.render.world_film import SCREEN, WorldFilm, film_world, write_3d_world
     from npa_envs.rule.files import load_rule
     from npa_envs.tasks.damage import parse_damage
@@ -69,6 +57,11 @@ def main(arguments: Sequence[str]) -> int:
     from npa_envs.training.run import stop_flag
     from npa_envs.training.task_of_rule import task_for_film, task_of_rule
 
+    common.check_numbers(options, steps=1, every=1)
+    if not 0 <= options.seed < 2**63:
+        raise NPAError(f"seed must be in [0, 2^63), got {options.seed}: try 0")
+    check_rate(options.fps, highest=GIF_HIGHEST_RATE)
+    background_colour(options.background)
     device = options.checked_device()
     damages = [parse_damage(text) for texts in options.damage for text in texts]
     after = [damage for damage in damages if damage.step >= options.steps]
@@ -125,6 +118,5 @@ def main(arguments: Sequence[str]) -> int:
             resolution=options.resolution or SCREEN,
             background=options.background,
         )
-    for path in paths:
-        print(f"wrote {path}")
+    print("\n".join(f"wrote {path}" for path in paths))
     return 0

@@ -51,7 +51,7 @@ def main(arguments: Sequence[str]) -> int:
     from npa_envs.measure.record import time_limit
 
     enough = time_limit(options.max_seconds)
-    world = SearchWorld(**{own.name: getattr(options, own.name) for own in fields(SearchWorld)})
+    world = SearchWorld(**{f.name: getattr(options, f.name) for f in fields(SearchWorld)})
     least = options.batch_size * world.particle_steps
     if not least <= options.budget < float("inf"):
         raise NPAError(

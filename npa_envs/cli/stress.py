@@ -65,19 +65,15 @@ def main(arguments: Sequence[str]) -> int:
         path = common.writable_folder(options.out) / name
     facts = measured_facts(device, options.commit, quick=options.quick, seed=options.seed)
     record = suite.StressRecord(facts, path, [check.name for check in checks]).read()
-    weights = suite.rule_weights(chosen)
-    record.drop_other_rules(weights)
-    done = {entry.name for entry in record.rows if entry.done}
-    before = sum(check.name in done for check in chosen)
-    if before:
-        print(f"{before} of {len(chosen)} checks were done before")
+    done = sum(map(record.is_done, chosen))
+    if done:
+        print(f"{done} of {len(chosen)} checks were done before")
     with common.measuring(options, len(chosen), "check") as bar:
         suite.run_checks(
             chosen,
             suite.CheckSession(device, quick=options.quick, seed=options.seed),
             record,
             max_seconds=options.max_seconds,
-            weights=weights,
             progress=bar.advance,
         )
     print(record.text())

@@ -74,10 +74,10 @@ class SweepRun(Child):
         """Start it on a device."""
         self.start_time = time.perf_counter()
         self.folder.mkdir(parents=True, exist_ok=True)
-        own = ("--out", str(self.folder), "--device", device, "--resume", "auto", "--no-progress")
+        where = ("--out", str(self.folder), "--device", device)
         with (self.folder / OUTPUT).open("wb") as output:
             self.process = subprocess.Popen(
-                [*PROGRAM, *self.arguments, *own],
+                [*PROGRAM, *self.arguments, *where, "--resume", "auto", "--no-progress"],
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=output,
@@ -127,12 +127,12 @@ class SweepRun(Child):
 
 def main(arguments: Sequence[str]) -> int:
     """Run what is missing, print and write; return 1 if a run failed."""
-    given = list(arguments)
-    split = given.index("--") if "--" in given else len(given)
-    options = common.parse_options(SweepOptions, "sweep", given[:split])
+    words = list(arguments)
+    split = words.index("--") if "--" in words else len(words)
+    options = common.parse_options(SweepOptions, "sweep", words[:split])
     common.check_numbers(options, jobs=1, threads=1)
     folder = common.writable_folder(options.out)
-    runs = combinations(options.over, given[split + 1 :], folder, options.threads)
+    runs = combinations(options.over, words[split + 1 :], folder, options.threads)
     mine = part_of(runs, options.part, lambda run: run.folder.name)
     waiting = [run for run in mine if not run.done]
     slots = Slots(options.devices, options.jobs or len(options.devices), options.threads)
@@ -169,15 +169,15 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def combinations(
-    over: Sequence[str], common: Sequence[str], folder: Path = Path(), threads: int = 1
+    over: Sequence[str], task_words: Sequence[str], folder: Path = Path(), threads: int = 1
 ) -> list[SweepRun]:
-    """Return a run for each combination of values NAME=A,B,C, with a task and common options."""
+    """Return a run for each combination of values NAME=A,B,C, with a task and its options."""
     from npa_envs.training import TASKS
 
-    if not common or common[0] not in TASKS:
-        hint = suggest(common[0], TASKS) if common else ", ".join(TASKS)
+    if not task_words or task_words[0] not in TASKS:
+        hint = suggest(task_words[0], TASKS) if task_words else ", ".join(TASKS)
         raise NPAError(f"the arguments after -- must begin with a task of npa-envs train: {hint}")
-    used = [_option(word.partition("=")[0]) for word in common if word.startswith("--")]
+    used = [_option(word.partition("=")[0]) for word in task_words if word.startswith("--")]
     values: dict[str, list[str]] = {}
     for word in over:
         name, _, listed = word.partition("=")
@@ -196,9 +196,9 @@ def combinations(
     runs = []
     for one in itertools.product(*values.values()):
         chosen = dict(zip(values, one, strict=True))
-        own = [word for option, value in chosen.items() for word in (f"--{option}", value)]
+        varied = [word for option, value in chosen.items() for word in (f"--{option}", value)]
         name = ",".join(f"{option}={quote(value, safe='')}" for option, value in chosen.items())
-        runs.append(SweepRun(chosen, [*common, *own], folder / name, threads))
+        runs.append(SweepRun(chosen, [*task_words, *varied], folder / name, threads))
     return runs
 
 

@@ -118,11 +118,9 @@ def _check_preset(
         and any(fields.get(field) != value for fields in presets.values())
     ]
     if others:
-        more = f" and {len(others) - 3} more" if len(others) > 3 else ""
         raise NPAError(
             f"preset must be the one that the run in {shown(str(folder.path))} was begun with, "
-            f"but {name!r} differs from it ({', '.join(others[:3])}{more} there): leave --preset "
-            "out"
+            f"but {name!r} differs from it ({', '.join(others)} there): leave --preset out"
         )
 
 

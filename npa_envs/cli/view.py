@@ -118,9 +118,9 @@ def world_maker(options: ViewOptions, device: torch.device) -> Callable[[], Live
         raise NPAError(
             f"{name} is for environments, got --{name} with a rule or a run: leave it out"
         )
-    given: dict[str, Any] = {"device": device, "seed": options.seed}
-    given["particle_count"] = options.particle_count
+    kwargs: dict[str, Any] = {"device": device, "seed": options.seed}
+    kwargs["particle_count"] = options.particle_count
     folder = Path(options.what)
     if folder.is_dir() and any((folder / name).exists() for name in RUN_FILES):
-        return lambda: RunWorld(folder, **given)
-    return lambda: RuleWorld(options.what, **given)
+        return lambda: RunWorld(folder, **kwargs)
+    return lambda: RuleWorld(options.what, **kwargs)

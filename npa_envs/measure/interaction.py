@@ -183,6 +183,7 @@ class Encounters:
         )
         """Particles of both rules together."""
         self._progress = progress
+        self._frame_steps = [round(time * settings.steps) for time in FRAME_TIMES]
         self._alone: dict[tuple[str, int, float], tuple[Tensor, Tensor]] = {}
         """Losses [B] and centroids [B, 2] by rule, number of particles and radius factor."""
         for other in rules:
@@ -214,28 +215,29 @@ class Encounters:
             settings.eps_factors, settings.ratios, settings.distances
         ):
             counts = self.counts(ratio)
-            losses_alone, centroids_alone = self._grown_alone(first, counts[0], factor)
+            key = first.name, counts[0], factor
+            if key not in self._alone:
+                *_, (_, *grown) = self._grow([first], counts[:1], 0.0, factor)
+                self._alone[key] = self._measured(first, counts[0], *grown)
+            losses_alone, centroids_alone = self._alone[key]
             radius = "" if factor == 1.0 else f"eps x {factor:g}, "
-            for step, now in self._grow([first, second], counts, distance, factor):
+            for step, *worlds in self._grow([first, second], counts, distance, factor):
                 if step in self._frame_steps:
                     # The picture is centred between the two seeds.
-                    frame = draw_worlds(
-                        now.x[:1],
-                        now.s[:1],
+                    frames[f"{radius}d {distance:g}, r {ratio:g}, step {step}"] = draw_worlds(
+                        worlds[0][:1],
+                        worlds[1][:1],
                         centre=(0.5 * distance, 0.0),
                         resolution=160,
                         pixel_size=0.5 * math.sqrt(4.0 / self.particle_count),
                         half_width=1.2 + 0.5 * distance,
                     )[0]
-                    frames[f"{radius}d {distance:g}, r {ratio:g}, step {step}"] = frame
-                worlds = now
-            x = worlds.x[:, : counts[0]]
-            losses = self._losses(first, counts[0], worlds)
+            losses, centroids = self._measured(first, counts[0], *worlds)
             alone, together = losses_alone.mean().item(), losses.mean().item()
             change = together / alone if alone > 0.0 else math.inf
-            mixings = mixing_index(worlds.x, counts, eps=factor * first.rule.eps0)
+            mixings = mixing_index(worlds[0], counts, eps=factor * first.rule.eps0)
             mixing = mixings.mean().item()
-            moved = (x.mean(dim=1) - centroids_alone).norm(dim=-1)
+            moved = (centroids - centroids_alone).norm(dim=-1)
             row = InteractionRow(
                 first.name, second.name, distance, ratio,
                 alone, together, change, mixing, moved.mean().item(),
@@ -246,47 +248,38 @@ class Encounters:
             rows.append(row)
         return rows, frames
 
-    def _grown_alone(self, rule: RuleUnderTest, count: int, factor: float) -> tuple[Tensor, Tensor]:
-        key = rule.name, count, factor
-        if key not in self._alone:
-            *_, (_, worlds) = self._grow([rule], (count,), 0.0, factor)
-            self._alone[key] = self._losses(rule, count, worlds), worlds.x.mean(dim=1)
-        return self._alone[key]
-
     @staticmethod
-    def _losses(rule: RuleUnderTest, count: int, worlds: _Grown) -> Tensor:
-        """Return the metric of the first `count` particles, [B], infinite if diverged."""
-        losses = _resized(rule, count).metric(worlds.x[:, :count], worlds.s[:, :count])
-        return losses.masked_fill(worlds.diverged, math.inf)
-
-    @property
-    def _frame_steps(self) -> set[int]:
-        return {round(time * self.settings.steps) for time in FRAME_TIMES}
+    def _measured(
+        rule: RuleUnderTest, count: int, x: Tensor, s: Tensor, diverged: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return metric [B], infinite if diverged, and centroids of the first `count` particles."""
+        x = x[:, :count]
+        losses = _resized(rule, count).metric(x, s[:, :count])
+        return losses.masked_fill(diverged, math.inf), x.mean(dim=1)
 
     def _grow(
         self,
         rules: Sequence[RuleUnderTest],
-        counts: tuple[int, ...],
+        counts: Sequence[int],
         distance: float,
         factor: float,
-    ) -> Iterator[tuple[int, _Grown]]:
-        """Grow one or two species from their seeds; yield the step and worlds.
+    ) -> Iterator[tuple[int, Tensor, Tensor, Tensor]]:
+        """Grow one or two species; yield the step, positions, states, and diverged worlds, [B].
 
         The first is seeded at the origin and has the same random stream as alone; the second is
         seeded at `distance` along the first axis. Worlds that diverge stay as they were, so that
         the others can be measured.
         """
         settings = self.settings
-        device = rules[0].rule.hidden.weight.device
-        random = WorldRandom(settings.seeds, device=device)
+        weight = rules[0].rule.hidden.weight
+        random = WorldRandom(settings.seeds, device=weight.device)
         streams = (random, random.substream(StreamId.SPECIES))
         species = [
-            _resized(rule, count).seed(settings.seed_count, generator=stream, device=device)
+            _resized(rule, count).seed(settings.seed_count, generator=stream, device=weight.device)
             for rule, count, stream in zip(rules, counts, streams, strict=False)
         ]
         for k, (x, *_) in enumerate(species):
             x[..., 0] += k * distance
-        weight = rules[0].rule.hidden.weight
         x = torch.cat([worlds.x for worlds in species], dim=1).to(weight)
         s = torch.cat([worlds.s for worlds in species], dim=1).to(weight)
         diverged = torch.zeros(len(x), dtype=torch.bool, device=x.device)
@@ -307,19 +300,11 @@ class Encounters:
             x, s = Particles(x, s).where(broken, Particles(new_x, new_s))[:2]
             diverged = diverged | broken
             self._progress(step - before)
-            yield step, _Grown(x, s, diverged)
+            yield step, x, s, diverged
 
 
 def _resized(rule: RuleUnderTest, particle_count: int) -> Task:
     return rule.task.resized(particle_count).for_rule(rule.rule)
-
-
-class _Grown(NamedTuple):
-    """Worlds, and which of them have diverged, bool, [B]."""
-
-    x: Tensor
-    s: Tensor
-    diverged: Tensor
 
 
 MAX_CHANGE = 4.0
@@ -331,86 +316,40 @@ class InteractionRecord(Record[InteractionRow]):
 
     command, key = "interact", "settings"
 
-    def parse(self, held: dict[str, Any]) -> list[InteractionRow]:
+    def parse(self, content: dict[str, Any]) -> list[InteractionRow]:
         """Return the rows; null stands for infinite numbers."""
         rows: list[dict[str, Any]] = [
-            {k: math.inf if v is None else v for k, v in row.items()} for row in held["rows"]
+            {k: math.inf if v is None else v for k, v in row.items()} for row in content["rows"]
         ]
         return [InteractionRow(**row) for row in rows]
 
 
 def heat_map(rows: Sequence[InteractionRow]) -> bytes:
-    """Return a PNG of matrices over all rules and the rules beside them, for each setting."""
-    names = list(dict.fromkeys([row.rule for row in rows] + [row.beside for row in rows]))
-    settings: dict[str, list[InteractionRow]] = {}
-    for row in rows:
-        title = f"distance {row.distance:g}, ratio {row.ratio:g}{_radius(row)}"
-        settings.setdefault(title, []).append(row)
-    return _draw(settings, "rule", names, "beside", names)
+    """Return a PNG of two matrices over all rules and those beside them, for each setting.
 
-
-def phase_diagram(rows: Sequence[InteractionRow]) -> bytes:
-    """Return a PNG of matrices over ratio and distance of a pair of rules, for each radius."""
-    ratios, distances = (sorted({getattr(row, of) for row in rows}) for of in ("ratio", "distance"))
-    radii: dict[str, list[InteractionRow]] = {}
-    for row in sorted(rows, key=lambda row: row.eps_factor):
-        radii.setdefault(f"{row.rule} beside {row.beside}{_radius(row)}", []).append(row)
-    return _draw(radii, "ratio", ratios, "distance", distances, intervals=True)
-
-
-def _draw(
-    groups: dict[str, list[InteractionRow]],
-    down: str,
-    down_values: Sequence[Any],
-    across: str,
-    across_values: Sequence[Any],
-    *,
-    intervals: bool = False,
-) -> bytes:
-    """Return a PNG of two matrices for each group of rows: change of the loss, and mixing index.
-
-    Needs matplotlib.
+    They are the change of the loss and the mixing index. Needs matplotlib.
     """
     from matplotlib.colors import LogNorm, Normalize
 
+    names = list(dict.fromkeys([row.rule for row in rows] + [row.beside for row in rows]))
+    settings: dict[str, dict[tuple[str, str], InteractionRow]] = {}
+    for row in rows:
+        radius = "" if row.eps_factor == 1.0 else f", ε × {row.eps_factor:g}"
+        title = f"distance {row.distance:g}, ratio {row.ratio:g}{radius}"
+        settings.setdefault(title, {})[row.rule, row.beside] = row
     ticks = {"ticks": [0.25, 0.5, 1.0, 2.0, 4.0], "format": "%g"}
     changes = LogNorm(1.0 / MAX_CHANGE, MAX_CHANGE)
     matrices: tuple[tuple[str, str, str, Any, dict[str, Any]], ...] = (
         ("change", "loss together / alone", "RdBu_r", changes, ticks),
         ("mixing", "mixing index", "viridis", Normalize(0.0, 1.0), {}),
     )
-    width, height = 1.6 + 0.6 * len(across_values), 1.6 + 0.5 * len(down_values)
-    figure, grid = new_figure(len(groups), 2, (2 * width + 2.0, height * len(groups)))
-    for (title, rows), panels in zip(groups.items(), grid, strict=True):
-        by_values = {(getattr(row, down), getattr(row, across)): row for row in rows}
-        cells = [
-            [by_values.get((first, second)) for second in across_values] for first in down_values
-        ]
-        for panel, (what, name, colours, norm, bar) in zip(panels, matrices, strict=True):
-            values: Any = [[row and getattr(row, what) for row in line] for line in cells]
-            notes = [[_interval(row, what) for row in line] for line in cells]
-            scale = draw_matrix(
-                panel,
-                list(map(str, down_values)),
-                list(map(str, across_values)),
-                values,
-                colours=colours,
-                norm=norm,
-                notes=notes if intervals else None,
-            )
-            panel.set(xlabel=across, ylabel=down)
+    width, height = 1.6 + 0.6 * len(names), 1.6 + 0.5 * len(names)
+    figure, grid = new_figure(len(settings), 2, (2 * width + 2.0, height * len(settings)))
+    for (title, pairs), panels in zip(settings.items(), grid, strict=True):
+        for panel, (column, name, colours, norm, bar) in zip(panels, matrices, strict=True):
+            values: Any = [[getattr(pairs.get((a, b)), column, None) for b in names] for a in names]
+            scale = draw_matrix(panel, names, names, values, colours=colours, norm=norm)
+            panel.set(xlabel="beside", ylabel="rule")
             panel.set_title(f"{name}\n{title}", fontsize=9)
             figure.colorbar(scale, ax=panel, **bar).minorticks_off()
     return png(figure)
-
-
-def _interval(row: InteractionRow | None, what: str) -> str:
-    if row is None:
-        return ""
-    ends = (getattr(row, f"{what}_{end}") for end in ("low", "high"))
-    # A cell has room for one digit of small numbers.
-    return " to ".join(f"{end:.2g}" if end >= 0.01 else f"{end:.1g}" for end in ends)
-
-
-def _radius(row: InteractionRow) -> str:
-    return "" if row.eps_factor == 1.0 else f", ε × {row.eps_factor:g}"

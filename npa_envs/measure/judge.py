@@ -97,6 +97,7 @@ class TextureJudge:
         least = 0.02 * self._distances(_images(noisy)).mean(0)
         self._units = torch.maximum(self._distances(_images(drawn)).mean(0), least)
 
+    @torch.no_grad()
     def __call__(self, pictures: Tensor) -> Tensor:
         """Return ratios of patches, spectra and colours, float64, [B, 3], for [B, R, R, 4]."""
         if pictures.shape[1:] != self._task.target_picture.shape:
@@ -104,10 +105,8 @@ class TextureJudge:
                 f"pictures must have shape [B, R, R, 4] with R as the target's "
                 f"{self._task.config.resolution}, got {tuple(pictures.shape)}"
             )
-        with torch.no_grad():
-            return self._distances(_images(pictures.to(self._task.target_picture.device))) / (
-                self._units
-            )
+        images = _images(pictures.to(self._task.target_picture.device))
+        return self._distances(images) / self._units
 
     def row(self, x: Tensor, s: Tensor, step: int) -> JudgeRow:
         """Measure worlds that are `step` steps after their seed."""

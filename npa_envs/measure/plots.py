@@ -85,11 +85,10 @@ def draw_matrix(
     *,
     colours: str,
     norm: Any,
-    notes: Sequence[Sequence[str]] | None = None,
 ) -> Any:
     """Draw a matrix with its numbers, and return the argument of `figure.colorbar`.
 
-    `notes` are below the numbers. Cells with None are blank; `norm` maps numbers to [0, 1].
+    Cells with None are blank; `norm` maps numbers to [0, 1].
     """
     numbers = [[math.nan if value is None else value for value in line] for line in values]
     image = panel.imshow(numbers, cmap=colours, norm=norm, aspect="auto")
@@ -97,10 +96,9 @@ def draw_matrix(
         for across, value in enumerate(line):
             if value is not None:
                 red, green, blue, _ = image.to_rgba(value)
-                text = f"{value:.2g}" + ("" if notes is None else f"\n{notes[down][across]}")
                 ink = "white" if red + green + blue < 1.2 else "black"
-                size = 6 if notes is None else 7
-                panel.text(across, down, text, color=ink, ha="center", va="center", fontsize=size)
+                style = {"color": ink, "ha": "center", "va": "center", "fontsize": 6}
+                panel.text(across, down, f"{value:.2g}", **style)
     panel.set_xticks(range(len(columns)), columns, rotation=45, ha="right", fontsize=7)
     panel.set_yticks(range(len(rows)), rows, fontsize=7)
     return image

@@ -382,16 +382,17 @@ def tables_of(
     They are `growth` and, if `changed`, `healing`; for clouds `accuracy` and, if `changed`,
     `changes`; and `judge`, if given. Clouds run on their task's device, with the first seed.
     """
+    options: dict[str, Any] = {"progress": progress}
     tables: dict[str, Sequence[Any]] = {}
     if task.classifies:
         clouds = cast(PointClassification, task)
+        options["seed"] = seeds[0]
         steps = checkpoints or CLOUD_CHECKPOINTS
-        options: dict[str, Any] = {"seed": seeds[0], "progress": progress}
         tables["accuracy"] = accuracies(rule, clouds, checkpoints=steps, **options)
         if changed:
             tables["changes"] = changes_of_mind(rule, clouds, **options)
         return tables
-    options = {"seeds": seeds, "device": device, "progress": progress}
+    options |= {"seeds": seeds, "device": device}
     judged: list[JudgeRow] = []
     watch = None if judge is None else lambda *world: judged.append(judge.row(*world))
     steps = checkpoints or CHECKPOINTS

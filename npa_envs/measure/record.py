@@ -13,6 +13,7 @@ import io
 import math
 import os
 import platform
+import shlex
 import subprocess
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -48,7 +49,7 @@ class Record(Generic[Row]):
         """Return the file's fields other than the facts."""
         return {"rows": as_objects(self.rows)}
 
-    def parse(self, held: dict[str, Any]) -> list[Row]:
+    def parse(self, content: dict[str, Any]) -> list[Row]:
         """Return the rows of the file's JSON object."""
         raise NotImplementedError
 
@@ -69,10 +70,6 @@ class Record(Generic[Row]):
         """Write the file, if the record has a path."""
         if self.path is not None:
             write_record(self.path, {self.key: self.facts, **self.content()})
-
-    def table(self) -> str:
-        """Return the rows as a plain text table."""
-        return table_text(self.rows)
 
 
 def write_record(path: Path, content: Any) -> None:
@@ -96,9 +93,9 @@ def read_record(
         return None
     hint = "remove it, or choose another folder with --out"
     try:
-        held = read_json(path, limit=64 * 2**20)
-        before = dict(held[key])
-        record = parse(held)
+        content = read_json(path, limit=64 * 2**20)
+        before = dict(content[key])
+        record = parse(content)
     except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
         raise NPAError(
             f"{str(path)!r} must be a record of npa-envs {command}, but cannot be read "
@@ -138,22 +135,20 @@ def measured_facts(device: torch.device, commit: str | None, **settings: Any) ->
     }
 
 
-def without_folders(arguments: Sequence[str], *options: str) -> list[str]:
-    """Return a command's arguments with OUT in place of the path after "--out".
+def command_text(name: str, arguments: Sequence[str], *options: str) -> str:
+    """Return a command line as text, with OUT in place of the path after "--out" of `options`.
 
     Records do not name folders of the machine that they were written on.
     """
-    plain: list[str] = []
-    before = ""
+    words = ["npa-envs", name]
     for argument in arguments:
-        name, mark, _ = argument.partition("=")
-        if before in options:
-            argument = before.lstrip("-").upper()
-        elif mark and name in options:
-            argument = f"{name}={name.lstrip('-').upper()}"
-        plain.append(argument)
-        before = argument
-    return plain
+        option, mark, _ = argument.partition("=")
+        if words[-1] in options:
+            argument = words[-1].lstrip("-").upper()
+        elif mark and option in options:
+            argument = f"{option}={option.lstrip('-').upper()}"
+        words.append(argument)
+    return shlex.join(words)
 
 
 def machine(device: torch.device) -> str:

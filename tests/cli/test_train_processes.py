@@ -14,6 +14,7 @@ from npa_envs.cli.train import (
     process_count,
     resolve_task,
     starting_configuration,
+    thread_count,
 )
 from npa_envs.errors import NPAError
 from npa_envs.training import RunFolder, config_to_dict, preset
@@ -51,6 +52,7 @@ def test_resume_auto_begins_and_later_goes_on(tmp_path):
 )
 def test_two_processes_train_where_a_second_core_would_be_idle(name, fields, threads, expected):
     with torch_threads(threads):
+        assert thread_count(preset(name)) == (threads if name == "paper" else 1)
         assert process_count(TASK, TrainOptions(), preset(name, **fields)) == expected
         for asked in (1, 3):
             options = TrainOptions(processes=asked)

@@ -12,9 +12,9 @@ from npa_envs.cli import main
 from npa_envs.cli.common import named_rules
 from npa_envs.errors import NPAError
 from npa_envs.measure import accuracy
-from npa_envs.measure.accuracy import all_checks, endurance, hard_cases, numerics, suite
+from npa_envs.measure.accuracy import all_checks, hard_cases, rule_checks, suite
 from npa_envs.measure.accuracy import scenes as places
-from npa_envs.measure.accuracy.endurance import habitat
+from npa_envs.measure.accuracy.rule_checks import habitat
 from npa_envs.measure.accuracy.scenes import scenes
 from npa_envs.measure.accuracy.suite import (
     GROUPS,
@@ -162,7 +162,7 @@ AS_EXPECTED = """
     geometry/touching/2d/open geometry/far/3d/open geometry/seam/2d/periodic
     geometry/tight_box/3d/periodic geometry/threshold/2d geometry/smooth_inverse/3d
     geometry/crowd/2d geometry/nearest/2d values/infinite_channel/2d values/gradient_of_nan
-    values/nan_state values/nan_position values/blown_up precision/order/2d precision/batch/3d
+    values/nan_state values/nan_position precision/order/2d precision/batch/3d
     precision/repeated/2d gradients/finite_differences/2d/periodic
 """
 
@@ -178,7 +178,7 @@ def test_a_wrong_operator_is_found_out(factor, monkeypatch):
     def wrong(*arguments, **options):
         return right(*arguments, **options) * factor
 
-    for module in (places, hard_cases, numerics):
+    for module in (places, hard_cases):
         right = module.perceive
         monkeypatch.setattr(module, "perceive", wrong)
     for name in ("geometry/clump/2d/open", "geometry/threshold/2d", "geometry/outside/3d"):
@@ -227,7 +227,7 @@ def test_a_rule_that_blows_up_is_found_out(factor, count, verdict, device, monke
             rule.output.weight *= factor
         return home._replace(rule=rule, worlds=home.worlds.map(lambda part: part[:, :count]))
 
-    monkeypatch.setattr(endurance, "habitat", tampered)
+    monkeypatch.setattr(rule_checks, "habitat", tampered)
     entry = suite.run_check(CHECKS["time/heart" if count == 1 else "time/dots"], session(device))
     if count == 1:
         # A world that extends nowhere is measured all the same.

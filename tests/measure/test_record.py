@@ -59,8 +59,8 @@ def test_facts_name_the_machine_the_commit_and_the_versions():
 
 def test_a_commands_folders_are_not_told():
     words = ["heart", "--out", "a/b", "--output=c", "--seed", "a/b"]
-    told = ["heart", "--out", "OUT", "--output=OUTPUT", "--seed", "a/b"]
-    assert record.without_folders(words, "--out", "--output") == told
+    told = "npa-envs stress heart --out OUT --output=OUTPUT --seed a/b"
+    assert record.command_text("stress", words, "--out", "--output") == told
 
 
 def test_a_time_limit_passes_once_and_never_without_one():

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from functools import partial
 
 # These two modules register their checks.
-from npa_envs.measure.accuracy import numerics  # noqa: F401
+from npa_envs.measure.accuracy import rule_checks  # noqa: F401
 from npa_envs.measure.accuracy.hard_cases import scene_checks
 from npa_envs.measure.accuracy.suite import CHECKS, GROUPS, RULE_CHECKS, Check
 from npa_envs.rule.files import shipped_rules
@@ -21,7 +21,7 @@ def all_checks(
     """
     # Gradients are checked for one rule of each task.
     few = ("gecko", "dots") if quick else ("gecko", "dots", "digits", "duck")
-    rule_checks = [
+    of_rules = [
         Check(f"{one.name}/{name}", one.expected, partial(one.run, source), source)
         for group, names in {"time": list(shipped_rules()), "gradients": few}.items()
         for name, source in (rules or dict(zip(names, names, strict=True))).items()
@@ -29,8 +29,8 @@ def all_checks(
         if one.group == group
     ]
     if rules:
-        return rule_checks
+        return of_rules
     by_dimension = sorted(CHECKS, key=lambda one: ("/2d" not in one.name, "/3d" not in one.name))
     groups = list(GROUPS)
-    checks = [*scene_checks(seed), *rule_checks, *by_dimension]
+    checks = [*scene_checks(seed), *of_rules, *by_dimension]
     return sorted(checks, key=lambda one: groups.index(one.group))

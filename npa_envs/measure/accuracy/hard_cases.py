@@ -1,9 +1,10 @@
-"""Checks of perception in hard cases: positions (`geometry`) and states (`values`)."""
+"""Checks of perception in hard cases: positions, states, gradients, order and batches."""
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
 
@@ -18,8 +19,10 @@ from npa_envs.measure.accuracy.scenes import (
     PRECISIONS,
     SIDE,
     STATE_DIM,
+    PerceptionOutcome,
     Scene,
     against_reference,
+    differing,
     error_limits,
     functional_weights,
     not_finite,
@@ -224,12 +227,6 @@ def _worlds(session: CheckSession, space_dim: int, state_dim: int) -> tuple[Tens
     return x.to(session.device), s.to(session.device)
 
 
-def differing(value: Tensor, expected: Tensor) -> float:
-    """Return the number of elements in which two tensors differ; NaN equals NaN."""
-    same = (value == expected) | (value.isnan() & expected.isnan())
-    return float((~same).sum())
-
-
 @check("values/scale", 2, 3)
 def _run_scale(space_dim: int, session: CheckSession) -> CheckResult:
     """States of 1e-30 to 1e30 are perceived as the float64 reference has them, forwards and
@@ -321,24 +318,18 @@ def _run_gradient(session: CheckSession) -> CheckResult:
     return CheckResult(figures, dict.fromkeys(figures, 0.0))
 
 
-def _broken_rollout(session: CheckSession) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
-    """Return worlds after a rollout from states with a NaN, and after one without."""
-    rule = load_rule("gecko", device=session.device).float()
-    x, s = _worlds(session, 2, rule.state_dim)
-    broken = s.clone()
-    broken[WORLD, PARTICLE, 0] = math.nan
-
-    @torch.no_grad()
-    def run(states: Tensor) -> tuple[Tensor, Tensor]:
-        return rollout(rule, x, states, STEPS, generator=session.generator())
-
-    return run(broken), run(s)
-
-
 @check("values/nan_state")
+@torch.no_grad()
 def _run_nan_state(session: CheckSession) -> CheckResult:
     """NaN in one state spreads in its own world only; other worlds' rollouts keep every bit."""
-    (x, s), (clean_x, clean_s) = _broken_rollout(session)
+    rule = load_rule("gecko", device=session.device).float()
+    x, clean = _worlds(session, 2, rule.state_dim)
+    with_nan = clean.clone()
+    with_nan[WORLD, PARTICLE, 0] = math.nan
+    (x, s), (clean_x, clean_s) = (
+        rollout(rule, x, states, STEPS, generator=session.generator())
+        for states in (with_nan, clean)
+    )
     others = torch.arange(WORLD_COUNT, device=x.device) != WORLD
     broken = (~s[WORLD].isfinite()).any(-1) | (~x[WORLD].isfinite()).any(-1)
     away = (clean_x[WORLD] - clean_x[WORLD, PARTICLE]).norm(dim=-1) > (2 * STEPS) * EPS
@@ -352,18 +343,6 @@ def _run_nan_state(session: CheckSession) -> CheckResult:
     return CheckResult(figures, dict.fromkeys(list(figures)[:4], 0.0))
 
 
-def _unreported(calls: dict[str, Callable[[], Any]], named: str) -> CheckResult:
-    """Check that each call raises an NPAError that contains the text `named`."""
-    figures = {}
-    for name, call in calls.items():
-        try:
-            call()
-            figures[name] = 1.0
-        except NPAError as error:
-            figures[name] = float(named not in str(error))
-    return CheckResult(figures, dict.fromkeys(figures, 0.0))
-
-
 @check("values/nan_position")
 def _run_nan_position(session: CheckSession) -> CheckResult:
     """A position that is NaN is refused, by an error that names its world and particle."""
@@ -374,16 +353,131 @@ def _run_nan_position(session: CheckSession) -> CheckResult:
         "perceive": partial(perceive, x, s, EPS),
         "rollout": partial(rollout, rule, x, s, 1),
     }
-    return _unreported(calls, f"world {WORLD}, particle {PARTICLE}")
+    figures = {}
+    for name, call in calls.items():
+        try:
+            call()
+            figures[name] = 1.0
+        except NPAError as error:
+            figures[name] = float(f"world {WORLD}, particle {PARTICLE}" not in str(error))
+    return CheckResult(figures, dict.fromkeys(figures, 0.0))
 
 
-@check("values/blown_up")
-def _run_blown_up(session: CheckSession) -> CheckResult:
-    """Positions that a rollout has made NaN are reported by the next call, with their world."""
-    rule = load_rule("gecko", device=session.device).float()
-    (x, s), _ = _broken_rollout(session)
-    if bool(x.isfinite().all()):
-        return CheckResult(
-            {"rollout": 1.0}, {"rollout": 0.0}, note="NaN in a state moved no particle"
-        )
-    return _unreported({"rollout": partial(rollout, rule, x, s, 1)}, f"world {WORLD}")
+# The group `gradients`: finite differences.
+
+
+@check("gradients/finite_differences", *itertools.product((2, 3), (False, True)))
+def _run_differences(space_dim: int, periodic: bool, session: CheckSession) -> CheckResult:
+    """In float64, derivatives along smooth motions and along random states agree with finite
+    differences, in every hard scene."""
+    figures = {}
+    for scene in scenes(space_dim, periodic=periodic, seed=session.seed):
+        for what in ("states", "positions"):
+            # Far from 0 floating-point numbers are too sparse.
+            if (scene.name, what) != ("far", "positions"):
+                figures[f"{scene.name}_{what}"] = _difference(scene, session, what)
+    return CheckResult(figures, dict.fromkeys(figures, 1e-6))
+
+
+def _difference(scene: Scene, session: CheckSession, what: str) -> float:
+    """Return the relative error of a directional derivative against a finite difference.
+
+    Positions move along a smooth periodic field that is 0 at the origin, so that coincident
+    particles stay together. There is no moment correction, through which no gradient flows.
+    """
+    x, s = scene.x.to(session.device), scene.s.to(session.device)
+    weights = functional_weights(x, s)
+    generator = torch.Generator().manual_seed(6)
+    if what == "states":
+        along = torch.randn(s.shape, generator=generator).to(s)
+    else:
+        mixing = torch.randn(x.shape[2], x.shape[2], generator=generator).to(x)
+        along = torch.sin(2.0 * math.pi * x / (scene.box[0] if scene.box else SIDE)) @ mixing * EPS
+
+    def functional(varied: Tensor) -> Tensor:
+        worlds = (x, varied) if what == "states" else (varied, s)
+        z = perceive(*worlds, EPS, EPS, scene.box, detach_positions=False, moment_correction=False)
+        return (z * weights).sum()
+
+    start = s if what == "states" else x
+    # Second derivatives jump at ε, which causes an error in proportion to `change`.
+    change = 1e-7
+    rise = functional(start + change * along) - functional(start - change * along)
+    quotient = float(rise) / (2.0 * change)
+    varied = start.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(functional(varied), varied)
+    slope = float((gradient * along).sum())
+    # The terms may cancel, so the error is relative to the sum of their absolute values.
+    size = float((gradient * along).abs().sum())
+    return abs(slope - quotient) / size if size > 0.0 else abs(quotient)
+
+
+# The group `precision`: changes that must have little or no effect.
+
+TWO_ERRORS = 2.0
+"""Allowed distance of two results, in errors that the group `geometry` allows for one."""
+
+
+def _every_scene(space_dim: int, session: CheckSession) -> Iterator[Scene]:
+    for periodic in (False, True):
+        yield from scenes(space_dim, periodic=periodic, seed=session.seed)
+
+
+def _on(scene: Scene, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Return positions and states of a scene in float32."""
+    return scene.x.to(device, torch.float32), scene.s.to(device, torch.float32)
+
+
+@check("precision/order", 2, 3)
+def _run_order(space_dim: int, session: CheckSession) -> CheckResult:
+    """Particles in another order perceive the same up to rounding, in every hard scene."""
+    fractions = {}
+    for scene in _every_scene(space_dim, session):
+        x, s = _on(scene, session.device)
+        order = torch.randperm(x.shape[1], generator=torch.Generator().manual_seed(7))
+        order = order.to(session.device)
+        weights = functional_weights(x, s)
+        moved = perceived(x[:, order], s[:, order], scene.box, weights=weights[:, order])
+        back = PerceptionOutcome(*(tensor[:, order.argsort()] for tensor in moved))
+        distances = perception_errors(back, perceived(x, s, scene.box, weights=weights))
+        exact = perceived(scene.x, scene.s, scene.box, by_reference=True)
+        allowed = error_limits(scene.x, scene.s, scene.box, exact)
+        # max() of a tensor never ignores NaN.
+        worst = torch.tensor([distances[name] / allowed[name] for name in distances]).max()
+        fractions[f"{scene.name}/{'open' if scene.box is None else 'periodic'}"] = float(worst)
+    wrong = [name for name, value in fractions.items() if not value <= TWO_ERRORS]
+    return CheckResult(
+        {"over_allowed_error": float(torch.tensor(list(fractions.values())).max())},
+        {"over_allowed_error": TWO_ERRORS},
+        note=f"too far apart: {', '.join(wrong)}" if wrong else "",
+    )
+
+
+@check("precision/repeated", 2, 3)
+def _run_repeated(space_dim: int, session: CheckSession) -> CheckResult:
+    """Perception and gradients of every hard scene are the same bits when repeated."""
+    figures = dict.fromkeys(PerceptionOutcome._fields, 0.0)
+    for scene in _every_scene(space_dim, session):
+        x, s = _on(scene, session.device)
+        first, second = (perceived(x, s, scene.box) for _ in range(2))
+        for what, a, b in zip(PerceptionOutcome._fields, first, second, strict=True):
+            figures[what] += differing(a, b)
+    return CheckResult(figures, dict.fromkeys(figures, 0.0))
+
+
+@check("precision/batch", 2, 3)
+def _run_batch(space_dim: int, session: CheckSession) -> CheckResult:
+    """Every world of a batch perceives the bits that it perceives alone."""
+    figures = {"open": 0.0, "periodic": 0.0}
+    for periodic in (False, True):
+        every = scenes(space_dim, periodic=periodic, seed=session.seed)
+        some = [scene for scene in every if scene.name != "tight_box"]
+        # Repeat each scene's particles until all worlds have equally many.
+        count = max(scene.x.shape[1] for scene in some)
+        x = torch.cat([scene.x.repeat(1, count, 1)[:, :count] for scene in some])
+        x, s = (tensor.to(session.device, torch.float32) for tensor in (x, states_at(x)))
+        together = perceive(x, s, EPS, box=some[0].box)
+        for k in range(len(x)):
+            alone = perceive(x[k : k + 1], s[k : k + 1], EPS, box=some[0].box)
+            figures["periodic" if periodic else "open"] += differing(together[k], alone[0])
+    return CheckResult(figures, dict.fromkeys(figures, 0.0))

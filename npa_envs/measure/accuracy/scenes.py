@@ -239,6 +239,12 @@ def not_finite(tensors: Iterable[Tensor]) -> float:
     return float(sum(int((~tensor.isfinite()).sum()) for tensor in tensors))
 
 
+def differing(value: Tensor, expected: Tensor) -> float:
+    """Return the number of elements in which two tensors differ; NaN equals NaN."""
+    same = (value == expected) | (value.isnan() & expected.isnan())
+    return float((~same).sum())
+
+
 def functional_weights(x: Tensor, s: Tensor) -> Tensor:
     """Return weights of a random linear functional of the perception of worlds, [B, N, P]."""
     width = s.shape[2] * (2 + x.shape[2]) + x.shape[2]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -24,7 +25,7 @@ GROUPS = {
     "values": "what states hold: tiny, huge, infinite, no number",
     "time": "every shipped rule for 100 000 steps",
     "gradients": "how gradients grow with the steps; finite differences; float32's errors",
-    "precision": "order, batches, repetitions, devices, recorded graphs",
+    "precision": "order, batches, repetitions, recorded graphs",
 }
 """Every group of checks with its summary."""
 
@@ -50,7 +51,7 @@ class CheckResult:
     """By default "fail" if a figure with a limit is above it, missing or NaN, else "range" if
     `holds` is given, or "pass"."""
     name: str = ""
-    """Name of the check; this and all below are set by `run_check`."""
+    """Name of the check; `run_check` sets this field and those below."""
     expected: str = ""
     seconds: float = 0.0
     """Duration [s]."""
@@ -60,14 +61,9 @@ class CheckResult:
     def __post_init__(self) -> None:
         """Set the default verdict."""
         # Comparisons with NaN are false.
-        kept = all(self.figures.get(key, math.nan) <= limit for key, limit in self.limits.items())
+        within = all(self.figures.get(key, math.nan) <= limit for key, limit in self.limits.items())
         default = "range" if self.holds else "pass"
-        object.__setattr__(self, "verdict", self.verdict or (default if kept else "fail"))
-
-    @property
-    def done(self) -> bool:
-        """Whether a resumed run need not repeat it."""
-        return self.verdict in ("pass", "range")
+        object.__setattr__(self, "verdict", self.verdict or (default if within else "fail"))
 
     def fraction(self, name: str) -> float:
         """Return a figure over its limit, which is exceeded if this is above 1 or NaN.
@@ -127,6 +123,11 @@ class Check:
     def group(self) -> str:
         """One of `GROUPS`."""
         return self.name.partition("/")[0]
+
+    @property
+    def weights(self) -> str:
+        """The `rule_digest` of its rule, "" without one."""
+        return rule_digest(load_rule(self.rule)) if self.rule else ""
 
 
 CHECKS: list[Check] = []
@@ -190,12 +191,12 @@ class StressRecord(Record[CheckResult]):
         """Return the entries; numbers that are not finite become text, such as "nan"."""
         return {"counts": self.counts(), "checks": _json_values(as_objects(self.rows))}
 
-    def parse(self, held: dict[str, Any]) -> list[CheckResult]:
+    def parse(self, content: dict[str, Any]) -> list[CheckResult]:
         """Return the entries of a run that was stopped."""
-        for fields in held["checks"]:
+        for fields in content["checks"]:
             for name in ("figures", "limits"):
                 fields[name] = {key: float(value) for key, value in fields[name].items()}
-        return [CheckResult(**fields) for fields in held["checks"]]
+        return [CheckResult(**fields) for fields in content["checks"]]
 
     def put(self, entry: CheckResult) -> None:
         """Add an entry or replace the one of its name, and write the file."""
@@ -203,16 +204,20 @@ class StressRecord(Record[CheckResult]):
         self.rows.sort(key=lambda row: self._order.get(row.name, len(self._order)))
         self.write()
 
-    def drop_other_rules(self, weights: Mapping[str, str]) -> None:
-        """Drop checks whose rule has changed; `weights`: `rule_digest` by names of checks."""
-        self.rows = [row for row in self.rows if weights.get(row.name, row.weights) == row.weights]
+    def result_of(self, check: Check) -> CheckResult | None:
+        """Return a check's result with its rule's present weights, or None."""
+        rows = (row for row in self.rows if row.name == check.name and row.weights == check.weights)
+        return next(rows, None)
+
+    def is_done(self, check: Check) -> bool:
+        """Return whether a resumed run need not repeat a check."""
+        result = self.result_of(check)
+        return result is not None and result.verdict in ("pass", "range")
 
     def counts(self) -> dict[str, int]:
         """Return the number of checks with each verdict."""
-        verdicts = [entry.verdict for entry in self.rows]
-        return {
-            verdict: verdicts.count(verdict) for verdict in ("pass", "range", "fail", "skipped")
-        }
+        counts = Counter(entry.verdict for entry in self.rows)
+        return {verdict: counts[verdict] for verdict in ("pass", "range", "fail", "skipped")}
 
     def failed(self) -> list[CheckResult]:
         """Return the entries of the checks that failed."""
@@ -260,42 +265,27 @@ def run_checks(
     record: StressRecord,
     *,
     max_seconds: float | None = None,
-    weights: Mapping[str, str] | None = None,
     progress: Callable[[int], None] = lambda done: None,
 ) -> None:
     """Run checks that are not done, and put their entries into the record.
 
-    No check starts after `max_seconds`; those without an entry are then skipped. `weights` is the
-    result of `rule_weights`. After each check `progress` is called with 1.
+    No check starts after `max_seconds`; those without an entry are then skipped. After each check
+    `progress` is called with 1.
     """
     time_is_up = time_limit(max_seconds)
     for check in checks:
-        result = next((row for row in record.rows if row.name == check.name), None)
-        if result is None or not result.done:
+        if not record.is_done(check):
             if not time_is_up():
-                result = run_check(check, session)
-                result = replace(result, weights=(weights or {}).get(check.name, ""))
-            elif result is None:
-                result = CheckResult(
-                    note="no time was left for it",
-                    verdict="skipped",
-                    name=check.name,
-                    expected=check.expected,
-                )
-            record.put(result)
+                record.put(run_check(check, session))
+            elif record.result_of(check) is None:
+                skipped = CheckResult(verdict="skipped", note="no time was left for it")
+                record.put(replace(skipped, name=check.name, expected=check.expected))
         progress(1)
-
-
-def rule_weights(checks: Iterable[Check]) -> dict[str, str]:
-    """Return the `rule_digest` of each check's rule by the check's name, for checks of a rule."""
-    rules = {check.name: check.rule for check in checks if check.rule}
-    digests = {rule: rule_digest(load_rule(rule)) for rule in set(rules.values())}
-    return {name: digests[rule] for name, rule in rules.items()}
 
 
 def run_check(check: Check, session: CheckSession) -> CheckResult:
     """Run a check and return its result; an error is a failure, lack of memory skips it."""
-    begin = time.perf_counter()
+    weights, begin = check.weights, time.perf_counter()
     try:
         result = check.run(session)
     except Skipped as reason:
@@ -303,33 +293,33 @@ def run_check(check: Check, session: CheckSession) -> CheckResult:
     except torch.OutOfMemoryError:
         result = CheckResult(verdict="skipped", note="not enough memory")
     except Exception as error:
-        # Any error is a finding.
+        # Any error is a failure of the check.
         note = f"{type(error).__name__}: {' '.join(str(error).split())}"
         result = CheckResult(verdict="fail", note=note)
     seconds = time.perf_counter() - begin
-    return replace(result, name=check.name, expected=check.expected, seconds=seconds)
+    about = {"name": check.name, "expected": check.expected, "weights": weights}
+    return replace(result, seconds=seconds, **about)
 
 
 def heat_maps(record: StressRecord) -> dict[str, bytes]:
     """Return PNG files of figures over their limits, by group."""
+    from matplotlib.colors import LogNorm
+
     drawn = {}
     for group, entries in record.by_group().items():
         limited = [entry for entry in entries if entry.figures and entry.limits]
-        if limited:
-            drawn[group] = _heat_map(group, limited)
+        if not limited:
+            continue
+        rows = [entry.name.partition("/")[2] for entry in limited]
+        columns = list(dict.fromkeys(name for entry in limited for name in entry.limits))
+        fractions = [
+            [entry.fraction(name) if name in entry.limits else None for name in columns]
+            for entry in limited
+        ]
+        size = 3.0 + 0.6 * len(columns), 1.6 + 0.26 * len(rows)
+        figure, ((panel,),) = new_figure(1, 1, size)
+        norm = LogNorm(1.0 / FAR, FAR)
+        draw_matrix(panel, rows, columns, fractions, colours="RdYlGn_r", norm=norm)
+        panel.set_title(f"{group}: figures over their limits")
+        drawn[group] = png(figure, 110)
     return drawn
-
-
-def _heat_map(group: str, entries: Sequence[CheckResult]) -> bytes:
-    from matplotlib.colors import LogNorm
-
-    columns = list(dict.fromkeys(name for entry in entries for name in entry.limits))
-    fractions = [
-        [entry.fraction(name) if name in entry.limits else None for name in columns]
-        for entry in entries
-    ]
-    rows = [entry.name.partition("/")[2] for entry in entries]
-    figure, ((panel,),) = new_figure(1, 1, (3.0 + 0.6 * len(columns), 1.6 + 0.26 * len(rows)))
-    draw_matrix(panel, rows, columns, fractions, colours="RdYlGn_r", norm=LogNorm(1.0 / FAR, FAR))
-    panel.set_title(f"{group}: figures over their limits")
-    return png(figure, 110)

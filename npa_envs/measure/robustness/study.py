@@ -89,20 +89,19 @@ class RuleRecord(Record[Response]):
         curves = [asdict(c) | {"recovery_steps": c.recovery_steps()} for c in self.curves]
         return {**self.about, "courses": curves, "responses": as_objects(self.rows)}
 
-    def parse(self, held: dict[str, Any]) -> list[Response]:
+    def parse(self, content: dict[str, Any]) -> list[Response]:
         """Read all fields of a file but its responses, and return these."""
 
         def numbers(values: list[float | None]) -> tuple[float, ...]:
             return tuple(map(number, values))
 
-        def curve(row: dict[str, Any]) -> LossCurve:
+        self.curves = []
+        for row in content.pop("courses"):
             losses, twins = (tuple(map(numbers, row[name])) for name in ("losses", "twins"))
-            return LossCurve(row["damage"], tuple(row["steps"]), losses, twins)
-
-        self.curves = list(map(curve, held.pop("courses")))
-        rows = held.pop("responses")
-        del held["facts"]
-        self.about = held
+            self.curves.append(LossCurve(row["damage"], tuple(row["steps"]), losses, twins))
+        rows = content.pop("responses")
+        del content["facts"]
+        self.about = content
         return [Response(**row | {"losses": numbers(row["losses"])}) for row in rows]
 
     def of(self, condition: str) -> list[Response]:
@@ -241,8 +240,8 @@ def working_range(values: Sequence[float], ratios: Sequence[float], trained: flo
 
 
 DAMAGE_GROUPS = {
-    "what rules are asked to heal": [d.name for d in DAMAGES.values() if not d.beyond],
-    "what is beyond that": [d.name for d in DAMAGES.values() if d.beyond],
+    "what rules are asked to heal": [name for name, d in DAMAGES.items() if not d.beyond],
+    "what is beyond that": [name for name, d in DAMAGES.items() if d.beyond],
 }
 """Damages whose recovered seeds are counted together, without the control."""
 
@@ -348,49 +347,24 @@ def pictures(records: Sequence[RuleRecord]) -> dict[str, bytes]:
 def _draw(records: Sequence[RuleRecord]) -> bytes:
     columns = 1 + len(DRAWN)
     figure, grid = new_figure(len(records), columns, (3.1 * columns, 2.3 * len(records)))
-    for record, panels in zip(records, grid, strict=True):
-        _draw_curves(panels[0], record)
-        for condition, panel in zip(DRAWN, panels[1:], strict=True):
-            _draw_responses(panel, record, condition)
-    for panel, condition in zip(grid[-1], ("", *DRAWN), strict=True):
-        panel.set_xlabel(DRAWN.get(condition, "steps after the damage"), fontsize=8)
+    for record, (damaged, *panels) in zip(records, grid, strict=True):
+        damaged.set_title(record.rule, fontsize=9, loc="left")
+        damaged.set(xscale="symlog", xlabel="steps after the damage", ylabel="loss over the twin's")
+        damaged.axhline(RECOVERED, color="black", lw=0.7, ls=":")
+        for k, curve in enumerate(record.curves):
+            colour = "0.5" if curve.damage == CONTROL else f"C{k}"
+            ratios = [curve.ratios(k) for k in range(len(curve.steps))]
+            _draw_seeds(damaged, curve.steps, ratios, colour, curve.damage)
+        for (condition, label), panel in zip(DRAWN.items(), panels, strict=True):
+            panel.set(xscale="log", xlabel=label, ylabel="loss")
+            trained = sorted(record.trained().losses)
+            panel.axhline(trained[len(trained) // 2], color="black", lw=0.7, ls=":")
+            measured = [response for response in record.of(condition) if response.losses]
+            values = [float(response.value) for response in measured]
+            losses = [response.losses for response in measured]
+            _draw_seeds(panel, values, losses, "C0", CONDITIONS[condition])
     legend_of(figure, grid[0][0], ncols=1 + len(DAMAGES), fontsize=7)
     return png(figure, 75)
-
-
-def _draw_curves(panel: Any, record: RuleRecord) -> None:
-    """Draw losses over the twins' after each damage."""
-    for k, curve in enumerate(record.curves):
-        colour = "0.5" if curve.damage == CONTROL else f"C{k}"
-        columns = [curve.ratios(k) for k in range(len(curve.steps))]
-        _draw_seeds(panel, curve.steps, columns, colour, curve.damage)
-    panel.axhline(RECOVERED, color="black", lw=0.7, ls=":")
-    steps = record.curves[0].steps
-    panel.set_xscale("symlog", linthresh=max(1, steps[1]))
-    panel.set_xlim(0, steps[-1])
-    ticks = [step for step in steps if step & (step - 1) == 0]
-    panel.set_xticks(ticks, [str(step) for step in ticks], rotation=45)
-    panel.set_yscale("log")
-    panel.set_ylabel("loss over the twin's", fontsize=8)
-    panel.set_title(record.rule, fontsize=9, loc="left")
-    number_plainly(panel.yaxis)
-    panel.tick_params(labelsize=7)
-
-
-def _draw_responses(panel: Any, record: RuleRecord, condition: str) -> None:
-    """Draw losses by the values of a condition."""
-    measured = [response for response in record.of(condition) if response.losses]
-    values = [float(response.value) for response in measured]
-    _draw_seeds(
-        panel, values, [response.losses for response in measured], "C0", CONDITIONS[condition]
-    )
-    trained = sorted(record.trained().losses)
-    panel.axhline(trained[len(trained) // 2], color="black", lw=0.7, ls=":")
-    panel.set(xscale="log", yscale="log")
-    panel.set_ylabel("loss", fontsize=8)
-    panel.set_xticks(values, [f"{value:.2g}" for value in values], rotation=45)
-    number_plainly(panel.yaxis)
-    panel.tick_params(labelsize=7)
 
 
 def _draw_seeds(
@@ -404,3 +378,5 @@ def _draw_seeds(
         for k in (0, len(columns[0]) // 2, -1)
     )
     draw_band(panel, across, (low, middle, high), colour, name, marker=".", ms=3, lw=1)
+    panel.set_yscale("log")
+    number_plainly(panel.yaxis)

@@ -10,13 +10,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from statistics import median
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.measure.accuracy.endurance import MIN_VIEWS, task_name
+from npa_envs.measure.accuracy.rule_checks import MIN_VIEWS, task_name
 from npa_envs.measure.quality import RuleRunner
 from npa_envs.ops import world_mean
 from npa_envs.rule.files import load_rule
@@ -199,32 +199,23 @@ class RuleTrial:
             raise NPAError(f"cannot measure {name!r}: {trained.doubt}: choose another rule")
         self.task: Any = trained.task
         self.metric_name = trained.task.trial_name
-        self._tasks: dict[int, list[Any]] = {self.particle_count: [self.task]}
-        self._pictures = torch.zeros(self.world_count, dtype=torch.int64, device=device)
-        """Index of each world's task, [B]."""
-        if self.rule.codes is not None:
-            tasks: list[Any] = [*tasks_of_codes(name, self.rule, device, **fields)]
-            self._tasks[self.particle_count] = tasks
-            self._pictures = torch.tensor(self._world_seeds, device=device) % len(tasks)
-
-    @property
-    def particle_count(self) -> int:
+        self.particle_count = int(self.task.config.particle_count)
         """Trained number of particles in a world."""
-        return int(self.task.config.particle_count)
-
-    @property
-    def world_count(self) -> int:
+        each = plan.worlds_per_seed
+        self._world_seeds = [seed * each + k for seed in seeds for k in range(each)]
+        self.world_count = len(self._world_seeds)
         """Worlds B of all seeds."""
-        return len(self.seeds) * self.plan.worlds_per_seed
+        self._tasks: dict[int, list[Any]] = {self.particle_count: [self.task]}
+        if self.rule.codes is not None:
+            tasks = tasks_of_codes(name, self.rule, device, **fields)
+            self._tasks[self.particle_count] = [*tasks]
+        picture_count = len(self._tasks[self.particle_count])
+        self._pictures = torch.tensor(self._world_seeds, device=device) % picture_count
+        """Index of each world's task, [B]."""
 
     def random(self, purpose: int) -> WorldRandom:
         """Return the streams of all worlds for a `StreamId`, at their start."""
         return WorldRandom(self._world_seeds, device=self._device).substream(purpose)
-
-    @property
-    def _world_seeds(self) -> list[int]:
-        each = self.plan.worlds_per_seed
-        return [seed * each + k for seed in self.seeds for k in range(each)]
 
     def particles(self, fraction: float) -> int:
         """Return a fraction of the trained number of particles."""
@@ -321,11 +312,9 @@ Change = Callable[[Tensor, Tensor, WorldRandom, Box], tuple[Tensor, Tensor]]
 """Makes damaged worlds from positions, states, a random source and sides of the box."""
 
 
-@dataclass(frozen=True)
-class Damage:
+class Damage(NamedTuple):
     """A kind of damage."""
 
-    name: str
     apply: Change
     static: bool
     """It also applies to particles that cannot move."""
@@ -386,15 +375,12 @@ def _lowest_half(x: Tensor, s: Tensor, key: Tensor) -> tuple[Tensor, Tensor]:
 
 
 DAMAGES = {
-    damage.name: damage
-    for damage in (
-        Damage("wipe", wipe, static=True),
-        Damage("cut", slit, static=False),
-        Damage("clump", pull_together, static=False),
-        Damage("noise", add_state_noise, static=True, beyond=True),
-        Damage("half", remove_half, static=True, halves=True),
-        Damage("side", remove_side, static=True, halves=True, beyond=True),
-    )
+    "wipe": Damage(wipe, static=True),
+    "cut": Damage(slit, static=False),
+    "clump": Damage(pull_together, static=False),
+    "noise": Damage(add_state_noise, static=True, beyond=True),
+    "half": Damage(remove_half, static=True, halves=True),
+    "side": Damage(remove_side, static=True, halves=True, beyond=True),
 }
 """Kinds of damage by name."""
 
@@ -425,8 +411,12 @@ class LossCurve:
 
     def recovery_steps(self) -> list[int | None]:
         """Return for each seed the first of `steps` at which it has recovered, or None."""
-        pairs = zip(self.losses, self.twins, strict=True)
-        return [recovery_step(self.steps, loss, twin) for loss, twin in pairs]
+        first: list[int | None] = []
+        for losses, twins in zip(self.losses, self.twins, strict=True):
+            # Comparisons with NaN are false.
+            rows = zip(self.steps, losses, twins, strict=True)
+            first.append(next((step for step, a, b in rows if a <= RECOVERED * b), None))
+        return first
 
     def recovered(self) -> int:
         """Return the number of seeds that have recovered."""
@@ -454,27 +444,22 @@ def ratio(loss: float, twin: float) -> float:
     return loss / twin
 
 
-def recovery_step(
-    steps: Sequence[int], losses: Sequence[float], twins: Sequence[float]
-) -> int | None:
-    """Return the first step at which a loss is at most `RECOVERED` times the twin's."""
-    # Comparisons with NaN are false.
-    rows = zip(steps, losses, twins, strict=True)
-    return next((step for step, loss, twin in rows if loss <= RECOVERED * twin), None)
-
-
 @torch.no_grad()
 def healing(trial: RuleTrial, grown: Particles) -> list[LossCurve]:
     """Damage grown worlds in every way; return a curve for the control and for each damage.
 
     If half of the particles are removed, twins are worlds that were grown from half as many.
     """
-    damages = [d for d in DAMAGES.values() if d.static or not trial.rule.static]
+    damages = {n: d for n, d in DAMAGES.items() if d.static or not trial.rule.static}
     growth = trial.random(StreamId.GROWTH)
     smaller, _ = trial.run(trial.initial_worlds(0.5), growth, [trial.plan.grow_steps])
+    whole, halved = (
+        {name: damage for name, damage in damages.items() if damage.halves == halves}
+        for halves in (False, True)
+    )
     return [
-        *_with_twins(trial, grown, grown, [d for d in damages if not d.halves], control=True),
-        *_with_twins(trial, grown, smaller, [d for d in damages if d.halves], control=False),
+        *_with_twins(trial, grown, grown, whole, control=True),
+        *_with_twins(trial, grown, smaller, halved, control=False),
     ]
 
 
@@ -482,7 +467,7 @@ def _with_twins(
     trial: RuleTrial,
     grown: Particles,
     twins: Particles,
-    damages: Sequence[Damage],
+    damages: Mapping[str, Damage],
     *,
     control: bool,
 ) -> list[LossCurve]:
@@ -492,10 +477,10 @@ def _with_twins(
     copies = {"twins": (twins, masks)}
     if control:
         copies[CONTROL] = twins, other_masks
-    for damage in damages:
+    for name, damage in damages.items():
         random = trial.random(StreamId.DAMAGE)
         x, s = damage.apply(grown.x, grown.s, random, trial.task.box)
-        copies[damage.name] = twins._replace(x=x, s=trial.coded(x, s)), masks
+        copies[name] = twins._replace(x=x, s=trial.coded(x, s)), masks
     worlds, keys = zip(*copies.values(), strict=True)
     random = WorldRandom.from_keys(torch.cat(keys))
     _, losses = trial.run(combined(torch.cat, worlds), random, steps)

@@ -9,15 +9,13 @@ from datetime import date
 from functools import partial
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from npa_envs.files import json_text
 from npa_envs.measure.plots import new_figure, number_plainly, png
-from npa_envs.measure.record import UNMEASURED, as_objects, machine, table_text, versions
+from npa_envs.measure.record import UNMEASURED, as_objects, machine, measured_facts, table_text
 from npa_envs.measure.speed.explain import kernel_rows
 from npa_envs.measure.speed.timing import (
-    LeftOut,
     Tables,
     Timing,
     TimingSession,
@@ -373,21 +371,10 @@ def paper(session: TimingSession) -> Tables:
     return tables
 
 
-def scaling(session: TimingSession) -> Tables:
-    """Return time and memory against N, neighbours, B and C."""
-    return {"scaling": scaling_rows(session)}
-
-
-def quick(session: TimingSession) -> Tables:
-    """Return the small tables of the suite `paper`."""
-    session.small = True
-    return paper(session)
-
-
 SUITES: dict[str, Callable[[TimingSession], Tables]] = {
-    "quick": quick,
+    "quick": lambda session: paper(replace(session, small=True)),
     "paper": paper,
-    "scaling": scaling,
+    "scaling": lambda session: {"scaling": scaling_rows(session)},
     "skips": lambda session: {"skips": skip_rows(session)},
     "species": lambda session: {"one_species": one_species_rows(session)},
     "kernels": lambda here: {"kernels": kernel_rows(here, SMALL if here.small else PROFILED)},
@@ -403,19 +390,18 @@ class BenchReport:
     command: str
     commit: str
     """Commit that was measured."""
-    device: torch.device
     threads: int
+    session: TimingSession
     tables: Tables
     """Rows by the table's name."""
-    left_out: Sequence[LeftOut]
 
     def text(self) -> str:
         """Return the tables as plain text."""
-        parts = [f"{self.suite} on {machine(self.device)}, commit {self.commit}"]
+        parts = [f"{self.suite} on {machine(self.session.device)}, commit {self.commit}"]
         for name, rows in self.tables.items():
             parts.append(f"{name}:\n{table_text(rows, missing=UNMEASURED)}")
         by_reason: dict[str, list[str]] = {}
-        for entry in self.left_out:
+        for entry in self.session.left_out:
             by_reason.setdefault(entry.why, []).append(entry.what)
         if by_reason:
             lines = [f"  {why}: {'; '.join(names)}" for why, names in by_reason.items()]
@@ -427,14 +413,10 @@ class BenchReport:
         content = {
             "suite": self.suite,
             "command": self.command,
-            "commit": self.commit,
             "date": date.today().isoformat(),
-            "device": self.device.type,
-            "machine": machine(self.device),
-            "threads": self.threads,
-            "versions": versions(),
+            **measured_facts(self.session.device, self.commit, threads=self.threads),
             "tables": {name: as_objects(rows) for name, rows in self.tables.items()},
-            "left_out": as_objects(self.left_out),
+            "left_out": as_objects(self.session.left_out),
         }
         return json_text(content)
 
@@ -444,31 +426,29 @@ class BenchReport:
 
 def pictures(tables: Tables) -> dict[str, bytes]:
     """Return PNG files by name, if the table `scaling` has all axes. Needs matplotlib."""
-    drawn = {}
     rows = tables.get("scaling", [])
-    if {row.axis for row in rows} == set(AXES):
-        drawn["scaling"] = png(_draw_scaling(rows, "time"))
-        if any(row.infer_mib is not None for row in rows):
-            drawn["memory"] = png(_draw_scaling(rows, "memory"))
+    if {row.axis for row in rows} != set(AXES):
+        return {}
+    drawn = {"scaling": _draw_scaling(rows, "us", "time of a step [µs]")}
+    if any(row.infer_mib is not None for row in rows):
+        drawn["memory"] = _draw_scaling(rows, "mib", "peak memory [MiB]")
     return drawn
 
 
-def _draw_scaling(table: Sequence[ScalingRow], what: str) -> Any:
+def _draw_scaling(table: Sequence[ScalingRow], unit: str, name: str) -> bytes:
+    """Return a PNG of the columns of inference and training of a unit, over each axis."""
     figure, grid = new_figure(2, 2, (9.2, 7.6))
-    panels = grid.ravel()
-    unit = "us" if what == "time" else "mib"
-    for name, panel in zip(AXES, panels, strict=True):
-        rows = [row for row in table if row.axis == name]
+    for axis, panel in zip(AXES, grid.flat, strict=True):
+        rows = [row for row in table if row.axis == axis]
+        values = [row.value for row in rows]
         for field, label in (("infer", "inference"), ("train", "training")):
             cells = [getattr(row, f"{field}_{unit}") for row in rows]
             # Missing values make gaps.
-            values = [cell.median if isinstance(cell, Timing) else cell for cell in cells]
-            panel.plot([row.value for row in rows], values, marker="o", ms=4, label=label)
-        panel.set(xscale="log", yscale="log", xlabel=AXES[name])
-        panel.set_ylabel("time of a step [µs]" if what == "time" else "peak memory [MiB]")
-        number_plainly(panel.xaxis, [row.value for row in rows])
+            numbers = [cell.median if isinstance(cell, Timing) else cell for cell in cells]
+            panel.plot(values, numbers, marker="o", ms=4, label=label)
+        panel.set(xscale="log", yscale="log", xlabel=AXES[axis], ylabel=name)
+        number_plainly(panel.xaxis, values)
         number_plainly(panel.yaxis)
-        panel.tick_params(axis="x", labelsize=8)
         panel.grid(alpha=0.3)
-    panels[0].legend(fontsize=8)
-    return figure
+    grid[0][0].legend()
+    return png(figure)

@@ -22,24 +22,19 @@ from npa_envs.world.rollout import rollout
 
 @dataclass(frozen=True)
 class Workload:
-    """Worlds of uniformly scattered particles and a fresh rule; about 66 neighbours in 2D."""
+    """B worlds of N uniformly scattered particles for a rollout of T steps, and a fresh rule.
+
+    `eps` [length units] is such that particles have about 66 neighbours in 2D.
+    """
 
     space_dim: int
-    """Space dimension D."""
     world_count: int
-    """Worlds B."""
     particle_count: int
-    """Particles in each world N."""
     steps: int
-    """Steps of a rollout T."""
     hidden_dim: int = 128
-    """Width of the rule's hidden layer."""
     state_dim: int = 16
-    """State channels C."""
     eps: float = 0.1
-    """Perception radius [length units]."""
     update_prob: float = 0.5
-    """Probability of each particle's update in a step (dimensionless)."""
 
     @property
     def name(self) -> str:
@@ -292,9 +287,9 @@ class TimingSession:
             return [make()]
         except torch.OutOfMemoryError:
             self.leave_out(what, "not enough memory")
-            return []
         finally:
             self.progress(1)
+        return []
 
     def rows(self, calls: Iterable[tuple[str, Callable[[], Row]]]) -> list[Row]:
         """Return the rows of several named calls, as `attempt`."""

@@ -1,20 +1,26 @@
-"""Trained rules in worlds of their task, and checks of 100 000 steps."""
+"""Checks of trained rules in worlds of their task: 100 000 steps, gradients, CUDA graphs."""
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import torch
+from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.measure.accuracy.suite import RULE_CHECKS, CheckResult, CheckSession, check
+from npa_envs.measure.accuracy.scenes import differing, relative_error
+from npa_envs.measure.accuracy.suite import RULE_CHECKS, CheckResult, CheckSession, Skipped, check
 from npa_envs.measure.quality import RuleRunner
 from npa_envs.rule.files import load_rule, rule_file, rule_metadata
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Task
 from npa_envs.training.task_of_rule import task_of_rule, trained_config
 from npa_envs.world.brushes import nearest_image
+from npa_envs.world.cuda_graph import capture
 from npa_envs.world.particles import Particles
+from npa_envs.world.randomness import WorldRandom
+from npa_envs.world.rollout import rollout
 
 TASKS = ("morphogenesis2d", "morphogenesis3d", "texture", "point_classification")
 """Tasks whose rules can be checked."""
@@ -160,3 +166,123 @@ def _run(name: str, session: CheckSession) -> CheckResult:
         if current["not_finite"]:
             break
     return CheckResult(figures, limits, note=note)
+
+
+# The group `gradients`: growth with the steps, errors of float32.
+
+GRADIENT_STEPS, QUICK_GRADIENT_STEPS = 512, 32
+"""Steps of the longest differentiated rollouts."""
+
+
+class RolloutOutcome(NamedTuple):
+    """Worlds after a rollout, and gradients of a random linear functional of them.
+
+    Gradients are by all weights, [1, W], and by the initial states.
+    """
+
+    x: Tensor
+    s: Tensor
+    by_weights: Tensor
+    by_states: Tensor
+
+
+def powers_of_two(most: int) -> list[int]:
+    """Return 1, 2, 4, ... up to `most`."""
+    return [2**k for k in range(int(math.log2(most)) + 1)]
+
+
+def outcome(home: Habitat, session: CheckSession, steps: int, dtype: torch.dtype) -> RolloutOutcome:
+    """Run a rollout and return worlds and gradients; masks do not depend on the dtype."""
+    rule = NPARule(**home.rule.hyper_parameters()).to(home.worlds.x.device)
+    rule.load_state_dict(home.rule.state_dict())
+    rule.to(dtype)
+    start = home.worlds.s.to(dtype).requires_grad_()
+    x, s, lengths = rollout(
+        rule,
+        home.worlds.x.to(dtype),
+        start,
+        steps,
+        generator=session.generator(1),
+        memory="minimal" if steps > 8 else "store",
+        return_path_length=True,
+        **home.task.rollout_options,
+    )
+    weights = torch.Generator().manual_seed(3)
+    worlds = torch.cat((x, s, lengths[..., None]), dim=2)
+    # A mean over particles, so that norms at different N can be compared.
+    terms = worlds * torch.randn(worlds.shape, generator=weights).to(worlds)
+    loss = terms.sum(-1).mean()
+    network = [*rule.hidden.parameters(), *rule.output.parameters()]
+    by_states, *by_weights = torch.autograd.grad(loss, [start, *network])
+    flat = [gradient.flatten() for gradient in by_weights]
+    return RolloutOutcome(x.detach(), s.detach(), torch.cat(flat)[None], by_states)
+
+
+def _home(session: CheckSession, name: str) -> Habitat:
+    return habitat(session, name, particles=0.25 if session.quick else 1.0)
+
+
+@check("gradients/norm", registry=RULE_CHECKS)
+def _run_norm(name: str, session: CheckSession) -> CheckResult:
+    """Gradients of a functional by weights and by states at the start are finite whatever the
+    number of steps; their norms are reported."""
+    home = _home(session, name)
+    figures: dict[str, float] = {}
+    not_finite = 0.0
+    for steps in powers_of_two(QUICK_GRADIENT_STEPS if session.quick else GRADIENT_STEPS):
+        result = outcome(home, session, steps, torch.float32)
+        figures[f"weights_{steps}"] = float(result.by_weights.norm())
+        figures[f"states_{steps}"] = float(result.by_states.norm())
+        for gradient in (result.by_weights, result.by_states):
+            not_finite = max(not_finite, float((~gradient.isfinite()).double().mean()))
+    return CheckResult(figures | {"not_finite": not_finite}, {"not_finite": 0.0})
+
+
+@check("gradients/float32", registry=RULE_CHECKS)
+def _run_float32(name: str, session: CheckSession) -> CheckResult:
+    """One step in float32 is within 1e-5 of one in float64, also its gradients; after how many
+    steps they still agree to 1e-2 is reported."""
+    home = _home(session, name)
+    if home.rule.divides:
+        raise Skipped("particles divide by draws that are others in float64")
+    counts = powers_of_two(QUICK_GRADIENT_STEPS if session.quick else 128)
+    figures: dict[str, float] = {}
+    usable = dict.fromkeys(RolloutOutcome._fields, 0)
+    for steps in counts:
+        single = outcome(home, session, steps, torch.float32)
+        exact = outcome(home, session, steps, torch.float64)
+        for what, value, right in zip(RolloutOutcome._fields, single, exact, strict=True):
+            figures[f"{what}_{steps}"] = error = relative_error(value, right)
+            if error <= 1e-2 and usable[what] in (0, steps // 2):
+                usable[what] = steps
+    limits = {f"{what}_1": 1e-5 for what in RolloutOutcome._fields}
+    text = ", ".join(f"{what} {steps}" for what, steps in usable.items())
+    return CheckResult(figures, limits, holds=f"steps within 1e-2, of {counts[-1]}: {text}")
+
+
+@check("precision/graph")
+@torch.no_grad()
+def _run_graph(session: CheckSession) -> CheckResult:
+    """A rollout of 16 steps recorded in a CUDA graph has the bits of one that is not."""
+    if not session.cuda:
+        raise Skipped("graphs are CUDA's: run it with --device cuda")
+    home = habitat(session, "gecko", world_count=3)
+    worlds = home.worlds
+    random = WorldRandom([0, 1, 2], device=session.device)
+    result = worlds.map(torch.empty_like)
+    runner = RuleRunner(home.rule, home.task, random)
+
+    def run() -> None:
+        result.copy_(runner.run(worlds, 16))
+
+    run()
+    eager = result.map(torch.clone)
+    figures = {"positions": 0.0, "states": 0.0}
+    graph = capture(run, session.device, warm_up=run)
+    for _ in range(2):
+        random.steps.zero_()
+        result.map(Tensor.zero_)
+        graph.replay()
+        figures["positions"] += differing(result.x, eager.x)
+        figures["states"] += differing(result.s, eager.s)
+    return CheckResult(figures, dict.fromkeys(figures, 0.0))
