@@ -13,7 +13,7 @@ from typing import Any, Literal, TypeGuard, get_args
 import torch
 from torch import Tensor
 
-from npa_envs.errors import NPAError, shown
+from npa_envs.errors import NPAError, shown, suggest
 
 DTYPES = (torch.float32, torch.float64)
 
@@ -343,6 +343,12 @@ def check_non_negative(config: object, *names: str, at_most: float = math.inf) -
 def check_fraction(config: object, *names: str) -> None:
     """Check that fields are numbers in (0, 1]."""
     _check_fields(config, names, lambda v: is_real(v) and 0 < v <= 1, "lie in (0, 1]", 0.5)
+
+
+def check_word(config: object, name: str, words: Sequence[str | None]) -> None:
+    """Check that a field is one of some words, or None if that is one of them."""
+    value, known = getattr(config, name), [word for word in words if word is not None]
+    check_field(config, name, value in words, "be a known word", suggest(value, known))
 
 
 def check_flag(config: object, *names: str) -> None:

@@ -2,7 +2,7 @@
 
 import torch
 
-from npa_envs.agents.learning import Problem, RuleSet
+from npa_envs.agents.learning import Budget, Problem, Progress, RuleSet
 
 WORLD = {"particle_count": 48, "eps": 0.25, "eps0": 0.25, "state_dim": 4}
 
@@ -30,6 +30,12 @@ def species(name="npa/Mixing-v0", episode_steps=8, **keywords):
     if "particle_counts" in given:
         del given["particle_count"]
     return Problem(env_id=name, keywords=given, episode_steps=episode_steps, num_envs=3)
+
+
+def progress_of(problem, device="cpu", **options):
+    """The progress of a run that a learner is made with."""
+    budget = Budget(particle_steps=1)
+    return Progress(problem, budget, device=device, evaluation_seeds=[500], **options)
 
 
 def wild_rules(problem, seed=0, factor=8.0):

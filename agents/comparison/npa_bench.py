@@ -16,7 +16,7 @@ from typing import Any
 from npa_envs.agents.comparison.plan import Axis, ComparisonPlan
 from npa_envs.agents.comparison.run import RunRecord
 from npa_envs.agents.learning import methods_for
-from npa_envs.agents.learning.problem import Problem, registered_steps
+from npa_envs.agents.learning.problem import Problem, registered
 from npa_envs.errors import NPAError, shown
 from npa_envs.files import read_json
 from npa_envs.measure.record import write_record
@@ -84,7 +84,7 @@ class Suite:
     def problem_of(self, task: str) -> Problem:
         """Return the problem of a task name: the registered environment in 16 or 64 worlds."""
         env_id = self.tasks[task]
-        steps, worlds = registered_steps(env_id), 64 if env_id in GARDEN_IDS else 16
+        steps, worlds = registered(env_id).steps, 64 if env_id in GARDEN_IDS else 16
         return Problem(env_id=env_id, episode_steps=steps, num_envs=worlds, hidden_dim=HIDDEN_DIM)
 
     def leaves_out(self, task: str, method: str) -> bool:
@@ -221,16 +221,16 @@ def _stored_row(
 def _joined(suite: Suite, stored: Mapping[str, Any], row: dict[str, Any]) -> dict[str, Any]:
     """Return `row` with the runs of the stored row added that it lacks."""
     new = {(run["id"], run["seed"]) for run in row["runs"]}
-    kept = [dict(run) for run in stored["runs"] if (run["id"], run["seed"]) not in new]
-    if not kept:
+    old = [dict(run) for run in stored["runs"] if (run["id"], run["seed"]) not in new]
+    if not old:
         return row
     added = [dict(run) for run in row["runs"]]
-    for some, machine in ((kept, stored["machine"]), (added, row["machine"])):
+    for some, machine in ((old, stored["machine"]), (added, row["machine"])):
         # In a row of several machines each run names its machine already.
         if stored["machine"] != row["machine"] and ";" not in machine:
             for run in some:
                 run.setdefault("machine", machine)
-    order, runs = list(suite.budgets), [*kept, *added]
+    order, runs = list(suite.budgets), [*old, *added]
     runs.sort(key=lambda run: (run["seed"], order.index(run["id"]) if run["id"] in order else -1))
     before, now = stored.get("versions", {}), row["versions"]
     versions = {

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, astuple, dataclass, fields
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -222,10 +222,8 @@ def curves(records: Iterable[RunRecord]) -> str:
     return csv_text(["axis", "task", "method", "seed", "status", *names], lines)
 
 
-ACROSS: dict[str, Callable[[CurvePoint], float]] = {
-    "wall time [s]": lambda point: point.seconds,
-    "particle-steps": lambda point: point.particle_steps,
-}
+ACROSS = {"wall time [s]": "seconds", "particle-steps": "particle_steps"}
+"""Fields of `CurvePoint` that are abscissae, by their labels."""
 
 CURVE_POINTS = 64
 """Points of a mean curve."""
@@ -240,7 +238,7 @@ class Curve(NamedTuple):
     """0 for a single seed."""
 
 
-def curve(records: Sequence[RunRecord], across: Callable[[CurvePoint], float]) -> Curve | None:
+def curve(records: Sequence[RunRecord], across: str) -> Curve | None:
     """Return the mean of learning curves, interpolated linearly, where they overlap, or None.
 
     A method that does not learn has a single point. Failed and diverged runs, whose curves are
@@ -248,7 +246,8 @@ def curve(records: Sequence[RunRecord], across: Callable[[CurvePoint], float]) -
     """
     lines = []
     for record in [record for record in records if record.status == "done"] or records:
-        points = [(across(p), p.mean_return) for p in record.curve if np.isfinite(p.mean_return)]
+        points = [(getattr(point, across), point.mean_return) for point in record.curve]
+        points = [point for point in points if np.isfinite(point[1])]
         if points:
             lines.append(np.array(points).T)
     if not lines:

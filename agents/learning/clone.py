@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from npa_envs.agents.learning.problem import Problem, world_seeds
+from npa_envs.agents.learning.problem import world_seeds
 from npa_envs.agents.learning.progress import Progress, annealed
 from npa_envs.agents.learning.rule_set import RuleSet, Source
 from npa_envs.checks import check_fraction, check_positive, is_real
@@ -65,16 +65,15 @@ def train(progress: Progress, options: CloneOptions = DEFAULTS) -> RuleSet:
     In a fraction of the worlds the student acts, so that it learns the teacher's actions also in
     states that its own errors lead to (dataset aggregation, Ross et al. 2011).
     """
-    problem, device, seed = progress.problem, progress.device, progress.seed
-    rules = progress.first_rules()
-    generator = torch.Generator(device).manual_seed(seed)
+    device, rules = progress.device, progress.first_rules()
+    generator = torch.Generator(device).manual_seed(progress.seed)
     optimiser = torch.optim.Adam(
         rules.parameters(), lr=options.learning_rate, fused=device.type == "cuda"
     )
     if options.dataset is None:
-        collect, pairs = _taught(problem, rules, seed, device, options)
+        collect, pairs = _taught(progress, rules, options)
     else:
-        collect, pairs = None, _recorded(problem, device, options)
+        collect, pairs = None, _recorded(progress, options)
 
     def iteration() -> int:
         steps = options.updates * options.batch_worlds if collect is None else collect()
@@ -86,22 +85,22 @@ def train(progress: Progress, options: CloneOptions = DEFAULTS) -> RuleSet:
             optimiser.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
             optimiser.step()
-        return steps * problem.particle_count
+        return steps * progress.problem.particle_count
 
     return progress.run(rules, iteration)
 
 
 def _taught(
-    problem: Problem, rules: RuleSet, seed: int, device: torch.device, options: CloneOptions
+    progress: Progress, rules: RuleSet, options: CloneOptions
 ) -> tuple[Callable[[], int], Demonstrations]:
     """Return a function that collects demonstrations and returns the steps, and these."""
-    source = options.teacher
+    problem, device, source = progress.problem, progress.device, options.teacher
     if source is None:
         raise NPAError("teacher must be given to clone, or a dataset: for example teacher='heart'")
     rules_of_teacher = list(source) if isinstance(source, RuleSet) else source
     teacher = RuleSet.of(problem, rules_of_teacher).to(device).policy()
     student, envs = rules.policy(), problem.make_envs(device=device)
-    observation, _ = envs.reset(seed=world_seeds(seed, problem.num_envs))
+    observation, _ = envs.reset(seed=world_seeds(progress.seed, problem.num_envs))
     stored_steps = max(STORED_STEPS, options.collect_steps)
     pairs = Demonstrations(stored_steps * problem.num_envs, observation, teacher(observation))
     taught = problem.num_envs - round(options.student_share * problem.num_envs)
@@ -119,7 +118,7 @@ def _taught(
     return collect, pairs
 
 
-def _recorded(problem: Problem, device: torch.device, options: CloneOptions) -> Demonstrations:
+def _recorded(progress: Progress, options: CloneOptions) -> Demonstrations:
     """Return the demonstrations of a dataset, on a device."""
     from npa_envs.wrappers.minari import read_pairs
 
@@ -127,7 +126,7 @@ def _recorded(problem: Problem, device: torch.device, options: CloneOptions) -> 
         raise NPAError("teacher must be None with a dataset, which contains the actions")
     assert options.dataset is not None, "checked by the caller"
     observations, actions = read_pairs(options.dataset)
-    interface, count = problem.interface, problem.particle_count
+    interface, count = progress.problem.interface, progress.problem.particle_count
     wanted = (count, interface.perception_dim), (count, interface.action_dim)
     if (observations.shape[1:], actions.shape[1:]) != wanted:
         raise NPAError(
@@ -135,7 +134,7 @@ def _recorded(problem: Problem, device: torch.device, options: CloneOptions) -> 
             f"{tuple(observations.shape[1:])} and {tuple(actions.shape[1:])}: record it in this "
             "problem"
         )
-    observations, actions = observations.to(device), actions.to(device)
+    observations, actions = observations.to(progress.device), actions.to(progress.device)
     pairs = Demonstrations(len(observations), observations, actions)
     pairs.add(observations, actions)
     return pairs

@@ -60,19 +60,19 @@ def train(progress: Progress, options: EvolutionOptions = DEFAULTS) -> RuleSet:
     """
     problem, device = progress.problem, progress.device
     rules = progress.first_rules()
-    candidates = RulePopulation(rules)
+    rule_weights = RuleWeights(rules)
     world_count = options.population * options.worlds_per_candidate
     envs = problem.make_envs(world_count, device=device, copy=False)
     draws = np.random.default_rng(progress.seed)
-    strategy = _strategy(candidates, options, draws)
+    strategy = _strategy(rule_weights, options, draws)
 
     def generation() -> int:
         proposed = strategy.ask()
         seeds = draws.integers(FIRST_EVALUATION_SEED, size=options.worlds_per_candidate).tolist()
         weights = torch.as_tensor(np.stack(proposed), dtype=torch.float32).to(device)
-        returns = fitness(envs, candidates, weights, seeds, problem.episode_steps)
+        returns = fitness(envs, rules, weights, seeds, problem.episode_steps)
         strategy.tell(proposed, costs(returns.cpu().double().numpy()))
-        candidates.put(strategy.mean)
+        rule_weights.put(strategy.mean)
         return world_count * problem.particle_count * problem.episode_steps
 
     return progress.run(rules, generation)
@@ -140,36 +140,27 @@ def updates_of(rule: NPARule, weights: Tensor, rows: Tensor) -> Tensor:
     return without_small(torch.cat(updates), rule.dead_zone)
 
 
-class RulePopulation(RuleWeights):
-    """Runs K candidates for a set of rules; a candidate's weights are a row of [K, W]."""
+@torch.no_grad()
+def candidates_actions(rules: RuleSet, weights: Tensor, observation: Tensor) -> Tensor:
+    """Return actions [K * M, N, A] of K candidates, weights [K, W], in M worlds each.
 
-    def __init__(self, rules: RuleSet) -> None:
-        super().__init__(rules)
-        self._rules = rules
+    Observations [K * M, N, P] are ordered by candidate.
+    """
+    sizes = [sum(part.numel() for part in layers_of(rule)) for rule in rules]
+    weights_of = dict(zip(rules, torch.split(weights, sizes, dim=1), strict=True))
 
-    @torch.no_grad()
-    def actions(self, weights: Tensor, observation: Tensor) -> Tensor:
-        """Return actions [K * M, N, A] of K candidates, weights [K, W], in M worlds each.
+    def update(rule: NPARule, observation: Tensor) -> tuple[Tensor, Tensor]:
+        rows = perceived(rule, observation)
+        rows = rows.view(len(weights), -1, rows.shape[1])
+        return bounded(rule, updates_of(rule, weights_of[rule], rows).flatten(0, 1))
 
-        Observations [K * M, N, P] are ordered by candidate.
-        """
-        sizes = [sum(part.numel() for part in layers_of(rule)) for rule in self._rules]
-        parts = []
-        each = zip(self._rules, self._rules.spans, torch.split(weights, sizes, dim=1), strict=True)
-        for rule, span, own in each:
-            observed = observation[:, span]
-            rows = perceived(rule, observed.flatten(0, 1))
-            rows = rows.view(len(weights), -1, rows.shape[1])
-            update = updates_of(rule, own, rows).flatten(0, 1)
-            action = self._rules.interface.action(*bounded(rule, update))
-            parts.append(action.view(*observed.shape[:2], -1))
-        return torch.cat(parts, dim=1)
+    return rules.acted(observation, rules.interface.action, update)
 
 
 def fitness(
-    envs: Any, candidates: RulePopulation, weights: Tensor, seeds: list[int], episode_steps: int
+    envs: Any, rules: RuleSet, weights: Tensor, seeds: list[int], episode_steps: int
 ) -> Tensor:
-    """Return the mean return of each candidate over worlds of the same seeds, shape [K].
+    """Return the mean returns [K] of candidates with weights [K, W] over worlds of the same seeds.
 
     `envs` has K * M worlds: M from k * M on for candidate k, one for each of the seeds.
     """
@@ -177,7 +168,7 @@ def fitness(
     returns = torch.zeros(envs.num_envs, device=weights.device)
     running = torch.ones(envs.num_envs, dtype=torch.bool, device=weights.device)
     for _ in range(episode_steps):
-        action = candidates.actions(weights, observation)
+        action = candidates_actions(rules, weights, observation)
         observation, reward, terminated, truncated, _ = envs.step(action)
         # The next episode of a world that restarted does not count.
         returns += torch.where(running, reward, 0.0)
@@ -186,7 +177,7 @@ def fitness(
 
 
 def _strategy(
-    candidates: RulePopulation, options: EvolutionOptions, draws: np.random.Generator
+    rule_weights: RuleWeights, options: EvolutionOptions, draws: np.random.Generator
 ) -> Any:
     """Return the strategy of `cma`, with `ask`, `tell` and `mean`."""
     try:
@@ -202,8 +193,8 @@ def _strategy(
 
     # The library takes no seed with `randn`.
     settings = {"popsize": options.population, "randn": normal, "seed": math.nan, "verbose": -9}
-    settings |= {"CMA_diagonal": True, "CMA_stds": candidates.scales()}
-    return cma.CMAEvolutionStrategy(candidates.vector(), options.sigma, settings)
+    settings |= {"CMA_diagonal": True, "CMA_stds": rule_weights.scales()}
+    return cma.CMAEvolutionStrategy(rule_weights.vector(), options.sigma, settings)
 
 
 def costs(returns: NDArray[np.float64]) -> list[float]:

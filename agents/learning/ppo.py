@@ -22,22 +22,19 @@ from torch import Tensor, nn
 from npa_envs.agents.learning.ppo_common import (
     CRITIC_RATE,
     CRITIC_WIDTH,
-    MAX_GRADIENT_NORM,
     CommonOptions,
     GaussianRules,
     Minibatches,
-    check_choice,
     find_gradients,
     gradients_of,
     learner_random,
     noise_left,
     seeded_critic,
-    zero_output_rules,
 )
 from npa_envs.agents.learning.problem import ROW_REWARDS, WORLDS_PER_SEED, Problem, world_seeds
 from npa_envs.agents.learning.progress import Budget, Progress
 from npa_envs.agents.learning.rule_set import RuleSet
-from npa_envs.checks import check_flag, check_positive
+from npa_envs.checks import check_flag, check_positive, check_word
 from npa_envs.envs.core.state import free_bytes, needed_bytes
 from npa_envs.errors import NPAError
 from npa_envs.training.ranks import ALONE, Ranks, registered, restart
@@ -81,8 +78,8 @@ class PPOOptions(CommonOptions):
             check_positive(self, float, "clip")
         if self.worlds is not None:
             check_positive(self, int, "worlds")
-        check_choice("ratio", self.ratio, ("particle", "world"))
-        check_choice("credit", self.credit, ("world", *ROW_REWARDS))
+        check_word(self, "ratio", ("particle", "world"))
+        check_word(self, "credit", ("world", *ROW_REWARDS))
         if self.ratio == "world" and self.credit != "world":
             raise NPAError(
                 f"credit={self.credit!r} needs ratio='particle': with ratio='world' there is one "
@@ -105,7 +102,7 @@ def train(progress: Progress, options: PPOOptions = DEFAULTS) -> RuleSet:
     problem, device, ranks = progress.problem, progress.device, progress.ranks
     count = ranks.broadcast(world_count(problem, options, device, progress.budget, ranks))
     options = replace(options, worlds=count)
-    learner = PPOLearner(problem, options, progress.seed, device, progress.initial, ranks)
+    learner = PPOLearner(progress, options)
 
     def round_of_ppo() -> int:
         budget_left = 1.0 - progress.share
@@ -124,16 +121,9 @@ class PPOLearner:
     as a CUDA graph, so that it reads and writes attributes and `memory` in place.
     """
 
-    def __init__(
-        self,
-        problem: Problem,
-        options: PPOOptions,
-        seed: int,
-        device: torch.device,
-        start: RuleSet | None,
-        ranks: Ranks = ALONE,
-    ) -> None:
-        self.options, self.pace, self.ranks = options, options.pace(start), ranks
+    def __init__(self, progress: Progress, options: PPOOptions) -> None:
+        problem, device, ranks = progress.problem, progress.device, progress.ranks
+        self.options, self.pace, self.ranks = options, options.pace(progress.initial), ranks
         total = problem.num_envs if options.worlds is None else options.worlds
         ranks.check_even("worlds", total)
         indices = ranks.indices(total)
@@ -144,11 +134,10 @@ class PPOLearner:
             tell_updated=options.masked,
             copy=False,
         )
-        self.random = learner_random(seed, total, indices, device, ranks)
-        rules = zero_output_rules(problem, seed, start)
+        self.random = learner_random(progress, total, indices)
+        rules = progress.first_rules(zero_output=True)
         self.actor = GaussianRules(rules, self.pace.initial_std).to(device)
-        perception_dim = problem.interface.perception_dim
-        self.critic = seeded_critic(problem, perception_dim, options.critic, seed).to(device)
+        self.critic = seeded_critic(progress, problem.interface.perception_dim, options.critic)
         self.modules = {"actor": self.actor, "critic": self.critic}
         # CUDA graphs read the learning rate from a tensor.
         self.optimisers = {
@@ -161,7 +150,7 @@ class PPOLearner:
             )
             for name, net in self.modules.items()
         }
-        self._seed, self._indices, self._total = seed, indices.tolist(), total
+        self._seed, self._indices, self._total = progress.seed, indices.tolist(), total
         observation = self._worlds_of_part(0)
         self.memory = RoundMemory(
             options.steps,
@@ -352,7 +341,7 @@ class PPOLearner:
 
     def _descend(self, optimiser: torch.optim.Optimizer) -> None:
         parameters = optimiser.param_groups[0]["params"]
-        nn.utils.clip_grad_norm_(parameters, MAX_GRADIENT_NORM)
+        nn.utils.clip_grad_norm_(parameters, self.options.max_gradient_norm)
         optimiser.step()
 
     def _critic_rows(self, part: int, values: Sequence[Tensor]) -> list[Tensor]:
@@ -396,7 +385,10 @@ class PPOLearner:
         if options.ratio == "world":
             log_ratio = over_particles(log_ratio, acted)
         weights, total = self._gain_weights(acted), self._weight_sums[self._current_part, 1]
-        return clipped_gain(log_ratio, advantages, weights, total, clip=options.largest_change)
+        gain = clipped_gain(log_ratio, advantages, weights, total, clip=options.largest_change)
+        if options.entropy_weight:
+            gain = gain + options.entropy_weight * actor.entropy()
+        return gain
 
 
 class Round(NamedTuple):

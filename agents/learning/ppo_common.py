@@ -11,10 +11,9 @@ from typing import Literal, NamedTuple, get_args
 import torch
 from torch import Tensor, nn
 
-from npa_envs.agents.learning.problem import Problem
+from npa_envs.agents.learning.progress import Progress
 from npa_envs.agents.learning.rule_set import RuleSet, species_of
-from npa_envs.checks import check_fraction, check_positive
-from npa_envs.errors import NPAError, shown, suggest
+from npa_envs.checks import check_fraction, check_non_negative, check_positive, check_word
 from npa_envs.training.ranks import ALONE, Ranks, restart, world_streams
 from npa_envs.world.randomness import Randomness, WorldRandom, normal_draws
 
@@ -33,10 +32,6 @@ FRESH = Pace(learning_rate=1e-3, initial_std=0.2, last_noise=0.25, critic_rounds
 
 WARM = Pace(learning_rate=1e-4, initial_std=0.05, last_noise=1.0, critic_rounds=4, target_kl=0.05)
 """With a `start`: much noise, large steps and an untrained critic would spoil those rules."""
-
-MAX_GRADIENT_NORM = 0.5
-"""Gradients are clipped to this norm: separately for rules and critic in `ppo.py`, together in
-Stable-Baselines3."""
 
 CRITIC_RATE = 1e-3
 """Adam's learning rate for the critic."""
@@ -66,6 +61,11 @@ class CommonOptions:
     """Discount of a reward one step later (dimensionless)."""
     gae_lambda: float = 0.9
     """λ of generalised advantage estimation (dimensionless)."""
+    entropy_weight: float = 0.0
+    """Weight of the entropy of an action in the objective."""
+    max_gradient_norm: float = 0.5
+    """Gradients are clipped to this norm: separately for rules and critic in `ppo.py`, together in
+    Stable-Baselines3."""
     target_kl: float | None = None
     """The rules learn no more in a round once the KL divergence from the rules that played it is
     larger [nats]. None: 0.2, or 0.05 with a `start`."""
@@ -84,6 +84,8 @@ class CommonOptions:
     def __post_init__(self) -> None:
         """Check every field; raises NPAError."""
         check_positive(self, int, "steps", "epochs", "minibatches")
+        check_positive(self, float, "max_gradient_norm")
+        check_non_negative(self, "entropy_weight")
         check_fraction(self, "gamma", "gae_lambda", "noise_decay_share")
         for name in ("learning_rate", "initial_std", "target_kl"):
             if getattr(self, name) is not None:
@@ -92,7 +94,7 @@ class CommonOptions:
             check_fraction(self, "last_noise")
         if self.critic_rounds is not None:
             check_positive(self, int, "critic_rounds", at_least=0)
-        check_choice("critic", self.critic, get_args(CriticKind))
+        check_word(self, "critic", get_args(CriticKind))
 
     def pace(self, start: RuleSet | None) -> Pace:
         """Return the options that depend on `start`, with `FRESH` or `WARM` in place of None."""
@@ -108,14 +110,6 @@ def noise_left(budget_left: float, last_noise: float, decay_share: float) -> flo
     without.
     """
     return math.pow(last_noise, max(0.0, 1.0 - budget_left / decay_share))
-
-
-def check_choice(name: str, value: object, choices: Sequence[str]) -> None:
-    """Check that an option is one of its choices."""
-    if value not in choices:
-        raise NPAError(
-            f"{name} must be a known word, got {shown(value)}: {suggest(value, choices)}"
-        )
 
 
 def find_gradients(optimiser: torch.optim.Optimizer, loss: Tensor) -> None:
@@ -136,19 +130,6 @@ def find_gradients(optimiser: torch.optim.Optimizer, loss: Tensor) -> None:
 def gradients_of(optimiser: torch.optim.Optimizer) -> list[Tensor]:
     """Return the gradients of an optimiser's parameters, without those that have none."""
     return [p.grad for p in optimiser.param_groups[0]["params"] if p.grad is not None]
-
-
-def zero_output_rules(problem: Problem, seed: int, start: RuleSet | None) -> RuleSet:
-    """Return the rules that actor-critics begin with: `start`, or new rules that do nothing.
-
-    Their output layers are zero: random ones destroy the picture in `npa/Regeneration2D-v0`.
-    """
-    if start is not None:
-        return start
-    rules = problem.new_rules(seed)
-    for rule in rules:
-        nn.init.zeros_(rule.output.weight)
-    return rules
 
 
 HALF_LOG_TAU = 0.5 * math.log(2.0 * math.pi)
@@ -217,6 +198,10 @@ class GaussianRules(nn.Module):
         """Return log-probabilities [K] of actions [K, A] of one species that observes [K, P]."""
         mean = self._each[species].mean(rows[:, None])[:, 0]
         return gaussian_log_prob(mean, self.log_std[species], action)
+
+    def entropy(self) -> Tensor:
+        """Return the mean entropy of a particle's action [nats]."""
+        return (self.row_log_std() + HALF_LOG_TAU + 0.5).sum(dim=-1).mean()
 
 
 MIN_RATE = 0.01
@@ -295,20 +280,18 @@ class Critic(nn.Module):
         return (1.0 / self.updates[moment]).clamp(min=MIN_RATE)
 
 
-def seeded_critic(problem: Problem, input_dim: int, kind: CriticKind, seed: int) -> Critic:
-    """Return a new critic; torch's global random state does not change."""
+def seeded_critic(progress: Progress, input_dim: int, kind: CriticKind) -> Critic:
+    """Return a new critic, on the device; torch's global random state does not change."""
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        return Critic(input_dim, problem.counts, kind)
+        torch.manual_seed(progress.seed)
+        return Critic(input_dim, progress.problem.counts, kind).to(progress.device)
 
 
-def learner_random(
-    seed: int, total: int, indices: Tensor, device: torch.device, ranks: Ranks
-) -> Randomness:
+def learner_random(progress: Progress, total: int, indices: Tensor) -> Randomness:
     """Return a learner's random source: with several processes one stream a world."""
-    if ranks.together:
-        return world_streams((seed,), total, indices, device)
-    return torch.Generator(device).manual_seed(seed)
+    if progress.ranks.together:
+        return world_streams((progress.seed,), total, indices, progress.device)
+    return torch.Generator(progress.device).manual_seed(progress.seed)
 
 
 class Minibatches:

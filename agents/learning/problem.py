@@ -286,8 +286,8 @@ class Registered(NamedTuple):
     """Class of the task."""
     keywords: dict[str, Any]
     """Fields of the environment's configuration."""
-    steps: int | None
-    """Steps after which an episode is truncated; None: no limit."""
+    steps: int
+    """Steps after which an episode is truncated; `DEFAULT_STEPS` without a limit."""
     species_task: str | None = None
     """Name of the task of several species; None: there is one species."""
 
@@ -296,7 +296,7 @@ def registered(env_id: Any) -> Registered:
     """Return what an id is registered with; raises NPAError if there is no batched environment."""
     if isinstance(env_id, str) and env_id in SPECIES:
         name, keywords = task_settings(env_id)
-        steps = keywords.pop("max_cycles", None)
+        steps = keywords.pop("max_cycles", DEFAULT_STEPS)
         return Registered(species_task_type(name), keywords, steps, name)
     spec = gymnasium.registry.get(env_id) if isinstance(env_id, str) else None
     entry: Any = None if spec is None else spec.vector_entry_point
@@ -308,13 +308,8 @@ def registered(env_id: Any) -> Registered:
             f"env_id must be of an environment of many worlds, got {shown(env_id)}: "
             f"{suggest(env_id, [*known, *SPECIES])}"
         )
-    return Registered(entry.task_type, dict(spec.kwargs), spec.max_episode_steps)
-
-
-def registered_steps(env_id: str) -> int:
-    """Return the steps after which episodes of an id are truncated; 256 without a limit."""
-    steps = registered(env_id).steps
-    return DEFAULT_STEPS if steps is None else steps
+    steps = DEFAULT_STEPS if spec.max_episode_steps is None else spec.max_episode_steps
+    return Registered(entry.task_type, dict(spec.kwargs), steps)
 
 
 def check_run_seed(seed: Any) -> None:

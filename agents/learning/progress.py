@@ -182,11 +182,18 @@ class Progress:
         if folder is not None and self.ranks.first:
             folder.prepare(0, pictures=False)
 
-    def first_rules(self) -> RuleSet:
-        """Return the rules that a learner begins with and trains in place, on the device."""
+    def first_rules(self, *, zero_output: bool = False) -> RuleSet:
+        """Return the rules that a learner begins with and trains in place, on the device.
+
+        zero_output: New rules do nothing, as their output layers are zero: random ones destroy the
+        picture in `npa/Regeneration2D-v0`.
+        """
         if self.initial is not None:
             return self.initial
-        return RuleSet.new(self.problem, self.seed).to(self.device)
+        rules = RuleSet.new(self.problem, self.seed)
+        for rule in rules if zero_output else ():
+            nn.init.zeros_(rule.output.weight)
+        return rules.to(self.device)
 
     def run(
         self, rules: RuleSet, iteration: Callable[[], int], learner: Learner | None = None

@@ -94,10 +94,10 @@ class RuleSet(nn.Module):
         if isinstance(source, str | Path) and (Path(source) / _file_name(0)).is_file():
             return cls.load(source, problem)
         single = isinstance(source, Source)
-        given: Sequence[Source] = [source] * len(problem.counts) if single else list(source)  # type: ignore[arg-type, list-item]
+        sources: Sequence[Source] = [source] * len(problem.counts) if single else list(source)  # type: ignore[arg-type, list-item]
         rules = [
             copy.deepcopy(one).cpu() if isinstance(one, NPARule) else load_rule(one)
-            for one in given
+            for one in sources
         ]
         for rule in rules:
             check_rule_fits(rule, problem.interface, problem.config)
@@ -147,13 +147,21 @@ class RuleSet(nn.Module):
         scale = self.interface.state_scale
         return self.acted(observation, lambda delta, step: torch.cat((delta, step / scale), dim=-1))
 
-    def acted(self, observation: Tensor, action: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
-        """Return actions [B, N, A] that `action` makes of displacements and state steps."""
+    def acted(
+        self,
+        observation: Tensor,
+        action: Callable[[Tensor, Tensor], Tensor],
+        update: Callable[[NPARule, Tensor], tuple[Tensor, Tensor]] = bounded_update,
+    ) -> Tensor:
+        """Return actions [B, N, A] that `action` makes of displacements and state steps.
+
+        update: Returns these for a rule and its observations [K, P].
+        """
         parts = []
         for rule, span in zip(self, self.spans, strict=True):
             rows = observation[:, span]
-            own = action(*bounded_update(rule, rows.flatten(0, 1)))
-            parts.append(own.view(*rows.shape[:2], -1))
+            actions = action(*update(rule, rows.flatten(0, 1)))
+            parts.append(actions.view(*rows.shape[:2], -1))
         return parts[0] if len(parts) == 1 else torch.cat(parts, dim=1)
 
     def policy(self) -> RuleSetPolicy:

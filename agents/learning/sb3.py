@@ -19,14 +19,12 @@ from torch import Tensor
 
 from npa_envs.agents.learning.baselines import check_no_start
 from npa_envs.agents.learning.ppo_common import (
-    MAX_GRADIENT_NORM,
     CommonOptions,
     Critic,
     CriticKind,
     GaussianRules,
     Pace,
     noise_left,
-    zero_output_rules,
 )
 from npa_envs.agents.learning.problem import world_seeds
 from npa_envs.agents.learning.progress import Progress
@@ -94,10 +92,11 @@ def train(progress: Progress, options: WorldOptions = DEFAULTS) -> RuleSet:
         gamma=options.gamma,
         gae_lambda=options.gae_lambda,
         clip_range=options.clip,
-        max_grad_norm=MAX_GRADIENT_NORM,
+        ent_coef=options.entropy_weight,
+        max_grad_norm=options.max_gradient_norm,
         target_kl=world_kl(pace.target_kl),
         policy_kwargs={
-            "rules": zero_output_rules(problem, seed, progress.initial),
+            "rules": progress.first_rules(zero_output=True),
             "initial_std": pace.initial_std,
             "critic": options.critic,
         },
@@ -220,10 +219,10 @@ class WorldRulePolicy(ActorCriticPolicy):
             action, log_prob = self.actor.sample(obs)
         return action, self.predict_values(obs), log_prob.mean(dim=1)
 
-    def evaluate_actions(self, obs: Any, actions: Tensor) -> tuple[Tensor, Tensor, None]:
-        """Return values [M, 1] and log-probabilities [M] of actions; no entropy is needed."""
+    def evaluate_actions(self, obs: Any, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return values [M, 1], log-probabilities [M] and entropies [M] of actions."""
         log_prob = self.actor.log_prob(obs, actions.view(*obs.shape[:2], -1))
-        return self.predict_values(obs), log_prob.mean(dim=1), None
+        return self.predict_values(obs), log_prob.mean(dim=1), self.actor.entropy().expand(len(obs))
 
     def predict_values(self, obs: Any) -> Tensor:
         """Return the values of worlds, shape [M, 1]."""

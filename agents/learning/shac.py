@@ -20,19 +20,16 @@ from npa_envs.agents.learning.ppo_common import (
     Critic,
     CriticKind,
     Minibatches,
-    check_choice,
     find_gradients,
     gradients_of,
     learner_random,
     seeded_critic,
-    zero_output_rules,
 )
-from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.learning.progress import Progress, annealed
 from npa_envs.agents.learning.rule_set import RuleSet
-from npa_envs.checks import check_fraction, check_non_negative, check_positive
+from npa_envs.checks import check_fraction, check_non_negative, check_positive, check_word
 from npa_envs.training.optimiser import normalise_gradients
-from npa_envs.training.ranks import ALONE, Ranks, restart
+from npa_envs.training.ranks import restart
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import WorldRandom
 from npa_envs.world.rollout import Memory
@@ -71,7 +68,7 @@ class SHACOptions:
     def __post_init__(self) -> None:
         """Check every field; raises NPAError. `memory` is checked where rollouts begin."""
         check_positive(self, int, "steps", "world_count", "critic_epochs", "minibatches")
-        check_choice("critic", self.critic, get_args(CriticKind))
+        check_word(self, "critic", get_args(CriticKind))
         check_positive(self, float, "learning_rate")
         check_fraction(self, "gamma", "td_lambda", "last_rate", "target_rate")
         check_non_negative(self, "value_weight")
@@ -86,12 +83,11 @@ def train(progress: Progress, options: SHACOptions = DEFAULTS) -> RuleSet:
     Rewards are decreases of the environment's loss, as with `reward="dense"`. The critic values
     worlds as if episodes had no end. State steps are clamped as in `gradient.train`.
     """
-    problem, ranks = progress.problem, progress.ranks
-    learner = SHACLearner(problem, options, progress.seed, progress.device, progress.initial, ranks)
+    learner = SHACLearner(progress, options)
 
     def iteration() -> int:
         learner.learn(annealed(options.learning_rate, options.last_rate, progress.share))
-        return options.world_count * learner.window * problem.particle_count
+        return options.world_count * learner.window * progress.problem.particle_count
 
     return progress.run(learner.rules, iteration, learner)
 
@@ -117,26 +113,19 @@ class SHACLearner:
     own, and gradients and moments are averaged.
     """
 
-    def __init__(
-        self,
-        problem: Problem,
-        options: SHACOptions,
-        seed: int,
-        device: torch.device,
-        start: RuleSet | None,
-        ranks: Ranks = ALONE,
-    ) -> None:
+    def __init__(self, progress: Progress, options: SHACOptions) -> None:
+        problem, device, ranks = progress.problem, progress.device, progress.ranks
         self.options, self.device, self.ranks = options, device, ranks
         ranks.check_even("world_count", options.world_count)
         indices = ranks.indices(options.world_count)
-        self.rules = zero_output_rules(problem, seed, start).to(device)
+        self.rules = progress.first_rules(zero_output=True)
         count = -(-problem.episode_steps // options.steps)
         self.window = -(-problem.episode_steps // count)
         """Steps of a window, h."""
         self.task = EnvironmentTask(problem, device)
-        self.random = learner_random(seed, options.world_count, indices, device, ranks)
+        self.random = learner_random(progress, options.world_count, indices)
         width = problem.physics.space_dim + problem.physics.state_dim + 1
-        self.critic = seeded_critic(problem, width, options.critic, seed).to(device)
+        self.critic = seeded_critic(progress, width, options.critic)
         self.target = copy.deepcopy(self.critic).requires_grad_(False)
         self.modules = {"rules": self.rules, "critic": self.critic, "target": self.target}
         weights = [p for p in self.rules.parameters() if p.requires_grad]

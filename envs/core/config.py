@@ -16,6 +16,7 @@ from npa_envs.checks import (
     check_fraction,
     check_non_negative,
     check_positive,
+    check_word,
     is_real,
 )
 from npa_envs.devices import check_device
@@ -128,8 +129,7 @@ class WorldConfig:
         check_fraction(self, "update_prob")
         check_non_negative(self, "position_noise")
         for name, words in self.words.items():
-            value, known = getattr(self, name), [word for word in words if word is not None]
-            check_field(self, name, value in words, "be a known word", suggest(value, known))
+            check_word(self, name, words)
         fits = self.boundary != "periodic" or self.box_size >= 2.0 * self.eps
         rule = f"be at least 2 eps = {2.0 * self.eps:g}"
         check_field(self, "box_size", fits, rule, "enlarge the box or perceive at a smaller eps")

@@ -142,12 +142,12 @@ def run(options: LearnOptions, ranks: Ranks) -> int:
 
 def problem_of(options: LearnOptions) -> Problem:
     """Return the environment to learn."""
-    from npa_envs.agents.learning.problem import Problem, registered_steps
+    from npa_envs.agents.learning.problem import Problem, registered
 
     steps = options.episode_steps
     return Problem(
         env_id=options.env,
         keywords=common.named_values("keywords", options.keywords),
-        episode_steps=registered_steps(options.env) if steps is None else steps,
+        episode_steps=registered(options.env).steps if steps is None else steps,
         num_envs=WORLDS if options.worlds is None else options.worlds,
     )

@@ -83,13 +83,13 @@ def main(arguments: Sequence[str]) -> int:
 
 def problem_of(options: RecordOptions) -> Problem:
     """Return the environment with its keywords."""
-    from npa_envs.agents.learning.problem import Problem, registered_steps
+    from npa_envs.agents.learning.problem import Problem, registered
 
     worlds = min(options.worlds, options.episodes)
     problem = Problem(
         env_id=options.env,
         keywords=common.named_values("options", options.options),
-        episode_steps=registered_steps(options.env),
+        episode_steps=registered(options.env).steps,
         num_envs=worlds,
     )
     if problem.actor == "species":

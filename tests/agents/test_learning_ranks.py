@@ -7,18 +7,16 @@ import signal
 
 import pytest
 import torch
-from learning_problems import heart, species
+from learning_problems import heart, progress_of, species
 from processes import on_ranks
 from refusals import refused
 
 from npa_envs.agents.learning import Budget, ppo, shac, train
 from npa_envs.rule.files import load_rule
 from npa_envs.training.checkpoint import load_checkpoint, save_checkpoint
-from npa_envs.training.ranks import Ranks
 
 HEART = heart(num_envs=4, episode_steps=6)
 DYING = species(episode_steps=6, deaths=[[1, 3]])
-CPU = torch.device("cpu")
 
 FORMS = {
     "PPO": (HEART, ppo, {"steps": 5, "masked": True, "minibatches": 2, "epochs": 2}),
@@ -31,9 +29,10 @@ FORMS = {
 def learner_of(form):
     """The learner of this process, whose numbers are float64; worlds themselves are float32."""
     problem, method, options = FORMS[form]
-    kind = ppo.PPOOptions if method is ppo else shac.SHACOptions
-    learner = ppo.PPOLearner if method is ppo else shac.SHACLearner
-    made = learner(problem, kind(**options), 0, CPU, None, Ranks.current())
+    learner, cls = (
+        (ppo.PPOLearner, ppo.PPOOptions) if method is ppo else (shac.SHACLearner, shac.SHACOptions)
+    )
+    made = learner(progress_of(problem), cls(**options))
     for module in made.modules.values():
         module.double()
     if method is ppo:
@@ -108,11 +107,11 @@ ROUND = {"ppo": 3 * 4 * 48, "shac": 2 * 4 * 48}
 """Particle-steps of an iteration."""
 
 
-def kept(method, out, rounds, **given):
+def kept(method, out, rounds, **options):
     """Learn for some rounds; what is learned, and the particle-steps of the curve's entries."""
-    budget, given = Budget(particle_steps=rounds * ROUND[method]), METHODS[method] | given
-    given = {"evaluation_seeds": range(500, 502), "entries": 2, "out": out} | given
-    trained = train(method, HEART, budget, 0, **given)
+    budget, options = Budget(particle_steps=rounds * ROUND[method]), METHODS[method] | options
+    options = {"evaluation_seeds": range(500, 502), "entries": 2, "out": out} | options
+    trained = train(method, HEART, budget, 0, **options)
     weights = [weight.flatten().tolist() for weight in trained.rules.parameters()]
     return weights, [entry.particle_steps // ROUND[method] for entry in trained.log]
 
@@ -155,10 +154,13 @@ def test_a_run_that_is_asked_to_stop_can_be_resumed(tmp_path, monkeypatch):
             os.kill(os.getpid(), signal.SIGTERM)
 
     monkeypatch.setattr(ppo.PPOLearner, "improve", asked)
-    assert kept("ppo", tmp_path, 8)[1] == [0, 3]
+    start = HEART.new_rules(3)
+    # Seeds of evaluations are read once.
+    seeds = iter([500, 501])
+    assert kept("ppo", tmp_path, 8, start=start, evaluation_seeds=seeds)[1] == [0, 3]
     assert load_checkpoint(tmp_path / "checkpoint.pt")["iteration"] == 3
     monkeypatch.undo()
-    assert kept("ppo", tmp_path, 8, resume=True)[1] == [0, 3, 4, 8]
+    assert kept("ppo", tmp_path, 8, start=start, resume=True)[1] == [0, 3, 4, 8]
 
 
 def test_a_shared_run_that_goes_on_by_seconds_evaluates_at_their_shares(tmp_path):
@@ -177,36 +179,24 @@ def test_a_shared_run_that_goes_on_by_seconds_evaluates_at_their_shares(tmp_path
     assert on_ranks(1, resumed, tmp_path) == [first + 1]
 
 
-@pytest.fixture(scope="module")
-def one_round(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("kept") / "run"
-    kept("ppo", folder, 1)
-    return folder
-
-
 @pytest.fixture
-def finished(one_round, tmp_path):
-    return shutil.copytree(one_round, tmp_path / "run")
+def finished(tmp_path):
+    """The folder of a run of one round."""
+    kept("ppo", tmp_path, 1)
+    return tmp_path
 
 
 @pytest.mark.parametrize(
-    ("method", "given", "message"),
+    ("method", "options", "message"),
     [
         ("ppo", {}, "holds one: resume it"),
+        ("ppo", {"resume": True, "start": HEART.new_rules(3), **METHODS["ppo"]}, "in started"),
         ("shac", {"resume": True}, "differs in method, options"),
         ("evolution", {"resume": True}, "cannot be kept in a folder"),
     ],
 )
-def test_a_folder_with_another_run_is_refused(method, given, message, finished):
-    refused(message, train, method, HEART, Budget(particle_steps=1), 0, out=finished, **given)
-
-
-def test_a_run_goes_on_with_rules_to_begin_with_if_it_began_with_some(tmp_path):
-    start = HEART.new_rules(3)
-    # Seeds of evaluations are read once.
-    kept("ppo", tmp_path, 1, start=start, evaluation_seeds=iter([500, 501]))
-    refused("differs in started", kept, "ppo", tmp_path, 2, resume=True)
-    kept("ppo", tmp_path, 2, resume=True, start=start)
+def test_a_folder_with_another_run_is_refused(method, options, message, finished):
+    refused(message, train, method, HEART, Budget(particle_steps=1), 0, out=finished, **options)
 
 
 def test_a_checkpoint_that_was_changed_is_refused(finished):
@@ -219,17 +209,17 @@ def test_a_checkpoint_that_was_changed_is_refused(finished):
         refused("must hold all that a run needs", kept, "ppo", finished, 2, resume=True)
 
 
-def test_what_cannot_be_shared_is_refused(tmp_path):
-    said = on_ranks(2, lambda: kept("ppo", None, 1), tmp_path)
-    assert said[0] == said[1]
+@pytest.mark.parametrize(
+    ("method", "options", "message"),
+    [
+        ("evolution", {}, "'evolution' cannot be shared by processes: take one of ppo, shac"),
+        ("ppo", {"worlds": 3}, "worlds must be a multiple of the number of processes, got 3 and 2"),
+    ],
+)
+def test_what_cannot_be_shared_is_refused(method, options, message, tmp_path):
+    def learn():
+        train(method, HEART, Budget(particle_steps=1), 0, **options)
 
-    def evolved():
-        train("evolution", HEART, Budget(particle_steps=1), 0)
-
-    def uneven():
-        train("ppo", HEART, Budget(particle_steps=1), 0, worlds=3)
-
-    for told in on_ranks(2, evolved, tmp_path):
-        assert "method 'evolution' cannot be shared by processes: take one of ppo, shac" in told
-    for told in on_ranks(2, uneven, tmp_path):
-        assert "worlds must be a multiple of the number of processes, got 3 and 2" in told
+    first, second = on_ranks(2, learn, tmp_path)
+    assert message in first
+    assert message in second

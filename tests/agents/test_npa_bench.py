@@ -145,16 +145,13 @@ def test_a_run_that_failed_is_in_no_row_and_one_that_diverged_has_no_returns(tmp
 
 BROKEN = [
     (lambda held: held.pop("machine"), "'machine' is a required property"),
-    (lambda held: held.update(extra=1), "Additional properties"),
     (lambda held: held.update(benchmark="npa-bench-v1"), "is not one of"),
     (lambda held: held["runs"][0].update(returns=[1.0]), r"\$.runs\[0\].returns"),
-    (lambda held: held["runs"][0].update(returns=["a"] * 32), "is not of type"),
     (lambda held: held["runs"][0].update(id="npa/Other-v0"), "no problem of npa-bench-v0"),
     (lambda held: held["runs"].pop(), "from at least 5 seeds"),
     (lambda held: held["runs"][0].update(seed=1), "each once"),
     (lambda held: held["runs"][0].update(particle_steps=1e12), "at most"),
     (lambda held: held["runs"][0].update(machine="abacus"), "its machine does not name"),
-    (lambda held: held["runs"][0].update(machine=""), r"\$.runs\[0\].machine"),
 ]
 OTHER = [
     (lambda held: held.update(benchmark="npa-bench-small-v0"), "must have the benchmark"),
@@ -181,13 +178,6 @@ def test_a_row_that_breaks_a_rule_or_is_of_something_else_is_refused(
     changed(path, change)
     given = (check_rows, SUITE, made, tmp_path) if adding else (read_row, path)
     refused(words, *given)
-
-
-def test_runs_of_a_row_from_several_machines_say_where_they_ran(zero_row):
-    _, path = zero_row
-    changed(path, lambda held: held.update(machine="abacus; slide rule"))
-    changed(path, lambda held: held["runs"][0].update(machine="slide rule"))
-    assert [run.machine for run in read_row(path).runs[:2]] == ["slide rule", ""]
 
 
 def test_a_narrower_call_keeps_the_rest_of_a_row(zero_row, tmp_path):

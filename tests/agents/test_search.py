@@ -1,7 +1,6 @@
 """The search for rules that differ: what candidates are judged by, and what a search leaves."""
 
 import json
-import math
 import sys
 
 import numpy as np
@@ -46,37 +45,24 @@ def search(**options):
     return Search(world, batch_size=4, device=CPU, **options)
 
 
-def needs_ribs():
-    pytest.importorskip("ribs", reason="the extra search is not installed")
-
-
 # Worlds
 
 
-def test_a_candidate_comes_to_the_same_alone_and_beside_others(device):
-    tried = candidates(device, world_count=2)
+def test_a_candidate_comes_to_the_same_alone_and_beside_others_and_as_its_rule(device):
+    tried = candidates(device)
     given = solutions(tried, 3)
     together = tried.try_all(given)
     for number, one in enumerate(given):
-        alone = tried.try_all(one[None])
+        random = WorldRandom([0], device=device)
+        x = uniform_ball(1, 16, 2, SEED_RADIUS, generator=random, device=device)
+        s, rule = x.new_zeros(1, 16, 4), tried.rule_of(one).to(device)
+        x, s = rollout(rule, x, s, 16, update_prob=UPDATE_PROB, generator=random)
+        torch.testing.assert_close(together.worlds.x[number], x, atol=1e-4, rtol=0.0)
+        torch.testing.assert_close(together.worlds.s[number], s, atol=1e-4, rtol=1e-3)
+        (alone,), beside = tried.try_all(one[None]).found, together.found[number]
         # But for rounding: some processors add up products of other sizes in another order.
-        pair = alone.worlds.x[0], together.worlds.x[number]
-        torch.testing.assert_close(*pair, atol=1e-6, rtol=0.0)
-        (ours,), theirs = alone.found, together.found[number]
-        assert ours.quality == pytest.approx(theirs.quality, abs=1e-6)
-        assert ours.measures == pytest.approx(theirs.measures, abs=1e-6)
-
-
-def test_a_candidate_lives_as_its_rule_does_in_a_rollout(device):
-    tried = candidates(device=device)
-    (given,) = solutions(tried, 1)
-    worlds = tried.try_all(given[None]).worlds
-    random = WorldRandom([0], device=device)
-    x = uniform_ball(1, 16, 2, SEED_RADIUS, generator=random, device=device)
-    s, rule = x.new_zeros(1, 16, 4), tried.rule_of(given).to(device)
-    x, s = rollout(rule, x, s, 16, update_prob=UPDATE_PROB, generator=random)
-    torch.testing.assert_close(worlds.x[0], x, atol=1e-4, rtol=0.0)
-    torch.testing.assert_close(worlds.s[0], s, atol=1e-4, rtol=1e-3)
+        assert alone.quality == pytest.approx(beside.quality, abs=1e-6)
+        assert alone.measures == pytest.approx(beside.measures, abs=1e-6)
 
 
 def test_dead_and_exploding_rules_are_nothing_and_descriptors_lie_within_their_axes():
@@ -135,7 +121,6 @@ def test_a_missing_library_is_named_with_its_extra(monkeypatch):
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("method", METHODS)
 def test_a_stopped_search_goes_on_as_if_it_had_not_been(method, tmp_path):
-    needs_ribs()
     # Many weights, whose steps cma adapts otherwise by default.
     options = {"method": method, "seed": 3, "world": {"hidden_dim": 16}}
     whole, path = search(**options), tmp_path / RESULTS
@@ -161,33 +146,7 @@ def test_a_stopped_search_goes_on_as_if_it_had_not_been(method, tmp_path):
         assert other.qd_score != pytest.approx(found.qd_score)
 
 
-@pytest.mark.slow
-def test_each_cell_keeps_its_best_and_the_scores_are_theirs(tmp_path):
-    needs_ribs()
-    path = tmp_path / RESULTS
-    done = search(method="random", path=path)
-    done.run(6 * BATCH_COST)
-    best: dict[tuple[int, ...], float] = {}
-    held = json.loads(path.read_text(encoding="utf-8"))
-    for batch in held["batches"]:
-        for told in batch["found"]:
-            if told is not None:
-                spans = [(a.lowest, a.highest, a.cells) for a in done.axes]
-                cell = tuple(
-                    min(max(math.floor((value - low) / (high - low) * cells), 0), cells - 1)
-                    for value, (low, high, cells) in zip(told[1:], spans, strict=True)
-                )
-                best[cell] = max(best.get(cell, 0.0), told[0])
-    growth = done.growth[-1]
-    assert growth.evaluations == 24
-    assert {elite.cell: elite.found.quality for elite in done.elites()} == best
-    assert growth.qd_score == pytest.approx(sum(best.values()))
-    assert growth.coverage == pytest.approx(len(best) / 400)
-    assert growth.best == pytest.approx(max(best.values()))
-
-
 def test_the_command_leaves_elites_that_other_commands_open(tmp_path, capsys):
-    needs_ribs()
     out = tmp_path / "found"
     words = ["search", *OPTIONS, "--no-progress", "--out", str(out), "--budget"]
     assert main([*words, str(2 * BATCH_COST)]) == 0
