@@ -94,7 +94,9 @@ class _NormalizesPerception(WrapperBase):
     def __init__(
         self, env: Any, *, clip: float = 10.0, epsilon: float = 1e-8, training: bool = True
     ) -> None:
-        self.clip, self.epsilon = above_zero("clip", clip), above_zero("epsilon", epsilon)
+        # A larger number is infinite in float32, the type of observations.
+        self.clip = min(above_zero("clip", clip), float(np.finfo(np.float32).max))
+        self.epsilon = above_zero("epsilon", epsilon)
         if not isinstance(training, bool | np.bool_):
             raise NPAError(f"training must be True or False, got {shown(training)}")
         super().__init__(env, clip=self.clip, epsilon=self.epsilon, training=training)
