@@ -13,6 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import crowds
 import gymnasium
 import numpy as np
 import small_envs
@@ -277,32 +278,46 @@ def read_damaged(suffix: str, content: bytes) -> None:
         FILES[suffix][1](path)
 
 
+@functools.cache
+def config_type(name: str) -> type:
+    """Return the configuration of an environment: an id, or a task of several species."""
+    env = small_envs.make(name).unwrapped if name.startswith("npa/") else crowds.make(name)
+    return type(env.config)
+
+
 def env_fields(draw: random.Random) -> dict[str, Any]:
-    name = draw.choice(small_envs.IDS)
+    one_species = draw.random() < 0.5
+    name = draw.choice(small_envs.IDS if one_species else crowds.TASKS)
     known = sorted(field.name for field in dataclasses.fields(config_type(name)))
     # Unknown ones come alone: Gymnasium itself repeats all keywords then, whole.
     unknown = draw.choice(("seed", "rules"))
     fields = draw.sample(known, draw.choice((1, 1, 2))) if draw.random() < 0.9 else [unknown]
     arguments = {field: getattr(config_type(name), field, None) for field in fields}
+    if not one_species:
+        maker = draw.choice(("parallel_env", "particles", "batched", "env"))
+        size = {"particle_count": 12, "max_cycles": 3, "species_count": 2}
+        return {"maker": maker} | arguments | crowds.small(name, **size)
     id = draw.choice((name, name, name, name, "npa/Texture-v9", "npa/None", ""))
-    return {"id": id, "world_count": draw.choice((None, 2)), **(arguments | small_envs.small(name))}
+    call = draw.choice(({"maker": "make"}, {"maker": "make_vec", "num_envs": 2}))
+    return call | {"id": id} | arguments | small_envs.small(name)
 
 
-@functools.cache
-def config_type(name: str) -> type:
-    return type(small_envs.make(name).unwrapped.config)
-
-
-def run_env(id: Any, world_count: Any, **keywords: Any) -> None:
+def run_env(maker: str, **keywords: Any) -> None:
     """Make an environment and act in it once."""
-    if world_count is None:
-        env = gymnasium.make(id, disable_env_checker=True, **keywords)
+    if maker == "make":
+        env = gymnasium.make(disable_env_checker=True, **keywords)
+    elif maker == "make_vec":
+        env = gymnasium.make_vec(vectorization_mode="vector_entry_point", **keywords)
+    elif maker == "particles":
+        env = particles_v0.parallel_env(**keywords)
     else:
-        mode = "vector_entry_point"
-        env = gymnasium.make_vec(id, num_envs=world_count, vectorization_mode=mode, **keywords)
+        env = getattr(multispecies_v0, maker)(**keywords)
     with contextlib.closing(env):
         env.reset(seed=0)
-        env.step(env.action_space.sample())
+        if maker in ("make", "make_vec"):
+            env.step(env.action_space.sample())
+        elif maker in ("parallel_env", "particles"):
+            env.step({agent: env.action_space(agent).sample() for agent in env.agents})
 
 
 @functools.cache
@@ -311,31 +326,6 @@ def standing(kind: str) -> Any:
     if kind == "single":
         return small_envs.make(small_envs.IDS[0]).unwrapped
     return small_envs.make_vec(small_envs.IDS[0], 2).unwrapped
-
-
-def crowd_fields(draw: random.Random) -> dict[str, Any]:
-    task = draw.choice(tuple(multispecies_v0.ENVIRONMENTS.values()))
-    known = sorted(species_config(task).__dataclass_fields__)
-    fields = draw.sample([*known, "seed"], draw.choice((1, 1, 2)))
-    arguments = {f: getattr(species_config(task), f, None) for f in fields if f != "species_count"}
-    fixed = {"particle_count": 12, "eps": 0.3, "max_cycles": 3, "render_size": 24}
-    maker = draw.choice(("parallel_env", "particles", "batched", "env"))
-    return {"maker": maker, "task": task, "species_count": 2, **(arguments | fixed)}
-
-
-@functools.cache
-def species_config(task: str) -> type:
-    return type(multispecies_v0.parallel_env(task, particle_count=12, eps=0.3).config)
-
-
-def run_species(maker: str, **keywords: Any) -> None:
-    """Make an environment of several species and act in it once."""
-    particles = maker == "particles"
-    make = particles_v0.parallel_env if particles else getattr(multispecies_v0, maker)
-    env = make(**keywords)
-    env.reset(seed=0)
-    if maker in ("parallel_env", "particles"):
-        env.step({agent: env.action_space(agent).sample() for agent in env.agents})
 
 
 CONSTRUCTED: dict[str, dict[str, Any]] = {
@@ -436,8 +426,9 @@ TARGETS: dict[str, Target] = {
     "preset": Target(configure, configured, 4, constant=("field",)),
     "TrainConfig": Target(reconfigure, configured, 4, constant=("name", "task", "field")),
     "damaged files": Target(read_damaged, damaged_files, 6, constant=("suffix", "content")),
-    "gymnasium.make": Target(run_env, env_fields, 5, (gymnasium.error.Error,), ("id",)),
-    "multispecies_v0": Target(run_species, crowd_fields, 5, constant=("maker",)),
+    "environments": Target(
+        run_env, env_fields, 10, (gymnasium.error.Error,), constant=("maker", "id")
+    ),
     "wrappers and agents": Target(construct, constructed, 5, constant=("name",)),
 }  # fmt: skip
 """What is called, by name."""

@@ -214,13 +214,7 @@ def every(strategy):
                 database=None,
                 suppress_health_check=[HealthCheck.too_slow],
             )
-
-            @chosen
-            @given(strategy(device))
-            def examined(drawn):
-                function(drawn)
-
-            examined()
+            chosen(given(strategy(device))(function))()
 
         run.__name__, run.__doc__ = function.__name__, function.__doc__
         return run

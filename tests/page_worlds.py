@@ -67,6 +67,9 @@ WORLDS: dict[str, tuple[str | Callable[[], NPARule], int, Box, float]] = {
     "digits, which stay": ("digits", 300, None, 0.1),
     "dead zone": (lambda: NPARule(2, 5, 9, dead_zone=0.2), 200, None, 0.1),
     "smooth inverse": (lambda: NPARule(2, 5, 9, moment_inverse="smooth"), 200, None, 0.1),
+    "no correction": (lambda: NPARule(2, 6, 5, moment_correction=False), 200, None, 0.1),
+    "no slopes of states": (lambda: NPARule(2, 6, 5, state_gradient=False), 200, None, 0.1),
+    "no slope of density": (lambda: NPARule(2, 6, 5, density_gradient=False), 200, None, 0.1),
 }
 
 

@@ -1,4 +1,4 @@
-"""What is public besides numbers: names, ids, commands with their options, documented imports."""
+"""What is public besides numbers: names, signatures, ids, commands with their options."""
 
 import contextlib
 import importlib
@@ -62,18 +62,6 @@ def options(*words):
     return sorted(set(re.findall(r"--[a-z][a-z0-9-]*[a-z0-9]", text.getvalue())))
 
 
-def documented(folder):
-    """Return the names that documents of a repository take from the library and that are there."""
-    texts = [path.read_text(encoding="utf-8") for path in sorted(folder.glob("docs/**/*.md"))]
-    text = "\n".join([*texts, (folder / "README.md").read_text(encoding="utf-8")])
-    names = set(re.findall(r"\bnpa_envs(?:\.\w+)+", text))
-    pattern = r"from (npa_envs[\w.]*) import (\([^)]*\)|[^\n]*)"
-    for module, group in re.findall(pattern, text):
-        words = re.sub(r"#.*", "", group).strip("() \n").replace("\n", " ").split(",")
-        names |= {f"{module}.{word.split()[0]}" for word in words if word.split()}
-    return sorted(name for name in names if is_there(name))
-
-
 def is_there(name):
     """Return whether a dotted name can be imported."""
     with contextlib.suppress(ImportError, AttributeError):
@@ -83,7 +71,7 @@ def is_there(name):
 
 
 def everything():
-    """Return all of it but the documented names."""
+    """Return all of it."""
     commands = {name: options(name) for name in COMMANDS if name != "train"}
     commands |= {f"train {task}": options("train", task) for task in TASKS}
     return {

@@ -289,7 +289,7 @@ def scenes():
     few = ("--checkpoints", "4", "12", "--particle-count", "128")
     healing = ("heart", "--checkpoints", "16", "--particle-count", "128", "--healing")
     kinds = ("parallel", "batch", "particles")
-    made = {
+    groups = {
         "rule": {name: partial(of_rule, name) for name in rules},
         "kind": {name: partial(of_kind, name) for name in KINDS},
         "env": {name: partial(of_environment, name, None) for name in names},
@@ -316,7 +316,7 @@ def scenes():
     }
     alone = {"at-rest": at_rest, "gardeners": two_gardeners, "page": page, "brushes": brushed}
     return alone | {
-        f"{group}/{n}": scene for group, own in made.items() for n, scene in own.items()
+        f"{group}/{n}": scene for group, members in groups.items() for n, scene in members.items()
     }
 
 

@@ -36,7 +36,7 @@ def call(seed: int) -> tuple[str, dict[str, Any]]:
         arguments[argument] = wrong(draw, argument, arguments[argument])
     if arguments.get("rule", "") is None:
         arguments["rule"] = "picture"  # None is legal, and grows a world for seconds.
-    if name == "gymnasium.make" and arguments.get("render_mode") is not None:
+    if name == "environments" and arguments.get("render_mode") is not None:
         arguments["render_mode"] = str(arguments["render_mode"])  # Gymnasium reads it itself.
     return name, arguments
 

@@ -14,11 +14,8 @@ from page_worlds import (
     SPECIES,
     TOLERANCE,
     WORLDS,
-    described,
     example,
-    lively,
     packed,
-    scattered,
     unpacked,
 )
 from torch import Tensor
@@ -41,7 +38,6 @@ from npa_envs.web.export import (
 from npa_envs.web.live import ColouredWorld, Colouring
 from npa_envs.web.rule_world import RuleWorld
 from npa_envs.world.brushes import nearest_image
-from npa_envs.world.rollout import rollout
 
 NODE_SECONDS = 60
 
@@ -75,7 +71,7 @@ def assert_worlds(got, x, s, bound=TOLERANCE):
 
 
 @pytest.mark.parametrize("kind", [*WORLDS, *SPECIES])
-def test_a_step_with_a_given_mask_is_that_of_python(run, kind):
+def test_a_step_with_a_mask_is_that_of_python(run, kind):
     fields, s, mask, after = example(kind)
     # The step is no small one.
     assert float((after[1] - s).abs().max()) > 1000 * TOLERANCE
@@ -86,20 +82,11 @@ def test_a_step_with_a_given_mask_is_that_of_python(run, kind):
         assert torch.equal(unpacked(got["s"], s.shape)[mask == 0], s[mask == 0])
 
 
-@pytest.mark.parametrize(
-    "left_out", ["moment_correction", "state_gradient", "density_gradient", "nothing"]
-)
-def test_a_step_has_the_noise_and_the_groups_of_perception_of_a_rollout(run, left_out):
-    groups = {} if left_out == "nothing" else {left_out: False}
-    rule = lively(NPARule(2, 6, 5, alpha=0.8, **groups))
-    x, s = scattered(200, 2, 6, None)
-    got = run(
-        "step", rules=[described(rule)], kernels="simd", x=packed(x), s=packed(s),
-        species=[0] * 200, eps=0.1, box=None, noise=packed(torch.full_like(x, 0.25))
-    )  # fmt: skip
-    with torch.no_grad():
-        want_x, want_s = rollout(rule.double(), x.double(), s.double(), 1, eps=0.1, update_prob=1.0)
-    assert_worlds(got, want_x + 0.25, want_s)
+def test_noise_is_added_to_the_positions_of_a_step(run):
+    step = example("two species")
+    x, s = step.after
+    got = run("step", kernels="simd", noise=packed(torch.full_like(x, 0.25)), **step.fields)
+    assert_worlds(got, x + 0.25, s)
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""Exported pages in a real browser: they live, are touched, heal, and load nothing."""
+"""Exported pages in a real browser: they live, are touched, and load nothing."""
 
 from __future__ import annotations
 
@@ -41,14 +41,6 @@ def exported(new_page, tmp_path):
 
 STEP = "document.page.frame.step"
 COUNT = "document.page.frame.positions.length / document.page.world.dimension"
-BLANK = """(() => {
-  const { colours } = document.page.frame;
-  let blank = 0;
-  for (let k = 0; k < colours.length; k += 3)
-    blank += [0, 1, 2].every((c) => Math.abs(colours[k + c] - 127.5) < 1) ? 1 : 0;
-  return blank;
-})()"""
-"""Particles of state zero, whose colour is grey."""
 
 
 def test_an_exported_page_lives_and_is_touched(exported):
@@ -72,21 +64,6 @@ def test_an_exported_page_lives_and_is_touched(exported):
     )
     assert not waits
     page.wait(f"{STEP} > {before} + 2")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("size", [DESK, PHONE])
-def test_an_exported_page_heals(exported, size):
-    page = exported("gecko", "heart", size=size, steps=100)
-    page.run("document.page.play(false)")
-    assert page.run(BLANK) < 10
-    page.run("document.page.send({ type: 'damage', name: 'wipe' })")
-    assert page.wait(f"{BLANK} > 40 && {BLANK}") > 40
-    page.run("document.page.play(true)")
-    page.wait(f"{BLANK} < 10", 120)
-    page.run("document.page.send({ type: 'set', name: 'rule', value: 'heart' })")
-    page.wait("document.page.world.rule === 'heart'")
-    page.wait(f"{STEP} >= 5")
 
 
 @pytest.mark.slow

@@ -168,25 +168,25 @@ def test_a_world_at_rest_is_not_stepped_until_something_changes_it(tmp_path, dev
     # Nothing but a state that is large leaves the zone.
     rule.dead_zone = 40.0
     world = world_of(rule, tmp_path / "resting.safetensors", device, particle_count=COUNT)
-    asked = []
+    step_counts = []
 
     def noted(*args, **options):
-        asked.append(args[3])
+        step_counts.append(args[3])
         return rollout(*args, **options)
 
     monkeypatch.setattr(rule_world, "rollout", noted)
     put(world, speed=16)
     advance(world, 8)
-    assert asked == [16] * 3
+    assert step_counts == [16] * 3
     assert world.step == 128
     world.s[0, 3] = 1e4
     put(world, show="colours")
     world.advance()
-    assert asked == [16] * 4
+    assert step_counts == [16] * 4
     world.handle({"type": "reset"})
     put(world, noise=0.002)
     advance(world, 8)
-    assert asked == [16] * 12
+    assert step_counts == [16] * 12
 
 
 def test_a_world_that_divides_shows_its_living_particles(tmp_path, device):
@@ -642,13 +642,13 @@ def test_an_unfinished_run_is_refused_in_words(tmp_path):
 # Environments.
 
 
-def made(name, **keywords):
+def small_environment(name, **keywords):
     small = {"particle_count": 64, "resolution": 16, "disable_env_checker": True}
     return gymnasium.make(name, **small, **keywords)
 
 
 def test_the_speed_of_a_step_across_an_edge_of_the_box_is_that_of_the_step():
-    env = made("npa/Texture-v0", target="dots")
+    env = small_environment("npa/Texture-v0", target="dots")
     action = np.zeros(env.action_space.shape, np.float32)
     action[:, 0] = 1.0
     world = EnvironmentWorld(env, lambda observation: action)
@@ -665,7 +665,7 @@ def test_the_speed_of_a_step_across_an_edge_of_the_box_is_that_of_the_step():
 
 @pytest.fixture
 def episodes():
-    env = made("npa/Morphogenesis2D-v0", max_episode_steps=3)
+    env = small_environment("npa/Morphogenesis2D-v0", max_episode_steps=3)
     world = EnvironmentWorld(env, ZeroPolicy(env))
     yield world
     world.close()

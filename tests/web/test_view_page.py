@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import signal
 import subprocess
@@ -29,37 +30,32 @@ def shown(new_page, tmp_path):
 
     No page may complain in the console until the end of the test.
     """
-    running, opened = [], []
+    opened = []
+    with contextlib.ExitStack() as stack:
 
-    def show(rule="gecko", count=256, size=DESK, query="", **options):
-        worlds = []
+        def show(rule="gecko", count=256, size=DESK, query="", **options):
+            worlds = []
 
-        def make_world():
-            torch.set_num_threads(1)
-            worlds.append(RuleWorld(rule, device=torch.device("cpu"), particle_count=count))
-            return worlds[-1]
+            def make_world():
+                torch.set_num_threads(1)
+                worlds.append(RuleWorld(rule, device=torch.device("cpu"), particle_count=count))
+                return worlds[-1]
 
-        site = server.Site(make_world, films=tmp_path / "films")
-        listener = server.open_port(site.host, 0)
-        running.append(server.make_server(site))
-        thread = threading.Thread(target=running[-1].run, kwargs={"sockets": [listener]})
-        thread.start()
-        running.append(thread)
-        opened.append(page := new_page())
-        page.open(server.address_of(site, listener) + query, size, **options)
-        page.wait(f"{FRAME}.step > 2")
-        return page, worlds[0]
+            site = server.Site(make_world, films=tmp_path / "films")
+            listener = server.open_port(site.host, 0)
+            viewer = server.make_server(site)
+            thread = threading.Thread(target=viewer.run, kwargs={"sockets": [listener]})
+            thread.start()
+            stack.callback(thread.join, timeout=60)
+            stack.callback(setattr, viewer, "should_exit", True)
+            opened.append(page := new_page())
+            stack.callback(page.open, "about:blank")
+            page.open(server.address_of(site, listener) + query, size, **options)
+            page.wait(f"{FRAME}.step > 2")
+            return page, worlds[0]
 
-    yield show
-    complaints = [list(page.complaints) for page in opened]
-    for page in opened:
-        page.open("about:blank")
-    for started in running:
-        if isinstance(started, threading.Thread):
-            started.join(timeout=60)
-            assert not started.is_alive()
-        else:
-            started.should_exit = True
+        yield show
+        complaints = [list(page.complaints) for page in opened]
     assert not any(complaints), complaints
 
 
@@ -97,7 +93,7 @@ def picture_of(page, path) -> np.ndarray:
     return np.asarray(Image.open(path).convert("RGB")).astype(int)
 
 
-def place_of(page, x: float, y: float) -> tuple[float, float]:
+def pixel_of(page, x: float, y: float) -> tuple[float, float]:
     """Where a position is on the page [pixels]."""
     place = page.run(
         "(() => { const { camera, canvas } = document.page; return camera.project("
@@ -113,7 +109,7 @@ def test_the_world_moves_the_brush_removes_and_a_slider_changes_eps(shown, tmp_p
     pause(page)
     middle = positions(page).mean(axis=0)
     assert nearest(page, *middle) < 0.1
-    page.drag([place_of(page, *middle)] * 3)
+    page.drag([pixel_of(page, *middle)] * 3)
     page.wait(f"{FRAME}.positions.length < 512")
     # The brush of 0.1 was there.
     assert nearest(page, *middle) > 0.1
@@ -144,7 +140,7 @@ def test_every_tool_and_every_show_works(shown):
     page.wait(f"{FRAME}.step > 20")
     for tool in ("push", "clump", "cut", "inject", "graft", "add"):
         take(page, tool)
-        page.drag([place_of(page, x, 0.0) for x in (-0.2, -0.1, 0.0, 0.1, 0.2)])
+        page.drag([pixel_of(page, x, 0.0) for x in (-0.2, -0.1, 0.0, 0.1, 0.2)])
         time.sleep(0.3)
     page.wait("document.page.world.species.length === 2")
     for show in page.run("document.page.world.shows"):
@@ -199,7 +195,7 @@ def test_on_a_phone_fingers_brush_and_the_settings_fold(shown):
         assert (left >= 0, right <= PHONE[0], bottom <= PHONE[1], size >= 40) == (True,) * 4
     pause(page)
     middle = positions(page).mean(axis=0)
-    page.touch([place_of(page, *middle)] * 2)
+    page.touch([pixel_of(page, *middle)] * 2)
     page.wait(f"{FRAME}.positions.length < 512")
     click(page, "fold")
     assert page.run("document.getElementById('panel').getBoundingClientRect().width") > 300
@@ -213,7 +209,7 @@ def test_a_3d_world_turns_under_the_pointer(shown, painter, tmp_path):
     page.drag([(400, 400), (450, 400), (500, 400)])
     assert page.run("document.page.camera.azimuth") == pytest.approx(-40.0)
     take(page, "remove")
-    page.drag([place_of(page, 0.0, 0.0)] * 3)
+    page.drag([pixel_of(page, 0.0, 0.0)] * 3)
     page.wait(f"{FRAME}.positions.length < 3072")
     picture = picture_of(page, tmp_path / "page.png")
     assert (np.abs(picture[100:650, 100:900] - picture[60, 950]).sum(axis=-1) > 60).mean() > 0.05
