@@ -90,6 +90,13 @@ def lively_rule(task, dtype=torch.float32):
     return rule
 
 
+def worlds_of(task, world_count, dtype=torch.float32):
+    """Fresh worlds of a task, with states about 0.3."""
+    generator = torch.Generator().manual_seed(0)
+    x, s, *_ = task.seed(world_count, generator=generator)
+    return x.to(dtype), 0.3 * torch.randn(s.shape, generator=generator, dtype=dtype)
+
+
 def make_cycle(config, task, device="cpu", rollout=None, **options):
     device = torch.device(device)
     schedule = torch.Generator().manual_seed(config.seed)

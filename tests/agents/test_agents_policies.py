@@ -93,7 +93,11 @@ WILD = {
     "not plain": wild_rule(kind=Replaced),
     "equivariant": wild_rule(equivariant=True, chiral=True),
     "other radius": wild_rule(eps0=0.15, alpha=0.3),
+    "dead zone": wild_rule(dead_zone=0.05),
+    "smooth inverse": wild_rule(moment_inverse="smooth"),
 }
+SHARED = ("eps0", "alpha", "moment_inverse")
+"""Fields that a rule and its environment share."""
 
 
 @pytest.mark.parametrize(
@@ -105,7 +109,7 @@ WILD = {
         ("gecko", {"boundary": "periodic", "box_size": 1.0}),
         ("gecko", {"update_prob": 1.0, "state_scale": 2.0}),
         ("gecko", {"dt": 0.5, "particle_count": 301}),
-        *((name, {"eps0": rule.eps0, "alpha": rule.alpha}) for name, rule in WILD.items()),
+        *((name, {field: getattr(rule, field) for field in SHARED}) for name, rule in WILD.items()),
     ],
     ids=str,
 )

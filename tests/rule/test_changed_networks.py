@@ -72,8 +72,8 @@ class Twofold(torch.nn.Module):
         return 2.0 * weight
 
 
-def remade(rule, kind):
-    changed = kind(**rule.hyper_parameters()).to(rule.hidden.weight)
+def remade(rule, cls):
+    changed = cls(**rule.hyper_parameters()).to(rule.hidden.weight)
     changed.load_state_dict(rule.state_dict())
     return changed
 
@@ -98,6 +98,13 @@ CHANGED = {
 """Rules that say twice what they said, or what twice the hidden layer makes of it."""
 
 
+def assert_changed(how, s, once, twice):
+    if "hidden" in how:
+        assert float((twice - once).detach().abs().max()) > 1e-3
+    else:
+        torch.testing.assert_close(twice - s, 2.0 * (once - s), rtol=1e-12, atol=1e-13)
+
+
 @pytest.mark.parametrize("gradients", [False, True])
 @pytest.mark.parametrize("how", CHANGED)
 def test_a_changed_network_is_run_as_the_module_that_it_is(how, gradients, device):
@@ -107,10 +114,7 @@ def test_a_changed_network_is_run_as_the_module_that_it_is(how, gradients, devic
         changed = CHANGED[how](rule) or rule
         _, twice = npa_envs.step(changed, x, s, update_prob=1.0)
     assert not changed.is_plain()
-    if "hidden" in how:
-        assert float((twice - once).detach().abs().max()) > 1e-3
-    else:
-        torch.testing.assert_close(twice - s, 2.0 * (once - s), rtol=1e-12, atol=1e-13)
+    assert_changed(how, s, once, twice)
 
 
 @pytest.mark.parametrize("name", ["", "hidden", "output"])
@@ -136,13 +140,10 @@ def test_hooks_of_all_modules_are_called(name, device):
         twice.sum().backward()
     assert rule.is_plain()
     assert {module, (module, "back")} <= set(seen)
-    if name == "hidden":
-        assert float((twice - once).detach().abs().max()) > 1e-3
-    else:
-        torch.testing.assert_close(twice - s, 2.0 * (once - s), rtol=1e-12, atol=1e-13)
+    assert_changed(name, s, once, twice)
 
 
-def test_what_changes_a_step_is_not_plain_and_a_subclass_that_changes_nothing_is():
+def test_a_subclass_that_changes_no_step_is_plain():
     class Named(npa_envs.NPARule):
         name = "gecko"
 
@@ -150,23 +151,27 @@ def test_what_changes_a_step_is_not_plain_and_a_subclass_that_changes_nothing_is
             return states[..., :3]
 
     assert Named(2, 4, 8).is_plain()
-    for kind in (Called, Weighted):
-        assert not kind(2, 4, 8).is_plain()
-        assert not kind(2, 4, 8, equivariant=True).has_network()
-    rule = npa_envs.NPARule(2, 4, 8)
-    rule.output = torch.nn.Linear(8, 6)
-    assert not rule.is_plain()
+    for cls in (Called, Weighted):
+        assert not cls(2, 4, 8, equivariant=True).has_network()
 
 
-@pytest.mark.parametrize("how", ["override", "attribute", "hook", "layer"])
-def test_fates_of_their_own_make_a_rule_that_is_not_plain(how):
-    rule = (Fated if how == "override" else npa_envs.NPARule)(2, 4, 8, divides=True)
-    division_probabilities = npa_envs.NPARule(2, 4, 8, divides=True).division_probabilities
-    assert npa_envs.NPARule(2, 4, 8, divides=True).is_plain()
-    if how == "attribute":
-        rule.division_probabilities = lambda states: division_probabilities(states)[::-1]
-    elif how == "hook":
-        rule.fate.register_forward_hook(lambda own, inputs, output: -output)
-    elif how == "layer":
-        rule.fate = torch.nn.Sequential(rule.fate)
-    assert not rule.is_plain()
+def reversed_fates(rule):
+    division_probabilities = rule.division_probabilities
+    rule.division_probabilities = lambda states: division_probabilities(states)[::-1]
+
+
+NOT_PLAIN = {
+    "weight": lambda rule: remade(rule, Weighted),
+    "fates": lambda rule: remade(rule, Fated),
+    "an output with biases": lambda rule: setattr(rule, "output", torch.nn.Linear(8, 6)),
+    "replaced fates": reversed_fates,
+    "a hook of the fates": lambda rule: rule.fate.register_forward_hook(doubled) and None,
+    "a wrapped fate": lambda rule: setattr(rule, "fate", torch.nn.Sequential(rule.fate)),
+}
+
+
+@pytest.mark.parametrize("how", NOT_PLAIN)
+def test_what_changes_a_step_or_a_fate_is_not_plain(how):
+    rule = npa_envs.NPARule(2, 4, 8, divides=True)
+    assert rule.is_plain()
+    assert not (NOT_PLAIN[how](rule) or rule).is_plain()

@@ -1,6 +1,5 @@
-"""Rules with a dead zone: updates, gradients, worlds at rest, files, training, environments."""
+"""Rules with a dead zone: updates, gradients, worlds at rest, files, training."""
 
-import gymnasium
 import pytest
 import torch
 from circle_task import CircleTask, circle_config
@@ -10,7 +9,6 @@ from worlds import assert_near, assert_same, lively_rule, random_world
 import npa_envs
 from npa_envs import NPAError, NPARule
 from npa_envs import reference as oracle
-from npa_envs.agents import RulePolicy
 from npa_envs.training import load_config
 from npa_envs.training.trainer import initial_rule
 from npa_envs.world import execute
@@ -51,18 +49,14 @@ def test_numbers_in_the_zone_are_zero_and_others_stay(space_dim, dtype, device):
 def test_a_rollout_follows_the_reference_and_so_do_its_gradients(space_dim, device):
     rule = lively_rule(device, space_dim=space_dim, dead_zone=ZONE)
     x, s = random_world(2, 40, space_dim, 5, dtype=torch.float64, device=device)
-    weights = list(rule.parameters())
-    ways = []
-    for by in (
-        lambda: npa_envs.rollout(rule, x, s, 3, eps=0.3, update_prob=1.0),
-        lambda: by_hand(rule, x, s, 3, 0.3),
-    ):
-        found = by()
-        loss = found[0].square().sum() + found[1].square().sum()
-        ways.append([*found, *torch.autograd.grad(loss, weights)])
+    ours = npa_envs.rollout(rule, x, s, 3, eps=0.3, update_prob=1.0)
+    results = []
+    for after in (ours, by_hand(rule, x, s, 3, 0.3)):
+        loss = after[0].square().sum() + after[1].square().sum()
+        results.append([*after, *torch.autograd.grad(loss, list(rule.parameters()))])
+    assert_near(*results, 1e-10)
     plain = npa_envs.rollout(without_zone(rule), x, s, 3, eps=0.3, update_prob=1.0)
-    assert float((plain[0] - ways[0][0]).detach().abs().max()) > 1e-3
-    assert_near(ways[0], ways[1], 1e-10)
+    assert float((plain[0] - ours[0]).detach().abs().max()) > 1e-3
 
 
 def test_a_world_whose_updates_are_in_the_zone_stays_as_it_is(device):
@@ -72,8 +66,7 @@ def test_a_world_whose_updates_are_in_the_zone_stays_as_it_is(device):
         # From the third call on worlds on a CPU are prepared, and those on CUDA are recorded.
         for _ in range(4):
             after = npa_envs.rollout(rule, x, s, 5, eps=0.3)
-            assert torch.equal(after[0], x)
-            assert torch.equal(after[1], s)
+            assert_same(after, (x, s))
         rule.dead_zone = 0.0
         moved, _ = npa_envs.rollout(rule, x, s, 5, eps=0.3)
         assert not torch.equal(moved, x)
@@ -96,9 +89,6 @@ def test_zones_that_are_none_are_refused(zone, tmp_path):
         NPARule(dead_zone=zone)
     with pytest.raises(NPAError, match=r"dead_zone must be (a finite number|of type float)"):
         circle_config(tmp_path, dead_zone=zone)
-
-
-def test_equivariant_rules_have_none(tmp_path):
     with pytest.raises(NPAError, match="an equivariant rule has no dead zone"):
         NPARule(equivariant=True, dead_zone=0.001)
     # That of a preset is not for them.
@@ -112,6 +102,7 @@ def test_equivariant_rules_have_none(tmp_path):
         ("dead_zone", 0.0, 0.01),
         ("dead_zone", 0.5, 0.01),
         ("moment_inverse", "threshold", "smooth"),
+        ("moment_inverse", "smooth", "threshold"),
     ],
 )
 def test_training_gives_its_rule_the_zone_and_the_inverse(tmp_path, field, begun, chosen):
@@ -120,6 +111,10 @@ def test_training_gives_its_rule_the_zone_and_the_inverse(tmp_path, field, begun
     npa_envs.save_rule(initial, tmp_path / "rule.safetensors")
     fields = {field: chosen, "initial_rule": str(tmp_path / "rule.safetensors")}
     config = circle_config(tmp_path / "run", iterations=2, **fields)
+    if begun == "smooth":
+        with pytest.raises(NPAError, match="differs in moment_inverse"):
+            initial_rule(config, untrained)
+        return
     rule = initial_rule(config, untrained)
     assert getattr(rule, field) == chosen
     assert torch.equal(rule.hidden.weight, initial.hidden.weight)
@@ -128,31 +123,26 @@ def test_training_gives_its_rule_the_zone_and_the_inverse(tmp_path, field, begun
     assert load_config(tmp_path / "run" / "config.json", circle_config(tmp_path)) == config
 
 
-def test_a_rule_acts_in_an_environment_as_in_a_rollout():
-    rule = NPARule(2, 16, 32, dead_zone=1e6)
-    env = gymnasium.make("npa/Morphogenesis2D-v0", particle_count=64, disable_env_checker=True)
-    observation, _ = env.reset(seed=1)
-    action = RulePolicy(rule, env)(observation)
-    assert not action.any()
-    rule.dead_zone = 0.0
-    assert RulePolicy(rule, env)(observation).any()
-
-
 class TestRest:
     """Worlds that come to rest: each particle goes on until its states are near 1, then stays."""
+
+    @pytest.fixture(autouse=True)
+    def short_parts_without_gradients(self, monkeypatch):
+        monkeypatch.setattr(execute, "FIRST_PART", {"cpu": 64, "cuda": 64})
+        with torch.no_grad():
+            yield
 
     @pytest.fixture
     def rule(self, device):
         rule = NPARule(2, 4, 8, eps0=0.3, dead_zone=0.02)
-        with torch.no_grad():
-            rule.hidden.weight.zero_()
-            rule.output.weight.zero_()
-            # Δs = 0.2 relu(1 - s), and a first step to the right as long as that lasts.
-            for channel in range(4):
-                rule.hidden.weight[channel, channel] = -1.0
-                rule.hidden.bias[channel] = 1.0
-                rule.output.weight[2 + channel, channel] = 0.2
-            rule.output.weight[0] = 0.02
+        rule.hidden.weight.zero_()
+        rule.output.weight.zero_()
+        # Δs = 0.2 relu(1 - s), and a first step to the right as long as that lasts.
+        for channel in range(4):
+            rule.hidden.weight[channel, channel] = -1.0
+            rule.hidden.bias[channel] = 1.0
+            rule.output.weight[2 + channel, channel] = 0.2
+        rule.output.weight[0] = 0.02
         return rule.to(device)
 
     @pytest.fixture
@@ -163,117 +153,98 @@ class TestRest:
     def generator(device):
         return torch.Generator(device).manual_seed(5)
 
-    def test_worlds_at_rest_are_told(self, rule, worlds):
-        x, s = worlds
-        assert not npa_envs.at_rest(rule, x, s, eps=0.3).any()
-        with torch.no_grad():
-            still, states = npa_envs.rollout(rule, x, s, 200, eps=0.3)
-        assert npa_envs.at_rest(rule, still, states, eps=0.3).all()
-        states[1, 7, 2] = 0.0
-        assert npa_envs.at_rest(rule, still, states, eps=0.3).tolist() == [True, False]
+    def test_worlds_at_rest_are_recognised(self, rule, worlds):
+        assert not npa_envs.at_rest(rule, *worlds, eps=0.3).any()
+        x, s = npa_envs.rollout(rule, *worlds, 200, eps=0.3)
+        assert npa_envs.at_rest(rule, x, s, eps=0.3).all()
+        s[1, 7, 2] = 0.0
+        assert npa_envs.at_rest(rule, x, s, eps=0.3).tolist() == [True, False]
 
     @pytest.mark.parametrize("by_world", [False, True])
     def test_a_rollout_leaves_them_out_and_ends_and_draws_as_if_it_did_not(
         self, rule, worlds, device, monkeypatch, by_world
     ):
-        monkeypatch.setattr(execute, "FIRST_PART", {"cpu": 64, "cuda": 64})
-        ways = []
+        results = []
         for fewest in (10**9, 256):
             monkeypatch.setattr(execute, "MIN_RESTING", fewest)
             generator = self.generator(device)
             if by_world:
                 generator = npa_envs.WorldRandom([3, 4], device=device)
-            told, (x, s) = [], worlds
-            with torch.no_grad():
-                # They come to rest within the first, and are so when the second begins.
-                for steps in (600, 300, 1):
-                    x, s = npa_envs.rollout(rule, x, s, steps, eps=0.3, generator=generator)
-                    told += [x, s]
-                told.append(uniform_draws(generator, (2, 50), x))
-            ways.append(told)
-        assert_same(*ways)
+            result, (x, s) = [], worlds
+            # They come to rest within the first, and are so when the second begins.
+            for steps in (600, 300, 1):
+                x, s = npa_envs.rollout(rule, x, s, steps, eps=0.3, generator=generator)
+                result += [x, s]
+            results.append([*result, uniform_draws(generator, (2, 50), x)])
+        assert_same(*results)
 
     @pytest.fixture
-    def asked(self, monkeypatch):
-        """The steps of each part that is run, of which 1 is a question."""
-        monkeypatch.setattr(execute, "FIRST_PART", {"cpu": 64, "cuda": 64})
-        asked = []
-        own = execute.run_all_steps
+    def parts(self, monkeypatch):
+        """The steps of each part that is run, of which 1 asks whether worlds are at rest."""
+        parts, run_all_steps = [], execute.run_all_steps
 
         def noted(call, *args, **options):
-            asked.append(call.steps)
-            return own(call, *args, **options)
+            parts.append(call.steps)
+            return run_all_steps(call, *args, **options)
 
         monkeypatch.setattr(execute, "run_all_steps", noted)
-        return asked
+        return parts
 
-    def test_it_runs_no_step_of_worlds_that_begin_at_rest(self, rule, worlds, asked):
-        x, s = worlds
-        with torch.no_grad():
-            x, s = npa_envs.rollout(rule, x, s, 200, eps=0.3)
-            asked.clear()
-            after = npa_envs.rollout(rule, x, s, 10_000, eps=0.3)
-        assert asked == [1]
+    def test_it_runs_no_step_of_worlds_that_begin_at_rest(self, rule, worlds, parts):
+        x, s = npa_envs.rollout(rule, *worlds, 200, eps=0.3)
+        parts.clear()
+        after = npa_envs.rollout(rule, x, s, 10_000, eps=0.3)
+        assert parts == [1]
         assert_same(after, (x, s))
         after[0].zero_()
         assert x.any()
 
-    def test_what_needs_each_step_runs_each_step(self, rule, worlds, asked):
-        class Own(NPARule):
+    def test_what_needs_each_step_runs_each_step(self, rule, worlds, parts):
+        class Changed(NPARule):
             def forward(self, perception):
                 return super().forward(perception)
 
-        x, s = worlds
-        own = Own(**rule.hyper_parameters()).to(x.device)
-        npa_envs.rollout(rule, x, s, 256, eps=0.3)
-        with torch.no_grad():
-            npa_envs.rollout(own, x, s, 256, eps=0.3)
-            for name, value in {
-                "keep_every": 64,
-                "return_path_length": True,
-                "position_noise": 1e-3,
-                "on_divergence": "raise",
-            }.items():
-                npa_envs.rollout(rule, x, s, 256, eps=0.3, **{name: value})
-        assert asked == [256] * 6
+        changed = Changed(**rule.hyper_parameters()).to(worlds[0].device)
+        with torch.enable_grad():
+            npa_envs.rollout(rule, *worlds, 256, eps=0.3)
+        npa_envs.rollout(changed, *worlds, 256, eps=0.3)
+        for options in (
+            {"keep_every": 64},
+            {"return_path_length": True},
+            {"position_noise": 1e-3},
+            {"on_divergence": "raise"},
+        ):
+            npa_envs.rollout(rule, *worlds, 256, eps=0.3, **options)
+        assert parts == [256] * 6
 
-    def test_worlds_that_diverge_are_returned_as_without_a_zone(self, rule, worlds, asked, device):
-        with torch.no_grad():
-            # Beyond 3 a state grows more from step to step, and takes the particle along.
-            rule.hidden.weight[7, 3] = 1.0
-            rule.hidden.bias[7] = -3.0
-            rule.output.weight[5, 7] = rule.output.weight[0, 7] = 2.0
+    def test_worlds_that_diverge_are_returned_as_without_a_zone(self, rule, worlds, parts, device):
+        # Beyond 3 a state grows more from step to step, and takes the particle along.
+        rule.hidden.weight[7, 3] = 1.0
+        rule.hidden.bias[7] = -3.0
+        rule.output.weight[5, 7] = rule.output.weight[0, 7] = 2.0
         x, s = worlds
         s[1, 5, 3] = 4.0
-        ways = []
         for zone in (0.02, 0.0):
             rule.dead_zone = zone
-            with torch.no_grad():
-                after = npa_envs.rollout(rule, x, s, 600, eps=0.3, generator=self.generator(device))
-            ways.append(after)
-        assert asked[:2] == [1, 64]
-        assert asked[-1] == 600
-        for x, _ in ways:
-            assert x.isfinite().flatten(1).all(dim=1).tolist() == [True, False]
+            after, _ = npa_envs.rollout(rule, x, s, 600, eps=0.3, generator=self.generator(device))
+            assert after.isfinite().flatten(1).all(dim=1).tolist() == [True, False]
+        assert parts[:2] == [1, 64]
+        assert parts[-1] == 600
 
     @pytest.mark.parametrize("steps", [257, 600])
-    def test_static_worlds_that_begin_outside_of_a_box_end_as_if_each_step_ran(
-        self, steps, device, monkeypatch
-    ):
-        monkeypatch.setattr(execute, "FIRST_PART", {"cpu": 64, "cuda": 64})
+    def test_static_worlds_that_begin_outside_of_a_box_end_as_if_each_step_ran(self, steps, device):
         rule = lively_rule(device, torch.float32, 2, 4, static=True, gain=2.0, dead_zone=1e-3)
         x, s = random_world(2, 50, 2, 4, dtype=torch.float32, device=device)
-        ways = []
-        for options in ({}, {"return_path_length": True}):
-            with torch.no_grad():
-                after = npa_envs.rollout(
-                    rule, x + 3.3, 0.1 * s, steps, eps=0.3, box=1.4, dt=0.01,
-                    generator=self.generator(device), **options,
-                )  # fmt: skip
-            ways.append(after[:2])
-        assert_same(*ways)
-        assert float(ways[0][0].abs().max()) <= 0.7
-        assert float((ways[0][1] - 0.1 * s).abs().max()) > 1e-3
+        options = {"eps": 0.3, "box": 1.4, "dt": 0.01}
+        skipping, every = (
+            npa_envs.rollout(
+                rule, x + 3.3, 0.1 * s, steps, generator=self.generator(device), **options, **more
+            )
+            for more in ({}, {"return_path_length": True})
+        )
+        assert_same(skipping, every[:2])
+        assert float(skipping[0].abs().max()) <= 0.7
+        assert float((skipping[1] - 0.1 * s).abs().max()) > 1e-3
 
     def test_rules_that_divide_are_refused(self, worlds):
         with pytest.raises(NPAError, match="at_rest is for rules whose particles do not divide"):

@@ -1,16 +1,12 @@
-"""Rules that know no direction: turned starts, kernels, files, and who runs such rules."""
+"""Rules that know no direction: turned starts, kernels, worlds of several species."""
 
 import copy
-import json
 
-import numpy as np
 import pytest
 import torch
-from test_rule_files import assert_same_rule, pack
 from worlds import assert_near, lively_rule, random_world, relative_error
 
 import npa_envs
-from npa_envs.cli import main
 from npa_envs.kernels.cuda.equivariance import fits_block, rows_of_warp
 from npa_envs.ops.equivariance import VectorForm, read_rows
 from npa_envs.rule.rule import NPARule
@@ -178,156 +174,6 @@ def test_what_does_not_go_together_is_refused(options, message):
         NPARule(**options)
 
 
-# The authors' formats.
-
-
-def authors_rule(seed=0, state_dim=3, mixed=2, hidden_dim=5):
-    """Return the tensors of a rule by the names of the authors' state dict."""
-    generator = torch.Generator().manual_seed(seed)
-    inputs, outputs = 2 * state_dim + mixed * (mixed + 1) // 2, state_dim + mixed
-    shapes = {
-        "model.W_hidden": (state_dim + 1, mixed),
-        "model.W_out": (mixed, 1),
-        "model.mlp.0.weight": (hidden_dim, inputs),
-        "model.mlp.0.bias": (hidden_dim,),
-        "model.mlp.2.weight": (outputs, hidden_dim),
-        "model.mlp.2.bias": (outputs,),
-    }
-    state = {name: torch.randn(shape, generator=generator) for name, shape in shapes.items()}
-    return state | {"eps0": torch.tensor(0.1), "N0": torch.tensor(4096), "alpha": torch.tensor(0.5)}
-
-
-def authors_update(state, z):
-    """Return [δ ; Δs] of perception vectors, written out pair by pair."""
-    mixing, steering = state["model.W_hidden"], state["model.W_out"]
-    channels, mixed = mixing.shape[0] - 1, mixing.shape[1]
-    vectors = z[:, 2 * channels :].view(len(z), channels + 1, 2)
-    u = [sum(mixing[i, a] * vectors[:, i] for i in range(channels + 1)) for a in range(mixed)]
-    products = [(u[a] * u[b]).sum(-1) for a in range(mixed) for b in range(a, mixed)]
-    inputs = torch.cat((z[:, : 2 * channels], torch.stack(products, dim=1)), dim=1)
-    hidden = torch.relu(inputs @ state["model.mlp.0.weight"].T + state["model.mlp.0.bias"])
-    y = hidden @ state["model.mlp.2.weight"].T + state["model.mlp.2.bias"]
-    gates = torch.relu(y[:, channels:])
-    delta = sum(u[a] * gates[:, a : a + 1] * steering[a, 0] for a in range(mixed))
-    return torch.cat((delta, y[:, :channels]), dim=1)
-
-
-def padded(tensor):
-    return torch.nn.functional.pad(tensor, (0, -tensor.shape[-1] % 4))
-
-
-def demo_tensors(state):
-    """Return the tensors as the web demo has them: padded, the mixtures' weights four times."""
-    return {
-        "W_hidden": state["model.W_hidden"].repeat_interleave(4, dim=-1),
-        "W_out": state["model.W_out"].repeat_interleave(4, dim=-1),
-        "w1.weight": padded(state["model.mlp.0.weight"]),
-        "w1.bias": padded(state["model.mlp.0.bias"]),
-        "w2.weight": padded(state["model.mlp.2.weight"]),
-        "w2.bias": padded(state["model.mlp.2.bias"]),
-    }
-
-
-def packed(tensors, stacked=False):
-    first = (lambda t: t) if stacked else (lambda t: t.numpy())
-    entry = {name: pack(first(tensor)) for name, tensor in tensors.items()}
-    return entry | {"eps0": 0.10000000149011612, "N0": 4096, "alpha": 0.5}
-
-
-def stack_of(rules):
-    tensors = [demo_tensors(state) for state in rules]
-    return packed({name: torch.stack([t[name] for t in tensors]) for name in tensors[0]})
-
-
-def assert_runs_as(rule, state):
-    z = torch.randn(30, rule.perception_dim, generator=torch.Generator().manual_seed(8))
-    assert (rule.space_dim, rule.eps0, rule.alpha) == (2, 0.1, 0.5)
-    assert relative_error(rule(z), authors_update(state, z)) < 1e-6
-
-
-def test_the_authors_equivariant_rules_run_as_theirs(tmp_path):
-    rules = [authors_rule(seed) for seed in range(3)]
-    torch.save(rules[0], tmp_path / "npa.pth")
-    assert_runs_as(npa_envs.load_rule(tmp_path / "npa.pth"), rules[0])
-    path = tmp_path / "models.json"
-    entries = {name: packed(demo_tensors(rules[k])) for k, name in enumerate("ab")}
-    path.write_text(json.dumps(entries), encoding="utf-8")
-    assert_runs_as(npa_envs.load_rule(f"{path}#b"), rules[1])
-    path.write_text(json.dumps(stack_of(rules)), encoding="utf-8")
-    for number, state in enumerate(rules):
-        assert_runs_as(npa_envs.load_rule(f"{path}#{number}"), state)
-
-
-def plain_stack(rules):
-    """Return plain rules as a stack."""
-    outputs = [torch.cat((rule.output.weight[2:], rule.output.weight[:2])).T for rule in rules]
-    tensors = {
-        "w1.weight": torch.stack([padded(rule.hidden.weight) for rule in rules]),
-        "w1.bias": torch.stack([rule.hidden.bias for rule in rules]),
-        "w2.weight.T": torch.stack([padded(output) for output in outputs]),
-    }
-    return packed({name: tensor.detach() for name, tensor in tensors.items()})
-
-
-def test_stacks_of_plain_rules_are_by_species_by_numbers(tmp_path):
-    torch.manual_seed(0)
-    rules, path = [NPARule(2, 5, 8) for _ in range(3)], tmp_path / "models_digits.json"
-    path.write_text(json.dumps(plain_stack(rules)), encoding="utf-8")
-    for number, rule in enumerate(rules):
-        assert_same_rule(npa_envs.load_rule(f"{path}#{number}"), rule)
-    with pytest.raises(npa_envs.NPAError, match="several rules: add #name; names: 0, 1, 2"):
-        npa_envs.load_rule(path)
-    for wrong in ("3", "-1", "lizard", "", "9" * 5000):
-        with pytest.raises(npa_envs.NPAError, match=f"no rule '{wrong[:20]}.*known: 0, 1, 2"):
-            npa_envs.load_rule(f"{path}#{wrong}")
-    path.write_text(json.dumps(plain_stack(rules[:1])), encoding="utf-8")
-    assert_same_rule(npa_envs.load_rule(path), rules[0])
-
-
-def ones(*shape):
-    return pack(np.ones(shape))
-
-
-BAD_ENTRIES = {
-    "a missing tensor": (lambda e: e.pop("w2.bias"), "lacks 'w2.bias'"),
-    "fewer mixtures": (lambda e: e.update(W_out=ones(1, 4)), "must have the sh"),
-    "few inputs": (lambda e: e.update({"w1.weight": ones(5, 8)}), "must have"),
-    "no channels": (lambda e: e.update(W_hidden=ones(1, 8)), "must have the"),
-    "NaN": (lambda e: e.update({"w1.bias": pack(np.full(5, np.nan))}), "finite"),
-    "no radius": (lambda e: e.pop("eps0"), "eps0 must be a number, got None"),
-}
-
-
-@pytest.mark.parametrize("case", BAD_ENTRIES)
-def test_wrong_files_of_equivariant_rules_are_refused(tmp_path, case):
-    change, message = BAD_ENTRIES[case]
-    entry, path = packed(demo_tensors(authors_rule())), tmp_path / "models.json"
-    change(entry)
-    path.write_text(json.dumps({"mine": entry}), encoding="utf-8")
-    with pytest.raises(npa_envs.NPAError, match=f"cannot load a rule from .*: .*{message}"):
-        npa_envs.load_rule(path)
-
-
-def test_wrong_stacks_and_state_dicts_are_refused(tmp_path):
-    stack, path = stack_of([authors_rule(0), authors_rule(1)]), tmp_path / "models.json"
-    stack["w2.bias"] = ones(1, 8)
-    path.write_text(json.dumps(stack), encoding="utf-8")
-    with pytest.raises(npa_envs.NPAError, match=r"w2\.bias must have as many rules as w1\.weight"):
-        npa_envs.load_rule(f"{path}#1")
-    stack["w1.weight"]["shape"][0] = 10**9
-    path.write_text(json.dumps(stack), encoding="utf-8")
-    with pytest.raises(npa_envs.NPAError, match="or be a stack of rules whose"):
-        npa_envs.load_rule(f"{path}#1")
-    state = authors_rule()
-    del state["model.W_out"]
-    torch.save(state, tmp_path / "npa.pth")
-    with pytest.raises(npa_envs.NPAError, match=r"missing: \['model.W_out'\]"):
-        npa_envs.load_rule(tmp_path / "npa.pth")
-
-
-# Who runs such rules.
-
-
 def test_species_of_both_kinds_share_a_world():
     rules = [equivariant(seed=1), lively_rule("cpu", eps0=0.3, seed=2)]
     x, s = random_world(2, 60, 2, 5, dtype=torch.float64, device="cpu")
@@ -348,11 +194,3 @@ class Unfolded(NPARule):
 
     def forward(self, perception):
         return super().forward(perception)
-
-
-def test_pages_and_collections_refuse_what_they_cannot_run(tmp_path):
-    path = tmp_path / "mine.safetensors"
-    npa_envs.save_rule(NPARule(equivariant=True), path)
-    for out in ("page.html", "models.json"):
-        assert main(["export-web", str(path), "--out", str(tmp_path / out)]) != 0
-        assert not (tmp_path / out).exists()

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import save_file
+from worlds import relative_error
 
 from npa_envs.errors import NPAError
 from npa_envs.rule.authors import save_demo_json
@@ -88,15 +89,11 @@ def test_metadata_is_kept_and_holds_every_hyper_parameter(tmp_path):
         ("rule.safetensors", {"steps": 3}, "must map text to text"),
         ("rule.safetensors", {"a": "\ud800"}, r"UTF-8 can write, got 'a': '\\ud800': leave"),
         ("rule.safetensors", {"\ud800": "a"}, r"UTF-8 can write, got '\\ud800': 'a': leave"),
-        ("rule.safetensors", {}, r"2 of 2304 numbers in 'output.weight'"),
     ],
 )
-def test_saving_refuses_what_could_not_be_loaded(tmp_path, name, metadata, message):
-    rule = NPARule()
-    with torch.no_grad():
-        rule.output.weight[0, :2] = math.nan
+def test_metadata_that_could_not_be_loaded_is_refused(tmp_path, name, metadata, message):
     with pytest.raises(NPAError, match=message):
-        save_rule(rule, tmp_path / name, metadata=metadata)
+        save_rule(NPARule(), tmp_path / name, metadata=metadata)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -110,7 +107,7 @@ class Sine(torch.nn.Linear):
         return torch.sin(super().forward(z))
 
 
-ALTERED = {
+CHANGED = {
     "another forward": lambda rule: setattr(rule, "__class__", Threefold),
     "normed weights": lambda rule: torch.nn.utils.parametrizations.weight_norm(rule.hidden),
     "a layer of another class": lambda rule: setattr(rule, "hidden", Sine(rule.input_dim, 8)),
@@ -122,19 +119,32 @@ ALTERED = {
     "a hook of the rule": lambda rule: rule.register_forward_hook(lambda m, i, o: 2.0 * o),
     "no biases": lambda rule: setattr(rule.hidden, "bias", None),
 }
+NETWORK = r"network of NPARule.*remove its hooks, or keep"
+PRECISION = r"all float32 or all float64, got .{}.: convert them, as rule\.float\(\) does"
+UNSAVED = {
+    **{case: (change, NETWORK) for case, change in CHANGED.items()},
+    "half": (NPARule.half, PRECISION.format("'torch.float16'")),
+    "bfloat16": (NPARule.bfloat16, PRECISION.format("'torch.bfloat16'")),
+    "mixed": (lambda r: r.output.double(), PRECISION.format("'torch.float32', 'torch.float64'")),
+    "NaN": (
+        lambda rule: rule.output.weight.data[0, :2].fill_(math.nan),
+        r"2 of \d+ numbers in 'out",
+    ),
+}
+"""Changes of a rule that its file could not hold, and the message."""
 
 
-@pytest.mark.parametrize("kind", ALTERED)
+@pytest.mark.parametrize("case", UNSAVED)
 @pytest.mark.parametrize("equivariant", [False, True])
-def test_a_network_that_would_be_loaded_as_another_is_refused(tmp_path, kind, equivariant):
-    rule, path = NPARule(2, 4, 8), tmp_path / "rule.safetensors"
-    save_rule(rule, path)
-    before = path.read_bytes()
+def test_a_rule_that_would_be_loaded_as_another_is_not_saved(tmp_path, case, equivariant):
+    change, message = UNSAVED[case]
+    path = tmp_path / "rule.safetensors"
+    path.write_bytes(b"as it was")
     rule = NPARule(2, 4, 8, readout_dim=3, readout_hidden_dim=5, equivariant=equivariant)
-    ALTERED[kind](rule)
-    with pytest.raises(NPAError, match=r"network of NPARule.*remove its hooks, or keep"):
+    change(rule)
+    with pytest.raises(NPAError, match=message):
         save_rule(rule, path)
-    assert path.read_bytes() == before
+    assert path.read_bytes() == b"as it was"
     assert list(tmp_path.iterdir()) == [path]
 
 
@@ -147,30 +157,13 @@ def test_what_does_not_change_a_network_does_not_keep_it_from_its_file(tmp_path)
     assert_same_rule(load_rule(tmp_path / "rule.safetensors"), rule)
 
 
-@pytest.mark.parametrize(
-    ("convert", "got"),
-    [
-        (NPARule.half, "'torch.float16'"),
-        (NPARule.bfloat16, "'torch.bfloat16'"),
-        (lambda rule: rule.output.double(), "'torch.float32', 'torch.float64'"),
-    ],
-)
-def test_weights_that_are_not_of_one_precision_are_not_saved(tmp_path, convert, got):
-    rule = NPARule(2, 4, 8)
-    convert(rule)
-    message = rf"all float32 or all float64, got .{got}.: convert them, as rule\.float\(\) does"
-    with pytest.raises(NPAError, match=message):
-        save_rule(rule, tmp_path / "rule.safetensors")
-    assert list(tmp_path.iterdir()) == []
-    save_rule(rule.float(), tmp_path / "rule.safetensors")
-    assert_same_rule(load_rule(tmp_path / "rule.safetensors"), rule)
-
-
 def test_rules_of_the_package_are_loaded_without_a_warning():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        for name in shipped_rules() | preset_rules():
-            load_rule(name)
+        rules = {name: load_rule(name) for name in shipped_rules() | preset_rules()}
+    # What older files do not say.
+    assert rules["gecko"].moment_inverse == "threshold"
+    assert rules["heart-first"].dead_zone == 0.0
 
 
 def test_no_bit_flips_unnoticed(tmp_path):
@@ -214,6 +207,7 @@ BAD_HEADERS = {
     "a wrong type": (lambda h, w: h.update(static="0"), "'static' must be a JSON bool, got '0'"),
     "no JSON": (lambda h, w: h.update(eps0="0,1"), "'eps0' must be a JSON float"),
     "a wrong value": (lambda h, w: h.update(space_dim="4"), "space_dim must be 2 or 3"),
+    "a wrong word": (lambda h, w: h.update(moment_inverse='"smoosh"'), "got 'smoosh'"),
     "huge radius": (lambda h, w: h.update(eps0="9" * 400), "'eps0' must be a JSON float"),
     "NaN radius": (lambda h, w: h.update(eps0="NaN"), "eps0 must be positive and finite"),
     "a huge size": (lambda h, w: h.update(hidden_dim="9" * 30), "at most 65536, got"),
@@ -325,35 +319,118 @@ def pack(array):
     return {"shape": list(array.shape), "dtype": "float32", "data64": text}
 
 
-def demo_entry(rule):
-    """A rule as the web demo has it: displacement last, rows padded to whole texels."""
+def ones(*shape):
+    return pack(np.ones(shape))
 
-    def padded(tensor):
-        return torch.nn.functional.pad(tensor.detach(), (0, -tensor.shape[-1] % 4))
 
+def padded(tensor):
+    """The tensor with its rows padded to whole texels, of four numbers."""
+    return torch.nn.functional.pad(tensor.detach(), (0, -tensor.shape[-1] % 4))
+
+
+def demo_tensors(rule):
+    """The tensors of a rule as the web demo has them: displacement last."""
     output = rule.output.weight
     return {
-        "eps0": float(np.float32(rule.eps0)),
-        "N0": 4096,
-        "alpha": rule.alpha,
-        "w1.weight": pack(padded(rule.hidden.weight)),
-        "w1.bias": pack(rule.hidden.bias.detach()),
-        "w2.weight.T": pack(padded(torch.cat([output[2:], output[:2]]).T)),
+        "w1.weight": padded(rule.hidden.weight),
+        "w1.bias": rule.hidden.bias.detach(),
+        "w2.weight.T": padded(torch.cat([output[2:], output[:2]]).T),
     }
 
 
+def demo_entry(tensors):
+    arrays = {name: pack(tensor) for name, tensor in tensors.items()}
+    return arrays | {"eps0": float(np.float32(0.1)), "N0": 4096, "alpha": 0.5}
+
+
+def demo_stack(rules):
+    """An entry of several rules: each array has a row for each rule."""
+    return demo_entry({name: torch.stack([rule[name] for rule in rules]) for name in rules[0]})
+
+
+def write_json(path, content):
+    path.write_text(json.dumps(content), encoding="utf-8")
+
+
 @pytest.mark.parametrize("state_dim", [16, 5])
-def test_a_rule_of_the_web_demo_is_the_same_rule(tmp_path, state_dim):
-    rule, path = NPARule(state_dim=state_dim), tmp_path / "models.json"
-    path.write_text(json.dumps({"mine": demo_entry(rule)}), encoding="utf-8")
-    assert_same_rule(load_rule(path), rule)
-    both = {"other": demo_entry(NPARule()), "mine": demo_entry(rule)}
-    path.write_text(json.dumps(both), encoding="utf-8")
-    assert_same_rule(load_rule(f"{path}#mine"), rule)
-    with pytest.raises(NPAError, match="several rules: add #name; names: mine, other"):
-        load_rule(path)
+def test_rules_of_the_web_demo_are_the_same_rules(tmp_path, state_dim):
+    rules, path = [NPARule(state_dim=state_dim) for _ in range(3)], tmp_path / "models.json"
+    tensors = [demo_tensors(rule) for rule in rules]
+    for content in ({"mine": demo_entry(tensors[0])}, demo_stack(tensors[:1])):
+        write_json(path, content)
+        assert_same_rule(load_rule(path), rules[0])
+    stack, several = demo_stack(tensors), "several rules: add #name; names: "
+    for content, names, unknown in (
+        ({name: demo_entry(t) for name, t in zip("abc", tensors, strict=True)}, "a, b, c", ("d",)),
+        (stack, "0, 1, 2", ("3", "-1", "lizard", "", "9" * 5000)),
+    ):
+        write_json(path, content)
+        for name, rule in zip(names.split(", "), rules, strict=True):
+            assert_same_rule(load_rule(f"{path}#{name}"), rule)
+        with pytest.raises(NPAError, match=f"{several}{names}"):
+            load_rule(path)
+        for name in unknown:
+            with pytest.raises(NPAError, match=f"no rule '{name[:20]}.*known: {names}"):
+                load_rule(f"{path}#{name}")
+    write_json(path, {"mine": demo_entry(tensors[0]), "other": demo_entry(tensors[1])})
     with pytest.raises(NPAError, match="no rule 'mina': did you mean 'mine'"):
         load_rule(f"{path}#mina")
+
+
+def equivariant_state(seed=0, state_dim=3, mixed=2, hidden_dim=5):
+    """The tensors of an equivariant rule by the names of the authors' state dict."""
+    generator = torch.Generator().manual_seed(seed)
+    inputs, outputs = 2 * state_dim + mixed * (mixed + 1) // 2, state_dim + mixed
+    shapes = {
+        "model.W_hidden": (state_dim + 1, mixed),
+        "model.W_out": (mixed, 1),
+        "model.mlp.0.weight": (hidden_dim, inputs),
+        "model.mlp.0.bias": (hidden_dim,),
+        "model.mlp.2.weight": (outputs, hidden_dim),
+        "model.mlp.2.bias": (outputs,),
+    }
+    state = {name: torch.randn(shape, generator=generator) for name, shape in shapes.items()}
+    return state | {"eps0": torch.tensor(0.1), "N0": torch.tensor(4096), "alpha": torch.tensor(0.5)}
+
+
+def equivariant_update(state, z):
+    """Return [δ ; Δs] of perception vectors, written out pair by pair."""
+    mixing, steering = state["model.W_hidden"], state["model.W_out"]
+    channels, mixed = mixing.shape[0] - 1, mixing.shape[1]
+    vectors = z[:, 2 * channels :].view(len(z), channels + 1, 2)
+    u = [sum(mixing[i, a] * vectors[:, i] for i in range(channels + 1)) for a in range(mixed)]
+    products = [(u[a] * u[b]).sum(-1) for a in range(mixed) for b in range(a, mixed)]
+    inputs = torch.cat((z[:, : 2 * channels], torch.stack(products, dim=1)), dim=1)
+    hidden = torch.relu(inputs @ state["model.mlp.0.weight"].T + state["model.mlp.0.bias"])
+    y = hidden @ state["model.mlp.2.weight"].T + state["model.mlp.2.bias"]
+    gates = torch.relu(y[:, channels:])
+    delta = sum(u[a] * gates[:, a : a + 1] * steering[a, 0] for a in range(mixed))
+    return torch.cat((delta, y[:, :channels]), dim=1)
+
+
+def equivariant_tensors(state):
+    """The tensors as the web demo has them: padded, the mixtures' weights four times."""
+    return {
+        "W_hidden": state["model.W_hidden"].repeat_interleave(4, dim=-1),
+        "W_out": state["model.W_out"].repeat_interleave(4, dim=-1),
+        "w1.weight": padded(state["model.mlp.0.weight"]),
+        "w1.bias": padded(state["model.mlp.0.bias"]),
+        "w2.weight": padded(state["model.mlp.2.weight"]),
+        "w2.bias": padded(state["model.mlp.2.bias"]),
+    }
+
+
+def test_the_authors_equivariant_rules_run_as_theirs(tmp_path):
+    states = [equivariant_state(seed) for seed in range(3)]
+    torch.save(states[0], tmp_path / "npa.pth")
+    tensors = [equivariant_tensors(state) for state in states]
+    write_json(tmp_path / "a.json", {f"{k}": demo_entry(t) for k, t in enumerate(tensors)})
+    write_json(tmp_path / "b.json", demo_stack(tensors))
+    for name, k in (("npa.pth", 0), *((f"{f}.json#{k}", k) for f in "ab" for k in range(3))):
+        rule = load_rule(f"{tmp_path / name}")
+        z = torch.randn(30, rule.perception_dim, generator=torch.Generator().manual_seed(8))
+        assert (rule.space_dim, rule.eps0, rule.alpha) == (2, 0.1, 0.5)
+        assert relative_error(rule(z), equivariant_update(states[k], z)) < 1e-6
 
 
 BAD_ENTRIES = {
@@ -369,37 +446,83 @@ BAD_ENTRIES = {
 }
 
 
-def write_state(path, change):
-    state = authors_state(NPARule())
-    change(state)
+BAD_EQUIVARIANT = {
+    "a missing tensor": (lambda e: e.pop("w2.bias"), "lacks 'w2.bias'"),
+    "fewer mixtures": (lambda e: e.update(W_out=ones(1, 4)), "must have the sh"),
+    "few inputs": (lambda e: e.update({"w1.weight": ones(5, 8)}), "must have"),
+    "no channels": (lambda e: e.update(W_hidden=ones(1, 8)), "must have the"),
+}
+BAD_EQUIVARIANT_STATES = {
+    "a missing key": (lambda s: s.pop("model.W_out"), r"missing: \['model.W_out'\]"),
+}
+BAD_STACKS = {
+    "fewer rules": (
+        lambda e: e.update({"w2.bias": ones(1, 8)}),
+        "w2.bias must have as many ru",
+    ),
+    "a huge stack": (
+        lambda e: e["w1.weight"]["shape"].__setitem__(0, 10**9),
+        "or be a stack of rules whose",
+    ),
+}
+
+
+def write_state(path, state):
     torch.save(state, path)
 
 
-def write_entry(path, change):
-    entry = demo_entry(NPARule())
-    change(entry)
-    path.write_text(json.dumps({"mine": entry}), encoding="utf-8")
+def write_entry(path, entry):
+    write_json(path, {"mine": entry})
+
+
+def changed(make, write):
+    """Return a function that writes a file whose content is changed first."""
+
+    def write_changed(path, change):
+        content = make()
+        change(content)
+        write(path, content)
+
+    return write_changed
+
+
+def equivariant_demo():
+    return equivariant_tensors(equivariant_state())
 
 
 FORMATS = {
-    "rule.safetensors": (write_ours, BAD_HEADERS, lambda h, w: None),
-    "npa.pth": (write_state, BAD_STATES, lambda s: None),
-    "models.json": (write_entry, BAD_ENTRIES, lambda e: None),
+    "rule.safetensors": (write_ours, BAD_HEADERS),
+    "npa.pth": (changed(lambda: authors_state(NPARule()), write_state), BAD_STATES),
+    "equivariant.pth": (changed(equivariant_state, write_state), BAD_EQUIVARIANT_STATES),
+    "models.json": (
+        changed(lambda: demo_entry(demo_tensors(NPARule())), write_entry),
+        BAD_ENTRIES,
+    ),
+    "equivariant.json": (
+        changed(lambda: demo_entry(equivariant_demo()), write_entry),
+        BAD_EQUIVARIANT,
+    ),
+    "stack.json#1": (changed(lambda: demo_stack([equivariant_demo()] * 2), write_json), BAD_STACKS),
 }
-"""How a changed file is written, the changes that are refused, and one that changes nothing."""
+"""How a changed file is written and the changes that are refused; #1: a stack's second rule."""
+
+
+def unchanged(*content):
+    pass
 
 
 @pytest.mark.parametrize(
-    ("name", "case"), [(name, case) for name, (_, cases, _) in FORMATS.items() for case in cases]
+    ("name", "case"), [(name, case) for name, (_, cases) in FORMATS.items() for case in cases]
 )
 def test_a_wrong_file_is_refused(tmp_path, name, case):
-    write, cases, nothing = FORMATS[name]
+    write, cases = FORMATS[name]
     change, message = cases[case]
-    write(tmp_path / name, nothing)
-    assert load_rule(tmp_path / name).hyper_parameters() == NPARule().hyper_parameters()
-    write(tmp_path / name, change)
+    path = tmp_path / name.partition("#")[0]
+    write(path, unchanged)
+    load_rule(f"{tmp_path / name}")
+    write(path, change)
     with pytest.raises(NPAError, match=f"cannot load a rule from .*: .*{message}"):
-        load_rule(tmp_path / name)
+        load_rule(f"{tmp_path / name}")
 
 
 @pytest.mark.parametrize("suffix", ["safetensors", "pth", "pt", "json"])
@@ -415,13 +538,14 @@ def test_garbage_is_refused(tmp_path, suffix, data):
 
 @pytest.mark.parametrize("name", FORMATS)
 def test_truncated_files_are_refused(tmp_path, name):
-    write, _, nothing = FORMATS[name]
-    write(tmp_path / name, nothing)
-    data = (tmp_path / name).read_bytes()
+    write, _ = FORMATS[name]
+    path = tmp_path / name.partition("#")[0]
+    write(path, unchanged)
+    data = path.read_bytes()
     for part in (0.01, 0.3, 0.9, 0.999):
-        (tmp_path / name).write_bytes(data[: int(part * len(data))])
+        path.write_bytes(data[: int(part * len(data))])
         with pytest.raises(NPAError, match="cannot load a rule from"):
-            load_rule(tmp_path / name)
+            load_rule(f"{tmp_path / name}")
 
 
 def test_missing_files_and_folders_are_named(tmp_path):

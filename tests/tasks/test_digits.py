@@ -17,11 +17,6 @@ from npa_envs.tasks.targets.clouds import (
 from npa_envs.world.randomness import WorldRandom
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    return write_idx(tmp_path_factory.mktemp("idx"))
-
-
 def test_idx_files_are_read_as_they_were_written(folder, monkeypatch):
     # A tilde is the user's home.
     monkeypatch.setenv("HOME", str(folder.parent))

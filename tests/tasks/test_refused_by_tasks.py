@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from small_digits import write_idx
 
 from npa_envs.errors import NPAError
 from npa_envs.rule.rule import NPARule
@@ -164,8 +163,8 @@ def test_damages_and_targets(call, message):
         ([0, 1], r"int64 tensor of shape \[B\], got \[0, 1\]"),
     ],
 )
-def test_classes_that_do_not_exist(tmp_path, goal, message):
-    config = PointClassificationConfig(data=str(write_idx(tmp_path)), class_count=3)
+def test_classes_that_do_not_exist(folder, goal, message):
+    config = PointClassificationConfig(data=str(folder), class_count=3)
     with pytest.raises(NPAError, match=f"goal must .*{message}"):
         PointClassification(config).toward(goal)
     task = PointClassification(replace(config, class_count=2))

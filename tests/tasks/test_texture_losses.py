@@ -1,4 +1,4 @@
-"""Texture losses: what they are in plain arithmetic, what they ignore, what they see."""
+"""Texture losses: plain arithmetic, what they ignore and distinguish, VGG16 of random weights."""
 
 from dataclasses import replace
 
@@ -6,14 +6,26 @@ import numpy as np
 import pytest
 import torch
 
-from npa_envs.tasks.losses.pieces import EVEN, MATCHED_PATCH, RandomFilters, pyramid, quantiles
+from npa_envs.errors import NPAError
+from npa_envs.tasks.losses.pieces import (
+    EVEN,
+    MATCHED_PATCH,
+    RandomFilters,
+    moment_distance,
+    pyramid,
+    quantiles,
+    relaxed_transport,
+)
 from npa_envs.tasks.losses.texture import (
     FILTERS,
     FLOOR,
     TEXTURE_LOSSES,
+    WEIGHTS_FILE,
     FilterDescriptor,
     LossOptions,
     PatchDescriptor,
+    VGGFeatures,
+    load_vgg_weights,
     make_texture_loss,
 )
 from npa_envs.tasks.targets.textures import load_texture
@@ -21,7 +33,49 @@ from npa_envs.tasks.texture import Texture, TextureConfig
 
 JOINT = tuple(name for name, entry in TEXTURE_LOSSES.items() if entry.joint)
 SLICED = ("patch_swd", "filter_swd")
+VGG = "vgg_ot"
+WIDTHS = ((64, 64), (128, 128), (256, 256, 256), (512, 512, 512), (512, 512, 512))
+"""Channels of VGG16's convolutions; a pooling layer follows each group."""
 SMALL = TextureConfig(target="hearts", particle_count=300, resolution=24, hidden_dim=8, eps=0.3)
+
+
+@pytest.fixture(scope="module")
+def vgg16():
+    """The network as torchvision builds it, with average pooling and random weights."""
+    layers, channels = [], 3
+    torch.manual_seed(0)
+    for group in WIDTHS:
+        for width in group:
+            layer = torch.nn.Conv2d(channels, width, 3, padding=1, padding_mode="circular")
+            torch.nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
+            layers += [layer, torch.nn.ReLU()]
+            channels = width
+        layers.append(torch.nn.AvgPool2d(2))
+    return torch.nn.Sequential(*layers).requires_grad_(False)
+
+
+@pytest.fixture(scope="module")
+def vgg_weights(vgg16):
+    return {f"features.{name}": weight for name, weight in vgg16.state_dict().items()}
+
+
+@pytest.fixture(scope="module")
+def vgg_file(vgg_weights, tmp_path_factory):
+    path = tmp_path_factory.mktemp("vgg") / "weights.pth"
+    torch.save(vgg_weights, path)
+    return str(path)
+
+
+@pytest.fixture
+def make_loss(request):
+    """`make_texture_loss`, which finds VGG's weights."""
+
+    def make(name, target, **options):
+        if name == VGG:
+            options["vgg_weights"] = request.getfixturevalue("vgg_file")
+        return make_texture_loss(name, target, LossOptions(**options))
+
+    return make
 
 
 def texture(name, resolution=32, dtype=torch.float32, density=False):
@@ -149,59 +203,69 @@ def test_random_filters_answer_as_sums_over_patches_do():
 
 @pytest.mark.parametrize(
     ("name", "density"),
-    [*((name, False) for name in (*JOINT, *SLICED)), *((name, True) for name in SLICED)],
+    [
+        *((name, False) for name in (*JOINT, *SLICED, VGG)),
+        *((name, True) for name in (*SLICED, VGG)),
+    ],
 )
-def test_a_texture_is_like_itself_wherever_it_lies(name, density):
+def test_a_texture_is_like_itself_wherever_it_lies(name, density, make_loss):
     target = target_of(name, "bubbles", 32)
     if density:
         target = texture("bubbles", 32, torch.float64, density=True)
-    loss = make_texture_loss(name, target)
-    away = float(loss(noise(*target.shape)[None]))
-    # Smaller sizes are means of two by two pixels.
-    shift = (8, -16) if name in JOINT else (4, -8)
+    if name == VGG:
+        target = target.float()
+    loss = make_loss(name, target)
+    away = float(loss(noise(*target.shape, dtype=target.dtype)[None]))
+    # Smaller sizes are means of two by two pixels; VGG's deepest layer has places of 16 pixels.
+    shift = (8, -16) if name in JOINT else (16, 16) if name == VGG else (4, -8)
     images = torch.stack([target, target.roll(shift, (1, 2)), target.roll(16, 1)])
-    bound, least = (1e-6 * away, 0.05) if name in JOINT else (1e-25, 0.1)
+    bound = 1e-6 * away if name in JOINT else 1e-4 if name == VGG else 1e-25
     assert float(loss(images).abs().max()) < bound
-    assert away > least
+    assert away > (0.05 if name in JOINT else 0.1)
 
 
-@pytest.mark.parametrize("name", [*JOINT, *SLICED])
-def test_loss_falls_as_a_picture_comes_nearer_and_tells_others_apart(name):
+@pytest.mark.parametrize("name", [*JOINT, *SLICED, VGG])
+def test_loss_falls_as_a_picture_comes_nearer_and_tells_others_apart(name, make_loss):
     target = target_of(name, "hearts" if name in JOINT else "cells", 48)
-    loss = make_texture_loss(name, target)
-    share = torch.linspace(0.0, 1.0, 6, dtype=torch.float64)[:, None, None, None]
-    values = loss(share * target + (1.0 - share) * noise(*target.shape))
+    loss = make_loss(name, target)
+    weight = torch.linspace(0.0, 1.0, 6, dtype=torch.float64)[:, None, None, None]
+    values = loss(weight * target + (1.0 - weight) * noise(*target.shape))
     assert (values.diff() < 0.0).all(), values
     # Shuffled pixels have the target's colours, but not its structure.
     order = torch.randperm(48 * 48, generator=torch.Generator().manual_seed(0))
     shuffled = target.flatten(1)[:, order].reshape_as(target)
-    if name in SLICED:
-        assert float(values[-1]) < 1e-10
-        assert float(loss(texture("stripes", 48, torch.float64)[None])) > 0.2
-        assert float(loss(shuffled[None])) > 0.3
-    else:
+    if name in JOINT:
         flat = target.mean(dim=(1, 2), keepdim=True).expand_as(target)
         for other in (shuffled, target.flip(1), flat, drawable("stars", 48)):
             assert float(loss(other[None])) > 4.0 * float(values[-1].abs()) + 1e-3
+    else:
+        assert abs(float(values[-1])) < (1e-4 if name == VGG else 1e-10)
+        for other in (shuffled, texture("stripes", 48, torch.float64)):
+            assert float(loss(other[None])) > 0.2
 
 
 @pytest.mark.parametrize(
     ("name", "resolution"),
-    [(name, side) for name in JOINT for side in (13, 24)]
-    + [(name, side) for name in SLICED for side in (13, 24, 128)],
+    [
+        *((name, side) for name in (*JOINT, *SLICED) for side in (13, 24)),
+        *((name, 128) for name in SLICED),
+        (VGG, 48),
+    ],
 )
-def test_losses_do_not_depend_on_the_batch_and_on_nothing_random(name, resolution, device):
+def test_losses_do_not_depend_on_the_batch_and_on_nothing_random(
+    name, resolution, device, make_loss
+):
     target = target_of(name, "cells", resolution, torch.float32).to(device)
     images = noise(3, *target.shape, dtype=torch.float32).to(device)
-    values = make_texture_loss(name, target, LossOptions(seed=4))(images)
-    again = make_texture_loss(name, target, LossOptions(seed=4))
+    values = make_loss(name, target, seed=4)(images)
+    again = make_loss(name, target, seed=4)
     assert torch.equal(values, again(images))
     for k in range(3):
         assert torch.equal(values[k : k + 1], again(images[k : k + 1]))
     batched = again(images.clone().requires_grad_()).detach()
     torch.testing.assert_close(batched, values, rtol=1e-4, atol=1e-6)
     if name in SLICED:
-        other = make_texture_loss(name, target, LossOptions(seed=5))(images)
+        other = make_loss(name, target, seed=5)(images)
         assert not torch.equal(values, other)
         torch.testing.assert_close(values, other, rtol=0.2, atol=0.0)
 
@@ -244,18 +308,6 @@ def test_quantiles_resolve_a_distribution_as_finely_as_asked_for():
 
 
 @pytest.mark.parametrize("name", JOINT)
-def test_gradients_are_those_of_differences(name):
-    target = drawable("droplets", 16)
-    loss = make_texture_loss(name, target)
-    image = noise(1, *target.shape).requires_grad_()
-    (slope,) = torch.autograd.grad(loss(image).sum(), image)
-    direction = noise(1, *target.shape, seed=2) - 0.5
-    with torch.no_grad():
-        ahead, behind = (float(loss(image + step * direction)) for step in (1e-6, -1e-6))
-    assert float((slope * direction).sum()) == pytest.approx((ahead - behind) / 2e-6, rel=2e-4)
-
-
-@pytest.mark.parametrize("name", JOINT)
 def test_grey_starts_and_empty_places_have_finite_slopes(name):
     for fields in ({}, {"colour_weight": 0.0, "density_weight": 0.0}):
         task = Texture(replace(SMALL, loss=name, **fields))
@@ -266,39 +318,45 @@ def test_grey_starts_and_empty_places_have_finite_slopes(name):
             slopes = torch.autograd.grad(loss, leaves)
             assert all(torch.isfinite(value).all() for value in (loss, *slopes))
             assert (float(slopes[1].abs().max()) > 0.0) == (not fields)
-    grey = torch.full((4, 24, 24), 0.5)[None].double().requires_grad_()
-    (slope,) = torch.autograd.grad(make_texture_loss(name, drawable("stripes", 24))(grey), grey)
-    assert torch.isfinite(slope).all()
 
 
-@pytest.mark.parametrize("name", JOINT)
-def test_worlds_may_be_of_another_precision_than_the_target(name):
-    target, images = drawable("hearts", 24, torch.float32), noise(2, 4, 24, 24).requires_grad_()
-    loss = make_texture_loss(name, target)
+@pytest.mark.parametrize("name", [*JOINT, VGG])
+def test_worlds_may_be_of_another_precision_than_the_target(name, make_loss):
+    target = target_of(name, "hearts", 32, torch.float32)
+    images = noise(2, *target.shape).requires_grad_()
+    loss = make_loss(name, target)
     values = loss(images)
     (slopes,) = torch.autograd.grad(values.sum(), images)
     assert values.dtype == torch.float64
     # Worst error measured: 4e-7.
     torch.testing.assert_close(loss(images.float()).double(), values, rtol=1e-5, atol=0.0)
     assert torch.isfinite(slopes).all()
-    task = Texture(replace(SMALL, loss=name))
-    x, s = seeded(task)
-    found = task.metric(x.double(), s.double())
-    torch.testing.assert_close(found, task.metric(x, s).double(), rtol=1e-5, atol=0.0)
+    if name in JOINT:
+        task = Texture(replace(SMALL, loss=name))
+        x, s = seeded(task)
+        expected = task.metric(x, s).double()
+        torch.testing.assert_close(
+            task.metric(x.double(), s.double()), expected, rtol=1e-5, atol=0.0
+        )
 
 
 @pytest.mark.parametrize("name", JOINT)
-def test_an_empty_target_can_be_compared_with(name):
-    loss = make_texture_loss(name, torch.zeros(4, 24, 24))
+def test_slopes_of_pictures_without_structure_are_finite(name):
     empty, full = torch.zeros(1, 4, 24, 24), noise(1, 4, 24, 24).float()
-    for images in (empty, full, 100.0 * full):
-        images.requires_grad_()
-        value = loss(images)
-        (slope,) = torch.autograd.grad(value.sum(), images)
+    grey = torch.full_like(empty, 0.5)
+    values = []
+    for target, image in (
+        (drawable("stripes", 24).float(), grey),
+        *((empty[0], image) for image in (empty, full, 100.0 * full)),
+    ):
+        image = image.clone().requires_grad_()
+        value = make_texture_loss(name, target)(image)
+        (slope,) = torch.autograd.grad(value.sum(), image)
         assert torch.isfinite(value).all()
         # What optimisers normalise by.
         assert torch.isfinite(slope.norm())
-    assert float(loss(full).detach()) > float(loss(empty).detach()) >= 0.0
+        values.append(float(value.detach()))
+    assert values[2] > values[1] >= 0.0
 
 
 @pytest.mark.parametrize("name", JOINT)
@@ -339,3 +397,90 @@ def test_names_joined_by_a_plus_are_summed():
     parts = [make_texture_loss(name, target)(images) for name in ("patch_ot", "filter_ot")]
     together = make_texture_loss("patch_ot+filter_ot", target)(images)
     torch.testing.assert_close(together, parts[0] + parts[1], rtol=1e-12, atol=0.0)
+
+
+def test_features_are_those_of_the_layers_as_torchvision_counts_them(vgg16, vgg_file):
+    images = torch.rand(2, 3, 32, 32, generator=torch.Generator().manual_seed(1))
+    expected = []
+    mean, deviation = torch.tensor([(0.485, 0.456, 0.406), (0.229, 0.224, 0.225)])
+    field = (images - mean[:, None, None]) / deviation[:, None, None]
+    for number, layer in enumerate(vgg16):
+        field = layer(field)
+        if number in (1, 6, 11, 18, 25):
+            expected.append(field.flatten(2).mT)
+    features = VGGFeatures(images[0], LossOptions(vgg_weights=vgg_file))
+    found = features(images, wrap=True)
+    shapes = [tuple(f.shape[1:]) for f in found]
+    assert shapes == [(1024, 64), (256, 128), (64, 256), (16, 512), (4, 512)]
+    for a, b in zip(found, expected, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-5)
+    # A density stands for all three colours.
+    density = images[:, :1]
+    grey = features(density.expand(2, 3, 32, 32), wrap=True)[0]
+    assert torch.equal(features(density, wrap=True)[0], grey)
+
+
+def test_transport_and_moments_equal_plain_arithmetic():
+    generator = torch.Generator().manual_seed(3)
+    a = torch.randn(1, 7, 4, generator=generator, dtype=torch.float64)
+    b = torch.randn(1, 9, 4, generator=generator, dtype=torch.float64)
+    cost = [[1.0 - float(u @ v / (u.norm() * v.norm())) for v in b[0]] for u in a[0]]
+    there = sum(min(row) for row in cost) / 7
+    back = sum(min(column) for column in zip(*cost, strict=True)) / 9
+    assert float(relaxed_transport(a, b)) == pytest.approx(max(there, back), rel=1e-9)
+    means = (a[0].mean(0) - b[0].mean(0)).abs().mean()
+    covariances = (torch.cov(a[0].T) - torch.cov(b[0].T)).abs().mean()
+    assert float(moment_distance(a, b)) == pytest.approx(float(means + covariances), rel=1e-12)
+    # The order of places does not matter.
+    shuffled = a[:, torch.randperm(7, generator=generator)]
+    assert float(relaxed_transport(shuffled, a)) < 1e-9
+    assert float(moment_distance(shuffled, a)) < 1e-14
+
+
+def test_gradients_of_vgg_lower_the_loss(make_loss):
+    loss = make_loss(VGG, texture("cells"))
+    image = torch.rand(1, 3, 32, 32, generator=torch.Generator().manual_seed(1)).requires_grad_()
+    value = loss(image)
+    (gradient,) = torch.autograd.grad(value.sum(), image)
+    assert torch.isfinite(gradient).all()
+    with torch.no_grad():
+        step = 1e-3 * float(value) / float(gradient.square().sum())
+        lower = loss(image - step * gradient)
+    assert float(lower) < float(value.detach())
+    assert float(lower) == pytest.approx(float(value.detach()) * (1.0 - 1e-3), rel=3e-4)
+
+
+def test_vgg_sees_no_seam_of_a_target_that_does_not_tile(make_loss):
+    density = texture("dots", density=True)
+    assert float(make_loss(VGG, density, tiles=False)(density[None])) > 1e-3
+
+
+def test_weights_are_looked_for_in_the_folder_of_downloads(tmp_path, monkeypatch):
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
+    path = tmp_path / "checkpoints" / WEIGHTS_FILE
+    with pytest.raises(NPAError) as caught:
+        make_texture_loss(VGG, texture("cells"))
+    for part in (
+        str(path),
+        f"https://download.pytorch.org/models/{WEIGHTS_FILE}",
+        "torch.hub.load_state_dict_from_url",
+        "vgg_weights",
+        "loss='patch_swd'",
+    ):
+        assert part in str(caught.value)
+    path.parent.mkdir()
+    torch.save({"features.0.bias": torch.ones(64)}, path)
+    assert torch.equal(load_vgg_weights()["features.0.bias"], torch.ones(64))
+
+
+def test_damaged_and_foreign_weights_are_refused(tmp_path, vgg_weights):
+    path = tmp_path / "bad.pth"
+    short = {name: weight for name, weight in vgg_weights.items() if name != "features.7.weight"}
+    for content, message in (
+        (None, "damaged or no torch file"),
+        ([1, 2], "must be a state dict, got list"),
+        (short, "must hold features.7.weight"),
+    ):
+        torch.save(content, path) if content else path.write_bytes(b"no weights")
+        with pytest.raises(NPAError, match=message):
+            make_texture_loss(VGG, texture("cells"), LossOptions(vgg_weights=str(path)))

@@ -4,6 +4,7 @@ import dataclasses
 
 import pytest
 import torch
+from training_runs import worlds_of
 
 from npa_envs.cli import main
 from npa_envs.rule.files import load_rule
@@ -12,12 +13,6 @@ from npa_envs.training import override, preset, train
 from npa_envs.world.particles import Particles
 
 SMALL = TextureConfig(target="bubbles", particle_count=300, resolution=24, eps=0.3)
-
-
-def worlds(task, world_count, dtype=torch.float32, seed=0):
-    generator = torch.Generator().manual_seed(seed)
-    x, s, *_ = task.seed(world_count, generator=generator)
-    return x.to(dtype), 0.3 * torch.randn(s.shape, generator=generator, dtype=dtype)
 
 
 def lattice(side):
@@ -41,7 +36,7 @@ def test_seeds_fill_the_box_evenly():
 
 def test_all_particles_together_have_the_target_s_mean_density():
     task = Texture(SMALL)
-    picture = task.picture(*worlds(task, 2))
+    picture = task.picture(*worlds_of(task, 2))
     expected = torch.full((2,), task.target.coverage)
     torch.testing.assert_close(picture[..., 3].mean((1, 2)), expected, rtol=1e-5, atol=0.0)
     assert 0.4 < task.target.coverage < 0.6
@@ -70,7 +65,7 @@ def test_density_is_compared_as_its_tenth_root():
 def test_colours_are_compared_as_the_mean_where_particles_overlap():
     task = Texture(dataclasses.replace(SMALL, target="cells", particle_count=24**2))
     places = lattice(24)
-    _, s = worlds(task, 1)
+    _, s = worlds_of(task, 1)
     colour, density = task.texture_losses(places, s)
     # Every particle stands twice where it stood: as before, but twice as dense.
     twice = task.texture_losses(places.repeat(1, 2, 1), s.repeat(1, 2, 1))
@@ -84,35 +79,13 @@ def test_colours_are_compared_as_the_mean_where_particles_overlap():
 @pytest.mark.parametrize("loss", ["patch_swd", "filter_swd"])
 def test_loss_ignores_which_particle_is_which_and_where_the_world_lies(loss):
     task = Texture(dataclasses.replace(SMALL, loss=loss))
-    x, s = worlds(task, 1, torch.float64)
+    x, s = worlds_of(task, 1, torch.float64)
     value = task.metric(x, s)
     # The first particle stays the first: the world is looked at from its place.
     order = torch.cat((torch.zeros(1).long(), 1 + torch.randperm(299)))
     torch.testing.assert_close(task.metric(x[:, order], s[:, order]), value, rtol=1e-12, atol=0.0)
     moved = (x + torch.tensor([0.7, -1.3]) + 1.0) % 2.0 - 1.0
     torch.testing.assert_close(task.metric(moved, s), value, rtol=1e-9, atol=0.0)
-
-
-@pytest.mark.parametrize("loss", ["patch_swd", "filter_swd"])
-def test_shares_average_to_the_loss_and_tell_what_a_particle_changes(loss):
-    task = Texture(dataclasses.replace(SMALL, loss=loss))
-    x, s = worlds(task, 2, torch.float64)
-    shares = task.particle_shares(x, s)
-    torch.testing.assert_close(shares.mean(1), task.metric(x, s), rtol=1e-9, atol=0.0)
-    # The change of the loss where a particle is drawn a little more strongly, by differences: its
-    # colours and its density grow by a share that a twin in the same place adds.
-    compare = task.compare_pictures
-    places = x[:1] - x[:1, :1]
-    colour = s[:1, :, -3:] + 0.5
-    picture = task.picture(places, s[:1])
-    values = []
-    for k in (3, 40, 41):
-        twin = task.splat(places[:, k : k + 1], colour[:, k : k + 1])
-        ahead, behind = (task.weighted(*compare(picture + h * twin)) for h in (1e-7, -1e-7))
-        values.append(float(ahead - behind) / 2e-7)
-    found = shares[0, [3, 40, 41]]
-    assert float(found[0] - found[1]) == pytest.approx(300 * (values[0] - values[1]), rel=1e-4)
-    assert float(found[2] - found[1]) == pytest.approx(300 * (values[2] - values[1]), rel=1e-4)
 
 
 def test_particles_in_the_target_s_place_are_nearer_than_any_others():
@@ -129,7 +102,7 @@ def test_particles_in_the_target_s_place_are_nearer_than_any_others():
 
 def test_damage_wipes_a_disk_that_reaches_across_the_seam():
     task = Texture(dataclasses.replace(SMALL, damage_radius=0.4))
-    x, _ = worlds(task, 1)
+    x, _ = worlds_of(task, 1)
     x = x.new_tensor([[[0.95, -0.95]] * 50]) + 0.02 * x[:, :50]
     corners = x.new_tensor([[[-0.95, 0.95], [0.95, 0.95], [0.0, 0.0], [-0.3, -0.95]]])
     before = Particles(torch.cat((x, corners), dim=1), torch.ones(1, 54, 16))

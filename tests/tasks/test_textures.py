@@ -26,9 +26,9 @@ def test_patterns_have_no_seam_and_are_the_same_at_every_resolution(name):
     ("name", "scattered"), [("cells", True), ("bubbles", True), ("maze", True), ("grid", False)]
 )
 def test_seeds_move_what_is_scattered(name, scattered):
-    same = np.array_equal(draw_pattern(name, 16, seed=3), draw_pattern(name, 16, seed=4))
-    assert same is not scattered
-    assert np.array_equal(draw_pattern(name, 16, seed=3), draw_pattern(name, 16, seed=3))
+    one, again, other = (draw_pattern(name, 16, seed=seed) for seed in (3, 3, 4))
+    assert np.array_equal(one, other) is not scattered
+    assert np.array_equal(one, again)
 
 
 @pytest.mark.parametrize(
@@ -94,9 +94,7 @@ def test_gap_is_the_way_between_neighbouring_things():
     # Dots of radius 0.09, a quarter of the side apart.
     assert load_texture("dots", resolution=64).gap == pytest.approx(0.25 - 2 * 0.09, abs=1 / 64)
     assert load_texture("stripes", resolution=32).gap == 0.0
-
-
-def test_gap_reaches_round_the_edges():
+    # It reaches round the edges.
     picture = torch.zeros(16, 16, 4)
     picture[4:8, 0:2, 3] = 1.0
     assert TextureTarget("one", picture, True).gap == 0.0

@@ -101,6 +101,7 @@ REFUSED = [
         "pool_size must be a multiple of world_count where",
     ),
     ({"damage_share": 1.5}, "damage_share must be at most 1, got 1.5"),
+    ({"fresh_share": 1.1}, "fresh_share must be at most 1, got 1.1"),
     ({"damage_share": -0.5}, "damage_share must be a finite number of at least 0, got -0.5"),
     ({"vary_eps": (0.0, 1.0)}, "vary_eps must be two factors"),
     ({"vary_eps": (2.0, 1.0)}, r"vary_eps must be two factors .*lo <= hi"),

@@ -1,0 +1,10 @@
+"""Data that several files of this folder share."""
+
+import pytest
+from small_digits import write_idx
+
+
+@pytest.fixture(scope="session")
+def folder(tmp_path_factory):
+    """Small pictures of three classes in MNIST's format."""
+    return write_idx(tmp_path_factory.mktemp("idx"))
