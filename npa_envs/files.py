@@ -202,7 +202,7 @@ def _temporary_name(path: Path, token: str) -> str:
     return f".{stem}.{token}.tmp{path.suffix}"
 
 
-def write_bytes(path: str | Path, data: bytes) -> None:
+def write_bytes(path: str | Path, data: bytes | memoryview) -> None:
     """Write `data` to `path`, completely or not at all."""
     with atomic_path(path) as temporary:
         temporary.write_bytes(data)

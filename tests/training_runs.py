@@ -1,5 +1,8 @@
 """Short training runs for tests: logs, kills in the middle, a CPU stand-in for CUDA graphs."""
 
+import contextlib
+
+import pytest
 import torch
 from circle_task import CircleTask, plain_rollout
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -44,6 +47,24 @@ class KilledTask(CircleTask):
 
 def kill():
     raise Killed
+
+
+def runaway(rule, x, s, steps, **options):
+    """A rollout that moves the second world so far away that the pool replaces it."""
+    x, s, path_length = plain_rollout(rule, x, s, steps, **options)
+    return x + torch.tensor([0.0, 100.0, 0.0])[:, None, None], s, path_length
+
+
+@contextlib.contextmanager
+def full_disk(file_size):
+    """The system refuses to write files beyond a size [bytes], as it does on a full disk."""
+    resource = pytest.importorskip("resource")
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (file_size, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
 
 class Recording(TorchDispatchMode):

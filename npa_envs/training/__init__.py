@@ -85,8 +85,8 @@ def train(
         raise NPAError(
             f"config must be a TrainConfig, got {shown(config)}: make one with preset('fast')"
         )
-    kind = type(next(iter(entry.presets.values())).task)
-    if not isinstance(config.task, kind):
+    cls = type(next(iter(entry.presets.values())).task)
+    if not isinstance(config.task, cls):
         raise NPAError(
             f"config must be one of the task {task_name!r}, got one with a "
             f"{type(config.task).__name__}: make it with preset('fast', {task_name!r})"

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import os
 import sys
 from collections.abc import Iterator, Mapping
-from io import FileIO
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from npa_envs.checks import is_real, is_whole
 from npa_envs.errors import NPAError, shown
-from npa_envs.files import atomic_path, check_torch_archive, open_regular
+from npa_envs.files import check_torch_archive, open_regular, write_bytes
 from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.presets import config_to_dict
 
@@ -36,11 +36,11 @@ MAY_DIFFER = frozenset(
 )
 """Configuration fields that a resumed run may change."""
 
-NEEDED: dict[str, type] = {
+NEEDED: dict[str, Any] = {
     "task_name": str,
     "config": dict,
     "iteration": int,
-    "seconds": float,
+    "seconds": int | float,
     "rule_hyper_parameters": dict,
     "rule": dict,
     "optimiser": dict,
@@ -59,31 +59,11 @@ NOT_NEGATIVE = {
 
 def save_checkpoint(path: Path, content: dict[str, Any]) -> None:
     """Write a checkpoint, completely or not at all."""
-    with atomic_path(path) as temporary, _PatientFile(temporary, "wb") as file:
-        torch.save(
-            {"format": CHECKPOINT_FORMAT, "format_version": CHECKPOINT_VERSION, **content}, file
-        )
-        if file.error is not None:
-            raise file.error
-
-
-class _PatientFile(FileIO):
-    """A file that stores the first error of writing in `error` and then writes no more.
-
-    Torch would raise another error, which hides the reason (such as a full disk).
-    """
-
-    error: OSError | None = None
-
-    def write(self, data: Any, /) -> int:
-        """Write all of the data, unless an error came before."""
-        rest = memoryview(data)
-        try:
-            while self.error is None and len(rest) > 0:
-                rest = rest[super().write(rest) :]
-        except OSError as error:
-            self.error = error
-        return len(data)
+    # Torch itself would hide the reason of an error of writing, such as a full disk.
+    buffer = io.BytesIO()
+    header = {"format": CHECKPOINT_FORMAT, "format_version": CHECKPOINT_VERSION}
+    torch.save(header | content, buffer)
+    write_bytes(path, buffer.getbuffer())
 
 
 def load_checkpoint(path: Path) -> dict[str, Any]:
@@ -138,18 +118,12 @@ def check_same_run(
     needed = [(name, content.get(name), cls) for name, cls in NEEDED.items()]
     if isinstance(content.get("config"), dict):
         needed.append(("config.task", content["config"].get("task"), dict))
-    # Seconds may be an int.
-    wrong = [
-        name
-        for name, value, cls in needed
-        if not isinstance(value, (int, float) if cls is float else cls)
-    ]
+    wrong = [name for name, value, cls in needed if not isinstance(value, cls)]
     if not wrong and not _is_plain(content["config"]):
         wrong = ["config"]
     if wrong:
         raise unusable_checkpoint(path, f"{', '.join(wrong)} is missing or of a wrong type")
-    zeros = {name: cls() for name, cls in NEEDED.items() if cls in (int, float)}
-    check_content(content, zeros, path)
+    check_content(content, {"iteration": 0, "seconds": 0.0}, path)
     check_task(content, task_name, path)
     theirs = _flat(content["config"])
     ours = _flat(config_to_dict(config))
@@ -201,9 +175,9 @@ def _wrong(name: str, value: Any, like: Any) -> Iterator[str]:
         for key in like:
             yield from _wrong(f"{name}.{key}", value[key], like[key])
     elif isinstance(like, Tensor):
-        if not isinstance(value, Tensor) or _kind(value) != _kind(like):
-            got = f"of {_kind(value)}" if isinstance(value, Tensor) else type(value).__name__
-            yield f"{name} must be a tensor of {_kind(like)}, got {got}"
+        if not isinstance(value, Tensor) or _form_of(value) != _form_of(like):
+            got = f"of {_form_of(value)}" if isinstance(value, Tensor) else type(value).__name__
+            yield f"{name} must be a tensor of {_form_of(like)}, got {got}"
         elif not bool(torch.isfinite(value).all()):
             yield f"{name} must be finite"
         elif name.rpartition(".")[2] in NOT_NEGATIVE and bool((value < 0).any()):
@@ -211,11 +185,11 @@ def _wrong(name: str, value: Any, like: Any) -> Iterator[str]:
     elif isinstance(like, int | float):
         right = is_whole(value) if isinstance(like, int) else is_real(value)
         if not right or value < 0:
-            kind = "whole" if isinstance(like, int) else "finite"
-            yield f"{name} must be a {kind} number of at least 0, got {str(value)[:40]}"
+            rule = "whole" if isinstance(like, int) else "finite"
+            yield f"{name} must be a {rule} number of at least 0, got {str(value)[:40]}"
 
 
-def _kind(tensor: Tensor) -> str:
+def _form_of(tensor: Tensor) -> str:
     usual = tensor.layout == torch.strided and not tensor.is_meta
     return f"{'' if usual else 'odd '}{str(tensor.dtype)[6:]} {tuple(tensor.shape)}"
 

@@ -69,8 +69,7 @@ class WorldPool:
         return {name: value for name, value in tensors.items() if value is not None}
 
     def sample(self, world_count: int, generator: Randomness) -> Tensor:
-        """Return random indices of B different worlds, one from each of B equal sections, shape
-        [B].
+        """Return random indices of B worlds, one from each of B equal sections, shape [B].
 
         A torch.Generator, if worlds have no lifetimes, draws from the whole pool instead.
         """
@@ -215,8 +214,7 @@ class TrainingCycle:
         return steps
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the state for a checkpoint, without the rule; rank 0 gets that of all
-        processes."""
+        """Return the state for a checkpoint without the rule, on rank 0 of all processes."""
         collected = self._ranks.collected
         return self._state(self.optimiser.state_dict(), lambda part: collected(part, self._section))
 

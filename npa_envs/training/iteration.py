@@ -102,9 +102,6 @@ class EagerIteration:
 
     def run(self, steps: int) -> None:
         """Run the rollout, the loss and the backward pass."""
-        self._forward_backward(steps)
-
-    def _forward_backward(self, steps: int) -> None:
         # Gradients of codes flow through these states; `start` keeps their values.
         first_states = self._task.coded(self.start.s)
         if first_states is not self.start.s:
@@ -177,10 +174,11 @@ class GraphedIteration(EagerIteration):
 
     def run(self, steps: int) -> None:
         """Replay the graph for this number of steps, captured at the first use."""
+        run_eagerly = super().run
         with torch.cuda.device(self.start.x.device):
             if steps not in self._graphs:
                 self._graphs[steps] = capture(
-                    lambda: self._forward_backward(steps),
+                    lambda: run_eagerly(steps),
                     self.start.x.device,
                     pool=self._memory_pool,
                     generator=registered(self._generator),
@@ -194,11 +192,11 @@ class GraphedIteration(EagerIteration):
         generator = self._generator
         if isinstance(generator, WorldRandom):
             streams = generator.take(slice(None))
-            self._forward_backward(WARM_UP_STEPS)
+            super().run(WARM_UP_STEPS)
             generator.put(slice(None), streams)
         else:
             state = generator.get_state()
-            self._forward_backward(WARM_UP_STEPS)
+            super().run(WARM_UP_STEPS)
             generator.set_state(state)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import tomllib
 import types
 import typing
@@ -240,17 +241,8 @@ def config_to_dict(config: TrainConfig[Any]) -> dict[str, Any]:
 
     `override(base, **config_to_dict(config))` restores it.
     """
-    result = _plain(dataclasses.asdict(config))
-    assert isinstance(result, dict)
+    result: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(config), default=str))
     return result
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, tuple | list):
-        return [_plain(item) for item in value]
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    return str(value) if isinstance(value, Path) else value
 
 
 def _parse(path: Path, text: str) -> Any:

@@ -1,5 +1,4 @@
-"""Processes that train one rule together, each on its part of the worlds; random streams of
-runs."""
+"""Processes that train one rule together, each on its part of the worlds; random streams."""
 
 from __future__ import annotations
 
@@ -165,13 +164,13 @@ class Ranks:
         """Check that tensors are the same on all processes, bit for bit."""
         if self.count == 1:
             return
-        own = torch.cat([tensor.detach().reshape(-1).double().cpu() for tensor in tensors])
-        low, high = (self._all_reduce(own.clone(), op) for op in ("MIN", "MAX"))
+        flat = torch.cat([tensor.detach().reshape(-1).double().cpu() for tensor in tensors])
+        low, high = (self._all_reduce(flat.clone(), op) for op in ("MIN", "MAX"))
         differing = int((low != high).sum())
         if differing:
             raise NPAError(
                 f"the parameters must be the same on all {self.count} processes, but {differing} "
-                f"of {len(own)} differ, by at most {float((high - low).max()):.3g}: the last "
+                f"of {len(flat)} differ, by at most {float((high - low).max()):.3g}: the last "
                 "checkpoint is intact; resume it, and look for a faulty device or for processes "
                 "with different versions of a library"
             )
@@ -265,8 +264,7 @@ class RunRandomness:
 def world_streams(
     seed: Sequence[int], total: int, indices: Tensor, device: torch.device
 ) -> WorldRandom:
-    """Return the streams of the worlds at `indices` among `total`, whatever the other indices
-    are."""
+    """Return the streams of the worlds at `indices` among `total`, whatever the others are."""
     keys = np.random.default_rng(seed).integers(2**64, size=total, dtype=np.uint64)
     return WorldRandom.from_keys(torch.from_numpy(keys.view(np.int64))[indices].to(device))
 
@@ -301,7 +299,10 @@ def joined_ranks() -> Iterator[Ranks]:
     # NVML, which does not initialise CUDA.
     has_gpus = torch.cuda.device_count() >= int(os.environ["LOCAL_WORLD_SIZE"])
     backend = "cpu:gloo,cuda:nccl" if dist.is_nccl_available() and has_gpus else "gloo"
-    _choose_device(int(os.environ["LOCAL_RANK"]))
+    if torch.cuda.device_count() > 0:
+        rank, visible = int(os.environ["LOCAL_RANK"]), os.environ.get("CUDA_VISIBLE_DEVICES")
+        devices = [str(rank)] if visible is None else visible.split(",")[rank : rank + 1]
+        os.environ["CUDA_VISIBLE_DEVICES"] = ",".join(devices)
     try:
         dist.init_process_group(backend)
         ranks = Ranks.current()
@@ -329,15 +330,6 @@ def joined_ranks() -> Iterator[Ranks]:
     # Not after an error: others may be gone. Recorded graphs keep references to the group.
     gc.collect()
     dist.destroy_process_group()
-
-
-def _choose_device(number: int) -> None:
-    """Let this process see only the CUDA device `number` of its visible ones, if there is one."""
-    if torch.cuda.device_count() == 0:
-        return
-    visible = os.environ.get("CUDA_VISIBLE_DEVICES")
-    devices = [str(number)] if visible is None else visible.split(",")[number : number + 1]
-    os.environ["CUDA_VISIBLE_DEVICES"] = ",".join(devices)
 
 
 BEAT_SECONDS = 5.0

@@ -87,8 +87,7 @@ class Run:
 
     @contextlib.contextmanager
     def held(self, *, begin: bool = False) -> Iterator[None]:
-        """Lock the folder within the block; with `begin`, remove unfinished and overwritten
-        files."""
+        """Lock the folder inside; with `begin`, remove unfinished and overwritten files."""
         folder = self.folder if self._ranks.first else None
         with contextlib.nullcontext() if folder is None else folder.locked():
             if begin and folder is not None:
@@ -229,8 +228,7 @@ class RunFolder:
         self._known: tuple[int, int] | None = None
 
     def prepare(self, byte_count: int, *, pictures: bool = True) -> None:
-        """Create the folder and check that a checkpoint of `byte_count` bytes can be written
-        there."""
+        """Create the folder, and check that the disk has room for two checkpoints of this size."""
         # The old checkpoint exists until the new one is complete.
         needed = 2 * byte_count
         try:

@@ -117,7 +117,10 @@ class Trainer:
         self._run = Run(self.folder, self._ranks, check, resume=resume, overwrite=overwrite)
         content, self._run.content = self._run.content, None
         self._make_cycle(content, device, rollout)
-        self._check_room()
+        if self._ranks.first:
+            rule_bytes = sum(p.nbytes for p in self.rule.parameters())
+            pool_bytes = sum(value.nbytes for value in self.pool.worlds.tensors())
+            self.folder.prepare(self._ranks.count * pool_bytes + 16 * rule_bytes)
         with self._run.held(begin=True):
             if content is not None:
                 self._restore(content)
@@ -140,13 +143,6 @@ class Trainer:
             self.task, self.rule, config, device, schedule, rollout, ranks=ranks, by_world=by_world
         )
         self.pool = self._cycle.pool
-
-    def _check_room(self) -> None:
-        """Create the folder, and check that the disk has room for checkpoints."""
-        if self._ranks.first:
-            rule_bytes = sum(p.nbytes for p in self.rule.parameters())
-            pool_bytes = sum(value.nbytes for value in self.pool.worlds.tensors())
-            self.folder.prepare(self._ranks.count * pool_bytes + 16 * rule_bytes)
 
     def _write_config(self, *, new: bool) -> None:
         """Write the configuration, before the first checkpoint, whose resumption needs it."""

@@ -142,7 +142,7 @@ def inject(
             number or a tensor of shape [B].
     """
     check_world(x, s)
-    _check_each("state", state, s, "s", "C")
+    _check_vector("state", state, s, "C")
     strength = _per_world("strength", strength, x, highest=1.0)
     return s + strength * softness(x, centre=centre, radius=radius, box=box) * (state[:, None] - s)
 
@@ -265,23 +265,22 @@ def _per_world(name: str, value: float | Tensor, x: Tensor, *, highest: float = 
     return x.new_full((1, 1, 1), value)
 
 
-def _check_vector(name: str, vector: Tensor, x: Tensor) -> None:
-    if x.ndim != 3:
-        raise NPAError(f"x must have shape [B, N, D], got {tuple(x.shape)}: add a world, x[None]")
-    _check_each(name, vector, x, "x", "D")
-
-
-def _check_each(name: str, value: Tensor, other: Tensor, other_name: str, letter: str) -> None:
-    """Check that a tensor has a vector for each world, of the last size of another tensor."""
-    shape = (other.shape[0], other.shape[2])
-    if not isinstance(value, Tensor) or value.shape != shape:
-        got = tuple(value.shape) if isinstance(value, Tensor) else shown(value)
+def _check_vector(name: str, vector: Tensor, like: Tensor, letter: str = "D") -> None:
+    """Check that a tensor has a vector for each world, like positions (D) or states (C)."""
+    if like.ndim != 3:
+        raise NPAError(
+            f"x must have shape [B, N, D], got {tuple(like.shape)}: add a world, x[None]"
+        )
+    shape = (like.shape[0], like.shape[2])
+    if not isinstance(vector, Tensor) or vector.shape != shape:
+        got = tuple(vector.shape) if isinstance(vector, Tensor) else shown(vector)
         raise NPAError(
             f"{name} must have shape [B, {letter}] = {shape}, got {got}: give one vector for each "
             f"world, for example torch.zeros{shape}"
         )
-    if value.device != other.device or value.dtype != other.dtype:
+    if vector.device != like.device or vector.dtype != like.dtype:
+        like_name = "x" if letter == "D" else "s"
         raise NPAError(
-            f"{name} must be {other.dtype} on {other.device} like {other_name}, got {value.dtype} "
-            f"on {value.device}: convert it with {name}.to({other_name})"
+            f"{name} must be {like.dtype} on {like.device} like {like_name}, got {vector.dtype} "
+            f"on {vector.device}: convert it with {name}.to({like_name})"
         )

@@ -42,7 +42,6 @@ recording_lock = threading.RLock()
 
 
 @functools.cache
-@functools.cache
 def can_capture() -> bool:
     """Return whether torch's allocator supports graphs: its own caching allocator does."""
     caching = "PYTORCH_NO_CUDA_MEMORY_CACHING" not in os.environ

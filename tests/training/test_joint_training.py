@@ -101,36 +101,31 @@ class TestTask:
 
 
 class TestRun:
-    def test_all_species_correct_gradients_as_the_run_is_told(self, tmp_path):
-        config = run_config(tmp_path / "run", iterations=1, moment_inverse="smooth")
-        for given in (None, CoMorphogenesis2D(pair()).make_rules(torch.Generator())):
-            result = train_together(config, given, overwrite=True, progress=False)
+    def test_new_rules_take_the_runs_options_and_initial_ones_keep_their_dead_zone(self, tmp_path):
+        options = {"moment_inverse": "smooth", "dead_zone": 0.01}
+        config = run_config(tmp_path / "run", iterations=1, **options)
+        initial = CoMorphogenesis2D(pair()).make_rules(torch.Generator())
+        initial[1].dead_zone = 0.5
+        for rules, dead_zones in ((None, [0.01, 0.01]), (initial, [0.0, 0.5])):
+            result = train_together(config, rules, overwrite=True, progress=False)
             assert [rule.moment_inverse for rule in result.rule] == ["smooth", "smooth"]
-        assert load_rule(tmp_path / "run" / "rule-1.safetensors").moment_inverse == "smooth"
-
-    def test_rules_get_the_dead_zone_but_those_that_are_given_keep_theirs(self, tmp_path):
-        config = run_config(tmp_path / "run", iterations=1, dead_zone=0.01)
-        made = train_together(config, None, overwrite=True, progress=False).rule
-        assert [rule.dead_zone for rule in made] == [0.01, 0.01]
-        given = CoMorphogenesis2D(pair()).make_rules(torch.Generator())
-        given[1].dead_zone = 0.5
-        kept = train_together(config, given, overwrite=True, progress=False).rule
-        assert [rule.dead_zone for rule in kept] == [0.0, 0.5]
-        assert load_rule(tmp_path / "run" / "rule-1.safetensors").dead_zone == 0.5
+            assert [rule.dead_zone for rule in result.rule] == dead_zones
+            saved = load_rule(tmp_path / "run" / "rule-1.safetensors")
+            assert (saved.moment_inverse, saved.dead_zone) == ("smooth", dead_zones[1])
 
     @pytest.mark.parametrize(
-        ("species", "kept", "fields", "message"),
+        ("species", "count", "fields", "message"),
         [
             (("heart", {}), 1, {}, "one for each of 2 species, got 1"),
             (("heart", {"hidden_dim": 8}), 2, {}, r"rule 1 differs in hidden_dim: .* of species 1"),
             (None, 0, {"initial_rule": "gecko"}, "initial_rule is for one rule, got 'gecko'"),
         ],
     )
-    def test_rules_that_do_not_fit_are_refused(self, tmp_path, species, kept, fields, message):
+    def test_rules_that_do_not_fit_are_refused(self, tmp_path, species, count, fields, message):
         rules = None
         if species is not None:
             target, own = species
-            given = pair(species=(small("ring"), small(target, 32, **own)))
-            rules = CoMorphogenesis2D(given).make_rules(torch.Generator())[:kept]
+            other = pair(species=(small("ring"), small(target, 32, **own)))
+            rules = CoMorphogenesis2D(other).make_rules(torch.Generator())[:count]
         with pytest.raises(NPAError, match=message):
             train_together(run_config(tmp_path, **fields), rules, progress=False)

@@ -1,6 +1,7 @@
 """Several processes that train one rule: the same curve for any number, and what ends them."""
 
 import os
+import re
 import signal
 import threading
 import time
@@ -13,7 +14,6 @@ from training_runs import log_of
 from worlds import assert_same
 
 from npa_envs.errors import NPAError
-from npa_envs.rule.files import load_rule
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
 from npa_envs.training import TASKS, Trainer, override, preset, ranks, train
 from npa_envs.training.checkpoint import load_checkpoint
@@ -32,9 +32,12 @@ STRAYING = {"escape_share": 0.1, "escape_weight": 10.0, "world_count": 4, "pool_
 """Worlds that lose particles, some more than others."""
 
 
+FEW = {"iterations": 3, "steps": (3, 5)}
+BASE = {"iterations": 5, "milestones": [2], "dtype": "float64", "steps": (3, 6)}
+
+
 def tiny(out, **fields):
-    fields = {"iterations": 5, "milestones": [2], "dtype": "float64", "steps": (3, 6)} | fields
-    return preset("tiny", out=out, particle_count=64, resolution=16, **fields)
+    return preset("tiny", out=out, particle_count=64, resolution=16, **BASE | fields)
 
 
 def trainer_of(config, **options):
@@ -46,13 +49,13 @@ def trained(config, **options):
     return trainer_of(config, **options).run(progress=False).interrupted
 
 
-def disturbed(config, iteration, disturb, *, first=False):
-    """A trainer of which one process does something else before an iteration."""
+def disturbed(config, iteration, disturb):
+    """A trainer that calls `disturb` before an iteration."""
     trainer = trainer_of(config)
     iterate = trainer.iterate
 
     def disturbing():
-        if trainer.iteration == iteration and Ranks.current().first == first:
+        if trainer.iteration == iteration:
             disturb()
         iterate()
 
@@ -77,37 +80,32 @@ def loaded_kernels(tmp_path_factory):
     make_cycle(tiny(folder / "grouped", iterations=1, milestones=[1], **LIVELY)).run(0)
 
 
-def assert_same_curve(folder, other):
-    ours, theirs = log_of(folder), log_of(other)
-    assert len(ours) == len(theirs) > 0
-    for one, two in zip(ours, theirs, strict=True):
-        assert one == pytest.approx(two, rel=1e-10, abs=1e-14)
-    rules = [load_rule(path / "rule.safetensors") for path in (folder, other)]
-    for one, two in zip(*(rule.parameters() for rule in rules), strict=True):
-        torch.testing.assert_close(one, two, rtol=1e-9, atol=1e-12)
+CASES = [
+    *(("morphogenesis2d", fields, 1e-10) for fields in ({}, LIVELY, SEEDED, STRAYING)),
+    # Its 16-bit numbers would differ between processes that did not step together.
+    ("morphogenesis2d", {"optimiser": "muon", "learning_rate": 5e-3}, 1e-2),
+    *(pytest.param(task, FEW | SEEDED, 1e-10, marks=pytest.mark.slow) for task in TASKS),
+]
 
 
-@pytest.mark.parametrize(
-    "fields", [{}, LIVELY, SEEDED, STRAYING], ids=["plain", "lively", "seeded", "straying"]
-)
-def test_two_processes_have_the_curve_of_one(tmp_path, fields):
+@pytest.mark.parametrize(("task", "fields", "tolerance"), CASES)
+def test_two_processes_have_the_curve_of_one(tmp_path, task, fields, tolerance):
+    if task == "point_classification":
+        pytest.importorskip("sklearn")
+
+    def run(name):
+        sizes = {"particle_count": 64, "resolution": 16} if task == "morphogenesis2d" else {}
+        config = preset("tiny", task, out=tmp_path / name, **BASE | sizes | fields)
+        return train(config, task, progress=False).interrupted
+
+    run("loads kernels")
     for count in (1, 2):
-        config = tiny(tmp_path / str(count), **fields)
-        assert on_ranks(count, lambda c=config: trained(c), tmp_path) == [False] * count
-    assert_same_curve(tmp_path / "1", tmp_path / "2")
-    pools = [load_checkpoint(tmp_path / n / "checkpoint.pt")["pool"] for n in ("1", "2")]
-    assert pools[0].keys() == pools[1].keys()
-    for name in pools[0]:
-        torch.testing.assert_close(pools[0][name], pools[1][name], rtol=1e-9, atol=1e-12)
-
-
-def test_processes_take_muons_steps_together(tmp_path):
-    """What rounds to another number of 16 bits on one process would be refused as another rule."""
-    for count in (1, 2):
-        config = tiny(tmp_path / str(count), optimiser="muon", learning_rate=5e-3)
-        assert on_ranks(count, lambda c=config: trained(c), tmp_path) == [False] * count
+        assert on_ranks(count, lambda n=count: run(str(n)), tmp_path) == [False] * count
     for one, two in zip(log_of(tmp_path / "1"), log_of(tmp_path / "2"), strict=True):
-        assert one["loss"] == pytest.approx(two["loss"], rel=1e-2)
+        assert one == pytest.approx(two, rel=tolerance, abs=1e-4 * tolerance)
+    single, double = (load_checkpoint(tmp_path / n / "checkpoint.pt") for n in ("1", "2"))
+    for name in ("rule", "pool") if tolerance < 1e-9 else ():
+        torch.testing.assert_close(single[name], double[name], rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize("fresh_share", [0.0, 0.25, 0.5, 0.75])
@@ -120,25 +118,6 @@ def test_seeds_come_into_the_part_of_the_pool_of_every_world(tmp_path, fresh_sha
         cycle.run(iteration)
     changed = (cycle.pool.worlds.x - before).abs().amax(dim=(1, 2)) > 1e-3
     assert changed.view(4, 2).any(dim=1).all()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", TASKS)
-def test_every_task_has_the_same_curve_on_two_processes(tmp_path, name):
-    if name == "point_classification":
-        pytest.importorskip("sklearn")
-    fields = {"iterations": 3, "milestones": [2], "dtype": "float64", "steps": (3, 5)}
-    fields |= {"world_count": 4, "pool_size": 8, "seed_interval": 2}
-
-    def run(folder):
-        config = preset("tiny", name, out=folder, **fields)
-        return train(config, name, progress=False).interrupted
-
-    run(tmp_path / "loads kernels")
-    for count in (1, 2):
-        assert on_ranks(count, lambda n=count: run(tmp_path / str(n)), tmp_path) == [False] * count
-    for one, two in zip(log_of(tmp_path / "1"), log_of(tmp_path / "2"), strict=True):
-        assert one == pytest.approx(two, rel=1e-10, abs=1e-14)
 
 
 def test_a_run_goes_on_with_another_number_of_processes(tmp_path):
@@ -180,40 +159,45 @@ def test_parameters_that_differ_are_refused_and_the_checkpoint_stays(tmp_path):
         trainer.iterate()
         trainer.save()
 
-    for said in on_ranks(2, drift, tmp_path):
-        assert "parameters must be the same on all 2 processes, but " in said
-        assert "by at most 0.5" in said
+    for message in on_ranks(2, drift, tmp_path):
+        assert "parameters must be the same on all 2 processes, but " in message
+        assert "by at most 0.5" in message
     assert load_checkpoint(tmp_path / "run" / "checkpoint.pt")["iteration"] == 0
 
 
-def test_a_lost_process_ends_the_others_and_the_run_goes_on_from_its_checkpoint(tmp_path):
+def kill_other():
+    if not Ranks.current().first:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+def fill_disk():
+    # The log has room for its line, a checkpoint has not.
+    if Ranks.current().first:
+        resource = pytest.importorskip("resource")
+        resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, resource.RLIM_INFINITY))
+
+
+@pytest.mark.parametrize(
+    ("disturb", "first_message", "other_result"),
+    [
+        (kill_other, "process 0 of 2 has lost another one", str(-signal.SIGKILL)),
+        (fill_disk, "cannot write .*the disk is full", "process 1 of 2 has lost another one"),
+    ],
+)
+def test_what_ends_one_process_ends_the_others_and_the_run_goes_on_from_its_checkpoint(
+    tmp_path, disturb, first_message, other_result
+):
     config = tiny(tmp_path / "run", iterations=30, checkpoint_interval=2)
 
-    def dying():
-        disturbed(config, 5, lambda: os.kill(os.getpid(), signal.SIGKILL)).run(progress=False)
+    def disturbed_run():
+        disturbed(config, 5, disturb).run(progress=False)
 
-    said, code = on_ranks(2, dying, tmp_path)
-    assert "process 0 of 2 has lost another one" in said
-    assert code == -signal.SIGKILL
+    first, other = on_ranks(2, disturbed_run, tmp_path)
+    assert re.search(first_message, first)
+    assert other_result in str(other)
     assert load_checkpoint(tmp_path / "run" / "checkpoint.pt")["iteration"] == 4
     assert trained(config, resume=True) is False
     assert log_of(tmp_path / "run")[-1]["iteration"] == 30
-
-
-def test_a_full_disk_ends_all_processes_and_leaves_the_checkpoint(tmp_path):
-    resource = pytest.importorskip("resource")
-    config = tiny(tmp_path / "run", iterations=30, checkpoint_interval=2)
-    # The log has room for its line, a checkpoint has not.
-    room = resource.RLIMIT_FSIZE, (10_000, resource.RLIM_INFINITY)
-
-    def filling():
-        disturbed(config, 3, lambda: resource.setrlimit(*room), first=True).run(progress=False)
-
-    first, other = on_ranks(2, filling, tmp_path)
-    assert "cannot write" in first
-    assert "the disk is full" in first
-    assert "process 1 of 2 has lost another one" in other
-    assert load_checkpoint(tmp_path / "run" / "checkpoint.pt")["iteration"] == 2
 
 
 def test_processes_whose_iterations_take_long_ask_each_other_in_every_one(tmp_path, monkeypatch):
@@ -234,15 +218,17 @@ def test_all_processes_stop_after_the_same_iteration_where_one_is_asked_to(tmp_p
     config = tiny(tmp_path / "run", iterations=60)
 
     def stop():
+        if Ranks.current().first:
+            return
         # Twice: torchrun passes on what a terminal has sent already.
         os.kill(os.getpid(), signal.SIGTERM)
         os.kill(os.getpid(), signal.SIGTERM)
 
-    def asked():
+    def stopped_run():
         trainer = disturbed(config, 3, stop)
         return trainer.run(progress=False).interrupted, trainer.iteration
 
-    one, other = on_ranks(2, asked, tmp_path)
+    one, other = on_ranks(2, stopped_run, tmp_path)
     assert one == other
     assert one[0]
     assert 3 < one[1] <= 13
@@ -251,10 +237,10 @@ def test_all_processes_stop_after_the_same_iteration_where_one_is_asked_to(tmp_p
 
 @pytest.mark.parametrize(("gpus", "backend"), [(0, "gloo"), (1, "gloo"), (2, "cpu:gloo,cuda:nccl")])
 def test_processes_meet_through_nccl_only_where_each_has_a_gpu(gpus, backend, monkeypatch):
-    asked = []
+    backends = []
 
     def join(backend):
-        asked.append(backend)
+        backends.append(backend)
         raise ValueError("enough")
 
     monkeypatch.setattr(dist, "is_torchelastic_launched", lambda: True)
@@ -262,12 +248,12 @@ def test_processes_meet_through_nccl_only_where_each_has_a_gpu(gpus, backend, mo
     monkeypatch.setattr(dist, "is_nccl_available", lambda: True)
     monkeypatch.setattr(dist, "init_process_group", join)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: gpus)
-    places = {"LOCAL_RANK": "0", "LOCAL_WORLD_SIZE": "2", "CUDA_VISIBLE_DEVICES": "0,1"}
-    for name, value in places.items():
+    variables = {"LOCAL_RANK": "0", "LOCAL_WORLD_SIZE": "2", "CUDA_VISIBLE_DEVICES": "0,1"}
+    for name, value in variables.items():
         monkeypatch.setenv(name, value)
     with pytest.raises(NPAError, match="must reach each other"), joined_ranks():
         pass
-    assert asked == [backend]
+    assert backends == [backend]
 
 
 def test_worlds_of_all_processes_are_diagnosed_when_the_loss_is_not_finite(tmp_path):
@@ -279,9 +265,9 @@ def test_worlds_of_all_processes_are_diagnosed_when_the_loss_is_not_finite(tmp_p
             trainer.pool.worlds.s[:] = 1e200
         trainer.run(progress=False)
 
-    for said in on_ranks(2, diverge, tmp_path):
-        assert "loss must stay finite" in said
-        assert "worlds 1, 3 of the batch" in said
+    for message in on_ranks(2, diverge, tmp_path):
+        assert "loss must stay finite" in message
+        assert "worlds 1, 3 of the batch" in message
     diagnosis = torch.load(tmp_path / "run" / "diverged.pt", weights_only=True)
     assert diagnosis["x0"].shape[0] == 4
 
@@ -290,11 +276,11 @@ def test_what_cannot_be_shared_out_is_refused():
     assert Ranks(1, 4).indices(16, 2).tolist() == [2, 3, 10, 11]
     parts = [Ranks(rank, 4).own(torch.arange(16), 2) for rank in range(4)]
     assert sorted(torch.cat(parts).tolist()) == list(range(16))
-    for worlds, pool, said in (
+    for worlds, pool, message in (
         (6, 12, "multiple of the number of processes, got 6 and 4: .*=4"),
         (4, 10, "pool_size must be a multiple .* 10 and 4: set pool_size=8"),
     ):
-        with pytest.raises(NPAError, match=said):
+        with pytest.raises(NPAError, match=message):
             Ranks(0, 4).check(tiny("x", world_count=worlds, pool_size=pool))
     # Alone, nothing is touched.
     numbers = torch.ones(2)
@@ -334,25 +320,25 @@ def test_nobody_is_missed_who_lives_or_has_left(codes, monkeypatch):
 class Store:
     """A store that fails, or that does not answer until it is thawed."""
 
-    def __init__(self, gone):
-        self.gone, self.thawed = gone, threading.Event()
+    def __init__(self, fails):
+        self.fails, self.thawed = fails, threading.Event()
 
     def add(self, _, __):
-        if self.gone:
+        if self.fails:
             raise RuntimeError("connection reset")
         self.thawed.wait()
         return 1
 
 
 @pytest.mark.parametrize(
-    ("make", "said"),
+    ("make", "message"),
     [
         (dist.HashStore, "process 0 of 3 has heard nothing from process 2 for"),
-        (lambda: Store(gone=True), "s, as the store of the processes is gone"),
-        (lambda: Store(gone=False), "has heard nothing from process 1"),
+        (lambda: Store(fails=True), "s, as the store of the processes is gone"),
+        (lambda: Store(fails=False), "has heard nothing from process 1"),
     ],
 )
-def test_a_process_or_store_that_falls_silent_is_missed(codes, capfd, make, said):
+def test_a_process_or_store_that_falls_silent_is_missed(codes, capfd, make, message):
     store = make()
     own = isinstance(store, Store)
     first, *others = (Heartbeat(store, rank, 3) for rank in range(1 if own else 3))
@@ -365,4 +351,4 @@ def test_a_process_or_store_that_falls_silent_is_missed(codes, capfd, make, said
     if own:
         store.thawed.set()
     first.end(left=True)
-    assert said in capfd.readouterr().err
+    assert message in capfd.readouterr().err

@@ -78,9 +78,9 @@ def test_a_folder_that_another_process_trains_in_is_refused_until_that_is_killed
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
     with subprocess.Popen(command, text=True, **pipes) as holder:
         assert holder.stdout.readline() == "locked\n"
-        told = rf"no other run writes to, but process {holder.pid} on .* is training in"
+        message = rf"no other run writes to, but process {holder.pid} on .* is training in"
         for options in ({"resume": True}, {"overwrite": True}, {}):
-            with pytest.raises(NPAError, match=told):
+            with pytest.raises(NPAError, match=message):
                 trainer_of(config, **options)
         holder.send_signal(signal.SIGKILL)
     # The file of the lock is still there, and of no effect.
@@ -146,7 +146,7 @@ DAMAGES = {
 }
 
 
-def made(word, present):
+def damaged(word, present):
     """What stands in a checkpoint instead of a tensor."""
     match word:
         case "sparse":
@@ -189,7 +189,7 @@ def test_a_checkpoint_with_something_wrong_in_it_is_refused_by_name(finished, re
         if last == "weight":
             last = next(name for name, weight in there.items() if weight.ndim == 2)
         words = ("negative", "nan", "sparse", "meta")
-        there[last] = made(value, there[last]) if value in words else value
+        there[last] = damaged(value, there[last]) if value in words else value
         resumed(content, rf"checkpoint\.pt' .*{place.split('/')[0]}.*: start a")
 
 
@@ -226,8 +226,8 @@ def test_a_damaged_line_of_the_log_is_named_and_the_log_left_alone(tmp_path, lin
     lines = log.read_text(encoding="utf-8").splitlines()
     log.write_text("\n".join([lines[0], line, *lines[2:]]) + "\n", encoding="utf-8")
     before = log.read_text(encoding="utf-8")
-    said = r"log\.jsonl' must hold .* but line 2 is .*move the file"
-    with pytest.raises(NPAError, match=said) as e:
+    message = r"log\.jsonl' must hold .* but line 2 is .*move the file"
+    with pytest.raises(NPAError, match=message) as e:
         trainer_of(config, resume=True)
     assert len(str(e.value)) < 500 + len(str(tmp_path))
     assert log.read_text(encoding="utf-8") == before

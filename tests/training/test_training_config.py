@@ -78,21 +78,18 @@ def test_override_reaches_fields_of_the_run_and_of_the_task():
 
 
 def test_no_field_of_the_run_hides_one_of_the_task():
-    own, of_task = (dataclasses.fields(kind) for kind in (TrainConfig, Morphogenesis2DConfig))
+    own, of_task = (dataclasses.fields(cls) for cls in (TrainConfig, Morphogenesis2DConfig))
     assert not {field.name for field in own} & {field.name for field in of_task}
 
 
 REFUSED = [
     ({"iterations": 0}, "iterations must be a whole number of at least 1, got 0"),
     ({"iterations": True}, "iterations must be of type int, got True"),
-    ({"iterations": 2.5}, "iterations must be of type int, got 2.5"),
     ({"learning_rate": math.nan}, "learning_rate must be a finite number greater than 0"),
     ({"learning_rate": "fast"}, "learning_rate must be of type float, got 'fast'"),
-    ({"weight_decay": -1}, "weight_decay must be a finite number of at least 0, got -1.0"),
     ({"steps": [5, 5]}, "steps must be two whole numbers"),
     ({"steps": 5}, "steps must be a list, got 5"),
     ({"max_age_range": [5, 2]}, "max_age_range must be two whole numbers"),
-    ({"max_age_range": [0, 2]}, "max_age_range must be two whole numbers"),
     ({"damage_and_keep_share": 1.0}, "damage_and_keep_share must be below 1, got 1.0"),
     ({"damage_and_keep_share": 0.5}, "damage_and_keep_share needs max_age_range, got 0.5 without"),
     ({"stillness_weight": 64}, "stillness_weight needs max_age_range, got 64"),
@@ -101,26 +98,19 @@ REFUSED = [
         "pool_size must be a multiple of world_count where",
     ),
     ({"damage_share": 1.5}, "damage_share must be at most 1, got 1.5"),
-    ({"fresh_share": 1.1}, "fresh_share must be at most 1, got 1.1"),
-    ({"damage_share": -0.5}, "damage_share must be a finite number of at least 0, got -0.5"),
-    ({"vary_eps": (0.0, 1.0)}, "vary_eps must be two factors"),
     ({"vary_eps": (2.0, 1.0)}, r"vary_eps must be two factors .*lo <= hi"),
     ({"stillness_power": 0.5}, "stillness_power must be at least 1 and at most 8, got 0.5"),
-    ({"stillness_power": 16}, "stillness_power must be at least 1 and at most 8, got 16"),
     ({"schedule": "linear"}, "schedule must be one of milestones, cosine, got 'linear'"),
     ({"milestones": [5, 2]}, "milestones must be positive and increasing"),
     ({"world_count": 1000}, "world_count must be at most pool_size"),
     ({"seed": -1}, r"seed must be a whole number of at least 0 and below 2\*\*63, got -1"),
     ({"seed": 2**63}, r"at least 0 and below 2\*\*63, got 9223372036854775808"),
     ({"picture_interval": -1}, "picture_interval must be a whole number of at least 0, got -1"),
-    ({"dtype": "float16"}, "dtype must be one of float32, float64, got 'float16'"),
     ({"memory": "disk"}, "memory must be one of store, recompute, minimal, got 'disk'"),
     ({"device": "gpu"}, "device must name a device, got 'gpu'"),
     ({"target": ""}, "target must be a built-in name, an emoji or a path, got ''"),
-    ({"eps": -0.1}, "eps must be a finite number greater than 0, got -0.1"),
     ({"update_prob": 0.0}, r"update_prob must lie in \(0, 1\], got 0.0"),
     ({"state_dim": 2}, "state_dim must be a whole number of at least 3, got 2"),
-    ({"resolution": 4}, "resolution must be a whole number of at least 8, got 4"),
     ({"splat_weight": math.inf}, "splat_weight must be a finite number of at least 0"),
     ({"itertions": 5}, r"unknown field 'itertions': did you mean 'iterations'\?"),
 ]
@@ -142,11 +132,13 @@ def test_each_wrong_value_is_named(base, fields, message):
         override(base, **fields)
 
 
-@pytest.mark.parametrize("field", ["tensorboard", "cuda_graph", "keep_background"])
-def test_flags_are_true_or_false(field):
-    told = PAPER.task if field == "keep_background" else PAPER
+@pytest.mark.parametrize(
+    ("config", "field"),
+    [(PAPER, "tensorboard"), (PAPER, "cuda_graph"), (PAPER.task, "keep_background")],
+)
+def test_flags_are_true_or_false(config, field):
     with pytest.raises(NPAError, match=f"{field} must be True or False, got 'no'"):
-        dataclasses.replace(told, **{field: "no"})
+        dataclasses.replace(config, **{field: "no"})
 
 
 def test_the_largest_seed_a_device_that_is_not_here_and_sections_are_accepted():

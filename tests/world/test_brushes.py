@@ -26,7 +26,7 @@ def worlds(world_count=2, particle_count=12, space_dim=2, state_dim=3, seed=0):
     return x, torch.randn(world_count, particle_count, state_dim, **draw)
 
 
-def places(x, seed=1):
+def points(x, seed=1):
     generator = torch.Generator().manual_seed(seed)
     return torch.rand(len(x), x.shape[2], generator=generator, dtype=x.dtype) - 0.5
 
@@ -34,7 +34,7 @@ def places(x, seed=1):
 @pytest.mark.parametrize("space_dim", [2, 3])
 def test_wiped_particles_are_gone_and_the_others_are_as_they_were(space_dim):
     x, s = worlds(1, 200, space_dim)
-    centre, radius = places(x), 0.6
+    centre, radius = points(x), 0.6
     gone = inside_ball(x, centre=centre, radius=radius)
     left_x, left_s = removed(x, s, gone=gone)
     assert 0 < int(gone.sum()) < 200
@@ -90,7 +90,7 @@ def test_inject_draws_states_towards_the_given_one():
 
 def test_the_state_around_a_place_is_the_mean_of_what_a_soft_brush_holds():
     x, s = worlds()
-    centre = places(x)
+    centre = points(x)
     share = softness(x, centre=centre, radius=0.9)
     mean, holds = state_around(x, s, centre=centre, radius=0.9)
     torch.testing.assert_close(mean, (share * s).sum(1) / share.sum(1))
@@ -118,7 +118,7 @@ def test_a_cut_with_ends_opens_only_between_them():
 def test_brushes_are_differentiable(box):
     x, s = worlds()
     radius, strength = torch.tensor([[0.4, 0.7], [0.3, 0.8]], dtype=x.dtype)
-    inputs = (x, s, places(x), places(x, seed=2), s[:, 0] + 0.3, radius, strength)
+    inputs = (x, s, points(x), points(x, seed=2), s[:, 0] + 0.3, radius, strength)
 
     def brushed(x, s, centre, move, state, radius, strength):
         at = {"centre": centre, "box": box}
@@ -133,20 +133,20 @@ def test_brushes_are_differentiable(box):
 
 def test_each_world_of_a_batch_is_brushed_as_it_is_alone():
     x, s = worlds(3)
-    centre, move = places(x), places(x, seed=2)
+    centre, move = points(x), points(x, seed=2)
     radius = torch.tensor([0.2, 0.5, 0.9], dtype=x.dtype)
     together = push(x, centre=centre, move=move, radius=radius)
     filled = inject(x, s, centre=centre, radius=radius, state=s[:, 0])
     for k in range(3):
         one = slice(k, k + 1)
-        told = {"centre": centre[one], "radius": float(radius[k])}
-        assert torch.equal(together[one], push(x[one], move=move[one], **told))
-        assert torch.equal(filled[one], inject(x[one], s[one], state=s[one, 0], **told))
+        ball = {"centre": centre[one], "radius": float(radius[k])}
+        assert torch.equal(together[one], push(x[one], move=move[one], **ball))
+        assert torch.equal(filled[one], inject(x[one], s[one], state=s[one, 0], **ball))
 
 
 X, S = worlds()
-AT, ONE = {"centre": places(X), "radius": 0.1}, torch.arange(24).view(2, 12) == 3
-PUSH = AT | {"move": places(X)}
+AT, ONE = {"centre": points(X), "radius": 0.1}, torch.arange(24).view(2, 12) == 3
+PUSH = AT | {"move": points(X)}
 
 
 @pytest.mark.parametrize(
@@ -154,17 +154,13 @@ PUSH = AT | {"move": places(X)}
     [
         (lambda: push(X, **PUSH | {"radius": -1.0}), "radius must be finite .* at least 0, got -1"),
         (lambda: push(X, **PUSH, strength=1.5), r"strength must be in \[0, 1\], got 1\.5"),
-        (lambda: push(X, **PUSH | {"move": places(X)[:, :1]}), r"move must have shape \[B, D\]"),
+        (lambda: push(X, **PUSH | {"move": points(X)[:, :1]}), r"move must have shape \[B, D\]"),
         (lambda: push(X, **PUSH | {"centre": AT["centre"].float()}), "centre must be .* like x"),
-        (
-            lambda: inject(X, S, **AT, state=S[:, 0].float()),
-            "state must be .*64 .* like s",
-        ),
+        (lambda: inject(X, S, **AT, state=S[:, 0].float()), "state must be .*64 .* like s"),
         (lambda: inject(X, S, **AT, state=S[:, 0, :2]), r"state must have .* \[B, C\] = \(2, 3\)"),
         (lambda: removed(X, S, gone=None), "gone must be a bool tensor of shape .* got None"),
         (lambda: removed(X, S, gone=ONE.float()), r"gone must be a bool .*\[B, N\] = \[2, 12\]"),
         (lambda: removed(X, S, gone=ONE), r"equally many particles of each world, got \[1, 0\]"),
-        (lambda: inside_ball(X, **AT, box=2.0), "box must have 2 sides"),
         (lambda: inside_ball(X, **AT, box=(2.0, 2.0, 2.0)), "box must have 2 sides"),
         (lambda: inside_ball(X[0], **AT), r"x must have shape \[B, N, D\]"),
     ],

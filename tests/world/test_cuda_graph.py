@@ -74,33 +74,17 @@ def events(monkeypatch):
     return seen
 
 
-CAPTURED = [
-    "side waits for current",
-    "enter side",
-    "begin None thread_local",
-    "run",
-    "end",
-    "leave side",
-    "current waits for side",
-]
-
-
-def test_a_capture_waits_for_nothing_and_collects_nothing(events, monkeypatch):
+def test_a_capture_follows_its_warm_up_and_collects_nothing(events, monkeypatch):
     monkeypatch.setattr(gc, "collect", lambda *_args: events.append("collect"))
-
-    def function():
-        events.append(f"run, collecting {gc.isenabled()}")
-
-    capture(function, CUDA, pool="memory", generator="dice")
+    capture(
+        lambda: events.append(f"run, collecting {gc.isenabled()}"), CUDA,
+        pool="memory", generator="dice", warm_up=lambda: events.append("warm up"),
+    )  # fmt: skip
     assert gc.isenabled()
-    changed = ["register dice", "begin memory thread_local", "run, collecting False"]
-    assert events == [*CAPTURED[:2], *changed, *CAPTURED[4:]]
-
-
-def test_what_a_warm_up_leaves_is_given_back_before_the_capture(events):
-    capture(lambda: events.append("run"), CUDA, warm_up=lambda: events.append("warm up"))
-    warmed = [*CAPTURED[:2], "warm up", "leave side", "synchronize", "empty"]
-    assert events == [*warmed, *CAPTURED]
+    enter = ["side waits for current", "enter side"]
+    captured = ["register dice", "begin memory thread_local", "run, collecting False", "end"]
+    warmed = [*enter, "warm up", "leave side", "synchronize", "empty"]
+    assert events == [*warmed, *enter, *captured, "leave side", "current waits for side"]
 
 
 @pytest.mark.parametrize("broken", [True, False])

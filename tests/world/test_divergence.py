@@ -6,7 +6,7 @@ import re
 import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
-from worlds import assert_same, random_world
+from worlds import random_world
 
 import npa_envs
 from npa_envs import DivergedError, NPAError, NPARule
@@ -112,8 +112,8 @@ def test_a_rollout_says_in_which_step_and_where_a_world_diverged(static, device)
         npa_envs.rollout(rule, x, s, 5, update_prob=1.0, on_divergence="raise")
     second = "world 2: states channel 0 of particle 4 was -inf in step 2"
     third = "world 1: states channel 3 of particle 7 was inf in step 3"
-    said = rf"worlds must stay finite, but 2 of 3 did not, .*\n?.*{second}.*\n?.*{third}"
-    assert re.search(said, str(caught.value))
+    message = rf"worlds must stay finite, but 2 of 3 did not, .*\n?.*{second}.*\n?.*{third}"
+    assert re.search(message, str(caught.value))
     assert "world 0" not in str(caught.value)
 
 
@@ -124,22 +124,6 @@ def test_what_was_not_finite_before_the_first_step_is_called_so(steps, static, d
     s[0, 17, 2] = math.inf
     with pytest.raises(DivergedError, match="channel 2 of particle 17 was inf before the first"):
         npa_envs.rollout(make_rule(device, static=static), x, s, steps, on_divergence="raise")
-
-
-@moving_and_static
-def test_a_watched_rollout_that_stays_finite_is_the_same_rollout(static, device):
-    rule = make_rule(device, growth=0.01, static=static)
-    x, s = worlds(device)
-    s.requires_grad_()
-
-    def run(word):
-        generator = torch.Generator(device).manual_seed(0)
-        after = npa_envs.rollout(
-            rule, x, s, 6, generator=generator, memory="minimal", on_divergence=word
-        )
-        return *after, torch.autograd.grad(after[1].square().sum(), s)[0]
-
-    assert_same(run("raise"), run("ignore"))
 
 
 def test_an_ignored_world_is_refused_by_the_next_call(device):

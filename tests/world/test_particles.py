@@ -35,6 +35,6 @@ def test_worlds_are_taken_put_chosen_and_combined_field_by_field(with_path):
 def test_gathered_particles_keep_the_goals_of_their_worlds():
     two = worlds(2)
     order = torch.tensor([2, 0, 1, 3, 5, 4])
-    found = two.gather(order)
-    assert_same(found.s, two.s.view(6, 1)[order].view(2, 3, 1))
-    assert found.goal is two.goal
+    result = two.gather(order)
+    assert_same(result.s, two.s.view(6, 1)[order].view(2, 3, 1))
+    assert result.goal is two.goal

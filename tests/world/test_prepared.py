@@ -32,8 +32,8 @@ def run(rule, x, s, steps=5, *, by_world=False, seed=3, **options):
     if by_world:
         generator = npa_envs.WorldRandom(range(seed, seed + len(x)))
     options = {"generator": generator, "return_path_length": True, **options}
-    found = npa_envs.rollout(rule, x, s, steps, **options)
-    return *found, generator.uniform(2) if by_world else torch.rand(2, generator=generator)
+    result = npa_envs.rollout(rule, x, s, steps, **options)
+    return *result, generator.uniform(2) if by_world else torch.rand(2, generator=generator)
 
 
 def steps_ready():
@@ -120,8 +120,8 @@ def test_threads_step_worlds_of_their_own():
     rule, starts = make_rule(), [worlds(seed=seed) for seed in range(4)]
     expected = [run(rule, *start) for start in starts]
     with ThreadPoolExecutor(len(starts)) as pool:
-        found = pool.map(lambda start: [run(rule, *start) for _ in range(20)][-1], starts)
-    assert_same(list(found), expected)
+        result = pool.map(lambda start: [run(rule, *start) for _ in range(20)][-1], starts)
+    assert_same(list(result), expected)
     assert 1 <= len(steps_ready()) <= len(starts)
 
 

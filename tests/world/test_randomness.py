@@ -12,7 +12,6 @@ from npa_envs import WorldRandom
 from npa_envs.errors import NPAError
 from npa_envs.ops.physics import Physics
 from npa_envs.tasks.damage import random_particle
-from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.world.randomness import StreamId, check_generator, uniform_draws
 from npa_envs.world.steps import draw_step, skip_draws
@@ -33,13 +32,6 @@ ROUNDING = {"normal": (1e-6, 1e-7), "normal_float64": (1e-12, 1e-14)}
 
 SIGMAS = 5.0
 """Statistics may be this many standard errors off: one test in a million by chance."""
-
-
-@pytest.fixture(scope="module")
-def task():
-    return Morphogenesis2D(
-        Morphogenesis2DConfig(particle_count=333, resolution=33, target_point_count=200)
-    )
 
 
 def plain_words(blocks, step, draw, episode, key):
@@ -212,26 +204,6 @@ def test_both_devices_draw_the_same_normal_numbers_up_to_rounding():
     assert float((there.cpu() != here).double().mean()) < 1e-4
 
 
-@pytest.mark.parametrize("position_noise", [0.0, 1e-3])
-def test_a_seeded_world_grows_in_a_batch_as_it_grows_alone(position_noise, task, device):
-    """On CUDA up to the rounding of the rule's products, which depends on their size there."""
-    rule = npa_envs.load_rule("gecko").to(device)
-    steps, tolerance = (64, 0.0) if device.type == "cpu" else (2, 1e-6)
-
-    def grown(seeds):
-        random = WorldRandom(seeds, device=device)
-        x, s, *_ = task.seed(random.world_count, generator=random, device=device)
-        with torch.no_grad():
-            noise = {"generator": random, "position_noise": position_noise}
-            return npa_envs.rollout(rule, x, s, steps, **noise)
-
-    together = grown([7, 8])
-    for world, seed in enumerate((7, 8)):
-        for value, expected in zip(grown(seed), together, strict=True):
-            assert torch.allclose(value[0], expected[world], rtol=0.0, atol=tolerance)
-    assert not torch.equal(together[0][0], together[0][1])
-
-
 def test_the_mask_of_a_step_is_the_streams_first_draw(device):
     # A fresh rule of few units leaves some particles exactly where they are.
     rule = lively_rule(device, torch.float32, 2, 4)
@@ -297,6 +269,7 @@ def test_damage_chooses_every_particle_about_equally_often(device):
     assert float((counts - 100.0).abs().max()) < SIGMAS * 10.0
 
 
+CUDA = torch.device("cuda", 1)
 RULE, WORLD = npa_envs.NPARule(2, 4, 8), torch.rand(2, 9, 4)
 PLACES, THREE = WORLD[..., :2].contiguous(), WorldRandom([1, 2, 3])
 AS_MANY = "generator must have one stream for each world, B = 2, got 3"
@@ -309,26 +282,16 @@ AS_MANY = "generator must have one stream for each world, B = 2, got 3"
         (lambda: npa_envs.rollout(RULE, PLACES, WORLD, 1, generator=THREE), AS_MANY),
         (lambda: random_particle(PLACES, THREE), AS_MANY),
         (lambda: uniform_ball(10**5000, 5, 2, 0.2), "coordinates must be at most .*, got <int>"),
-        (
-            lambda: check_generator(WorldRandom(1), torch.device("cuda", 1), 1),
-            "worlds' device, cuda:1, got cpu: make it with W",
-        ),
+        (lambda: check_generator(WorldRandom(1), CUDA, 1), "device, cuda:1, got cpu: make it with"),
         (lambda: WorldRandom(-1), "a seed must be an integer of at least 0, got -1"),
         (lambda: WorldRandom([1, 0.5]), "a seed must be an integer of at least 0, got 0.5"),
-        (lambda: WorldRandom("12"), "a seed must be an integer of at least 0, got '1'"),
         (lambda: WorldRandom([]), "seeds must hold at least one seed, got none"),
         (lambda: WorldRandom.from_keys(torch.zeros(3)), "keys must be an int64 .* got torch.flo"),
-        (lambda: WorldRandom.from_keys([1]), "keys must be an int64 tensor .* got list"),
         (lambda: WorldRandom(1).advance(-1), "steps must be an integer of at least 0, got -1"),
         (lambda: WorldRandom(1).substream(-1), "purpose must be an integer of at least 0, got -1"),
-        (
-            lambda: WorldRandom(1).substream("x"),
-            "purpose must be an integer of at least 0, got 'x'",
-        ),
         (lambda: WorldRandom(1).uniform(-1), "a size must be an integer of at least 0, got -1"),
         (lambda: WorldRandom(1).normal(2, dtype=torch.float16), "dtype must be .* got torch.f.*16"),
         (lambda: WorldRandom(1).bernoulli(1.5, 2), r"probability must lie in \[0, 1\], got 1.5"),
-        (lambda: WorldRandom(1).bernoulli(math.nan, 2), r"probability must lie in \[0, 1\]"),
         (lambda: WorldRandom(1).integers(0, 2), r"high must lie in \[1, 2\^63 - 1\], got 0"),
         (lambda: WorldRandom(1).integers(2**63, 2), "high must lie in .* got 9223372036854775808"),
     ],

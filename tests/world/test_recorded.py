@@ -38,12 +38,12 @@ def run(rule, x, s, steps=7, *, seed=0, gradients=True, by_world=False, **option
     options = {"generator": generator, "return_path_length": True, **options}
     with torch.set_grad_enabled(gradients):
         results = npa_envs.rollout(rule, x, s, steps, **options)
-    found = list(results)
+    result = list(results)
     if gradients:
         loss = sum(value.sin().sum() for value in results)
-        found += torch.autograd.grad(loss, [x, s, *rule.parameters()], allow_unused=True)
+        result += torch.autograd.grad(loss, [x, s, *rule.parameters()], allow_unused=True)
     drawn = generator.uniform(3) if by_world else torch.rand(3, device=DEVICE, generator=generator)
-    return [*found, drawn]
+    return [*result, drawn]
 
 
 def same(first, second):
@@ -136,9 +136,9 @@ def test_weights_are_read_anew_and_results_are_kept():
     kept = []
     for call in range(6):
         expected = run(rule, x, s, seed=call, cuda_graph=False)
-        found = run(rule, x, s, seed=call, cuda_graph="auto")
-        kept.append((found, [None if value is None else value.clone() for value in found]))
-        same(found, expected)
+        result = run(rule, x, s, seed=call, cuda_graph="auto")
+        kept.append((result, [None if value is None else value.clone() for value in result]))
+        same(result, expected)
         with torch.no_grad():
             for parameter in rule.parameters():
                 parameter.mul_(1.01)
@@ -147,8 +147,8 @@ def test_weights_are_read_anew_and_results_are_kept():
         if call == 4:
             rule = rule.cpu().to(DEVICE)
             rule.load_state_dict(make_rule(seed=6).state_dict())
-    for found, copies in kept:
-        same(found, copies)
+    for result, copies in kept:
+        same(result, copies)
 
 
 def optimise(rule, x, s, cuda_graph, arrange):
@@ -272,14 +272,14 @@ def test_species_are_recorded():
     parameters = [own for rule in rules for own in rule.parameters()]
     for call in range(4):
         x, s = worlds(particles=50, seed=call)
-        found = []
+        result = []
         for cuda_graph in (False, "auto"):
             generator = torch.Generator(DEVICE).manual_seed(call)
             options = {"counts": (20, 30), "update_prob": (0.5, 0.3), "generator": generator}
             after = npa_envs.rollout_species(rules, x, s, 6, cuda_graph=cuda_graph, **options)
             loss = after[0].sum() + after[1].square().sum()
-            found.append([*after, *torch.autograd.grad(loss, parameters)])
-        same(*found)
+            result.append([*after, *torch.autograd.grad(loss, parameters)])
+        same(*result)
     assert is_recorded()
 
 
@@ -291,9 +291,9 @@ def test_streams_and_threads():
     def work(k, calls=1):
         for _ in range(calls):
             with torch.cuda.stream(torch.cuda.Stream()):
-                found = run(rule, *cases[k][0], seed=k, cuda_graph="auto")
+                result = run(rule, *cases[k][0], seed=k, cuda_graph="auto")
                 torch.cuda.current_stream().synchronize()
-            same(found, expected[k])
+            same(result, expected[k])
 
     for k in 3 * [0, 1, 2, 3]:
         work(k)
@@ -309,9 +309,9 @@ def test_inside_a_graph_of_the_caller():
         expected = npa_envs.rollout(rule, x, s, 5, update_prob=1.0, cuda_graph=False)
         graph = torch.cuda.CUDAGraph()
         with torch.cuda.graph(graph):
-            found = npa_envs.rollout(rule, x, s, 5, update_prob=1.0)
+            result = npa_envs.rollout(rule, x, s, 5, update_prob=1.0)
         graph.replay()
-    same(found, expected)
+    same(result, expected)
 
 
 def test_memory_is_bounded(monkeypatch):

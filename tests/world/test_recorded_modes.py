@@ -37,8 +37,8 @@ def test_what_is_recorded_in_inference_mode_serves_other_calls(by_world):
                 generator = torch.Generator(DEVICE).manual_seed(0)
                 if by_world:
                     generator = npa_envs.WorldRandom([0, 1, 2], device=DEVICE)
-                found = npa_envs.rollout(rule, x, s, 7, generator=generator)
-            same(list(found), expected[:2])
+                result = npa_envs.rollout(rule, x, s, 7, generator=generator)
+            same(list(result), expected[:2])
     assert is_recorded()
 
 
@@ -48,18 +48,18 @@ def test_threads_that_share_a_generator_draw_different_numbers():
     with torch.no_grad():
         for _ in range(4):
             npa_envs.rollout(rule, x, s, 20)
-    found = []
+    result = []
     start = threading.Barrier(4)
 
     def work():
         with torch.no_grad():
             for _ in range(20):
                 start.wait()
-                found.append(npa_envs.rollout(rule, x, s, 20)[1])
+                result.append(npa_envs.rollout(rule, x, s, 20)[1])
 
     together(*[work] * 4)
-    sums = {float(states.double().sum()) for states in found}
-    assert len(sums) == len(found) == 80
+    sums = {float(states.double().sum()) for states in result}
+    assert len(sums) == len(result) == 80
 
 
 def test_draws_are_reserved_and_given_back():
@@ -184,7 +184,7 @@ def test_compiled_with_graphs_of_its_own(gradients):
         x, s = worlds(seed=call)
         torch.compiler.cudagraph_mark_step_begin()
         with torch.set_grad_enabled(gradients):
-            found = compiled(x, s)
-            assert torch.allclose(found, function(x, s), rtol=1e-4)
+            result = compiled(x, s)
+            assert torch.allclose(result, function(x, s), rtol=1e-4)
             if gradients:
-                torch.autograd.grad(found, rule.hidden.weight)
+                torch.autograd.grad(result, rule.hidden.weight)

@@ -109,10 +109,10 @@ def test_what_a_network_depends_on_is_seen(change):
 def test_tensors_of_a_rule_are_its_parameters_buffers_and_attributes():
     rule = Scaled(2, 8, 32, eps0=EPS)
     rule.same = rule.factor
-    found = rule_tensors(rule, CPU)
+    result = rule_tensors(rule, CPU)
     wanted = [rule.hidden.weight, rule.hidden.bias, rule.output.weight, rule.shift, rule.factor]
-    assert {id(tensor) for tensor in found} == {id(tensor) for tensor in wanted}
-    assert len(found) == len(wanted)
+    assert {id(tensor) for tensor in result} == {id(tensor) for tensor in wanted}
+    assert len(result) == len(wanted)
 
 
 @pytest.mark.gpu
@@ -173,9 +173,9 @@ def test_gradients_are_those_of_what_was_dropped_within_a_graph_of_the_caller():
     torch.cuda.synchronize()
     graph = torch.cuda.CUDAGraph()
     with torch.cuda.graph(graph):
-        change, found = gradient()
+        change, result = gradient()
     graph.replay()
-    assert float(found) == pytest.approx(float(change), rel=1e-4)
+    assert float(result) == pytest.approx(float(change), rel=1e-4)
 
 
 @pytest.mark.gpu

@@ -1,4 +1,4 @@
-"""Boxes whose walls reflect: trajectories and gradients of the oracle, in every way of running."""
+"""Boxes whose walls reflect: trajectories and gradients of the oracle."""
 
 import pytest
 import torch
@@ -51,31 +51,6 @@ def test_trajectories_and_gradients_are_the_oracles(space_dim, name, dtype, boun
     for value, answer in zip(found, expected, strict=True):
         assert relative_error(value, answer) < bound
     assert (found[0].abs() <= 0.5 * x.new_tensor(walls)).all()
-
-
-@pytest.mark.device
-def test_every_way_of_running_gives_the_same_numbers(device):
-    rule, x, s = world(2, device, torch.float32)
-    options = {"box": 0.7, "boundary": "reflecting", "update_prob": 1.0, "position_noise": 0.1}
-
-    def run(steps=4, **more):
-        source = torch.Generator(device).manual_seed(0)
-        return rollout(rule, x, s, steps, generator=source, **(options | more))
-
-    def gradients(memory):
-        loss = sum(value.square().sum() for value in run(memory=memory))
-        return torch.autograd.grad(loss, list(rule.parameters()))
-
-    launched = run(cuda_graph=False)
-    with torch.no_grad():
-        for _ in range(4):
-            assert_same(run(), launched)
-        assert_same([value[-1] for value in run(keep_every=2)], launched)
-    one_species = rollout_species(
-        [rule], x, s, 4, counts=[20], generator=torch.Generator(device).manual_seed(0), **options
-    )
-    assert_same(one_species, launched)
-    assert_same(gradients("minimal"), gradients("store"))
 
 
 def test_species_are_reflected_at_the_same_walls():
