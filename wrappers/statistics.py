@@ -94,7 +94,8 @@ class _NormalizesPerception(WrapperBase):
     def __init__(
         self, env: Any, *, clip: float = 10.0, epsilon: float = 1e-8, training: bool = True
     ) -> None:
-        self.clip = checked_positive("clip", clip)
+        # A larger number is infinite in float32, the type of observations.
+        self.clip = min(checked_positive("clip", clip), float(np.finfo(np.float32).max))
         self.epsilon = checked_positive("epsilon", epsilon)
         if not isinstance(training, bool | np.bool_):
             raise NPAError(f"training must be True or False, got {shown(training)}")
