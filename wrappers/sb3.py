@@ -275,7 +275,6 @@ class ParticleVecEnv(_EpisodeRows):
         base = vector_env(env, type(self).__name__)
         check_same_step(autoreset_mode(env))
         self.bootstrap = bootstrap
-        """Whether infos mark truncation by the step limit."""
         self.particle_count = base.config.particle_count
         """Particles N of a world."""
         super().__init__(

@@ -138,6 +138,7 @@ def write_mp4(path: str | Path, frames: Iterable[Frame], fps: float = 25) -> Non
     height, width, _ = pictures[0].shape
     padding = ((0, height % 2), (0, width % 2), (0, 0))
     with atomic_path(path) as temporary:
+        writer: Any
         with imageio.get_writer(
             temporary, format="FFMPEG", mode="I", fps=fps, codec="libx264", quality=8,
             pixelformat="yuv420p", macro_block_size=2, output_params=["-movflags", "+faststart"],
