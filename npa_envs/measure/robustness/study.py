@@ -363,6 +363,7 @@ def _draw(records: Sequence[RuleRecord]) -> bytes:
             values = [float(response.value) for response in measured]
             losses = [response.losses for response in measured]
             _draw_seeds(panel, values, losses, "C0", CONDITIONS[condition])
+            number_plainly(panel.xaxis, values)
     legend_of(figure, grid[0][0], ncols=1 + len(DAMAGES), fontsize=7)
     return png(figure, 75)
 
