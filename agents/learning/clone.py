@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import torch
@@ -25,7 +25,7 @@ VARIANCE_FLOOR = 1e-8
 class CloneOptions:
     """Options of `train`."""
 
-    teacher: Source | Sequence[Source] | RuleSet | None = None
+    teacher: Source | Iterable[Source] | None = None
     """A rule, a shipped rule's name or a file, for all species or one for each, or a set of rules.
     Either it or a dataset is needed."""
     dataset: str | None = None
@@ -97,8 +97,7 @@ def _taught(
     problem, device, source = progress.problem, progress.device, options.teacher
     if source is None:
         raise NPAError("teacher must be given to clone, or a dataset: for example teacher='heart'")
-    rules_of_teacher = list(source) if isinstance(source, RuleSet) else source
-    teacher = RuleSet.of(problem, rules_of_teacher).to(device).policy()
+    teacher = RuleSet.of(problem, source).to(device).policy()
     student, envs = rules.policy(), problem.make_envs(device=device)
     observation, _ = envs.reset(seed=world_seeds(progress.seed, problem.num_envs))
     stored_steps = max(STORED_STEPS, options.collect_steps)

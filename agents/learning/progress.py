@@ -156,7 +156,7 @@ class Progress:
                     f"start must be a RuleSet, got {type(initial).__name__}: "
                     "RuleSet.of(problem, 'heart')"
                 )
-            self.initial = RuleSet.of(problem, list(initial)).to(self.device)
+            self.initial = RuleSet.of(problem, initial).to(self.device)
         self.particle_steps = 0
         """Particle-steps spent so far."""
         self.log: list[CurvePoint] = []

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -80,7 +80,7 @@ class RuleSet(nn.Module):
         return cls(rules, problem.counts, interface)
 
     @classmethod
-    def of(cls, problem: Problem, source: Source | Sequence[Source]) -> RuleSet:
+    def of(cls, problem: Problem, source: Source | Iterable[Source]) -> RuleSet:
         """Return copies of existing rules for a problem that they fit, on the CPU.
 
         Args:
@@ -93,8 +93,8 @@ class RuleSet(nn.Module):
         """
         if isinstance(source, str | Path) and (Path(source) / _file_name(0)).is_file():
             return cls.load(source, problem)
-        single = isinstance(source, Source)
-        sources: Sequence[Source] = [source] * len(problem.counts) if single else list(source)  # type: ignore[arg-type, list-item]
+        single = isinstance(source, str | Path | NPARule)
+        sources = [source] * len(problem.counts) if single else list(source)
         rules = [
             copy.deepcopy(one).cpu() if isinstance(one, NPARule) else load_rule(one)
             for one in sources

@@ -359,15 +359,10 @@ class GardenPolicy:
     def load(cls, path: str | Path) -> GardenPolicy:
         """Return what `save` wrote; Stable-Baselines3 unpickles it, so trust who made the file."""
         name = Path(path).stem
-        if name not in ALGORITHMS:
+        if name not in ALGORITHMS or not Path(path).is_file():
             raise NPAError(
-                f"path must be of a file sac.zip or ppo.zip, got {shown(str(path))}: rename the "
-                "file by the algorithm that wrote it"
-            )
-        if not Path(path).is_file():
-            raise NPAError(
-                f"path must be of a file that exists, got {shown(str(path))}: name one that "
-                "`save` or `npa-envs learn` wrote"
+                f"path must be of a file sac.zip or ppo.zip that exists, got {shown(str(path))}: "
+                "name one that `save` or `npa-envs learn` wrote, by its algorithm's name"
             )
         try:
             return cls(ALGORITHMS[name].load(path, device="cpu"))

@@ -29,45 +29,45 @@ FORMS = {
 def learner_of(form):
     """The learner of this process, whose numbers are float64; worlds themselves are float32."""
     problem, method, options = FORMS[form]
-    learner, cls = (
-        (ppo.PPOLearner, ppo.PPOOptions) if method is ppo else (shac.SHACLearner, shac.SHACOptions)
-    )
-    made = learner(progress_of(problem), cls(**options))
-    for module in made.modules.values():
+    if method is ppo:
+        learner = ppo.PPOLearner(progress_of(problem), ppo.PPOOptions(**options))
+    else:
+        learner = shac.SHACLearner(progress_of(problem), shac.SHACOptions(**options))
+    for module in learner.modules.values():
         module.double()
     if method is ppo:
-        for holder in (made.memory, made):
+        for holder in (learner.memory, learner):
             for name, value in vars(holder).items():
                 if isinstance(value, torch.Tensor) and value.is_floating_point():
                     setattr(holder, name, value.double())
         # As at the beginning.
-        made.critic.updates.zero_()
-        made.critic.observe(made.memory.observations[-1], made.ranks)
-        return made
-    fresh = made._fresh
-    made._fresh = lambda worlds: fresh(worlds).map(
+        learner.critic.updates.zero_()
+        learner.critic.observe(learner.memory.observations[-1], learner.ranks)
+        return learner
+    fresh = learner._fresh
+    learner._fresh = lambda worlds: fresh(worlds).map(
         lambda part: part.double() if part.is_floating_point() else part
     )
-    made._begin()
-    return made
+    learner._begin()
+    return learner
 
 
 def learned(form):
     """What a process has learned in some rounds, and what it has learned it from."""
-    made, said = learner_of(form), []
+    learner, means = learner_of(form), []
     for share_left in (1.0, 0.5):
-        if isinstance(made, ppo.PPOLearner):
-            batch = made.play()
-            made.improve(share_left)
-            told = batch.advantages.square().mean(), batch.targets.mean()
+        if isinstance(learner, ppo.PPOLearner):
+            batch = learner.play()
+            learner.improve(share_left)
+            values = batch.advantages.square().mean(), batch.targets.mean()
         else:
-            told = made.play().losses[-1].mean(), made.gain(made.play())
-            made.learn(0.01 * share_left)
-        said.append([float(part.detach()) for part in told])
+            values = learner.play().losses[-1].mean(), learner.gain(learner.play())
+            learner.learn(0.01 * share_left)
+        means.append([float(part.detach()) for part in values])
     weights = [
-        weight for module in made.modules.values() for weight in module.state_dict().values()
+        weight for module in learner.modules.values() for weight in module.state_dict().values()
     ]
-    return said, [
+    return means, [
         weight.flatten().tolist() for weight in weights if isinstance(weight, torch.Tensor)
     ]
 
@@ -107,7 +107,7 @@ ROUND = {"ppo": 3 * 4 * 48, "shac": 2 * 4 * 48}
 """Particle-steps of an iteration."""
 
 
-def kept(method, out, rounds, **options):
+def run_in(method, out, rounds, **options):
     """Learn for some rounds; what is learned, and the particle-steps of the curve's entries."""
     budget, options = Budget(particle_steps=rounds * ROUND[method]), METHODS[method] | options
     options = {"evaluation_seeds": range(500, 502), "entries": 2, "out": out} | options
@@ -121,7 +121,7 @@ def kept(method, out, rounds, **options):
 )
 def test_a_run_of_two_processes_goes_on_alike_with_any_number_of_processes(method, tmp_path):
     run = tmp_path / "run"
-    one, other = on_ranks(2, lambda: kept(method, run, 4), tmp_path)
+    one, other = on_ranks(2, lambda: run_in(method, run, 4), tmp_path)
     assert one == other
     assert one[1] == [0, 2, 4]
     assert sorted(path.name for path in run.iterdir()) == [
@@ -130,12 +130,12 @@ def test_a_run_of_two_processes_goes_on_alike_with_any_number_of_processes(metho
     ends = []
     for count in (1, 2):
         copy = shutil.copytree(run, tmp_path / str(count))
-        ends += on_ranks(count, lambda out=copy: kept(method, out, 8, resume=True), tmp_path)
+        ends += on_ranks(count, lambda out=copy: run_in(method, out, 8, resume=True), tmp_path)
     # Within what float32 makes of sums in another order.
     for ours, theirs in zip(ends[1][0], ends[0][0], strict=True):
         assert ours == pytest.approx(theirs, rel=1e-3, abs=1e-5)
     # A process that has no others draws otherwise.
-    weights, steps = kept(method, run, 8, resume=True)
+    weights, steps = run_in(method, run, 8, resume=True)
     # It has gone on from where it was, with the entries that there were.
     assert steps == [0, 2, 4, 8]
     assert weights != one[0]
@@ -157,17 +157,17 @@ def test_a_run_that_is_asked_to_stop_can_be_resumed(tmp_path, monkeypatch):
     start = HEART.new_rules(3)
     # Seeds of evaluations are read once.
     seeds = iter([500, 501])
-    assert kept("ppo", tmp_path, 8, start=start, evaluation_seeds=seeds)[1] == [0, 3]
+    assert run_in("ppo", tmp_path, 8, start=start, evaluation_seeds=seeds)[1] == [0, 3]
     assert load_checkpoint(tmp_path / "checkpoint.pt")["iteration"] == 3
     monkeypatch.undo()
-    assert kept("ppo", tmp_path, 8, start=start, resume=True)[1] == [0, 3, 4, 8]
+    assert run_in("ppo", tmp_path, 8, start=start, resume=True)[1] == [0, 3, 4, 8]
 
 
 def test_a_shared_run_that_goes_on_by_seconds_evaluates_at_their_shares(tmp_path):
-    def learn(seconds, **given):
-        budget = Budget(seconds=seconds)
-        told = {"evaluation_seeds": [500], "entries": 2, "out": tmp_path / "run"}
-        return len(train("ppo", HEART, budget, 0, **told, **METHODS["ppo"], **given).log)
+    def learn(seconds, **options):
+        budget, options = Budget(seconds=seconds), METHODS["ppo"] | options
+        options |= {"evaluation_seeds": [500], "entries": 2, "out": tmp_path / "run"}
+        return len(train("ppo", HEART, budget, 0, **options).log)
 
     def resumed():
         spent = load_checkpoint(tmp_path / "run" / "checkpoint.pt")["seconds"]
@@ -182,7 +182,7 @@ def test_a_shared_run_that_goes_on_by_seconds_evaluates_at_their_shares(tmp_path
 @pytest.fixture
 def finished(tmp_path):
     """The folder of a run of one round."""
-    kept("ppo", tmp_path, 1)
+    run_in("ppo", tmp_path, 1)
     return tmp_path
 
 
@@ -206,7 +206,7 @@ def test_a_checkpoint_that_was_changed_is_refused(finished):
     modules = content["modules"] | {"actor": content["modules"]["actor"] | {name: torch.ones(1)}}
     for change in (*spoilt, {"modules": modules}):
         save_checkpoint(finished / "checkpoint.pt", content | change)
-        refused("must hold all that a run needs", kept, "ppo", finished, 2, resume=True)
+        refused("must hold all that a run needs", run_in, "ppo", finished, 2, resume=True)
 
 
 @pytest.mark.parametrize(

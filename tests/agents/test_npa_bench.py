@@ -60,27 +60,27 @@ def records(plan, status="done"):
 @pytest.fixture
 def zero_row(tmp_path):
     """A plan of one method, and the file of its row."""
-    made = plan_of(methods=("zero",))
-    (path,) = write_rows(SUITE, made, records(made), tmp_path, "first")
-    return made, path
+    plan = plan_of(methods=("zero",))
+    (path,) = write_rows(SUITE, plan, records(plan), tmp_path, "first")
+    return plan, path
 
 
 def changed(path, change) -> None:
     """Change what a file of JSON holds."""
-    held = json.loads(path.read_text(encoding="utf-8"))
-    change(held)
-    path.write_text(json.dumps(held), encoding="utf-8")
+    data = json.loads(path.read_text(encoding="utf-8"))
+    change(data)
+    path.write_text(json.dumps(data), encoding="utf-8")
 
 
 @pytest.mark.parametrize("suite", SUITES.values(), ids=SUITES)
 def test_a_suite_is_every_method_on_all_that_it_can_learn_within_the_frozen_budgets(suite):
-    made = plan_of(suite.name)
-    assert set(made.tasks) == set(suite.tasks)
-    assert (list(made.seeds), made.episodes) == ([0, 1, 2, 3, 4], 32)
+    plan = plan_of(suite.name)
+    assert set(plan.tasks) == set(suite.tasks)
+    assert (list(plan.seeds), plan.episodes) == ([0, 1, 2, 3, 4], 32)
     for task, env_id in suite.tasks.items():
-        assert made.budgets["particle-steps"][task] == suite.budgets[env_id]
+        assert plan.budgets["particle-steps"][task] == suite.budgets[env_id]
         problem = suite.problem_of(task)
-        ran = {job.method for job in made.jobs() if job.task == task}
+        ran = {job.method for job in plan.jobs() if job.task == task}
         assert ran <= methods_for(problem).keys()
         assert {"zero", "gradient", "random", "ppo_world"} <= ran
         assert ("sac" in ran) == (problem.actor == "brushes")
@@ -97,16 +97,16 @@ def test_the_small_suite_is_all_small_worlds_that_rules_act_in():
 
 
 def test_rows_come_back_from_their_files(tmp_path):
-    made = plan_of(methods=("zero", "random"))
-    (first, second) = write_rows(SUITE, made, records(made), tmp_path, "it")
+    plan = plan_of(methods=("zero", "random"))
+    (first, second) = write_rows(SUITE, plan, records(plan), tmp_path, "it")
     assert (first.name, second.name) == ("random.json", "zero.json")
     rows = read_rows(SUITE, tmp_path)
     assert list(rows) == ["random", "zero"]
     for env_id in SUITE.budgets:
         assert rows["zero"].returns(env_id).tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
     assert rows["zero"].runs[0].curve == ((0.0, -1.0), (1000.0, 0.5))
-    held = json.loads(first.read_text(encoding="utf-8"))
-    assert (held["commit"], held["command"], held["date"]) == ("c0ffee", "it", "2026-01-02")
+    data = json.loads(first.read_text(encoding="utf-8"))
+    assert (data["commit"], data["command"], data["date"]) == ("c0ffee", "it", "2026-01-02")
     (tmp_path / "again.json").write_bytes(second.read_bytes())
     refused("second row of 'zero'", read_rows, SUITE, tmp_path)
 
@@ -115,52 +115,52 @@ def test_a_row_of_ones_own_says_what_was_run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     code = "def train(progress, *, patience=1): progress.start(progress.first_rules())"
     (tmp_path / "still.py").write_text(code, encoding="utf-8")
-    made = plan_of(
+    plan = plan_of(
         SMALL_SUITE.name,
         methods=("zero", "still=still:train", "bold=ppo"),
         options=("bold.credit=marginal", "still.patience=2"),
         tasks=("MixingSmall-v0",),
     )
-    assert made.methods == ["zero", "still", "bold"]
-    assert {made.facts(job)["method"] for job in made.jobs()} == {"zero", "still:train", "ppo"}
-    write_rows(SMALL_SUITE, made, records(made), tmp_path, "it")
+    assert plan.methods == ["zero", "still", "bold"]
+    assert {plan.facts(job)["method"] for job in plan.jobs()} == {"zero", "still:train", "ppo"}
+    write_rows(SMALL_SUITE, plan, records(plan), tmp_path, "it")
     rows = read_rows(SMALL_SUITE, tmp_path)
     assert (rows["still"].about, rows["bold"].about) == ("still:train", "ppo")
-    held = json.loads((tmp_path / "bold.json").read_text(encoding="utf-8"))
-    assert held["options"] == {"credit": "marginal"}
+    data = json.loads((tmp_path / "bold.json").read_text(encoding="utf-8"))
+    assert data["options"] == {"credit": "marginal"}
     refused("must be a row of npa-bench-v0", read_rows, SUITE, tmp_path)
 
 
 def test_a_run_that_failed_is_in_no_row_and_one_that_diverged_has_no_returns(tmp_path):
-    made = plan_of(methods=("zero",))
-    some = records(made)
+    plan = plan_of(methods=("zero",))
+    some = records(plan)
     some[0] = RunRecord(job=some[0].job, facts={}, status="failed")
-    (path,) = write_rows(SUITE, made, some, tmp_path, "it")
+    (path,) = write_rows(SUITE, plan, some, tmp_path, "it")
     assert len(json.loads(path.read_text(encoding="utf-8"))["runs"]) == len(some) - 1
     some[0] = RunRecord(job=some[0].job, facts={}, status="diverged", date="2026-01-01")
-    write_rows(SUITE, made, some, tmp_path, "it")
+    write_rows(SUITE, plan, some, tmp_path, "it")
     found = read_row(path)
     assert math.isnan(next(run for run in found.runs if run.seed == some[0].job.seed).mean_return)
 
 
 BROKEN = [
-    (lambda held: held.pop("machine"), "'machine' is a required property"),
-    (lambda held: held.update(benchmark="npa-bench-v1"), "is not one of"),
-    (lambda held: held["runs"][0].update(returns=[1.0]), r"\$.runs\[0\].returns"),
-    (lambda held: held["runs"][0].update(id="npa/Other-v0"), "no problem of npa-bench-v0"),
-    (lambda held: held["runs"].pop(), "from at least 5 seeds"),
-    (lambda held: held["runs"][0].update(seed=1), "each once"),
-    (lambda held: held["runs"][0].update(particle_steps=1e12), "at most"),
-    (lambda held: held["runs"][0].update(machine="abacus"), "its machine does not name"),
+    (lambda data: data.pop("machine"), "'machine' is a required property"),
+    (lambda data: data.update(benchmark="npa-bench-v1"), "is not one of"),
+    (lambda data: data["runs"][0].update(returns=[1.0]), r"\$.runs\[0\].returns"),
+    (lambda data: data["runs"][0].update(id="npa/Other-v0"), "no problem of npa-bench-v0"),
+    (lambda data: data["runs"].pop(), "from at least 5 seeds"),
+    (lambda data: data["runs"][0].update(seed=1), "each once"),
+    (lambda data: data["runs"][0].update(particle_steps=1e12), "at most"),
+    (lambda data: data["runs"][0].update(machine="abacus"), "its machine does not name"),
 ]
 OTHER = [
-    (lambda held: held.update(benchmark="npa-bench-small-v0"), "must have the benchmark"),
-    (lambda held: held.update(options={"a": 1}), r"must have the options \{\} for runs to be"),
-    (lambda held: held.update(about="other:train"), "must have the about 'zero'"),
-    (lambda held: held["runs"][0].update(returns=[1.0]), "must have the episodes 32"),
-    (lambda held: held.pop("runs"), "cannot be read"),
-    (lambda held: held["runs"][0].pop("seed"), "cannot be read"),
-    (lambda held: held.update(machine=None), "cannot be read"),
+    (lambda data: data.update(benchmark="npa-bench-small-v0"), "must have the benchmark"),
+    (lambda data: data.update(options={"a": 1}), r"must have the options \{\} for runs to be"),
+    (lambda data: data.update(about="other:train"), "must have the about 'zero'"),
+    (lambda data: data["runs"][0].update(returns=[1.0]), "must have the episodes 32"),
+    (lambda data: data.pop("runs"), "cannot be read"),
+    (lambda data: data["runs"][0].pop("seed"), "cannot be read"),
+    (lambda data: data.update(machine=None), "cannot be read"),
 ]
 
 
@@ -171,27 +171,27 @@ OTHER = [
 def test_a_row_that_breaks_a_rule_or_is_of_something_else_is_refused(
     tmp_path, adding, change, words
 ):
-    made = plan_of(methods=("mine=zero" if adding else "zero",))
-    check_rows(SUITE, made, tmp_path)
-    (path,) = write_rows(SUITE, made, records(made), tmp_path, "it")
-    check_rows(SUITE, made, tmp_path)
+    plan = plan_of(methods=("mine=zero" if adding else "zero",))
+    check_rows(SUITE, plan, tmp_path)
+    (path,) = write_rows(SUITE, plan, records(plan), tmp_path, "it")
+    check_rows(SUITE, plan, tmp_path)
     changed(path, change)
-    given = (check_rows, SUITE, made, tmp_path) if adding else (read_row, path)
+    given = (check_rows, SUITE, plan, tmp_path) if adding else (read_row, path)
     refused(words, *given)
 
 
 def test_a_narrower_call_keeps_the_rest_of_a_row(zero_row, tmp_path):
-    made, path = zero_row
+    plan, path = zero_row
     whole = json.loads(path.read_text(encoding="utf-8"))
     fewer = plan_of(methods=("zero",), tasks=("MixingSmall-v0",))
     settings = fewer.settings | {"commit": "decade", "machine": "abacus"}
     fewer = dataclasses.replace(fewer, settings=settings)
     write_rows(SUITE, fewer, records(fewer), tmp_path, "second")
-    held = json.loads(path.read_text(encoding="utf-8"))
-    assert (held["command"], held["commit"]) == ("first; second", "c0ffee; decade")
-    assert held["machine"] == f"{whole['machine']}; abacus"
-    assert held["versions"] == whole["versions"]
-    assert [(run["id"], run["seed"]) for run in held["runs"]] == [
+    data = json.loads(path.read_text(encoding="utf-8"))
+    assert (data["command"], data["commit"]) == ("first; second", "c0ffee; decade")
+    assert data["machine"] == f"{whole['machine']}; abacus"
+    assert data["versions"] == whole["versions"]
+    assert [(run["id"], run["seed"]) for run in data["runs"]] == [
         (run["id"], run["seed"]) for run in whole["runs"]
     ]
     read = read_row(path)
@@ -199,7 +199,7 @@ def test_a_narrower_call_keeps_the_rest_of_a_row(zero_row, tmp_path):
     assert where.pop("npa/MixingSmall-v0") == "abacus"
     assert set(where.values()) == {whole["machine"]}
     # What holds all of it takes its place.
-    write_rows(SUITE, made, records(made), tmp_path, "first")
+    write_rows(SUITE, plan, records(plan), tmp_path, "first")
     assert json.loads(path.read_text(encoding="utf-8")) == whole
 
 

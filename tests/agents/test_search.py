@@ -135,9 +135,9 @@ def test_a_stopped_search_goes_on_as_if_it_had_not_been(method, tmp_path):
         assert ours.cell == theirs.cell
         assert np.array_equal(ours.solution, theirs.solution)
     refused("figures of other settings: seed was 3", search, **options | {"seed": 1}, path=path)
-    held = json.loads(path.read_text(encoding="utf-8"))
-    held["batches"][1]["fingerprint"] += 1
-    path.write_text(json.dumps(held), encoding="utf-8")
+    content = json.loads(path.read_text(encoding="utf-8"))
+    content["batches"][1]["fingerprint"] += 1
+    path.write_text(json.dumps(content), encoding="utf-8")
     refused("batch 1 differs", search, **options, path=path)
     same, found = tried_again(whole, [0]), whole.growth[-1]
     assert same.qd_score == pytest.approx(found.qd_score)
@@ -154,8 +154,8 @@ def test_the_command_leaves_elites_that_other_commands_open(tmp_path, capsys):
     printed = capsys.readouterr().out
     assert "8 candidates were tried before\n12 candidates, " in printed
     files = sorted((out / "elites").glob("*.safetensors"))
-    told = json.loads(rule_metadata(files[0])["found"])
-    assert sorted(told) == ["crowding", "mixing", "quality", "speed"]
+    metadata = json.loads(rule_metadata(files[0])["found"])
+    assert sorted(metadata) == ["crowding", "mixing", "quality", "speed"]
     page = (out / "atlas.html").read_text(encoding="utf-8")
     assert page.count("<img") == len(files)
     assert f'href="elites/{files[0].name}"' in page
@@ -171,6 +171,6 @@ def test_the_command_leaves_elites_that_other_commands_open(tmp_path, capsys):
 def test_a_damaged_world_of_a_rule_is_an_error(tmp_path):
     path = tmp_path / "odd.safetensors"
     rule = SearchWorld(**SMALL).make_rule()
-    for told, words in (("[1]", "must be a JSON object, got"), ('{"sides": 3}', "sides")):
-        save_rule(rule, path, metadata={"world": told})
+    for metadata, words in (("[1]", "must be a JSON object, got"), ('{"sides": 3}', "sides")):
+        save_rule(rule, path, metadata={"world": metadata})
         refused(words, task_of_rule, str(path), rule, CPU)

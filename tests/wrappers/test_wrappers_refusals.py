@@ -165,7 +165,7 @@ GROWTH, GARDEN = "npa/Morphogenesis2D-v0", "npa/Gardener2DSmall-v0"
         (f"{GROWTH} --episodes 0", "episodes must be at least 1"),
         ("npa/Gardener2DSmal-v0", "did you mean 'npa/Gardener2DSmall-v0'"),
         (f"{GARDEN} --policy heart", "policy must be one of"),
-        (f"{GARDEN} --policy none/sac.zip", "must be of a file that exists"),
+        (f"{GARDEN} --policy none/sac.zip", "must be of a file sac.zip or ppo.zip that exists"),
         (f"{GARDEN} --policy best.zip", "must be of a file sac.zip or ppo.zip"),
         (f"{GARDEN} --episodes 1 --dataset heart", "must be an id with a version"),
         (f"{GARDEN} --episodes 1 --dataset ../heart-first", "must be an id"),
