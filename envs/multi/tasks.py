@@ -322,12 +322,10 @@ ENVIRONMENTS = SPECIES
 
 def task_settings(name: str) -> tuple[str, dict[str, Any]]:
     """Return the task's name and the keywords of an id; names of tasks are returned unchanged."""
-    if not isinstance(name, str):
-        return name, {}
     for size in SPECIES_SIZES:
-        if name == size.id:
+        if isinstance(name, str) and name == size.id:
             return size.task, dict(size.keywords)
-    return ENVIRONMENTS.get(name, name), {}
+    return (ENVIRONMENTS.get(name, name) if isinstance(name, str) else name), {}
 
 
 def task_type(name: str) -> type[SpeciesTask]:

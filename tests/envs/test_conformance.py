@@ -107,7 +107,7 @@ class TestEveryEnvironment:
             assert_same(left[:4], right[:4])
             for key, value in right[4].items():
                 if key != "final_info":
-                    assert_same(list(left[4][key]), list(value), key)
+                    assert_same(list(left[4][key]), list(value))
 
     @every_case
     def test_an_episode_follows_from_its_seed_or_generator_and_from_nothing_else(self):

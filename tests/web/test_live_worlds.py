@@ -598,10 +598,6 @@ def test_a_log_that_begins_anew_or_goes_back_is_told_from_its_start(tmp_path, fo
     with path.open("r+", encoding="utf-8") as file:
         file.write("".join(f'{{"iteration": {k}, "loss": 2.0}}\n' for k in range(20)))
     assert points(world) == [(False, [[k, 2.0] for k in range(20)])]
-    path.write_text("", encoding="utf-8")
-    assert points(world) == []
-    log(tmp_path, 0, 2)
-    assert points(world) == [(False, [[0, 1.0], [1, 0.5]])]
     path.unlink()
     assert points(world) == []
     log(tmp_path, 0, 1)
@@ -714,12 +710,8 @@ def test_environments_are_made_with_a_policy():
     world.advance()
     assert not np.array_equal(world.frame().positions, before)
     world.close()
-    for name, message in (
-        ("npa/Nothing-v0", "unknown environment 'npa/Nothing-v0'"),
-        ("npa/Gardener2DSmall-v0", "updates of particles can be viewed, got 'npa/Gardener2DSm"),
-    ):
-        with pytest.raises(NPAError, match=message):
-            make_environment(name)
+    with pytest.raises(NPAError, match="updates of particles can be viewed, got 'npa/Gardener2DSm"):
+        make_environment("npa/Gardener2DSmall-v0")
     make_environment("npa/Morphogenesis2DSmall-v0")[0].close()
     with pytest.raises(NPAError, match="env must be an environment of npa_envs"):
         EnvironmentWorld(gymnasium.make("CartPole-v1"), lambda observation: 0)
