@@ -47,6 +47,7 @@ from npa_envs.tasks.targets.views import Views, over, some_views, views_of_mesh
 from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training import Trainer, override, preset
 from npa_envs.training.presets import config_to_dict
+from npa_envs.world.particles import Particles
 from npa_envs.world.recorded import release_recordings
 
 SEEDS = tuple(range(1_000_000, 1_000_008))
@@ -440,7 +441,7 @@ def particles(arguments: argparse.Namespace) -> None:
             fall = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, arguments.iterations)
             for number in range(arguments.iterations):
                 task.begin(number)
-                loss, _ = task.compare(x, s)
+                loss, _ = task.compare(Particles(x, s))
                 optimiser.zero_grad()
                 loss.backward()
                 optimiser.step()

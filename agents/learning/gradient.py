@@ -185,9 +185,8 @@ class EnvironmentTask(ParticleTask[Any]):
         """Return a copy of the task whose losses are for these goals, shape [B]."""
         return self if goal is None else self._with(inner=self.inner.toward(goal))
 
-    def compare(self, x: Tensor, s: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+    def compare(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the loss, averaged over worlds and species, and its parts by name."""
-        worlds = Particles(x, s)
         parts = {name: part.mean() for name, part in self._losses(worlds).items()}
         total = torch.stack(list(parts.values())).sum()
         self._check_gradient(total, worlds)

@@ -255,7 +255,7 @@ class ParticleTask(Generic[ConfigT]):
         task: Self = make(config, device=self.target_picture.device, **options)
         return task
 
-    def compare(self, x: Tensor, s: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+    def compare(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the weighted distance from the target, and its named parts, unweighted."""
         raise NotImplementedError
 
@@ -283,7 +283,7 @@ class ParticleTask(Generic[ConfigT]):
 
     def loss_of(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:
         """Return `loss` of worlds at the end of a rollout."""
-        total, parts = self.compare(worlds.x, worlds.s)
+        total, parts = self.compare(worlds)
         for name, (weight, term) in self.penalties(worlds).items():
             parts[name] = term
             total = total + weight * term
@@ -302,9 +302,9 @@ class ParticleTask(Generic[ConfigT]):
         """Name of `trial_metric`."""
         return self.metric_name
 
-    def trial_metric(self, x: Tensor, s: Tensor) -> Tensor:
+    def trial_metric(self, worlds: Particles) -> Tensor:
         """Return the metric under damage or changed conditions, shape [B]; by default `metric`."""
-        return self.metric(x, s)
+        return self.metric(worlds.x, worlds.s)
 
     def colours(self, s: Tensor) -> Tensor:
         """Return each particle's colour as pictures show it, shape [B, N, 3]."""

@@ -296,9 +296,9 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         density, colour = self.splat_losses(x, s)
         return density + self.config.colour_weight * colour
 
-    def compare(self, x: Tensor, s: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+    def compare(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the batch's splat loss, weighted, and its density and colour terms."""
-        density, colour = (term.mean() for term in self.splat_losses(x, s))
+        density, colour = (term.mean() for term in self.splat_losses(worlds.x, worlds.s))
         total = self.config.splat_weight * (density + self.config.colour_weight * colour)
         return total, {"density": density, "colour": colour}
 

@@ -35,6 +35,7 @@ from npa_envs.tasks.targets.views import (
 )
 from npa_envs.tasks.train_config import TrainConfig, fast_run, presets_of, tiny_run
 from npa_envs.world.cuda_graph import to_device_async
+from npa_envs.world.particles import Particles
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -230,10 +231,10 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
             (slope,) = torch.autograd.grad(loss.sum(), opacities)
         return shares_of_loss(loss.detach(), opacities.detach() * slope)
 
-    def compare(self, x: Tensor, s: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+    def compare(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the weighted loss of this iteration's views, and its parts."""
-        config, schedule = self.config, self.schedule
-        gaussians = self.gaussians(s)
+        config, schedule, x = self.config, self.schedule, worlds.x
+        gaussians = self.gaussians(worlds.s)
         target = some_views(self.target.training, schedule.index)
         target = Views(target.cameras, blurred(target.pictures.to(x), schedule.sigma))
         backgrounds = schedule.backgrounds.to(x)[:, None, None]

@@ -187,12 +187,12 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
 
     def damage(self, worlds: Particles, generator: Randomness) -> Particles:
         """Return the worlds, some with the positions and class of another cloud; states stay."""
-        x, share = worlds.x, self.config.mutated_share
-        if worlds.goal is None or share == 0.0:
+        x, probability = worlds.x, self.config.mutated_share
+        if worlds.goal is None or probability == 0.0:
             return worlds
         other = self.seed(len(x), generator=generator, device=x.device)
         other = worlds._replace(x=other.x.to(x.dtype), goal=other.goal)
-        return other.where(drawn_worlds(x, generator, share), worlds)
+        return other.where(drawn_worlds(x, generator, probability), worlds)
 
     def outputs(self, s: Tensor) -> Tensor:
         """Return each particle's class scores, dimensionless, shape [B, N, K]."""
@@ -225,9 +225,9 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         """Return each world's mean squared error, shape [B]."""
         return world_mean(self.errors(s)[..., None])[:, 0]
 
-    def trial_metric(self, x: Tensor, s: Tensor) -> Tensor:
+    def trial_metric(self, worlds: Particles) -> Tensor:
         """Return the fraction of each world's particles with a wrong class, shape [B]."""
-        return self.mistakes(s).mean(1)
+        return self.mistakes(worlds.s).mean(1)
 
     def colours(self, s: Tensor) -> Tensor:
         """Return each particle's colour, by its class; [B, N, 3]."""
@@ -237,10 +237,11 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         """Return each particle's mean |s − clip(s, −1, 1)|, [B, N]."""
         return channel_mean((s - s.clamp(-1.0, 1.0)).abs())
 
-    def compare(self, x: Tensor, s: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+    def compare(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the batch's mean squared error; parts are the error and the accuracy."""
-        error = self.errors(s).mean()
-        return error, {"error": error, "accuracy": 1.0 - self.mistakes(s.detach()).mean()}
+        error = self.errors(worlds.s).mean()
+        accuracy = 1.0 - self.mistakes(worlds.s.detach()).mean()
+        return error, {"error": error, "accuracy": accuracy}
 
     def picture(self, x: Tensor, s: Tensor) -> Tensor:
         """Return each world's picture, coloured by class: colour sums, density, [B, R, R, 4]."""

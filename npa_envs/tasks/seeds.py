@@ -90,10 +90,10 @@ def drawn_indices(
     return torch.randint(count, (world_count,), generator=generator, device=device)
 
 
-def drawn_worlds(x: Tensor, generator: Randomness, share: float) -> Tensor:
-    """Return a random bool for each world, True with probability `share`, shape [B]."""
+def drawn_worlds(x: Tensor, generator: Randomness, probability: float) -> Tensor:
+    """Return a random bool for each world, True with a probability, shape [B]."""
     single = x.new_empty(0, dtype=torch.float32)
-    return uniform_draws(generator, (len(x), 1), single)[:, 0] < share
+    return uniform_draws(generator, (len(x), 1), single)[:, 0] < probability
 
 
 def _check_points(number_count: int, dtype: torch.dtype) -> None:

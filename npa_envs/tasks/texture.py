@@ -260,9 +260,10 @@ class Texture(ParticleTask[TextureConfig]):
         amounts = red + green + blue + density[..., 0]
         return shares_of_loss(loss.detach(), amounts)
 
-    def compare(self, x: Tensor, s: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+    def compare(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the batch's texture loss, weighted, and its colour and density terms."""
-        colour, density = (term.mean() for term in self.texture_losses(x, s))
+        losses = self.texture_losses(worlds.x, worlds.s)
+        colour, density = (term.mean() for term in losses)
         return self.weighted(colour, density), {"colour": colour, "density": density}
 
     def penalties(self, worlds: Particles) -> dict[str, tuple[float, Tensor]]:

@@ -41,8 +41,8 @@ def test_a_hidden_layer_without_biases_is_as_one_whose_biases_are_zero(equivaria
     _, expected = npa_envs.rollout(rule, x, s, 2, update_prob=1.0)
     rule.hidden.bias = None
     assert not rule.has_network()
-    _, found = npa_envs.rollout(rule, x, s, 2, update_prob=1.0)
-    torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-13)
+    _, after = npa_envs.rollout(rule, x, s, 2, update_prob=1.0)
+    torch.testing.assert_close(after, expected, rtol=1e-12, atol=1e-13)
 
 
 class Overridden(npa_envs.NPARule):
@@ -120,16 +120,16 @@ def test_a_changed_network_is_run_as_the_module_that_it_is(how, gradients, devic
 @pytest.mark.parametrize("name", ["", "hidden", "output"])
 def test_hooks_of_all_modules_are_called(name, device):
     rule, (x, s) = lively_rule(device), world(device)
-    module, seen, registered = getattr(rule, name) if name else rule, [], []
+    module, calls, registered = getattr(rule, name) if name else rule, [], []
     _, once = npa_envs.step(rule, x, s, update_prob=1.0)
     hooks = {
-        "forward_hook": lambda own, inputs, output: 2.0 * output if own is module else None,
-        "forward_pre_hook": lambda own, inputs: seen.append(own),
-        "full_backward_hook": lambda own, *bars: seen.append((own, "back")),
+        "forward_hook": lambda called, inputs, output: 2.0 * output if called is module else None,
+        "forward_pre_hook": lambda called, inputs: calls.append(called),
+        "full_backward_hook": lambda called, *bars: calls.append((called, "back")),
     }
     with contextlib.ExitStack() as stack:
-        for kind, hook in hooks.items():
-            register = getattr(torch.nn.modules.module, f"register_module_{kind}")
+        for hook_name, hook in hooks.items():
+            register = getattr(torch.nn.modules.module, f"register_module_{hook_name}")
             # One of them alone is enough.
             with register(hook):
                 assert not rule.is_plain()
@@ -139,7 +139,7 @@ def test_hooks_of_all_modules_are_called(name, device):
         _, twice = npa_envs.step(rule, x, s.requires_grad_(), update_prob=1.0)
         twice.sum().backward()
     assert rule.is_plain()
-    assert {module, (module, "back")} <= set(seen)
+    assert {module, (module, "back")} <= set(calls)
     assert_changed(name, s, once, twice)
 
 

@@ -1,5 +1,7 @@
-"""Rules with a dead zone: updates, gradients, worlds at rest, files, training."""
+"""Rules with a dead zone: updates, gradients, worlds at rest; those with the smooth inverse too."""
 
+import gymnasium
+import numpy as np
 import pytest
 import torch
 from circle_task import CircleTask, circle_config
@@ -9,6 +11,8 @@ from worlds import assert_near, assert_same, lively_rule, random_world
 import npa_envs
 from npa_envs import NPAError, NPARule
 from npa_envs import reference as oracle
+from npa_envs.agents import RulePolicy
+from npa_envs.envs import multispecies_v0
 from npa_envs.training import load_config
 from npa_envs.training.trainer import initial_rule
 from npa_envs.world import execute
@@ -121,6 +125,30 @@ def test_training_gives_its_rule_the_zone_and_the_inverse(tmp_path, field, begun
     train(config)
     assert getattr(npa_envs.load_rule(tmp_path / "run"), field) == chosen
     assert load_config(tmp_path / "run" / "config.json", circle_config(tmp_path)) == config
+
+
+def test_a_rule_acts_only_where_its_choice_is_observed():
+    rule = NPARule(moment_inverse="smooth")
+    env = gymnasium.make("npa/Morphogenesis2D-v0", particle_count=32)
+    with pytest.raises(NPAError, match="the environment with moment_inverse='smooth'"):
+        RulePolicy(rule, env)
+    env = gymnasium.make("npa/Morphogenesis2D-v0", particle_count=32, moment_inverse="smooth")
+    RulePolicy(rule, env)
+    with pytest.raises(NPAError, match="moment_inverse must be a known word, got 'soft'"):
+        gymnasium.make("npa/Morphogenesis2D-v0", moment_inverse="soft")
+
+
+def test_several_species_observe_what_they_are_told():
+    observations = []
+    for word in ("smooth", "threshold"):
+        env = multispecies_v0.parallel_env(particle_count=40, moment_inverse=word)
+        env.reset(seed=0)
+        actions = {}
+        for agent in env.agents:
+            shape = env.action_space(agent).shape
+            actions[agent] = np.linspace(-0.5, 0.5, np.prod(shape), dtype=np.float32).reshape(shape)
+        observations.append(np.concatenate(list(env.step(actions)[0].values())))
+    assert np.abs(observations[0] - observations[1]).max() > 1e-6
 
 
 class TestRest:

@@ -11,7 +11,7 @@ from npa_envs.kernels.cuda.equivariance import fits_block, rows_of_warp
 from npa_envs.ops.equivariance import VectorForm, read_rows
 from npa_envs.rule.rule import NPARule
 
-KINDS = {
+RULES = {
     "2D": {"space_dim": 2},
     "chiral": {"space_dim": 2, "chiral": True},
     "3D": {"space_dim": 3},
@@ -55,9 +55,9 @@ def largest_difference(rule, x, s, turns):
 
 # Worst difference measured: 8.3e-6 and 2e-14.
 @pytest.mark.parametrize(("dtype", "bound"), [(torch.float32, 4e-5), (torch.float64, 1e-12)])
-@pytest.mark.parametrize("kind", KINDS)
-def test_turned_starts_stay_turned(kind, dtype, bound, device):
-    options = KINDS[kind]
+@pytest.mark.parametrize("case", RULES)
+def test_turned_starts_stay_turned(case, dtype, bound, device):
+    options = RULES[case]
     rule = equivariant(device, dtype, **options)
     x, s = random_world(1, 160, options["space_dim"], 5, dtype=torch.float64, device=device)
     s = s.clamp(-1.0, 1.0)
@@ -79,9 +79,9 @@ def test_plain_rules_and_mirrors_tell_where_it_ends():
 # Worst error measured: 1.1e-5, of the bias, whose gradients by rows all but cancel.
 @pytest.mark.parametrize(("dtype", "bound"), [(torch.float64, 1e-13), (torch.float32, 5e-5)])
 @pytest.mark.parametrize("static", [False, True])
-@pytest.mark.parametrize("kind", KINDS)
-def test_kernels_of_rows_are_the_formulas(kind, static, dtype, bound, count, mixed_vectors, device):
-    options = KINDS[kind] | {"mixed_vectors": mixed_vectors}
+@pytest.mark.parametrize("case", RULES)
+def test_kernels_of_rows_are_the_formulas(case, static, dtype, bound, count, mixed_vectors, device):
+    options = RULES[case] | {"mixed_vectors": mixed_vectors}
     exact = equivariant(device, static=static, **options)
     with torch.no_grad():
         # What moves nothing learns to.
@@ -92,7 +92,7 @@ def test_kernels_of_rows_are_the_formulas(kind, static, dtype, bound, count, mix
     rows = torch.nn.functional.pad(z, (0, network.row_width - rule.perception_dim))
     rows[:, rule.perception_dim] = 1.0
     rows = rows.to(device)
-    found = []
+    results = []
     for run, wide in ((network, rows.to(dtype)), (exact, rows[:, : rule.perception_dim].double())):
         wide = wide.clone().requires_grad_()
         update = run(wide)[:, : rule.update_dim]
@@ -100,8 +100,8 @@ def test_kernels_of_rows_are_the_formulas(kind, static, dtype, bound, count, mix
         bar = torch.linspace(-1.0, 1.0, update.numel(), device=device).to(update).view_as(update)
         gradients = torch.autograd.grad(update, (wide, *weights), bar)
         by_rows = gradients[0][:, : rule.perception_dim]
-        found.append([update.detach(), by_rows, *gradients[1:]])
-    for ours, theirs in zip(*found, strict=True):
+        results.append([update.detach(), by_rows, *gradients[1:]])
+    for ours, theirs in zip(*results, strict=True):
         assert relative_error(ours.double(), theirs) < bound
 
 
@@ -119,17 +119,17 @@ def test_forms_that_a_block_of_cuda_has_room_for():
 def test_gradients_are_taken_of_what_needs_them(count, device):
     form = VectorForm(2, 10, 6, 8, chiral=True)
     rows, mixing = torch.randn(count, 24, device=device), torch.randn(6, 8, device=device)
-    found = []
+    results = []
     for wanted in ("rows", "mixing", "both"):
         leaves = [rows.clone(), mixing.clone()]
         wanted_leaves = leaves if wanted == "both" else leaves[wanted == "mixing" :][:1]
         for leaf in wanted_leaves:
             leaf.requires_grad_()
         mixed, inputs = read_rows(*leaves, form, form.input_dim + 3)
-        found.append(torch.autograd.grad((mixed.sum() + inputs).sum(), wanted_leaves))
-    assert torch.equal(found[0][0], found[2][0])
-    assert torch.equal(found[1][0], found[2][1])
-    assert bool(found[1][0].any()) == (count > 0)
+        results.append(torch.autograd.grad((mixed.sum() + inputs).sum(), wanted_leaves))
+    assert torch.equal(results[0][0], results[2][0])
+    assert torch.equal(results[1][0], results[2][1])
+    assert bool(results[1][0].any()) == (count > 0)
 
 
 def test_rows_in_plenty_are_all_read(device):
@@ -139,13 +139,13 @@ def test_rows_in_plenty_are_all_read(device):
         torch.randn(*shape, generator=generator, dtype=torch.float64).to(device)
         for shape in ((20_001, 24), (form.perceived, form.mixed))
     )
-    found = []
+    results = []
     for dtype in (torch.float32, torch.float64):
         leaves = [value.to(dtype).requires_grad_() for value in (rows, mixing)]
         mixed, inputs = read_rows(*leaves, form, form.input_dim + 3)
         loss = (mixed.square().sum() + inputs.square().sum()) / len(rows)
-        found.append([mixed, inputs, *torch.autograd.grad(loss, leaves)])
-    for ours, theirs in zip(*found, strict=True):
+        results.append([mixed, inputs, *torch.autograd.grad(loss, leaves)])
+    for ours, theirs in zip(*results, strict=True):
         assert relative_error(ours, theirs) < 1e-6
 
 

@@ -41,10 +41,10 @@ def assert_same_rule(got, expected):
         assert torch.equal(tensor, state[name]), name
 
 
-@pytest.mark.parametrize("kind", RULES)
+@pytest.mark.parametrize("case", RULES)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_a_saved_rule_comes_back_bit_by_bit(tmp_path, kind, dtype):
-    rule = RULES[kind]().to(dtype)
+def test_a_saved_rule_comes_back_bit_by_bit(tmp_path, case, dtype):
+    rule = RULES[case]().to(dtype)
     save_rule(rule, tmp_path / "rule.safetensors")
     before = torch.get_rng_state()
     loaded = load_rule(tmp_path / "rule.safetensors")
@@ -169,7 +169,7 @@ def test_rules_of_the_package_are_loaded_without_a_warning():
 def test_no_bit_flips_unnoticed(tmp_path):
     rule, path = NPARule(2, 3, 8, eps0=0.1), tmp_path / "rule.safetensors"
     save_rule(rule, path, metadata={"trained": "10 000 iterations"})
-    data, told = path.read_bytes(), rule_metadata(path)
+    data, metadata_before = path.read_bytes(), rule_metadata(path)
     refused = 0
     for place in np.random.default_rng(0).integers(8 * len(data), size=250).tolist():
         flipped = bytearray(data)
@@ -182,7 +182,7 @@ def test_no_bit_flips_unnoticed(tmp_path):
         except (NPAError, UserWarning):
             refused += 1
         else:  # A space after the header.
-            assert rule_metadata(path) == told
+            assert rule_metadata(path) == metadata_before
             assert_same_rule(loaded, rule)
     assert refused >= 245
 
@@ -241,9 +241,9 @@ def authors_state(rule):
     return state
 
 
-@pytest.mark.parametrize("kind", ["plain 2D", "3D with read-out", "static"])
-def test_the_authors_state_dict_is_the_same_rule(tmp_path, kind):
-    rule = RULES[kind]()
+@pytest.mark.parametrize("case", ["plain 2D", "3D with read-out", "static"])
+def test_the_authors_state_dict_is_the_same_rule(tmp_path, case):
+    rule = RULES[case]()
     state = authors_state(rule)
     torch.save(state, tmp_path / "npa.pth")
     assert_same_rule(load_rule(tmp_path / "npa.pth"), rule)

@@ -40,12 +40,12 @@ def test_a_card_says_what_was_measured(name):
     rows = measured.get("growth") or measured["accuracy"]
     for row in rows:
         (line,) = re.findall(rf"^\| {row['step']} \| .*$", card, re.MULTILINE)
-        told = line.split(" | ")[1]
+        cell = line.split(" | ")[1]
         if "accuracy" in measured:
-            assert told == f"{100 * row['majority']:.1f} %"
+            assert cell == f"{100 * row['majority']:.1f} %"
         else:
-            digits = len(told.partition(".")[2])
-            assert told == f"{row['loss']:.{digits}f}"
+            digits = len(cell.partition(".")[2])
+            assert cell == f"{row['loss']:.{digits}f}"
 
 
 def test_what_is_grown_lasts_and_the_classifier_is_right():

@@ -37,18 +37,18 @@ def test_brushes_move_and_wipe_as_their_formulas_say(world):
         assert torch.equal(wiped, s.masked_fill(distance <= radius.view(-1, 1, 1), 0.0))
     moves = []
     for radius, factor in ((0.5, 0.75), (9.0, 1.0), (9.0, 0.0)):
-        moved = brushes.clump(x, s, centre=centre, radius=radius, factor=factor)
-        moves.append((moved, distance <= radius, -factor * offset))
+        after = brushes.clump(x, s, centre=centre, radius=radius, factor=factor)
+        moves.append((after, distance <= radius, -factor * offset))
     normal = torch.randn(B, x.shape[-1], generator=torch.Generator().manual_seed(1)).to(x)
     unit = torch.nn.functional.normalize(normal, dim=-1)[:, None]
     before = (offset * unit).sum(dim=-1, keepdim=True)
-    moved = brushes.cut(x, s, centre=centre, normal=normal, gap=0.2)
-    moves.append((moved, before.abs() < 0.2, (0.1 * before.sign() - before / 2.0) * unit))
-    for (found, states), inside, move in moves:
+    after = brushes.cut(x, s, centre=centre, normal=normal, gap=0.2)
+    moves.append((after, before.abs() < 0.2, (0.1 * before.sign() - before / 2.0) * unit))
+    for (moved, states), inside, move in moves:
         inside = inside[..., 0]
         assert int(inside.sum()) > 10
-        torch.testing.assert_close(found[inside], (x + move)[inside], rtol=1e-5, atol=1e-6)
-        assert torch.equal(found[~inside], x[~inside])
+        torch.testing.assert_close(moved[inside], (x + move)[inside], rtol=1e-5, atol=1e-6)
+        assert torch.equal(moved[~inside], x[~inside])
         assert states is s
     moved, _ = brushes.cut(x, s, centre=centre, normal=torch.zeros_like(centre), gap=0.2)
     assert torch.equal(moved, x)
@@ -83,35 +83,35 @@ def changed(before, after):
 @pytest.mark.parametrize("space_dim", [2, 3])
 def test_a_ball_of_states_is_wiped_in_every_world(space_dim):
     before = worlds(40, space_dim)
-    found = damage_pool(before, PoolDamage(damage_radius=0.3), generator=seeded(2))
-    assert found.x is before.x
-    for places, blank in zip(found.x, (found.s == 0.0).all(dim=-1), strict=True):
+    damaged = damage_pool(before, PoolDamage(damage_radius=0.3), generator=seeded(2))
+    assert damaged.x is before.x
+    for positions, blank in zip(damaged.x, (damaged.s == 0.0).all(dim=-1), strict=True):
         assert 0 < int(blank.sum()) < 150
-        assert float(torch.cdist(places[blank], places[blank]).max()) <= 0.6
+        assert float(torch.cdist(positions[blank], positions[blank]).max()) <= 0.6
 
 
 @pytest.mark.parametrize(
-    ("fields", "share"),
+    ("fields", "fraction"),
     [
         *(({name: 0.5}, SHARE) for name in ("clump_radius", "cut_gap", "flake_radius")),
         ({"cut_gap": 0.5, "cut_share": 0.7}, 0.7),
     ],
 )
 @pytest.mark.parametrize("space_dim", [2, 3])
-def test_as_many_worlds_are_hit_as_asked_for(fields, share, space_dim):
+def test_as_many_worlds_are_hit_as_asked_for(fields, fraction, space_dim):
     before = worlds(400, space_dim, 60)
-    found = damage_pool(before, PoolDamage(**fields), generator=seeded(2))
+    damaged = damage_pool(before, PoolDamage(**fields), generator=seeded(2))
     # Five standard deviations of a share of 400 worlds; some are hit where nobody is.
-    assert share - 0.13 < float(changed(before.x, found.x).float().mean()) < share + 0.11
-    assert torch.equal(found.s, before.s)
+    assert fraction - 0.13 < float(changed(before.x, damaged.x).float().mean()) < fraction + 0.11
+    assert torch.equal(damaged.s, before.s)
 
 
 def test_a_clump_is_one_point():
     x, s, *_ = worlds(40)
-    found, *_ = damage_pool(Particles(x, s), PoolDamage(clump_radius=0.3), generator=seeded(2))
-    hit = changed(x, found)
+    damaged, *_ = damage_pool(Particles(x, s), PoolDamage(clump_radius=0.3), generator=seeded(2))
+    hit = changed(x, damaged)
     assert hit.any()
-    for before, after in zip(x[hit], found[hit], strict=True):
+    for before, after in zip(x[hit], damaged[hit], strict=True):
         moved = (before != after).any(dim=1)
         middle = after[moved].mean(dim=0)
         at_one_point = (after - middle).norm(dim=1) < 1e-6
@@ -122,13 +122,13 @@ def test_a_clump_is_one_point():
 @pytest.mark.parametrize("space_dim", [2, 3])
 def test_a_flake_leaves_as_it_is(space_dim):
     x = worlds(60, space_dim).x
-    found = damage.tear_off(
+    damaged = damage.tear_off(
         x, radius=0.3, probability=0.5, generator=torch.Generator().manual_seed(3)
     )
-    hit = changed(x, found)
+    hit = changed(x, damaged)
     assert 15 <= int(hit.sum()) <= 45
     sizes = []
-    for before, after in zip(x[hit], found[hit], strict=True):
+    for before, after in zip(x[hit], damaged[hit], strict=True):
         torn = (before != after).any(dim=1)
         shift = (after - before)[torn]
         torch.testing.assert_close(shift, shift[:1].expand_as(shift), rtol=0.0, atol=1e-6)
@@ -166,14 +166,14 @@ SMALL = Morphogenesis2DConfig(
 def test_as_many_are_thrown_out_as_was_said_and_on_all_sides(device, by_world, space_dim):
     x = torch.zeros(2, 4000, space_dim, device=device)
     random = WorldRandom([4, 5], device=device) if by_world else torch.Generator(device)
-    found = damage.displace(x, probability=0.25, generator=random)
-    distance = found.norm(dim=-1)
+    damaged = damage.displace(x, probability=0.25, generator=random)
+    distance = damaged.norm(dim=-1)
     out = distance > 0.0
     assert ((distance[out] >= NEAREST) & (distance[out] <= FARTHEST)).all()
     # Five standard deviations of a share of 8000, and of the mean of vectors as long as 4.
     assert float(out.float().mean()) == pytest.approx(0.25, abs=0.025)
-    assert found[out].mean(dim=0).abs().max() < 0.4
-    assert torch.equal(found[~out], x[~out])
+    assert damaged[out].mean(dim=0).abs().max() < 0.4
+    assert torch.equal(damaged[~out], x[~out])
 
 
 def test_only_the_paths_of_those_outside_count():

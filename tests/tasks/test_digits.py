@@ -17,6 +17,11 @@ from npa_envs.tasks.targets.clouds import (
 from npa_envs.world.randomness import WorldRandom
 
 
+def write_training_files(folder, images, labels):
+    (folder / "train-images-idx3-ubyte").write_bytes(idx(images))
+    (folder / "train-labels-idx1-ubyte").write_bytes(idx(labels))
+
+
 def test_idx_files_are_read_as_they_were_written(folder, monkeypatch):
     # A tilde is the user's home.
     monkeypatch.setenv("HOME", str(folder.parent))
@@ -54,8 +59,7 @@ def test_a_damaged_idx_file_is_a_clear_error(tmp_path, content, message):
 def test_folders_without_data_are_clear_errors(tmp_path):
     with pytest.raises(NPAError, match="must hold MNIST's file train-images-idx3-ubyte or"):
         load_pictures(str(tmp_path))
-    for name in ("train-images-idx3-ubyte", "train-labels-idx1-ubyte"):
-        (tmp_path / name).write_bytes(idx(np.zeros((3, 2), np.uint8)))
+    write_training_files(tmp_path, np.zeros((3, 2), np.uint8), np.zeros(3, np.uint8))
     with pytest.raises(NPAError, match=r"must hold pictures \[M, H, W\].*got \[3, 2\]"):
         load_pictures(str(tmp_path))
 
@@ -87,13 +91,13 @@ def test_each_point_is_as_far_as_can_be_from_those_before():
     candidates = torch.randint(2048, (3, 60, 2), generator=random).float()
     counts = torch.tensor([60, 31, 5])
     chosen = _farthest_points(candidates, counts, 9).double()
-    for cloud, given, count in zip(chosen, candidates.double(), counts.tolist(), strict=True):
-        assert torch.equal(cloud[0], given[0])
+    for cloud, points, count in zip(chosen, candidates.double(), counts.tolist(), strict=True):
+        assert torch.equal(cloud[0], points[0])
         for k in range(1, min(9, count)):
-            nearest = torch.cdist(given[:count], cloud[:k]).amin(1)
+            nearest = torch.cdist(points[:count], cloud[:k]).amin(1)
             assert torch.cdist(cloud[k : k + 1], cloud[:k]).min() == nearest.max()
         # Where there are no more, those that there are come again, and nothing else.
-        assert {tuple(p) for p in cloud.tolist()} <= {tuple(p) for p in given[:count].tolist()}
+        assert {tuple(p) for p in cloud.tolist()} <= {tuple(p) for p in points[:count].tolist()}
 
 
 def test_points_lie_on_the_ink_and_the_first_row_is_the_highest():
@@ -113,21 +117,14 @@ def test_points_lie_on_the_ink_and_the_first_row_is_the_highest():
         sample_ink(np.stack([ink[0], 0 * ink[0]]), 10)
 
 
-def test_coverage_is_the_share_of_the_unit_square(tmp_path):
-    images = (pictures(COUNTS["train"], 0)[0] / 255.0).astype(np.float32)
-    cases = {shape: np.ones((2, *shape), np.float32) for shape in ((12, 12), (3, 12), (12, 6))}
-    # In a square picture it is the share of the picture, to the last bit.
-    for number, ink in enumerate((*cases.values(), images)):
-        folder = tmp_path / str(number)
-        folder.mkdir()
-        label = np.arange(len(ink), dtype=np.uint8)
-        (folder / "train-images-idx3-ubyte").write_bytes(idx((255 * ink).round().astype(np.uint8)))
-        (folder / "train-labels-idx1-ubyte").write_bytes(idx(label))
-        clouds = load_clouds(str(folder), "train", 20, device=torch.device("cpu"))
-        height, width = ink.shape[1:]
-        square = height * width / max(height, width) ** 2
-        assert clouds.coverage == sample_ink(ink, 20)[1] * square
-        assert (clouds.coverage == square) == (ink is not images)
+@pytest.mark.parametrize("shape", [(12, 12), (3, 12), (12, 6)])
+def test_coverage_is_the_fraction_of_the_unit_square(folder, tmp_path, shape):
+    write_training_files(tmp_path, np.full((2, *shape), 255, np.uint8), np.zeros(2, np.uint8))
+    clouds = load_clouds(str(tmp_path), "train", 20, device=torch.device("cpu"))
+    assert clouds.coverage == shape[0] * shape[1] / max(shape) ** 2
+    # In a square picture it is the fraction of the picture, to the last bit.
+    clouds = load_clouds(str(folder), "train", 20, device=torch.device("cpu"))
+    assert clouds.coverage == sample_ink(load_pictures(str(folder)).ink, 20)[1] < 1.0
 
 
 def test_a_cloud_does_not_depend_on_the_others_nor_on_the_device(device, monkeypatch):

@@ -124,9 +124,9 @@ def test_shares_average_to_the_loss_and_show_what_a_particle_changes(tiny, name,
     shares = task.particle_shares(x, s)
     torch.testing.assert_close(shares.mean(1), task.metric(x, s), rtol=1e-9, atol=0.0)
     slopes = [slope_of(task, x[:1], s[:1], k) for k in (3, 40, 41)]
-    for found, expected in zip(shares[0, [3, 41]], (slopes[0], slopes[2]), strict=True):
+    for contribution, expected in zip(shares[0, [3, 41]], (slopes[0], slopes[2]), strict=True):
         change = x.shape[1] * (expected - slopes[1])
-        assert float(found - shares[0, 40]) == pytest.approx(change, rel=1e-4)
+        assert float(contribution - shares[0, 40]) == pytest.approx(change, rel=1e-4)
 
 
 PENALTIES = {"motion_weight": 0.5, "overflow_weight": 11.0, "bound_weight": 13.0}

@@ -71,8 +71,8 @@ def test_each_world_is_compared_with_its_own_target(device):
         assert int(losses.argmin()) == number
         assert float(losses[number]) < 0.2 * float(losses.sum()) / 3
         # The target itself has the density that it has alone, whatever its size.
-        own, alone = aimed.target_picture[number], singles[int(goal[number])].target_picture
-        assert float(own[..., 3].sum()) == pytest.approx(float(alone[..., 3].sum()), rel=0.1)
+        together, alone = aimed.target_picture[number], singles[int(goal[number])].target_picture
+        assert float(together[..., 3].sum()) == pytest.approx(float(alone[..., 3].sum()), rel=0.1)
 
 
 def test_gradients_of_the_loss_reach_the_worlds_codes_alone(device):
@@ -101,8 +101,8 @@ def test_switched_worlds_get_another_goal_and_its_code(device):
     after = task.toward(switched).coded(hurt)
     codes = after[..., :3].unique(dim=1)[:, 0]
     assert len(codes.unique(dim=0)) == 2
-    kept = task_of(device, switch_share=0.0)
-    assert torch.equal(kept.damage(Particles(x, s, goal=goal), generator(2, device)).goal, goal)
+    steady = task_of(device, switch_share=0.0)
+    assert torch.equal(steady.damage(Particles(x, s, goal=goal), generator(2, device)).goal, goal)
 
 
 @pytest.mark.parametrize("encoder", [False, True])

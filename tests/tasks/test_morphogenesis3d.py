@@ -103,9 +103,9 @@ def test_particles_under_the_target_s_surface_look_like_it():
     s[..., -3:] = colours - 0.5
     shuffled = s[:, torch.randperm(6000, generator=torch.Generator().manual_seed(0))]
     upside_down = x * torch.tensor([1.0, -1.0, 1.0])
-    made = ((x, s), (x, shuffled), (upside_down, s))
-    ratios = [float(task.view_psnr(*world)) for world in made]
-    losses = [float(task.metric(*world)) for world in made]
+    candidates = ((x, s), (x, shuffled), (upside_down, s))
+    ratios = [float(task.view_psnr(*world)) for world in candidates]
+    losses = [float(task.metric(*world)) for world in candidates]
     # Seen: 30.2, 21.8 and 17.6 dB, and losses of 0.006, 0.027 and 0.044.
     assert ratios[0] > 28.0
     assert max(ratios[1:]) < ratios[0] - 6.0
@@ -115,12 +115,12 @@ def test_particles_under_the_target_s_surface_look_like_it():
 def test_psnr_is_that_of_colours_over_white(task):
     x, s = worlds(task, 2)
     held_out = task.target.held_out
-    found = task.views(x, s, held_out.cameras)
+    drawn = task.views(x, s, held_out.cameras)
     by_hand = []
     for world in range(2):
         ratios = []
         for view in range(3):
-            pictures = (found[world, view], held_out.pictures[view])
+            pictures = (drawn[world, view], held_out.pictures[view])
             shown = [(p[..., :3] + 1 - p[..., 3:]).clamp(0, 1).double() for p in pictures]
             ratios.append(-10 * math.log10(float((shown[0] - shown[1]).square().mean())))
         by_hand.append(sum(ratios) / 3)
@@ -153,12 +153,12 @@ def test_loss_sees_the_views_of_its_iteration_before_their_backgrounds(task):
     schedule = task.schedule
     assert float(schedule.sigma) == 0.0
     chosen = some_views(task.target.training, schedule.index)
-    found = task.views(x, s, chosen.cameras)
+    drawn = task.views(x, s, chosen.cameras)
     error = 0.0
     for view in range(2):
         back = schedule.backgrounds[view]
-        colours = over(found[:, view], back) - over(chosen.pictures[view], back)
-        alpha = found[:, view, ..., 3:] - chosen.pictures[view, ..., 3:]
+        colours = over(drawn[:, view], back) - over(chosen.pictures[view], back)
+        alpha = drawn[:, view, ..., 3:] - chosen.pictures[view, ..., 3:]
         error += float(torch.cat((colours, alpha), dim=-1).abs().mean()) / 2
     assert float(parts["views"]) == pytest.approx(error, rel=1e-5)
     task.begin(0)
@@ -166,7 +166,7 @@ def test_loss_sees_the_views_of_its_iteration_before_their_backgrounds(task):
 
 
 def read_ply(path):
-    """Return the columns of a binary PLY file, read by its own header."""
+    """Return the columns of a binary PLY file, read by its header."""
     header, _, body = path.read_bytes().partition(b"end_header\n")
     lines = header.decode().split("\n")
     kinds = {"float": "<f4", "uchar": "u1"}
@@ -216,14 +216,14 @@ def test_splats_are_32_bytes_each_the_largest_first(cloud, task, tmp_path):
     write_splat(tmp_path / "a.splat", x, look)
     content = (tmp_path / "a.splat").read_bytes()
     assert len(content) == 32 * 150
-    numbers = np.frombuffer(content, "<f4").reshape(150, 8)
+    floats = np.frombuffer(content, "<f4").reshape(150, 8)
     bytes_ = np.frombuffer(content, np.uint8).reshape(150, 32)
-    size = numbers[:, 3:6].prod(axis=1) * bytes_[:, 27]
+    size = floats[:, 3:6].prod(axis=1) * bytes_[:, 27]
     assert (np.diff(size) <= 0.01 * size[0]).all()
-    places = x[0].numpy()
-    order = [int(np.abs(places - row[:3]).sum(axis=1).argmin()) for row in numbers]
+    positions = x[0].numpy()
+    order = [int(np.abs(positions - row[:3]).sum(axis=1).argmin()) for row in floats]
     assert sorted(order) == list(range(150))
-    assert np.array_equal(numbers[:, 3:6], look.scales[0, order].detach().numpy())
+    assert np.array_equal(floats[:, 3:6], look.scales[0, order].detach().numpy())
     assert np.abs(bytes_[:, 24:27] / 255.0 - colours[order]).max() < 0.51 / 255.0
     turns = torch.nn.functional.normalize(look.quaternions[0, order], dim=-1).detach().numpy()
     assert np.abs((bytes_[:, 28:] - 128.0) / 128.0 - turns).max() < 1.01 / 128.0

@@ -72,10 +72,10 @@ def test_worlds_are_clouds_of_their_class_with_blank_states(task, device):
 def test_test_clouds_are_others_and_never_varied(folder):
     task = task_of(folder, rotation=90.0, jitter=0.1)
     for split, count in (("train", 36), ("test", 18)):
-        own = task.on(split)
-        assert len(own.clouds.label) == count
-        x, *_ = own.seed(5, generator=random())
-        is_cloud = [bool((own.clouds.x == cloud).flatten(1).all(1).any()) for cloud in x]
+        on_split = task.on(split)
+        assert len(on_split.clouds.label) == count
+        x, *_ = on_split.seed(5, generator=random())
+        is_cloud = [bool((on_split.clouds.x == cloud).flatten(1).all(1).any()) for cloud in x]
         assert is_cloud == [split == "test"] * 5
 
 
@@ -148,9 +148,9 @@ def test_classes_stay_with_their_worlds(
     assert not torch.equal(cycle.pool.worlds.x, before)
 
 
-@pytest.mark.parametrize(("share", "count"), [(0.0, 1), (0.5, 3), (1.0, 6)])
-def test_so_many_worlds_of_a_batch_are_fresh_clouds(folder, tmp_path, share, count):
-    cycle, _ = cycle_of(folder, tmp_path, fresh_share=share, world_count=6, damage_share=0.0)
+@pytest.mark.parametrize(("fraction", "count"), [(0.0, 1), (0.5, 3), (1.0, 6)])
+def test_so_many_worlds_of_a_batch_are_fresh_clouds(folder, tmp_path, fraction, count):
+    cycle, _ = cycle_of(folder, tmp_path, fresh_share=fraction, world_count=6, damage_share=0.0)
     cycle.pool.worlds.s.add_(0.5)
     cycle.run(0)
     blank = (cycle.batch.start.s == 0.0).flatten(1).all(1)

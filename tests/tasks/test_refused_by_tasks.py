@@ -33,7 +33,7 @@ TINY = replace(SMALL, resolution=12, ssim_weight=0.2)
 
 
 @pytest.mark.parametrize(
-    ("kind", "fields", "message"),
+    ("cls", "fields", "message"),
     [
         (TEXTURE, {"target": ""}, "target must be a built-in texture or a path"),
         (TEXTURE, {"loss": "swd"}, "loss must be a texture loss that exists"),
@@ -77,9 +77,9 @@ TINY = replace(SMALL, resolution=12, ssim_weight=0.2)
         (PLANE, {"targets": ("ring",), "switch_share": 1.5}, "switch_share must be at most 1"),
     ],
 )
-def test_fields_that_are_no_choice(kind, fields, message):
+def test_fields_that_are_no_choice(cls, fields, message):
     with pytest.raises(NPAError, match=message):
-        kind(**fields)
+        cls(**fields)
 
 
 X, S, PLACE = torch.zeros(2, 4, 2), torch.zeros(2, 4, 3), torch.zeros(2, 2)

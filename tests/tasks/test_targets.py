@@ -1,4 +1,4 @@
-"""Targets of points: built-in drawings, and pictures cut out, scaled and read from files."""
+"""Targets of points: drawings, emoji, and pictures cut out, scaled and read from files."""
 
 import io
 import os
@@ -6,11 +6,11 @@ import os
 import numpy as np
 import pytest
 import torch
-from PIL import Image, ImageDraw
+from PIL import Image, ImageDraw, ImageFont
 
-from npa_envs.errors import NPAError
+from npa_envs.errors import MissingDependencyError, NPAError
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
-from npa_envs.tasks.targets import images
+from npa_envs.tasks.targets import emoji, images
 from npa_envs.tasks.targets.images import read_image, resample
 from npa_envs.tasks.targets.points import builtin_targets, load_target, target_from_image
 
@@ -61,11 +61,11 @@ def test_top_of_the_picture_has_high_y_and_its_left_low_x(tmp_path, monkeypatch)
     assert target.name == "corners"
 
 
-def encoded(image, kind="PNG", share=1.0):
+def encoded(image, codec="PNG", fraction=1.0):
     """The first part of a picture's file."""
     buffer = io.BytesIO()
-    image.save(buffer, kind)
-    return buffer.getvalue()[: int(share * buffer.tell())]
+    image.save(buffer, codec)
+    return buffer.getvalue()[: int(fraction * buffer.tell())]
 
 
 LINE = Image.new("RGBA", (1000, 3), (0, 0, 0, 0))
@@ -75,8 +75,8 @@ BAD_PICTURES = {
     "empty": (b"", "empty file"),
     "text": (b"this is no picture, only text", "none of these"),
     **{
-        kind: (encoded(disk_picture("RGB", "white"), kind, 0.5), "truncated or damaged")
-        for kind in ("PNG", "JPEG", "WEBP")
+        codec: (encoded(disk_picture("RGB", "white"), codec, 0.5), "truncated or damaged")
+        for codec in ("PNG", "JPEG", "WEBP")
     },
     "transparent": (
         encoded(Image.new("RGBA", (20, 20), (255, 0, 0, 100))),
@@ -129,8 +129,8 @@ def test_thin_lines_of_a_large_picture_survive():
     draw = ImageDraw.Draw(image)
     for k in range(10):
         draw.line((20, 60 + 120 * k, 1180, 60 + 120 * k), fill=RED, width=1)
-    found = np.asarray(resample(image, 500))[..., 3] >= 128
-    assert 250 < found.sum() < 20000
+    opaque = np.asarray(resample(image, 500))[..., 3] >= 128
+    assert 250 < opaque.sum() < 20000
     assert target_from_image(LINE, name="line", point_count=1000).point_count == 1000
 
 
@@ -224,3 +224,44 @@ def test_unreadable_picture_is_a_clear_error(tmp_path):
     (tmp_path / "secret.png").chmod(0)
     with pytest.raises(NPAError, match="permissions"):
         load_target(tmp_path / "secret.png")
+
+
+def test_emoji_are_distinguished_from_words():
+    for text in ("🦎", "❤", "❤️", "👩‍🚀", "🇨🇭", "1️⃣", "👍🏽", "☀"):
+        assert emoji.is_emoji(text), text
+    for text in ("", "gecko", "gëcko", "1", "守宫", "🦎" * 20):
+        assert not emoji.is_emoji(text), text
+
+
+@pytest.mark.parametrize(
+    ("fonts", "error", "message"),
+    [
+        ([], MissingDependencyError, "apt install fonts-noto-color-emoji"),
+        ([ImageFont.load_default(100)], NPAError, "draws in colour, but none of Aileron does"),
+    ],
+)
+def test_emoji_that_no_font_draws_in_colour_are_clear_errors(monkeypatch, fonts, error, message):
+    monkeypatch.setattr(emoji, "find_emoji_fonts", lambda: fonts)
+    with pytest.raises(error, match=message):
+        load_target("☀")
+
+
+needs_emoji_font = pytest.mark.skipif(
+    not emoji.find_emoji_fonts(), reason="no colour-emoji font is installed"
+)
+
+
+@needs_emoji_font
+def test_lizard_emoji_is_green():
+    target = load_target("🦎")
+    red, green, blue = target.colours.mean(dim=0)
+    assert green > max(red, blue) + 0.1
+    assert abs(target.point_count - 4096) <= 40
+    assert target.name == "🦎"
+
+
+@needs_emoji_font
+def test_joined_emoji_is_one_picture_and_two_emoji_are_a_clear_error():
+    assert load_target("👩‍🚀", point_count=1000).point_count > 900
+    with pytest.raises(NPAError, match="must be one emoji"):
+        load_target("🦎🦎")

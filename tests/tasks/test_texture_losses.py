@@ -122,8 +122,8 @@ def halves(image, count):
 def plain_distance(tables, expected_tables):
     """The sum over sizes of the mean squared difference of sorted columns, over the variance."""
     total = 0.0
-    for found, expected in zip(tables, expected_tables, strict=True):
-        difference = np.sort(found, axis=0) - np.sort(expected, axis=0)
+    for actual, expected in zip(tables, expected_tables, strict=True):
+        difference = np.sort(actual, axis=0) - np.sort(expected, axis=0)
         scale = expected.var(axis=0, ddof=1).mean() + FLOOR
         total += (difference**2).mean() / scale
     return total
@@ -174,8 +174,8 @@ def test_filter_distance_equals_plain_arithmetic():
 def test_patch_transport_equals_plain_arithmetic():
     target, image = drawable("hearts", 24), noise(4, 24, 24)
     total = 0.0
-    for found, expected in zip(pyramid(image[None], 2), pyramid(target[None], 2), strict=True):
-        ours, theirs = (rolled_patches(p[0].numpy(), MATCHED_PATCH) for p in (found, expected))
+    for actual, expected in zip(pyramid(image[None], 2), pyramid(target[None], 2), strict=True):
+        ours, theirs = (rolled_patches(p[0].numpy(), MATCHED_PATCH) for p in (actual, expected))
         costs = ((ours[:, None] - theirs[None]) ** 2).mean(axis=2)
         spread = theirs.var(axis=0).mean() + EVEN
         total += max(costs.min(axis=1).mean(), costs.min(axis=0).mean()) / spread
@@ -282,10 +282,10 @@ def test_a_thinned_out_fine_size_is_like_the_whole(name):
 def test_nothing_is_read_across_the_edges_of_a_target_that_does_not_tile():
     image = noise(3, 16, 16)
     descriptor = PatchDescriptor(image, seed=0)
-    (found,) = descriptor(image[None], wrap=False, thinned=False)
+    (actual,) = descriptor(image[None], wrap=False, thinned=False)
     every = rolled_patches(image.numpy(), 5) @ descriptor.directions[0].numpy()
     inside = every.reshape(16, 16, -1)[2:-2, 2:-2].reshape(144, -1)
-    np.testing.assert_allclose(found[0].numpy(), inside, rtol=0.0, atol=1e-14)
+    np.testing.assert_allclose(actual[0].numpy(), inside, rtol=0.0, atol=1e-14)
 
     edges = image.clone()
     edges[:, 0], edges[:, -1], edges[:, :, 0], edges[:, :, -1] = 9.0, 9.0, -9.0, -9.0
@@ -312,8 +312,8 @@ def test_grey_starts_and_empty_places_have_finite_slopes(name):
     for fields in ({}, {"colour_weight": 0.0, "density_weight": 0.0}):
         task = Texture(replace(SMALL, loss=name, **fields))
         x, s = seeded(task, 2)
-        for places in (x, torch.zeros_like(x)):
-            leaves = places.clone().requires_grad_(), s.clone().requires_grad_()
+        for positions in (x, torch.zeros_like(x)):
+            leaves = positions.clone().requires_grad_(), s.clone().requires_grad_()
             loss, _ = task.loss(*leaves, torch.zeros(x.shape[:2]))
             slopes = torch.autograd.grad(loss, leaves)
             assert all(torch.isfinite(value).all() for value in (loss, *slopes))
@@ -409,10 +409,10 @@ def test_features_are_those_of_the_layers_as_torchvision_counts_them(vgg16, vgg_
         if number in (1, 6, 11, 18, 25):
             expected.append(field.flatten(2).mT)
     features = VGGFeatures(images[0], LossOptions(vgg_weights=vgg_file))
-    found = features(images, wrap=True)
-    shapes = [tuple(f.shape[1:]) for f in found]
+    actual = features(images, wrap=True)
+    shapes = [tuple(f.shape[1:]) for f in actual]
     assert shapes == [(1024, 64), (256, 128), (64, 256), (16, 512), (4, 512)]
-    for a, b in zip(found, expected, strict=True):
+    for a, b in zip(actual, expected, strict=True):
         torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-5)
     # A density stands for all three colours.
     density = images[:, :1]

@@ -44,9 +44,9 @@ def test_all_particles_together_have_the_target_s_mean_density():
 
 def test_eps_is_raised_so_that_particles_see_across_gaps(tmp_path):
     config = TextureConfig(target="hearts", resolution=48, particle_count=64, see_across=True)
-    told = Texture(config).config
-    assert told.eps == pytest.approx(0.3, abs=0.05)
-    assert Texture(told).config == told, "settled once"
+    raised = Texture(config).config
+    assert raised.eps == pytest.approx(0.3, abs=0.05)
+    assert Texture(raised).config == raised, "settled once"
     assert Texture(dataclasses.replace(config, eps=0.5)).config.eps == 0.5, "never lowered"
     assert Texture(dataclasses.replace(config, target="maze")).config.eps == 0.2, "no gaps"
     # The rule's file tells at which it was trained.
@@ -64,11 +64,11 @@ def test_density_is_compared_as_its_tenth_root():
 
 def test_colours_are_compared_as_the_mean_where_particles_overlap():
     task = Texture(dataclasses.replace(SMALL, target="cells", particle_count=24**2))
-    places = lattice(24)
+    positions = lattice(24)
     _, s = worlds_of(task, 1)
-    colour, density = task.texture_losses(places, s)
+    colour, density = task.texture_losses(positions, s)
     # Every particle stands twice where it stood: as before, but twice as dense.
-    twice = task.texture_losses(places.repeat(1, 2, 1), s.repeat(1, 2, 1))
+    twice = task.texture_losses(positions.repeat(1, 2, 1), s.repeat(1, 2, 1))
     torch.testing.assert_close(twice[0], colour, rtol=1e-4, atol=0.0)
     assert float(density) < 1e-4 < float(twice[1])
     half = torch.tensor([0.1, 0.2, 0.3, 0.5])[:, None, None]

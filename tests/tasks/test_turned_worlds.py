@@ -38,9 +38,9 @@ def test_a_turned_target_is_recognised_and_a_plain_loss_sees_another():
     task, plain = task_of(), task_of(equivariant=False)
     for angle in ANGLES:
         x, s = grown(task, angle)
-        found = task.best_turn(x, s)
-        assert found.det().item() == pytest.approx(1.0)
-        back = torch.atan2(found[0, 1, 0], found[0, 0, 0]).item()
+        turn = task.best_turn(x, s)
+        assert turn.det().item() == pytest.approx(1.0)
+        back = torch.atan2(turn[0, 1, 0], turn[0, 0, 0]).item()
         assert abs(math.remainder(back + angle, 2.0 * math.pi)) < math.radians(0.4)
         assert task.metric(x, s).item() < 0.06
         if angle > 0.0:

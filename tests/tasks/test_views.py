@@ -60,9 +60,9 @@ def test_surfaces_are_lit_alike_from_wherever_one_looks():
     light = 0.50 / math.sqrt(0.35**2 + 0.80**2 + 0.50**2)
     for azimuth in (0.0, 50.0):
         cameras = orbit(1, 0.0, DISTANCE, ANGLE, width=32, height=32, azimuth=azimuth)
-        seen = draw_mesh(plate, cameras)[0, 16, 16]
+        pixel = draw_mesh(plate, cameras)[0, 16, 16]
         lit = 0.5 * (AMBIENT + (1 - AMBIENT) * light)
-        assert seen == pytest.approx([lit] * 3 + [1.0], rel=1e-5)
+        assert pixel == pytest.approx([lit] * 3 + [1.0], rel=1e-5)
 
 
 def test_near_triangles_hide_far_ones_and_colours_follow_perspective():
@@ -84,25 +84,25 @@ def test_near_triangles_hide_far_ones_and_colours_follow_perspective():
     mesh = Mesh(floor, np.array([(0, 1, 2), (0, 2, 3)]), shade)
     cameras = orbit(1, 10.0, DISTANCE, ANGLE, width=201, height=201)
     place = torch.tensor([0.0, 0.0, -0.8, 1.0])
-    seen = cameras.world_to_camera[0] @ place
-    row = float(cameras.intrinsics[1] * seen[1] / seen[2] + cameras.intrinsics[3])
+    point = cameras.world_to_camera[0] @ place
+    row = float(cameras.intrinsics[1] * point[1] / point[2] + cameras.intrinsics[3])
     lit = AMBIENT + (1 - AMBIENT) * 0.8 / math.sqrt(0.35**2 + 0.80**2 + 0.50**2)
     assert draw_mesh(mesh, cameras)[0, int(row), 100, 0] / lit == pytest.approx(0.5, abs=0.02)
 
 
 def test_cameras_surround_the_world_evenly_and_held_out_ones_are_others():
     cameras, others = (surrounding_cameras(40, 16, turn=turn) for turn in (0.0, 0.5))
-    places = [
+    positions = [
         -(c.world_to_camera[:, :3, :3].mT @ c.world_to_camera[:, :3, 3:])[..., 0]
         for c in (cameras, others)
     ]
-    assert torch.allclose(places[0].norm(dim=1), torch.tensor(DISTANCE), atol=1e-5)
-    assert float(places[0].mean(0).norm()) < 0.1
-    angles = torch.rad2deg(torch.acos((places[0] @ places[0].T / DISTANCE**2).clamp(-1, 1)))
+    assert torch.allclose(positions[0].norm(dim=1), torch.tensor(DISTANCE), atol=1e-5)
+    assert float(positions[0].mean(0).norm()) < 0.1
+    angles = torch.rad2deg(torch.acos((positions[0] @ positions[0].T / DISTANCE**2).clamp(-1, 1)))
     nearest = (angles + 360.0 * torch.eye(40)).amin(1)
     # 40 points as far apart as can be are some 34 degrees from each other.
     assert 20.0 < float(nearest.min()) <= float(nearest.max()) < 40.0
-    assert float(torch.cdist(places[0], places[1]).min()) > 0.1
+    assert float(torch.cdist(positions[0], positions[1]).min()) > 0.1
 
 
 def test_targets_have_views_to_train_with_and_others_to_measure_by():
@@ -122,16 +122,16 @@ def test_targets_have_views_to_train_with_and_others_to_measure_by():
 
 def test_mesh_files_are_read_with_their_colours(tmp_path):
     trimesh = pytest.importorskip("trimesh")
-    made = ball(colour=(0.2, 0.6, 1.0))
+    mesh = ball(colour=(0.2, 0.6, 1.0))
     path = tmp_path / "ball.ply"
-    options = {"vertex_colors": made.colours, "process": False}
-    trimesh.Trimesh(made.vertices, made.faces, **options).export(path)
+    options = {"vertex_colors": mesh.colours, "process": False}
+    trimesh.Trimesh(mesh.vertices, mesh.faces, **options).export(path)
     read = load_mesh(path)
-    assert read.faces.shape == made.faces.shape
+    assert read.faces.shape == mesh.faces.shape
     assert np.abs(read.colours - (0.2, 0.6, 1.0)).max() <= 1 / 255
     assert np.linalg.norm(read.vertices, axis=1).max() == pytest.approx(RADIUS)
     plain = tmp_path / "plain.stl"
-    trimesh.Trimesh(made.vertices, made.faces, process=False).export(plain)
+    trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(plain)
     assert np.ptp(load_mesh(plain).colours) < 0.01
     (tmp_path / "broken.ply").write_bytes(path.read_bytes()[:200])
     with pytest.raises(NPAError, match=r"cannot be read as a mesh|must hold triangles"):
@@ -150,10 +150,12 @@ def nerf_folder(folder, side=40):
         turn = torch.eye(4, dtype=torch.float64)
         turn[:3, :3] = torch.tensor([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
         poses = turn @ back @ torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
-        seen = dataclasses.replace(cameras, world_to_camera=torch.linalg.inv(turn @ back).float())
+        rotated = dataclasses.replace(
+            cameras, world_to_camera=torch.linalg.inv(turn @ back).float()
+        )
         (folder / split).mkdir(parents=True)
         frames = []
-        for k, picture in enumerate(draw_mesh(turned, seen)):
+        for k, picture in enumerate(draw_mesh(turned, rotated)):
             alpha = picture[..., 3:]
             plain = np.concatenate((picture[..., :3] / alpha.clip(1e-6), alpha), axis=-1)
             pixels = (255 * plain.clip(0, 1)).round().astype(np.uint8)
@@ -186,12 +188,12 @@ def test_nerf_folders_are_turned_upright_and_scaled_into_the_ball(tmp_path):
 
 
 def edited(change, name="transforms_train.json"):
-    def made(folder):
+    def edit(folder):
         content = json.loads((folder / name).read_text(encoding="utf-8"))
         change(content["frames"], content)
         (folder / name).write_text(json.dumps(content), encoding="utf-8")
 
-    return made
+    return edit
 
 
 def emptied(folder):
@@ -231,17 +233,17 @@ def test_similarity_is_the_library_s(side):
     generator = torch.Generator().manual_seed(0)
     base = torch.rand(3, 4, 24, 24, generator=generator)
     wanted = torch.nn.functional.interpolate(base, size=side, mode="bilinear")
-    found = (wanted + 0.8 * torch.rand(wanted.shape, generator=generator)).clamp(0, 1)
-    expected = library.ms_ssim(found, wanted, data_range=1.0, size_average=False)
+    noisy = (wanted + 0.8 * torch.rand(wanted.shape, generator=generator)).clamp(0, 1)
+    expected = library.ms_ssim(noisy, wanted, data_range=1.0, size_average=False)
     similarity = MultiScaleSimilarity(side)
-    values = similarity(found, wanted).mean(dim=1)
+    values = similarity(noisy, wanted).mean(dim=1)
     assert 0.3 < float(values.max()) < 0.99
     # Worst seen 1e-6.
     torch.testing.assert_close(values, expected, rtol=5e-6, atol=0.0)
     assert torch.allclose(similarity(wanted, wanted), torch.ones(3, 4))
     # One picture that several are to be.
-    each = similarity(found, wanted[:1].expand_as(found))
-    torch.testing.assert_close(similarity(found, wanted[0]), each, rtol=1e-6, atol=0.0)
+    each = similarity(noisy, wanted[:1].expand_as(noisy))
+    torch.testing.assert_close(similarity(noisy, wanted[0]), each, rtol=1e-6, atol=0.0)
 
 
 @pytest.mark.parametrize("side", [16, 37, 64])
@@ -250,15 +252,17 @@ def test_similarity_has_finite_gradients_also_where_pictures_are_opposites(side)
     generator = torch.Generator().manual_seed(0)
     wanted, noise = torch.rand(2, side, side, dtype=torch.float64, generator=generator)
     for picture in (1.0 - wanted, wanted.clone(), torch.zeros_like(wanted)):
-        found = picture.requires_grad_()
-        (gradient,) = torch.autograd.grad(similarity(found, wanted), found)
+        noisy = picture.requires_grad_()
+        (gradient,) = torch.autograd.grad(similarity(noisy, wanted), noisy)
         assert bool(gradient.isfinite().all())
-    found = (0.7 * wanted + 0.2 * noise).detach().requires_grad_()
-    way = torch.randn(wanted.shape, dtype=torch.float64, generator=generator)
-    (gradient,) = torch.autograd.grad(similarity(found, wanted), found)
-    ahead, behind = (similarity(found.detach() + h * way, wanted) for h in (1e-6, -1e-6))
+    noisy = (0.7 * wanted + 0.2 * noise).detach().requires_grad_()
+    direction = torch.randn(wanted.shape, dtype=torch.float64, generator=generator)
+    (gradient,) = torch.autograd.grad(similarity(noisy, wanted), noisy)
+    ahead, behind = (similarity(noisy.detach() + h * direction, wanted) for h in (1e-6, -1e-6))
     # Up to 4e-8 was seen, 1.6e-7 over other draws.
-    assert float((gradient * way).sum()) == pytest.approx(float(ahead - behind) / 2e-6, rel=2e-6)
+    assert float((gradient * direction).sum()) == pytest.approx(
+        float(ahead - behind) / 2e-6, rel=2e-6
+    )
 
 
 def test_blur_is_a_gaussian_and_none_at_zero():
@@ -283,12 +287,12 @@ def test_schedules_follow_from_seed_and_iteration_alone():
         return [t.clone() for t in (schedule.index, schedule.backgrounds, schedule.sigma)]
 
     one, other = make(0), make(0)
-    kept = one.index, one.backgrounds, one.sigma
+    before = one.index, one.backgrounds, one.sigma
     history = [drawn(one, k) for k in range(60)]
     for k in (59, 7, 0):
         assert all(torch.equal(a, b) for a, b in zip(history[k], drawn(other, k), strict=True))
     # Graphs that were recorded read the same tensors.
-    assert all(a is b for a, b in zip(kept, (one.index, one.backgrounds, one.sigma), strict=True))
+    assert all(a is b for a, b in zip(before, (one.index, one.backgrounds, one.sigma), strict=True))
     assert [float(history[k][2]) for k in (0, 25, 50, 59)] == [10.0, 5.0, 0.0, 0.0]
     chosen = torch.stack([h[0] for h in history])
     assert all(len(set(row.tolist())) == 4 for row in chosen)

@@ -293,8 +293,8 @@ class RuleTrial:
         losses = worlds.x.new_empty(len(worlds.x))
         for task, index in self._by_task(worlds.x):
             for some in torch.split(index, size):
-                x, s, _, goal = worlds.take(some)
-                losses[some] = task.toward(goal).trial_metric(x, s)
+                chosen = worlds.take(some)
+                losses[some] = task.toward(chosen.goal).trial_metric(chosen)
         return losses
 
     def by_seed(self, losses: Tensor) -> Tensor:
