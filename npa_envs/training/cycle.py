@@ -6,6 +6,7 @@ stay on the device until a line of the log needs them.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from typing import Any
@@ -20,7 +21,7 @@ from npa_envs.tasks.base import Task
 from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.iteration import EagerIteration, GraphedIteration, LossMeter, Rollout
 from npa_envs.training.optimiser import RuleOptimiser
-from npa_envs.training.ranks import Ranks, RunRandomness, registered, restart
+from npa_envs.training.ranks import ALONE, Ranks, RunRandomness, registered, restart
 from npa_envs.world.cuda_graph import GraphedCallable
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness, WorldRandom, uniform_draws
@@ -128,13 +129,13 @@ class TrainingCycle:
         schedule: torch.Generator,
         rollout: Rollout | None = None,
         *,
-        ranks: Ranks | None = None,
+        ranks: Ranks = ALONE,
         by_world: bool = False,
     ) -> None:
         self.task = task.for_rule(rule)
         _check_varied_eps(self.task, rule, config)
         self._config = config
-        self._ranks = ranks = Ranks() if ranks is None else ranks
+        self._ranks = ranks
         whole_pool, whole_batch = config.pool_size, config.world_count
         # By world, each world of the batch draws from its own section of the pool.
         self._section = whole_pool // whole_batch if by_world else whole_pool
@@ -146,6 +147,7 @@ class TrainingCycle:
         pool_indices = ranks.indices(whole_pool, self._section)
         batch_indices = ranks.indices(whole_batch)
         self._pool_indices = pool_indices.to(device)
+        self._batch_indices = batch_indices.to(device)
         seeds = self._seeds(len(pool_indices), self.random.pool)
         self.pool = WorldPool(
             seeds,
@@ -155,12 +157,7 @@ class TrainingCycle:
             total=whole_pool,
         )
         # By world, seeds replace all worlds of the batch in turn, and so come into all sections.
-        first_indices = range(0, whole_batch if by_world else 1, config.fresh_count)
-        self._seeded = [
-            ((batch_indices - first) % whole_batch < config.fresh_count).nonzero()[:, 0].to(device)
-            for first in first_indices
-        ]
-        """Indices of the worlds of a batch that are replaced by seeds, taken in turn."""
+        self._turns = math.ceil(whole_batch / config.fresh_count) if by_world else 1
         count = len(batch_indices)
         batch = seeds.map(lambda value: value[:count])
         graphed = device.type == "cuda" and config.cuda_graph
@@ -181,14 +178,10 @@ class TrainingCycle:
         self._steps = torch.zeros_like(self._index[0])
         self._replaced = torch.zeros_like(self._index[0])
         self._fresh_worlds = batch.map(torch.empty_like)
-        self._draw, self._keep, self._record = (
-            GraphedCallable(function, device, generator, recorded=graphed)
-            for function, generator in (
-                (self._draw_worlds, registered(self.random.worlds)),
-                (self._keep_worlds, None),
-                (self._record_iteration, None),
-            )
-        )
+        graph = functools.partial(GraphedCallable, device=device, recorded=graphed)
+        self._draw = graph(self._draw_worlds, generator=registered(self.random.worlds))
+        self._keep = graph(self._keep_worlds)
+        self._record = graph(self._record_iteration)
 
     def run(self, iteration: int, share: float = 0.0) -> int:
         """Train for one iteration, and return the number of steps of its rollout.
@@ -201,8 +194,10 @@ class TrainingCycle:
         self.task.begin(iteration)
         self._draw()
         if not config.ages and iteration % config.seed_interval == 0:
-            index = self._seeded[iteration // config.seed_interval % len(self._seeded)]
-            batch.start.put_(index, self._fresh_worlds.take(index))
+            turn = iteration // config.seed_interval % self._turns
+            offset = self._batch_indices - turn * config.fresh_count
+            is_fresh = offset % config.world_count < config.fresh_count
+            batch.start.copy_(self._fresh_worlds.where(is_fresh, batch.start))
         batch.run(steps)
         self.meter.begin(iteration + 1, steps)
         self._steps.fill_(steps)

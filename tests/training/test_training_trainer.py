@@ -50,7 +50,7 @@ def test_a_log_without_its_checkpoint_is_not_gone_on_with(tmp_path):
     assert log_of(tmp_path / "run") == before
 
 
-def test_a_loss_that_is_not_finite_is_told_where_its_worlds_cannot_be_written(tmp_path):
+def test_a_loss_that_is_not_finite_is_an_error_where_its_worlds_cannot_be_written(tmp_path):
     (tmp_path / "run" / "diverged.pt").mkdir(parents=True)
     config = circle_config(tmp_path / "run", learning_rate=1e30)
     with pytest.raises(DivergedError, match=r"must stay finite.*not written: .*diverged.pt"):
@@ -246,11 +246,11 @@ def test_worlds_whose_time_is_over_are_damaged_then_and_live_again(tmp_path, sha
         indices, ages = cycle._index.tolist(), cycle._age.tolist()
         before = cycle.pool.worlds.x[indices], cycle.pool.worlds.s[indices]
         for k, (index, age) in enumerate(zip(indices, ages, strict=True)):
-            hurt = not torch.equal(s[k], before[1][k])
+            is_damaged = not torch.equal(s[k], before[1][k])
             if age == 0 and index in seen:
-                begun.append((torch.equal(x[k], before[0][k]), hurt))
+                begun.append((torch.equal(x[k], before[0][k]), is_damaged))
             elif index > 0:  # the first index is damaged each time
-                assert not hurt
+                assert not is_damaged
             seen.add(index)
 
     fields = {"iterations": 150, "pool_size": 16, "world_count": 4, "max_age_range": (8, 32)}
@@ -258,7 +258,7 @@ def test_worlds_whose_time_is_over_are_damaged_then_and_live_again(tmp_path, sha
     config = circle_config(tmp_path, damage_share=1e-6, **fields)
     trainer = trainer_of(config, WatchedTask(), rollout=watching(note))
     trainer.run(progress=False)
-    again = [hurt for kept, hurt in begun if kept]
+    again = [is_damaged for is_same, is_damaged in begun if is_same]
     assert len(begun) > 80
     assert len(again) == pytest.approx(share * len(begun), abs=0.15 * len(begun) * (share > 0))
     # 12 particles, each blanked with probability 0.2: 7 % of the damaged worlds have none.

@@ -215,15 +215,6 @@ def test_rows_and_columns_that_nothing_reads_change_nothing(
     assert torch.equal(plain[1][~changed], s[~changed])
 
 
-def test_worlds_keep_their_precision_under_autocast(device):
-    rule = lively_rule(device, dtype=torch.float32)
-    x, s = random_world(1, 50, 2, 5, dtype=torch.float32, device=device)
-    expected = npa_envs.rollout(rule, x, s, 2, update_prob=1.0)
-    with torch.autocast(device.type, dtype=torch.bfloat16):
-        values = npa_envs.rollout(rule, x, s, 2, update_prob=1.0)
-    assert_same(values, expected)
-
-
 @pytest.mark.parametrize("update_prob", [0.01, 0.05, 0.5, 0.95])
 @pytest.mark.parametrize("particle_total", [16, 512, 32768])
 def test_row_capacity_holds_far_more_than_ever_drawn(particle_total, update_prob):

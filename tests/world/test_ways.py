@@ -69,6 +69,11 @@ def rollout(rule, x, s, **options):
     return [value[-1] for value in worlds] if "keep_every" in options else worlds
 
 
+def under_autocast(rule, x, s, **options):
+    with torch.autocast(x.device.type, dtype=torch.bfloat16):
+        return npa_envs.rollout(rule, x, s, STEPS, **options)
+
+
 WAYS = {
     "recompute": (rollout, {"memory": "recompute"}),
     "minimal": (rollout, {"memory": "minimal"}),
@@ -76,6 +81,7 @@ WAYS = {
     "trajectory": (rollout, {"keep_every": 2}),
     "one by one": (one_by_one, {}),
     "repeated": (repeated, {}),
+    "autocast": (under_autocast, {}),
     "one species": (one_species, {}),
     "recomputed species": (one_species, {"memory": "minimal"}),
 }
