@@ -112,10 +112,8 @@ def train_small(options: DemoOptions, device: torch.device) -> Iterator[str]:
     from npa_envs.tasks.morphogenesis2d import HALF_SEEDS
     from npa_envs.training import RunFolder, override, preset, task_entry, train
 
-    task_name = "morphogenesis2d"
     config = preset(
         "fast",
-        task_name,
         target=options.target,
         seed=options.seed,
         device=options.device,
@@ -128,7 +126,6 @@ def train_small(options: DemoOptions, device: torch.device) -> Iterator[str]:
     start = time.perf_counter()
     result = train(
         config,
-        task_name,
         overwrite=True,
         progress=options.progress,
         max_seconds=options.train_seconds,
@@ -137,7 +134,7 @@ def train_small(options: DemoOptions, device: torch.device) -> Iterator[str]:
         raise KeyboardInterrupt
     yield f"  {result.iteration} iterations in {time.perf_counter() - start:.1f} s"
     # Figures and film have more pixels than the loss.
-    task = task_entry(task_name).make(override(config, resolution=192).task, device)
+    task = task_entry("morphogenesis2d").make(override(config, resolution=192).task, device)
     generator = torch.Generator(device).manual_seed(options.seed + 1)
     worlds = task.seed(1, generator=generator, device=device)
     steps = 4 * config.steps[1]

@@ -13,11 +13,8 @@ from small_digits import write_idx
 from npa_envs.cli import main
 from npa_envs.cli import training_report as report
 from npa_envs.errors import MissingDependencyError
-from npa_envs.measure.quality import evaluate
 from npa_envs.render import world_film
-from npa_envs.rule.files import load_rule
 from npa_envs.training import TASKS
-from npa_envs.training.task_of_rule import task_of_rule
 
 SOLID = {"turntable.gif", "points.ply", "gaussians.ply", "cloud.splat"}
 
@@ -71,7 +68,7 @@ def test_a_run_of_every_task_ends_with_a_card_of_each_rule(task, tmp_path, capsy
     assert {path.name for path in (run / "report").iterdir()} == expected
 
 
-def test_the_figures_of_a_report_are_those_of_the_command_that_it_names(tmp_path, capsys):
+def test_the_figures_of_a_report_are_those_of_the_command_that_it_names(tmp_path):
     words = words_of("morphogenesis2d", tmp_path)
     assert main(words) == 0
     held = json.loads((tmp_path / "run" / "report" / "rule.json").read_text("utf-8"))
@@ -79,13 +76,6 @@ def test_the_figures_of_a_report_are_those_of_the_command_that_it_names(tmp_path
     assert main([*command, "--no-progress", "--json", str(tmp_path / "again.json")]) == 0
     again = json.loads((tmp_path / "again.json").read_text("utf-8"))
     assert again["growth"] == held["growth"]
-    folder = str(tmp_path / "run")  # stands for its rule
-    rule = load_rule(folder)
-    task = task_of_rule(folder, rule, report.torch.device("cpu"))
-    seeds = (report.FIRST_SEED, report.FIRST_SEED + 1)
-    (row,) = evaluate(rule, task.task, checkpoints=(8,), seeds=seeds)
-    assert row.loss == held["growth"][0]["loss"]
-    capsys.readouterr()
 
 
 def test_a_run_writes_no_report_where_none_is_wanted_or_no_iteration_was_done(

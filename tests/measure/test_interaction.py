@@ -176,10 +176,7 @@ def test_rules_that_cannot_share_a_world_are_named_and_a_share_leaves_a_particle
         ({"seed_count": 0}, "seed_count must be at least 1, got 0"),
         ({"distances": (-1.0,)}, r"finite and not negative, got \(-1\.0,\)"),
         ({"ratios": (0.5, 1.0)}, r"ratios and margin must lie in \(0, 1\), got \(0\.5, 1\.0\)"),
-        (
-            {"eps_factors": (math.inf,)},
-            r"eps_factors must be finite and .*inf",
-        ),
+        ({"eps_factors": (math.inf,)}, "eps_factors must be finite and .*inf"),
         ({"margin": 0.0}, r"ratios and margin must lie in \(0, 1\)"),
         ({"distances": ()}, "must have a value each"),
     ],
@@ -189,114 +186,106 @@ def test_wrong_settings_are_clear_errors(options, message):
         settings(**options)
 
 
-def rules_metadata(folder):
-    """What rules that grow the picture in `folder` say in their files."""
-    config = {"target": str(folder / "disk.png"), "particle_count": COUNT, "hidden_dim": 16}
-    config |= SMALL
-    return {"task": "morphogenesis2d", "config": json.dumps(config)}
+# The command
 
 
 def saved(folder, rules, *names, first=0):
     """Write rules that grow the picture in `rules`, and return their files."""
+    config = {"target": str(rules / "disk.png"), "particle_count": COUNT, "hidden_dim": 16}
+    metadata = {"task": "morphogenesis2d", "config": json.dumps(config | SMALL)}
     paths = [folder / f"{name}.safetensors" for name in names]
     for number, path in enumerate(paths, start=first):
-        save_rule(make_rule(number), path, metadata=rules_metadata(rules))
+        save_rule(make_rule(number), path, metadata=metadata)
     return [str(path) for path in paths]
+
+
+@pytest.fixture
+def rules(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("rules")
+    picture = Image.new("RGBA", (16, 16))
+    ImageDraw.Draw(picture).ellipse((3, 3, 12, 12), fill="#30a050")
+    picture.save(folder / "disk.png")
+    saved(folder, folder, "one", "two")
+    return folder
+
+
+def words_of(rules, out, *more):
+    paths = [str(rules / f"{name}.safetensors") for name in ("one", "two")]
+    return ["interact", *paths, "--out", str(out), "--no-progress", *more]
 
 
 def held_in(folder):
     return json.loads((folder / "interactions.json").read_text(encoding="utf-8"))
 
 
-class TestCommand:
-    @pytest.fixture
-    def rules(self, tmp_path_factory):
-        folder = tmp_path_factory.mktemp("rules")
-        picture = Image.new("RGBA", (16, 16))
-        ImageDraw.Draw(picture).ellipse((3, 3, 12, 12), fill="#30a050")
-        picture.save(folder / "disk.png")
-        saved(folder, folder, "one", "two")
-        return folder
-
-    @staticmethod
-    def words(rules, out, *more):
-        paths = [str(rules / f"{name}.safetensors") for name in ("one", "two")]
-        usual = ["--seed-count", "2", "--steps", "6", "--distances", "0", "2"]
-        return ["interact", *paths, *usual, "--out", str(out), "--no-progress", *more]
-
-    def test_every_pair_is_measured_written_and_drawn(self, rules, tmp_path, capsys):
-        assert main(self.words(rules, tmp_path)) == 0
-        held = held_in(tmp_path)
-        pairs = [(found["rule"], found["beside"]) for found in held["rows"]]
-        names = ["one", "two"]
-        assert pairs == [(a, b) for a in names for b in names for _ in range(2)]
-        assert held["settings"]["particle_count"] == COUNT
-        for a, b in {*pairs}:
-            with Image.open(tmp_path / f"{a}-{b}.png") as strip:
-                assert strip.width > strip.height
-        printed = capsys.readouterr().out
-        assert printed.count("\n") >= 9
-        assert "undisturbed" in printed
-
-    def test_mistakes_are_refused_and_nothing_is_written(self, rules, tmp_path, capsys):
-        out, unknown = tmp_path / "out", tmp_path / "unknown.safetensors"
-        save_rule(make_rule(), unknown)
-        one = str(rules / "one.safetensors")
-        for words, message in (
-            (["interact", one, "--no-itself", "--out", str(out)], "more without itself, got one"),
-            (["interact", str(unknown), "--out", str(out)], "does not say what it grows: leave it"),
-        ):
-            assert main(words) == 2
-            assert message in capsys.readouterr().err
-            assert not out.exists()
-
-    def test_a_stopped_run_goes_on_and_ends_as_one_that_was_not(
-        self, rules, tmp_path, capsys, monkeypatch
+def test_mistakes_are_refused_and_nothing_is_written(rules, tmp_path, capsys):
+    out, unknown = tmp_path / "out", tmp_path / "unknown.safetensors"
+    save_rule(make_rule(), unknown)
+    one = str(rules / "one.safetensors")
+    for words, message in (
+        (["interact", one, "--no-itself", "--out", str(out)], "more without itself, got one"),
+        (["interact", str(unknown), "--out", str(out)], "does not say what it grows: leave it"),
     ):
-        whole, parts = tmp_path / "whole", tmp_path / "parts"
-        assert main(self.words(rules, whole)) == 0
-        meet, met = interaction.Encounters.meet, []
+        assert main(words) == 2
+        assert message in capsys.readouterr().err
+        assert not out.exists()
 
-        def stopped(self, first, second):
-            met.append((first.name, second.name))
-            if len(met) == 3:
-                raise KeyboardInterrupt
-            return meet(self, first, second)
 
-        monkeypatch.setattr(interaction.Encounters, "meet", stopped)
-        assert main(self.words(rules, parts)) == 130
-        assert len(held_in(parts)["rows"]) == 4
-        capsys.readouterr()
-        assert main(self.words(rules, parts)) == 0
-        assert "2 of 4 pairs were measured before" in capsys.readouterr().out
-        assert met[3:] == [("two", "one"), ("two", "two")]
-        assert held_in(whole) == held_in(parts)
-        # Results of other settings are not mixed with these.
-        assert main(self.words(rules, parts, "--update-prob", "0.9")) == 2
-        error = capsys.readouterr().err
-        assert "update_prob was None, now 0.9: remove it, or choose another folder with" in error
-        saved(rules, rules, "two", first=5)
-        assert main(self.words(rules, parts)) == 2
-        assert "has figures of other settings: rules was" in capsys.readouterr().err
+def test_every_pair_is_measured_and_a_stopped_run_ends_as_one_that_was_not(
+    rules, tmp_path, capsys, monkeypatch
+):
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    few = ["--seed-count", "2", "--steps", "6", "--distances", "0", "2"]
+    assert main(words_of(rules, whole, *few)) == 0
+    pairs = [(a, b) for a in ("one", "two") for b in ("one", "two")]
+    rows = held_in(whole)["rows"]
+    assert [(row["rule"], row["beside"]) for row in rows[::2]] == pairs
+    assert held_in(whole)["settings"]["particle_count"] == COUNT
+    for a, b in pairs:
+        with Image.open(whole / f"{a}-{b}.png") as strip:
+            assert strip.width > strip.height
+    assert "undisturbed" in capsys.readouterr().out
+    meet, met = interaction.Encounters.meet, []
 
-    def test_pairs_whose_names_look_alike_have_files_of_their_own(self, rules, tmp_path):
-        pytest.importorskip("matplotlib")
-        paths = saved(tmp_path, rules, "p", "p-q", "q-r", "r")
-        words = ["--seed-count", "1", "--steps", "2", "--distances", "0", "--no-itself"]
-        words += ["--eps-factors", "1", "1.5", "--out", str(tmp_path / "out"), "--no-progress"]
-        assert main(["interact", *paths, *words]) == 0
-        names = {path.name for path in (tmp_path / "out").glob("*.png")}
-        # 4 rules, each beside 3 others.
-        assert "interactions.png" in names
-        assert len(names) == 13
-        assert {"p-q-r.png", "p-q-r-2.png"} < names
+    def stopped(self, first, second):
+        met.append((first.name, second.name))
+        if len(met) == 3:
+            raise KeyboardInterrupt
+        return meet(self, first, second)
 
-    def test_quick_leaves_what_was_said(self, rules, tmp_path):
-        paths = [str(rules / f"{name}.safetensors") for name in ("one", "two")]
-        words = ["--quick", "--steps", "3", "--seed-count", "1", "--distances", "0", "0.5", "1"]
-        words += ["--out", str(tmp_path), "--no-progress"]
-        assert main(["interact", *paths, *words]) == 0
-        told = held_in(tmp_path)["settings"]
-        # The last is the default, and was said all the same.
-        assert (told["steps"], told["seeds"], told["distances"]) == (3, [1_000_000], [0, 0.5, 1])
-        assert told["particle_count"] == 512
+    monkeypatch.setattr(interaction.Encounters, "meet", stopped)
+    assert main(words_of(rules, parts, *few)) == 130
+    assert len(held_in(parts)["rows"]) == 4
+    capsys.readouterr()
+    assert main(words_of(rules, parts, *few)) == 0
+    assert "2 of 4 pairs were measured before" in capsys.readouterr().out
+    assert met[3:] == pairs[2:]
+    assert held_in(whole) == held_in(parts)
+    # Results of other settings are not mixed with these.
+    assert main(words_of(rules, parts, *few, "--update-prob", "0.9")) == 2
+    error = capsys.readouterr().err
+    assert "update_prob was None, now 0.9: remove it, or choose another folder with" in error
+    saved(rules, rules, "two", first=5)
+    assert main(words_of(rules, parts, *few)) == 2
+    assert "has figures of other settings: rules was" in capsys.readouterr().err
+
+
+def test_pairs_whose_names_look_alike_have_files_of_their_own(rules, tmp_path):
+    pytest.importorskip("matplotlib")
+    paths = saved(tmp_path, rules, "p", "p-q", "q-r", "r")
+    words = ["--seed-count", "1", "--steps", "2", "--distances", "0", "--no-itself"]
+    words += ["--out", str(tmp_path / "out"), "--no-progress"]
+    assert main(["interact", *paths, *words]) == 0
+    names = {path.name for path in (tmp_path / "out").glob("*.png")}
+    # 4 rules, each beside 3 others, and the heat map.
+    assert len(names) == 13
+    assert {"p-q-r.png", "p-q-r-2.png", "interactions.png"} < names
+
+
+def test_quick_leaves_what_was_said(rules, tmp_path):
+    words = ["--quick", "--steps", "3", "--seed-count", "1", "--distances", "0", "0.5", "1"]
+    assert main(words_of(rules, tmp_path, *words)) == 0
+    told = held_in(tmp_path)["settings"]
+    # The last is the default, and was said all the same.
+    assert (told["steps"], told["seeds"], told["distances"]) == (3, [1_000_000], [0, 0.5, 1])
+    assert told["particle_count"] == 512

@@ -297,8 +297,9 @@ def run_check(check: Check, session: CheckSession) -> CheckResult:
         note = f"{type(error).__name__}: {' '.join(str(error).split())}"
         result = CheckResult(verdict="fail", note=note)
     seconds = time.perf_counter() - begin
-    about = {"name": check.name, "expected": check.expected, "weights": weights}
-    return replace(result, seconds=seconds, **about)
+    return replace(
+        result, name=check.name, expected=check.expected, seconds=seconds, weights=weights
+    )
 
 
 def heat_maps(record: StressRecord) -> dict[str, bytes]:
