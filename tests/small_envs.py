@@ -95,6 +95,7 @@ def assert_batch_of_singles(
         for k, env in enumerate(singles):
             if over[k] and mode == "next-step":
                 assert_same(world_of(observations, k), env.reset()[0])
+                assert (rewards[k], terminations[k], truncations[k]) == (0.0, False, False)
                 over[k] = False
                 continue
             observation, reward_k, terminated, truncated, info = env.step(action[k])

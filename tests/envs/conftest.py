@@ -21,9 +21,3 @@ def coded(tmp_path_factory):
     path = tmp_path_factory.mktemp("rule") / "rule.safetensors"
     npa_envs.save_rule(rule, path)
     return {"rule": str(path), "state_dim": 8, "eps0": 0.3}
-
-
-@pytest.fixture
-def where(device):
-    """Keywords that put worlds on the device of the numerical tests."""
-    return {"device": str(device)}

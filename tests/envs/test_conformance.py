@@ -1,4 +1,4 @@
-"""What holds for every environment of one species, alone and batched: one class over all ids."""
+"""What holds for every environment, alone and batched: one class over all ids."""
 
 import json
 import pickle
@@ -6,6 +6,7 @@ import re
 import warnings
 from pathlib import Path
 
+import crowds
 import gymnasium
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from gymnasium.utils.env_checker import check_env
 from refusals import refused
 from small_envs import IDS, SPECIAL, assert_batch_of_singles, assert_same, begun
 
+from npa_envs.envs import multispecies_v0
 from npa_envs.registration import GARDENS, SIZES
 from npa_envs.registration import SMALL as SMALL_GARDENS
 
@@ -38,13 +40,39 @@ SIZED = {row.id: (row.id, {"seed_pool": 2, "grow_steps": 4}) for row in SMALL_GA
 }
 """Small forms as they are registered; large ones with few particles."""
 
+SPECIES = "species"
+"""The case of several species, one of which is removed in an episode."""
+
 MODES = ("same-step", "next-step")
 every_case = pytest.mark.parametrize("case", CASES)
+every_case_and_species = pytest.mark.parametrize("case", [*CASES, SPECIES])
+
+
+def leaves(result):
+    """Return all arrays and tensors of what a step or a reset returned."""
+    if isinstance(result, dict):
+        result = result.values()
+    elif isinstance(result, np.ndarray | torch.Tensor):
+        return [result]
+    elif not isinstance(result, tuple):
+        return []
+    return [leaf for part in result for leaf in leaves(part)]
+
+
+def losses(infos):
+    """Return the losses of worlds, summed over agents, [B]."""
+    infos = [infos] if "loss" in infos else infos.values()
+    return np.sum([np.asarray(info["loss"]) for info in infos], axis=0)
 
 
 class TestEveryEnvironment:
     @pytest.fixture(autouse=True)
     def _case(self, case, coded):
+        self.is_species = case == SPECIES
+        if self.is_species:
+            self.name, deaths = SPECIES, {"species_count": 3, "deaths": ((1, 2),)}
+            self.given = crowds.small("co_morphogenesis", position_noise=0.01, **deaths)
+            return
         self.name, self.given = (CASES | SIZED)[case]
         if self.name == SHAPESHIFTER:
             self.given = self.given | coded
@@ -52,17 +80,25 @@ class TestEveryEnvironment:
             self.given = small_envs.small(self.name, **self.given)
 
     def make(self, **keywords):
-        return gymnasium.make(self.name, **(self.given | keywords))
+        keywords = self.given | keywords
+        if self.is_species:
+            keywords["max_cycles"] = keywords.pop("max_episode_steps", 6)
+            return multispecies_v0.parallel_env(**keywords)
+        return gymnasium.make(self.name, **keywords)
 
     def make_vec(self, world_count, **keywords):
-        return gymnasium.make_vec(
-            self.name,
-            world_count,
-            vectorization_mode="vector_entry_point",
-            **(self.given | keywords),
-        )
+        keywords = self.given | keywords
+        if self.is_species:
+            keywords["max_cycles"] = keywords.pop("max_episode_steps", 6)
+            return multispecies_v0.batched(world_count=world_count, **keywords)
+        form = {"vectorization_mode": "vector_entry_point"}
+        return gymnasium.make_vec(self.name, world_count, **form, **keywords)
 
     def sampled(self, env, count, seed=0):
+        """Return actions; those of species are of all that are live now."""
+        if self.is_species:
+            generator = np.random.default_rng(seed)
+            return [crowds.drawn(env, generator) for _ in range(count)]
         env.action_space.seed(seed)
         return [env.action_space.sample() for _ in range(count)]
 
@@ -145,21 +181,58 @@ class TestEveryEnvironment:
         batched = pickle.loads(pickle.dumps(self.make_vec(2).spec))
         assert gymnasium.make_vec(batched).num_envs == 2
 
-    @every_case
+    @every_case_and_species
     def test_it_survives_pickling_in_the_midst_of_an_episode(self, device):
-        given = {"device": str(device), "max_episode_steps": 5}
-        kept = [self.make(**given).unwrapped]
-        kept += [self.make_vec(2, copy=copy, **given) for copy in (True, False)]
-        begun(*kept)
-        actions = [self.sampled(env, 7) for env in kept]
-        for env, given in zip(kept, actions, strict=True):
-            for action in given[:3]:
-                env.step(action)
-        again = pickle.loads(pickle.dumps(kept))
-        # Episodes of the batches end meanwhile.
-        for env, copied, given in zip(kept, again, actions, strict=True):
-            for action in given[3:]:
+        keywords = {"device": str(device), "max_episode_steps": 5}
+        envs = [self.make(**keywords), self.make_vec(2, **keywords)]
+        if not self.is_species:
+            envs.append(self.make_vec(2, copy=False, **keywords))
+        envs = [getattr(env, "unwrapped", env) for env in begun(*envs)]
+        for step in range(3):
+            for env in envs:
+                env.step(self.sampled(env, 1, step)[0])
+        # Episodes end meanwhile.
+        for env, copied in zip(envs, pickle.loads(pickle.dumps(envs)), strict=True):
+            for step in range(4):
+                action = self.sampled(env, 1, step)[0]
                 assert_same(env.step(action), copied.step(action))
+            assert_same(env.reset(), copied.reset())
+
+    @pytest.mark.parametrize(
+        ("case", "mode"),
+        [(case, "same-step") for case in [*CASES, SPECIES] if "Shepherd" not in case]
+        + [(name, "next-step") for name in IDS]
+        + [(case, "disabled") for case in [*IDS, SPECIES]],
+    )
+    def test_tensors_and_shared_arrays_are_as_new_arrays_which_are_the_callers(self, mode, device):
+        """What was returned stays as it is, and what its owner changes has no effect."""
+        steps = 30 if mode == "disabled" else 3
+        keywords = {"autoreset_mode": mode, "max_episode_steps": steps, "device": str(device)}
+        keywords |= {"reward": "particle"} if self.name in IDS else {}
+        arrays, changed = (self.make_vec(3, **keywords) for _ in range(2))
+        tensors = self.make_vec(3, output="torch", **keywords)
+        shared = changed if self.is_species else self.make_vec(3, copy=False, **keywords)
+        calls = [lambda env: env.reset(seed=0)]
+        calls += [lambda env, a=a: env.step(a) for a in self.sampled(arrays, 8)]
+        calls.append(lambda env: env.reset(options={"reset_mask": np.array([True, False, True])}))
+        results, pickled, first = [], [], None
+        for call in calls:
+            returned = call(arrays), call(tensors)
+            results.append(returned)
+            pickled.append(pickle.dumps(returned))
+            assert_same(*returned)
+            for values in (*returned[1][:-1], losses):
+                assert all(leaf.device.type == device.type for leaf in leaves(values))
+            if not self.is_species:
+                result = call(shared)
+                assert_same(returned[0], result)
+                first = result[0] if first is None else first
+                assert self.name not in IDS or np.shares_memory(first, result[0])
+            result = call(changed)
+            assert_same(returned[0], result)
+            for leaf in leaves(result):
+                leaf[...] = 0
+        assert_same(results, [pickle.loads(then) for then in pickled])
 
     @every_case
     def test_info_has_the_keys_that_the_page_lists(self):
@@ -174,34 +247,34 @@ class TestEveryEnvironment:
         assert sorted(key for key, when in listed if "reset" in when) == sorted(at_reset)
         assert sorted(key for key, _ in listed) == sorted(at_step)
 
-    @every_case
+    @every_case_and_species
     def test_disabled_mode_resets_only_the_worlds_of_the_mask(self):
-        given = {"autoreset_mode": "disabled", "output": "torch"}
-        ended = begun(self.make_vec(4, max_episode_steps=3, **given))
-        envs, others = begun(*(self.make_vec(4, **given) for _ in range(2)))
+        keywords = {"autoreset_mode": "disabled", "output": "torch"}
+        ended = begun(self.make_vec(4, max_episode_steps=3, **keywords))
+        envs, others = begun(*(self.make_vec(4, **keywords) for _ in range(2)))
         actions = self.sampled(envs, 6)
         for action in actions[:3]:
-            *_, truncated, _ = ended.step(action)
+            ended.step(action)
             envs.step(action)
-            _, _, _, _, before = others.step(action)
-        assert truncated.all()
+            *_, before = others.step(action)
         mask = np.array([True, False, False, True])
         _, fresh = self.make_vec(4).reset(seed=0)
         for batch in (ended, envs):
             _, infos = batch.reset(options={"reset_mask": torch.from_numpy(mask)})
-            assert (np.asarray(infos["loss"] == before["loss"]) != mask).all()
-            assert np.asarray(infos["_loss"]).tolist() == mask.tolist()
+            assert self.is_species or np.asarray(infos["_loss"]).tolist() == mask.tolist()
+        assert ((losses(infos) == losses(before)) != mask).all()
         refused(r"the episodes of worlds \[1, 2\] are over", ended.step, actions[3])
         # Where the others may go on, they go on as if nothing had happened to their neighbours.
         for action in actions[3:]:
-            left, right = envs.step(action)[4]["loss"], others.step(action)[4]["loss"]
-            assert (np.asarray(left == right) != mask).all()
+            left, right = losses(envs.step(action)[4]), losses(others.step(action)[4])
+            assert ((left == right) != mask).all()
         _, again = envs.reset(seed=0, options={"reset_mask": mask})
-        assert ((np.asarray(again["loss"]) == fresh["loss"]) == mask).all()
+        assert ((losses(again) == losses(fresh)) == mask).all()
 
     @pytest.mark.parametrize(
         ("case", "style"),
-        [(case, "particles") for case in CASES]
+        [(case, "particles") for case in [*CASES, SPECIES]]
+        + [(SPECIES, "species")]
         + [(name, style) for name in IDS for style in ("density", "states")],
     )
     def test_pictures_show_each_world(self, style):

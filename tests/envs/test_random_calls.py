@@ -1,16 +1,15 @@
 """Random calls, right and wrong, of every environment in every form, by a model of what they owe.
 
 What is refused leaves the worlds as they were; what is not keeps the documented types, shapes,
-limits, rewards, episode ends and reasons.
+limits, rewards, episode ends and reasons. Many worlds have no model of their own, as they equal
+single ones in other tests.
 """
 
 from __future__ import annotations
 
-import copy
 import os
 import random
 import resource
-import time
 from typing import Any, ClassVar
 
 import gymnasium
@@ -19,7 +18,6 @@ import pytest
 import torch
 from crowds import few, small
 from fuzz_values import wrong
-from gymnasium.vector import AutoresetMode
 from small_envs import IDS, assert_same
 from small_envs import small as small_keywords
 
@@ -52,19 +50,51 @@ def limited_memory():
 def world_fields(draw: random.Random) -> dict[str, Any]:
     """Keywords that all environments have; some make worlds diverge within a few steps."""
     return {
-        "particle_count": draw.choice((2, 3, 5, 12)),
+        "particle_count": draw.choice((3, 5, 12)),
         "eps": draw.choice((0.1, 0.3, 1.0)),
         "alpha": draw.choice((0.5, 0.5, 20.0)),
         "state_scale": draw.choice((1.0, 1.0, 40.0)),
         "update_prob": draw.choice((0.5, 1.0)),
         "position_noise": draw.choice((0.0, 0.05)),
+        "position_limit": draw.choice((4.0, 1.5)),
         "moment_inverse": draw.choice(("threshold", "smooth")),
         "observation_limit": draw.choice((64.0, 3.0)),
         "boundary": draw.choice(("open", "open", "periodic", "reflecting")),
+        "on_divergence": draw.choice(("terminate", "terminate", "raise", "ignore")),
         "output": draw.choice(("numpy", "torch")),
         "render_mode": draw.choice((None, "rgb_array")),
         "render_size": 8,
     }
+
+
+def one_species_fields(name: str, draw: random.Random) -> dict[str, Any]:
+    fields = small_keywords(name) | world_fields(draw)
+    fields |= {
+        "reward": draw.choice(("dense", "dense", "sparse", "particle", "marginal")),
+        "seed_pool": draw.choice((0, 0, 2)),
+        "success_loss": draw.choice((None, 0.0, 0.2)),
+        "max_episode_steps": draw.choice((1, 3, 8)),
+    }
+    if draw.random() < 0.2:
+        fields["on_divergence"] = "reset"
+    if name == "npa/Pictures2D-v0":
+        fields |= {"observe_target": draw.random() < 0.5}
+        fields |= {"split": draw.choice(("train", "train", "test"))}
+    return fields
+
+
+def species_fields(task: str, draw: random.Random, *, by_particle: bool) -> dict[str, Any]:
+    fields = (few if by_particle else small)(task) | world_fields(draw)
+    fields |= {
+        "species_count": draw.choice((2, 2, 3)),
+        "max_cycles": draw.choice((1, 3, 8)),
+        "reward": "individual" if task == "invasion" else draw.choice(("individual", "team")),
+        "perception": draw.choice(("shared", "per_species")),
+        "deaths": draw.choice(((), (), ((1, 2),), ((0, 1), (1, 3)))),
+    }
+    if task == "invasion":
+        fields |= {"opponent": draw.choice((None, "random"))}
+    return fields
 
 
 def actions_of(draw: random.Random, shape: tuple[int, ...]) -> Any:
@@ -81,39 +111,44 @@ def host(value: Any) -> np.ndarray:
     return value.cpu().numpy() if isinstance(value, torch.Tensor) else np.asarray(value)
 
 
-def check_array(value: Any, shape: tuple[int, ...], limit: float, output: str) -> None:
-    """Check what particles perceive."""
-    assert type(value) is (torch.Tensor if output == "torch" else np.ndarray)
-    found = host(value)
-    assert found.shape == shape
-    assert found.dtype == np.float32
-    assert np.abs(found).max(initial=0.0) <= limit  # NaN fails as well.
+def by_agent(value: Any) -> dict[str, Any]:
+    """Return arrays or spaces by agent; those of one species have no agents."""
+    return value if isinstance(value, dict) else {"": value}
+
+
+def checked_loss(info: Any) -> np.ndarray:
+    loss = host(info["loss"])
+    assert np.isfinite(loss).all()
+    return loss
 
 
 class Played:
     """An environment that is called at random, and what is known of its worlds."""
 
-    env: Any
-    worlds: int
-    fields: dict[str, Any]
-    started = False
-    often: dict[str, int]
+    often: ClassVar = {"step": 12, "reset": 3, "place": 2, "render": 1}
     """How often each method is called."""
-    lost: str
-    """What an error says where numbers ran away."""
+
+    def __init__(self, env: Any, fields: dict[str, Any]) -> None:
+        self.env, self.fields = env, fields
+        self.inner: Any = getattr(env, "unwrapped", env)
+        self.started = False
+        observations = getattr(env, "observation_spaces", None) or env.observation_space
+        actions = getattr(env, "action_spaces", None) or env.action_space
+        self.observation_shapes = {a: space.shape for a, space in by_agent(observations).items()}
+        self.action_shapes = {a: space.shape for a, space in by_agent(actions).items()}
 
     def call(self, draw: random.Random) -> None:
         """Make a call; check what it does."""
-        (kind,) = draw.choices(list(self.often), list(self.often.values()))
-        getattr(self, kind)(draw)
+        (method,) = draw.choices(list(self.often), list(self.often.values()))
+        getattr(self, method)(draw)
 
     def refused(self, call: Any) -> Any:
-        """Return what a call gives, or None where it is refused: the worlds are as they were."""
+        """Return what a call returns, or None where it is refused: the worlds are as before."""
         before = self.snapshot() if self.started else ()
         try:
             return call()
         except DivergedError as error:
-            if self.lost in str(error):
+            if "must be finite" not in str(error):
                 assert self.fields["on_divergence"] == "raise"
                 self.settle()
                 return None
@@ -123,7 +158,65 @@ class Played:
         return None
 
     def settle(self) -> None:
-        self.expect_reset(self.env.reset(seed=5), np.ones(self.worlds, bool))
+        self.expect_reset(*self.env.reset(seed=5))
+
+    def snapshot(self) -> Any:
+        return self.inner.particles()
+
+    def reset(self, draw: random.Random) -> None:
+        seed = draw.choice((draw.randrange(99), None, 3, np.int64(7), np.uint8(4), 2**31))
+        if draw.random() < 0.25:
+            seed = wrong(draw, "seed", 3)
+        options, is_known = self.options(draw)
+        result = self.refused(lambda: self.env.reset(seed=seed, options=options))
+        if result is not None:
+            assert not options or is_known, "unknown options were taken without a word"
+            self.expect_reset(*result)
+
+    def options(self, draw: random.Random) -> tuple[Any, bool]:
+        """Return options of `reset`, and whether they are known."""
+        return (wrong(draw, "options", None), False) if draw.random() < 0.2 else (None, True)
+
+    def expect_reset(self, observation: Any, info: Any) -> None:
+        self.started = True
+        self.check_observation(observation)
+
+    def step(self, draw: random.Random) -> None:
+        actions = self.actions(draw)
+        result = self.refused(lambda: self.env.step(actions))
+        if result is not None:
+            assert self.started, "a step before the first reset"
+            self.check_observation(result[0])
+            self.expect_step(*result[1:])
+
+    def actions(self, draw: random.Random) -> Any:
+        if "" in self.action_shapes:
+            return actions_of(draw, self.action_shapes[""])
+        self.acted, actions = self.env.agents, {}
+        for agent in self.acted:
+            shape = self.action_shapes[agent]
+            # One wrong action among many is wrong enough.
+            is_drawn = draw.random() < 2.0 / max(2, len(self.acted))
+            actions[agent] = actions_of(draw, shape) if is_drawn else torch.zeros(shape)
+        if draw.random() < 0.1:
+            changes = (lambda a: a | {"nobody": 1}, lambda a: dict(list(a.items())[1:]), list)
+            return draw.choice(changes)(actions)
+        return actions
+
+    def place(self, draw: random.Random) -> None:
+        """Put particles into worlds, which is no part of Gymnasium's or PettingZoo's interface."""
+        x, s = self.inner.particles() if self.started else (torch.zeros(1, 2), torch.zeros(1, 16))
+        particles = {"x": x.clamp(-0.5, 0.5), "s": s.clamp(-0.5, 0.5)}
+        if draw.random() < 0.4:
+            name = draw.choice(("x", "s"))
+            particles[name] = wrong(draw, name, particles[name])
+        result = self.refused(lambda: self.inner.place_particles(**particles))
+        if result is not None:
+            self.check_observation(result)
+            self.expect_place()
+
+    def expect_place(self) -> None:
+        """Note losses, which placing changes without a reward."""
 
     def render(self, draw: random.Random) -> None:
         pictures = self.refused(self.env.render)
@@ -132,386 +225,209 @@ class Played:
                 assert self.fields["render_mode"] == "rgb_array"
                 assert (picture.shape, picture.dtype) == ((8, 8, 3), np.uint8)
 
+    def check_observation(self, observation: Any) -> None:
+        for agent, rows in by_agent(observation).items():
+            assert type(rows) is (torch.Tensor if self.fields["output"] == "torch" else np.ndarray)
+            array = host(rows)
+            assert array.shape == self.observation_shapes[agent]
+            assert array.dtype == np.float32
+            # NaN fails as well.
+            assert np.abs(array).max(initial=0.0) <= self.fields["observation_limit"]
 
-class OneSpecies(Played):
-    """An environment of one species, "single" or "vector"."""
 
-    often: ClassVar = {"step": 12, "reset": 3, "place": 2, "render": 1}
-    lost = "numbers must stay"
+class OneWorld(Played):
+    """A world of one species."""
 
-    def __init__(self, name: str, form: str, draw: random.Random) -> None:
-        self.single = form == "single"
-        fields = small_keywords(name) | world_fields(draw)
-        fields |= {
-            "position_limit": draw.choice((4.0, 1.5)),
-            "reward": draw.choice(("dense", "dense", "sparse", "particle", "marginal")),
-            "on_divergence": draw.choice(("terminate", "terminate", "reset", "raise", "ignore")),
-            "seed_pool": draw.choice((0, 0, 2)),
-            "success_loss": draw.choice((None, 0.0, 0.2)),
-            "max_episode_steps": draw.choice((1, 3, 8)),
-        }
-        if name == "npa/Pictures2D-v0":
-            fields |= {"observe_target": draw.random() < 0.5}
-            fields |= {"split": draw.choice(("train", "train", "test"))}
-        self.worlds, self.mode = 1, None
-        checked = self.single and draw.random() < 0.5
-        if self.single:
-            self.env = gymnasium.make(name, disable_env_checker=not checked, **fields)
-        else:
-            self.worlds = draw.choice((1, 2, 3))
-            fields |= {"copy": draw.random() < 0.7}
-            fields |= {"autoreset_mode": draw.choice(("same-step", "next-step", "disabled"))}
-            self.env = gymnasium.make_vec(name, self.worlds, "vector_entry_point", **fields)
-            self.mode = self.env.metadata["autoreset_mode"]
-        self.fields = fields
-        self.steps = np.zeros(self.worlds, int)
-        """Steps of each world's episode."""
-        self.loss = np.zeros(self.worlds, np.float32)
-        self.over = np.zeros(self.worlds, bool)
-        self.was_lost = np.zeros(self.worlds, bool)
-        """Whether the last step ended the episode by divergence, and no reset followed."""
-        if checked:
-            # The checker of Gymnasium 1.4 fails itself after a first reset that was refused.
-            self.settle()
+    @classmethod
+    def make(cls, name: str, draw: random.Random) -> Played:
+        fields = one_species_fields(name, draw)
+        return cls(gymnasium.make(name, disable_env_checker=True, **fields), fields)
 
-    def snapshot(self) -> Any:
-        return self.env.unwrapped.particles()
+    def expect_reset(self, observation: Any, info: Any) -> None:
+        super().expect_reset(observation, info)
+        assert "reason" not in info
+        self.steps, self.is_over = 0, False
+        self.loss = self.first_loss = np.float32(checked_loss(info))
 
-    def reset(self, draw: random.Random) -> None:
-        seed, options, chosen = draw.randrange(99), draw.choice((None, None, {})), None
-        if draw.random() < 0.3:
-            seed = draw.choice((None, np.int64(3), np.uint8(4), 2**31))
-        if not self.single and draw.random() < 0.4:
-            chosen = np.array([draw.random() < 0.6 for _ in range(self.worlds)])
-            if chosen.any():
-                options = {"reset_mask": chosen}
-                seed = draw.choice((seed, None))
-            else:
-                chosen = None
-        if draw.random() < 0.25:
-            seed = wrong(draw, "seed", 3)
-        if draw.random() < 0.2:
-            options, chosen = wrong(draw, "options", None), None
-        given = copy.copy(options)
-        found = self.refused(lambda: self.env.reset(seed=seed, options=given))
-        if found is None:
-            return
-        assert not options or chosen is not None, "unknown options were taken without a word"
-        self.expect_reset(found, np.ones(self.worlds, bool) if chosen is None else chosen)
-
-    def expect_reset(self, found: Any, chosen: np.ndarray) -> None:
-        observation, info = found
-        self.started = True
-        self.check_observation(observation)
-        self.steps[chosen], self.over[chosen], self.was_lost[chosen] = 0, False, False
-        for k in np.flatnonzero(chosen):
-            told = self.told(info, k)
-            assert "reason" not in told
-            self.loss[k] = self.checked_loss(told)
-
-    def step(self, draw: random.Random) -> None:
-        action = actions_of(draw, self.env.action_space.shape)
-        found = self.refused(lambda: self.env.step(action))
-        if found is None:
-            return
-        assert self.started, "a step before the first reset"
-        observation, rewards, terminated, truncated, infos = found
-        self.check_observation(observation)
-        if self.single:
-            assert [type(v) for v in (rewards, terminated, truncated)] == [float, bool, bool]
-            rewards, terminated, truncated = ([v] for v in (rewards, terminated, truncated))
-        else:
-            kind = np.float32 if self.fields["output"] == "torch" else np.float64
-            arrays = [host(v) for v in (rewards, terminated, truncated)]
-            assert [a.dtype for a in arrays] == [kind, bool, bool]
-            assert all(a.shape == (self.worlds,) for a in arrays)
-            rewards, terminated, truncated = arrays
-        again = self.over.copy() if self.mode is AutoresetMode.NEXT_STEP else [False] * self.worlds
-        for k in range(self.worlds):
-            self.expect_step(k, rewards[k], terminated[k], truncated[k], infos, again[k])
-
-    def expect_step(
-        self, k: int, reward: Any, terminated: Any, truncated: Any, infos: Any, again: Any
-    ) -> None:
-        """Check what a step brought world k."""
-        told = self.told(infos, k)
-        if again:
-            assert (reward, terminated, truncated) == (0.0, False, False)
-            self.steps[k], self.over[k], self.loss[k] = 0, False, self.checked_loss(told)
-            return
-        ended = bool(terminated or truncated)
-        following = told
-        if ended and self.mode is AutoresetMode.SAME_STEP:
-            final = infos["final_obs"][k]
-            check_array(final, host(final).shape, self.limit, self.fields["output"])
-            told = self.told(infos["final_info"], k)
-        self.steps[k] += 1
+    def expect_step(self, reward: Any, terminated: Any, truncated: Any, info: Any) -> None:
+        assert [type(v) for v in (reward, terminated, truncated)] == [float, bool, bool]
+        self.steps += 1
         limit, way = self.fields["max_episode_steps"], self.fields["on_divergence"]
-        loss = self.checked_loss(told)
-        success, diverged = bool(told["success"]), bool(told["diverged"])
-        lost = diverged and way == "terminate"
-        assert bool(truncated) == (self.steps[k] >= limit)
-        assert bool(terminated) == (success or lost)
-        expected = "diverged" if lost else "success" if success else "time limit"
-        assert told.get("reason") == (expected if ended else None)
+        success, diverged, loss = info["success"], info["diverged"], checked_loss(info)
+        ends_by_divergence = diverged and way == "terminate"
+        assert truncated == (self.steps >= limit)
+        assert terminated == (success or ends_by_divergence)
+        reason = "diverged" if ends_by_divergence else "success" if success else "time limit"
+        assert info.get("reason") == (reason if terminated or truncated else None)
         assert np.isfinite(reward)
         if not (diverged and way == "reset"):
-            self.check_reward(k, np.float32(reward), loss, told, diverged, terminated)
-        self.loss[k] = loss
-        self.over[k], self.was_lost[k] = ended, lost and self.single
-        if ended and self.mode is AutoresetMode.SAME_STEP:
-            self.steps[k], self.over[k] = 0, False
-            self.loss[k] = self.checked_loss(following)
+            self.check_reward(np.float32(reward), np.float32(loss), info, terminated)
+        self.loss, self.is_over = np.float32(loss), ends_by_divergence
 
-    def check_reward(
-        self, k: int, reward: Any, loss: Any, told: Any, diverged: bool, terminated: Any
-    ) -> None:
-        fell = self.loss[k] - loss
+    def check_reward(self, reward: Any, loss: Any, info: Any, terminated: bool) -> None:
         if self.fields["reward"] == "sparse":
-            last = terminated or self.steps[k] == self.fields["max_episode_steps"]
-            assert reward == (-loss if last else 0.0)
+            is_last = terminated or self.steps == self.fields["max_episode_steps"]
+            assert reward == (-loss if is_last else 0.0)
         else:
-            assert reward == fell
-        if not diverged:
-            parts = [v for name, v in told.items() if name.startswith("loss_")]
+            assert reward == self.loss - loss
+            falls = [v for name, v in info.items() if name.startswith("reward_")]
+            size = max(abs(self.loss), abs(loss))
+            assert info["diverged"] or self.is_over or abs(sum(falls) - reward) <= 1e-5 * size
+        if info["diverged"]:
+            assert self.fields["on_divergence"] == "ignore" or loss >= self.first_loss
+        else:
+            parts = [v for name, v in info.items() if name.startswith("loss_")]
             assert np.isclose(loss, sum(parts), rtol=1e-5, atol=1e-6)
         # Rewards of particles add up as long as the episode lasts.
-        if self.fields["reward"] in ("particle", "marginal") and not self.was_lost[k]:
-            own = host(told["particle_reward"])
+        if self.fields["reward"] in ("particle", "marginal") and not self.is_over:
+            own = host(info["particle_reward"])
             assert own.shape == (self.fields["particle_count"],)
-            size = max(abs(self.loss[k]), abs(loss), np.abs(own).max())
+            size = max(abs(self.loss), abs(loss), np.abs(own).max())
             assert abs(own.mean(dtype=np.float64) - reward) <= 1e-4 * size + 1e-6
 
-    def place(self, draw: random.Random) -> None:
-        """Put particles into worlds, which is no part of Gymnasium's interface."""
-        env, lead = self.env.unwrapped, self.env.observation_space.shape[:-1]
-        physics = env.worlds.physics
-        given = {
-            "x": torch.rand(*lead, physics.space_dim) - 0.5,
-            "s": torch.rand(*lead, physics.state_dim) - 0.5,
-        }
-        if draw.random() < 0.4:
-            name = draw.choice(("x", "s"))
-            given[name] = wrong(draw, name, given[name])
-        if self.refused(lambda: env.place_particles(**given)) is not None:
-            self.loss[:], self.was_lost[:] = host(env.worlds.loss), False
-            assert np.isfinite(self.loss).all()
-
-    @property
-    def limit(self) -> float:
-        return self.fields["observation_limit"]
-
-    def check_observation(self, observation: Any) -> None:
-        shape = self.env.observation_space.shape
-        check_array(observation, shape, self.limit, self.fields["output"])
-
-    def told(self, infos: Any, k: int) -> dict[str, Any]:
-        if self.single:
-            return infos
-        names = [name for name in infos if not name.startswith(("_", "final_"))]
-        return {name: infos[name][k] for name in names if bool(infos[f"_{name}"][k])}
-
-    def checked_loss(self, told: Any) -> np.float32:
-        assert np.isfinite(float(told["loss"]))
-        return np.float32(float(told["loss"]))
+    def expect_place(self) -> None:
+        self.loss, self.is_over = np.float32(self.inner.worlds.loss[0]), False
+        assert np.isfinite(self.loss)
 
 
 class Crowd(Played):
-    """An environment of several species: "parallel", or many worlds, "batched"."""
+    """A world of several species, whose agents are species or particles."""
 
     often: ClassVar = {"step": 14, "reset": 2, "place": 1, "state": 1, "render": 1}
-    lost = "agents must have a particle"
 
-    def __init__(self, task: str, form: str, draw: random.Random, *, by_particle: bool) -> None:
-        self.form, self.count = form, draw.choice((2, 2, 3))
-        fields = (few if by_particle else small)(task) | world_fields(draw)
-        fields |= {
-            "species_count": self.count,
-            "particle_count": draw.choice((3, 5, 9)),
-            "max_cycles": draw.choice((1, 3, 8)),
-            "on_divergence": draw.choice(("terminate", "terminate", "raise", "ignore")),
-            "reward": "individual" if task == "invasion" else draw.choice(("individual", "team")),
-            "perception": draw.choice(("shared", "per_species")),
-            **({"opponent": draw.choice((None, "random"))} if task == "invasion" else {}),
-            "deaths": draw.choice(((), (), ((1, 2),), ((0, 1), (1, 3)))),
-            "position_limit": draw.choice((4.0, 1.5)),
-        }
-        module = particles_v0 if by_particle else multispecies_v0
-        if form == "batched":
-            self.worlds, self.same = draw.choice((1, 2, 3)), draw.random() < 0.5
-            fields |= {"world_count": self.worlds}
-            fields |= {"autoreset_mode": "same-step" if self.same else "disabled"}
-            self.env = module.batched(**fields)
-            self.spaces = self.env.single_action_spaces
-        else:
-            self.worlds = 1
-            self.env = module.parallel_env(**fields)
-            self.spaces = self.env.action_spaces
-        self.fields = fields
-        self.steps = np.zeros(self.worlds, int)
-        self.loss: dict[str, np.ndarray] = {}
+    @classmethod
+    def make(cls, name: str, draw: random.Random) -> Played:
+        module = particles_v0 if name in particles_v0.ENVIRONMENTS else multispecies_v0
+        by_particle = module is particles_v0
+        fields = species_fields(module.ENVIRONMENTS[name], draw, by_particle=by_particle)
+        return cls(module.parallel_env(**fields), fields)
 
     def snapshot(self) -> Any:
         return self.env.state()
 
-    def reset(self, draw: random.Random) -> None:
-        seed, options = draw.choice((None, 3, np.int64(7))), None
-        chosen = np.ones(self.worlds, bool)
-        if draw.random() < 0.3:
-            seed = wrong(draw, "seed", 3)
-        if self.form == "batched" and draw.random() < 0.5:
-            options = {"reset_mask": np.array([draw.random() < 0.6 for _ in chosen])}
-            chosen = options["reset_mask"]
-        elif self.form == "batched" and draw.random() < 0.3:
-            options = wrong(draw, "options", None)
-        call = {"seed": seed, "options": options}
-        done = []
-        self.refused(lambda: done.append(self.env.reset(**call)))
-        if done:
-            self.expect_reset(done[0], chosen)
+    def options(self, draw: random.Random) -> tuple[Any, bool]:
+        return None, True
 
-    def expect_reset(self, found: Any, chosen: np.ndarray) -> None:
-        self.started = True
-        self.steps[chosen] = 0
-        observations, infos = found
-        self.check_observations(observations)
-        self.loss = {agent: self.checked_loss(info) for agent, info in infos.items()}
+    def expect_reset(self, observation: Any, info: Any) -> None:
+        super().expect_reset(observation, info)
+        self.steps = 0
+        self.loss = {agent: checked_loss(of_agent) for agent, of_agent in info.items()}
 
-    def step(self, draw: random.Random) -> None:
-        agents = self.env.agents
-        lead = (self.worlds,) if self.form == "batched" else ()
-        actions: Any = {}
-        for agent in agents:
-            shape = (*lead, *self.spaces[agent].shape)
-            # One wrong action among many is wrong enough.
-            chance = draw.random() < 2.0 / max(2, len(agents))
-            actions[agent] = actions_of(draw, shape) if chance else torch.zeros(shape)
-        if draw.random() < 0.1:
-            changes = (lambda a: a | {"nobody": 1}, lambda a: dict(list(a.items())[1:]), list)
-            actions = draw.choice(changes)(actions)
-        closed = self.form == "batched" and not self.env.worlds.running.all()
-        found = self.refused(lambda: self.env.step(actions))
-        if found is None:
-            if closed:
-                self.settle()
-            return
-        assert self.started, "a step before the first reset"
-        if self.form == "batched":
-            self.expect_batch(*found)
-        else:
-            self.expect_step(agents, *found)
-
-    def expect_step(
-        self, acted: list[str], observations: Any, rewards: Any, ended: Any, late: Any, infos: Any
-    ) -> None:
-        if not acted:
-            assert (observations, rewards, ended, late, infos) == ({}, {}, {}, {}, {})
+    def expect_step(self, rewards: Any, ended: Any, late: Any, infos: Any) -> None:
+        if not self.acted:
+            assert (rewards, ended, late, infos) == ({}, {}, {}, {})
             self.settle()
             return
         self.steps += 1
-        for part in (observations, rewards, ended, late, infos):
-            assert list(part) == acted
-        self.check_observations(observations)
-        is_last = bool(self.steps[0] >= self.fields["max_cycles"])
+        for part in (rewards, ended, late, infos):
+            assert list(part) == self.acted
+        is_last = self.steps >= self.fields["max_cycles"]
         words = {"removed", "left the world", "no opponent"}
-        for agent in acted:
+        for agent in self.acted:
             assert type(rewards[agent]) is float
             assert np.isfinite(rewards[agent])
             assert late[agent] is is_last
             reason = infos[agent].get("reason")
-            assert (
-                (reason in words) if ended[agent] else reason == ("time limit" if is_last else None)
-            )
-            loss = self.checked_loss(infos[agent])
+            expected = words if ended[agent] else {"time limit" if is_last else None}
+            assert reason in expected
+            loss = checked_loss(infos[agent])
             if self.fields["reward"] == "individual" and self.fields["task"] != "invasion":
                 fell = self.loss[agent] - loss
-                gone = reason == "left the world"
                 # A species that leaves the world is not paid for it.
-                assert rewards[agent] <= fell + 1e-9 if gone else np.isclose(rewards[agent], fell)
+                leaves = reason == "left the world"
+                assert rewards[agent] <= fell + 1e-9 if leaves else np.isclose(rewards[agent], fell)
             self.loss[agent] = loss
-        assert self.env.agents == [a for a in acted if not (ended[a] or late[a])]
-        if any(ended.values()):
-            self.loss = {a: self.numbers()[a] for a in self.env.agents}
+        assert self.env.agents == [a for a in self.acted if not (ended[a] or late[a])]
+        # Boxes are two length units wide.
+        assert self.fields["boundary"] == "open" or (self.env.particles()[0].abs() <= 1.0).all()
+        if self.env.agents and any(ended.values()):
+            self.expect_place()
         if self.fields["task"] == "invasion" and self.fields["opponent"] is None:
             assert abs(sum(rewards.values())) <= 1e-6 * (1 + max(map(abs, rewards.values())))
 
-    def numbers(self) -> dict[str, Any]:
-        """Return losses of the world as it is: deaths and placing change them at no charge."""
+    def expect_place(self) -> None:
         losses = sum(part[0].double() for part in self.env.worlds.measured().values())
         # An opponent that the environment plays comes last.
-        return dict(zip(self.env.possible_agents, losses.tolist(), strict=False))
-
-    def expect_batch(
-        self, observations: Any, rewards: Any, ended: Any, late: Any, infos: Any
-    ) -> None:
-        """Check what a batch returns; that it equals single worlds is tested elsewhere."""
-        self.check_observations(observations)
-        self.steps += 1
-        over = self.steps >= self.fields["max_cycles"]
-        for agent, info in infos.items():
-            kinds = ((rewards, np.float32), (ended, bool), (late, bool))
-            for part, kind in kinds:
-                assert host(part[agent]).dtype == kind
-                assert host(part[agent]).shape == (self.worlds,)
-            assert np.isfinite(host(rewards[agent])).all()
-            assert np.array_equal(host(late[agent]), over & host(info["acted"]))
-            self.checked_loss(info)
-        if self.same:
-            going_on = [host(infos[a]["acted"]) & ~host(ended[a]) for a in infos]
-            self.steps[over | ~np.any(going_on, axis=0)] = 0
-
-    def place(self, draw: random.Random) -> None:
-        """Put particles into the world, which only single ones have a call for."""
-        if self.form == "batched":
-            return
-        x, s = self.env.particles() if self.started else (torch.zeros(1, 2), torch.zeros(1, 16))
-        given = {"x": x.clamp(-1, 1), "s": s.clamp(-1, 1)}
-        if draw.random() < 0.4:
-            name = draw.choice(("x", "s"))
-            given[name] = wrong(draw, name, given[name])
-        found = self.refused(lambda: self.env.place_particles(**given))
-        if found is not None:
-            self.check_observations(found)
-            self.loss = {a: self.numbers()[a] for a in self.env.agents}
+        now = dict(zip(self.env.possible_agents, losses.tolist(), strict=False))
+        self.loss = {agent: now[agent] for agent in self.env.agents}
 
     def state(self, draw: random.Random) -> None:
-        found = self.refused(self.env.state)
-        assert (found is not None) == self.started
-        if found is not None and self.form != "batched":
-            assert self.env.state_space.contains(host(found))
-
-    def check_observations(self, observations: Any) -> None:
-        lead = (self.worlds,) if self.form == "batched" else ()
-        for agent, rows in observations.items():
-            shape = (*lead, *self.space_of(agent).shape)
-            check_array(rows, shape, self.fields["observation_limit"], self.fields["output"])
-
-    def space_of(self, agent: str) -> Any:
-        if self.form == "batched":
-            return self.env.single_observation_spaces[agent]
-        return self.env.observation_space(agent)
-
-    def checked_loss(self, told: Any) -> Any:
-        loss = host(told["loss"])
-        assert np.isfinite(loss).all()
-        return loss
+        state = self.refused(self.env.state)
+        assert (state is not None) == self.started
+        if state is not None:
+            assert self.env.state_space.contains(host(state))
 
 
+class Batch(Played):
+    """Many worlds of one species or of several."""
+
+    @classmethod
+    def make(cls, name: str, draw: random.Random) -> Played:
+        modes = ("same-step", "disabled")
+        if name in IDS:
+            fields = one_species_fields(name, draw) | {"copy": draw.random() < 0.7}
+            fields |= {"autoreset_mode": draw.choice((*modes, "next-step"))}
+            worlds = draw.choice((1, 2, 3))
+            return cls(gymnasium.make_vec(name, worlds, "vector_entry_point", **fields), fields)
+        fields = species_fields(multispecies_v0.ENVIRONMENTS[name], draw, by_particle=False)
+        fields |= {"world_count": draw.choice((1, 2, 3)), "autoreset_mode": draw.choice(modes)}
+        return cls(multispecies_v0.batched(**fields), fields)
+
+    def __init__(self, env: Any, fields: dict[str, Any]) -> None:
+        super().__init__(env, fields)
+        self.worlds = self.inner.worlds.world_count
+
+    def snapshot(self) -> Any:
+        return self.inner.particles() if "" in self.action_shapes else self.env.state()
+
+    def options(self, draw: random.Random) -> tuple[Any, bool]:
+        if draw.random() < 0.4:
+            mask = [draw.random() < 0.6 for _ in range(self.worlds)]
+            return {"reset_mask": np.array(mask)}, True
+        return super().options(draw)
+
+    def expect_reset(self, observation: Any, info: Any) -> None:
+        super().expect_reset(observation, info)
+        self.check_infos(info)
+
+    def expect_step(self, rewards: Any, terminated: Any, truncated: Any, infos: Any) -> None:
+        is_plain = "" in self.action_shapes and self.fields["output"] == "numpy"
+        dtypes = (np.float64 if is_plain else np.float32, bool, bool)
+        for values, dtype in zip((rewards, terminated, truncated), dtypes, strict=True):
+            for array in map(host, by_agent(values).values()):
+                assert (array.dtype, array.shape) == (dtype, (self.worlds,))
+                assert np.isfinite(array).all()
+        self.check_infos(infos)
+        flags = (*by_agent(terminated).values(), *by_agent(truncated).values())
+        if self.fields["autoreset_mode"] == "disabled" and any(host(f).any() for f in flags):
+            self.settle()
+
+    def check_infos(self, infos: Any) -> None:
+        for info in [infos] if "" in self.action_shapes else infos.values():
+            assert checked_loss(info).shape == (self.worlds,)
+
+    def place(self, draw: random.Random) -> None:
+        if "" in self.action_shapes:
+            super().place(draw)
+
+
+PLAYED: dict[str, type[Any]] = {
+    "single": OneWorld,
+    "vector": Batch,
+    "parallel": Crowd,
+    "batched": Batch,
+}
 FORMS: dict[str, tuple[str, ...]] = dict.fromkeys(IDS, ("single", "vector"))
 FORMS |= dict.fromkeys(multispecies_v0.ENVIRONMENTS, ("parallel", "batched"))
 FORMS |= dict.fromkeys(particles_v0.ENVIRONMENTS, ("parallel",))
 """All environments, by the ids of both registries, and their forms."""
 
 
-def make(name: str, form: str, draw: random.Random) -> OneSpecies | Crowd:
+def make(name: str, form: str, draw: random.Random) -> Played:
     """Return an environment; a choice of keywords that is refused is drawn anew."""
     while True:
         try:
-            if name in IDS:
-                return OneSpecies(name, form, draw)
-            tasks = multispecies_v0.ENVIRONMENTS | particles_v0.ENVIRONMENTS
-            by_particle = name in particles_v0.ENVIRONMENTS
-            return Crowd(tasks[name], form, draw, by_particle=by_particle)
+            return PLAYED[form].make(name, draw)
         except NPAError:
             continue
 
@@ -522,7 +438,7 @@ def make(name: str, form: str, draw: random.Random) -> OneSpecies | Crowd:
 def test_whatever_an_environment_is_given_it_keeps_its_contract(
     name: str, form: str, total: int
 ) -> None:
-    count, began = total // len(FORMS[name]), time.monotonic()
+    count = total // len(FORMS[name])
     for first in range(0, count, LIFE):
         seed = FIRST_SEED + first
         draw = random.Random(f"{name} {form} {seed}")
@@ -537,5 +453,3 @@ def test_whatever_an_environment_is_given_it_keeps_its_contract(
                     raise
         finally:
             made.env.close()
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss >> 10
-    print(f"{name} {form}: {count} calls, {time.monotonic() - began:.0f} s, peak {peak} MiB")

@@ -5,11 +5,10 @@ import json
 from pathlib import Path
 
 import gymnasium
-import numpy as np
 import pytest
 from pettingzoo.test import parallel_api_test
 
-from npa_envs.agents.learning import Budget, Problem, train
+from npa_envs.agents.learning import Problem
 from npa_envs.envs import multispecies_v0
 from npa_envs.envs.grown import GrownConfig, growing_rule
 from npa_envs.envs.regeneration2d import Regeneration2DEnvConfig
@@ -68,22 +67,6 @@ def test_an_id_is_the_environment_of_its_name_with_other_keywords(row):
     changed = Problem(env_id=row.id, keywords={"update_prob": 0.25}, episode_steps=4)
     assert changed.config.update_prob == 0.25
     assert changed.config.particle_count == sized.config.particle_count
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("method", ["ppo", "ppo_world"])
-def test_ppo_is_above_random_zero_and_scripted_policies_in_a_small_world(method):
-    if method == "ppo_world":
-        pytest.importorskip("stable_baselines3")
-    problem = Problem(env_id="npa/Morphogenesis2DSmall-v0", episode_steps=32, hidden_dim=64)
-
-    def returned(method, seed):
-        budget = Budget(particle_steps=1_000_000)
-        return train(method, problem, budget, seed, entries=1).log[-1].mean_return
-
-    learned = np.array([returned(method, seed) for seed in range(3)])
-    others = max(0.0, *(returned(name, 0) for name in ("random", "scripted")))
-    assert learned.mean() - 3.0 * learned.std(ddof=1) / np.sqrt(3) > others
 
 
 @pytest.mark.parametrize("row", SPECIES_SIZES, ids=lambda row: row.id)

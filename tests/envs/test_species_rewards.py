@@ -2,20 +2,10 @@
 
 import numpy as np
 import pytest
-import torch
-from crowds import (
-    HALF_WAY,
-    apart,
-    drawn,
-    make,
-    pair,
-    pair_entropy,
-    placed,
-    still,
-)
+from crowds import HALF_WAY, apart, drawn, make, pair, pair_entropy, placed, small, still
 from small_envs import begun
 
-from npa_envs.envs.multi.worlds import AgentReturns
+from npa_envs.envs import multispecies_v0, particles_v0
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 
 
@@ -27,33 +17,32 @@ def splat_loss(target, x, s, count):
     return float(Morphogenesis2D(config).metric(x[None], s[None])[0])
 
 
-@pytest.mark.parametrize(("task", "sign"), [("mixing", -1.0), ("segregation", 1.0)])
-def test_parting_two_neighbours_costs_or_pays_their_entropy(task, sign):
-    env = pair(task)
-    _, rewards, _, _, infos = env.step(still(env))
-    assert rewards == {"species_0": 0.0, "species_1": 0.0}
-    loss = HALF_WAY if task == "segregation" else 1.0 - HALF_WAY
-    assert infos["species_0"]["loss"] == pytest.approx(loss, abs=1e-6)
-    _, rewards, _, _, infos = env.step(apart(env))
-    # The smoothing weight is zero at a whole radius.
-    name = "mixture" if task == "segregation" else "separation"
-    for agent in ("species_0", "species_1"):
-        assert rewards[agent] == pytest.approx(sign * HALF_WAY, abs=1e-6)
-        assert infos[agent][f"reward_{name}"] == rewards[agent]
-        assert infos[agent][f"loss_{name}"] == infos[agent]["loss"]
-
-
 @pytest.mark.parametrize("reward", ["individual", "team"])
-def test_a_species_is_paid_for_the_mean_of_its_particles_and_a_team_for_that_of_species(reward):
-    points = [[0.0, 0.0], [0.15, 0.0], [2.0, 2.0]]
-    env = placed(points, particle_counts=(1, 2), reward=reward)
-    _, _, _, _, infos = env.step(still(env))
-    assert infos["species_0"]["loss"] == pytest.approx(1.0 - HALF_WAY, abs=1e-6)
-    assert infos["species_1"]["loss"] == pytest.approx(1.0 - 0.5 * HALF_WAY, abs=1e-6)
-    _, rewards, *_ = env.step(apart(env))
-    own = {"species_0": -HALF_WAY, "species_1": -0.5 * HALF_WAY}
-    team = dict.fromkeys(own, -0.75 * HALF_WAY)
-    assert rewards == pytest.approx(own if reward == "individual" else team, abs=1e-6)
+@pytest.mark.parametrize(
+    ("task", "part", "sign"), [("mixing", "separation", -1.0), ("segregation", "mixture", 1.0)]
+)
+@pytest.mark.parametrize(
+    ("module", "means"), [(multispecies_v0, [1.0, 0.5]), (particles_v0, [1.0, 1.0, 0.0])]
+)
+def test_parting_neighbours_costs_or_pays_agents_their_mean_entropy_or_a_team_that_of_all(
+    module, means, task, part, sign, reward
+):
+    fields = small(task, particle_counts=(1, 2), update_prob=1.0, reward=reward)
+    env = begun(module.parallel_env(**fields))
+    env.place_particles([[0.0, 0.0], [0.15, 0.0], [2.0, 2.0]], np.zeros((3, 16)))
+    entropies = HALF_WAY * np.array(means)
+    actions, second = still(env), env.agents[1]
+    _, rewards, _, _, infos = env.step(actions)
+    assert not any(rewards.values())
+    losses = entropies if task == "segregation" else 1.0 - entropies
+    for agent, loss in zip(env.agents, losses, strict=True):
+        assert infos[agent]["loss"] == infos[agent][f"loss_{part}"] == pytest.approx(loss, abs=1e-6)
+    # The smoothing weight is zero at a whole radius.
+    actions[second][..., 0] = 1.0
+    _, rewards, _, _, infos = env.step(actions)
+    paid = entropies if reward == "individual" else entropies.mean().repeat(len(means))
+    assert list(rewards.values()) == pytest.approx(sign * paid, abs=1e-6)
+    assert infos[second][f"reward_{part}"] == pytest.approx(sign * entropies[1], abs=1e-6)
 
 
 def test_entropy_weighs_neighbours_by_their_volumes():
@@ -75,51 +64,43 @@ def test_entropy_reaches_across_the_edge_of_a_periodic_box():
     assert infos["species_0"]["loss"] == pytest.approx(1.0 - HALF_WAY, abs=1e-5)
 
 
-def test_each_species_of_co_morphogenesis_is_paid_for_its_own_picture():
-    env = begun(make("co_morphogenesis", targets=("heart", "ring"), particle_counts=(40, 30)))
-    x0, s0 = env.particles()
-    actions = drawn(env, np.random.default_rng(0))
-    _, rewards, _, _, infos = env.step(actions)
-    x1, s1 = env.particles()
-    spans = {"species_0": ("heart", slice(0, 40)), "species_1": ("ring", slice(40, 70))}
-    for agent, (target, span) in spans.items():
-        before, after = (
-            splat_loss(target, x[span], s[span], span.stop - span.start)
-            for x, s in ((x0, s0), (x1, s1))
+def test_each_species_of_co_morphogenesis_is_paid_for_its_own_picture_also_after_a_death():
+    targets, counts = ("heart", "flower", "ring"), (20, 25, 30)
+    env = begun(
+        make(
+            "co_morphogenesis",
+            species_count=3,
+            targets=targets,
+            particle_counts=counts,
+            deaths=((1, 1),),
         )
-        assert infos[agent]["loss"] == pytest.approx(after, rel=1e-5)
-        assert rewards[agent] == pytest.approx(before - after, abs=1e-6)
-        assert rewards[agent] != 0.0
-        parts = infos[agent]["reward_density"] + infos[agent]["reward_colour"]
-        assert parts == pytest.approx(rewards[agent], abs=1e-6)
+    )
+    generator = np.random.default_rng(0)
+    for live in ((0, 1, 2), (0, 2)):
+        x0, s0 = env.particles()
+        _, rewards, _, _, infos = env.step(drawn(env, generator))
+        x1, s1 = env.particles()
+        first = 0
+        for k in live:
+            agent, span = f"species_{k}", slice(first, first + counts[k])
+            first += counts[k]
+            assert infos[agent]["species"] == k
+            parts = infos[agent]["reward_density"] + infos[agent]["reward_colour"]
+            assert parts == pytest.approx(rewards[agent], abs=1e-6)
+            # After the first step the particles of species 1 are removed.
+            if live == (0, 2):
+                before, after = (
+                    splat_loss(targets[k], x[span], s[span], counts[k])
+                    for x, s in ((x0, s0), (x1, s1))
+                )
+                assert infos[agent]["loss"] == pytest.approx(after, rel=1e-5)
+                assert rewards[agent] == pytest.approx(before - after, abs=1e-6)
+            assert rewards[agent] != 0.0
     actions = still(env)
-    actions["species_1"][:] = 1.0
+    actions["species_2"][:] = 1.0
     _, rewards, *_ = env.step(actions)
     assert rewards["species_0"] == 0.0
-    assert rewards["species_1"] != 0.0
-
-
-def test_after_a_death_each_survivor_is_still_paid_for_its_own_picture():
-    env = make(
-        "co_morphogenesis",
-        species_count=3,
-        targets=("heart", "flower", "ring"),
-        particle_counts=(20, 25, 30),
-        deaths=((1, 1),),
-    )
-    env.reset(seed=0)
-    generator = np.random.default_rng(0)
-    for _ in range(2):
-        *_, infos = env.step(drawn(env, generator))
-    x, s = env.particles()
-    for agent, target, span in (
-        ("species_0", "heart", slice(20)),
-        ("species_2", "ring", slice(20, 50)),
-    ):
-        count = len(x[span])
-        assert infos[agent]["species"] == int(agent[-1])
-        expected = splat_loss(target, x[span], s[span], count)
-        assert infos[agent]["loss"] == pytest.approx(expected, rel=1e-5)
+    assert rewards["species_2"] != 0.0
 
 
 @pytest.mark.parametrize("species_count", [2, 4])
@@ -163,26 +144,3 @@ def test_leaving_the_world_never_pays_nor_gives_back_what_came_at_no_charge(keyw
     assert infos["species_1"]["loss"] == pytest.approx(max(at_start, HALF_WAY), abs=1e-6)
     assert rewards["species_1"] == pytest.approx(min(0.0, HALF_WAY - at_start), abs=1e-6)
     assert rewards["species_0"] == pytest.approx(HALF_WAY, abs=0.01)
-
-
-@pytest.mark.parametrize("carried", [3.0, 0.5, 1.0])
-def test_rewards_of_an_agent_that_left_never_add_up_to_more_than_zero(carried):
-    account = AgentReturns(make("mixing").worlds.task, torch.tensor([0, 1]), 1, team=False)
-
-    def losses(*values):
-        return {"loss": torch.tensor([values], dtype=torch.float64)}
-
-    def pay(parts, fled):
-        return account.step_rewards(
-            parts, torch.tensor([[True, True]]), torch.tensor([[fled, False]])
-        )[0]
-
-    account.begin(losses(1.0, 1.0), torch.tensor([0]))
-    paid = pay(losses(0.8, 1.0), False)
-    account.carry_over(losses(carried, 1.0))
-    paid = paid + pay(losses(0.0, 0.0), True)
-    assert float(paid[0]) == pytest.approx(min(0.0, carried - 0.8), abs=1e-12)
-    assert paid[1] == 1.0
-    # What an episode left behind is forgotten in the next one.
-    account.begin(losses(1.0, 1.0), torch.tensor([0]))
-    assert pay(losses(0.0, 1.0), True)[0] == 0.0

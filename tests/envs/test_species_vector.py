@@ -1,13 +1,10 @@
 """Batches of worlds of several species: world k is the single environment, whoever dies."""
 
-import pickle
-
 import numpy as np
 import pytest
 import torch
-from crowds import TASKS, drawn, make, small, still
+from crowds import TASKS, drawn, make, small
 from refusals import refused
-from small_envs import assert_same, begun
 
 from npa_envs.envs import multispecies_v0
 from npa_envs.envs.core import state
@@ -46,8 +43,8 @@ def assert_info_equal(infos, agent, k, info):
         ("segregation", {"perception": "per_species"}),
     ],
 )
-def test_a_batch_equals_single_environments_while_species_die_here_and_there(task, changes, where):
-    keywords = DEADLY | changes | where
+def test_a_batch_equals_single_environments_while_species_die_here_and_there(task, changes, device):
+    keywords = DEADLY | changes | {"device": str(device)}
     envs = batch(task, 3, **keywords)
     singles = [make(task, **keywords) for _ in range(3)]
     observations, infos = envs.reset(seed=7)
@@ -98,99 +95,6 @@ def test_a_batch_equals_single_environments_while_species_die_here_and_there(tas
     )
     # Worlds had lost different species at the same time.
     assert any(len(set(zip(*pattern, strict=True))) > 1 for pattern in patterns)
-
-
-def test_resetting_one_world_leaves_the_others_as_they_are(where):
-    envs, untouched = begun(*(batch(autoreset_mode="disabled", **DEADLY | where) for _ in range(2)))
-    generator = np.random.default_rng(0)
-    for _ in range(10):
-        actions = drawn(envs, generator)
-        for e in (envs, untouched):
-            e.step(actions)
-    before = envs.state()
-    assert not before[:, 9:12].any()
-    mask = np.array([False, True, False])
-    seen, infos = envs.reset(options={"reset_mask": mask})
-    assert np.array_equal(envs.state()[~mask], before[~mask])
-    assert envs.state()[1, :, -1].all()
-    assert infos["species_1"]["live"].tolist() == [False, True, False]
-    assert not seen["species_1"][~mask].any()
-    single = begun(make(**DEADLY | where), seed=1)
-    assert np.array_equal(seen["species_1"][1], single.reset()[0]["species_1"])
-    actions = drawn(envs, generator)
-    _, rewards, *_ = envs.step(actions)
-    _, paid, *_ = untouched.step(actions)
-    assert np.array_equal(rewards["species_0"][~mask], paid["species_0"][~mask])
-
-
-def test_a_disabled_autoreset_waits_for_the_reset():
-    envs = begun(batch(autoreset_mode="disabled", max_cycles=2))
-    for _ in range(2):
-        observations, _, terminations, truncations, infos = envs.step(still(envs))
-    assert truncations["species_0"].all()
-    assert not terminations["species_0"].any()
-    assert infos["species_1"]["reason"].tolist() == ["time limit"] * 3
-    assert "final_obs" not in infos["species_0"]
-    assert observations["species_0"].any(axis=(1, 2)).all()
-    refused(r"episodes of worlds \[0, 1, 2\] are over: reset them", envs.step, still(envs))
-    envs.reset(options={"reset_mask": np.array([True, False, True])})
-    refused(r"episodes of worlds \[1\] are over", envs.step, still(envs))
-
-
-HOST = ("species", "reason")
-"""What infos hold that is no tensor."""
-
-
-def test_tensors_stay_on_the_device_where_asked_for(device):
-    keywords = DEADLY | {"device": str(device)}
-    arrays, tensors = batch(**keywords), batch(output="torch", **keywords)
-    arrays.reset(seed=0)
-    observations, _ = tensors.reset(seed=0)
-    generator = np.random.default_rng(0)
-    handed, bytes_then = [], []
-    for _ in range(16):
-        actions = drawn(arrays, generator)
-        sent = {agent: torch.from_numpy(a).to(device) for agent, a in actions.items()}
-        got = tensors.step(sent)
-        assert_same(arrays.step(actions), got)
-        told = [value for name, value in got[4]["species_2"].items() if name not in HOST]
-        for value in (*(values["species_2"] for values in got[:4]), *told):
-            assert value.device.type == device.type
-        handed.append(got)
-        bytes_then.append(pickle.dumps(got))
-    # What was handed out stays as it was.
-    assert_same(handed, [pickle.loads(then) for then in bytes_then])
-    assert tensors.state().device.type == device.type
-    assert observations["species_0"].shape == (3, 9, 66)
-    assert got[1]["species_0"].dtype == torch.float32
-
-
-@pytest.mark.parametrize("maker", [make, batch])
-def test_a_copy_by_pickle_goes_on_alike(maker, device):
-    env = begun(maker(**DEADLY, device=str(device)))
-    generator = np.random.default_rng(0)
-    for _ in range(10):
-        env.step(drawn(env, generator))
-    copy = pickle.loads(pickle.dumps(env))
-    for _ in range(10 if maker is batch else 4):
-        actions = drawn(env, generator)
-        assert_same(env.step(actions), copy.step(actions))
-    assert np.array_equal(env.state(), copy.state())
-    assert_same(env.reset(), copy.reset())
-
-
-def test_pictures_are_those_of_the_single_worlds():
-    keywords = {"render_mode": "rgb_array", "deaths": ((0, 1),)}
-    envs, single = batch(**keywords), make(**keywords)
-    envs.reset(seed=4)
-    single.reset(seed=5)
-    envs.step(still(envs))
-    single.step({agent: action[1] for agent, action in still(envs).items()})
-    pictures = envs.render()
-    assert len(pictures) == 3
-    assert np.array_equal(pictures[1], single.render())
-    assert pictures[1].min() < 200
-    envs.close()
 
 
 def test_telling_species_apart_needs_memory_of_its_own(monkeypatch):
