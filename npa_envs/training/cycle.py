@@ -233,7 +233,7 @@ class TrainingCycle:
         """Restore what `state_dict` returned after `iteration`; to be called before `run`."""
         self.optimiser.load_state_dict(state["optimiser"])
         for name, part in self.pool.tensors().items():
-            part.copy_(self._ranks.own(state["pool"][name], self._section))
+            part.copy_(self._ranks.local(state["pool"][name], self._section))
         self.meter.load_state_dict(state["meter"])
         self.random.load_state_dict(state["random_states"], iteration)
 

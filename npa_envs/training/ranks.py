@@ -82,9 +82,9 @@ class Ranks:
 
     def indices(self, total: int, section: int = 1) -> Tensor:
         """Return the indices of this process's worlds, on the CPU, int64, shape [total / count]."""
-        return self.own(torch.arange(total), section)
+        return self.local(torch.arange(total), section)
 
-    def own(self, worlds: Tensor, section: int) -> Tensor:
+    def local(self, worlds: Tensor, section: int) -> Tensor:
         """Return this process's part of all worlds, which come in sections of `section` worlds."""
         parts = worlds.view(-1, self.count, section, *worlds.shape[1:])
         return parts[:, self.rank].flatten(0, 1)
@@ -320,13 +320,13 @@ def joined_ranks() -> Iterator[Ranks]:
             f"the processes that torchrun starts must reach each other, but this one cannot "
             f"({shown(error)}): see its options --rdzv-endpoint and --master-addr"
         ) from error
-    left = False
+    finished = False
     try:
         yield ranks
-        left = True
+        finished = True
     finally:
         if heartbeat is not None:
-            heartbeat.end(left=left)
+            heartbeat.end(finished=finished)
     # Not after an error: others may be gone. Recorded graphs keep references to the group.
     gc.collect()
     dist.destroy_process_group()
@@ -341,7 +341,7 @@ SILENT_BEATS = 8
 LOST_CODE = 2
 """Exit code of a process that has lost another one, that of errors on the command line."""
 
-_LEFT = -(2**62)
+_FINISHED = -(2**62)
 
 
 class Heartbeat:
@@ -356,7 +356,7 @@ class Heartbeat:
         self._store, self._rank = store, rank
         self._beats = [0] * count
         self._ended = threading.Event()
-        self._left = self._store_gone = False
+        self._finished = self._store_gone = False
         # Two threads, as a store that does not answer blocks the one that reads it.
         self._threads = [
             threading.Thread(target=task, daemon=True) for task in (self._beat, self._watch)
@@ -364,9 +364,9 @@ class Heartbeat:
         for thread in self._threads:
             thread.start()
 
-    def end(self, *, left: bool) -> None:
-        """Stop watching; with `left`, tell the others that this process leaves."""
-        self._left = left
+    def end(self, *, finished: bool) -> None:
+        """Stop watching; with `finished`, let the others go on without this process."""
+        self._finished = finished
         self._ended.set()
         for thread in self._threads:
             thread.join(BEAT_SECONDS)
@@ -377,8 +377,8 @@ class Heartbeat:
                 for other in range(len(self._beats)):
                     self._beats[other] = self._store.add(str(other), int(other == self._rank))
                 self._ended.wait(BEAT_SECONDS)
-            if self._left:
-                self._store.add(str(self._rank), _LEFT)
+            if self._finished:
+                self._store.add(str(self._rank), _FINISHED)
         except RuntimeError:
             # From now on all processes that have not left seem silent.
             self._store_gone = True

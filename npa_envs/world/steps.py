@@ -399,7 +399,10 @@ class SpeciesStep(Step):
             if appended is not None:
                 extra = appended[:, own.first : own.end].flatten(0, 1).index_select(0, particle)
                 if own.count_ratio != 1.0:
-                    extra = _recounted_by_species(extra, len(species), own.count_ratio)
+                    density, gradient = extra[:, : len(species)], extra[:, len(species) :]
+                    gradient = gradient.view(len(extra), len(species), -1)
+                    gradient = _recounted(gradient, own.count_ratio).flatten(1)
+                    extra = torch.cat((own.count_ratio * density, gradient), dim=1)
                 z = torch.cat((z, extra), dim=1)
             outputs.append(_update_of(own, z))
             rows.append(row)
@@ -443,13 +446,6 @@ def _recounted(scaled: Tensor, ratio: float) -> Tensor:
     divisor = torch.where(somewhere, length, 1.0)
     factor = torch.log1p(ratio * torch.expm1(divisor)) / divisor
     return scaled * torch.where(somewhere, factor, ratio)
-
-
-def _recounted_by_species(appended: Tensor, species_count: int, ratio: float) -> Tensor:
-    """Multiply the densities in perception of each species, [R, K (1 + D)], by `ratio`."""
-    density, gradient = appended[:, :species_count], appended[:, species_count:]
-    gradient = _recounted(gradient.view(len(gradient), species_count, -1), ratio).flatten(1)
-    return torch.cat((ratio * density, gradient), dim=1)
 
 
 def _update_of(own: Species, z: Tensor) -> Tensor:

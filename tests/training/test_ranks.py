@@ -274,7 +274,7 @@ def test_worlds_of_all_processes_are_diagnosed_when_the_loss_is_not_finite(tmp_p
 
 def test_what_cannot_be_shared_out_is_refused():
     assert Ranks(1, 4).indices(16, 2).tolist() == [2, 3, 10, 11]
-    parts = [Ranks(rank, 4).own(torch.arange(16), 2) for rank in range(4)]
+    parts = [Ranks(rank, 4).local(torch.arange(16), 2) for rank in range(4)]
     assert sorted(torch.cat(parts).tolist()) == list(range(16))
     for worlds, pool, message in (
         (6, 12, "multiple of the number of processes, got 6 and 4: .*=4"),
@@ -311,9 +311,9 @@ def test_nobody_is_missed_who_lives_or_has_left(codes, monkeypatch):
     store = dist.HashStore()
     first, second = (Heartbeat(store, rank, 2) for rank in (0, 1))
     time.sleep(2.0)
-    second.end(left=True)
+    second.end(finished=True)
     time.sleep(2.0)
-    first.end(left=True)
+    first.end(finished=True)
     assert codes == []
 
 
@@ -342,13 +342,13 @@ def test_a_process_or_store_that_falls_silent_is_missed(codes, capfd, make, mess
     store = make()
     own = isinstance(store, Store)
     first, *others = (Heartbeat(store, rank, 3) for rank in range(1 if own else 3))
-    for other, left in zip(others, (True, False), strict=not own):
-        other.end(left=left)
+    for other, finished in zip(others, (True, False), strict=not own):
+        other.end(finished=finished)
     end = time.monotonic() + 60.0
     while not codes and time.monotonic() < end:
         time.sleep(0.01)
     assert set(codes) == {LOST_CODE}
     if own:
         store.thawed.set()
-    first.end(left=True)
+    first.end(finished=True)
     assert message in capfd.readouterr().err
