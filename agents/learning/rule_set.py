@@ -93,8 +93,8 @@ class RuleSet(nn.Module):
         """
         if isinstance(source, str | Path) and (Path(source) / _file_name(0)).is_file():
             return cls.load(source, problem)
-        single = isinstance(source, str | Path | NPARule)
-        sources = [source] * len(problem.counts) if single else list(source)
+        single = isinstance(source, Source)
+        sources: list[Source] = [source] * len(problem.counts) if single else list(source)  # type: ignore[arg-type, list-item]
         rules = [
             copy.deepcopy(one).cpu() if isinstance(one, NPARule) else load_rule(one)
             for one in sources
