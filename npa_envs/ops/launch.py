@@ -256,11 +256,13 @@ class _Arguments:
                 self._launch.bounds = bounds
                 self._launch.launch(_warp_stream(self._device, stream))
             return
-        ranges = _ranges(self._launch.kernel, size)
-        if len(ranges) == 1:
-            self._run_on_cpu(self._memory, size)
-        else:
+        # Kernels without a smallest range are not split.
+        smallest = MIN_RANGES.get(self._launch.kernel)
+        ranges = [] if smallest is None else even_ranges(size[0], smallest)
+        if len(ranges) > 1:
             run_together([functools.partial(self._run_range, size, part) for part in ranges])
+        else:
+            self._run_on_cpu(self._memory, size)
 
     def _run_range(self, size: tuple[int, ...], indices: range) -> None:
         """Run the part of a launch that has these indices along the first dimension."""
@@ -288,12 +290,6 @@ MAX_BOUNDS = 4096
 @functools.lru_cache(maxsize=1024)
 def _struct(fields: tuple[tuple[str, type], ...]) -> Any:
     return type("Arguments", (ctypes.Structure,), {"_fields_": list(fields)})
-
-
-def _ranges(kernel: Any, size: tuple[int, ...]) -> list[range]:
-    """Return the ranges of a launch's first dimension that CPU threads run; one range: no split."""
-    smallest = MIN_RANGES.get(kernel)
-    return [range(size[0])] if smallest is None else even_ranges(size[0], smallest)
 
 
 class Launch(NamedTuple):

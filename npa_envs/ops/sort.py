@@ -22,7 +22,7 @@ from npa_envs.ops.backend import (
     multiprocessor_count,
     rollout_listing,
 )
-from npa_envs.ops.launch import aligned, channel_width, is_aligned, is_recorded, launch, scalar_type
+from npa_envs.ops.launch import channel_width, is_aligned, is_recorded, launch, scalar_type
 from npa_envs.ops.physics import Physics
 
 MAX_INDEX = 2**31 - 1
@@ -357,9 +357,3 @@ def _sort_by_blocks(
         block_dim=block,
     )
     return ordered
-
-
-def grouped_states(plan: KernelPlan, s: Tensor) -> Tensor:
-    """Return sorted states in groups of channels, padded with zeros, [B N G, W]."""
-    width = plan.group_count * plan.width
-    return aligned(torch.nn.functional.pad(s, (0, width - plan.state_dim))).view(-1, plan.width)

@@ -14,10 +14,10 @@ from torch import Tensor
 from npa_envs.kernels.portable.density import density_kernels
 from npa_envs.kernels.portable.sort import give_rows
 from npa_envs.ops.custom_op import custom_op
-from npa_envs.ops.launch import is_traced, launch, scalar_type
+from npa_envs.ops.launch import aligned, is_traced, launch, scalar_type
 from npa_envs.ops.passes import Densities, ListedNeighbours, NeighbourLists, compute_densities
 from npa_envs.ops.physics import Physics
-from npa_envs.ops.sort import KernelPlan, SortedWorlds, grouped_states, plan_kernels, sort_worlds
+from npa_envs.ops.sort import KernelPlan, SortedWorlds, plan_kernels, sort_worlds
 
 MAX_LISTS = 2**31
 """Largest bytes of all lists on a CPU; with more neighbours, each step searches again."""
@@ -129,7 +129,12 @@ def _static_rows(
     active = masks.view(step_count, total).index_select(1, source)
     # One sum over all steps: torch is fastest on one long row.
     active_before = torch.cumsum(active.view(-1), 0, dtype=torch.int32)
-    rows = _empty_rows(x, step_count, cell_starts, row_capacity)
+    rows = (
+        source.new_empty(step_count, total),
+        source.new_empty(step_count, row_capacity),
+        source.new_empty(step_count, 2 * cell_starts.shape[0] - 1),
+        x.new_empty(step_count, row_capacity, space_dim),
+    )
     launch(
         give_rows(space_dim, scalar_type(x.dtype)),
         (step_count, max(total, rows[2].shape[1])),
@@ -142,18 +147,6 @@ def _static_rows(
         *rows,
     )
     return [*rows, active_before.view(step_count, total)[:, -1].diff(prepend=rows[0].new_zeros(1))]
-
-
-def _empty_rows(
-    x: Tensor, step_count: int, cell_starts: Tensor, row_capacity: int
-) -> tuple[Tensor, ...]:
-    integers = cell_starts.new_empty
-    return (
-        integers(step_count, x.shape[0] * x.shape[1]),
-        integers(step_count, row_capacity),
-        integers(step_count, 2 * cell_starts.shape[0] - 1),
-        x.new_empty(step_count, row_capacity, x.shape[2]),
-    )
 
 
 def static_rows(
@@ -193,6 +186,8 @@ def static_worlds(
     if plan.lists_neighbours:
         steps, lengths, records = worlds.lists
         lists = NeighbourLists(plan.listing, steps, lengths, records, by_place=True)
+    # States in groups of channels.
+    padding = 0, plan.group_count * plan.width - plan.state_dim
     ordered = SortedWorlds(
         starts=rows.starts,
         source=worlds.all_indices,
@@ -202,6 +197,6 @@ def static_worlds(
         row_place=rows.row_source,
         positions=x.view(plan.total, plan.space_dim),
         row_positions=rows.row_positions,
-        states=grouped_states(plan, s),
+        states=aligned(torch.nn.functional.pad(s, padding)).view(-1, plan.width),
     )
     return ordered, Densities(worlds.particles, worlds.density_gradient, lists, worlds.listed)

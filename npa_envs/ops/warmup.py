@@ -67,12 +67,14 @@ def warmup(
             physics = Physics(space_dim, state_dim, 0.1, 0.1, max_displacement=0.1, limits=limits)
             # Small, medium and large worlds run different kernels.
             for count in (2, SHARED_WORLD, SHARED_WORLD + 1):
-                worlds = [value.detach()[:, :1].expand(-1, count, -1) for value in (x, s)]
-                build_neighbours(*worlds, physics).perceive()
-                _warm_steps(*worlds, physics)
+                positions, states = (v.detach()[:, :1].expand(-1, count, -1) for v in (x, s))
+                build_neighbours(positions, states, physics).perceive()
+                _warm_steps(positions, states, physics)
                 if space_dim == 2:
                     target, middle = x.new_zeros(8, 8, 4), x.new_zeros(2)
-                    picture_losses(*worlds, target, goal=middle, shift=0.0, pixel_size=0.1)
+                    picture_losses(
+                        positions, states, target, goal=middle, shift=0.0, pixel_size=0.1
+                    )
             _warm_static(x, s, physics)
             _warm_network(x, physics)
             _warm_invariants(x, state_dim)
@@ -109,11 +111,11 @@ def _warm_judgement(elapsed: torch.Tensor) -> None:
 
 def _warm_steps(x: torch.Tensor, s: torch.Tensor, physics: Physics) -> None:
     """Run perception and update as in rollouts, of all particles and of those in a mask."""
-    size = {"row_capacity": x.shape[1], "row_width": physics.perception_dim + 1}
+    count, width = x.shape[1], physics.perception_dim + 1
     every = torch.ones(x.shape[:2], dtype=torch.uint8, device=x.device)
     for mask, gradients in itertools.product((None, every), (False, True)):
         worlds = x, s.clone().requires_grad_(gradients)
-        rows, maps = perceive_rows(*worlds, physics, mask=mask, **size)
+        rows, maps = perceive_rows(*worlds, physics, mask=mask, row_capacity=count, row_width=width)
         path_length = x.new_zeros(x.shape[:2])
         update = rows[:, : physics.action_dim]
         _, states, _ = update_particles(update, *worlds, path_length, maps, physics)

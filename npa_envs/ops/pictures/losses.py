@@ -44,7 +44,10 @@ def _picture_losses(
         starts, footprints, _ = sort_splats(splats, view)
         tile_total = view.tile_columns * view.tile_rows
         partial_sums = x.new_empty(world_count, tile_total, 2, dtype=torch.float64)
-        tile_count = block_tiles(world_count * tile_total, multiprocessor_count(device))
+        # Fewer tiles for a block if many would leave multiprocessors idle.
+        tile_count, fewest = BLOCK_TILES, BLOCKS_OF_PROCESSOR * multiprocessor_count(device)
+        while tile_count > TURN_TILES and world_count * tile_total < fewest * tile_count:
+            tile_count //= 2
         threads = world_count * -(-tile_total // tile_count) * CUDA_BLOCK
         pixels = aligned(target).view(-1, CHANNELS)
         gathered = (tile_count, starts, footprints, pixels, partial_sums)
@@ -55,14 +58,6 @@ def _picture_losses(
         partial_sums = x.new_empty(*rows, 2, dtype=torch.float64)
         launch(sum_errors(scalar), rows, device, picture, target.contiguous(), partial_sums)
     return average_sums(partial_sums, view.resolution**2, x)
-
-
-def block_tiles(tile_total: int, processors: int) -> int:
-    """Return the number of tiles of a block: fewer if many would leave multiprocessors idle."""
-    tile_count = BLOCK_TILES
-    while tile_count > TURN_TILES and tile_total < BLOCKS_OF_PROCESSOR * processors * tile_count:
-        tile_count //= 2
-    return tile_count
 
 
 def picture_losses(
