@@ -25,7 +25,8 @@ class Particles(NamedTuple):
         """Return the worlds with paths of length 0, in `zeros` if it is given, shape [B, N]."""
         if zeros is None:
             zeros = self.x.new_zeros(self.x.shape[:2])
-        return self._replace(path_length=zeros)
+        # Not by `_replace`: torch.compile cannot trace it.
+        return Particles(self.x, self.s, zeros, self.goal)
 
     def per_particle(self) -> tuple[Tensor, Tensor, Any]:
         """Return the fields of particles, without those of worlds, in the order of updates."""

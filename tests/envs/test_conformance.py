@@ -227,7 +227,8 @@ class TestEveryEnvironment:
                 result = call(shared)
                 assert_same(returned[0], result)
                 first = result[0] if first is None else first
-                assert self.name not in IDS or np.shares_memory(first, result[0])
+                if self.name in IDS and device.type == "cpu":
+                    assert np.shares_memory(first, result[0])
             result = call(changed)
             assert_same(returned[0], result)
             for leaf in leaves(result):

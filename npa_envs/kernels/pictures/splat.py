@@ -7,9 +7,8 @@ the picture. They are products of a row's weight and a column's.
 On CUDA n threads gather a tile of pixels: each sums every n-th particle around the tile, and gets a
 row of the sums. Particles are sorted by cells, the tiles that contain their patch's centre, with an
 origin r pixels before the picture: the particles that cover tiles along a row of cells are then one
-contiguous run. Small worlds are sorted by `kernels/cuda/splat.py`, large ones by torch. On a CPU a
-thread draws a world, particle by particle. Either way the order of a pixel's sum depends only on
-its own world.
+contiguous run. Small worlds are sorted by `kernels/cuda/splat.py`. On a CPU a thread draws a world,
+particle by particle. Either way the order of a pixel's sum depends only on its own world.
 """
 
 import math
@@ -326,7 +325,42 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         return pixel_place(view, position, mean, goal)
 
     @wp.kernel(enable_backward=False, module=module)
-    def measure_splats(
+    def count_splats(
+        view: View,
+        particle_count: int,
+        positions: wp.array[vector],
+        means: wp.array[vector],
+        goal: wp.array[vector],
+        # outputs
+        cell: wp.array[wp.int32],
+        arrival: wp.array[wp.int32],
+        counts: wp.array[wp.int32],
+    ):
+        """Store each particle's cell and order of arrival, and count particles at counts[cell + 1];
+        counts[0] stays 0 for the prefix sum."""
+        await_earlier()
+        i = wp.tid()
+        world = i / particle_count
+        place = place_in_world(view, positions[i], means, goal, world)
+        index = world * view.cell_count + cell_of_centre(view, patch_centre(place))
+        cell[i] = index
+        arrival[i] = wp.atomic_add(counts, index + 1, 1)
+
+    @wp.kernel(enable_backward=False, module=module)
+    def place_splats(
+        cell: wp.array[wp.int32],
+        arrival: wp.array[wp.int32],
+        starts: wp.array[wp.int32],
+        # outputs
+        arrived: wp.array[wp.int32],
+    ):
+        """List the particles of each cell in the order in which they were counted."""
+        await_earlier()
+        i = wp.tid()
+        arrived[starts[cell[i]] + arrival[i]] = i
+
+    @wp.kernel(enable_backward=False, module=module)
+    def order_splats(
         view: View,
         particle_count: int,
         positions: wp.array[vector],
@@ -334,17 +368,31 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         shift: scalar,
         means: wp.array[vector],
         goal: wp.array[vector],
-        # outputs
         cell: wp.array[wp.int32],
+        arrived: wp.array[wp.int32],
+        starts: wp.array[wp.int32],
+        # outputs
         footprints: wp.array[footprint_type],
+        source: wp.array[wp.int32],
     ):
-        """Write each particle's cell, counted through all worlds, and its footprint."""
+        """Write each particle's footprint at its rank by index within its cell."""
         await_earlier()
-        i = wp.tid()
+        k = wp.tid()
+        i = arrived[k]
+        c = cell[i]
         world = i / particle_count
         place = place_in_world(view, positions[i], means, goal, world)
-        cell[i] = world * view.cell_count + cell_of_centre(view, patch_centre(place))
-        store_footprint(footprints, i, footprint_of(view, place, i, states, shift))
+        footprint = footprint_of(view, place, i, states, shift)
+        begin = starts[c]
+        target = k
+        # Invisible particles, which may be many, can have any order.
+        if c != (world + 1) * view.cell_count - 1:
+            target = begin
+            for other in range(begin, starts[c + 1]):
+                if arrived[other] < i:
+                    target += 1
+        store_footprint(footprints, target, footprint)
+        source[target] = i
 
     @wp.func
     def tile_of(view: View, t: int):
@@ -503,4 +551,6 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
             for c in range(3):
                 colours_bar[i, c] = colour_bar[c]
 
-    return named(measure_splats, gather_splats, scatter_splats, pull_back_splats)
+    return named(
+        count_splats, place_splats, order_splats, gather_splats, scatter_splats, pull_back_splats
+    )

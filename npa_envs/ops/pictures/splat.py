@@ -80,6 +80,12 @@ def device_kernels(like: Tensor) -> Any:
     return splat_kernels(scalar_type(like.dtype), splat_lanes(like.device))
 
 
+def gather_threads(world_count: int, resolution: int, device: torch.device) -> int:
+    """Return the number of threads that gather pictures."""
+    group = GROUP_WIDTH * GROUP_HEIGHT * splat_lanes(device)
+    return world_count * group_count(resolution) * group
+
+
 def _check_size(largest: int, world_count: int, view: Any) -> None:
     if largest >= MAX_INDEX:
         raise NPAError(
@@ -116,13 +122,16 @@ def sort_splats(splats: Splats, view: Any) -> tuple[Tensor, Tensor, Tensor]:
             block_dim=block,
         )
         return starts, footprints, source
-    cell = torch.empty_like(source)
-    measured = (*splats.contents(), *splats.places(), cell, footprints)
-    launch(device_kernels(x).measure_splats, total, x.device, view, *measured)
-    cells, order = torch.sort(cell, stable=True)
-    numbers = torch.arange(cell_total + 1, dtype=torch.int32, device=x.device)
-    starts = torch.searchsorted(cells, numbers, out_int32=True)
-    return starts, footprints[order], order.int()
+    kernels, contents, places = device_kernels(x), splats.contents(), splats.places()
+    cell, arrival, arrived = torch.empty(3, total, dtype=torch.int32, device=x.device).unbind()
+    counts = torch.zeros(cell_total + 1, dtype=torch.int32, device=x.device)
+    counted = (cell, arrival, counts)
+    launch(kernels.count_splats, total, x.device, view, *contents[:2], *places, *counted)
+    starts = torch.cumsum(counts, 0, dtype=torch.int32)
+    launch(kernels.place_splats, total, x.device, cell, arrival, starts, arrived)
+    sorted_splats = (cell, arrived, starts, footprints, source)
+    launch(kernels.order_splats, total, x.device, view, *contents, *places, *sorted_splats)
+    return starts, footprints, source
 
 
 def scatter_splats(splats: Splats, view: Any) -> tuple[Tensor, Tensor, Tensor]:
@@ -137,6 +146,20 @@ def scatter_splats(splats: Splats, view: Any) -> tuple[Tensor, Tensor, Tensor]:
     return picture, footprints, source
 
 
+def _draw(splats: Splats, view: Any) -> tuple[Tensor, Tensor, Tensor]:
+    """Draw as `scatter_splats`, by the kernels for the device."""
+    x = splats.x
+    if x.device.type != "cuda":
+        return scatter_splats(splats, view)
+    _check_size(x.shape[0] * CHANNELS * view.resolution**2, x.shape[0], view)
+    starts, footprints, source = sort_splats(splats, view)
+    picture = x.new_empty(x.shape[0], view.resolution, view.resolution, CHANNELS)
+    threads = gather_threads(x.shape[0], view.resolution, x.device)
+    flat = picture.view(-1, CHANNELS)
+    launch(device_kernels(x).gather_splats, threads, x.device, view, starts, footprints, flat)
+    return picture, footprints, source
+
+
 @custom_op("npa::splat")
 def _splat(
     x: Tensor,
@@ -147,19 +170,8 @@ def _splat(
     low: float,
     high: float,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return pictures, footprints and sources as `scatter_splats`, by the device's kernels."""
-    resolution, world_count = int(resolution), x.shape[0]
-    splats = Splats(x, colour)
-    view = make_view(scalar_type(x.dtype), resolution, pixel_size, sigma, low, high)
-    if x.device.type != "cuda":
-        return scatter_splats(splats, view)
-    _check_size(world_count * CHANNELS * resolution**2, world_count, view)
-    starts, footprints, source = sort_splats(splats, view)
-    picture = x.new_empty(world_count, resolution, resolution, CHANNELS)
-    threads = world_count * group_count(resolution) * GROUP_WIDTH * GROUP_HEIGHT * TILE_LANES
-    gathered = (view, starts, footprints, picture.view(-1, CHANNELS))
-    launch(device_kernels(x).gather_splats, threads, x.device, *gathered)
-    return picture, footprints, source
+    view = make_view(scalar_type(x.dtype), int(resolution), pixel_size, sigma, low, high)
+    return _draw(Splats(x, colour), view)
 
 
 @custom_op("npa::splat_backward")
