@@ -26,9 +26,9 @@ import torch
 from PIL import Image
 from side_by_side import iterate_together, on, stream_of
 
-from npa_envs.measure.judge import JudgeRow, TextureJudge
 from npa_envs.measure.quality import evaluate
 from npa_envs.measure.record import as_objects
+from npa_envs.measure.texture_judge import JudgeRow, TextureJudge
 from npa_envs.render import to_uint8, write_filmstrip
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule

@@ -5,7 +5,7 @@ keywords, and returns rules and a learning curve. Each method is a function in i
 is imported with its libraries when it is used.
 
 To read a method, for example `ppo.py`: `problem.py` makes the worlds, `rule_set.py` has the rules
-as functions, `progress.py` the budget, the curve and checkpoints; `ppo_common.py` has the parts
+as functions, `progress.py` the budget, the curve and checkpoints; `actor_critic.py` has the parts
 that the actor-critics `ppo.py`, `sb3.py` and `shac.py` share.
 """
 

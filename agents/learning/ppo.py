@@ -2,7 +2,7 @@
 
 Source: Schulman et al., arXiv 1707.06347. A round is `steps` steps of all worlds, then `epochs`
 passes over them in minibatches of particles. Read `PPOLearner.play` and `improve` first, then the
-formulas at the end of the file. Actor, critic and minibatches are in `ppo_common.py`.
+formulas at the end of the file. Actor, critic and minibatches are in `actor_critic.py`.
 
 The CPU reads one byte a world in each step (whether its episode ended) and one number a pass. On
 CUDA most work is recorded once as CUDA graphs, as launching its short kernels one by one takes
@@ -19,7 +19,7 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from npa_envs.agents.learning.ppo_common import (
+from npa_envs.agents.learning.actor_critic import (
     CRITIC_RATE,
     CRITIC_WIDTH,
     CommonOptions,

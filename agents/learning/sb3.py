@@ -17,8 +17,7 @@ from gymnasium.spaces import Dict, Space
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.agents.learning.baselines import check_no_start
-from npa_envs.agents.learning.ppo_common import (
+from npa_envs.agents.learning.actor_critic import (
     CommonOptions,
     Critic,
     CriticKind,
@@ -26,6 +25,7 @@ from npa_envs.agents.learning.ppo_common import (
     Pace,
     noise_left,
 )
+from npa_envs.agents.learning.baselines import check_no_start
 from npa_envs.agents.learning.problem import world_seeds
 from npa_envs.agents.learning.progress import Progress
 from npa_envs.agents.learning.rule_set import RuleSet

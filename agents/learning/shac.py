@@ -14,8 +14,7 @@ from typing import NamedTuple, get_args
 import torch
 from torch import Tensor
 
-from npa_envs.agents.learning.gradient import EnvironmentTask
-from npa_envs.agents.learning.ppo_common import (
+from npa_envs.agents.learning.actor_critic import (
     CRITIC_RATE,
     Critic,
     CriticKind,
@@ -25,6 +24,7 @@ from npa_envs.agents.learning.ppo_common import (
     learner_random,
     seeded_critic,
 )
+from npa_envs.agents.learning.gradient import EnvironmentTask
 from npa_envs.agents.learning.progress import Progress, annealed
 from npa_envs.agents.learning.rule_set import RuleSet
 from npa_envs.checks import check_fraction, check_non_negative, check_positive, check_word

@@ -29,6 +29,7 @@ from npa_envs.envs.garden.brushes import (
 from npa_envs.envs.grown import GrownTask, check_runs, run_rule
 from npa_envs.rule.rule import COLOUR_OFFSET
 from npa_envs.tasks.targets.points import PointTarget
+from npa_envs.world.brushes import nearest_image
 from npa_envs.world.cuda_graph import makes_plain_tensors, to_device_async
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import StreamId, WorldRandom
@@ -230,10 +231,12 @@ class GardenTask(RuleDriven, GrownTask[Config]):
         particles, rate = apply_brushes(particles, action, middle, config)
         if rate is None:
             return run(particles, config.rule_steps)
+        box = None if config.periodic_box is None else (config.periodic_box,) * 2
         for _ in range(config.rule_steps):
             x, s, *_ = particles
             new_x, new_s, *_ = run(particles, 1)
-            particles = Particles(x + rate * (new_x - x), s + rate * (new_s - s))
+            x = x + rate * nearest_image(new_x - x, box)
+            particles = Particles(nearest_image(x, box), s + rate * (new_s - s))
         return particles
 
     def disturb(self, particles: Particles, random: WorldRandom) -> Particles:

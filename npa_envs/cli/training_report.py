@@ -15,7 +15,6 @@ import torch
 from npa_envs.cli import common
 from npa_envs.errors import MissingDependencyError
 from npa_envs.files import write_text
-from npa_envs.measure.judge import TextureJudge
 from npa_envs.measure.quality import (
     CHECKPOINTS,
     CLOUD_CHECKPOINTS,
@@ -32,6 +31,7 @@ from npa_envs.measure.record import (
     tables_json,
     versions,
 )
+from npa_envs.measure.texture_judge import TextureJudge
 from npa_envs.render.world_film import SCREEN, film_world, write_3d_world
 from npa_envs.rule.files import load_rule
 from npa_envs.tasks.damage import DamageEvent

@@ -31,8 +31,8 @@ def await_earlier():
     """Wait for earlier launches; kernels call it first, before they access memory.
 
     On compute capability 9.0 and above such a kernel is started before the previous one has ended
-    (`npa_envs/ops/driver.py`). It must not load by `__ldg` or `ld.global.nc`, which the compiler
-    moves ahead of the wait.
+    (`npa_envs/ops/cuda_driver.py`). It must not load by `__ldg` or `ld.global.nc`, which the
+    compiler moves ahead of the wait.
     """
 
 

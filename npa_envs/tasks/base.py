@@ -107,7 +107,7 @@ class ParticleTask(Generic[ConfigT]):
     """Whether the task has `views`, `view_psnr` and `gaussians`: pictures from several cameras."""
 
     has_judge: bool = False
-    """Whether pictures of the task are compared by `npa_envs.measure.judge.TextureJudge`."""
+    """Whether `npa_envs.measure.texture_judge` compares pictures of the task."""
 
     classifies: bool = False
     """Whether static particles output class scores of their point cloud."""

@@ -24,7 +24,7 @@ from npa_envs.ops import Cameras, render_gaussians, world_mean
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.appearance import OUTPUTS, Gaussians, appearance
 from npa_envs.tasks.base import GrowthConfig, GrowthTask, shares_of_loss
-from npa_envs.tasks.losses.pieces import MultiScaleSimilarity
+from npa_envs.tasks.losses.image_distances import MultiScaleSimilarity
 from npa_envs.tasks.targets.views import (
     Views,
     ViewTarget,

@@ -22,7 +22,7 @@ from npa_envs.ops import periodic_splat
 from npa_envs.rule.rule import COLOUR_OFFSET
 from npa_envs.tasks.base import ParticleTask, TaskConfig, distances_moved, shares_of_loss
 from npa_envs.tasks.damage import random_particle
-from npa_envs.tasks.losses.pieces import LossOptions
+from npa_envs.tasks.losses.image_distances import LossOptions
 from npa_envs.tasks.losses.texture import (
     DEFAULT_LOSS,
     TextureLoss,

@@ -55,12 +55,12 @@ CONSTANTS = {
     "MIN_SEED": MIN_SEED,
     "SEED_FRACTION": SEED_FRACTION,
 }
-"""Numbers and names of the Python worlds that live_world.js also needs."""
+"""Numbers and names of the Python worlds that page_world.js also needs."""
 
 PAGE_MODULES = ("drawing.js", "plots.js", "page.js", "worker_engine.js")
 WORKER_MODULES = (
     *("physics.js", "kernels_simd.js", "physics_gpu.js", "brushes.js", "colours.js"),
-    "live_world.js",
+    "page_world.js",
 )
 """Modules of the page and of its worker, each after those that it imports."""
 
@@ -142,7 +142,7 @@ def distinct_names(sources: Sequence[str], what: str) -> list[str]:
 
 
 def page_rule(source: str, *, particle_count: int | None = None) -> dict[str, Any]:
-    """Return a rule and its world for live_world.js, as JSON; arrays are float32 in base64."""
+    """Return a rule and its world for page_world.js, as JSON; arrays are float32 in base64."""
     check_browser_rule(load_rule(source), name_of(source))
     live = RuleWorld(source, device=torch.device("cpu"), particle_count=particle_count, choices={})
     rule, task = live.main.rule, live.task
@@ -163,7 +163,7 @@ def page_rule(source: str, *, particle_count: int | None = None) -> dict[str, An
             f"a {type(task).__name__}: watch it with npa-envs view"
         )
     world = live.describe()
-    # live_world.js adds these itself.
+    # page_world.js adds these itself.
     for name in ("type", "rules", "rule", "others", "species", "show", "playing", "seed"):
         del world[name]
     classes = {"palette": PALETTE, "undecided": UNDECIDED}

@@ -77,7 +77,7 @@ TOOLS = (
     Tool("add", "Add a seed of another rule", "growth", "once", "rule",
          "M12 4a8 8 0 1 0 .1 0M12 8v8M8 12h8"),
 )  # fmt: skip
-"""All brushes. `brushed`, `RuleWorld._brush` and `brush` of live_world.js apply them."""
+"""All brushes. `brushed`, `RuleWorld._brush` and `brush` of page_world.js apply them."""
 
 
 class WorldView(NamedTuple):

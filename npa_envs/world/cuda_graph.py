@@ -18,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.ops.driver import new_stream
+from npa_envs.ops.cuda_driver import new_stream
 
 
 def to_device_async(values: NDArray[Any], device: torch.device) -> Tensor:

@@ -13,6 +13,7 @@ from learning_problems import heart, progress_of, wild_rules
 
 from npa_envs.agents import RandomPolicy, evaluate_policy
 from npa_envs.agents.learning import Budget, Problem, RuleSet, ppo, train
+from npa_envs.agents.learning.actor_critic import Critic, GaussianRules
 from npa_envs.agents.learning.ppo import (
     PPOLearner,
     PPOOptions,
@@ -23,7 +24,6 @@ from npa_envs.agents.learning.ppo import (
     world_bytes,
     world_count,
 )
-from npa_envs.agents.learning.ppo_common import Critic, GaussianRules
 from npa_envs.rule.rule import NPARule
 from npa_envs.world.cuda_graph import no_garbage_collection
 

@@ -417,3 +417,20 @@ def test_a_script_recognises_goals_and_says_their_codes(coded, actions):
     assert RecognisingShapeshifter(batch)(seen).shape[0] == 3
     plain = make("npa/Morphogenesis2D-v0")
     refused("env must be one whose agent chooses codes", RecognisingShapeshifter, plain)
+
+
+def test_slowed_particles_cross_the_edge_of_a_periodic_box_by_the_shortest_way():
+    options = {"actions": "free", "tools": ("rate",), "boundary": "periodic", "box_size": 2.0}
+    envs = make_vec(GARDENER, 2, **options, brush_radius=2.0)
+    envs.reset(seed=0)
+    worlds, task = envs.unwrapped.worlds, envs.unwrapped.worlds.task
+    before = worlds.particles._replace(x=worlds.particles.x + 1.0)
+    before = before._replace(x=before.x - 2.0 * (before.x / 2.0).round())
+    action = torch.full((2, *envs.single_action_space.shape), -0.5)
+    after = task.brush_and_roll(before, action, worlds.random)
+    moved = after.x - before.x
+    moved -= 2.0 * (moved / 2.0).round()
+    config = task.config
+    most = config.rule_steps * task.rule.alpha * config.eps
+    assert 0.0 < float(moved.norm(dim=-1).max()) <= most
+    assert float(after.x.abs().max()) <= 1.0

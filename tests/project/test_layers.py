@@ -56,7 +56,7 @@ LAYERS = {
     "npa_envs": Layer(10, COMPUTED_NAME, never=ORACLES),
     "npa_envs.measure.record": Layer(3, "torch", never=INSIDES),
     "npa_envs.measure.plots": Layer(2, "matplotlib"),
-    "npa_envs.measure.judge": Layer(10, "torch", never=INSIDES),
+    "npa_envs.measure.texture_judge": Layer(10, "torch", never=INSIDES),
     "npa_envs.measure.quality": Layer(11, "torch numpy tqdm", never=INSIDES),
     "npa_envs.measure.interaction": Layer(11, "torch numpy matplotlib", never=ORACLES),
     "npa_envs.measure.speed": Layer(13, "torch numpy matplotlib", never=("npa_envs.kernels",)),

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from npa_envs.errors import NPAError
-from npa_envs.tasks.losses.pieces import (
+from npa_envs.tasks.losses.image_distances import (
     EVEN,
     MATCHED_PATCH,
     RandomFilters,
