@@ -116,9 +116,9 @@ def _warm_steps(x: torch.Tensor, s: torch.Tensor, physics: Physics) -> None:
     for mask, gradients in itertools.product((None, every), (False, True)):
         worlds = x, s.clone().requires_grad_(gradients)
         rows, maps = perceive_rows(*worlds, physics, mask=mask, row_capacity=count, row_width=width)
-        path_length = x.new_zeros(x.shape[:2])
+        paths = x.new_zeros(x.shape[:2])
         update = rows[:, : physics.action_dim]
-        _, states, _ = update_particles(update, *worlds, path_length, maps, physics)
+        _, states, _ = update_particles(update, *worlds, paths, maps, physics)
         if gradients:
             _pull_back(states)
 
