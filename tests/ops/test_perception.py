@@ -24,9 +24,9 @@ from npa_envs.ops.perceive import build_neighbours
 from npa_envs.ops.physics import Limits, Physics, Terms
 
 # The bound of the tests, then the worst error measured on CPUs and CUDA: a quarter of it at most.
-FORWARD = {torch.float32: 3e-6, torch.float64: 1e-14}  # 7.1e-7, 2e-15
+FORWARD = {torch.float32: 8e-6, torch.float64: 1e-14}  # 1.9e-6 (CUDA), 2e-15
 GRADIENT = {torch.float32: 5e-6, torch.float64: 1e-14}  # 5e-7, 1e-15
-POSITION_GRADIENT = {torch.float32: 2e-5, torch.float64: 3e-14}  # 7e-7, 7e-15
+POSITION_GRADIENT = {torch.float32: 2e-5, torch.float64: 4e-14}  # 7e-7, 8e-15
 
 REFERENCE_FILES = ("2d_open", "2d_open_degenerate", "2d_periodic", "3d_open", "3d_periodic")
 
@@ -210,8 +210,8 @@ def test_particles_several_boxes_away_are_perceived_where_they_are_wrapped(box, 
     turns = torch.randint(-3, 4, x.shape, generator=torch.Generator().manual_seed(0))
     away = (x / 2.8 + turns.to(x)) * x.new_tensor(box)
     expected = oracle.perceive(*exact(away, s), 0.2, 0.2, box=box)
-    # Positions of up to 15 are wrapped: worst error measured 1.7e-5.
-    assert relative_error(npa_envs.perceive(away, s, 0.2, box=box), expected) < 7e-5
+    # Positions of up to 15 are wrapped: worst error measured 3.5e-5 (CUDA).
+    assert relative_error(npa_envs.perceive(away, s, 0.2, box=box), expected) < 1.5e-4
 
 
 def test_smoothing_kernel_integrates_to_one():
