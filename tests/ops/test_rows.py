@@ -17,7 +17,7 @@ from npa_envs.errors import NPAError
 from npa_envs.ops import backend, passes
 from npa_envs.ops.physics import Terms
 
-# The worst errors measured were 1.2e-6 (CUDA), and, in a box of two eps, 2.1e-6 on CUDA, 1.3e-6 on the CPU.
+# The worst errors measured were 1.2e-6 (CUDA), and in a box of two eps 2.1e-6 (CUDA).
 BOUNDS = (5e-6, 1e-5)
 
 all_or_half = pytest.mark.parametrize("masked", [False, True], ids=("all", "half"))
