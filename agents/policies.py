@@ -40,7 +40,7 @@ class Interface(NamedTuple):
 
     @classmethod
     def of(cls, physics: Physics, species_count: int = 0, target_dim: int = 0) -> Interface:
-        """Return the interface of worlds with these physical constants."""
+        """Return the columns of observations and actions for these physical constants."""
         scale = physics.limits.state_scale
         sizes = physics.space_dim, physics.state_dim, physics.moving
         return cls(*sizes, scale, species_count, target_dim)
@@ -386,7 +386,7 @@ class PaintPolicy(SpreadPolicy):
             )
 
     def state_step(self, observation: Tensor) -> Tensor:
-        """Return the difference to the colour, in the last three channels."""
+        """Return target colour minus own colour in the last three channels, 0 in the others."""
         step = torch.zeros_like(self.interface.states(observation))
         target = self._colour.to(step.device) - COLOUR_OFFSET
         step[..., -3:] = target - self.interface.states(observation)[..., -3:]
@@ -410,7 +410,7 @@ class MendPolicy(SpreadPolicy):
         self._blank = checked_finite("blank", blank)
 
     def state_step(self, observation: Tensor) -> Tensor:
-        """Return the difference to the neighbours' mean state for blank particles, else 0."""
+        """Return the neighbours' mean state minus own state for blank particles, else 0."""
         states = self.interface.states(observation)
         blank = states.norm(dim=-1, keepdim=True) < self._blank
         return torch.where(blank, self.interface.mean_states(observation) - states, 0.0)

@@ -97,7 +97,7 @@ class GrownTask(PictureEnvTask[Config]):
         return 0 if self.config.split == "train" else FIRST_TEST_SEED
 
     def seed(self, random: WorldRandom) -> tuple[Tensor, Tensor]:
-        """Return grown worlds."""
+        """Return seeds that `rule` has grown `grow_steps` steps: x [B, N, D] and s [B, N, C]."""
         seeds = Particles(*super().seed(random))
         x, s, *_ = grow(self.rule, self.config, seeds, random, dt=1.0, position_noise=0.0)
         return x, s

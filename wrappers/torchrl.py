@@ -117,7 +117,7 @@ class NPATorchRLEnv(EnvBase):  # type: ignore[misc]
         return chosen
 
     def _spread(self, values: Tensor) -> Tensor:
-        """Return values of worlds, [B], in the shape of entries: [B, 1] or [B, N, 1]."""
+        """Return worlds' values [B] in a TensorDict's shape: [B, 1], or per particle [B, N, 1]."""
         if not self.rows:
             return values[:, None]
         return values[:, None, None].expand(-1, self.particle_count, -1).clone()

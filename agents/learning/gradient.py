@@ -275,7 +275,7 @@ def with_clamped_states(update: Tensor, rule: ClampedRule) -> Tensor:
 
 
 class ClampedWeights(FoldedRule):
-    """Folded weights of a rule, whose state steps are clamped to a limit."""
+    """The `FoldedRule` of a `ClampedRule`: it clamps the state part of each update."""
 
     rule: ClampedRule
 

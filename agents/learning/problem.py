@@ -324,7 +324,7 @@ def check_run_seed(seed: Any) -> None:
 def world_seeds(seed: int, count: int, part: int = 0) -> list[int]:
     """Return the seeds of a run's worlds, which no other run has.
 
-    part: how often the run was resumed; each part has other seeds until all are used.
+    part: number of resumptions. Each uses new seeds; after `WORLDS_PER_SEED` seeds they repeat.
     """
     check_run_seed(seed)
     if count > WORLDS_PER_SEED:

@@ -53,7 +53,7 @@ class Budget:
             check_positive(self, int, "particle_steps")
 
     def share(self, seconds: float, particle_steps: int) -> float:
-        """Return the fraction of the budget that time [s] and particle-steps make; 1: all of it."""
+        """Return the spent fraction of time [s] or particle-steps, whichever is larger; 1: all."""
         by_time = 0.0 if self.seconds is None else seconds / self.seconds
         by_steps = 0.0 if self.particle_steps is None else particle_steps / self.particle_steps
         return max(by_time, by_steps)

@@ -200,7 +200,7 @@ class WorldsEnv(ShownEnv):
         self.form: ParticleSpaces = form_type(self.worlds.physics, self.config)
 
     def _begin(self, worlds: Tensor, keys: Tensor | None, out: Tensor | None = None) -> Tensor:
-        """Start episodes in some worlds, int64, [M]; return all worlds' observations, [B, ...]."""
+        """Start the next episodes of M worlds, or those of `keys`; return all B observations."""
         with self.worlds.device_context():
             self.worlds.start(worlds, keys)
             observation: Tensor = self.worlds.perceive(out)
@@ -209,7 +209,7 @@ class WorldsEnv(ShownEnv):
         return observation
 
     def _place(self, particles: Particles, worlds: Tensor, out: Tensor | None = None) -> Tensor:
-        """Replace particles of some worlds, [M]; return all worlds' observations, [B, ...]."""
+        """Replace particles in worlds of indices [M]; return all worlds' observations, [B, ...]."""
         with self.worlds.device_context():
             self.worlds.place(worlds, particles)
             observation: Tensor = self.worlds.perceive(out)

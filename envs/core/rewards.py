@@ -53,7 +53,7 @@ class StepReport(NamedTuple):
     buffer: Tensor
     """The memory of the fields below, uint8."""
     numbers: Tensor
-    """Reward, loss, its K parts, and the last step's fall of each part, shape [2 + 2 K, B]."""
+    """Reward, loss, its K parts, and each part's decrease in the last step, shape [2 + 2 K, B]."""
     endings: Tensor
     """Terminated, truncated, success, diverged, bool, shape [4, B]."""
     everyone: Tensor
@@ -101,12 +101,12 @@ class StepReport(NamedTuple):
 
     @property
     def improvements(self) -> Tensor:
-        """How much each part fell in the last step, shape [K, B]."""
+        """Decrease of each part of the loss in the last step, shape [K, B]."""
         return self.numbers[1 + len(self.numbers) // 2 :]
 
 
 class ParticleRewards:
-    """Rewards of single particles: the fall of their own losses, or their marginal gains."""
+    """Rewards of single particles: the decrease of their own losses, or their marginal gains."""
 
     def __init__(self, particles: Particles, *, by_loss: bool) -> None:
         self.reward = torch.zeros_like(particles.x[..., 0])

@@ -144,7 +144,7 @@ class EnvTask(WorldTask[Config]):
 
     @classmethod
     def bytes_per_world(cls, config: Any) -> int:
-        """Return about how much of this memory each world needs [bytes]; by default none."""
+        """Return about how much extra memory the task needs per world [bytes]; by default 0."""
         return 0
 
     def seed(self, random: WorldRandom) -> tuple[Tensor, Tensor]:
@@ -300,7 +300,7 @@ class TargetEnvTask(EnvTask[Config]):
 
     @classmethod
     def bytes_per_world(cls, config: Any) -> int:
-        """Return about how much memory comparing a world takes [bytes]."""
+        """Return about how much memory the loss of one world takes [bytes]."""
         copies = 4 if config.per_particle_reward else 1
         return copies * cls.pixel_bytes * int(getattr(config, "resolution", 0)) ** 2
 

@@ -146,7 +146,7 @@ class PictureLossTask(SpeciesTask):
 
     @property
     def open_half_width(self) -> float:
-        """Half of a picture's side [length units], which shows a target around each seed."""
+        """Half of a picture's side in open space [length units]; each seed's target fits in."""
         return float(1.0 + 0.5 * (self.config.species_count - 1) * self.config.seed_distance)
 
 
@@ -195,7 +195,7 @@ class CoMorphogenesisTask(PictureLossTask):
         return {name: by_species([part[name] for part in parts], population) for name in parts[0]}
 
     def particle_losses(self, population: Population) -> Mapping[str, Tensor]:
-        """Return each particle's part of its species' splat loss."""
+        """Return each particle's share of its species' splat loss, shape [B, N]."""
         losses = [self.tasks[k].particle_shares(*population.of(k)) for k in _present(population)]
         return {"picture": torch.cat(losses, dim=1)}
 
@@ -240,7 +240,7 @@ class InvasionTask(PictureLossTask):
         }
 
     def particle_losses(self, population: Population) -> Mapping[str, Tensor]:
-        """Return parts of species 0's splat loss, and minus an equal part for each invader."""
+        """Return each particle's loss; an invader's is −(sum of species 0) / (invader count)."""
         losses = self.task.particle_shares(*population.of(0))
         count, invader_count = losses.shape[1], sum(population.counts[1:])
         part = world_mean(losses[..., None])[:, 0] * (-count / max(invader_count, 1))
@@ -288,7 +288,7 @@ class SymbiosisTask(PictureLossTask):
         return {name: loss[:, None].expand(-1, count) for name, loss in parts.items()}
 
     def particle_losses(self, population: Population) -> Mapping[str, Tensor]:
-        """Return each particle's part of the splat loss."""
+        """Return each particle's share of the splat loss, shape [B, N]."""
         return {"picture": self.task.particle_shares(population.x, population.s)}
 
     # There is one picture, in the middle.

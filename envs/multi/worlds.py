@@ -425,7 +425,7 @@ class SpeciesWorlds(WorldState):
 class Cohort:
     """Worlds of a batch with the same remaining particles, stepped together.
 
-    On CUDA the second step is captured as a graph, which only later steps make up for.
+    On CUDA the second step is captured as a graph; only later steps regain the time it takes.
     """
 
     def __init__(

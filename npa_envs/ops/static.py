@@ -103,7 +103,7 @@ def _list_neighbours(plan: KernelPlan, starts: Tensor, particles: Tensor) -> lis
 
 
 def prepare_static(x: Tensor, physics: Physics) -> StaticWorlds:
-    """Sort checked worlds whose particles do not move, and list their neighbours; no gradient."""
+    """Return static particles sorted by cell, with neighbours; x is validated; no gradient."""
     return StaticWorlds.of(_prepare_static(x.detach().contiguous(), physics.state_dim, physics))
 
 

@@ -169,7 +169,7 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
         self.target = target.to(device)
         """The views of the target."""
         self._shown = some_views(self.target.held_out, torch.tensor([visible], device=device))
-        # Pictures show this view; rows point up.
+        # Pictures show this view; their first row is the bottom.
         self._target_picture = self._shown.pictures[0].flip(0)
         self.schedule = ViewSchedule(len(target.training.pictures), config, device)
         """Views, blur and backgrounds of an iteration."""
@@ -205,7 +205,7 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
         return self._draw(x, self.gaussians(s), cameras)
 
     def picture(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return one held-out view of each world; rows point up, shape [B, R, R, 4]."""
+        """Return a held-out view per world, [B, R, R, 4]; the first row is the bottom."""
         return self.views(x, s, self._shown.cameras)[:, 0].flip(1)
 
     def metric(self, x: Tensor, s: Tensor) -> Tensor:

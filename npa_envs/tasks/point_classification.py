@@ -222,7 +222,7 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         return -chances.gather(-1, wanted).squeeze(-1)
 
     def metric(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return each world's mean squared error, shape [B]."""
+        """Return each world's mean of (class score − one-hot of its class)², shape [B]."""
         return world_mean(self.errors(s)[..., None])[:, 0]
 
     def trial_metric(self, worlds: Particles) -> Tensor:

@@ -304,7 +304,7 @@ def _replaced(name: str, present: Any, fields: Mapping[str, Any]) -> Any:
 
 
 def _convert(name: str, value: Any, cls: Any, present: Any) -> Any:
-    """Return a value of a file as the field's type; the dataclass checks ranges."""
+    """Convert a value read from a file to a field's type `cls`; `present` is its current value."""
     origin = typing.get_origin(cls)
     if origin is typing.Literal:
         return value

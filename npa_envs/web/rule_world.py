@@ -123,7 +123,7 @@ class RuleWorld(LiveWorld):
 
     @torch.no_grad()
     def _begin(self, seed: int | None) -> None:
-        """Start a fresh world of the chosen rule alone."""
+        """Start a fresh world in which all particles follow the chosen rule."""
         super()._begin(seed)
         self._generator = torch.Generator(self._device).manual_seed(self.seed)
         seeds = self.task.seed(1, generator=self._generator, device=self._device)

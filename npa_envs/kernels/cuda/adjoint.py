@@ -63,7 +63,7 @@ store_channels = make_wide_store(CHANNELS)
 def make_sum_listed(space_dim: int, width: int, kinds: int, periodic: bool) -> wp.Function:
     """Return a Warp function that adds weighted channels of listed rows for a warp's particles.
 
-    A pair has one weight of the smoothing kernel; with the spiky gradient kernel, D more.
+    A pair has `kinds` weights: one of the smoothing kernel, and D or none of its spiky gradient.
     """
     vector = wp.types.vector(space_dim, wp.float32)
 
@@ -118,7 +118,7 @@ def pad_list(address: wp.uint32, count: int, entry: ENTRY) -> int:
 
 @native.func_native()
 def carry_rest(address: wp.uint32, summed: int, count: int):
-    """Move entries that are not summed yet, fewer than `TILE`, to the list's beginning."""
+    """Copy entries `summed` to `count` - 1 of a list, fewer than `TILE`, to its beginning."""
 
 
 @native.func_native()

@@ -90,7 +90,7 @@ def row_kernels(
 
 @cached_under_lock()
 def mixing_sum() -> wp.Kernel:
-    """Return the kernel that adds the sums of blocks; its own blocks are larger."""
+    """Return the kernel that adds up the blocks' gradients of the mixing weights."""
 
     @wp.kernel(
         enable_backward=False,
@@ -102,7 +102,7 @@ def mixing_sum() -> wp.Kernel:
         # outputs
         total: wp.array[wp.float32],
     ):
-        """Add the blocks' sums."""
+        """Add up the gradients that each block of `pull_back_rows` has written."""
         await_earlier()
         add_partial_sums(partial_sums, total)
 

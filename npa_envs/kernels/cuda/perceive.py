@@ -160,10 +160,10 @@ def slot_functions(variant: PerceptionVariant, lane_channels: type) -> SimpleNam
 
 
 def weighing_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> SimpleNamespace:
-    """Return the functions that put neighbours' weights into a slot and add up the short sums.
+    """Return the functions that write neighbours' weights to a slot of shared memory.
 
-    These are sums whose terms have no channels: of v K, of the moment matrix, and of the density
-    gradient. Each lane sums its own neighbours.
+    They also add up the sums without state channels: of v K, the moment matrix and the density
+    gradient. Each lane adds up those of its own neighbours.
     """
     scalar = wp.float32
     space_dim, lanes, periodic = variant.space_dim, variant.lanes, variant.periodic
@@ -189,7 +189,7 @@ def weighing_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> Si
 
     @wp.struct
     class Sums:
-        """A lane's short sums: of v K, the moment matrix, the density gradient over its norm."""
+        """A lane's sums: of v K, the moment matrix, and the unnormalised density gradient."""
 
         kernel: vector
         moment: square
@@ -197,7 +197,7 @@ def weighing_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> Si
 
     @wp.func
     def spiky_f64(domain: Domain, centre: Centre, neighbour: vector, squared: scalar):
-        """Return a pair's spiky factor with norm 1, and its offset r, both in float64."""
+        """Return a pair's unnormalised spiky factor and its offset r, both in float64."""
         r = vector_f64()
         start = squared
         for d in range(wp.static(space_dim)):
@@ -223,7 +223,7 @@ def weighing_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> Si
         counts: bool,
         sums: Sums,
     ):
-        """Put neighbour j's weights into the slot, and add its terms to this lane's short sums.
+        """Write neighbour j's weights to the slot, and add its terms to this lane's `Sums`.
 
         Entries that only pad a list have `counts` False and the centre's position: they add 0.
         """

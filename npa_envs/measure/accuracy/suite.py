@@ -66,7 +66,7 @@ class CheckResult:
         object.__setattr__(self, "verdict", self.verdict or (default if within else "fail"))
 
     def fraction(self, name: str) -> float:
-        """Return a figure over its limit, which is exceeded if this is above 1 or NaN.
+        """Return a figure divided by its limit; if this is above 1 or NaN, it exceeds the limit.
 
         With a limit of 0 it is 0 or infinite.
         """
@@ -188,18 +188,18 @@ class StressRecord(Record[CheckResult]):
         self._order = {name: k for k, name in enumerate(names)}
 
     def content(self) -> dict[str, Any]:
-        """Return the entries; numbers that are not finite become text, such as "nan"."""
+        """Return counts and check results; numbers that are not finite become text: "nan"."""
         return {"counts": self.counts(), "checks": _json_values(as_objects(self.rows))}
 
     def parse(self, content: dict[str, Any]) -> list[CheckResult]:
-        """Return the entries of a run that was stopped."""
+        """Return the check results in the content of a record file, to continue a stopped run."""
         for fields in content["checks"]:
             for name in ("figures", "limits"):
                 fields[name] = {key: float(value) for key, value in fields[name].items()}
         return [CheckResult(**fields) for fields in content["checks"]]
 
     def put(self, entry: CheckResult) -> None:
-        """Add an entry or replace the one of its name, and write the file."""
+        """Add a check's result, or replace the earlier one of its name, and write the file."""
         self.rows = [row for row in self.rows if row.name != entry.name] + [entry]
         self.rows.sort(key=lambda row: self._order.get(row.name, len(self._order)))
         self.write()
@@ -303,7 +303,7 @@ def run_check(check: Check, session: CheckSession) -> CheckResult:
 
 
 def heat_maps(record: StressRecord) -> dict[str, bytes]:
-    """Return PNG files of figures over their limits, by group."""
+    """Return a heat map as PNG for each group of checks: each figure divided by its limit."""
     from matplotlib.colors import LogNorm
 
     drawn = {}

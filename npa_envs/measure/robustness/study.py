@@ -120,7 +120,7 @@ def measure_rule(
     *,
     enough: Callable[[], bool] = lambda: False,
 ) -> None:
-    """Measure what is missing in a rule's record, and write it after damages and each value.
+    """Measure what a rule's record lacks; write it after damages and each value of a condition.
 
     Values that need more than `most_particles` are left out. If `enough` returns True before a
     value, the measurement stops, and the record is not done.
@@ -218,9 +218,9 @@ def where_it_works(record: RuleRecord, condition: str) -> str:
 
 
 def working_range(values: Sequence[float], ratios: Sequence[float], trained: float) -> str:
-    """Return the range of values around the trained one at which a rule works, as text.
+    """Return as text the values around the trained one at which the ratio is at most `WORKS`.
 
-    Values increase; ratios are the loss at each over the trained one, NaN if a seed has diverged.
+    Values increase. Ratios are losses divided by the trained one; NaN: a seed has diverged.
     """
     works = [value <= WORKS for value in ratios]
     low = high = min(range(len(values)), key=lambda k: abs(values[k] - trained))

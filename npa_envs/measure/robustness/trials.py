@@ -231,14 +231,14 @@ class RuleTrial:
         return self._tasks[particle_count]
 
     def _by_task(self, x: Tensor) -> Iterator[tuple[Any, Tensor]]:
-        """Yield each task and the indices of its worlds, of whole copies of all worlds."""
+        """Yield each task and its worlds' indices in x, which repeats all B worlds in order."""
         pictures = self._pictures.repeat(len(x) // self.world_count)
         tasks = self.tasks_of(x.shape[1])
         for k in sorted(set(pictures.tolist())):
             yield tasks[k], (pictures == k).nonzero()[:, 0]
 
     def coded(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return states with the code of each world's picture, which damage may have erased."""
+        """Return states with each world's target code, if any, restored in the first channels."""
         s = s.clone()
         for task, index in self._by_task(x):
             s[index] = task.coded(s[index])
