@@ -295,7 +295,7 @@ class PolicyDraws:
         self._random: WorldRandom | None = None
 
     def next(self, world_count: int, device: torch.device) -> WorldRandom:
-        """Return the source for the next step; another number of worlds restarts the streams."""
+        """Return the next step's random streams; a change of `world_count` restarts them."""
         if self._random is None or self._random.world_count != world_count:
             seeds = range(self._seed, self._seed + world_count)
             # A substream, as an environment with the same seed uses these streams itself.
@@ -386,7 +386,7 @@ class PaintPolicy(SpreadPolicy):
             )
 
     def state_step(self, observation: Tensor) -> Tensor:
-        """Return target colour minus own colour in the last three channels, 0 in the others."""
+        """Return the wanted colour minus the particle's in the last three channels, else 0."""
         step = torch.zeros_like(self.interface.states(observation))
         target = self._colour.to(step.device) - COLOUR_OFFSET
         step[..., -3:] = target - self.interface.states(observation)[..., -3:]
@@ -410,7 +410,7 @@ class MendPolicy(SpreadPolicy):
         self._blank = checked_finite("blank", blank)
 
     def state_step(self, observation: Tensor) -> Tensor:
-        """Return the neighbours' mean state minus own state for blank particles, else 0."""
+        """Return the neighbours' mean state minus the own one for blank particles, else 0."""
         states = self.interface.states(observation)
         blank = states.norm(dim=-1, keepdim=True) < self._blank
         return torch.where(blank, self.interface.mean_states(observation) - states, 0.0)

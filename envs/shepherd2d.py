@@ -161,7 +161,7 @@ class ShepherdTask(GardenTask[Shepherd2DEnvConfig]):
                 assert_never(unknown)
 
     def reward(self, particles: Particles, loss: Tensor, context: Tensor) -> Tensor:
-        """Return rewards, shape [B]."""
+        """Return rewards [B] of a step, from the particles after it and the goals in `context`."""
         achieved = self.achieved(particles, context)
         return self.goal_reward(achieved, self.desired(context)).to(torch.float32)
 

@@ -94,7 +94,7 @@ def autoreset_mode(env: AnyVectorEnv) -> AutoresetMode:
 
 
 def check_autoreset(mode: AutoresetMode, word: str, rule: str) -> None:
-    """Check that an environment has the autoreset mode of this name; `rule` explains it."""
+    """Raise NPAError unless `mode` is the mode named `word`; the message says env must `rule`."""
     if mode is not AUTORESET_MODES[word]:
         raise NPAError(f"env must {rule}, got {mode}: make it with autoreset_mode={shown(word)}")
 

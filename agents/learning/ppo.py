@@ -345,7 +345,7 @@ class PPOLearner:
         optimiser.step()
 
     def _critic_rows(self, part: int, values: Sequence[Tensor]) -> list[Tensor]:
-        """Return the worlds of the critic's minibatch `part`, from each of values [M, N, ...]."""
+        """Return the critic's minibatch `part` of tensors [T B, N, ...]: worlds at some steps."""
         order = self._minibatches.parts[-1][part]
         return [value[order] for value in values]
 

@@ -46,7 +46,7 @@ class Record(Generic[Row]):
         self.facts, self.path, self.rows = facts, path, list(rows)
 
     def content(self) -> Mapping[str, Any]:
-        """Return the file's fields other than the facts."""
+        """Return the file's fields except the facts: settings and versions of the measurement."""
         return {"rows": as_objects(self.rows)}
 
     def parse(self, content: dict[str, Any]) -> list[Row]:

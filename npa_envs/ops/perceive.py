@@ -234,7 +234,7 @@ def _perceive_rows(
 
 
 class _PerceiveRows(torch.autograd.Function):
-    """Perception of the active particles; the adjoint gathers, without atomics."""
+    """Autograd function of active particles' perception; backward gathers, without atomics."""
 
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:

@@ -144,7 +144,7 @@ def _parts(
 
 
 def _equivariant_parts(tensors: Mapping[str, Tensor], numbers: Mapping[Any, Any]) -> RuleParts:
-    """Return a 2D equivariant rule from tensors by the web demo's names."""
+    """Return a 2D equivariant rule's parts, from tensors and numbers named as in `models.json`."""
     mixing, first, second = (tensors[name] for name in ("W_hidden", "w1.weight", "w2.weight"))
     state_dim, mixed = mixing.shape[0] - 1, mixing.shape[1]
     hidden_dim = first.shape[0]

@@ -169,7 +169,7 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
         self.target = target.to(device)
         """The views of the target."""
         self._shown = some_views(self.target.held_out, torch.tensor([visible], device=device))
-        # Pictures show this view; their first row is the bottom.
+        # Pictures show this view, from the bottom row up.
         self._target_picture = self._shown.pictures[0].flip(0)
         self.schedule = ViewSchedule(len(target.training.pictures), config, device)
         """Views, blur and backgrounds of an iteration."""
@@ -205,15 +205,15 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
         return self._draw(x, self.gaussians(s), cameras)
 
     def picture(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return a held-out view per world, [B, R, R, 4]; the first row is the bottom."""
+        """Return one held-out view of each world, from the bottom row up, shape [B, R, R, 4]."""
         return self.views(x, s, self._shown.cameras)[:, 0].flip(1)
 
     def metric(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return each world's loss of the held-out views over grey, shape [B]."""
+        """Return each world's loss on the held-out views, drawn on a grey background, shape [B]."""
         return self._metric(x, self.gaussians(s))
 
     def view_psnr(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return the PSNR of colours over white, mean of the held-out views [dB], shape [B]."""
+        """Return each world's mean PSNR [dB] of held-out views on a white background, [B]."""
         held_out, white = self.target.held_out, x.new_ones(3)
         views, targets = self.views(x, s, held_out.cameras), held_out.pictures.to(x)
         error = over(views, white).clamp(0.0, 1.0) - over(targets, white)

@@ -222,7 +222,7 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         return -chances.gather(-1, wanted).squeeze(-1)
 
     def metric(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return each world's mean of (class score − one-hot of its class)², shape [B]."""
+        """Return each world's mean squared error of class scores to the one-hot class, [B]."""
         return world_mean(self.errors(s)[..., None])[:, 0]
 
     def trial_metric(self, worlds: Particles) -> Tensor:
@@ -238,7 +238,7 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         return channel_mean((s - s.clamp(-1.0, 1.0)).abs())
 
     def compare(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the batch's mean squared error; parts are the error and the accuracy."""
+        """Return the batch's mean squared error, and a dict of this `error` and the `accuracy`."""
         error = self.errors(worlds.s).mean()
         accuracy = 1.0 - self.mistakes(worlds.s.detach()).mean()
         return error, {"error": error, "accuracy": accuracy}

@@ -221,7 +221,7 @@ class RunRandomness:
     def of_batch(
         cls, config: TrainConfig[Any], device: torch.device, schedule: torch.Generator
     ) -> RunRandomness:
-        """Return the generators of a run of one process."""
+        """Return generators that all worlds of a batch share, for a run of one process."""
         worlds = torch.Generator(device).manual_seed(config.seed + 1)
         masks = torch.Generator(device).manual_seed(config.seed + 2)
         return cls(schedule, worlds, worlds, masks)
@@ -230,7 +230,7 @@ class RunRandomness:
     def by_world(
         cls, config: TrainConfig[Any], device: torch.device, schedule: torch.Generator, ranks: Ranks
     ) -> RunRandomness:
-        """Return the streams by world of a run of several processes."""
+        """Return random streams of each world, for a run of several processes."""
         batch, pool = config.world_count, config.pool_size
 
         def streams(purpose: int, total: int, indices: Tensor) -> WorldRandom:

@@ -131,7 +131,7 @@ def export_web(
 
 
 def distinct_names(sources: Sequence[str], what: str) -> list[str]:
-    """Return the names of rules, which must differ; `what` is their file, for errors."""
+    """Return rules' names; raise NPAError if two are equal. `what` is the output in its message."""
     names = [name_of(source) for source in sources]
     if not names or len(set(names)) < len(names):
         raise NPAError(

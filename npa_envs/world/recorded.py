@@ -327,7 +327,7 @@ class _Recording:
         return [gradient.contiguous() for gradient in gradients]
 
     def replay(self, call: _Call, lease: _Lease) -> Particles:
-        """Replay the graphs of a rollout one after the other; copy changed buffers to the rule."""
+        """Replay a rollout's graphs in order; copy buffers that they change back to the rule."""
         generator, interval = call.generator, call.spec.keep_every
         inputs = self._inputs_of(call)
         self.ready.record(current_stream(self.device))

@@ -61,9 +61,9 @@ store_channels = make_wide_store(CHANNELS)
 
 @cached_under_lock()
 def make_sum_listed(space_dim: int, width: int, kinds: int, periodic: bool) -> wp.Function:
-    """Return a Warp function that adds weighted channels of listed rows for a warp's particles.
+    """Return a Warp function: a warp's particles sum `width` weighted channels of listed rows.
 
-    A pair has `kinds` weights: one of the smoothing kernel, and D or none of its spiky gradient.
+    `kinds`: weights of a pair: 1 (smoothing kernel), or 1 + D (also the spiky gradient kernel).
     """
     vector = wp.types.vector(space_dim, wp.float32)
 

@@ -189,7 +189,7 @@ def weighing_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> Si
 
     @wp.struct
     class Sums:
-        """A lane's sums: of v K, the moment matrix, and the unnormalised density gradient."""
+        """A lane's sums over neighbours: v K, moment matrix, density gradient / `spiky_norm`."""
 
         kernel: vector
         moment: square
@@ -197,7 +197,7 @@ def weighing_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> Si
 
     @wp.func
     def spiky_f64(domain: Domain, centre: Centre, neighbour: vector, squared: scalar):
-        """Return a pair's unnormalised spiky factor and its offset r, both in float64."""
+        """Return a pair's spiky factor / `spiky_norm`, and its offset r, both in float64."""
         r = vector_f64()
         start = squared
         for d in range(wp.static(space_dim)):

@@ -45,7 +45,7 @@ TURN_TILES = WARP_TILES * BLOCK_WARPS
 
 @cached_under_lock()
 def make_pixel_errors(scalar: type) -> wp.Function:
-    """Return a Warp function for a pixel's density error and three times its colour error."""
+    """Return a Warp function: a pixel's density error, and the sum of its three colour errors."""
     colour_type = splat_types(scalar).colour
 
     @wp.func

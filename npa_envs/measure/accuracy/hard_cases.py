@@ -467,7 +467,7 @@ def _run_repeated(space_dim: int, session: CheckSession) -> CheckResult:
 
 @check("precision/batch", 2, 3)
 def _run_batch(space_dim: int, session: CheckSession) -> CheckResult:
-    """Every world of a batch perceives the bits that it perceives alone."""
+    """Each world of a batch gets bit for bit the perception that it gets alone."""
     figures = {"open": 0.0, "periodic": 0.0}
     for periodic in (False, True):
         every = scenes(space_dim, periodic=periodic, seed=session.seed)

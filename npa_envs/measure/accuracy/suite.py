@@ -205,7 +205,7 @@ class StressRecord(Record[CheckResult]):
         self.write()
 
     def result_of(self, check: Check) -> CheckResult | None:
-        """Return a check's result with its rule's present weights, or None."""
+        """Return a check's stored result, or None if it has none for the rule's present weights."""
         rows = (row for row in self.rows if row.name == check.name and row.weights == check.weights)
         return next(rows, None)
 

@@ -85,7 +85,7 @@ class RuleRecord(Record[Response]):
         return bool(self.about["done"])
 
     def content(self) -> dict[str, Any]:
-        """Return all fields of the file but the facts."""
+        """Return the file's fields except the facts: settings and versions of the measurement."""
         curves = [asdict(c) | {"recovery_steps": c.recovery_steps()} for c in self.curves]
         return {**self.about, "courses": curves, "responses": as_objects(self.rows)}
 
@@ -120,10 +120,10 @@ def measure_rule(
     *,
     enough: Callable[[], bool] = lambda: False,
 ) -> None:
-    """Measure what a rule's record lacks; write it after damages and each value of a condition.
+    """Measure what a rule's record lacks; save it after the damage curves and after each value.
 
-    Values that need more than `most_particles` are left out. If `enough` returns True before a
-    value, the measurement stops, and the record is not done.
+    Values of conditions that need more than `most_particles` particles are left out. If `enough`
+    returns True before a value, the measurement stops, and the record stays unfinished.
     """
     begin = time.perf_counter() - record.about["seconds"]
     grown, trained = grow(trial)
@@ -218,9 +218,9 @@ def where_it_works(record: RuleRecord, condition: str) -> str:
 
 
 def working_range(values: Sequence[float], ratios: Sequence[float], trained: float) -> str:
-    """Return as text the values around the trained one at which the ratio is at most `WORKS`.
+    """Return, as text, the values around the trained one with a ratio of at most `WORKS`.
 
-    Values increase. Ratios are losses divided by the trained one; NaN: a seed has diverged.
+    Values increase. A ratio is a value's loss over the trained loss, NaN if a seed has diverged.
     """
     works = [value <= WORKS for value in ratios]
     low = high = min(range(len(values)), key=lambda k: abs(values[k] - trained))

@@ -231,7 +231,7 @@ class RuleTrial:
         return self._tasks[particle_count]
 
     def _by_task(self, x: Tensor) -> Iterator[tuple[Any, Tensor]]:
-        """Yield each task and its worlds' indices in x, which repeats all B worlds in order."""
+        """Yield each task and its worlds' indices in x, which holds all worlds once or more."""
         pictures = self._pictures.repeat(len(x) // self.world_count)
         tasks = self.tasks_of(x.shape[1])
         for k in sorted(set(pictures.tolist())):
@@ -471,7 +471,7 @@ def _with_twins(
     *,
     control: bool,
 ) -> list[LossCurve]:
-    """Run twins and damaged worlds as one batch; return their curves, the control first."""
+    """Return damaged worlds' loss curves; `control` puts that of twins with other masks first."""
     steps = trial.plan.heal_steps
     masks, other_masks = (trial.random(stream).keys for stream in (AFTERWARDS, OTHERWISE))
     copies = {"twins": (twins, masks)}

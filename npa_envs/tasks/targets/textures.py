@@ -43,7 +43,7 @@ class TextureTarget:
 
     picture: Tensor
     """Red, green and blue, each times the density, and the density, dimensionless, shape
-    [R, R, 4], float32; the first row is the bottom, as in the pictures of worlds."""
+    [R, R, 4], float32, from the bottom row up, as in the pictures of worlds."""
 
     tiles: bool
     """Whether opposite edges fit together."""
@@ -175,7 +175,7 @@ OVERSAMPLING = 4
 
 
 def draw_pattern(name: str, resolution: int, *, seed: int = 0) -> Array:
-    """Draw a texture: colours times alpha, and alpha, float64, shape [R, R, 4].
+    """Draw a texture: colours times alpha, and alpha, float64, [R, R, 4], bottom row first.
 
     The first row is the bottom. Pixel r is centred at (r + 1/2) / R.
     """
