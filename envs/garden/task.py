@@ -231,7 +231,7 @@ class GardenTask(RuleDriven, GrownTask[Config]):
         particles, rate = apply_brushes(particles, action, middle, config)
         if rate is None:
             return run(particles, config.rule_steps)
-        box = None if config.periodic_box is None else (config.periodic_box,) * 2
+        box = config.periodic_sides
         for _ in range(config.rule_steps):
             x, s, *_ = particles
             new_x, new_s, *_ = run(particles, 1)
