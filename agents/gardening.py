@@ -10,8 +10,8 @@ from torch import Tensor
 
 from npa_envs.agents.policies import PolicyDraws, unwrapped
 from npa_envs.checks import checked_positive
+from npa_envs.envs.garden.base import GardenTask, TargetDeficit
 from npa_envs.envs.garden.brushes import BrushLayout, grid_places
-from npa_envs.envs.garden.task import GardenTask, TargetDeficit
 from npa_envs.envs.shepherd2d import ShepherdTask
 from npa_envs.errors import NPAError
 from npa_envs.world.randomness import StreamId, WorldRandom

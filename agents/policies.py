@@ -16,7 +16,7 @@ from torch import Tensor
 from npa_envs.checks import checked_count, checked_finite, checked_positive, number_tensor
 from npa_envs.errors import NPAError, shown
 from npa_envs.rule.rule import COLOUR_OFFSET, NPARule, check_rule
-from npa_envs.world.actions import Physics
+from npa_envs.world.environment_steps import Physics
 from npa_envs.world.randomness import StreamId, WorldRandom
 
 Array = TypeVar("Array", NDArray[Any], Tensor)

@@ -23,7 +23,7 @@ from recipes import train_side_by_side
 from torch import Tensor
 
 import npa_envs
-from npa_envs.measure.record import machine, write_record
+from npa_envs.measure.benchmark_records import machine, write_record
 from npa_envs.rule.files import rule_metadata
 from npa_envs.tasks.base import Task
 from npa_envs.training import preset

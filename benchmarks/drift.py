@@ -14,7 +14,7 @@ from scripts import script_parser
 from torch import Tensor
 
 from npa_envs.devices import check_device
-from npa_envs.measure.record import table_text
+from npa_envs.measure.benchmark_records import table_text
 from npa_envs.measure.speed.suites import PROFILED
 from npa_envs.measure.speed.timing import TimingSession, Workload
 from npa_envs.world.rollout import rollout

@@ -37,7 +37,7 @@ from torch.autograd import DeviceType
 from torch.profiler import ProfilerActivity, profile
 
 from npa_envs.agents.learning import Problem
-from npa_envs.measure.record import markdown_table, write_record
+from npa_envs.measure.benchmark_records import markdown_table, write_record
 from npa_envs.measure.speed.timing import synchronize
 from npa_envs.registration import SIZES, SPECIES_SIZES
 

@@ -33,7 +33,7 @@ from stable_baselines3 import PPO, SAC, HerReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 
 import npa_envs  # noqa: F401 (registers the environments)
-from npa_envs.agents.comparison.run import FIRST_TEST_SEED
+from npa_envs.agents.comparison.single_run import FIRST_TEST_SEED
 from npa_envs.agents.gardening import (
     RandomGardener,
     ScriptedGardener,
@@ -41,8 +41,8 @@ from npa_envs.agents.gardening import (
     StillGardener,
 )
 from npa_envs.agents.learning.problem import EVALUATION_SEEDS
-from npa_envs.files import write_text
-from npa_envs.measure.record import write_record
+from npa_envs.atomic_files import write_text
+from npa_envs.measure.benchmark_records import write_record
 from npa_envs.registration import GARDEN_IDS
 from npa_envs.wrappers import WorldVecEnv
 

@@ -32,7 +32,7 @@ from npa_envs.agents.gardening import (
     StillGardener,
 )
 from npa_envs.agents.learning.problem import EVALUATION_SEEDS
-from npa_envs.measure.record import write_record
+from npa_envs.measure.benchmark_records import write_record
 from npa_envs.measure.speed.timing import synchronize
 from npa_envs.registration import GARDEN_IDS
 

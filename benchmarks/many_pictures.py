@@ -31,6 +31,7 @@ from recipes import train_side_by_side
 from torch import Tensor, nn
 
 import npa_envs
+from npa_envs.measure.benchmark_records import machine, write_record
 from npa_envs.measure.quality import (
     MEDIAN,
     PICTURE_CHECKPOINTS,
@@ -39,7 +40,6 @@ from npa_envs.measure.quality import (
     picture_rows,
     psnr,
 )
-from npa_envs.measure.record import machine, write_record
 from npa_envs.rule.files import rule_metadata
 from npa_envs.tasks.many_pictures import ManyPictures, named_targets
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D

@@ -28,9 +28,9 @@ from PIL import Image
 from side_by_side import iterate_together, on, stream_of
 from torch import Tensor
 
-from npa_envs.files import write_text
+from npa_envs.atomic_files import write_text
+from npa_envs.measure.benchmark_records import as_objects, current_commit, machine
 from npa_envs.measure.quality import evaluate
-from npa_envs.measure.record import as_objects, current_commit, machine
 from npa_envs.rule.files import load_rule, save_rule
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.morphogenesis3d import Morphogenesis3D
@@ -46,9 +46,9 @@ from npa_envs.tasks.targets.meshes import (
 from npa_envs.tasks.targets.views import Views, over, some_views, views_of_mesh
 from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training import Trainer, override, preset
-from npa_envs.training.presets import config_to_dict
+from npa_envs.training.task_table import config_to_dict
+from npa_envs.world.graphed_rollouts import release_recordings
 from npa_envs.world.particles import Particles
-from npa_envs.world.recorded import release_recordings
 
 SEEDS = tuple(range(1_000_000, 1_000_008))
 """Seeds of the worlds that rules are measured on."""

@@ -16,14 +16,14 @@ import torch.nn.functional as F
 from recipe_arms import SEEDS
 from torch import Tensor
 
-from npa_envs.measure.accuracy import rule_checks as long_runs
+from npa_envs.measure.accuracy import trained_rule_checks as long_runs
 from npa_envs.measure.quality import RuleRunner, healing
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
 from npa_envs.training import preset
+from npa_envs.world.graphed_rollouts import release_recordings
 from npa_envs.world.particles import Particles, combined
-from npa_envs.world.recorded import release_recordings
 from npa_envs.world.rollout import rollout
 
 MOTIONS = ("place", "angle", "affine", "deformation")

@@ -19,7 +19,7 @@ from torch.nn import functional
 from npa_envs.devices import check_device
 from npa_envs.ops.equivariance import invariants, steered
 from npa_envs.rule.files import load_rule
-from npa_envs.rule.network import without_small
+from npa_envs.rule.folded_network import without_small
 from npa_envs.rule.rule import NPARule
 from npa_envs.training.task_of_rule import task_of_rule
 from npa_envs.world.rollout import rollout

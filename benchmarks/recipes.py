@@ -45,17 +45,17 @@ from PIL import Image
 from recipe_arms import ARMS, FAST_ARMS, SEEDS, SIZES, Run, configuration
 from side_by_side import iterate_together, on, stream_of
 
+from npa_envs.atomic_files import write_bytes
 from npa_envs.errors import NPAError
-from npa_envs.files import write_bytes
-from npa_envs.measure.accuracy import rule_checks
+from npa_envs.measure.accuracy import trained_rule_checks
+from npa_envs.measure.benchmark_records import machine, write_record
 from npa_envs.measure.plots import new_figure, number_plainly, png
 from npa_envs.measure.quality import RuleRunner, evaluate, healing
-from npa_envs.measure.record import machine, write_record
 from npa_envs.render.colours import to_uint8
 from npa_envs.rule.files import save_rule
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2DTrainConfig
 from npa_envs.training import Trainer, task_entry
-from npa_envs.world.recorded import release_recordings
+from npa_envs.world.graphed_rollouts import release_recordings
 
 STEPS = (64, 128, 256, 512, 1024, 2048, 4096)
 """Steps at which worlds are measured, before `LAST`."""
@@ -423,7 +423,7 @@ def main() -> None:
         own.add_argument("--pictures", type=Path, required=True, help="folder of PNG files")
         own.add_argument("--device", default="cpu")
         own.add_argument("--preset", default="paper", help="what the world is like")
-    long.add_argument("--steps", type=int, default=rule_checks.STEPS)
+    long.add_argument("--steps", type=int, default=trained_rule_checks.STEPS)
     heal.add_argument("--count", type=int, default=32, help="seeds")
     heal.add_argument(
         "--steps", type=int, nargs=2, default=[1024, 500], help="before and after the damage"

@@ -23,7 +23,7 @@ from torch import Tensor
 
 import npa_envs
 from npa_envs.ops import Cameras, render_gaussians
-from npa_envs.tasks.appearance import Gaussians
+from npa_envs.tasks.gaussian_outputs import Gaussians
 from npa_envs.tasks.targets.views import some_views
 from npa_envs.training.task_of_rule import task_of_rule
 from npa_envs.world.cuda_graph import capture

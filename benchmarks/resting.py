@@ -17,7 +17,7 @@ import torch
 from scripts import script_facts, script_parser
 
 import npa_envs
-from npa_envs.measure.record import write_record
+from npa_envs.measure.benchmark_records import write_record
 from npa_envs.measure.speed.timing import synchronize
 from npa_envs.rule.files import load_rule
 from npa_envs.training.task_of_rule import task_of_rule

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import torch
 
-from npa_envs.measure.record import current_commit, machine
+from npa_envs.measure.benchmark_records import current_commit, machine
 
 
 def script_parser(description: str | None) -> argparse.ArgumentParser:

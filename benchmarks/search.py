@@ -23,12 +23,12 @@ from numpy.typing import NDArray
 from scipy.stats import t as student
 from scripts import script_facts, script_parser
 
-from npa_envs.agents.search.run import METHODS, RESULTS, Growth, Search, tried_again
-from npa_envs.agents.search.worlds import SearchWorld
+from npa_envs.agents.search.candidates import SearchWorld
+from npa_envs.agents.search.quality_diversity import METHODS, RESULTS, Growth, Search, tried_again
+from npa_envs.atomic_files import read_json, write_bytes
 from npa_envs.devices import check_device
-from npa_envs.files import read_json, write_bytes
+from npa_envs.measure.benchmark_records import markdown_table, write_record
 from npa_envs.measure.plots import draw_band, legend_of, new_figure, png
-from npa_envs.measure.record import markdown_table, write_record
 
 IMAGE = Path("runs/search_growth.png")
 

@@ -26,16 +26,16 @@ import torch
 from PIL import Image
 from side_by_side import iterate_together, on, stream_of
 
+from npa_envs.measure.benchmark_records import as_objects
 from npa_envs.measure.quality import evaluate
-from npa_envs.measure.record import as_objects
-from npa_envs.measure.texture_judge import JudgeRow, TextureJudge
+from npa_envs.measure.texture_metric import JudgeRow, TextureJudge
 from npa_envs.render import to_uint8, write_filmstrip
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.texture import Texture
 from npa_envs.training import Trainer, preset
 from npa_envs.training.task_of_rule import task_of_rule
-from npa_envs.world.recorded import release_recordings
+from npa_envs.world.graphed_rollouts import release_recordings
 
 SEEDS = tuple(range(1_000_000, 1_000_008))
 """Seeds of the worlds for the judge."""

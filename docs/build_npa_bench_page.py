@@ -19,8 +19,8 @@ from page_parts import table, write_or_check
 
 from npa_envs.agents.comparison.npa_bench import METHODS, SUITES, Suite, task_name
 from npa_envs.agents.comparison.plan import NOTHING, YARDSTICK
+from npa_envs.measure.benchmark_records import NONE
 from npa_envs.measure.plots import draw_band, legend_of, new_figure, png
-from npa_envs.measure.record import NONE
 
 DOCS = Path(__file__).resolve().parent
 ROWS = DOCS.parent / "benchmarks" / "results"

@@ -19,7 +19,7 @@ from matplotlib.patches import Circle, Rectangle
 from torch import Tensor
 
 import npa_envs
-from npa_envs.files import atomic_path
+from npa_envs.atomic_files import atomic_path
 from npa_envs.reference import smoothing_kernel
 from npa_envs.training.task_of_rule import task_of_rule
 

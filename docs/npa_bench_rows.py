@@ -18,10 +18,10 @@ from scipy.stats import bootstrap, trim_mean
 
 from npa_envs.agents.comparison.npa_bench import MIN_SEEDS, SCHEMA, SUITES, Suite
 from npa_envs.agents.comparison.plan import NOTHING, YARDSTICK
-from npa_envs.agents.comparison.run import mean_of
+from npa_envs.agents.comparison.single_run import mean_of
+from npa_envs.atomic_files import read_json
 from npa_envs.errors import NPAError, shown
-from npa_envs.files import read_json
-from npa_envs.measure.record import number
+from npa_envs.measure.benchmark_records import number
 
 EXCESS = 1.25
 """Most particle-steps of a run over its budget, which the last iteration may exceed."""

@@ -2,7 +2,7 @@
 
 `gym.make` and `gym.make_vec` take the ids of `npa_envs.registration`; these names are for tasks of
 your own (docs/own_environment.md). Tasks say where worlds start and how far they are from the goal;
-`npa_envs.world.actions` moves the particles.
+`npa_envs.world.environment_steps` moves the particles.
 """
 
 from npa_envs.envs.core.config import EnvConfig

@@ -16,7 +16,7 @@ from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import EnvTask, TargetEnvTask
 from npa_envs.envs.core.vector import vector_class
-from npa_envs.envs.grown import load_read_out
+from npa_envs.envs.grown_worlds import load_read_out
 from npa_envs.render import turntable_frames
 from npa_envs.tasks.morphogenesis3d import Morphogenesis3D, Morphogenesis3DConfig
 from npa_envs.world.particles import Particles

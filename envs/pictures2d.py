@@ -12,14 +12,14 @@ from torch import Tensor
 from npa_envs.checks import check_flag, check_positive
 from npa_envs.envs.core.config import EnvConfig, check_picture_size
 from npa_envs.envs.core.single import NPAEnv
-from npa_envs.envs.core.state import OBSERVATION_COPIES
 from npa_envs.envs.core.task import Start
 from npa_envs.envs.core.vector import vector_class
+from npa_envs.envs.core.world_state import OBSERVATION_COPIES
 from npa_envs.envs.morphogenesis2d import PictureConfig, PictureEnvTask
 from npa_envs.errors import NPAError, shown
 from npa_envs.tasks.many_pictures import ManyPictures, named_targets
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2DConfig
-from npa_envs.tasks.targets.clouds import Split
+from npa_envs.tasks.targets.digit_clouds import Split
 from npa_envs.world.randomness import WorldRandom
 
 CHANNELS = 4

@@ -17,7 +17,7 @@ from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import Start, TargetEnvTask
 from npa_envs.envs.core.vector import vector_class
-from npa_envs.envs.grown import load_read_out
+from npa_envs.envs.grown_worlds import load_read_out
 from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
 from npa_envs.tasks.point_classification import (
     PICTURE_MARGIN,
@@ -25,7 +25,7 @@ from npa_envs.tasks.point_classification import (
     PointClassificationConfig,
     class_colours,
 )
-from npa_envs.tasks.targets.clouds import Split
+from npa_envs.tasks.targets.digit_clouds import Split
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import WorldRandom
 

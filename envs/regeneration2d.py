@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 
 from npa_envs.checks import check_flag, check_fraction, check_positive
-from npa_envs.envs.core.rewards import total
+from npa_envs.envs.core.rewards_and_ends import total
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import Start
 from npa_envs.envs.core.vector import vector_class
-from npa_envs.envs.grown import GrownConfig, GrownTask
+from npa_envs.envs.grown_worlds import GrownConfig, GrownTask
 from npa_envs.envs.morphogenesis2d import PictureEnvTask
 from npa_envs.errors import shown
 from npa_envs.rule.rule import COLOUR_OFFSET

@@ -18,18 +18,18 @@ from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import Start
 from npa_envs.envs.core.vector import vector_class
+from npa_envs.envs.garden.base import RuleDriven
 from npa_envs.envs.garden.brushes import GardenReward
-from npa_envs.envs.garden.task import RuleDriven
-from npa_envs.envs.grown import check_rule_driven, check_runs, grow, run_rule
+from npa_envs.envs.grown_worlds import check_rule_driven, check_runs, grow, run_rule
 from npa_envs.envs.morphogenesis2d import PictureConfig, PictureEnvTask
 from npa_envs.errors import NPAError
-from npa_envs.rule.codes import Codes
 from npa_envs.rule.files import load_rule
+from npa_envs.rule.picture_codes import Codes
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.many_pictures import ManyPictures
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2DConfig
 from npa_envs.training.task_of_rule import sources_of_codes
-from npa_envs.world.actions import Physics
+from npa_envs.world.environment_steps import Physics
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import WorldRandom
 

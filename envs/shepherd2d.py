@@ -17,10 +17,10 @@ from npa_envs.checks import check_field, check_non_negative, check_positive
 from npa_envs.envs.core.base import to_output
 from npa_envs.envs.core.task import Start
 from npa_envs.envs.core.vector import NPAVectorEnv
+from npa_envs.envs.garden.base import GardenEnv, GardenTask
 from npa_envs.envs.garden.brushes import OBSERVATION_LIMIT, BrushSpaces, GardenConfig, GardenReward
-from npa_envs.envs.garden.task import GardenEnv, GardenTask
 from npa_envs.tasks.seeds import uniform_ball
-from npa_envs.world.actions import Physics
+from npa_envs.world.environment_steps import Physics
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import WorldRandom
 

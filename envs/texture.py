@@ -13,7 +13,7 @@ from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import TargetEnvTask
 from npa_envs.envs.core.vector import vector_class
 from npa_envs.tasks.texture import Texture, TextureConfig
-from npa_envs.world.actions import Boundary
+from npa_envs.world.environment_steps import Boundary
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -30,12 +30,12 @@ from npa_envs.ops.pictures.cameras import cameras_of_poses, look_at
 from npa_envs.render import draw_worlds, to_uint8, turntable_frames, write_gif, write_png
 from npa_envs.tasks.damage import damage_worlds, parse_damage
 from npa_envs.tasks.seeds import uniform_ball, uniform_box
-from npa_envs.tasks.targets.clouds import read_idx
-from npa_envs.tasks.targets.points import load_target
+from npa_envs.tasks.targets.digit_clouds import read_idx
+from npa_envs.tasks.targets.picture_points import load_target
 from npa_envs.tasks.targets.textures import load_texture
 from npa_envs.tasks.targets.views import load_views
 from npa_envs.training import TASKS, load_config, override, preset
-from npa_envs.training.presets import config_to_dict
+from npa_envs.training.task_table import config_to_dict
 
 
 @dataclasses.dataclass(frozen=True)

@@ -13,19 +13,23 @@ if TYPE_CHECKING:
     from npa_envs.wrappers.numeric_infos import NumericInfos as NumericInfos
     from npa_envs.wrappers.particle_rows import ParticleRows as ParticleRows
     from npa_envs.wrappers.rsl_rl import RslRlParticleEnv as RslRlParticleEnv
+    from npa_envs.wrappers.running_statistics import NormalizePerception as NormalizePerception
+    from npa_envs.wrappers.running_statistics import (
+        TorchNormalizeObservation as TorchNormalizeObservation,
+    )
+    from npa_envs.wrappers.running_statistics import TorchNormalizeReward as TorchNormalizeReward
+    from npa_envs.wrappers.running_statistics import (
+        TorchRecordEpisodeStatistics as TorchRecordEpisodeStatistics,
+    )
+    from npa_envs.wrappers.running_statistics import (
+        VectorNormalizePerception as VectorNormalizePerception,
+    )
     from npa_envs.wrappers.sb3 import ParticleVecEnv as ParticleVecEnv
     from npa_envs.wrappers.sb3 import RowPolicy as RowPolicy
     from npa_envs.wrappers.sb3 import SpeciesVecEnv as SpeciesVecEnv
     from npa_envs.wrappers.sb3 import WorldVecEnv as WorldVecEnv
     from npa_envs.wrappers.species_tags import SpeciesTags as SpeciesTags
     from npa_envs.wrappers.species_tags import VectorSpeciesTags as VectorSpeciesTags
-    from npa_envs.wrappers.statistics import NormalizePerception as NormalizePerception
-    from npa_envs.wrappers.statistics import TorchNormalizeObservation as TorchNormalizeObservation
-    from npa_envs.wrappers.statistics import TorchNormalizeReward as TorchNormalizeReward
-    from npa_envs.wrappers.statistics import (
-        TorchRecordEpisodeStatistics as TorchRecordEpisodeStatistics,
-    )
-    from npa_envs.wrappers.statistics import VectorNormalizePerception as VectorNormalizePerception
     from npa_envs.wrappers.torchrl import NPATorchRLEnv as NPATorchRLEnv
 
 # Not in `__all__`, as a star import must not need optional libraries.
@@ -40,14 +44,14 @@ ON_REQUEST = {
 }
 MODULES = {
     "DamageEvents": "damage",
-    "NormalizePerception": "statistics",
+    "NormalizePerception": "running_statistics",
     "ParticleRows": "particle_rows",
     "SpeciesTags": "species_tags",
-    "TorchNormalizeObservation": "statistics",
-    "TorchNormalizeReward": "statistics",
-    "TorchRecordEpisodeStatistics": "statistics",
+    "TorchNormalizeObservation": "running_statistics",
+    "TorchNormalizeReward": "running_statistics",
+    "TorchRecordEpisodeStatistics": "running_statistics",
     "VectorDamageEvents": "damage",
-    "VectorNormalizePerception": "statistics",
+    "VectorNormalizePerception": "running_statistics",
     "VectorSpeciesTags": "species_tags",
 }
 __all__ = [*MODULES]

@@ -14,12 +14,12 @@ from pathlib import Path
 from typing import Any
 
 from npa_envs.agents.comparison.plan import Axis, ComparisonPlan
-from npa_envs.agents.comparison.run import RunRecord
+from npa_envs.agents.comparison.single_run import RunRecord
 from npa_envs.agents.learning import methods_for
 from npa_envs.agents.learning.problem import Problem, registered
+from npa_envs.atomic_files import read_json
 from npa_envs.errors import NPAError, shown
-from npa_envs.files import read_json
-from npa_envs.measure.record import write_record
+from npa_envs.measure.benchmark_records import write_record
 from npa_envs.registration import GARDEN_IDS
 
 AXIS: Axis = "particle-steps"

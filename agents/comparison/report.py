@@ -15,11 +15,18 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from npa_envs.agents.comparison.plan import AXES, NOTHING, YARDSTICK, Axis, ComparisonPlan
-from npa_envs.agents.comparison.run import PICTURE, SIZE, RunRecord, mean_of
+from npa_envs.agents.comparison.single_run import PICTURE, SIZE, RunRecord, mean_of
 from npa_envs.agents.learning import CurvePoint
-from npa_envs.files import write_text
+from npa_envs.atomic_files import write_text
+from npa_envs.measure.benchmark_records import (
+    NONE,
+    Record,
+    csv_text,
+    markdown_table,
+    mean_with_error,
+    short,
+)
 from npa_envs.measure.plots import draw_band, legend_of, new_figure, png, write_plots
-from npa_envs.measure.record import NONE, Record, csv_text, markdown_table, mean_with_error, short
 from npa_envs.render import write_filmstrip
 
 DIVERGED = ("diverged", "left the world")

@@ -24,7 +24,7 @@ from npa_envs.agents.learning.rule_set import RuleSet
 from npa_envs.agents.policies import bounded, perceived
 from npa_envs.checks import check_positive
 from npa_envs.errors import MissingDependencyError, NPAError
-from npa_envs.rule.network import without_small
+from npa_envs.rule.folded_network import without_small
 from npa_envs.rule.rule import NPARule
 
 MAX_HIDDEN = 2**27

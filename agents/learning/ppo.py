@@ -35,7 +35,7 @@ from npa_envs.agents.learning.problem import ROW_REWARDS, WORLDS_PER_SEED, Probl
 from npa_envs.agents.learning.progress import Budget, Progress
 from npa_envs.agents.learning.rule_set import RuleSet
 from npa_envs.checks import check_flag, check_positive, check_word
-from npa_envs.envs.core.state import free_bytes, needed_bytes
+from npa_envs.envs.core.world_state import free_bytes, needed_bytes
 from npa_envs.errors import NPAError
 from npa_envs.training.ranks import ALONE, Ranks, registered, restart
 from npa_envs.world.cuda_graph import GraphedCallable

@@ -26,15 +26,15 @@ from npa_envs.devices import check_device
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.task import Actor, EnvTask
 from npa_envs.envs.core.vector import NPAVectorEnv, worlds_to_reset
-from npa_envs.envs.multi.task import SpeciesConfig, SpeciesTask
+from npa_envs.envs.multi.base import SpeciesConfig, SpeciesTask
 from npa_envs.envs.multi.tasks import ENVIRONMENTS as SPECIES_TASKS
 from npa_envs.envs.multi.tasks import task_settings
 from npa_envs.envs.multi.tasks import task_type as species_task_type
 from npa_envs.envs.multi.vector import MultiSpeciesVectorEnv
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.registration import ALL, SPECIES_SIZES
-from npa_envs.world.actions import Physics
 from npa_envs.world.cuda_graph import to_device_async
+from npa_envs.world.environment_steps import Physics
 
 WORLDS_PER_SEED = 10_000
 """Seeds of worlds that each run has: run k has those from k times this."""

@@ -16,14 +16,14 @@ from torch import Tensor, nn
 from npa_envs.agents.evaluation import checked_seeds, evaluate_policy
 from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.learning.rule_set import RuleSet
+from npa_envs.atomic_files import json_text, write_text
 from npa_envs.checks import check_count, check_positive, is_real
 from npa_envs.devices import check_device
 from npa_envs.errors import DivergedError, NPAError, shown
-from npa_envs.files import json_text, write_text
 from npa_envs.training.checkpoint import check_content, unusable_checkpoint
 from npa_envs.training.optimiser import load_moments
 from npa_envs.training.ranks import Ranks
-from npa_envs.training.run import Run, RunFolder
+from npa_envs.training.run_folder import Run, RunFolder
 from npa_envs.world.randomness import Randomness, WorldRandom
 
 
@@ -124,7 +124,7 @@ class Progress:
 
     Raises:
         NPAError: Seeds are missing or wrong, or the number of entries is not positive. Or as for
-            `npa_envs.training.run.Run`.
+            `npa_envs.training.run_folder.Run`.
     """
 
     def __init__(

@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from npa_envs.agents.search.run import Elite, Search
-from npa_envs.agents.search.worlds import SEED_RADIUS, UPDATE_PROB, Axis
-from npa_envs.files import made_folder
+from npa_envs.agents.search.candidates import SEED_RADIUS, UPDATE_PROB, Axis
+from npa_envs.agents.search.quality_diversity import Elite, Search
+from npa_envs.atomic_files import made_folder
 from npa_envs.measure.plots import new_figure, png
 from npa_envs.render import draw_worlds
-from npa_envs.render.film import encode_frame
+from npa_envs.render.picture_files import encode_frame
 from npa_envs.rule.files import save_rule
 
 ELITES, PAGE = "elites", "atlas.html"

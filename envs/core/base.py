@@ -22,8 +22,8 @@ from npa_envs.envs.core.worlds import BatchedWorlds
 from npa_envs.errors import NPAError
 from npa_envs.render import Window, show
 from npa_envs.render.display import side_by_side
-from npa_envs.world.actions import Physics
 from npa_envs.world.cuda_graph import to_device_async
+from npa_envs.world.environment_steps import Physics
 from npa_envs.world.particles import Particles
 
 SHOWN_ACROSS = 4

@@ -15,10 +15,10 @@ from torch import Tensor
 
 from npa_envs.checks import number_tensor
 from npa_envs.envs.core.base import WorldsEnv
-from npa_envs.envs.core.rewards import reason
+from npa_envs.envs.core.rewards_and_ends import reason
 from npa_envs.envs.core.vector import check_options, plain_seed, rng_keys
 from npa_envs.errors import NPAError
-from npa_envs.world.actions import DIVERGED, SUCCESS, TIME_LIMIT
+from npa_envs.world.environment_steps import DIVERGED, SUCCESS, TIME_LIMIT
 
 
 class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):

@@ -15,8 +15,8 @@ from torch import Tensor
 from npa_envs.envs.core.config import EnvConfig, WorldConfig
 from npa_envs.errors import NPAError, shown
 from npa_envs.render import draw_worlds
-from npa_envs.world.actions import marginal_gains
 from npa_envs.world.cuda_graph import recording_lock
+from npa_envs.world.environment_steps import marginal_gains
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import StreamId, WorldRandom
 

@@ -17,10 +17,10 @@ from torch import Tensor
 
 from npa_envs.checks import is_whole, number_tensor
 from npa_envs.envs.core.base import WorldsEnv
-from npa_envs.envs.core.rewards import FLAGS, StepReport, reason
+from npa_envs.envs.core.rewards_and_ends import FLAGS, StepReport, reason
 from npa_envs.errors import NPAError, shown, suggest
-from npa_envs.world.actions import TIME_LIMIT
 from npa_envs.world.cuda_graph import to_device_async
+from npa_envs.world.environment_steps import TIME_LIMIT
 from npa_envs.world.randomness import WorldRandom
 
 AUTORESET_MODES = {mode.name.lower().replace("_", "-"): mode for mode in AutoresetMode}

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.envs.core.config import EnvConfig
-from npa_envs.envs.core.rewards import RewardedWorlds
-from npa_envs.envs.core.state import check_default_dtype, not_finite
+from npa_envs.envs.core.rewards_and_ends import RewardedWorlds
 from npa_envs.envs.core.task import (
     EnvTask,
     Start,
@@ -26,14 +25,8 @@ from npa_envs.envs.core.task import (
     global_draws,
     start_method,
 )
+from npa_envs.envs.core.world_state import check_default_dtype, not_finite
 from npa_envs.errors import DivergedError, NPAError
-from npa_envs.world.actions import (
-    DIVERGED,
-    NOT_FINITE,
-    Actions,
-    NeighbourState,
-    build_neighbours,
-)
 from npa_envs.world.cuda_graph import (
     GraphedCallable,
     SideStream,
@@ -43,6 +36,13 @@ from npa_envs.world.cuda_graph import (
     to_device_async,
 )
 from npa_envs.world.divergence import MAX_REPORT, term_name
+from npa_envs.world.environment_steps import (
+    DIVERGED,
+    NOT_FINITE,
+    Actions,
+    NeighbourState,
+    build_neighbours,
+)
 
 FEW_PARTICLES = 8192
 """Particles of all worlds up to which a step on CUDA is one graph; larger steps hide launches."""

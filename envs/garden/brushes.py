@@ -13,10 +13,10 @@ from torch import Tensor
 from npa_envs import world_mean
 from npa_envs.checks import check_field, check_flag, check_positive, is_whole
 from npa_envs.envs.core.base import ParticleSpaces, batch_choices, batch_tensor
-from npa_envs.envs.grown import GrownConfig, check_rule_driven
+from npa_envs.envs.grown_worlds import GrownConfig, check_rule_driven
 from npa_envs.errors import NPAError, shown
-from npa_envs.world.actions import Physics
 from npa_envs.world.brushes import offsets_from, softness
+from npa_envs.world.environment_steps import Physics
 from npa_envs.world.particles import Particles
 
 OBSERVATION_LIMIT = 8.0

@@ -25,7 +25,7 @@ from npa_envs.envs.core.vector import (
     rng_keys,
     worlds_to_reset,
 )
-from npa_envs.envs.multi.worlds import AgentOutcome, SpeciesWorlds
+from npa_envs.envs.multi.species_worlds import AgentOutcome, SpeciesWorlds
 from npa_envs.errors import DivergedError, NPAError, shown
 from npa_envs.world.cuda_graph import to_device_async
 

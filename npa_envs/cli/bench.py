@@ -51,8 +51,8 @@ class BenchOptions(common.MeasureOptions):
 def main(arguments: Sequence[str]) -> int:
     """Measure, print and write."""
     options = common.parse_options(BenchOptions, "bench", arguments)
-    from npa_envs.files import write_text
-    from npa_envs.measure import plots, record
+    from npa_envs.atomic_files import write_text
+    from npa_envs.measure import benchmark_records, plots
     from npa_envs.measure.speed import suites, timing
 
     common.check_numbers(
@@ -84,11 +84,11 @@ def main(arguments: Sequence[str]) -> int:
             repeats=options.repeats,
             small=options.quick,
             progress=bar.advance,
-            enough=record.time_limit(options.max_seconds),
+            enough=benchmark_records.time_limit(options.max_seconds),
         )
         tables = suites.SUITES[name](session)
-    command = record.command_text("bench", arguments)
-    commit = options.commit or record.current_commit()
+    command = benchmark_records.command_text("bench", arguments)
+    commit = options.commit or benchmark_records.current_commit()
     report = suites.BenchReport(name, command, commit, options.threads, session, tables)
     print(report.text())
     if folder is not None:

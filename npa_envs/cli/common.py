@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 import tyro
 from tqdm import tqdm
 
+from npa_envs.atomic_files import NEARLY_FULL_BYTES, made_folder
 from npa_envs.errors import NPAError, suggest
-from npa_envs.files import NEARLY_FULL_BYTES, made_folder
 
 if TYPE_CHECKING:
     import torch
@@ -276,7 +276,7 @@ def resolve_run(arguments: Sequence[str], out_of: Callable[[Sequence[str]], Path
     if first.gpus is not None and first.device is None:
         resolved += ["--device", "cuda"]
     if first.resume is not None:
-        from npa_envs.training.run import RunFolder, check_choice
+        from npa_envs.training.run_folder import RunFolder, check_choice
 
         check_choice(resume=True, overwrite=first.overwrite)
         if first.resume == "auto":

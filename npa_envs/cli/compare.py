@@ -21,7 +21,7 @@ from npa_envs.errors import NPAError, suggest
 
 if TYPE_CHECKING:
     from npa_envs.agents.comparison.plan import Axis, ComparisonPlan
-    from npa_envs.agents.comparison.run import RunRecord
+    from npa_envs.agents.comparison.single_run import RunRecord
 
 ROWS = "rows"
 """Folder of a suite's rows in that of the comparison."""
@@ -84,9 +84,9 @@ def main(arguments: Sequence[str]) -> int:
     options = common.parse_options(CompareOptions, "compare", arguments)
     from npa_envs.agents.comparison.npa_bench import SUITES, check_rows, write_rows
     from npa_envs.agents.comparison.report import write_pictures, write_table
-    from npa_envs.agents.comparison.run import held_records, run_jobs
-    from npa_envs.measure.record import command_text
-    from npa_envs.processes import Slots
+    from npa_envs.agents.comparison.single_run import held_records, run_jobs
+    from npa_envs.measure.benchmark_records import command_text
+    from npa_envs.process_queue import Slots
 
     command = command_text("compare", arguments, "--out")
     plan = make_plan(options)
@@ -292,7 +292,7 @@ def _jobs(options: CompareOptions) -> int:
 def _settings(options: CompareOptions) -> dict[str, Any]:
     """Return the machine, versions and threads, which the record names."""
     from npa_envs.devices import check_device
-    from npa_envs.measure.record import installed_version, machine, measured_facts
+    from npa_envs.measure.benchmark_records import installed_version, machine, measured_facts
 
     devices = [check_device(name) for name in (options.devices or (options.device,))]
     kinds = {(device.type, machine(device)) for device in devices}

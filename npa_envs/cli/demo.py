@@ -53,7 +53,7 @@ class DemoOptions(common.RunOptions):
 def main(arguments: Sequence[str]) -> int:
     """Grow, heal and train; print and write the figures."""
     options = common.parse_options(DemoOptions, "demo", arguments)
-    from npa_envs.files import write_text
+    from npa_envs.atomic_files import write_text
 
     if not 1.0 <= options.train_seconds <= 3600.0:
         raise NPAError(f"train_seconds must lie in [1, 3600], got {options.train_seconds}")

@@ -45,10 +45,10 @@ class EvaluateOptions(common.RuleOptions):
 def main(arguments: Sequence[str]) -> int:
     """Measure, print and write the table."""
     options = common.parse_options(EvaluateOptions, "evaluate", arguments)
-    from npa_envs.files import write_text
+    from npa_envs.atomic_files import write_text
     from npa_envs.measure import quality
-    from npa_envs.measure.record import UNMEASURED, table_text, tables_json
-    from npa_envs.measure.texture_judge import TextureJudge
+    from npa_envs.measure.benchmark_records import UNMEASURED, table_text, tables_json
+    from npa_envs.measure.texture_metric import TextureJudge
     from npa_envs.rule.files import load_rule
     from npa_envs.training.task_of_rule import task_of_rule, tasks_of_codes
 

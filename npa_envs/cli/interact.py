@@ -11,18 +11,18 @@ from typing import Annotated, Any
 import torch
 import tyro
 
+from npa_envs.atomic_files import plain_numbers
 from npa_envs.cli import common
 from npa_envs.errors import NPAError
-from npa_envs.files import plain_numbers
-from npa_envs.measure.interaction import (
+from npa_envs.measure.benchmark_records import table_text
+from npa_envs.measure.plots import write_plots
+from npa_envs.measure.rule_interaction import (
     Encounters,
     InteractionRecord,
     InteractionSettings,
     RuleUnderTest,
     heat_map,
 )
-from npa_envs.measure.plots import write_plots
-from npa_envs.measure.record import table_text
 from npa_envs.render import write_filmstrip
 from npa_envs.rule.files import load_rule, rule_digest, shipped_rules
 from npa_envs.training.task_of_rule import task_of_rule

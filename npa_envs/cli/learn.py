@@ -69,7 +69,7 @@ class LearnOptions(common.RunOptions):
 
 def main(arguments: Sequence[str]) -> int:
     """Learn; return 130 if it was stopped."""
-    from npa_envs.training.launch import launch, print_once, requested_processes
+    from npa_envs.training.process_launcher import launch, print_once, requested_processes
     from npa_envs.training.ranks import joined_ranks
 
     with joined_ranks() as ranks:

@@ -21,7 +21,7 @@ def main(arguments: Sequence[str]) -> int:
     from npa_envs.registration import ALL, SPECIES_SIZES
     from npa_envs.rule.files import load_rule, shipped_rules
     from npa_envs.tasks.losses.texture import TEXTURE_LOSSES
-    from npa_envs.tasks.targets.clouds import BUILT_IN
+    from npa_envs.tasks.targets.digit_clouds import BUILT_IN
     from npa_envs.training import TASKS
 
     print("tasks (npa-envs train TASK --preset PRESET)")

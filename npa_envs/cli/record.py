@@ -52,7 +52,7 @@ def main(arguments: Sequence[str]) -> int:
     options = common.parse_options(RecordOptions, "record", arguments)
     common.check_numbers(options, episodes=1, worlds=1)
     from npa_envs.agents.evaluation import policy_in
-    from npa_envs.measure.record import command_text
+    from npa_envs.measure.benchmark_records import command_text
     from npa_envs.wrappers.minari import ROOT, record_episodes, spec_of, write_dataset
 
     problem = problem_of(options)

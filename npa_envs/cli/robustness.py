@@ -45,11 +45,11 @@ class RobustnessOptions(common.MeasureOptions):
 def main(arguments: Sequence[str]) -> int:
     """Measure, print and write."""
     options = common.parse_options(RobustnessOptions, "robustness", arguments)
-    from npa_envs.files import write_text
-    from npa_envs.measure.accuracy.rule_checks import task_name
+    from npa_envs.atomic_files import write_text
+    from npa_envs.measure.accuracy.trained_rule_checks import task_name
+    from npa_envs.measure.benchmark_records import command_text, measured_facts, time_limit
     from npa_envs.measure.plots import write_plots
-    from npa_envs.measure.record import command_text, measured_facts, time_limit
-    from npa_envs.measure.robustness import study
+    from npa_envs.measure.robustness import report
     from npa_envs.measure.robustness.trials import PLANS, RuleTrial, quick_plan
     from npa_envs.rule.files import load_rule, rule_digest, shipped_rules
 
@@ -61,7 +61,7 @@ def main(arguments: Sequence[str]) -> int:
         # One of each task.
         names = list({task_name(name): name for name in reversed(names)}.values())[::-1]
     device = options.checked_device()
-    most = options.most_particles or study.MAX_PARTICLES[device.type]
+    most = options.most_particles or report.MAX_PARTICLES[device.type]
     count = options.seed_count or (QUICK_SEEDS if options.quick else 8)
     seeds = range(options.first_seed, options.first_seed + count)
     facts = measured_facts(
@@ -72,7 +72,7 @@ def main(arguments: Sequence[str]) -> int:
     # Read before any measurement, so that a file of other settings is refused at once.
     for name in names:
         # A rule that is trained again keeps its name, but not its weights.
-        records[name] = study.RuleRecord(
+        records[name] = report.RuleRecord(
             facts | {"weights": rule_digest(load_rule(sources[name]))},
             folder and folder / f"robustness_{name}.json",
             rule=name,
@@ -86,18 +86,18 @@ def main(arguments: Sequence[str]) -> int:
                 plan = quick_plan(task) if options.quick else PLANS[task]
                 small = QUICK_PARTICLES if options.quick else None
                 trial = RuleTrial(sources[name], device, plan, seeds, small)
-                study.measure_rule(record, trial, most, enough=enough)
+                report.measure_rule(record, trial, most, enough=enough)
             bar.advance(1)
     done = [record for record in records.values() if record.done]
     lines = []
     if done:
-        lines.append(study.tables(done))
+        lines.append(report.tables(done))
     if done and folder is not None:
         # Written before printing, which fails if the reader of a pipe has ended.
         write_text(folder / "robustness.md", lines[0])
         lines.append(f"wrote {folder}: robustness.md and a record for each rule")
         place = folder / "robustness_*.png"
-        lines += write_plots(lambda: study.pictures(done), place, "curves")
+        lines += write_plots(lambda: report.pictures(done), place, "curves")
     if left := len(names) - len(done):
         lines.append(f"{left} rules are left: call again with the same options")
     print("\n".join(lines))

@@ -49,12 +49,12 @@ def main(arguments: Sequence[str]) -> int:
 
     from npa_envs.measure.quality import measure
     from npa_envs.render.colours import background_colour
-    from npa_envs.render.film import GIF_HIGHEST_RATE, check_rate
+    from npa_envs.render.picture_files import GIF_HIGHEST_RATE, check_rate
     from npa_envs.render.world_film import SCREEN, WorldFilm, film_world, write_3d_world
     from npa_envs.rule.files import load_rule
     from npa_envs.tasks.damage import parse_damage
     from npa_envs.tasks.point_classification import PointClassification, majority
-    from npa_envs.training.run import stop_flag
+    from npa_envs.training.run_folder import stop_flag
     from npa_envs.training.task_of_rule import task_for_film, task_of_rule
 
     common.check_numbers(options, steps=1, every=1)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Literal
 
-from npa_envs.agents.search.worlds import SearchWorld
+from npa_envs.agents.search.candidates import SearchWorld
 from npa_envs.cli import common
 from npa_envs.errors import NPAError
 
@@ -45,10 +45,10 @@ def main(arguments: Sequence[str]) -> int:
     options = common.parse_options(SearchOptions, "search", arguments)
     common.check_numbers(options, threads=1)
     from npa_envs.agents.search.atlas import PAGE, figure, page, write_elites
-    from npa_envs.agents.search.run import RESULTS, Search
-    from npa_envs.files import write_text
+    from npa_envs.agents.search.quality_diversity import RESULTS, Search
+    from npa_envs.atomic_files import write_text
+    from npa_envs.measure.benchmark_records import time_limit
     from npa_envs.measure.plots import write_plots
-    from npa_envs.measure.record import time_limit
 
     enough = time_limit(options.max_seconds)
     world = SearchWorld(**{f.name: getattr(options, f.name) for f in fields(SearchWorld)})

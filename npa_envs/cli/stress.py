@@ -43,16 +43,16 @@ def main(arguments: Sequence[str]) -> int:
     """Check, print and write; return 1 if a check failed."""
     options = common.parse_options(StressOptions, "stress", arguments)
     from npa_envs.measure import accuracy
-    from npa_envs.measure.accuracy import suite
+    from npa_envs.measure.accuracy import check_runner
+    from npa_envs.measure.benchmark_records import measured_facts
     from npa_envs.measure.plots import write_plots
-    from npa_envs.measure.record import measured_facts
 
     common.check_numbers(options, seed=0, threads=1)
     rules = common.named_rules(options.rules)
     checks = accuracy.all_checks(quick=options.quick, seed=options.seed, rules=rules)
-    chosen = suite.chosen_checks(checks, options.only)
+    chosen = check_runner.chosen_checks(checks, options.only)
     if options.list:
-        for group, summary in suite.GROUPS.items():
+        for group, summary in check_runner.GROUPS.items():
             some = [check for check in chosen if check.group == group]
             if some:
                 print(f"{group}: {summary}")
@@ -64,14 +64,14 @@ def main(arguments: Sequence[str]) -> int:
         name = f"stress_{device.type}{'_quick' * options.quick}.json"
         path = common.writable_folder(options.out) / name
     facts = measured_facts(device, options.commit, quick=options.quick, seed=options.seed)
-    record = suite.StressRecord(facts, path, [check.name for check in checks]).read()
+    record = check_runner.StressRecord(facts, path, [check.name for check in checks]).read()
     done = sum(map(record.is_done, chosen))
     if done:
         print(f"{done} of {len(chosen)} checks were done before")
     with common.measuring(options, len(chosen), "check") as bar:
-        suite.run_checks(
+        check_runner.run_checks(
             chosen,
-            suite.CheckSession(device, quick=options.quick, seed=options.seed),
+            check_runner.CheckSession(device, quick=options.quick, seed=options.seed),
             record,
             max_seconds=options.max_seconds,
             progress=bar.advance,
@@ -79,6 +79,6 @@ def main(arguments: Sequence[str]) -> int:
     print(record.text())
     if path is not None:
         maps = path.with_name(f"{path.stem}_*.png")
-        drawn = write_plots(lambda: suite.heat_maps(record), maps, "heat maps")
+        drawn = write_plots(lambda: check_runner.heat_maps(record), maps, "heat maps")
         print("\n".join([f"wrote {path}", *drawn]))
     return 1 if record.failed() else 0

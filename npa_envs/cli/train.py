@@ -15,7 +15,7 @@ import torch.distributed as dist
 import tyro
 
 from npa_envs.cli import INTERRUPTED, common
-from npa_envs.cli.training_report import Training, write_report
+from npa_envs.cli.train_report import Training, write_report
 from npa_envs.errors import NPAError, shown
 from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2DConfig
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2DConfig
@@ -33,7 +33,7 @@ from npa_envs.training import (
     train,
 )
 from npa_envs.training.checkpoint import check_task, drawn_by_world, load_checkpoint
-from npa_envs.training.launch import launch, print_once, requested_processes
+from npa_envs.training.process_launcher import launch, print_once, requested_processes
 from npa_envs.training.ranks import Ranks, joined_ranks
 
 VIEWER = ("starlette", "uvicorn")

@@ -18,7 +18,7 @@ from npa_envs.errors import NPAError
 if TYPE_CHECKING:
     import torch
 
-    from npa_envs.web.live import LiveWorld
+    from npa_envs.web.live_world import LiveWorld
 
 RESERVED = ("id", "policy", "device", "output", "disable_env_checker")
 """Keywords of an environment that the command sets itself."""

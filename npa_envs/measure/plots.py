@@ -11,8 +11,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from npa_envs.atomic_files import write_bytes
 from npa_envs.errors import MissingDependencyError
-from npa_envs.files import write_bytes
 
 
 def check_matplotlib() -> None:

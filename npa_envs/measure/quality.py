@@ -15,7 +15,7 @@ from torch import Tensor
 
 from npa_envs.devices import check_device
 from npa_envs.errors import NPAError, shown, suggest
-from npa_envs.measure.texture_judge import JudgeRow, TextureJudge
+from npa_envs.measure.texture_metric import JudgeRow, TextureJudge
 from npa_envs.rule.files import shipped_rules
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Task

@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from npa_envs.kernels.access import WARP
 from npa_envs.kernels.cuda.equivariance import (
     MIXING_SUM_WARPS,
     PULL_WARPS,
@@ -26,6 +25,7 @@ from npa_envs.kernels.cuda.equivariance import (
     steering_kernels,
 )
 from npa_envs.kernels.portable.equivariance import equivariance_kernels
+from npa_envs.kernels.primitives import WARP
 from npa_envs.ops.backend import KernelRequest, choose, multiprocessor_count
 from npa_envs.ops.custom_op import custom_op, once_differentiable
 from npa_envs.ops.launch import launch, scalar_type

@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from npa_envs.kernels.access import WARP
 from npa_envs.kernels.cuda.network import (
     SUM_WARPS,
     UNIT_GROUP,
@@ -17,6 +16,7 @@ from npa_envs.kernels.cuda.network import (
     two_layer_kernel,
     weight_gradient_kernels,
 )
+from npa_envs.kernels.primitives import WARP
 from npa_envs.ops.backend import KernelRequest, choose, multiprocessor_count
 from npa_envs.ops.custom_op import custom_op, once_differentiable
 from npa_envs.ops.launch import aligned, launch

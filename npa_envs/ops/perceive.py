@@ -24,7 +24,7 @@ from npa_envs.checks import (
 from npa_envs.ops.backend import batch_listing
 from npa_envs.ops.custom_op import check_derivatives, custom_op, once_differentiable
 from npa_envs.ops.launch import Tape, is_aligned, launch
-from npa_envs.ops.passes import (
+from npa_envs.ops.perception_passes import (
     SavedPerception,
     compute_densities,
     compute_density_gradients,
@@ -32,7 +32,7 @@ from npa_envs.ops.passes import (
     perception_launch,
     portable_kernels,
 )
-from npa_envs.ops.physics import Physics, Terms, physics
+from npa_envs.ops.physics_constants import Physics, Terms, physics
 from npa_envs.ops.sort import plan_kernels, sort_worlds
 from npa_envs.ops.static import StaticRows, StaticWorlds, all_rows, static_worlds
 

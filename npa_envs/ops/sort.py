@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.kernels.access import CUDA_LANES, WARP
 from npa_envs.kernels.cuda.sort import BLOCKS, THREAD_CHANNELS, order_particles, sort_small_worlds
 from npa_envs.kernels.domain import cell_grid, make_domain
 from npa_envs.kernels.portable.sort import sort_kernels
+from npa_envs.kernels.primitives import CUDA_LANES, WARP
 from npa_envs.ops.backend import (
     KernelRequest,
     Listing,
@@ -23,7 +23,7 @@ from npa_envs.ops.backend import (
     rollout_listing,
 )
 from npa_envs.ops.launch import channel_width, is_aligned, is_recorded, launch, scalar_type
-from npa_envs.ops.physics import Physics
+from npa_envs.ops.physics_constants import Physics
 
 MAX_INDEX = 2**31 - 1
 """Largest index of an array in a kernel: indices have 32 bits."""

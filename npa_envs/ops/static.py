@@ -15,8 +15,13 @@ from npa_envs.kernels.portable.density import density_kernels
 from npa_envs.kernels.portable.sort import give_rows
 from npa_envs.ops.custom_op import custom_op
 from npa_envs.ops.launch import aligned, is_traced, launch, scalar_type
-from npa_envs.ops.passes import Densities, ListedNeighbours, NeighbourLists, compute_densities
-from npa_envs.ops.physics import Physics
+from npa_envs.ops.perception_passes import (
+    Densities,
+    ListedNeighbours,
+    NeighbourLists,
+    compute_densities,
+)
+from npa_envs.ops.physics_constants import Physics
 from npa_envs.ops.sort import KernelPlan, SortedWorlds, plan_kernels, sort_worlds
 
 MAX_LISTS = 2**31

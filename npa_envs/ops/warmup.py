@@ -13,16 +13,16 @@ from npa_envs.devices import check_device
 from npa_envs.errors import NPAError, shown
 from npa_envs.ops.backend import SHARED_WORLD
 from npa_envs.ops.draws import draw
-from npa_envs.ops.episodes import EpisodeRules, EpisodeUpdate
 from npa_envs.ops.equivariance import MIXED_VECTORS, VectorForm, read_rows, steer_rows
 from npa_envs.ops.network import arrange_weights, run_network
 from npa_envs.ops.perceive import build_neighbours, perceive, perceive_rows
-from npa_envs.ops.physics import Limits, Physics
+from npa_envs.ops.physics_constants import Limits, Physics
 from npa_envs.ops.pictures.cameras import orbit
 from npa_envs.ops.pictures.gaussians import render_gaussians
-from npa_envs.ops.pictures.losses import picture_losses
+from npa_envs.ops.pictures.losses_without_gradient import picture_losses
 from npa_envs.ops.pictures.splat import splat
 from npa_envs.ops.pictures.triangles import nearest_triangles
+from npa_envs.ops.rewards_and_ends import EpisodeRules, EpisodeUpdate
 from npa_envs.ops.static import prepare_static, static_rows
 from npa_envs.ops.update import ActedWorlds, PreparedActions, update_particles
 from npa_envs.ops.world_mean import world_mean

@@ -5,7 +5,7 @@ Wrong arguments and files that cannot be written raise NPAError.
 
 from npa_envs.render.colours import to_uint8
 from npa_envs.render.display import Shown, Window, show, show_worlds
-from npa_envs.render.film import (
+from npa_envs.render.picture_files import (
     turntable_frames,
     write_filmstrip,
     write_gif,

@@ -17,7 +17,13 @@ from torch import Tensor
 
 from npa_envs.checks import checked_side
 from npa_envs.errors import NPAError, importing, shown
-from npa_envs.render.film import Frame, check_rate, checked_frames, encode_frame, encode_webp
+from npa_envs.render.picture_files import (
+    Frame,
+    check_rate,
+    checked_frames,
+    encode_frame,
+    encode_webp,
+)
 from npa_envs.render.worlds import draw_worlds
 
 MAX_SHOWN = 16

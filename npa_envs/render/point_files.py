@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from npa_envs.atomic_files import write_bytes
 from npa_envs.errors import NPAError
-from npa_envs.files import write_bytes
-from npa_envs.tasks.appearance import FLAT, Gaussians
+from npa_envs.tasks.gaussian_outputs import FLAT, Gaussians
 
 Columns = dict[str, NDArray[np.generic]]
 

@@ -12,7 +12,13 @@ import numpy as np
 import torch
 
 from npa_envs.render.colours import to_uint8
-from npa_envs.render.film import Frame, turntable_frames, write_filmstrip, write_gif, write_mp4
+from npa_envs.render.picture_files import (
+    Frame,
+    turntable_frames,
+    write_filmstrip,
+    write_gif,
+    write_mp4,
+)
 from npa_envs.render.point_files import write_gaussians, write_points, write_splat
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Task

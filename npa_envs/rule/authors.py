@@ -33,9 +33,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from npa_envs.atomic_files import check_torch_archive, checked_path, parse_json, write_text
 from npa_envs.checks import check_dense, checked_finite
 from npa_envs.errors import NPAError, shown, suggest
-from npa_envs.files import check_torch_archive, checked_path, parse_json, write_text
 from npa_envs.rule.rule import NPARule, check_rule
 
 _DEMO_SPACE_DIM = 2

@@ -19,15 +19,15 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save as serialise
 from torch import Tensor
 
-from npa_envs.devices import check_device
-from npa_envs.errors import NPAError, shown, suggest
-from npa_envs.files import (
+from npa_envs.atomic_files import (
     check_regular,
     checked_path,
     parse_json,
     read_bytes,
     write_bytes,
 )
+from npa_envs.devices import check_device
+from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.rule.authors import (
     ZIP_MARK,
     RuleParts,

@@ -23,8 +23,7 @@ from npa_envs.checks import (
 )
 from npa_envs.errors import NPAError, shown
 from npa_envs.ops.equivariance import MIXED_VECTORS, VectorForm, invariants, signed_gates, steered
-from npa_envs.rule.codes import Codes, carrying, checked_names
-from npa_envs.rule.network import (
+from npa_envs.rule.folded_network import (
     FOLD,
     FoldedInvariants,
     FoldedRule,
@@ -32,6 +31,7 @@ from npa_envs.rule.network import (
     fold_weights,
     without_small,
 )
+from npa_envs.rule.picture_codes import Codes, carrying, checked_names
 
 COLOUR_OFFSET = 0.5
 """Added to a particle's last three outputs to get its colour, dimensionless."""

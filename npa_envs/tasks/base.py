@@ -16,8 +16,8 @@ from npa_envs.checks import check_fraction, check_non_negative, check_positive
 from npa_envs.errors import NPAError, shown
 from npa_envs.ops import Cameras, world_mean
 from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
-from npa_envs.tasks.appearance import Gaussians
 from npa_envs.tasks.damage import PoolDamage, damage_pool, escape_motion
+from npa_envs.tasks.gaussian_outputs import Gaussians
 from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness
@@ -107,7 +107,7 @@ class ParticleTask(Generic[ConfigT]):
     """Whether the task has `views`, `view_psnr` and `gaussians`: pictures from several cameras."""
 
     has_judge: bool = False
-    """Whether `npa_envs.measure.texture_judge` compares pictures of the task."""
+    """Whether `npa_envs.measure.texture_metric` compares pictures of the task."""
 
     classifies: bool = False
     """Whether static particles output class scores of their point cloud."""

@@ -9,14 +9,14 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
+from npa_envs.atomic_files import home_path
 from npa_envs.errors import NPAError, shown
-from npa_envs.files import home_path
-from npa_envs.rule.codes import Codes, carrying
+from npa_envs.rule.picture_codes import Codes, carrying
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 from npa_envs.tasks.seeds import drawn_indices, drawn_worlds
 from npa_envs.tasks.targets.images import looks_like_path
-from npa_envs.tasks.targets.points import builtin_targets
+from npa_envs.tasks.targets.picture_points import builtin_targets
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness
 

@@ -20,13 +20,13 @@ from npa_envs.checks import (
 )
 from npa_envs.errors import NPAError
 from npa_envs.ops import splat, world_mean
-from npa_envs.ops.pictures.losses import picture_losses
-from npa_envs.rule.codes import carrying
+from npa_envs.ops.pictures.losses_without_gradient import picture_losses
+from npa_envs.rule.picture_codes import carrying
 from npa_envs.rule.rule import COLOUR_OFFSET, LIFE, NPARule
 from npa_envs.tasks.base import GrowthConfig, GrowthTask
 from npa_envs.tasks.damage import damage_pool
 from npa_envs.tasks.targets.images import MAX_POINT_COUNT
-from npa_envs.tasks.targets.points import PointTarget, load_target
+from npa_envs.tasks.targets.picture_points import PointTarget, load_target
 from npa_envs.tasks.train_config import TrainConfig, fast_run, presets_of, tiny_run
 from npa_envs.world.division import living
 from npa_envs.world.particles import Particles

@@ -22,8 +22,8 @@ from npa_envs.checks import (
 from npa_envs.errors import NPAError
 from npa_envs.ops import Cameras, render_gaussians, world_mean
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.appearance import OUTPUTS, Gaussians, appearance
 from npa_envs.tasks.base import GrowthConfig, GrowthTask, shares_of_loss
+from npa_envs.tasks.gaussian_outputs import OUTPUTS, Gaussians, appearance
 from npa_envs.tasks.losses.image_distances import MultiScaleSimilarity
 from npa_envs.tasks.targets.views import (
     Views,

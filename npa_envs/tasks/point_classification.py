@@ -16,7 +16,7 @@ from npa_envs.ops import splat, world_mean
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Frame, ParticleTask, TaskConfig
 from npa_envs.tasks.seeds import drawn_indices, drawn_worlds
-from npa_envs.tasks.targets.clouds import PointClouds, Split, load_clouds, varied
+from npa_envs.tasks.targets.digit_clouds import PointClouds, Split, load_clouds, varied
 from npa_envs.tasks.train_config import TrainConfig, fast_run, presets_of, tiny_run
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness

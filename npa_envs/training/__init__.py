@@ -11,7 +11,8 @@ from npa_envs.errors import DivergedError, NPAError, shown
 from npa_envs.tasks.base import ParticleTask, PictureTask, Task
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2DTrainConfig
 from npa_envs.tasks.train_config import JointTrainConfig, TrainConfig
-from npa_envs.training.presets import (
+from npa_envs.training.run_folder import JsonlLog, RunFolder
+from npa_envs.training.task_table import (
     TASKS,
     TaskEntry,
     config_to_dict,
@@ -20,7 +21,6 @@ from npa_envs.training.presets import (
     preset,
     task_entry,
 )
-from npa_envs.training.run import JsonlLog, RunFolder
 from npa_envs.training.trainer import (
     JointRules,
     Trainer,

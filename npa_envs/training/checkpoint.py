@@ -12,11 +12,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from npa_envs.atomic_files import check_torch_archive, open_regular, write_bytes
 from npa_envs.checks import is_real, is_whole
 from npa_envs.errors import NPAError, shown
-from npa_envs.files import check_torch_archive, open_regular, write_bytes
 from npa_envs.tasks.train_config import TrainConfig
-from npa_envs.training.presets import config_to_dict
+from npa_envs.training.task_table import config_to_dict
 
 CHECKPOINT_FORMAT = "npa-envs checkpoint"
 

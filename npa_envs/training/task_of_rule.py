@@ -9,15 +9,15 @@ from typing import Any, cast
 
 import torch
 
+from npa_envs.atomic_files import parse_json
 from npa_envs.errors import NPAError, shown
-from npa_envs.files import parse_json
-from npa_envs.rule.codes import Codes
 from npa_envs.rule.files import rule_file, rule_metadata
+from npa_envs.rule.picture_codes import Codes
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Task
 from npa_envs.tasks.many_pictures import named_targets
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
-from npa_envs.training.presets import override, preset, task_entry
+from npa_envs.training.task_table import override, preset, task_entry
 
 
 @dataclass(frozen=True)

@@ -15,10 +15,10 @@ import torch
 from torch import Tensor, nn
 from tqdm import tqdm
 
+from npa_envs.atomic_files import write_text
 from npa_envs.checks import is_real
 from npa_envs.devices import check_device
 from npa_envs.errors import DivergedError, NPAError, shown
-from npa_envs.files import write_text
 from npa_envs.rule.files import load_rule, preset_rules, save_rule
 from npa_envs.rule.rule import NPARule, dividing, with_codes
 from npa_envs.tasks.base import Task, differing_fields, untrained_rule
@@ -33,9 +33,15 @@ from npa_envs.training.checkpoint import (
 )
 from npa_envs.training.cycle import TrainingCycle
 from npa_envs.training.iteration import Rollout, TrainingOptions, divergence_error
-from npa_envs.training.presets import config_to_dict
 from npa_envs.training.ranks import Ranks
-from npa_envs.training.run import JsonlLog, Run, RunFolder, open_tensorboard, write_batch_picture
+from npa_envs.training.run_folder import (
+    JsonlLog,
+    Run,
+    RunFolder,
+    open_tensorboard,
+    write_batch_picture,
+)
+from npa_envs.training.task_table import config_to_dict
 from npa_envs.world.species import rollout_species
 
 FIRST_PICTURE = 10

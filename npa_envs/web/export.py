@@ -17,13 +17,13 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from npa_envs.atomic_files import atomic_path, checked_path
 from npa_envs.errors import NPAError, shown
-from npa_envs.files import atomic_path, checked_path
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule, check_rule
 from npa_envs.tasks.damage import CLUMP_FACTOR, DAMAGE_SIZES
 from npa_envs.tasks.point_classification import PALETTE, UNDECIDED, PointClassification
-from npa_envs.web.live import CLUMP_RATE, INJECT_RATE, MIN_PUSH, checked_seed, colour_ramp
+from npa_envs.web.live_world import CLUMP_RATE, INJECT_RATE, MIN_PUSH, checked_seed, colour_ramp
 from npa_envs.web.rule_world import MIN_SEED, SEED_FRACTION, RuleWorld, name_of
 from npa_envs.world.species import AGREEMENTS
 

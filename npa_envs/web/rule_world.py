@@ -20,10 +20,10 @@ from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2DConfig
 from npa_envs.tasks.damage import DAMAGE_SIZES, damage_worlds
 from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.tasks.train_config import TrainConfig
-from npa_envs.training.presets import load_config, preset
-from npa_envs.training.run import JsonlLog, RunFolder
+from npa_envs.training.run_folder import JsonlLog, RunFolder
 from npa_envs.training.task_of_rule import TrainedTask, task_of_rule, trained_config
-from npa_envs.web.live import (
+from npa_envs.training.task_table import load_config, preset
+from npa_envs.web.live_world import (
     ColouredWorld,
     Colouring,
     LiveWorld,

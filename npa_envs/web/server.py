@@ -25,10 +25,10 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from npa_envs.atomic_files import made_folder
 from npa_envs.errors import MissingDependencyError, NPAError, shown
-from npa_envs.files import made_folder
 from npa_envs.render import write_gif, write_mp4
-from npa_envs.web.live import LiveWorld, WorldView
+from npa_envs.web.live_world import LiveWorld, WorldView
 
 try:
     import uvicorn

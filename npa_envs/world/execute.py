@@ -15,15 +15,21 @@ from torch.utils.checkpoint import checkpoint
 from npa_envs.checks import check_finite_positions
 from npa_envs.errors import NPAError
 from npa_envs.ops.launch import Tape
-from npa_envs.ops.physics import Physics
+from npa_envs.ops.physics_constants import Physics
 from npa_envs.ops.sort import sorts_at_once
-from npa_envs.rule.network import Network
+from npa_envs.rule.folded_network import Network
 from npa_envs.rule.rule import NPARule
 from npa_envs.world.cuda_graph import draws_alone
 from npa_envs.world.divergence import DivergenceWatch
+from npa_envs.world.graphed_rollouts import (
+    LAUNCHED_FIRST,
+    CallKinds,
+    CudaGraph,
+    rule_form,
+    run_recorded,
+)
 from npa_envs.world.particles import Particles, combined
 from npa_envs.world.randomness import Randomness
-from npa_envs.world.recorded import LAUNCHED_FIRST, CallKinds, CudaGraph, rule_form, run_recorded
 from npa_envs.world.steps import (
     DivisionStep,
     Draws,

@@ -9,13 +9,13 @@ from torch import Tensor
 from npa_envs.checks import Box, check_world, checked_count, checked_flag
 from npa_envs.errors import NPAError, shown
 from npa_envs.ops.custom_op import check_derivatives
-from npa_envs.ops.physics import Boundary, Physics, Terms, physics
+from npa_envs.ops.physics_constants import Boundary, Physics, Terms, physics
 from npa_envs.rule.rule import NPARule, check_rule
 from npa_envs.world.divergence import OnDivergence, make_watch
 from npa_envs.world.execute import STORED_INTERVAL, Memory, RolloutSpec, execute, resting
+from npa_envs.world.graphed_rollouts import CudaGraph, check_cuda_graph
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness, check_generator
-from npa_envs.world.recorded import CudaGraph, check_cuda_graph
 
 __all__ = ["Memory", "at_rest", "rollout", "step"]
 

@@ -10,14 +10,14 @@ from torch import Tensor
 
 from npa_envs.checks import Box, check_world, checked_count, checked_flag, checked_number, entries
 from npa_envs.errors import NPAError, shown
-from npa_envs.ops.physics import Boundary
-from npa_envs.ops.species import checked_counts
+from npa_envs.ops.physics_constants import Boundary
+from npa_envs.ops.species_density import checked_counts
 from npa_envs.rule.rule import NPARule
 from npa_envs.world.divergence import OnDivergence, make_watch
 from npa_envs.world.execute import Memory, RolloutSpec, execute
+from npa_envs.world.graphed_rollouts import CudaGraph, check_cuda_graph
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness, check_generator
-from npa_envs.world.recorded import CudaGraph, check_cuda_graph
 from npa_envs.world.rollout import (
     RolloutOptions,
     check_memory,

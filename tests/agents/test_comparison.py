@@ -18,7 +18,7 @@ from clock import Clock
 from refusals import refused
 
 from npa_envs.agents import RandomPolicy, ZeroPolicy
-from npa_envs.agents.comparison import run as one_run
+from npa_envs.agents.comparison import single_run as one_run
 from npa_envs.agents.comparison.plan import LEFT_OUT, PROBLEMS, ComparisonPlan, Job, make_problem
 from npa_envs.agents.comparison.report import (
     Estimate,
@@ -28,7 +28,7 @@ from npa_envs.agents.comparison.report import (
     rows,
     text,
 )
-from npa_envs.agents.comparison.run import (
+from npa_envs.agents.comparison.single_run import (
     SIZE,
     RunRecord,
     final_picture,
@@ -39,7 +39,7 @@ from npa_envs.agents.learning import METHODS, CurvePoint, RuleSet
 from npa_envs.cli import main
 from npa_envs.cli.compare import CompareOptions, make_plan
 from npa_envs.cli.compare import _jobs as jobs_of
-from npa_envs.processes import Slots
+from npa_envs.process_queue import Slots
 
 FACTS = {"problem": {}, "budget": 1.0, "options": {}, "episodes": 2}
 
@@ -349,7 +349,7 @@ def test_an_interrupted_comparison_ends_its_processes_and_goes_on_where_it_was(
 def test_no_run_begins_once_the_time_is_over_and_who_waits_leaves_nothing(
     tmp_path, monkeypatch, child, device
 ):
-    monkeypatch.setattr("npa_envs.processes.time", Clock(tick=1e-3))
+    monkeypatch.setattr("npa_envs.process_queue.time", Clock(tick=1e-3))
     child("time.sleep(0.3)", before=WRITE_PID.format(tmp_path))
     ended = ran(plan(), tmp_path, device, max_seconds=0.2)
     assert [one.job for one in ended] == plan().jobs()[:1]

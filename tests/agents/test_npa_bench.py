@@ -9,7 +9,7 @@ import pytest
 from refusals import refused
 
 from npa_envs.agents.comparison.npa_bench import SUITES, check_rows, write_rows
-from npa_envs.agents.comparison.run import RunRecord
+from npa_envs.agents.comparison.single_run import RunRecord
 from npa_envs.agents.learning import CurvePoint, methods_for
 from npa_envs.cli import main
 from npa_envs.cli.compare import CompareOptions, make_plan

@@ -10,14 +10,14 @@ from refusals import refused
 
 from npa_envs import load_rule, rollout
 from npa_envs.agents.search import Search, SearchWorld, tried_again
-from npa_envs.agents.search.run import METHODS, RESULTS, import_ribs
-from npa_envs.agents.search.worlds import (
+from npa_envs.agents.search.candidates import (
     SEED_RADIUS,
     UPDATE_PROB,
     Candidates,
     correlation,
     quality_of,
 )
+from npa_envs.agents.search.quality_diversity import METHODS, RESULTS, import_ribs
 from npa_envs.cli import main
 from npa_envs.errors import MissingDependencyError
 from npa_envs.rule.files import rule_metadata, save_rule

@@ -14,7 +14,7 @@ from clock import Clock
 from npa_envs.cli import main
 from npa_envs.cli.learn import parse, problem_of
 from npa_envs.training.checkpoint import load_checkpoint
-from npa_envs.training.run import Run
+from npa_envs.training.run_folder import Run
 
 WORDS = ["learn", "ppo", "npa/Morphogenesis2DSmall-v0", "--keywords", "target=ring"]
 WORDS += ["--worlds", "2", "--episode-steps", "4", "--episodes", "1", "--entries", "2"]

@@ -11,7 +11,7 @@ from PIL import Image
 from small_digits import write_idx
 
 from npa_envs.cli import main
-from npa_envs.cli import training_report as report
+from npa_envs.cli import train_report as report
 from npa_envs.errors import MissingDependencyError
 from npa_envs.render import world_film
 from npa_envs.training import TASKS

@@ -13,7 +13,7 @@ from small_envs import IDS, assert_same, begun, make, make_vec
 import npa_envs
 from npa_envs import reference
 from npa_envs.agents import RandomPolicy, ZeroPolicy
-from npa_envs.tasks.targets.points import load_target
+from npa_envs.tasks.targets.picture_points import load_target
 from npa_envs.world.randomness import StreamId
 
 CLOSEST_CREDIT = 0.98

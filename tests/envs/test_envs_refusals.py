@@ -177,7 +177,7 @@ def test_an_unknown_keyword_is_a_type_error_in_pythons_words(name):
     "keywords", [{"particle_count": 10**5}, {"resolution": 4096}, {"seed_pool": 10**6}]
 )
 def test_worlds_beyond_memory_are_refused_before_they_are_made(keywords, monkeypatch):
-    monkeypatch.setattr("npa_envs.envs.core.state.free_bytes", lambda device: 10**8)
+    monkeypatch.setattr("npa_envs.envs.core.world_state.free_bytes", lambda device: 10**8)
     make(IDS[0])
     refused("particle_count must fit into memory: 1 world", make, IDS[0], **keywords)
 

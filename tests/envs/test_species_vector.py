@@ -7,7 +7,7 @@ from crowds import TASKS, drawn, make, small
 from refusals import refused
 
 from npa_envs.envs import multispecies_v0
-from npa_envs.envs.core import state
+from npa_envs.envs.core import world_state
 from npa_envs.errors import NPAError
 
 # Species leave, run out of bounds in their states, are removed, and are cut off.
@@ -99,12 +99,12 @@ def test_a_batch_equals_single_environments_while_species_die_here_and_there(tas
 
 def test_telling_species_apart_needs_memory_of_its_own(monkeypatch):
     # 64 worlds of 41 particles: P is 66, and 8 species append 24 numbers, of which 4 copies live.
-    free = state.needed_bytes(64, 41, batch().worlds.physics, torch.device("cpu"))
-    monkeypatch.setattr(state, "free_bytes", lambda device: free + 4 * 4 * 64 * 41 * 24 - 1)
+    free = world_state.needed_bytes(64, 41, batch().worlds.physics, torch.device("cpu"))
+    monkeypatch.setattr(world_state, "free_bytes", lambda device: free + 4 * 4 * 64 * 41 * 24 - 1)
     assert batch(world_count=64, species_count=8).worlds.perception_dim == 66
     with pytest.raises(NPAError, match="particle_count must fit into memory"):
         batch(world_count=64, species_count=8, perception="per_species")
-    monkeypatch.setattr(state, "free_bytes", lambda device: free + 4 * 4 * 64 * 41 * 24)
+    monkeypatch.setattr(world_state, "free_bytes", lambda device: free + 4 * 4 * 64 * 41 * 24)
     envs = batch(world_count=64, species_count=8, perception="per_species")
     assert envs.worlds.perception_dim == 66 + 24
 
@@ -117,4 +117,4 @@ def test_a_first_reset_that_is_refused_leaves_the_next_one_random():
         envs.reset()
         states += list(envs.state())
     # Neither two worlds nor two environments are alike.
-    assert len({state.tobytes() for state in states}) == 6
+    assert len({world_state.tobytes() for world_state in states}) == 6

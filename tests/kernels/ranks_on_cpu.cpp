@@ -4,7 +4,7 @@
 
 #include "cuda_on_cpu.h"
 
-#include "errors.cuh"
+#include "tile_order.cuh"
 
 constexpr int CAPACITY = 128;
 

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import warp as wp
 
-from npa_envs.kernels import native
+from npa_envs.kernels import native_functions as native
 from npa_envs.kernels.cuda.adjoint import listed_adjoint
 from npa_envs.kernels.cuda.density import listed_density, tiled_density
 from npa_envs.kernels.cuda.equivariance import mixing_sum, row_kernels, steering_kernels
@@ -18,10 +18,10 @@ from npa_envs.kernels.cuda.network import (
 )
 from npa_envs.kernels.cuda.perceive import PerceptionVariant, listed_perception
 from npa_envs.kernels.cuda.sort import BLOCKS, order_particles, sort_small_worlds
-from npa_envs.kernels.cuda.splat import sort_small_splats
+from npa_envs.kernels.cuda.splat_sort import sort_small_splats
 from npa_envs.kernels.pictures.blending import block_kernels
 from npa_envs.kernels.pictures.errors import gather_errors
-from npa_envs.kernels.portable.episodes import update_episodes
+from npa_envs.kernels.portable.rewards_and_ends import update_episodes
 from npa_envs.ops import warmup
 from npa_envs.ops.launch import launched
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 from worlds import relative_error
 
-from npa_envs.kernels import native
+from npa_envs.kernels import native_functions as native
 from npa_envs.kernels.cuda import equivariance as cuda
 from npa_envs.ops.equivariance import VectorForm, read_rows, steer_rows
 
@@ -49,13 +49,13 @@ def test_tiles_of_pictures_are_ranked_by_their_candidates(tmp_path):
 
 
 def test_tiles_find_all_neighbours_of_all_particles(tmp_path):
-    tiles = text_of("cuda/tiles.cuh")
+    tiles = text_of("cuda/density.cuh")
     fetch, wait = function_of(tiles, "fetch"), function_of(tiles, "await_fetched")
     tiles = tiles.replace(fetch, fetch.split("{")[0] + "{ *to = *from; }\n")
     tiles = tiles.replace(wait, wait.split("{")[0] + "{}\n")
     mathematics = text_of("mathematics.cuh")
     needed = [function_of(mathematics, name) for name in ("falloff_within", "smoothing")]
-    needed.append(function_of(text_of("access.cuh"), "sum_up_to"))
+    needed.append(function_of(text_of("primitives.cuh"), "sum_up_to"))
     head = "namespace npa {\n" + "\n".join(needed) + "}\nusing std::fmaf;\n"
     (tmp_path / "native.h").write_text(head + tiles, encoding="utf-8")
     printed = printed_by("tiles_on_cpu.cpp", tmp_path, KERNELS)

@@ -13,17 +13,17 @@ from npa_envs.cli import main
 from npa_envs.cli.common import named_rules
 from npa_envs.errors import NPAError
 from npa_envs.measure import accuracy
-from npa_envs.measure.accuracy import all_checks, hard_cases, rule_checks, suite
+from npa_envs.measure.accuracy import all_checks, check_runner, hard_cases, trained_rule_checks
 from npa_envs.measure.accuracy import scenes as places
-from npa_envs.measure.accuracy.rule_checks import habitat
-from npa_envs.measure.accuracy.scenes import scenes
-from npa_envs.measure.accuracy.suite import (
+from npa_envs.measure.accuracy.check_runner import (
     GROUPS,
     Check,
     CheckResult,
     CheckSession,
     Skipped,
 )
+from npa_envs.measure.accuracy.scenes import scenes
+from npa_envs.measure.accuracy.trained_rule_checks import habitat
 from npa_envs.rule.files import load_rule, rule_digest, rule_file, rule_metadata, save_rule
 from npa_envs.training import preset, train
 
@@ -53,15 +53,15 @@ def test_every_check_has_a_name_of_its_own_a_group_and_an_expectation():
 
 def test_checks_are_chosen_by_group_by_name_and_by_how_names_begin():
     checks = list(CHECKS.values())
-    groups = {check.group for check in suite.chosen_checks(checks, ["time", "values"])}
+    groups = {check.group for check in check_runner.chosen_checks(checks, ["time", "values"])}
     assert groups == {"time", "values"}
-    assert [c.name for c in suite.chosen_checks(checks, ["time/gecko"])] == ["time/gecko"]
-    clumps = suite.chosen_checks(checks, ["geometry/clump"])
+    assert [c.name for c in check_runner.chosen_checks(checks, ["time/gecko"])] == ["time/gecko"]
+    clumps = check_runner.chosen_checks(checks, ["geometry/clump"])
     where = ["2d/open", "2d/periodic", "3d/open", "3d/periodic"]
     assert [c.name.removeprefix("geometry/clump/") for c in clumps] == where
-    assert suite.chosen_checks(checks, []) == checks
+    assert check_runner.chosen_checks(checks, []) == checks
     with pytest.raises(NPAError, match="unknown check 'geometri': did you mean 'geometry'"):
-        suite.chosen_checks(checks, ["geometri"])
+        check_runner.chosen_checks(checks, ["geometri"])
 
 
 # Verdicts
@@ -98,9 +98,9 @@ def test_what_raises_has_failed_and_the_others_go_on():
 
         return Check(f"values/{type(error).__name__}", "no error", run)
 
-    record = suite.StressRecord(FACTS)
+    record = check_runner.StressRecord(FACTS)
     errors = (ZeroDivisionError("by\nzero"), Skipped("no device"), torch.OutOfMemoryError("much"))
-    suite.run_checks([*map(raising, errors), told("values/last")], session(), record)
+    check_runner.run_checks([*map(raising, errors), told("values/last")], session(), record)
     found = {entry.name: (entry.verdict, entry.note) for entry in record.rows}
     assert found == {
         "values/ZeroDivisionError": ("fail", "ZeroDivisionError: by zero"),
@@ -117,14 +117,14 @@ def test_what_raises_has_failed_and_the_others_go_on():
 
 def test_a_record_comes_back_as_it_was_written(tmp_path: Path):
     path = tmp_path / "record.json"
-    assert suite.StressRecord(FACTS, path).read().rows == []
+    assert check_runner.StressRecord(FACTS, path).read().rows == []
     figures = {"a": 1.5, "b": math.inf, "c": math.nan}
-    record = suite.StressRecord(FACTS, path)
+    record = check_runner.StressRecord(FACTS, path)
     record.put(CheckResult(figures, {"a": 1.0}, note="n", name="x/y", expected="s"))
     held = json.loads(path.read_text(encoding="utf-8"))
     assert held["counts"] == {"pass": 0, "range": 0, "fail": 1, "skipped": 0}
     assert held["checks"][0]["figures"] == {"a": 1.5, "b": "inf", "c": "nan"}
-    assert repr(suite.StressRecord(FACTS, path).read().rows) == repr(record.rows)
+    assert repr(check_runner.StressRecord(FACTS, path).read().rows) == repr(record.rows)
 
 
 def test_a_run_goes_on_where_it_was_and_repeats_what_did_not_pass():
@@ -136,17 +136,17 @@ def test_a_run_goes_on_where_it_was_and_repeats_what_did_not_pass():
 
     failing = {"figures": {"x": 2.0}, "limits": {"x": 1.0}}
     checks = [counted("a/1"), counted("a/2", **failing), counted("a/3", holds="all")]
-    record, sizes = suite.StressRecord(FACTS), []
+    record, sizes = check_runner.StressRecord(FACTS), []
     record.write = lambda: sizes.append(len(record.rows))
-    suite.run_checks(checks, session(), record)
+    check_runner.run_checks(checks, session(), record)
     assert sizes == [1, 2, 3]
-    suite.run_checks(checks, session(), record)
+    check_runner.run_checks(checks, session(), record)
     assert ran == ["a/1", "a/2", "a/3", "a/2"]
-    late = suite.StressRecord(FACTS, names=["a/3", "a/1"])
+    late = check_runner.StressRecord(FACTS, names=["a/3", "a/1"])
     verdicts = []
     # No time is no reason to forget that something failed.
     for seconds in (0.0, None, 0.0):
-        suite.run_checks(checks, session(), late, max_seconds=seconds)
+        check_runner.run_checks(checks, session(), late, max_seconds=seconds)
         verdicts.append([entry.verdict for entry in late.rows])
     assert verdicts == [["skipped"] * 3, *(2 * [["range", "pass", "fail"]])]
     assert [entry.name for entry in late.rows] == ["a/3", "a/1", "a/2"]
@@ -166,7 +166,7 @@ AS_EXPECTED = """
 
 @pytest.mark.parametrize("name", AS_EXPECTED.split())
 def test_the_library_is_as_expected(name, device):
-    entry = suite.run_check(CHECKS[name], session(device))
+    entry = check_runner.run_check(CHECKS[name], session(device))
     assert entry.verdict in ("pass", "range"), (entry.worst(), entry.note)
 
 
@@ -179,8 +179,8 @@ def test_a_wrong_operator_is_found_out(factor, monkeypatch):
         right = module.perceive
         monkeypatch.setattr(module, "perceive", wrong)
     for name in ("geometry/clump/2d/open", "geometry/threshold/2d", "geometry/outside/3d"):
-        assert suite.run_check(CHECKS[name], session()).verdict == "fail"
-    difference = suite.run_check(CHECKS["gradients/finite_differences/2d/open"], session())
+        assert check_runner.run_check(CHECKS[name], session()).verdict == "fail"
+    difference = check_runner.run_check(CHECKS["gradients/finite_differences/2d/open"], session())
     # A wrong factor is differentiated rightly; what is not a number is not.
     assert difference.verdict == ("fail" if math.isnan(factor) else "pass")
 
@@ -198,7 +198,7 @@ def test_jumps_and_results_that_change_from_call_to_call_are_found_out(module, n
         return right(*arguments, **options) * (1.0 + 1e-6 * next(calls))
 
     monkeypatch.setattr(module, "perceive", wrong)
-    assert suite.run_check(CHECKS[name], session()).verdict == "fail"
+    assert check_runner.run_check(CHECKS[name], session()).verdict == "fail"
 
 
 def test_no_limit_is_more_than_a_scene_asks_for():
@@ -224,8 +224,10 @@ def test_a_rule_that_blows_up_is_found_out(factor, count, verdict, device, monke
             rule.output.weight *= factor
         return home._replace(rule=rule, worlds=home.worlds.map(lambda part: part[:, :count]))
 
-    monkeypatch.setattr(rule_checks, "habitat", tampered)
-    entry = suite.run_check(CHECKS["time/heart" if count == 1 else "time/dots"], session(device))
+    monkeypatch.setattr(trained_rule_checks, "habitat", tampered)
+    entry = check_runner.run_check(
+        CHECKS["time/heart" if count == 1 else "time/dots"], session(device)
+    )
     if count == 1:
         # A world that extends nowhere is measured all the same.
         assert (entry.figures["extent"], entry.figures["drift"] >= 0.0) == (0.0, True)
@@ -255,7 +257,7 @@ def test_rules_of_every_kind_in_files_are_checked_by_themselves(fields, tmp_path
         "gradients/norm/mine",
         "gradients/float32/mine",
     ]
-    entries = {check.name: suite.run_check(check, session(device)) for check in checks}
+    entries = {check.name: check_runner.run_check(check, session(device)) for check in checks}
     assert all(entry.figures or entry.verdict == "skipped" for entry in entries.values())
     assert entries["gradients/norm/mine"].verdict == "pass"
     alike = entries["gradients/float32/mine"]
@@ -334,6 +336,6 @@ def test_the_command_lists_its_checks(capsys):
 
 @pytest.mark.slow
 def test_everything_quick_is_as_expected(device):
-    record = suite.StressRecord(FACTS)
-    suite.run_checks(list(CHECKS.values()), session(device), record)
+    record = check_runner.StressRecord(FACTS)
+    check_runner.run_checks(list(CHECKS.values()), session(device), record)
     assert [entry.name for entry in record.failed()] == []

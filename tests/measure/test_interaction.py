@@ -11,7 +11,7 @@ from PIL import Image, ImageDraw
 
 from npa_envs.cli import main
 from npa_envs.errors import NPAError
-from npa_envs.measure import interaction
+from npa_envs.measure import rule_interaction as interaction
 from npa_envs.rule.files import save_rule
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
@@ -131,7 +131,10 @@ def test_the_interval_of_a_ratio_is_that_of_its_worlds():
     ones = torch.ones(4)
     assert interaction.ratio_interval(2.0 * ones, ones) == (2.0, 2.0)
     # Both numbers of a world are drawn together.
-    assert interaction.ratio_interval(torch.arange(1.0, 5.0), torch.arange(1.0, 5.0)) == (1.0, 1.0)
+    assert interaction.ratio_interval(torch.arange(1.0, 5.0), torch.arange(1.0, 5.0)) == (
+        1.0,
+        1.0,
+    )
     above = torch.randn(200, generator=torch.Generator().manual_seed(0)) + 3.0
     low, high = interaction.ratio_interval(above, torch.ones(200))
     half = 1.96 * above.std().item() / math.sqrt(200)

@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from npa_envs.cli import main
-from npa_envs.measure.accuracy.rule_checks import task_name
-from npa_envs.measure.robustness import study, trials
+from npa_envs.measure.accuracy.trained_rule_checks import task_name
+from npa_envs.measure.robustness import report, trials
 from npa_envs.measure.robustness.trials import (
     BLOB_DISTANCE,
     CONDITIONS,
@@ -161,27 +161,27 @@ def test_a_course_counts_its_seeds():
     assert (course.recovered(), course.median_step(), course.within_at_end()) == (3, 16, 2)
     assert course.ratios(-1) == [1.0, 1.0, 2.0, 2.0]
     others = [dataclasses.replace(course, damage=name) for name in (trials.CONTROL, "side")]
-    assert study.recovered_counts([record(course, *others)], ["wipe", "cut"]) == (3, 2, 4)
-    assert study.recovered_counts([record(course, *others)], trials.DAMAGES) == (6, 4, 8)
+    assert report.recovered_counts([record(course, *others)], ["wipe", "cut"]) == (3, 2, 4)
+    assert report.recovered_counts([record(course, *others)], trials.DAMAGES) == (6, 4, 8)
 
 
-def record(*found: trials.LossCurve, **changed) -> study.RuleRecord:
+def record(*found: trials.LossCurve, **changed) -> report.RuleRecord:
     values = [("eps", 1.0), ("eps", 2.0), ("particles", 1.0), ("update_prob", 0.5)]
-    told = tuple(study.Response(name, value, 8, (0.5, value)) for name, value in values)
-    lost = study.Response("eps", 4.0, 8, (0.5, math.nan))
-    left_out = study.Response("particles", 2.0, 0, (), note="256 particles in all")
+    told = tuple(report.Response(name, value, 8, (0.5, value)) for name, value in values)
+    lost = report.Response("eps", 4.0, 8, (0.5, math.nan))
+    left_out = report.Response("particles", 2.0, 0, (), note="256 particles in all")
     fields = {"rule": "heart", "task": "morphogenesis2d", "metric": "loss", "update_prob": 0.5}
     fields |= {"curves": found, "responses": (*told, lost, left_out)}
-    return study.RuleRecord({"a": 1}, **fields | changed)
+    return report.RuleRecord({"a": 1}, **fields | changed)
 
 
 # Where rules work
 
 
-def responding(condition: str, *losses_by_value) -> study.RuleRecord:
+def responding(condition: str, *losses_by_value) -> report.RuleRecord:
     """A record of one condition beside the loss as trained, which is 1 unless it says so."""
-    told = [study.Response(condition, value, 8, losses) for value, losses in losses_by_value]
-    trained = () if condition == "eps" else (study.Response("eps", 1.0, 8, (0.5, 1.5)),)
+    told = [report.Response(condition, value, 8, losses) for value, losses in losses_by_value]
+    trained = () if condition == "eps" else (report.Response("eps", 1.0, 8, (0.5, 1.5)),)
     return record(responses=(*trained, *told))
 
 
@@ -212,7 +212,7 @@ def responding(condition: str, *losses_by_value) -> study.RuleRecord:
 def test_where_a_rule_works_follows_from_the_mean_loss_of_its_seeds(
     condition, losses_by_value, text
 ):
-    assert study.where_it_works(responding(condition, *losses_by_value), condition) == text
+    assert report.where_it_works(responding(condition, *losses_by_value), condition) == text
 
 
 # Measuring
@@ -221,7 +221,7 @@ def test_where_a_rule_works_follows_from_the_mean_loss_of_its_seeds(
 @pytest.mark.parametrize("name", ["heart", "dots", "digits"])
 def test_damaged_worlds_go_beside_twins_with_the_same_masks(name, device):
     trial = trial_of(name, device)
-    grown, trained = study.grow(trial)
+    grown, trained = report.grow(trial)
     found = {course.damage: course for course in trials.healing(trial, grown)}
     static = name == "digits"
     assert set(found) == {
@@ -245,8 +245,8 @@ def test_damaged_worlds_go_beside_twins_with_the_same_masks(name, device):
 
 def test_conditions_are_grown_for_as_many_updates_and_left_out_where_too_large(device):
     trial = trial_of("heart", device)
-    _, trained = study.grow(trial)
-    found = list(study.responses(trial, trained, most_particles=300))
+    _, trained = report.grow(trial)
+    found = list(report.responses(trial, trained, most_particles=300))
     assert [(r.condition, r.value, r.steps) for r in found] == [
         ("eps", 1.0, 8),
         ("eps", 2.0, 8),
@@ -296,13 +296,13 @@ def test_seeds_of_a_rule_of_many_pictures_grow_them_in_turn(device):
     one = RuleTrial("seven-pictures", device, TINY, range(8, 9), 128).initial_worlds(0.5)
     assert torch.equal(one.s, trial.initial_worlds(0.5).s[3:])
     # What takes codes away gives them back.
-    curves = trials.healing(trial, study.grow(trial)[0])
+    curves = trials.healing(trial, report.grow(trial)[0])
     assert all(len(curve.losses) == 4 for curve in curves)
 
 
 def test_a_world_that_diverges_stays_lost_and_leaves_the_others_as_they_are(device, monkeypatch):
     trial = trial_of("heart", device)
-    grown, _ = study.grow(trial)
+    grown, _ = report.grow(trial)
     _, whole = trial.run(grown, trial.random(9), (0, 4, 8))
     run = trials.RuleRunner.run
 
@@ -340,16 +340,16 @@ def test_stored_records_can_be_read_and_give_tables():
     paths = sorted(folder.glob("*.json"))
     facts = [json.loads(path.read_text("utf-8"))["facts"] for path in paths]
     pairs = zip(facts, paths, strict=True)
-    records = [study.RuleRecord(content, path).read() for content, path in pairs]
+    records = [report.RuleRecord(content, path).read() for content, path in pairs]
     assert len(records) == 15
     assert all(record.done for record in records)
-    text = study.tables(records)
+    text = report.tables(records)
     assert all(f"| {record.rule} | " in text for record in records)
 
 
 def test_tables_say_what_was_not_measured_and_what_is_not_finite():
     course = trials.LossCurve("wipe", (0, 16), ((2.0, 1.0), (2.0, 3.0)), ((1.0, 1.0), (1.0, 1.0)))
-    text = study.tables([record(course), record(rule="dots")])
+    text = report.tables([record(course), record(rule="dots")])
     ranges = "1 … 2 | 1 alone (not measured: 2) | 0.5 alone | – | – | – |"
     assert f"| heart | {ranges}\n| dots | {ranges}" in text
     for line in ("| heart | 1/2, 16 |", "| heart | 2 → 2 (1/2) |", "| dots | – |"):
@@ -365,11 +365,11 @@ def test_records_come_back_as_they_were_written_and_curves_are_drawn_by_task(tmp
     records[0].write()
     (held,) = json.loads(path.read_text(encoding="utf-8"))["courses"]
     assert held["recovery_steps"] == [16, None]
-    found = study.RuleRecord({"a": 1}, path).read()
+    found = report.RuleRecord({"a": 1}, path).read()
     assert repr((found.rows, found.curves)) == repr((records[0].rows, records[0].curves))
     assert found.about == records[0].about
     pytest.importorskip("matplotlib")
-    drawn = study.pictures(records)
+    drawn = report.pictures(records)
     assert set(drawn) == {"morphogenesis2d", "texture"}
     assert all(picture.startswith(b"\x89PNG") for picture in drawn.values())
 
@@ -380,14 +380,16 @@ def test_the_command_measures_writes_and_goes_on(tmp_path, capsys, monkeypatch):
     path = tmp_path / "robustness_heart.json"
     # No time is left after the damages and three values.
     asked = iter([False] * 4)
-    monkeypatch.setattr("npa_envs.measure.record.time_limit", lambda _: lambda: next(asked, True))
+    monkeypatch.setattr(
+        "npa_envs.measure.benchmark_records.time_limit", lambda _: lambda: next(asked, True)
+    )
     assert main(words) == 0
     assert capsys.readouterr().out == "1 rules are left: call again with the same options\n"
     part = json.loads(path.read_text(encoding="utf-8"))
     assert (part["done"], len(part["responses"])) == (False, 3)
     monkeypatch.undo()
     # The damages are not measured again.
-    monkeypatch.setattr(study, "healing", lambda *_: pytest.fail("measured"))
+    monkeypatch.setattr(report, "healing", lambda *_: pytest.fail("measured"))
     assert main(words) == 0
     first = capsys.readouterr().out
     held = json.loads(path.read_text(encoding="utf-8"))

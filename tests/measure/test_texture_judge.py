@@ -9,8 +9,8 @@ import torch.nn.functional as F
 
 from npa_envs.cli import main
 from npa_envs.errors import NPAError
-from npa_envs.measure import texture_judge as judges
-from npa_envs.measure.texture_judge import TextureJudge
+from npa_envs.measure import texture_metric as judges
+from npa_envs.measure.texture_metric import TextureJudge
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 from npa_envs.tasks.targets.textures import TextureTarget, draw_pattern
 from npa_envs.tasks.texture import Texture, TextureConfig

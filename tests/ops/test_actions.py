@@ -9,7 +9,7 @@ from worlds import assert_same, random_mask
 from npa_envs.errors import NPAError
 from npa_envs.ops import apply_actions
 from npa_envs.ops.perceive import Rows
-from npa_envs.ops.physics import Limits, Physics
+from npa_envs.ops.physics_constants import Limits, Physics
 from npa_envs.ops.update import ActedWorlds, PreparedActions, update_particles
 
 B, N, C = 3, 77, 5

@@ -5,7 +5,7 @@ import itertools
 import pytest
 import torch
 
-from npa_envs.ops.episodes import (
+from npa_envs.ops.rewards_and_ends import (
     DIVERGED,
     NOT_FINITE,
     SUCCESS,

@@ -20,8 +20,8 @@ from npa_envs.ops import launch as threads
 from npa_envs.ops import orbit, render_gaussians, splat
 from npa_envs.ops.launch import even_ranges, run_together
 from npa_envs.ops.perceive import build_neighbours
-from npa_envs.ops.physics import Limits, Physics
-from npa_envs.ops.pictures.losses import picture_losses
+from npa_envs.ops.physics_constants import Limits, Physics
+from npa_envs.ops.pictures.losses_without_gradient import picture_losses
 from npa_envs.ops.update import ActedWorlds, PreparedActions
 
 lively_rule = functools.cache(made_rule)

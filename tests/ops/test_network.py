@@ -4,7 +4,7 @@ import pytest
 import torch
 from worlds import assert_same, relative_error
 
-from npa_envs.rule.network import fold_weights
+from npa_envs.rule.folded_network import fold_weights
 from npa_envs.rule.rule import NPARule
 
 # Norms of errors over norms of answers, against float64; beside, the worst measured on an H200.

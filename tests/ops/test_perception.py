@@ -21,7 +21,7 @@ from worlds import (
 import npa_envs
 from npa_envs import reference as oracle
 from npa_envs.ops.perceive import build_neighbours
-from npa_envs.ops.physics import Limits, Physics, Terms
+from npa_envs.ops.physics_constants import Limits, Physics, Terms
 
 # The bound of the tests, then the worst error measured on CPUs and CUDA: a quarter of it at most.
 FORWARD = {torch.float32: 8e-6, torch.float64: 1e-14}  # 1.9e-6 (CUDA), 2e-15

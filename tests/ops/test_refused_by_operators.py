@@ -18,8 +18,8 @@ from npa_envs.ops import (
     splat,
     world_mean,
 )
-from npa_envs.ops.physics import Limits, Physics
-from npa_envs.ops.pictures.losses import picture_losses
+from npa_envs.ops.physics_constants import Limits, Physics
+from npa_envs.ops.pictures.losses_without_gradient import picture_losses
 
 SIZE = {"width": 40, "height": 30}
 EYES = torch.eye(4)[None].repeat(2, 1, 1)

@@ -14,8 +14,8 @@ from worlds import (
 
 import npa_envs
 from npa_envs.errors import NPAError
-from npa_envs.ops import backend, passes
-from npa_envs.ops.physics import Terms
+from npa_envs.ops import backend, perception_passes
+from npa_envs.ops.physics_constants import Terms
 
 # The worst errors measured were 1.2e-6 (CUDA), and in a box of two eps 2.1e-6 (CUDA).
 BOUNDS = (5e-6, 1e-5)
@@ -148,6 +148,6 @@ def test_a_position_that_is_not_a_number_leaves_other_worlds_alone(device):
 def test_gradients_that_kernels_could_not_index_are_refused(monkeypatch):
     x, s = random_world(1, 20, 3, 5, dtype=torch.float64, device="cpu")
     z = npa_envs.perceive(x, s.requires_grad_(), 0.3)
-    monkeypatch.setattr(passes, "MAX_INDEX", 20 * 8 * 3)
+    monkeypatch.setattr(perception_passes, "MAX_INDEX", 20 * 8 * 3)
     with pytest.raises(NPAError, match=r"gradients must stay below 480 .* split the batch"):
         z.sum().backward()

@@ -10,9 +10,9 @@ import time
 import pytest
 import torch
 
-from npa_envs.kernel_lock import kernel_lock
 from npa_envs.ops import launch as threads
 from npa_envs.ops.launch import run_together
+from npa_envs.thread_lock import kernel_lock
 
 needs_fork = pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 

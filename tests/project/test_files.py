@@ -16,11 +16,17 @@ import pytest
 from PIL import Image
 
 from npa_envs.agents.learning.rule_set import RuleSet
+from npa_envs.atomic_files import (
+    atomic_path,
+    made_folder,
+    remove_unfinished,
+    write_bytes,
+    write_text,
+)
 from npa_envs.cli.common import writable_folder
 from npa_envs.errors import NPAError
-from npa_envs.files import atomic_path, made_folder, remove_unfinished, write_bytes, write_text
 from npa_envs.rule.rule import NPARule
-from npa_envs.training.run import RunFolder
+from npa_envs.training.run_folder import RunFolder
 
 
 def write_half_and_raise(target: Path, error: BaseException, content: bytes = b"half") -> None:
@@ -62,7 +68,7 @@ def test_a_killed_process_keeps_the_old_file(tmp_path: Path) -> None:
     target.write_bytes(b"old")
     program = (
         "import os, signal, sys\n"
-        "from npa_envs.files import atomic_path\n"
+        "from npa_envs.atomic_files import atomic_path\n"
         "with atomic_path(sys.argv[1]) as temporary:\n"
         "    temporary.write_bytes(b'half')\n"
         "    os.kill(os.getpid(), signal.SIGKILL)\n"

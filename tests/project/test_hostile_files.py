@@ -17,13 +17,13 @@ import torch
 from PIL import EpsImagePlugin, Image
 
 from npa_envs import NPAError, NPARule, load_rule, save_rule
-from npa_envs.measure.record import read_record
+from npa_envs.measure.benchmark_records import read_record
 from npa_envs.runtime import kernel_cache_folder, quiet_warp
 from npa_envs.tasks.losses.texture import load_vgg_weights
-from npa_envs.tasks.targets.clouds import load_pictures, read_idx
+from npa_envs.tasks.targets.digit_clouds import load_pictures, read_idx
 from npa_envs.tasks.targets.images import open_image
 from npa_envs.tasks.targets.meshes import load_mesh
-from npa_envs.tasks.targets.points import load_target, target_from_image
+from npa_envs.tasks.targets.picture_points import load_target, target_from_image
 from npa_envs.tasks.targets.textures import load_texture
 from npa_envs.tasks.targets.views import load_views
 from npa_envs.training import load_config, preset

@@ -13,7 +13,7 @@ from npa_envs import wrappers
 from npa_envs.agents.learning import Budget, train
 from npa_envs.errors import MissingDependencyError
 from npa_envs.render import Window, write_mp4
-from npa_envs.tasks.targets.clouds import load_pictures
+from npa_envs.tasks.targets.digit_clouds import load_pictures
 from npa_envs.tasks.targets.meshes import load_mesh
 
 PACKAGE = """

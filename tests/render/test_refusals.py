@@ -20,7 +20,7 @@ from npa_envs.render import (
     write_mp4,
     write_webp,
 )
-from npa_envs.render.film import encode_frame
+from npa_envs.render.picture_files import encode_frame
 
 FRAME = np.zeros((4, 4, 3), np.uint8)
 FILM = [FRAME] * 6

@@ -10,7 +10,7 @@ import torch
 from PIL import Image, ImageSequence
 
 from npa_envs.render import to_uint8, write_filmstrip, write_gif, write_mp4, write_png
-from npa_envs.render.film import encode_frame
+from npa_envs.render.picture_files import encode_frame
 
 WRITERS = [(write_gif, "film.gif"), (write_mp4, "film.mp4"), (write_filmstrip, "film.png")]
 
@@ -170,7 +170,7 @@ FILE_SIZE_LIMIT = """
 import resource, sys
 import numpy as np
 from npa_envs.errors import NPAError
-from npa_envs.render import film
+from npa_envs.render import picture_files as film
 noise = np.random.default_rng(0).integers(0, 256, (6, 128, 128, 3), dtype=np.uint8)
 resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
 for writer, path in zip(sys.argv[1::2], sys.argv[2::2]):

@@ -6,7 +6,7 @@ import torch
 from small_digits import COUNTS, idx, pictures, write_idx
 
 from npa_envs.errors import NPAError
-from npa_envs.tasks.targets.clouds import (
+from npa_envs.tasks.targets.digit_clouds import (
     _farthest_points,
     load_clouds,
     load_pictures,
@@ -132,7 +132,7 @@ def test_a_cloud_does_not_depend_on_the_others_nor_on_the_device(device, monkeyp
     x, _ = sample_ink(images, 100, sample_seed=5)
     for k in (0, 1, 11):
         assert torch.equal(sample_ink(images[k : k + 1], 100, sample_seed=5)[0][0], x[k])
-    monkeypatch.setattr("npa_envs.tasks.targets.clouds.CHUNK", {"cpu": 5, "cuda": 5})
+    monkeypatch.setattr("npa_envs.tasks.targets.digit_clouds.CHUNK", {"cpu": 5, "cuda": 5})
     assert torch.equal(sample_ink(images, 100, sample_seed=5, device=device)[0].cpu(), x)
     assert not torch.equal(sample_ink(images, 100, sample_seed=6)[0], x)
 

@@ -12,8 +12,8 @@ import npa_envs
 from npa_envs.cli import main
 from npa_envs.errors import NPAError
 from npa_envs.measure.quality import picture_rows
-from npa_envs.rule.codes import Codes
 from npa_envs.rule.files import load_rule
+from npa_envs.rule.picture_codes import Codes
 from npa_envs.tasks.many_pictures import ManyPictures, named_targets
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 from npa_envs.training import preset, train

@@ -12,7 +12,7 @@ from npa_envs.errors import NPAError
 from npa_envs.measure.quality import measure
 from npa_envs.render import turntable_frames, write_gaussians, write_points, write_splat
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.appearance import FLAT, OUTPUTS, appearance
+from npa_envs.tasks.gaussian_outputs import FLAT, OUTPUTS, appearance
 from npa_envs.tasks.morphogenesis3d import Morphogenesis3D, Morphogenesis3DConfig
 from npa_envs.tasks.targets.meshes import AMBIENT, LIGHT, load_mesh
 from npa_envs.tasks.targets.views import ANGLE, DISTANCE, load_views, over, some_views

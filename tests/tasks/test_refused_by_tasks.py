@@ -16,8 +16,8 @@ from npa_envs.tasks.many_pictures import ManyPictures
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2DConfig
 from npa_envs.tasks.morphogenesis3d import Morphogenesis3D, Morphogenesis3DConfig
 from npa_envs.tasks.point_classification import PointClassification, PointClassificationConfig
-from npa_envs.tasks.targets.clouds import load_pictures
-from npa_envs.tasks.targets.points import load_target
+from npa_envs.tasks.targets.digit_clouds import load_pictures
+from npa_envs.tasks.targets.picture_points import load_target
 from npa_envs.tasks.targets.textures import draw_pattern, load_texture
 from npa_envs.tasks.targets.views import load_views
 from npa_envs.tasks.texture import Texture, TextureConfig

@@ -12,7 +12,7 @@ from npa_envs.errors import MissingDependencyError, NPAError
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 from npa_envs.tasks.targets import emoji, images
 from npa_envs.tasks.targets.images import read_image, resample
-from npa_envs.tasks.targets.points import builtin_targets, load_target, target_from_image
+from npa_envs.tasks.targets.picture_points import builtin_targets, load_target, target_from_image
 
 RED, GREEN, BLUE = (255, 0, 0), (0, 160, 0), (0, 0, 255)
 

@@ -11,8 +11,8 @@ import torch
 from circle_task import circle_config
 from training_runs import Killed, KilledTask, kill, log_of, train, trainer_of
 
+from npa_envs.atomic_files import write_text
 from npa_envs.errors import NPAError
-from npa_envs.files import write_text
 from npa_envs.training import JsonlLog, RunFolder, load_config, override
 from npa_envs.training.checkpoint import load_checkpoint, save_checkpoint
 
@@ -26,7 +26,7 @@ def test_a_run_killed_at_its_first_checkpoint_is_resumed_with_its_configuration(
         save_checkpoint(path, content)
         kill()
 
-    monkeypatch.setattr("npa_envs.training.run.save_checkpoint", killed_after)
+    monkeypatch.setattr("npa_envs.training.run_folder.save_checkpoint", killed_after)
     with pytest.raises(Killed):
         trainer_of(config)
     monkeypatch.undo()
@@ -168,7 +168,7 @@ def resumed(finished, monkeypatch):
     """A function that resumes the finished run from another content of its checkpoint."""
 
     def resume(content, message):
-        monkeypatch.setattr("npa_envs.training.run.load_checkpoint", lambda _: content)
+        monkeypatch.setattr("npa_envs.training.run_folder.load_checkpoint", lambda _: content)
         before = {path: path.read_bytes() for path in finished.iterdir() if path.is_file()}
         with pytest.raises(NPAError, match=message):
             trainer_of(circle_config(finished, log_interval=2), resume=True)

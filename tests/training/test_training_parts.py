@@ -17,7 +17,7 @@ from npa_envs.training.cycle import WorldPool
 from npa_envs.training.iteration import EagerIteration, Interval, LossMeter, power_mean
 from npa_envs.training.optimiser import FATE_RATE, RuleOptimiser, layer_weights, normalise_gradients
 from npa_envs.training.ranks import RunRandomness
-from npa_envs.training.run import JsonlLog
+from npa_envs.training.run_folder import JsonlLog
 from npa_envs.world.particles import Particles
 
 

@@ -22,7 +22,7 @@ from npa_envs.rule.files import load_rule, rule_metadata, save_rule
 from npa_envs.rule.rule import NPARule
 from npa_envs.training import DivergedError, JsonlLog, load_config, override
 from npa_envs.training.checkpoint import load_checkpoint
-from npa_envs.training.run import ONE_REQUEST, stop_flag
+from npa_envs.training.run_folder import ONE_REQUEST, stop_flag
 
 
 def test_training_starts_from_an_initial_rule_of_its_shape(tmp_path):
@@ -454,7 +454,7 @@ def test_folders_that_do_not_do_are_named_before_training(tmp_path, monkeypatch)
     (tmp_path / "file").write_text("", encoding="utf-8")
     refuse("file/run", r"out must be a folder that can be created .*file/run")
     usage = type("Usage", (), {"free": 100})
-    monkeypatch.setattr("npa_envs.training.run.shutil.disk_usage", lambda path: usage)
+    monkeypatch.setattr("npa_envs.training.run_folder.shutil.disk_usage", lambda path: usage)
     refuse("full", "must have room for two checkpoints")
     assert not (tmp_path / "full" / "checkpoint.pt").exists()
     if os.geteuid() != 0:  # Root may write everywhere.
@@ -481,7 +481,7 @@ def test_signals_of_one_moment_are_one_request_and_a_later_one_ends_the_impatien
     patient, monkeypatch, capfd
 ):
     clock, usual = Clock(), signal.getsignal(signal.SIGINT)
-    monkeypatch.setattr("npa_envs.training.run.time", clock)
+    monkeypatch.setattr("npa_envs.training.run_folder.time", clock)
     with stop_flag(patient=patient) as stop:
         assert not stop.is_set()
         # A launcher passes on what its scheduler has sent to all processes.

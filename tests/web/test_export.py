@@ -35,7 +35,7 @@ from npa_envs.web.export import (
     page_rule,
     page_text,
 )
-from npa_envs.web.live import ColouredWorld, Colouring
+from npa_envs.web.live_world import ColouredWorld, Colouring
 from npa_envs.web.rule_world import RuleWorld
 from npa_envs.world.brushes import nearest_image
 

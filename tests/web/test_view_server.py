@@ -16,7 +16,7 @@ import pytest
 from PIL import Image
 
 from npa_envs.errors import MissingDependencyError, NPAError
-from npa_envs.web.live import WorldView
+from npa_envs.web.live_world import WorldView
 
 pytest.importorskip("uvicorn")
 testclient = pytest.importorskip("starlette.testclient")

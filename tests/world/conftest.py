@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from npa_envs.world import recorded
+from npa_envs.world import graphed_rollouts
 
 
 @pytest.fixture
@@ -11,6 +11,6 @@ def nothing_recorded():
     """No recordings before and after a test, where there is a CUDA device."""
     for before in (True, False):
         if torch.cuda.is_available():
-            recorded.release_recordings()
+            graphed_rollouts.release_recordings()
         if before:
             yield

@@ -9,7 +9,7 @@ from torch.utils.checkpoint import checkpoint
 from worlds import random_world
 
 import npa_envs
-from npa_envs.world import recorded
+from npa_envs.world import graphed_rollouts
 
 pytestmark = [pytest.mark.gpu, pytest.mark.usefixtures("nothing_recorded")]
 
@@ -70,7 +70,7 @@ def together(*works):
 
 
 def is_recorded():
-    return recorded.recorded_memory(DEVICE) > 0
+    return graphed_rollouts.recorded_memory(DEVICE) > 0
 
 
 @pytest.mark.parametrize("gradients", [False, True])
@@ -315,7 +315,7 @@ def test_inside_a_graph_of_the_caller():
 
 
 def test_memory_is_bounded(monkeypatch):
-    monkeypatch.setattr(recorded, "MEMORY_SHARE", 1e-12)
+    monkeypatch.setattr(graphed_rollouts, "MEMORY_SHARE", 1e-12)
     as_launched(make_rule(), 5)
 
 
@@ -334,6 +334,6 @@ def test_nothing_leaks_over_ten_thousand_calls_of_changing_shapes():
         del states
         if call in (4_999, 9_999):
             torch.cuda.synchronize()
-            taken.append((torch.cuda.memory_allocated(), recorded.recorded_memory(DEVICE)))
+            taken.append((torch.cuda.memory_allocated(), graphed_rollouts.recorded_memory(DEVICE)))
     assert taken[1][0] <= taken[0][0] + 2**20
     assert taken[1][1] == taken[0][1]

@@ -9,7 +9,7 @@ from test_recorded import as_launched as follows
 from torch import nn
 
 import npa_envs
-from npa_envs.world.module_state import rule_settings, rule_tensors
+from npa_envs.world.network_fingerprint import rule_settings, rule_tensors
 
 pytestmark = pytest.mark.usefixtures("nothing_recorded")
 

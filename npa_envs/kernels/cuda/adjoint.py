@@ -10,9 +10,10 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from npa_envs.kernel_lock import cached_under_lock
-from npa_envs.kernels import native
-from npa_envs.kernels.access import (
+from npa_envs.kernels import native_functions as native
+from npa_envs.kernels.domain import SLACK, TERMS_PER_SUM, domain_types, kernel_module
+from npa_envs.kernels.mathematics import make_log_scale_pull
+from npa_envs.kernels.primitives import (
     CUDA_BLOCK,
     WARP,
     allow_next_launch,
@@ -31,8 +32,7 @@ from npa_envs.kernels.access import (
     thread_of,
     vote_of_warp,
 )
-from npa_envs.kernels.domain import SLACK, TERMS_PER_SUM, domain_types, kernel_module
-from npa_envs.kernels.mathematics import make_log_scale_pull
+from npa_envs.thread_lock import cached_under_lock
 
 TILE = 8
 """Particles that a warp serves together, and rows of one matrix product."""

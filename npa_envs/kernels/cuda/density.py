@@ -17,9 +17,10 @@ thread for each particle. Worlds have at most 2^15 particles: entries of lists h
 
 import warp as wp
 
-from npa_envs.kernel_lock import cached_under_lock
-from npa_envs.kernels import native
-from npa_envs.kernels.access import (
+from npa_envs.kernels import native_functions as native
+from npa_envs.kernels.domain import SLACK, TERMS_PER_SUM, domain_types, kernel_module
+from npa_envs.kernels.mathematics import falloff_within, smoothing_of
+from npa_envs.kernels.primitives import (
     WARP,
     as_word,
     await_earlier,
@@ -29,8 +30,7 @@ from npa_envs.kernels.access import (
     make_wide_store,
     thread_number,
 )
-from npa_envs.kernels.domain import SLACK, TERMS_PER_SUM, domain_types, kernel_module
-from npa_envs.kernels.mathematics import falloff_within, smoothing_of
+from npa_envs.thread_lock import cached_under_lock
 
 AHEAD, SHARED_AHEAD = 6, 5
 """Candidates that a thread loads at a time, if a particle has one lane, and if it has several."""

@@ -42,7 +42,7 @@ template <int ROOM, int BLOCK> __device__ inline ListEnd cut_off(unsigned addres
 }
 
 // Index at which a row's list begins: lists of 32 rows are interleaved, two entries at a time. (Those
-// of `tiles.cuh` are stored one after the other.)
+// of `density.cuh` are stored one after the other.)
 template <int CAPACITY> __device__ inline size_t place_of_list(int row)
 {
     return (size_t)(row / 32) * (32 * CAPACITY) + row % 32 * 2;

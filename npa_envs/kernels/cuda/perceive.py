@@ -14,9 +14,20 @@ from typing import NamedTuple
 
 import warp as wp
 
-from npa_envs.kernel_lock import cached_under_lock
-from npa_envs.kernels import native
-from npa_envs.kernels.access import (
+from npa_envs.kernels import native_functions as native
+from npa_envs.kernels.cuda.density import RECORD, make_steps_at, step_of
+from npa_envs.kernels.domain import domain_types, kernel_module
+from npa_envs.kernels.mathematics import (
+    inverse_root,
+    log_scale_of_square,
+    log_scaled_huge,
+    make_corrected,
+    perception_topic,
+    smoothing,
+    spiky_factor_f64,
+    within,
+)
+from npa_envs.kernels.primitives import (
     CUDA_BLOCK,
     CUDA_LANES,
     any_in_warp,
@@ -30,18 +41,7 @@ from npa_envs.kernels.access import (
     sync_warp,
     thread_number,
 )
-from npa_envs.kernels.cuda.density import RECORD, make_steps_at, step_of
-from npa_envs.kernels.domain import domain_types, kernel_module
-from npa_envs.kernels.mathematics import (
-    inverse_root,
-    log_scale_of_square,
-    log_scaled_huge,
-    make_corrected,
-    perception_topic,
-    smoothing,
-    spiky_factor_f64,
-    within,
-)
+from npa_envs.thread_lock import cached_under_lock
 
 CUDA_REGISTERS, TEAM_REGISTERS = {2: 80, 3: 112}, 128
 """Registers per thread: with one team for a particle, by dimension, and with several."""

@@ -10,9 +10,9 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from npa_envs.kernel_lock import cached_under_lock
-from npa_envs.kernels import native
-from npa_envs.kernels.access import (
+from npa_envs.kernels import native_functions as native
+from npa_envs.kernels.domain import domain_types, kernel_module
+from npa_envs.kernels.primitives import (
     CUDA_LANES,
     WARP,
     await_earlier,
@@ -25,7 +25,7 @@ from npa_envs.kernels.access import (
     sync_block,
     thread_of_block,
 )
-from npa_envs.kernels.domain import domain_types, kernel_module
+from npa_envs.thread_lock import cached_under_lock
 
 load_pair = make_wide_load(wp.vec2i)
 

@@ -19,19 +19,10 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from npa_envs.kernel_lock import cached_under_lock
-from npa_envs.kernels import native
-from npa_envs.kernels.access import (
-    WARP,
-    any_in_warp,
-    load_integer,
-    make_lane_sum,
-    make_wide_load,
-    sync_block,
-)
+from npa_envs.kernels import native_functions as native
 from npa_envs.kernels.domain import scalar_name
 from npa_envs.kernels.mathematics import make_fast_exp2
-from npa_envs.kernels.native import TILES, in_ranges, named
+from npa_envs.kernels.native_functions import TILES, in_ranges, named
 from npa_envs.kernels.pictures.gaussians import (
     CHANNELS,
     MIN_ALPHA,
@@ -40,6 +31,15 @@ from npa_envs.kernels.pictures.gaussians import (
     gaussian_types,
     make_covered,
 )
+from npa_envs.kernels.primitives import (
+    WARP,
+    any_in_warp,
+    load_integer,
+    make_lane_sum,
+    make_wide_load,
+    sync_block,
+)
+from npa_envs.thread_lock import cached_under_lock
 
 MAX_ALPHA = 0.99
 """Largest alpha: the adjoint divides by 1 - alpha."""

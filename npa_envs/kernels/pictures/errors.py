@@ -8,17 +8,7 @@ do not depend on which threads serve a tile. On a CPU a drawn picture is compare
 
 import warp as wp
 
-from npa_envs.kernel_lock import cached_under_lock
-from npa_envs.kernels import native
-from npa_envs.kernels.access import (
-    CUDA_BLOCK,
-    WARP,
-    await_earlier,
-    block_number,
-    make_lane_sum,
-    make_wide_load,
-    thread_of_block,
-)
+from npa_envs.kernels import native_functions as native
 from npa_envs.kernels.domain import scalar_name
 from npa_envs.kernels.pictures.splat import (
     CHANNELS,
@@ -29,6 +19,16 @@ from npa_envs.kernels.pictures.splat import (
     gather_registers,
     splat_types,
 )
+from npa_envs.kernels.primitives import (
+    CUDA_BLOCK,
+    WARP,
+    await_earlier,
+    block_number,
+    make_lane_sum,
+    make_wide_load,
+    thread_of_block,
+)
+from npa_envs.thread_lock import cached_under_lock
 
 BLOCK_TILES = CUDA_BLOCK
 """Most tiles of a block: each thread counts the particles around one."""

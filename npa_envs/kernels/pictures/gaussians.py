@@ -15,11 +15,11 @@ from typing import Any
 
 import warp as wp
 
-from npa_envs.kernel_lock import cached_under_lock
-from npa_envs.kernels import native
-from npa_envs.kernels.access import make_wide_load, make_wide_store
+from npa_envs.kernels import native_functions as native
 from npa_envs.kernels.domain import scalar_name
-from npa_envs.kernels.native import PAIRS, in_ranges, named
+from npa_envs.kernels.native_functions import PAIRS, in_ranges, named
+from npa_envs.kernels.primitives import make_wide_load, make_wide_store
+from npa_envs.thread_lock import cached_under_lock
 
 TILE = 16
 """Pixels along each side of a tile."""

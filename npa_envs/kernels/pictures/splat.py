@@ -7,8 +7,8 @@ the picture. They are products of a row's weight and a column's.
 On CUDA n threads gather a tile of pixels: each sums every n-th particle around the tile, and gets a
 row of the sums. Particles are sorted by cells, the tiles that contain their patch's centre, with an
 origin r pixels before the picture: the particles that cover tiles along a row of cells are then one
-contiguous run. Small worlds are sorted by `kernels/cuda/splat.py`. On a CPU a thread draws a world,
-particle by particle. Either way the order of a pixel's sum depends only on its own world.
+contiguous run. Small worlds are sorted by `kernels/cuda/splat_sort.py`. On a CPU a thread draws a
+world, particle by particle. Either way the order of a pixel's sum depends only on its own world.
 """
 
 import math
@@ -17,9 +17,11 @@ from typing import Any
 
 import warp as wp
 
-from npa_envs.kernel_lock import cached_under_lock
-from npa_envs.kernels import native
-from npa_envs.kernels.access import (
+from npa_envs.kernels import native_functions as native
+from npa_envs.kernels.domain import scalar_name
+from npa_envs.kernels.mathematics import make_fast_exp2
+from npa_envs.kernels.native_functions import PAIRS, WORLDS, in_ranges, named
+from npa_envs.kernels.primitives import (
     await_earlier,
     load_integer,
     make_kept,
@@ -28,9 +30,7 @@ from npa_envs.kernels.access import (
     make_wide_load,
     make_wide_store,
 )
-from npa_envs.kernels.domain import scalar_name
-from npa_envs.kernels.mathematics import make_fast_exp2
-from npa_envs.kernels.native import PAIRS, WORLDS, in_ranges, named
+from npa_envs.thread_lock import cached_under_lock
 
 CHANNELS = 4
 """Red, green, blue and density."""

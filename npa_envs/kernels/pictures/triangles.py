@@ -5,7 +5,7 @@ They are targets, drawn once on the CPU before training, in float64.
 
 import warp as wp
 
-from npa_envs.kernels.native import CAMERAS, in_ranges
+from npa_envs.kernels.native_functions import CAMERAS, in_ranges
 
 module = wp.get_module("npa_envs.kernels.triangles")
 

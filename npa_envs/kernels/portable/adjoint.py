@@ -14,8 +14,6 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from npa_envs.kernel_lock import cached_under_lock
-from npa_envs.kernels.access import make_add_scaled, make_wide_load
 from npa_envs.kernels.domain import domain_types, kernel_module
 from npa_envs.kernels.mathematics import (
     log_scale_adjoint,
@@ -24,8 +22,10 @@ from npa_envs.kernels.mathematics import (
     spiky_factor,
     spiky_radial_slope,
 )
-from npa_envs.kernels.native import PAIRS, in_ranges, named
+from npa_envs.kernels.native_functions import PAIRS, in_ranges, named
 from npa_envs.kernels.portable.search import make_search
+from npa_envs.kernels.primitives import make_add_scaled, make_wide_load
+from npa_envs.thread_lock import cached_under_lock
 
 CUDA_REGISTERS = 64
 """Registers per thread in the gathering of state cotangents, which mostly waits for memory."""

@@ -11,10 +11,15 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from npa_envs.kernel_lock import cached_under_lock
-from npa_envs.kernels.access import await_earlier, load_integer, make_read_channels, make_wide_store
 from npa_envs.kernels.domain import domain_types, kernel_module
-from npa_envs.kernels.native import PARTICLES, WORLDS, in_ranges, named
+from npa_envs.kernels.native_functions import PARTICLES, WORLDS, in_ranges, named
+from npa_envs.kernels.primitives import (
+    await_earlier,
+    load_integer,
+    make_read_channels,
+    make_wide_store,
+)
+from npa_envs.thread_lock import cached_under_lock
 
 store_pair = make_wide_store(wp.vec2i)
 

@@ -9,9 +9,10 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from npa_envs.kernel_lock import cached_under_lock
-from npa_envs.kernels import native
-from npa_envs.kernels.access import (
+from npa_envs.kernels import native_functions as native
+from npa_envs.kernels.domain import domain_types, kernel_module, scalar_name
+from npa_envs.kernels.native_functions import ELEMENTS, in_ranges, named
+from npa_envs.kernels.primitives import (
     allow_next_launch,
     await_earlier,
     load_integer,
@@ -19,8 +20,7 @@ from npa_envs.kernels.access import (
     make_wide_load,
     make_write_at,
 )
-from npa_envs.kernels.domain import domain_types, kernel_module, scalar_name
-from npa_envs.kernels.native import ELEMENTS, in_ranges, named
+from npa_envs.thread_lock import cached_under_lock
 
 THREAD_CHANNELS = 4
 """Adjacent channels of a particle, or columns of a row, that one thread changes."""

@@ -7,10 +7,10 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from npa_envs.kernel_lock import cached_under_lock
-from npa_envs.kernels import native
-from npa_envs.kernels.access import await_earlier, make_lane_sum
+from npa_envs.kernels import native_functions as native
 from npa_envs.kernels.domain import scalar_name
+from npa_envs.kernels.primitives import await_earlier, make_lane_sum
+from npa_envs.thread_lock import cached_under_lock
 
 CHUNK = 256
 """Values of one partial sum."""

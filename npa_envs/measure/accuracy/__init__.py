@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from functools import partial
 
 # These two modules register their checks.
-from npa_envs.measure.accuracy import rule_checks  # noqa: F401
+from npa_envs.measure.accuracy import trained_rule_checks  # noqa: F401
+from npa_envs.measure.accuracy.check_runner import CHECKS, GROUPS, RULE_CHECKS, Check
 from npa_envs.measure.accuracy.hard_cases import scene_checks
-from npa_envs.measure.accuracy.suite import CHECKS, GROUPS, RULE_CHECKS, Check
 from npa_envs.rule.files import shipped_rules
 
 

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from npa_envs import reference
 from npa_envs.errors import NPAError
+from npa_envs.measure.accuracy.check_runner import Check, CheckResult, CheckSession, check
 from npa_envs.measure.accuracy.scenes import (
     EPS,
     LIMITS,
@@ -33,7 +34,6 @@ from npa_envs.measure.accuracy.scenes import (
     states_at,
     threshold_scenes,
 )
-from npa_envs.measure.accuracy.suite import Check, CheckResult, CheckSession, check
 from npa_envs.ops import perceive, perception_fields
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import LIFE, NPARule

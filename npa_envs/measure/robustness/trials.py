@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.measure.accuracy.rule_checks import MIN_VIEWS, task_name
+from npa_envs.measure.accuracy.trained_rule_checks import MIN_VIEWS, task_name
 from npa_envs.measure.quality import RuleRunner
 from npa_envs.ops import world_mean
 from npa_envs.rule.files import load_rule

@@ -11,9 +11,15 @@ from typing import Any
 
 from torch import Tensor
 
-from npa_envs.files import json_text
+from npa_envs.atomic_files import json_text
+from npa_envs.measure.benchmark_records import (
+    UNMEASURED,
+    as_objects,
+    machine,
+    measured_facts,
+    table_text,
+)
 from npa_envs.measure.plots import new_figure, number_plainly, png
-from npa_envs.measure.record import UNMEASURED, as_objects, machine, measured_facts, table_text
 from npa_envs.measure.speed.explain import kernel_rows
 from npa_envs.measure.speed.timing import (
     Tables,
@@ -25,7 +31,7 @@ from npa_envs.measure.speed.timing import (
     timed_calls,
 )
 from npa_envs.rule.rule import NPARule
-from npa_envs.world.recorded import release_recordings
+from npa_envs.world.graphed_rollouts import release_recordings
 from npa_envs.world.rollout import Memory
 from npa_envs.world.species import rollout_species
 

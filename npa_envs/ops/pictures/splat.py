@@ -18,7 +18,7 @@ from npa_envs.checks import (
 )
 from npa_envs.errors import NPAError, shown
 from npa_envs.kernels.cuda.sort import BLOCKS
-from npa_envs.kernels.cuda.splat import sort_small_splats
+from npa_envs.kernels.cuda.splat_sort import sort_small_splats
 from npa_envs.kernels.pictures.splat import (
     CHANNELS,
     FOOTPRINT,

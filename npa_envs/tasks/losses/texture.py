@@ -14,8 +14,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from npa_envs.atomic_files import check_torch_archive, home_path, open_regular
 from npa_envs.errors import NPAError, shown, suggest
-from npa_envs.files import check_torch_archive, home_path, open_regular
 from npa_envs.ops import world_mean
 from npa_envs.tasks.losses.image_distances import (
     FeatureTransport,

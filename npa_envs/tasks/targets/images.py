@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import EpsImagePlugin, Image, ImageOps, UnidentifiedImageError
 
+from npa_envs.atomic_files import read_bytes
 from npa_envs.errors import NPAError, shown
-from npa_envs.files import read_bytes
 
 OPAQUE = 128
 """Least alpha of a pixel of the target, of 255."""

@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from npa_envs.atomic_files import check_regular, home_path
 from npa_envs.errors import MissingDependencyError, NPAError, shown, suggest
-from npa_envs.files import check_regular, home_path
 from npa_envs.ops import Cameras
 from npa_envs.ops.pictures.triangles import nearest_triangles
 from npa_envs.tasks.targets.images import no_foreign_programs

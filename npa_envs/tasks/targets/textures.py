@@ -20,9 +20,9 @@ from PIL import ImageColor
 from torch import Tensor
 from torch.nn.functional import max_pool2d, pad
 
+from npa_envs.atomic_files import home_path
 from npa_envs.checks import check_count
 from npa_envs.errors import NPAError, shown, suggest
-from npa_envs.files import home_path
 from npa_envs.tasks.targets.images import (
     looks_like_path,
     open_image,

@@ -12,9 +12,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from npa_envs.atomic_files import home_path, read_json
 from npa_envs.checks import check_count, is_real
 from npa_envs.errors import NPAError, shown
-from npa_envs.files import home_path, read_json
 from npa_envs.ops import Cameras, cameras_of_poses, look_at, orbit
 from npa_envs.tasks.targets.images import open_image, scaled_square
 from npa_envs.tasks.targets.meshes import RADIUS, Mesh, draw_mesh, load_mesh

@@ -1,6 +1,6 @@
-// Colours of particles by state, density, species, speed or update mask, as npa_envs/web/live.py.
+// Colours of particles by state, density, species, speed or update mask, as npa_envs/web/live_world.py.
 
-// Of npa_envs/render/colours.py and npa_envs/web/live.py.
+// Of npa_envs/render/colours.py and npa_envs/web/live_world.py.
 const COLOUR_OFFSET = 0.5;
 const GOLDEN_ANGLE = Math.PI * (3 - Math.sqrt(5));
 const STATE_CHROMA = 0.16;

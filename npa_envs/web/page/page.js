@@ -32,7 +32,7 @@
 //       [length units]; rules: choices of `rule`; others: choices of graft and add; species: names of
 //       the rules of the world's particles; settings: {name: {value, low, high, scale?: "log",
 //       whole?: true}}, names: eps, update_prob, noise, count, speed (steps a frame);
-//       tools: [{name, label, icon, sends, takes}], the rows of TOOLS in npa_envs/web/live.py;
+//       tools: [{name, label, icon, sends, takes}], the rows of TOOLS in npa_envs/web/live_world.py;
 //       capabilities: some of "film", "loss".
 //       `BLANK` below has the defaults of missing keys.
 //   {type: "frame", step, positions, colours, milliseconds, loss?}

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
+from npa_envs.atomic_files import atomic_path, write_bytes
 from npa_envs.checks import check_count, checked_count, checked_finite, entries, is_real
 from npa_envs.errors import NPAError, importing, shown
-from npa_envs.files import atomic_path, write_bytes
 from npa_envs.ops import Cameras, orbit
 from npa_envs.render.colours import Background, background_colour, to_uint8
 from npa_envs.tasks.targets.views import ANGLE, DISTANCE

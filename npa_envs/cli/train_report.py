@@ -12,17 +12,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 
+from npa_envs.atomic_files import write_text
 from npa_envs.cli import common
 from npa_envs.errors import MissingDependencyError
-from npa_envs.files import write_text
-from npa_envs.measure.quality import (
-    CHECKPOINTS,
-    CLOUD_CHECKPOINTS,
-    picture_rows,
-    score_line,
-    tables_of,
-)
-from npa_envs.measure.record import (
+from npa_envs.measure.benchmark_records import (
     UNMEASURED,
     current_commit,
     machine,
@@ -31,7 +24,14 @@ from npa_envs.measure.record import (
     tables_json,
     versions,
 )
-from npa_envs.measure.texture_judge import TextureJudge
+from npa_envs.measure.quality import (
+    CHECKPOINTS,
+    CLOUD_CHECKPOINTS,
+    picture_rows,
+    score_line,
+    tables_of,
+)
+from npa_envs.measure.texture_metric import TextureJudge
 from npa_envs.render.world_film import SCREEN, film_world, write_3d_world
 from npa_envs.rule.files import load_rule
 from npa_envs.tasks.damage import DamageEvent

@@ -6,9 +6,9 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.kernels.access import CUDA_BLOCK
 from npa_envs.kernels.pictures.errors import BLOCK_TILES, TURN_TILES, gather_errors, sum_errors
 from npa_envs.kernels.pictures.splat import CHANNELS, make_view
+from npa_envs.kernels.primitives import CUDA_BLOCK
 from npa_envs.ops.backend import multiprocessor_count
 from npa_envs.ops.custom_op import custom_op
 from npa_envs.ops.launch import aligned, launch, scalar_type

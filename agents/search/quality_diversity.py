@@ -16,10 +16,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from npa_envs.agents.search.worlds import Axis, Candidates, Found, Numbers, SearchWorld
+from npa_envs.agents.search.candidates import Axis, Candidates, Found, Numbers, SearchWorld
 from npa_envs.checks import is_whole
 from npa_envs.errors import MissingDependencyError, NPAError, shown, suggest
-from npa_envs.measure.record import installed_version, read_record, write_record
+from npa_envs.measure.benchmark_records import installed_version, read_record, write_record
 
 RESULTS = "search.json"
 """The file of a search's record, from which a stopped search continues."""

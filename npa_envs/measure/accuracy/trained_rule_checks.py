@@ -9,8 +9,14 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
+from npa_envs.measure.accuracy.check_runner import (
+    RULE_CHECKS,
+    CheckResult,
+    CheckSession,
+    Skipped,
+    check,
+)
 from npa_envs.measure.accuracy.scenes import differing, relative_error
-from npa_envs.measure.accuracy.suite import RULE_CHECKS, CheckResult, CheckSession, Skipped, check
 from npa_envs.measure.quality import RuleRunner
 from npa_envs.rule.files import load_rule, rule_file, rule_metadata
 from npa_envs.rule.rule import NPARule

@@ -15,7 +15,7 @@ from npa_envs.envs.morphogenesis2d import Morphogenesis2DEnvConfig, PictureEnvTa
 from npa_envs.errors import NPAError, shown
 from npa_envs.rule.files import load_rule, shipped_rules
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.targets.clouds import Split
+from npa_envs.tasks.targets.digit_clouds import Split
 from npa_envs.world.particles import Particles, combined
 from npa_envs.world.randomness import StreamId, WorldRandom
 from npa_envs.world.rollout import rollout

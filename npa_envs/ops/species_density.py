@@ -18,11 +18,11 @@ from npa_envs.checks import (
     entries,
 )
 from npa_envs.errors import NPAError, shown
-from npa_envs.kernels.portable.species import species_kernel
+from npa_envs.kernels.portable.species_density import species_kernel
 from npa_envs.ops.custom_op import check_derivatives, custom_op
 from npa_envs.ops.launch import launch, scalar_type
 from npa_envs.ops.perceive import perceive
-from npa_envs.ops.physics import Physics, physics
+from npa_envs.ops.physics_constants import Physics, physics
 from npa_envs.ops.sort import plan_kernels, sort_worlds
 
 MAX_SPECIES = 64

@@ -39,7 +39,7 @@ from npa_envs.world.cuda_graph import (
     prepare_capture,
     recording_lock,
 )
-from npa_envs.world.module_state import rule_settings, rule_tensors
+from npa_envs.world.network_fingerprint import rule_settings, rule_tensors
 from npa_envs.world.particles import Particles, combined
 from npa_envs.world.randomness import (
     Randomness,

@@ -2,8 +2,8 @@
 
 import warp as wp
 
-from npa_envs.kernels import native
-from npa_envs.kernels.access import await_earlier
+from npa_envs.kernels import native_functions as native
+from npa_envs.kernels.primitives import await_earlier
 
 SUCCESS, DIVERGED, TIME_LIMIT = 1, 2, 4
 """Bits of an ending, the reasons why an episode is over; 0 while it runs."""

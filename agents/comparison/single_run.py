@@ -1,7 +1,7 @@
 """Runs of a comparison: each learns, is tested on held-out episodes, writes a record and a picture.
 
-Runs are processes, `python -m npa_envs.agents.comparison.run FOLDER`, on several cores or GPUs. A
-process loads its libraries, waits for a line on its standard input that names a device, and does
+Runs are processes: `python -m npa_envs.agents.comparison.single_run FOLDER`, on several cores or GPUs.
+A process loads its libraries, waits for a line on its standard input that names a device, and does
 the run of `request.json` in FOLDER. Two more lines, a folder as JSON and a device, start another
 run. The process ends with its input.
 """
@@ -37,8 +37,8 @@ from npa_envs.agents.learning import method_options, train
 from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.learning.progress import Budget, CurvePoint
 from npa_envs.errors import DivergedError, NPAError
-from npa_envs.measure.record import number, read_record, write_record
-from npa_envs.processes import Child, Slots, run_children
+from npa_envs.measure.benchmark_records import number, read_record, write_record
+from npa_envs.process_queue import Child, Slots, run_children
 from npa_envs.render import write_png
 
 Status = Literal["done", "diverged", "failed"]
@@ -241,7 +241,7 @@ def main(folder: Path) -> None:
 # The parent process. The start of a process (libraries, a GPU's context, kernels) takes longer than
 # many runs, so that processes do several runs where possible.
 
-PROGRAM = (sys.executable, "-m", "npa_envs.agents.comparison.run")
+PROGRAM = (sys.executable, "-m", "npa_envs.agents.comparison.single_run")
 
 MEASURED = ("done", "diverged")
 """Runs that a resumed comparison does not repeat."""

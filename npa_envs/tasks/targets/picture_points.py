@@ -11,9 +11,9 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from npa_envs.atomic_files import home_path
 from npa_envs.checks import check_count, is_real
 from npa_envs.errors import NPAError, shown, suggest
-from npa_envs.files import home_path
 from npa_envs.tasks.targets.emoji import is_emoji, render_emoji
 from npa_envs.tasks.targets.images import (
     MAX_POINT_COUNT,

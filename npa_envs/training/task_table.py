@@ -14,8 +14,8 @@ from typing import Any, TypeVar
 
 import torch
 
+from npa_envs.atomic_files import checked_path, parse_json, read_bytes
 from npa_envs.errors import MissingDependencyError, NPAError, shown, suggest
-from npa_envs.files import checked_path, parse_json, read_bytes
 from npa_envs.tasks.base import Task
 from npa_envs.tasks.co_morphogenesis2d import CO_MORPHOGENESIS2D_PRESETS, CoMorphogenesis2D
 from npa_envs.tasks.many_pictures import ManyPictures
@@ -23,7 +23,7 @@ from npa_envs.tasks.morphogenesis2d import MORPHOGENESIS2D_PRESETS, Morphogenesi
 from npa_envs.tasks.morphogenesis3d import MORPHOGENESIS3D_PRESETS, Morphogenesis3D
 from npa_envs.tasks.point_classification import POINT_CLASSIFICATION_PRESETS, PointClassification
 from npa_envs.tasks.targets.meshes import builtin_meshes
-from npa_envs.tasks.targets.points import builtin_targets
+from npa_envs.tasks.targets.picture_points import builtin_targets
 from npa_envs.tasks.targets.textures import builtin_textures
 from npa_envs.tasks.texture import TEXTURE_PRESETS, Texture
 from npa_envs.tasks.train_config import TrainConfig

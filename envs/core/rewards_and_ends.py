@@ -9,10 +9,11 @@ import torch
 from torch import Tensor
 
 from npa_envs.envs.core.config import EnvConfig
-from npa_envs.envs.core.state import WorldState
 from npa_envs.envs.core.task import EnvTask, Start, check_finite, checked_losses, checked_tensor
+from npa_envs.envs.core.world_state import WorldState
 from npa_envs.errors import shown
-from npa_envs.world.actions import (
+from npa_envs.world.cuda_graph import makes_plain_tensors, pinned_like
+from npa_envs.world.environment_steps import (
     DIVERGED,
     SUCCESS,
     TIME_LIMIT,
@@ -20,7 +21,6 @@ from npa_envs.world.actions import (
     EpisodeUpdate,
     with_mean_reward,
 )
-from npa_envs.world.cuda_graph import makes_plain_tensors, pinned_like
 from npa_envs.world.particles import Particles
 
 FLAGS = ("success", "diverged")

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from npa_envs.checks import check_count, checked_positive, is_real
 from npa_envs.errors import NPAError, shown, suggest
-from npa_envs.world.actions import Physics
+from npa_envs.world.environment_steps import Physics
 from npa_envs.wrappers.base import (
     AnyVectorEnv,
     EpisodeWrapper,

@@ -17,7 +17,7 @@ import torch.distributed as dist
 
 from npa_envs.errors import LostProcessError, NPAError, shown
 from npa_envs.training.ranks import Ranks
-from npa_envs.training.run import RunFolder
+from npa_envs.training.run_folder import RunFolder
 
 if TYPE_CHECKING:
     from torch.distributed.elastic.multiprocessing.errors import ProcessFailure

@@ -16,8 +16,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from npa_envs.atomic_files import home_path, open_regular
 from npa_envs.errors import MissingDependencyError, NPAError, shown, suggest
-from npa_envs.files import home_path, open_regular
 from npa_envs.world.randomness import Randomness, normal_draws, uniform_draws
 
 Split = Literal["train", "test"]

@@ -14,7 +14,7 @@ from npa_envs.checks import number_tensor
 from npa_envs.envs.core.config import WorldConfig
 from npa_envs.envs.core.task import WorldTask
 from npa_envs.errors import DivergedError, NPAError
-from npa_envs.world.actions import Physics
+from npa_envs.world.environment_steps import Physics
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import WorldRandom
 

@@ -14,18 +14,11 @@ from torch import Tensor
 
 from npa_envs import world_mean
 from npa_envs.checks import number_tensor
-from npa_envs.envs.core.rewards import total
-from npa_envs.envs.core.state import OBSERVATION_COPIES, WorldState
-from npa_envs.envs.multi.task import Population, SpeciesTask
+from npa_envs.envs.core.rewards_and_ends import total
+from npa_envs.envs.core.world_state import OBSERVATION_COPIES, WorldState
+from npa_envs.envs.multi.base import Population, SpeciesTask
 from npa_envs.envs.multi.tasks import task_type
 from npa_envs.errors import DivergedError
-from npa_envs.world.actions import (
-    Actions,
-    NeighbourState,
-    Physics,
-    build_neighbours,
-    perceive_each_species,
-)
 from npa_envs.world.cuda_graph import (
     GraphedCallable,
     SideStream,
@@ -33,6 +26,13 @@ from npa_envs.world.cuda_graph import (
     to_device_async,
 )
 from npa_envs.world.divergence import MAX_REPORT
+from npa_envs.world.environment_steps import (
+    Actions,
+    NeighbourState,
+    Physics,
+    build_neighbours,
+    perceive_each_species,
+)
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import WorldRandom
 

@@ -13,22 +13,22 @@ from typing import Any
 
 import warp as wp
 
-from npa_envs.kernel_lock import cached_under_lock
+from npa_envs.thread_lock import cached_under_lock
 
-BOTH_DEVICES = ("access.cuh", "mathematics.cuh")
+BOTH_DEVICES = ("primitives.cuh", "mathematics.cuh")
 """Files for CPU and CUDA."""
 
 CUDA_ONLY = (
     "cuda/sort.cuh",
-    "cuda/splat.cuh",
+    "cuda/world_mean.cuh",
     "cuda/neighbour_list.cuh",
-    "cuda/tiles.cuh",
+    "cuda/density.cuh",
     "cuda/perceive.cuh",
     "cuda/adjoint.cuh",
     "cuda/network.cuh",
     "cuda/equivariance.cuh",
-    "pictures/blending.cuh",
-    "pictures/errors.cuh",
+    "pictures/warp_sums.cuh",
+    "pictures/tile_order.cuh",
 )
 """Files for CUDA, in an order in which each uses only earlier ones."""
 

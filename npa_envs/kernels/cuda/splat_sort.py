@@ -6,9 +6,11 @@ mean. If worlds are few, several blocks sort the same world, and each writes a s
 
 import warp as wp
 
-from npa_envs.kernel_lock import cached_under_lock
-from npa_envs.kernels import native
-from npa_envs.kernels.access import (
+from npa_envs.kernels import native_functions as native
+from npa_envs.kernels.cuda.sort import BLOCKS, RESIDENT_THREADS, block_functions, store_integer
+from npa_envs.kernels.pictures.splat import splat_functions, splat_types
+from npa_envs.kernels.portable.world_mean import CHUNK
+from npa_envs.kernels.primitives import (
     await_earlier,
     block_number,
     make_wide_load,
@@ -16,9 +18,7 @@ from npa_envs.kernels.access import (
     sync_block,
     thread_of_block,
 )
-from npa_envs.kernels.cuda.sort import BLOCKS, RESIDENT_THREADS, block_functions, store_integer
-from npa_envs.kernels.pictures.splat import splat_functions, splat_types
-from npa_envs.kernels.portable.world_mean import CHUNK
+from npa_envs.thread_lock import cached_under_lock
 
 
 @cached_under_lock()

@@ -7,7 +7,7 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from npa_envs.kernels.portable.episodes import (
+from npa_envs.kernels.portable.rewards_and_ends import (
     CONTINUE,
     DIVERGED,
     END,

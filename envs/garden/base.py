@@ -13,8 +13,8 @@ from torch import Tensor
 
 from npa_envs import world_mean
 from npa_envs.envs.core.single import NPAEnv
-from npa_envs.envs.core.state import not_finite
 from npa_envs.envs.core.task import Start
+from npa_envs.envs.core.world_state import not_finite
 from npa_envs.envs.core.worlds import BatchedWorlds
 from npa_envs.envs.garden.brushes import (
     OBSERVATION_LIMIT,
@@ -26,9 +26,9 @@ from npa_envs.envs.garden.brushes import (
     grid_places,
     offsets,
 )
-from npa_envs.envs.grown import GrownTask, check_runs, run_rule
+from npa_envs.envs.grown_worlds import GrownTask, check_runs, run_rule
 from npa_envs.rule.rule import COLOUR_OFFSET
-from npa_envs.tasks.targets.points import PointTarget
+from npa_envs.tasks.targets.picture_points import PointTarget
 from npa_envs.world.brushes import nearest_image
 from npa_envs.world.cuda_graph import makes_plain_tensors, to_device_async
 from npa_envs.world.particles import Particles

@@ -22,8 +22,8 @@ from typing import Any, Generic, Self, TypeVar
 
 import torch
 
+from npa_envs.atomic_files import json_text, plain_numbers, read_json, write_text
 from npa_envs.errors import NPAError, shown
-from npa_envs.files import json_text, plain_numbers, read_json, write_text
 
 LIBRARIES = ("npa-envs", "torch", "warp-lang", "numpy", "scipy", "warpSPHCore")
 """Distributions whose versions are recorded."""

@@ -9,10 +9,10 @@ Sources: kernels of arXiv 2601.16096, section 3, summed over the particles of on
 
 import warp as wp
 
-from npa_envs.kernel_lock import cached_under_lock
 from npa_envs.kernels.domain import domain_types, kernel_module
 from npa_envs.kernels.mathematics import log_scaled, smoothing, spiky_factor
-from npa_envs.kernels.native import PAIRS, in_ranges
+from npa_envs.kernels.native_functions import PAIRS, in_ranges
+from npa_envs.thread_lock import cached_under_lock
 
 
 @cached_under_lock()

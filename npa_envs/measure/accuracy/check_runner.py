@@ -14,8 +14,8 @@ from typing import Any, Literal
 import torch
 
 from npa_envs.errors import NPAError, suggest
+from npa_envs.measure.benchmark_records import Record, aligned, as_objects, time_limit
 from npa_envs.measure.plots import draw_matrix, new_figure, png
-from npa_envs.measure.record import Record, aligned, as_objects, time_limit
 from npa_envs.rule.files import load_rule, rule_digest
 
 Verdict = Literal["pass", "fail", "range", "skipped", ""]

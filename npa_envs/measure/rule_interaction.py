@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.errors import NPAError
+from npa_envs.measure.benchmark_records import Record
 from npa_envs.measure.plots import draw_matrix, new_figure, png
-from npa_envs.measure.record import Record
 from npa_envs.ops import species_fields
 from npa_envs.render import draw_worlds
 from npa_envs.rule.rule import NPARule

@@ -20,11 +20,17 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
+from npa_envs.atomic_files import (
+    made_folder,
+    read_bytes,
+    remove_unfinished,
+    write_bytes,
+    write_text,
+)
 from npa_envs.checks import is_real, is_whole
 from npa_envs.errors import MissingDependencyError, NPAError, shown
-from npa_envs.files import made_folder, read_bytes, remove_unfinished, write_bytes, write_text
 from npa_envs.render.colours import to_uint8
-from npa_envs.render.film import encode_frame
+from npa_envs.render.picture_files import encode_frame
 from npa_envs.training.checkpoint import load_checkpoint, save_checkpoint
 from npa_envs.training.ranks import Ranks
 

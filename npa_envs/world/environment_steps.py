@@ -12,7 +12,9 @@ import torch
 from torch import Tensor
 
 from npa_envs.checks import MomentInverse
-from npa_envs.ops.episodes import (
+from npa_envs.ops.perceive import NeighbourState, build_neighbours
+from npa_envs.ops.physics_constants import Boundary, Limits, Physics, Terms
+from npa_envs.ops.rewards_and_ends import (
     DIVERGED,
     NOT_FINITE,
     SUCCESS,
@@ -20,9 +22,7 @@ from npa_envs.ops.episodes import (
     EpisodeRules,
     EpisodeUpdate,
 )
-from npa_envs.ops.perceive import NeighbourState, build_neighbours
-from npa_envs.ops.physics import Boundary, Limits, Physics, Terms
-from npa_envs.ops.species import perceive_by_species
+from npa_envs.ops.species_density import perceive_by_species
 from npa_envs.ops.update import ActedWorlds, PreparedActions, wrapped
 from npa_envs.ops.world_mean import world_mean
 from npa_envs.world.randomness import WorldRandom

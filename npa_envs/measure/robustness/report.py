@@ -12,8 +12,15 @@ from typing import Any
 
 import torch
 
+from npa_envs.measure.benchmark_records import (
+    NONE,
+    Record,
+    as_objects,
+    markdown_table,
+    number,
+    short,
+)
 from npa_envs.measure.plots import draw_band, legend_of, new_figure, number_plainly, png
-from npa_envs.measure.record import NONE, Record, as_objects, markdown_table, number, short
 from npa_envs.measure.robustness.trials import (
     CONDITIONS,
     CONTROL,

@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.kernels.access import WARP
 from npa_envs.kernels.cuda.adjoint import THREAD_CHANNELS, listed_adjoint
 from npa_envs.kernels.cuda.adjoint import TILE as ADJOINT_TILE
 from npa_envs.kernels.cuda.density import LIST_BLOCK, TILE, listed_density, tiled_density
@@ -16,10 +15,11 @@ from npa_envs.kernels.cuda.perceive import PerceptionVariant, listed_perception
 from npa_envs.kernels.portable.adjoint import adjoint_kernels
 from npa_envs.kernels.portable.density import density_kernels
 from npa_envs.kernels.portable.perceive import perception_kernels
+from npa_envs.kernels.primitives import WARP
 from npa_envs.ops.backend import Listing
 from npa_envs.ops.custom_op import custom_op
 from npa_envs.ops.launch import launch
-from npa_envs.ops.physics import Physics
+from npa_envs.ops.physics_constants import Physics
 from npa_envs.ops.sort import MAX_INDEX, KernelPlan, SortedWorlds, plan_kernels
 
 INTERLEAVED_LISTS = 32
