@@ -1,9 +1,9 @@
 """Runs of a comparison: each learns, is tested on held-out episodes, writes a record and a picture.
 
-Runs are processes: `python -m npa_envs.agents.comparison.single_run FOLDER`, on several cores or GPUs.
-A process loads its libraries, waits for a line on its standard input that names a device, and does
-the run of `request.json` in FOLDER. Two more lines, a folder as JSON and a device, start another
-run. The process ends with its input.
+Runs are processes, `python -m npa_envs.agents.comparison.single_run FOLDER`, on several cores or
+GPUs. A process loads its libraries, waits for a line on its standard input that names a device, and
+does the run of `request.json` in FOLDER. Two more lines, a folder as JSON and a device, start
+another run. The process ends with its input.
 """
 
 from __future__ import annotations
