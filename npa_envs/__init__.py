@@ -73,7 +73,9 @@ def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     module = next((path for path, names in _MODULES.items() if name in names), "ops")
-    return getattr(_import_module(f"npa_envs.{module}"), name)
+    # Kept, so that only the first use searches.
+    value = globals()[name] = getattr(_import_module(f"npa_envs.{module}"), name)
+    return value
 
 
 def __dir__() -> list[str]:
