@@ -4,6 +4,7 @@ import multiprocessing
 import os
 import traceback
 
+import pytest
 import torch
 import torch.distributed as dist
 
@@ -17,6 +18,9 @@ def on_ranks(count, function, folder):
         By process: what it returned, the message of the NPAError that it raised, or its exit code.
     """
     # Forked, they need not load torch again.
+    if torch.cuda.is_available():
+        # Autograd has a thread for each GPU, and refuses the backward pass in a fork.
+        pytest.skip("forks of processes with a GPU cannot train: set CUDA_VISIBLE_DEVICES=''")
     context = multiprocessing.get_context("fork")
     pipes = [context.Pipe(duplex=False) for _ in range(count)]
     store = folder / f"store{len(list(folder.glob('store*')))}"
