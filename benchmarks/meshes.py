@@ -24,6 +24,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from mesh_shapes import ellipsoid, grid_faces, joined, turned
 from PIL import Image
 from side_by_side import iterate_together, on, stream_of
 from torch import Tensor
@@ -34,15 +35,7 @@ from npa_envs.measure.quality import evaluate
 from npa_envs.rule.files import load_rule, save_rule
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.morphogenesis3d import Morphogenesis3D
-from npa_envs.tasks.targets.meshes import (
-    FloatArray,
-    Mesh,
-    ellipsoid,
-    grid_faces,
-    joined,
-    load_mesh,
-    turned,
-)
+from npa_envs.tasks.targets.meshes import FloatArray, Mesh, load_mesh
 from npa_envs.tasks.targets.views import Views, over, some_views, views_of_mesh
 from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training import Trainer, override, preset
