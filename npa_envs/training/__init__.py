@@ -12,6 +12,7 @@ from npa_envs.tasks.base import ParticleTask, PictureTask, Task
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2DTrainConfig
 from npa_envs.tasks.train_config import JointTrainConfig, TrainConfig
 from npa_envs.training.run_folder import JsonlLog, RunFolder
+from npa_envs.training.run_rules import JointRules
 from npa_envs.training.task_table import (
     TASKS,
     TaskEntry,
@@ -21,13 +22,7 @@ from npa_envs.training.task_table import (
     preset,
     task_entry,
 )
-from npa_envs.training.trainer import (
-    JointRules,
-    Trainer,
-    TrainResult,
-    check_seconds,
-    train_together,
-)
+from npa_envs.training.trainer import Trainer, TrainResult, check_seconds, train_together
 
 __all__ = [
     "TASKS",

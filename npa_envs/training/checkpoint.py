@@ -95,8 +95,8 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     return content
 
 
-def drawn_by_world(content: Mapping[str, Any]) -> bool:
-    """Return whether a checkpoint is of a run with random streams by world."""
+def has_per_world_streams(content: Mapping[str, Any]) -> bool:
+    """Return whether a checkpoint is of a run with random streams of each world."""
     states = content.get("random_states")
     return isinstance(states, dict) and states.keys() == {"schedule"}
 

@@ -1,4 +1,4 @@
-"""Training runs in a folder: files, lock, checkpoints, log, and a clean stop on signals."""
+"""Training runs in a folder: files, lock, checkpoints, log and pictures; clean stop on signals."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from npa_envs.errors import MissingDependencyError, NPAError, shown
 from npa_envs.render.colours import to_uint8
 from npa_envs.render.picture_files import encode_frame
 from npa_envs.training.checkpoint import load_checkpoint, save_checkpoint
-from npa_envs.training.ranks import Ranks
+from npa_envs.training.process_group import ProcessGroup
 
 try:
     import fcntl
@@ -57,11 +57,11 @@ def check_choice(*, resume: bool, overwrite: bool) -> None:
 
 
 class Run:
-    """A run of any learner; rank 0 reads and writes its files.
+    """A run of any learner, whose first process reads and writes its files.
 
     Args:
         folder: Its files; None: nothing is written, and no signal stops it.
-        ranks: Its processes.
+        processes: Its processes.
         check: Checks the checkpoint of a resumed run.
         resume: Continue from the checkpoint in the folder.
         overwrite: Remove the files of an earlier run in the folder.
@@ -74,7 +74,7 @@ class Run:
     def __init__(
         self,
         folder: RunFolder | None,
-        ranks: Ranks,
+        processes: ProcessGroup,
         check: Check,
         *,
         resume: bool = False,
@@ -82,19 +82,23 @@ class Run:
     ) -> None:
         self.folder = folder
         self.iteration = 0
-        self._ranks = ranks
+        self._processes = processes
         self._overwrite = overwrite
         content = None
-        if folder is not None and ranks.first:
+        if folder is not None and processes.first:
             check_choice(resume=resume, overwrite=overwrite)
             content = self._opened(folder, check, resume)
-        self.content: dict[str, Any] | None = ranks.broadcast(content)
-        """The checkpoint of a resumed run; set it to None after reading, to free its memory."""
+        self._content: dict[str, Any] | None = processes.broadcast(content)
+
+    def take_content(self) -> dict[str, Any] | None:
+        """Return the checkpoint of a resumed run once; its memory is then the caller's to free."""
+        content, self._content = self._content, None
+        return content
 
     @contextlib.contextmanager
     def held(self, *, begin: bool = False) -> Iterator[None]:
         """Lock the folder inside; with `begin`, remove unfinished and overwritten files."""
-        folder = self.folder if self._ranks.first else None
+        folder = self.folder if self._processes.first else None
         with contextlib.nullcontext() if folder is None else folder.locked():
             if begin and folder is not None:
                 folder.tidy()
@@ -129,16 +133,15 @@ class Run:
                 step()
             end(False)
             return False
-        with stop_flag(patient=self._ranks.together) as stop:
+        with stop_flag(patient=self._processes.distributed) as stop:
             begin()
             stopped = False
             while not stopped and not over():
-                requested = stop.is_set() or late()
-                stopped = self._ranks.agree_to_stop(requested, self.iteration)
+                stopped = self._processes.agree_to_stop(stop.is_set() or late())
                 if not stopped:
                     step()
             end(stopped)
-            return self._ranks.any(stop.is_set())
+            return self._processes.any(stop.is_set())
 
     def keep(self, content: dict[str, Any]) -> None:
         """Write the checkpoint; to be called on rank 0."""
@@ -407,28 +410,6 @@ def _parsed_record(line: str) -> dict[str, Any] | None:
     return record if sound else None
 
 
-def open_tensorboard(folder: RunFolder, iteration: int) -> Any:
-    """Return a TensorBoard writer that hides events of an earlier process after `iteration`."""
-    # TensorBoard imports TensorFlow if it is installed; this silences it.
-    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError as error:
-        raise MissingDependencyError(
-            "tensorboard=True needs TensorBoard: pip install tensorboard, "
-            "or train with tensorboard=False (the JSONL log has the same numbers)"
-        ) from error
-    try:
-        return SummaryWriter(
-            str(folder.tensorboard), purge_step=iteration + 1 if iteration else None
-        )
-    except OSError as error:
-        raise NPAError(
-            f"cannot write to {str(folder.tensorboard)!r} ({error}): change its permissions or "
-            "train with tensorboard=False"
-        ) from error
-
-
 PICTURE_HEIGHT = 256
 """Least height of the pictures [pixels]; pixels of smaller ones are repeated."""
 
@@ -436,26 +417,75 @@ PICTURE_GAP = 8
 """Pixels between the worlds of a picture."""
 
 
-def write_batch_picture(path: Path, picture: Tensor, board: Any, iteration: int) -> None:
-    """Write target and worlds of a batch side by side as a PNG, and as a JPEG to TensorBoard."""
-    repeats = math.ceil(PICTURE_HEIGHT / picture.shape[1])
-    frames = to_uint8(picture).repeat(repeats, axis=1).repeat(repeats, axis=2)
-    frames = np.pad(frames, ((0, 0), (0, 0), (0, PICTURE_GAP), (0, 0)), constant_values=255)
-    frame = np.concatenate(list(frames), axis=1)[:, :-PICTURE_GAP]
-    write_bytes(path, encode_frame(frame, "PNG"))
-    if board is None:
-        return
-    # Imported here: only runs with TensorBoard need it.
-    from tensorboard.compat.proto.summary_pb2 import Summary
+class RunLog:
+    """The log lines and pictures of a run: in its folder, and for TensorBoard while opened."""
 
-    # The writer's add_image makes a PNG, whose checksum TensorBoard computes in Python, byte by
-    # byte, which takes longer than all the rest.
-    height, width, channels = frame.shape
-    image = Summary.Image(
-        height=height,
-        width=width,
-        colorspace=channels,
-        encoded_image_string=encode_frame(frame, "JPEG"),
-    )
-    summary = Summary(value=[Summary.Value(tag="batch", image=image)])
-    board.file_writer.add_summary(summary, iteration)
+    def __init__(self, folder: RunFolder) -> None:
+        self._folder = folder
+        self.lines = JsonlLog(folder.log)
+        self._board: Any = None
+
+    @contextlib.contextmanager
+    def opened(self, tensorboard: bool, iteration: int) -> Iterator[None]:
+        """Within the block, also write to TensorBoard, if `tensorboard`.
+
+        Events of an earlier process after `iteration` are hidden.
+        """
+        self._board = self._open_board(iteration) if tensorboard else None
+        try:
+            yield
+        finally:
+            if self._board is not None:
+                self._board.close()
+                self._board = None
+
+    def _open_board(self, iteration: int) -> Any:
+        # TensorBoard imports TensorFlow if it is installed; this silences it.
+        os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+        try:
+            from torch.utils.tensorboard import SummaryWriter
+        except ImportError as error:
+            raise MissingDependencyError(
+                "tensorboard=True needs TensorBoard: pip install tensorboard, "
+                "or train with tensorboard=False (the JSONL log has the same numbers)"
+            ) from error
+        path = str(self._folder.tensorboard)
+        try:
+            return SummaryWriter(path, purge_step=iteration + 1 if iteration else None)
+        except OSError as error:
+            raise NPAError(
+                f"cannot write to {path!r} ({error}): change its permissions or train with "
+                "tensorboard=False"
+            ) from error
+
+    def add(self, record: dict[str, Any]) -> None:
+        """Add a line of numbers, with its `iteration`."""
+        self.lines.append(record)
+        if self._board is not None:
+            for name, value in record.items():
+                if name != "iteration":
+                    self._board.add_scalar(name, value, record["iteration"])
+
+    def add_picture(self, picture: Tensor, iteration: int) -> None:
+        """Add target and worlds of a batch side by side: a PNG file, for TensorBoard a JPEG."""
+        repeats = math.ceil(PICTURE_HEIGHT / picture.shape[1])
+        frames = to_uint8(picture).repeat(repeats, axis=1).repeat(repeats, axis=2)
+        frames = np.pad(frames, ((0, 0), (0, 0), (0, PICTURE_GAP), (0, 0)), constant_values=255)
+        frame = np.concatenate(list(frames), axis=1)[:, :-PICTURE_GAP]
+        write_bytes(self._folder.picture(iteration), encode_frame(frame, "PNG"))
+        if self._board is None:
+            return
+        # Imported here: only runs with TensorBoard need it.
+        from tensorboard.compat.proto.summary_pb2 import Summary
+
+        # The writer's add_image makes a PNG, whose checksum TensorBoard computes in Python, byte by
+        # byte, which takes longer than all the rest.
+        height, width, channels = frame.shape
+        image = Summary.Image(
+            height=height,
+            width=width,
+            colorspace=channels,
+            encoded_image_string=encode_frame(frame, "JPEG"),
+        )
+        summary = Summary(value=[Summary.Value(tag="batch", image=image)])
+        self._board.file_writer.add_summary(summary, iteration)

@@ -22,7 +22,7 @@ from npa_envs.training import (
     preset,
     task_entry,
 )
-from npa_envs.training.trainer import initial_rule
+from npa_envs.training.run_rules import initial_rule
 
 PAPER = preset("paper")
 PAIR = preset("tiny", "co_morphogenesis2d")

@@ -1,4 +1,4 @@
-"""Pool, optimiser, iteration and meter, each by itself."""
+"""Pool, optimiser, iteration and loss statistics, each by itself."""
 
 import itertools
 import math
@@ -14,9 +14,10 @@ from npa_envs.errors import NPAError
 from npa_envs.rule.rule import NPARule, fate_parameters
 from npa_envs.training.checkpoint import load_checkpoint, save_checkpoint
 from npa_envs.training.cycle import WorldPool
-from npa_envs.training.iteration import EagerIteration, Interval, LossMeter, power_mean
+from npa_envs.training.iteration import EagerIteration, power_mean
+from npa_envs.training.loss_statistics import LossStatistics
 from npa_envs.training.optimiser import FATE_RATE, RuleOptimiser, layer_weights, normalise_gradients
-from npa_envs.training.ranks import RunRandomness
+from npa_envs.training.process_group import ALONE, RunRandomness
 from npa_envs.training.run_folder import JsonlLog
 from npa_envs.world.particles import Particles
 
@@ -24,7 +25,7 @@ from npa_envs.world.particles import Particles
 def make_pool(pool_size=6, particle_count=4, limit=10.0, device="cpu"):
     x = torch.arange(pool_size, dtype=torch.float32, device=device)
     x = x[:, None, None].repeat(1, particle_count, 2)
-    return WorldPool(Particles(x, x[..., :1].repeat(1, 1, 3)), runaway_limit=limit)
+    return WorldPool(Particles(x, x[..., :1].repeat(1, 1, 3)), largest_value=limit)
 
 
 def test_pool_draws_different_worlds_and_all_of_them_in_the_long_run():
@@ -47,7 +48,7 @@ def test_pool_draws_different_worlds_and_all_of_them_in_the_long_run():
 
 def test_a_pool_with_lifetimes_draws_one_world_of_each_section():
     x = torch.zeros(12, 2, 2)
-    pool = WorldPool(Particles(x, x.clone()), runaway_limit=1.0, max_age_range=(10, 1000))
+    pool = WorldPool(Particles(x, x.clone()), largest_value=1.0, max_age_range=(10, 1000))
     lifetimes = pool.lifetime.tolist()
     assert (lifetimes[0], lifetimes[-1]) == (10, 1000)
     ratios = [b / a for a, b in itertools.pairwise(lifetimes)]
@@ -60,7 +61,7 @@ def test_a_pool_with_lifetimes_draws_one_world_of_each_section():
 
 def test_worlds_age_and_are_new_when_they_run_away():
     x = torch.zeros(4, 2, 2)
-    pool = WorldPool(Particles(x, x.clone()), runaway_limit=1.0, max_age_range=(5, 40))
+    pool = WorldPool(Particles(x, x.clone()), largest_value=1.0, max_age_range=(5, 40))
     index = torch.tensor([0, 2, 3])
     after = torch.tensor([0.0, 0.0, 3.0])[:, None, None].expand(3, 2, 2)
     pool.write(index, Particles(after, after), Particles(x[:3], x[:3]), age=torch.tensor([7, 8, 9]))
@@ -241,51 +242,50 @@ def test_a_parameter_outside_the_loss_gets_a_zero_gradient(tmp_path):
     assert rule.unused.grad.tolist() == [0.0, 0.0]
 
 
-def interval(iteration, mean, steps, replaced):
-    terms = dict.fromkeys(iteration.term_names, mean)
-    return Interval(terms | {"steps": steps, "replaced_worlds": replaced}, None)
-
-
-def test_meter_gives_the_means_of_the_interval(tmp_path, device):
+def test_statistics_are_the_means_of_the_interval(tmp_path, device):
     _, _, iteration = make_iteration(circle_config(tmp_path), device=device)
-    meter, resumed = LossMeter(iteration), LossMeter(iteration)
+    statistics, resumed = LossStatistics(iteration), LossStatistics(iteration)
+
+    def expected(mean, steps, replaced):
+        terms = dict.fromkeys(iteration.term_names, mean)
+        return terms | {"steps": steps, "replaced_worlds": replaced}, True
+
     for number, value in enumerate([1.0, 2.0, 6.0], start=1):
         iteration.terms.fill_(value)
-        meter.begin(number, 4 * number)
-        meter.observe(torch.tensor([number == 2, False], device=device))
-    resumed.load_state_dict(meter.state_dict())
-    meter.send()
-    # What is observed before the numbers are received belongs to the next interval.
+        statistics.begin(number, 4 * number)
+        statistics.add(torch.tensor([number == 2, False], device=device))
+    resumed.load_state_dict(statistics.state_dict())
+    statistics.send()
+    # What is added before the numbers are received belongs to the next interval.
     iteration.terms.fill_(5.0)
-    meter.begin(4, 7)
-    meter.observe(torch.tensor([False], device=device))
-    assert meter.receive() == interval(iteration, 3.0, 8.0, 1)
-    meter.send()
-    assert meter.receive() == interval(iteration, 5.0, 7.0, 0)
+    statistics.begin(4, 7)
+    statistics.add(torch.tensor([False], device=device))
+    assert statistics.receive() == expected(3.0, 8.0, 1)
+    statistics.send()
+    assert statistics.receive() == expected(5.0, 7.0, 0)
     resumed.send()
-    assert resumed.receive() == interval(iteration, 3.0, 8.0, 1)
+    assert resumed.receive() == expected(3.0, 8.0, 1)
 
 
 def test_worlds_and_masks_are_drawn_independently(tmp_path):
-    drawn = RunRandomness.of_batch(
-        circle_config(tmp_path), torch.device("cpu"), torch.Generator().manual_seed(0)
-    )
+    schedule = torch.Generator().manual_seed(0)
+    cpu, config = torch.device("cpu"), circle_config(tmp_path)
+    drawn = RunRandomness(config, cpu, schedule, ALONE, per_world_streams=False)
     assert torch.rand(4, generator=drawn.worlds).ne(torch.rand(4, generator=drawn.masks)).all()
 
 
-def test_meter_keeps_the_first_bad_iteration_and_not_a_later_one(tmp_path, device):
+def test_the_snapshot_is_of_the_first_bad_iteration_and_not_of_a_later_one(tmp_path, device):
     _, _, iteration = make_iteration(circle_config(tmp_path), device=device)
-    meter = LossMeter(iteration)
+    statistics = LossStatistics(iteration)
     for number, (term, mark) in enumerate([(1.0, 10.0), (math.nan, 20.0), (math.inf, 30.0)], 1):
         iteration.terms.fill_(1.0)
         iteration.terms[2] = term
         iteration.start.x.fill_(mark)
-        meter.begin(number, 100 + number)
-        meter.observe(torch.tensor([False], device=device))
-        meter.send()
-        assert meter.receive().bad_iteration == (None if number == 1 else 2)
-    assert meter.bad_iteration() == 2
-    snapshot = meter.snapshot()
+        statistics.begin(number, 100 + number)
+        statistics.add(torch.tensor([False], device=device))
+        statistics.send()
+        assert statistics.receive()[1] == (number == 1) == statistics.all_finite()
+    snapshot = statistics.snapshot()
     assert (snapshot["iteration"], snapshot["steps"]) == (2, 102)
     assert math.isnan(snapshot["terms"]["state"])
     assert snapshot["terms"]["distance"] == 1.0
