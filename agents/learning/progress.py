@@ -228,12 +228,12 @@ class Progress:
             self.look(rules, force=True)
             self._save(rules, learner)
 
-        with self._run.held(begin=True):
+        with self._run.locked(begin=True):
             content = self._run.take_content()
             if content is not None:
                 assert learner is not None, "methods whose runs are kept are learners"
                 self._restore(learner, content)
-            self._run.go(step, begin=begin, over=lambda: self.over, end=end)
+            self._run.repeat(step, begin=begin, over=lambda: self.over, end=end)
         return rules
 
     def start(self, actor: RuleSet | Callable[[Any], Any]) -> None:
@@ -352,7 +352,7 @@ class Progress:
             curve = [asdict(entry) for entry in self.log]
             state |= {"learner": self._settings, "curve": curve, "iteration": self._run.iteration}
             state |= {"part": self._part, "seconds": self._agreed_seconds}
-            self._run.keep(state | {"particle_steps": self.particle_steps})
+            self._run.write_checkpoint(state | {"particle_steps": self.particle_steps})
             rules.save(folder.path)
             lines = [" ".join(json_text(line).split()) for line in curve]
             write_text(folder.log, "\n".join(lines) + "\n")

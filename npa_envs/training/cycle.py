@@ -176,7 +176,7 @@ class TrainingCycle:
             batch,
             self.random.masks,
             npa_envs.world.rollout.rollout if rollout is None else rollout,
-            mean_over_processes=None if processes.count == 1 else processes.mean,
+            take_means=None if processes.count == 1 else processes.reduce,
         )
         self.optimiser = RuleOptimiser(self.batch.parameters, config, rule)
         self.statistics = LossStatistics(self.batch)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -40,7 +40,8 @@ class EagerIteration:
     """One iteration up to the gradients, launched kernel by kernel.
 
     Reads `start`; writes `end`, `terms` and the `.grad` of every parameter, always in the same
-    tensors: write to `start` with `copy_`.
+    tensors: write to `start` with `copy_`. `take_means` replaces tensors by their means over all
+    processes; None: there is one process.
     """
 
     def __init__(
@@ -52,7 +53,7 @@ class EagerIteration:
         generator: Randomness,
         rollout: Rollout,
         *,
-        mean_over_processes: Callable[[Tensor], Tensor] | None = None,
+        take_means: Callable[[Sequence[Tensor]], None] | None = None,
     ) -> None:
         self.start = worlds.map(torch.clone)
         self.end = self.start._replace(x=torch.empty_like(worlds.x), s=torch.empty_like(worlds.s))
@@ -61,7 +62,7 @@ class EagerIteration:
         """Worlds to which the stillness loss applies, bool, shape [B]."""
         self._stillness_weight = config.stillness_weight
         self._stillness_power = config.stillness_power
-        self._mean_over_processes = mean_over_processes
+        self._take_means = take_means
         self._divides = bool(fate_parameters(rule))
         self._task = task
         with torch.no_grad():
@@ -98,7 +99,7 @@ class EagerIteration:
             return_path_length=True,
         )
         end = Particles(*fields)
-        single = self._mean_over_processes is None
+        single = self._take_means is None
         with contextlib.nullcontext() if single else counted_together(self._mean):
             total, parts = self._loss(end)
         # Not backward(): its accumulation nodes remember the stream they were first used on,
@@ -114,10 +115,9 @@ class EagerIteration:
 
     def _mean(self, value: Tensor) -> Tensor:
         """Return the mean of a tensor over all processes, computed between two graphs."""
-        assert self._mean_over_processes is not None, "there are several processes"
-        own, over = value.detach().clone(), self._mean_over_processes
-        mean = torch.empty_like(own)
-        host_call(lambda: mean.copy_(over(own)))
+        take_means, mean = self._take_means, value.detach().clone()
+        assert take_means is not None, "there are several processes"
+        host_call(lambda: take_means([mean]))
         return mean
 
     def _loss(self, end: Particles) -> tuple[Tensor, dict[str, Tensor]]:
@@ -131,8 +131,9 @@ class EagerIteration:
                 stayed = (living(s) & living(self.start.s))[..., None]
                 change = torch.where(stayed, change, 0.0)[..., LIFE + 1 :]
             moved, changed = (power_mean(each, self._stillness_power) for each in (path, change))
-            unrest = moved / self._task.eps + changed
-            parts["rest"] = (self.grown.to(x.dtype) * unrest).mean()
+            change_of_world = moved / self._task.eps + changed
+            # The log's name of the stillness loss.
+            parts["rest"] = (self.grown.to(x.dtype) * change_of_world).mean()
             total = total + self._stillness_weight * parts["rest"]
         return total, parts
 

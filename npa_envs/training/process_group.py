@@ -126,12 +126,6 @@ class ProcessGroup:
         for mean, values in zip(means, reduced, strict=False):
             mean.copy_(values.view(mean.shape))
 
-    def mean(self, value: Tensor) -> Tensor:
-        """Return the mean of a tensor over all processes; all of them must call it."""
-        mean = value.detach().clone()
-        self.reduce([mean])
-        return mean
-
     def check_same(self, tensors: Sequence[Tensor]) -> None:
         """Check that tensors are the same on all processes, bit for bit."""
         if self.count == 1:

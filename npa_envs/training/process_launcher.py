@@ -37,10 +37,6 @@ def launch(count: int, arguments: Sequence[str], out: Path, device: str) -> int:
             f"processes must be at most the {device_count} CUDA devices that torch sees, got "
             f"{count}: take fewer, or --device cpu"
         )
-    if not dist.is_available():
-        raise NPAError(
-            f"processes must be 1 with a torch that has no torch.distributed, got {count}"
-        )
     # These imports are slow, and only runs of several processes need them.
     from torch.distributed.elastic.multiprocessing.api import SignalException
     from torch.distributed.elastic.multiprocessing.errors import ChildFailedError

@@ -28,7 +28,7 @@ from npa_envs.atomic_files import (
     write_text,
 )
 from npa_envs.checks import is_real, is_whole
-from npa_envs.errors import MissingDependencyError, NPAError, shown
+from npa_envs.errors import NPAError, shown
 from npa_envs.render.colours import to_uint8
 from npa_envs.render.picture_files import encode_frame
 from npa_envs.training.checkpoint import load_checkpoint, save_checkpoint
@@ -87,7 +87,22 @@ class Run:
         content = None
         if folder is not None and processes.first:
             check_choice(resume=resume, overwrite=overwrite)
-            content = self._opened(folder, check, resume)
+            folder.note_checkpoint()
+            path = folder.checkpoint
+            exists = path.exists()
+            if exists:
+                # Raises if another run is active in the folder, before anything is created.
+                with folder.locked():
+                    pass
+            if resume:
+                content = load_checkpoint(path)
+                check(content, path)
+            elif exists and not overwrite:
+                raise NPAError(
+                    f"out must be a folder without a run, but {shown(str(folder.path))} holds one: "
+                    "resume it (--resume), choose another folder (--out), or overwrite it "
+                    "(--overwrite)"
+                )
         self._content: dict[str, Any] | None = processes.broadcast(content)
 
     def take_content(self) -> dict[str, Any] | None:
@@ -96,7 +111,7 @@ class Run:
         return content
 
     @contextlib.contextmanager
-    def held(self, *, begin: bool = False) -> Iterator[None]:
+    def locked(self, *, begin: bool = False) -> Iterator[None]:
         """Lock the folder inside; with `begin`, remove unfinished and overwritten files."""
         folder = self.folder if self._processes.first else None
         with contextlib.nullcontext() if folder is None else folder.locked():
@@ -106,7 +121,7 @@ class Run:
                     folder.clear()
             yield
 
-    def go(
+    def repeat(
         self,
         step: Callable[[], None],
         *,
@@ -127,13 +142,8 @@ class Run:
         Returns:
             Whether a signal came.
         """
-        if self.folder is None:
-            begin()
-            while not over():
-                step()
-            end(False)
-            return False
-        with stop_flag(patient=self._processes.distributed) as stop:
+        catches_signals = self.folder is not None
+        with stop_flag(patient=self._processes.distributed, active=catches_signals) as stop:
             begin()
             stopped = False
             while not stopped and not over():
@@ -143,33 +153,15 @@ class Run:
             end(stopped)
             return self._processes.any(stop.is_set())
 
-    def keep(self, content: dict[str, Any]) -> None:
+    def write_checkpoint(self, content: dict[str, Any]) -> None:
         """Write the checkpoint; to be called on rank 0."""
         assert self.folder is not None, "the run has a folder"
         save_checkpoint(self.folder.checkpoint, content)
         self.folder.note_checkpoint()
 
-    def _opened(self, folder: RunFolder, check: Check, resume: bool) -> dict[str, Any] | None:
-        folder.note_checkpoint()
-        path = folder.checkpoint
-        if path.exists():
-            # Raises if another run is active in the folder, before anything is created.
-            with folder.locked():
-                pass
-        if resume:
-            content = load_checkpoint(path)
-            check(content, path)
-            return content
-        if path.exists() and not self._overwrite:
-            raise NPAError(
-                f"out must be a folder without a run, but {shown(str(folder.path))} holds one: "
-                "resume it (--resume), choose another folder (--out), or overwrite it (--overwrite)"
-            )
-        return None
-
 
 @contextlib.contextmanager
-def stop_flag(*, patient: bool = False) -> Iterator[threading.Event]:
+def stop_flag(*, patient: bool = False, active: bool = True) -> Iterator[threading.Event]:
     """Within the block, the first SIGINT or SIGTERM sets the event; later ones act as usual.
 
     Signals within `ONE_REQUEST` of the first one are ignored. In a thread other than the main one,
@@ -177,9 +169,10 @@ def stop_flag(*, patient: bool = False) -> Iterator[threading.Event]:
 
     Args:
         patient: Ignore all later signals: torchrun forwards those that a terminal has sent already.
+        active: False: catch no signals.
     """
     requested = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
+    if not active or threading.current_thread() is not threading.main_thread():
         yield requested
         return
     previous: dict[signal.Signals, Any] = {}
@@ -347,22 +340,12 @@ class JsonlLog:
         self.path = path
 
     def append(self, record: dict[str, Any]) -> None:
-        """Write a line without a buffer, so that a kill right after it does not lose it.
-
-        If that fails, the file is truncated to its former size.
-        """
+        """Write a line without a buffer, so that a kill right after it does not lose it."""
         line = (json.dumps(record, allow_nan=False) + "\n").encode()
         try:
-            # Without a buffer, which would be written again when the file closes.
             with self.path.open("ab", buffering=0) as file:
-                size = file.tell()
-                try:
-                    while line:
-                        line = line[file.write(line) :]
-                except OSError:
-                    with contextlib.suppress(OSError):
-                        file.truncate(size)
-                    raise
+                while line:
+                    line = line[file.write(line) :]
         except OSError as error:
             raise NPAError(
                 f"cannot write the log {str(self.path)!r} ({error.strerror or error}): free disk "
@@ -442,13 +425,8 @@ class RunLog:
     def _open_board(self, iteration: int) -> Any:
         # TensorBoard imports TensorFlow if it is installed; this silences it.
         os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
-        try:
-            from torch.utils.tensorboard import SummaryWriter
-        except ImportError as error:
-            raise MissingDependencyError(
-                "tensorboard=True needs TensorBoard: pip install tensorboard, "
-                "or train with tensorboard=False (the JSONL log has the same numbers)"
-            ) from error
+        from torch.utils.tensorboard import SummaryWriter
+
         path = str(self._folder.tensorboard)
         try:
             return SummaryWriter(path, purge_step=iteration + 1 if iteration else None)

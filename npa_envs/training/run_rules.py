@@ -157,6 +157,11 @@ def _species_rules(
     rules: Sequence[NPARule] | None,
 ) -> list[NPARule]:
     """Return a rule for each species, in the form of the `untrained` ones."""
+    if config.initial_rule:
+        raise NPAError(
+            f"initial_rule is for one rule, got {shown(config.initial_rule)}: give one for each "
+            "species as rules"
+        )
     for rule in untrained:
         take_options(rule, config)
     sources: tuple[str, ...] = getattr(config, "initial_rules", ())

@@ -6,7 +6,7 @@ import copy
 import json
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,6 @@ from npa_envs.devices import check_device
 from npa_envs.errors import DivergedError, NPAError, shown
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Task
-from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2D, CoMorphogenesis2DConfig
 from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.checkpoint import (
     check_content,
@@ -35,7 +34,6 @@ from npa_envs.training.loss_statistics import divergence_error
 from npa_envs.training.process_group import ProcessGroup
 from npa_envs.training.run_folder import Run, RunFolder, RunLog
 from npa_envs.training.run_rules import (
-    JOINT_TASK_NAME,
     JointRules,
     first_rule,
     joint_rollout,
@@ -125,7 +123,7 @@ class Trainer:
         schedule = torch.Generator().manual_seed(config.seed)
         saved = None if content is None else content["rule_hyper_parameters"]
         self.rule = first_rule(task, config, schedule, saved, rules).to(device, config.torch_dtype)
-        if isinstance(self.rule, JointRules) and rollout is None:
+        if isinstance(self.rule, JointRules):
             rollout = joint_rollout(config.task.counts)
         self._cycle = TrainingCycle(
             task,
@@ -144,25 +142,22 @@ class Trainer:
             rule_bytes = sum(p.nbytes for p in self.rule.parameters())
             pool_bytes = sum(value.nbytes for value in self.pool.worlds.tensors())
             self.folder.prepare(self._processes.count * pool_bytes + 16 * rule_bytes)
-        with self._run.held(begin=True):
+        with self._run.locked(begin=True):
             if content is not None:
                 self._restore(content)
+            elif self._processes.first and self._log.lines.records():
+                raise NPAError(
+                    f"out must be a folder without a run, but {shown(str(self.folder.path))} "
+                    "holds a log without its checkpoint: choose another folder (--out), or "
+                    "overwrite it (--overwrite)"
+                )
             if self._processes.first:
                 # Before the first checkpoint, whose resumption needs it.
-                self._write_config(new=content is None)
+                text = json.dumps(config_to_dict(config), indent=2)
+                write_text(self.folder.config, text + "\n")
             if content is None:
                 # Now, so that a run that is killed early can be resumed and a full disk is noticed.
                 self.save()
-
-    def _write_config(self, *, new: bool) -> None:
-        if new and self._log.lines.records():
-            raise NPAError(
-                f"out must be a folder without a run, but {shown(str(self.folder.path))} "
-                "holds a log without its checkpoint: choose another folder (--out), or "
-                "overwrite it (--overwrite)"
-            )
-        text = json.dumps(config_to_dict(self.config), indent=2)
-        write_text(self.folder.config, text + "\n")
 
     @property
     def iteration(self) -> int:
@@ -202,7 +197,7 @@ class Trainer:
                 bar.set_postfix(loss=f"{self._record['loss']:.4g}", refresh=False)
 
         with (
-            self._run.held(),
+            self._run.locked(),
             self._log.opened(config.tensorboard and first, self.iteration),
             tqdm(**options, disable=not (progress and first)) as bar,
         ):
@@ -211,7 +206,7 @@ class Trainer:
             if first:
                 self._record = next(iter(self._log.lines.records()[-1:]), {})
             try:
-                interrupted = self._run.go(
+                interrupted = self._run.repeat(
                     step,
                     over=lambda: self.iteration >= total,
                     late=lambda: time.perf_counter() - start >= seconds,
@@ -274,7 +269,7 @@ class Trainer:
         state = {"rule": self.rule.state_dict(), **self._cycle.state_dict()}
         if not self._processes.first:
             return
-        self._run.keep(self._origin() | progress | state)
+        self._run.write_checkpoint(self._origin() | progress | state)
         write_rules(self.saved_rule, self.folder, self.config, self.task_name, self.iteration)
 
     def _origin(self) -> dict[str, Any]:
@@ -377,52 +372,3 @@ def check_seconds(max_seconds: object) -> None:
             f"max_seconds must be a number of at least 0, or None for no limit, got "
             f"{shown(max_seconds)}: try 60"
         )
-
-
-def train_together(
-    config: TrainConfig[CoMorphogenesis2DConfig],
-    rules: Sequence[NPARule] | None = None,
-    *,
-    resume: bool = False,
-    overwrite: bool = False,
-    progress: bool = True,
-    max_seconds: float | None = None,
-    begun: Callable[[], None] = lambda: None,
-) -> TrainResult:
-    """Train one rule for each species of a common world.
-
-    Each rule perceives densities divided by the number of its own particles, as it would alone. A
-    rule whose parameters do not require gradients does not change.
-
-    Args:
-        config: The run's configuration, for example `preset("fast", "co_morphogenesis2d")` or
-            `TrainConfig(task=CoMorphogenesis2DConfig())`.
-        rules: Initial rules, one for each species; copied. None: the configuration's
-            `initial_rules`, or untrained ones.
-        resume: Continue from the checkpoint in `config.out`; give the same `rules` again.
-        overwrite: As of `train`, like `progress`, `max_seconds` and `begun`.
-
-    Returns:
-        The result; its `rule` is a `JointRules`, in the order of the species. Their files
-        are `rule-0.safetensors`, `rule-1.safetensors`, ... in `config.out`.
-
-    Raises:
-        NPAError: Rules do not fit the species, a target cannot be loaded, or as for `Trainer`.
-        DivergedError: The loss is not finite.
-    """
-    if config.initial_rule:
-        raise NPAError(
-            f"initial_rule is for one rule, got {shown(config.initial_rule)}: give one for each "
-            "species as rules"
-        )
-    task = CoMorphogenesis2D(config.task, device=check_device(config.device))
-    trainer = Trainer(
-        task,
-        config,
-        task_name=JOINT_TASK_NAME,
-        resume=resume,
-        overwrite=overwrite,
-        rules=rules,
-    )
-    begun()
-    return trainer.run(progress=progress, max_seconds=max_seconds)

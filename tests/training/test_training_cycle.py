@@ -102,12 +102,12 @@ def test_recorded_iterations_take_means_over_processes_where_eager_ones_do(tmp_p
     for cls in (EagerIteration, GraphedIteration):
         counts = []
 
-        def mean(count, counts=counts):
-            counts.append(float(count))
-            return 2.0 * count
+        def take_means(values, counts=counts):
+            counts.append(float(values[0]))
+            values[0] *= 2.0
 
         arguments = task, rule, config, Particles(x, s), generator, npa_envs.rollout
-        iteration = cls(*arguments, mean_over_processes=mean)
+        iteration = cls(*arguments, take_means=take_means)
         for number in range(3):
             strayed = x.clone()
             strayed[:, : 5 + number] += 3.0

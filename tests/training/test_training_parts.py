@@ -7,7 +7,6 @@ import pytest
 import torch
 from circle_task import CircleTask, circle_config, plain_rollout
 from torch import nn
-from training_runs import full_disk
 
 from npa_envs.devices import check_device, parse_device
 from npa_envs.errors import NPAError
@@ -18,7 +17,6 @@ from npa_envs.training.iteration import EagerIteration, power_mean
 from npa_envs.training.loss_statistics import LossStatistics
 from npa_envs.training.optimiser import FATE_RATE, RuleOptimiser, layer_weights, normalise_gradients
 from npa_envs.training.process_group import ALONE, RunRandomness
-from npa_envs.training.run_folder import JsonlLog
 from npa_envs.world.particles import Particles
 
 
@@ -371,15 +369,3 @@ def test_what_is_no_checkpoint_is_refused_and_never_run(tmp_path, case):
     with pytest.raises(NPAError, match=message):
         load_checkpoint(tmp_path / "checkpoint.pt")
     assert [path.name for path in tmp_path.iterdir()] == ["checkpoint.pt"]
-
-
-def test_a_line_that_does_not_fit_on_the_disk_leaves_the_log_as_it_was(tmp_path):
-    log = JsonlLog(tmp_path / "log.jsonl")
-    log.append({"iteration": 1})
-    before = log.path.read_bytes()
-    # Part of the second line fits, and is written.
-    with full_disk(len(before) + 10), pytest.raises(NPAError, match=r"cannot write the log .*log"):
-        log.append({"iteration": 2, "loss": 0.25})
-    assert log.path.read_bytes() == before
-    log.append({"iteration": 2})
-    assert log.records() == [{"iteration": 1}, {"iteration": 2}]
