@@ -14,7 +14,6 @@ from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2DConfig
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2DTrainConfig
 from npa_envs.tasks.train_config import JointTrainConfig, TrainConfig
 from npa_envs.training.run_folder import JsonlLog, RunFolder
-from npa_envs.training.run_rules import JOINT_TASK_NAME, JointRules
 from npa_envs.training.task_table import (
     TASKS,
     TaskEntry,
@@ -24,7 +23,13 @@ from npa_envs.training.task_table import (
     preset,
     task_entry,
 )
-from npa_envs.training.trainer import Trainer, TrainResult, check_seconds
+from npa_envs.training.trainer import (
+    JOINT_TASK_NAME,
+    JointRules,
+    Trainer,
+    TrainResult,
+    check_seconds,
+)
 
 __all__ = [
     "TASKS",

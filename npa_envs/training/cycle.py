@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -231,22 +230,13 @@ class TrainingCycle:
 
     def state_dict(self) -> dict[str, Any]:
         """Return the state for a checkpoint without the rule, on rank 0 of all processes."""
-        return self._state(
-            self.optimiser.state_dict(), lambda own: self._processes.gathered(own, self._section)
-        )
-
-    def state_like(self, iteration: int) -> dict[str, Any]:
-        """Return a dict with the keys, shapes and types of `state_dict` after `iteration`."""
-        moments = self.optimiser.moments_like() if iteration > 0 else {}
-        size = self._config.pool_size
-        return self._state({"state": moments}, lambda own: own[:1].expand(size, *own.shape[1:]))
-
-    def _state(
-        self, optimiser: dict[str, Any], all_worlds: Callable[[Tensor], Tensor]
-    ) -> dict[str, Any]:
+        pool = {
+            name: self._processes.gathered(local, self._section)
+            for name, local in self.pool.tensors().items()
+        }
         return {
-            "optimiser": optimiser,
-            "pool": {name: all_worlds(own) for name, own in self.pool.tensors().items()},
+            "optimiser": self.optimiser.state_dict(),
+            "pool": pool,
             "meter": self.statistics.state_dict(),
             "random_states": self.random.state_dict(),
         }
@@ -254,8 +244,8 @@ class TrainingCycle:
     def load_state_dict(self, state: dict[str, Any], iteration: int) -> None:
         """Restore what `state_dict` returned after `iteration`; to be called before `run`."""
         self.optimiser.load_state_dict(state["optimiser"])
-        for name, own in self.pool.tensors().items():
-            own.copy_(self._processes.local(state["pool"][name], self._section))
+        for name, local in self.pool.tensors().items():
+            local.copy_(self._processes.local(state["pool"][name], self._section))
         self.statistics.load_state_dict(state["meter"])
         self.random.load_state_dict(state["random_states"], iteration)
 

@@ -86,25 +86,20 @@ class RuleOptimiser:
 
     def state_dict(self) -> dict[str, Any]:
         """Return moments and step counts by the index of a parameter, for a checkpoint."""
-        return {"state": _moments(self._optimisers, self._parameters)}
-
-    def moments_like(self) -> dict[int, dict[str, Tensor]]:
-        """Return moments and step counts after one step with zero gradients, by parameter."""
-        copies = [nn.Parameter(torch.zeros_like(p)) for p in self._parameters]
-        optimisers = self._fresh(copies)
-        for parameter in copies:
-            parameter.grad = torch.zeros_like(parameter)
-        for optimiser in optimisers:
-            optimiser.step()
-        return _moments(optimisers, copies)
+        indices = self._indices()
+        states = [item for optimiser in self._optimisers for item in optimiser.state.items()]
+        return {"state": {indices[id(parameter)]: state for parameter, state in states}}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore what `state_dict` returned."""
-        moments = state["state"]
-        indices = {id(p): index for index, p in enumerate(self._parameters)}
+        moments, indices = state["state"], self._indices()
         for optimiser in self._optimisers:
             own = [indices[id(p)] for group in optimiser.param_groups for p in group["params"]]
             load_moments(optimiser, {k: moments[i] for k, i in enumerate(own) if i in moments})
+
+    def _indices(self) -> dict[int, int]:
+        """Return the index of each parameter by its `id`."""
+        return {id(parameter): index for index, parameter in enumerate(self._parameters)}
 
     def _fresh(self, parameters: list[nn.Parameter]) -> list[Optimizer]:
         """Return new optimisers, whose moments are zero."""
@@ -137,11 +132,3 @@ def load_moments(optimiser: Optimizer, state: dict[int, Any]) -> None:
     """Load an optimiser's state without its parameter groups, which stay as they are."""
     groups = optimiser.state_dict()["param_groups"]
     optimiser.load_state_dict({"state": state, "param_groups": groups})
-
-
-def _moments(
-    optimisers: list[Optimizer], parameters: list[nn.Parameter]
-) -> dict[int, dict[str, Tensor]]:
-    """Return the states of all parameters, by index."""
-    indices = {id(p): index for index, p in enumerate(parameters)}
-    return {indices[id(p)]: state for one in optimisers for p, state in one.state.items()}

@@ -199,7 +199,7 @@ class Heartbeat:
         self._store, self._rank = store, rank
         self._beats = [0] * count
         self._ended = threading.Event()
-        self._finished = self._store_gone = False
+        self._finished = False
         # Two threads, as a store that does not answer blocks the one that reads it.
         self._threads = [
             threading.Thread(target=task, daemon=True) for task in (self._beat, self._watch)
@@ -215,16 +215,14 @@ class Heartbeat:
             thread.join(BEAT_SECONDS)
 
     def _beat(self) -> None:
-        try:
+        # Without its store, all processes that have not left seem silent.
+        with contextlib.suppress(RuntimeError):
             while not self._ended.is_set():
                 for other in range(len(self._beats)):
                     self._beats[other] = self._store.add(str(other), int(other == self._rank))
                 self._ended.wait(BEAT_SECONDS)
             if self._finished:
                 self._store.add(str(self._rank), _FINISHED)
-        except RuntimeError:
-            # From now on all processes that have not left seem silent.
-            self._store_gone = True
 
     def _watch(self) -> None:
         count = len(self._beats)
@@ -237,15 +235,11 @@ class Heartbeat:
             last = beats
             lost = [str(other) for other in range(count) if silent[other] >= SILENT_BEATS]
             if lost:
-                why = (
-                    "as the store of the processes is gone"
-                    if self._store_gone
-                    else "which was killed or stopped, or cannot be reached"
-                )
                 print(
                     f"npa-envs: error: process {self._rank} of {count} has heard nothing from "
-                    f"process {', '.join(lost)} for {SILENT_BEATS * BEAT_SECONDS:.0f} s, {why}: "
-                    "the last checkpoint is intact; resume it",
+                    f"process {', '.join(lost)} for {SILENT_BEATS * BEAT_SECONDS:.0f} s, "
+                    "which was killed or stopped, or cannot be reached: the last checkpoint is "
+                    "intact; resume it",
                     file=sys.stderr,
                     flush=True,
                 )

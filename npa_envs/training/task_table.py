@@ -218,7 +218,16 @@ def load_config(
         text = read_bytes(path, limit=MAX_FILE).decode("utf-8")
     except (NPAError, UnicodeDecodeError) as error:
         raise NPAError(f"cannot read the configuration file {shown(str(path))}: {error}") from error
-    fields = _parse(path, text)
+    parse = PARSERS.get(path.suffix.lower())
+    if parse is None:
+        raise NPAError(
+            f"a configuration file must end in {', '.join(PARSERS)}, got {shown(str(path))}"
+        )
+    try:
+        fields = parse(text)
+    except Exception as error:
+        # Parsers raise exceptions of many kinds.
+        raise NPAError(f"{shown(str(path))} cannot be parsed: {shown(error)}") from error
     if not isinstance(fields, Mapping) or not all(isinstance(key, str) for key in fields):
         raise NPAError(
             f"the configuration file {shown(str(path))} must hold field names and values at its "
@@ -244,25 +253,6 @@ def config_to_dict(config: TrainConfig[Any]) -> dict[str, Any]:
     return result
 
 
-def _parse(path: Path, text: str) -> Any:
-    suffix = path.suffix.lower()
-    try:
-        if suffix == ".toml":
-            return tomllib.loads(text)
-        if suffix == ".json":
-            return parse_json(text)
-        if suffix in (".yaml", ".yml"):
-            return _parse_yaml(text)
-    except Exception as error:
-        # Parsers raise exceptions of many kinds.
-        raise NPAError(
-            f"{shown(str(path))} is not valid {suffix[1:].upper()}: {shown(error)}"
-        ) from error
-    raise NPAError(
-        f"a configuration file must end in .yaml, .yml, .toml or .json, got {shown(str(path))}"
-    )
-
-
 def _parse_yaml(text: str) -> Any:
     # Imported here: most runs do not need it.
     import yaml
@@ -277,6 +267,15 @@ def _parse_yaml(text: str) -> Any:
 
     # An empty file sets nothing.
     return yaml.load(text, Loader) or {}
+
+
+PARSERS: Mapping[str, Callable[[str], Any]] = {
+    ".yaml": _parse_yaml,
+    ".yml": _parse_yaml,
+    ".toml": tomllib.loads,
+    ".json": parse_json,
+}
+"""Parsers of configuration files by suffix."""
 
 
 def _field_types(config: Any) -> dict[str, Any]:

@@ -134,10 +134,7 @@ WIDE = NPARule(state_dim=2)
         (rule(species_count="2"), "species_count must be a whole number of at least 0, got '2'"),
         (lambda: WIDE.colour(S[..., :2]), "the last three outputs .* got 2"),
         (lambda: train("fast"), "config must be a TrainConfig of .*, got 'fast'"),
-        (
-            lambda: train(preset("tiny"), "texture"),
-            "config must be a TrainConfig of the task 'texture'",
-        ),
+        (lambda: train(preset("tiny"), "texture"), "config must .* of the task 'texture'"),
         (lambda: train(preset("tiny"), max_seconds="3"), "max_seconds must be a number"),
         (lambda: learn("gradient", "npa/X-v0", ONE_STEP, 0), "a Problem, got 'npa/X-v0'"),
         (lambda: learn("gradient", PROBLEM, 1000, 0), "budget must be a Budget, got 1000"),

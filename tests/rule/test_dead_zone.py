@@ -14,7 +14,7 @@ from npa_envs import reference as oracle
 from npa_envs.agents import RulePolicy
 from npa_envs.envs import multispecies_v0
 from npa_envs.training import load_config
-from npa_envs.training.run_rules import initial_rule
+from npa_envs.training.trainer import initial_rule
 from npa_envs.world import execute
 from npa_envs.world.randomness import uniform_draws
 

@@ -11,7 +11,7 @@ from npa_envs.errors import NPAError
 from npa_envs.rule.files import save_rule
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig, turned, turns
 from npa_envs.training import preset
-from npa_envs.training.run_rules import initial_rule
+from npa_envs.training.trainer import initial_rule
 from npa_envs.world.particles import Particles
 
 SMALL = {"target": "octopus", "target_point_count": 300, "particle_count": 300, "resolution": 48}

@@ -321,7 +321,7 @@ class Store:
     ("make", "message"),
     [
         (dist.HashStore, "process 0 of 3 has heard nothing from process 2 for"),
-        (lambda: Store(fails=True), "s, as the store of the processes is gone"),
+        (lambda: Store(fails=True), "has heard nothing from process 1"),
         (lambda: Store(fails=False), "has heard nothing from process 1"),
     ],
 )
