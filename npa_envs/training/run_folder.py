@@ -43,9 +43,6 @@ ONE_REQUEST = 1.0
 """Signals within this time are one request to stop [s]: a scheduler may signal both a run and its
 launcher, which forwards it."""
 
-Check = Callable[[dict[str, Any], Path], None]
-"""Raises NPAError if a checkpoint, given with its path, is of another run."""
-
 
 def check_choice(*, resume: bool, overwrite: bool) -> None:
     """Check that a run is not both resumed and overwritten."""
@@ -62,7 +59,7 @@ class Run:
     Args:
         folder: Its files; None: nothing is written, and no signal stops it.
         processes: Its processes.
-        check: Checks the checkpoint of a resumed run.
+        check: Raises NPAError if a checkpoint, given with its path, is of another run.
         resume: Continue from the checkpoint in the folder.
         overwrite: Remove the files of an earlier run in the folder.
 
@@ -75,7 +72,7 @@ class Run:
         self,
         folder: RunFolder | None,
         processes: ProcessGroup,
-        check: Check,
+        check: Callable[[dict[str, Any], Path], None],
         *,
         resume: bool = False,
         overwrite: bool = False,
@@ -414,27 +411,19 @@ class RunLog:
 
         Events of an earlier process after `iteration` are hidden.
         """
-        self._board = self._open_board(iteration) if tensorboard else None
+        if tensorboard:
+            # TensorBoard imports TensorFlow if it is installed; this silences it.
+            os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+            from torch.utils.tensorboard import SummaryWriter
+
+            purge_step = iteration + 1 if iteration else None
+            self._board = SummaryWriter(str(self._folder.tensorboard), purge_step=purge_step)
         try:
             yield
         finally:
             if self._board is not None:
                 self._board.close()
                 self._board = None
-
-    def _open_board(self, iteration: int) -> Any:
-        # TensorBoard imports TensorFlow if it is installed; this silences it.
-        os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
-        from torch.utils.tensorboard import SummaryWriter
-
-        path = str(self._folder.tensorboard)
-        try:
-            return SummaryWriter(path, purge_step=iteration + 1 if iteration else None)
-        except OSError as error:
-            raise NPAError(
-                f"cannot write to {path!r} ({error}): change its permissions or train with "
-                "tensorboard=False"
-            ) from error
 
     def add(self, record: dict[str, Any]) -> None:
         """Add a line of numbers, with its `iteration`."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import functools
 import json
 import math
 import time
@@ -12,7 +13,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 from tqdm import tqdm
 
 from npa_envs.atomic_files import write_text
@@ -126,7 +127,8 @@ class Trainer:
         saved = None if content is None else content["rule_hyper_parameters"]
         self.rule = first_rule(task, config, schedule, saved, rules).to(device, config.torch_dtype)
         if isinstance(self.rule, JointRules):
-            rollout = joint_rollout(config.task.counts)
+            counts = config.task.counts
+            rollout = functools.partial(rollout_species, counts=counts, density_counts=counts)
         self._cycle = TrainingCycle(
             task,
             self.rule,
@@ -401,19 +403,6 @@ def first_rule(
         return cast(NPARule, JointRules(_species_rules(config, untrained, saved, rules)))
     untrained_one = task.make_rule(generator)
     return initial_rule(config, untrained_one) if saved is None else rule_like(saved)
-
-
-def joint_rollout(counts: Sequence[int]) -> Rollout:
-    """Return the rollout of `JointRules` for species with these numbers of particles."""
-
-    def rollout(
-        rules: JointRules, x: Tensor, s: Tensor, steps: int, /, **options: Any
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        return rollout_species(
-            list(rules), x, s, steps, counts=counts, density_counts=counts, **options
-        )
-
-    return rollout
 
 
 def write_rules(
