@@ -24,17 +24,8 @@ CHECKPOINT_FORMAT = "npa-envs checkpoint"
 CHECKPOINT_VERSION = 1
 """Incremented when the content of checkpoints changes."""
 
-MAY_DIFFER = frozenset(
-    {
-        "out",
-        "repeats",
-        "log_interval",
-        "picture_interval",
-        "checkpoint_interval",
-        "tensorboard",
-        "cuda_graph",
-    }
-)
+MAY_DIFFER = {"out", "repeats", "tensorboard", "cuda_graph"}
+MAY_DIFFER |= {"log_interval", "picture_interval", "checkpoint_interval"}
 """Configuration fields that a resumed run may change."""
 
 READ_FIRST: dict[str, Any] = {

@@ -305,13 +305,13 @@ def _check_varied_eps(task: Task, rule: NPARule, config: TrainConfig[Any]) -> No
         return
     if not isinstance(rule, NPARule):
         raise NPAError("vary_eps is for runs of one rule, got several: leave it out")
-    if task.box is not None or rule.static:
-        raise NPAError(
-            "vary_eps needs particles that move in open space, got a task in a box or whose "
-            "particles stay: leave it out"
-        )
-    if rule.divides:
-        raise NPAError(
-            "vary_eps needs seeds of more than one particle, whose size it varies, got a rule that "
-            "divides: leave it out"
-        )
+    reasons = {
+        "a periodic box": task.box is not None,
+        "particles that stay": rule.static,
+        "a rule that divides, whose seeds are single particles": rule.divides,
+    }
+    for reason, applies in reasons.items():
+        if applies:
+            raise NPAError(
+                f"vary_eps needs particles that move in open space, got {reason}: leave it out"
+            )

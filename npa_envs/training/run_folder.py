@@ -139,8 +139,11 @@ class Run:
         Returns:
             Whether a signal came.
         """
-        catches_signals = self.folder is not None
-        with stop_flag(patient=self._processes.distributed, active=catches_signals) as stop:
+        requests: contextlib.AbstractContextManager[threading.Event]
+        requests = stop_flag(patient=self._processes.distributed)
+        if self.folder is None:
+            requests = contextlib.nullcontext(threading.Event())
+        with requests as stop:
             begin()
             stopped = False
             while not stopped and not over():
@@ -158,7 +161,7 @@ class Run:
 
 
 @contextlib.contextmanager
-def stop_flag(*, patient: bool = False, active: bool = True) -> Iterator[threading.Event]:
+def stop_flag(*, patient: bool = False) -> Iterator[threading.Event]:
     """Within the block, the first SIGINT or SIGTERM sets the event; later ones act as usual.
 
     Signals within `ONE_REQUEST` of the first one are ignored. In a thread other than the main one,
@@ -166,10 +169,9 @@ def stop_flag(*, patient: bool = False, active: bool = True) -> Iterator[threadi
 
     Args:
         patient: Ignore all later signals: torchrun forwards those that a terminal has sent already.
-        active: False: catch no signals.
     """
     requested = threading.Event()
-    if not active or threading.current_thread() is not threading.main_thread():
+    if threading.current_thread() is not threading.main_thread():
         yield requested
         return
     previous: dict[signal.Signals, Any] = {}

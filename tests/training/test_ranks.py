@@ -29,7 +29,7 @@ SEEDED = {"seed_interval": 3, "fresh_share": 0.7, "damage_share": 0.5}
 SEEDED |= {"world_count": 4, "pool_size": 8}
 """Batches with several fresh seeds; worlds of some places are damaged."""
 
-STRAYING = {"escape_share": 0.1, "escape_weight": 10.0, "world_count": 4, "pool_size": 8}
+ESCAPING = {"escape_share": 0.1, "escape_weight": 10.0, "world_count": 4, "pool_size": 8}
 """Worlds that lose particles, some more than others."""
 
 
@@ -82,7 +82,7 @@ def loaded_kernels(tmp_path_factory):
 
 
 CASES = [
-    *(("morphogenesis2d", fields, 1e-10) for fields in ({}, LIVELY, SEEDED, STRAYING)),
+    *(("morphogenesis2d", fields, 1e-10) for fields in ({}, LIVELY, SEEDED, ESCAPING)),
     # Its 16-bit numbers would differ between processes that did not step together.
     ("morphogenesis2d", {"optimiser": "muon", "learning_rate": 5e-3}, 1e-2),
     *(pytest.param(task, FEW | SEEDED, 1e-10, marks=pytest.mark.slow) for task in TASKS),

@@ -88,8 +88,8 @@ def test_replayed_operations_train_the_same_rule_as_called_ones(tmp_path, make, 
 
 @pytest.mark.gpu
 def test_recorded_iterations_take_means_over_processes_where_eager_ones_do(tmp_path):
-    straying = {"escape_share": 0.2, "escape_weight": 10.0, "cuda_graph": False}
-    config = preset("tiny", out=tmp_path, device="cuda", **straying)
+    escaping = {"escape_share": 0.2, "escape_weight": 10.0, "cuda_graph": False}
+    config = preset("tiny", out=tmp_path, device="cuda", **escaping)
     task = Morphogenesis2D(config.task, device="cuda")
     device = torch.device("cuda")
     rule = task.make_rule(torch.Generator().manual_seed(1)).to(device)
@@ -109,9 +109,9 @@ def test_recorded_iterations_take_means_over_processes_where_eager_ones_do(tmp_p
         arguments = task, rule, config, Particles(x, s), generator, npa_envs.rollout
         iteration = cls(*arguments, take_means=take_means)
         for number in range(3):
-            strayed = x.clone()
-            strayed[:, : 5 + number] += 3.0
-            iteration.start.x.copy_(strayed)
+            escaped = x.clone()
+            escaped[:, : 5 + number] += 3.0
+            iteration.start.x.copy_(escaped)
             generator.manual_seed(number)
             iteration.run(6 + number % 2)
             rows = [*iteration.gradients, iteration.terms, iteration.end.x, iteration.end.s]
@@ -143,8 +143,8 @@ def test_seeds_are_as_large_as_eps_makes_them(tmp_path):
 @pytest.mark.parametrize(
     ("task", "fields", "message"),
     [
-        ("texture", {}, "vary_eps needs particles that move in open space"),
-        ("morphogenesis2d", {"division": True}, "vary_eps needs seeds of more than one particle"),
+        ("texture", {}, "vary_eps needs particles that move in open space, got a periodic box"),
+        ("morphogenesis2d", {"division": True}, "vary_eps needs .*, got a rule that divides"),
         ("co_morphogenesis2d", {}, "vary_eps is for runs of one rule"),
     ],
 )

@@ -185,7 +185,7 @@ def test_iteration_leaves_the_worlds_the_terms_and_the_gradients(tmp_path):
 
 
 @pytest.mark.parametrize("power", [1.0, 2.0, 4.0])
-def test_grown_worlds_are_to_rest(tmp_path, power):
+def test_the_stillness_loss_is_of_grown_worlds(tmp_path, power):
     fields = {"dtype": "float64", "max_age_range": (8, 64), "pool_size": 9}
     _, _, plain = make_iteration(circle_config(tmp_path, **fields))
     fields |= {"stillness_weight": 0.5, "stillness_power": power}
@@ -200,9 +200,9 @@ def test_grown_worlds_are_to_rest(tmp_path, power):
     way = (iteration.end.x - iteration.start.x)[1].norm(dim=-1) / task.eps
     change = (iteration.end.s - iteration.start.s)[1].abs()
     way, change = (each.pow(power).mean() ** (1.0 / power) for each in (way, change))
-    rest = 3.0 * iteration.terms[-1]
-    assert rest >= way + change - 1e-12
-    assert rest < 3.0 * (way + change)
+    stillness = 3.0 * iteration.terms[-1]
+    assert stillness >= way + change - 1e-12
+    assert stillness < 3.0 * (way + change)
     torch.testing.assert_close(iteration.terms[0], plain.terms[0] + 0.5 * iteration.terms[-1])
 
 
@@ -216,7 +216,7 @@ def test_power_means_of_small_motions_are_right_in_float32(power):
 
 
 @pytest.mark.parametrize("power", [1.0, 2.0, 4.0])
-def test_worlds_that_do_not_move_have_finite_gradients_of_rest(tmp_path, power):
+def test_worlds_that_do_not_move_have_finite_gradients_of_stillness(tmp_path, power):
     config = circle_config(
         tmp_path, max_age_range=(8, 64), pool_size=9, stillness_weight=0.5, stillness_power=power
     )
