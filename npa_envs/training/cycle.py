@@ -199,7 +199,7 @@ class TrainingCycle:
         steps = int(torch.randint(lo, hi, (), generator=self.random.schedule))
         self.task.begin(iteration)
         self._draw()
-        is_fresh = self._fresh_in(iteration)
+        is_fresh = self._seeded_worlds(iteration)
         if is_fresh is not None:
             batch.start.copy_(self._fresh_worlds.where(is_fresh, batch.start))
         batch.run(steps)
@@ -212,12 +212,13 @@ class TrainingCycle:
         self.optimiser.step(iteration, share)
         return steps
 
-    def _fresh_in(self, iteration: int) -> Tensor | None:
+    def _seeded_worlds(self, iteration: int) -> Tensor | None:
         """Return which worlds of the batch start as fresh seeds, bool, shape [B]; None: none.
 
-        Every `seed_interval` iterations `fresh_count` worlds do: the first ones of the batch. With
-        per-world streams each world stays in its section of the pool, so these are the first worlds
-        at first, then the next `fresh_count`, and so on, which brings seeds into all sections.
+        Every `seed_interval` iterations there are `fresh_count` of them: the first of the batch.
+        With per-world streams each world of the batch stays in its own section of the pool. Then
+        the seeds are the first `fresh_count` worlds, the next time the next `fresh_count`, and so
+        on, so that seeds come into all sections.
         """
         config = self._config
         if config.ages or iteration % config.seed_interval != 0:

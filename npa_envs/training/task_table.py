@@ -174,9 +174,9 @@ def override(config: TrainConfig[TaskConfigT], /, **fields: Any) -> TrainConfig[
         NPAError: A name is unknown, or a value has the wrong type or lies outside its range.
     """
     run_types, task_types = _field_types(config), _field_types(config.task)
+    known = [*run_types, *task_types]
     for name in fields:
-        if name not in run_types and name not in task_types:
-            known = [*run_types, *task_types]
+        if name not in known:
             raise NPAError(f"unknown field {shown(name)}: {suggest(name, known)}")
     run_fields = {name: value for name, value in fields.items() if name in run_types}
     task_fields = {name: value for name, value in fields.items() if name not in run_types}
