@@ -93,7 +93,7 @@ def follow(arguments: argparse.Namespace) -> None:
 
 
 def endurance(
-    home: long_runs.Habitat, steps: int, generators: Sequence[torch.Generator]
+    home: long_runs.RuleWorlds, steps: int, generators: Sequence[torch.Generator]
 ) -> dict[str, Any]:
     """Return losses and figures of all worlds of a case, each against itself when settled.
 
@@ -182,7 +182,7 @@ def run_long(arguments: argparse.Namespace) -> None:
             for seed in SEEDS
         ]
         worlds = combined(torch.cat, seeds).map(torch.Tensor.float)
-        home = long_runs.Habitat(rule, task, worlds)
+        home = long_runs.RuleWorlds(rule, task, worlds)
         generators = [torch.Generator(device).manual_seed(seed) for seed in (1, 2)]
         line = {"picture": picture} | endurance(home, arguments.steps, generators)
         append_line(arguments.out / "long.jsonl", line)

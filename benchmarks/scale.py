@@ -30,7 +30,8 @@ from torch import Tensor
 
 from npa_envs.devices import check_device
 from npa_envs.training import Trainer, preset, task_entry
-from npa_envs.training.ranks import ALONE, Ranks, joined_ranks
+from npa_envs.training.process_group import ALONE, ProcessGroup
+from npa_envs.training.process_launcher import joined_processes
 
 WARM_UP = 10
 """Iterations before the first block."""
@@ -49,7 +50,7 @@ def main() -> None:
     parser.add_argument("--device", default="cuda")
     parser.add_argument("--eager", action="store_true", help="record no graphs")
     told = parser.parse_args()
-    with joined_ranks() as ranks, tempfile.TemporaryDirectory() as folder:
+    with joined_processes() as ranks, tempfile.TemporaryDirectory() as folder:
         forms = [(ALONE, worlds) for worlds in told.alone if ranks.first]
         forms += [(ranks, worlds) for worlds in told.worlds]
         made = [Run(*form, told, Path(folder) / str(n)) for n, form in enumerate(forms)]
@@ -75,7 +76,9 @@ class Run:
         folder: Where the run is written to.
     """
 
-    def __init__(self, sharing: Ranks, worlds: int, told: argparse.Namespace, folder: Path) -> None:
+    def __init__(
+        self, sharing: ProcessGroup, worlds: int, told: argparse.Namespace, folder: Path
+    ) -> None:
         self._sharing = sharing
         self._worlds = worlds
         self._device = check_device(told.device)
@@ -94,7 +97,7 @@ class Run:
             out=folder,
         )
         task = task_entry("morphogenesis2d").make(config.task, self._device)
-        self._trainer = Trainer(task, config, task_name="morphogenesis2d", ranks=sharing)
+        self._trainer = Trainer(task, config, task_name="morphogenesis2d", processes=sharing)
         self._iterate(WARM_UP)
         self._loss = self._trainer._cycle.batch.terms[0].item()
         self._times: list[float] = []
@@ -104,10 +107,10 @@ class Run:
     def _iterate(self, count: int) -> None:
         """Train as the trainer's own loop does."""
         for _ in range(count):
-            self._sharing.agree_to_stop(False, self._trainer.iteration)
+            self._sharing.agree_to_stop(False)
             self._trainer.iterate()
 
-    def block(self, all_ranks: Ranks, iterations: int) -> None:
+    def block(self, all_ranks: ProcessGroup, iterations: int) -> None:
         """Time some iterations."""
         wait(self._sharing, self._device)
         start = time.perf_counter()
@@ -116,13 +119,13 @@ class Run:
         wait(self._sharing, self._device)
         self._times.append((time.perf_counter() - start) / iterations * 1e3)
         self._host_times.append((launched - start) / iterations * 1e3)
-        if not self._sharing.together:
+        if not self._sharing.distributed:
             all_ranks.any(False)
 
     def reductions(self, iterations: int) -> None:
         """Time the reductions of some iterations, by events of the device."""
         sharing, plain = self._sharing, self._sharing.reduce
-        if not sharing.together or self._device.type != "cuda":
+        if not sharing.distributed or self._device.type != "cuda":
             return
         marks: list[tuple[torch.cuda.Event, torch.cuda.Event]] = []
 
@@ -153,7 +156,7 @@ class Run:
     def line(self, told: argparse.Namespace) -> dict[str, object]:
         """Return the measurements."""
         return {
-            "processes": self._sharing.count if self._sharing.together else "alone",
+            "processes": self._sharing.count if self._sharing.distributed else "alone",
             "worlds": self._worlds,
             "particles": told.particles,
             "steps": told.steps,
@@ -168,7 +171,7 @@ class Run:
         }
 
 
-def wait(ranks: Ranks, device: torch.device) -> None:
+def wait(ranks: ProcessGroup, device: torch.device) -> None:
     """Wait for the device of each process."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)

@@ -25,7 +25,7 @@ from npa_envs.agents.learning.problem import EVALUATION_SEEDS, Problem, check_ru
 from npa_envs.agents.learning.progress import Budget, CurvePoint, Progress, check_finite
 from npa_envs.agents.learning.rule_set import RuleSet, RuleSetPolicy
 from npa_envs.errors import MissingDependencyError, NPAError, shown, suggest
-from npa_envs.training.ranks import Ranks
+from npa_envs.training.process_group import ProcessGroup
 
 __all__ = [
     "GARDEN_METHODS",
@@ -162,7 +162,7 @@ def train(
                 f"method {shown(method)} has no option {shown(name)}: {suggest(name, known)}"
             )
     check_run_seed(seed)
-    several = Ranks.current().count > 1
+    several = ProcessGroup.current().count > 1
     if method not in KEPT_METHODS and (several or out is not None):
         wanted = "be shared by processes" if several else "be kept in a folder (out)"
         raise NPAError(

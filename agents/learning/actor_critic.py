@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from npa_envs.agents.learning.progress import Progress
 from npa_envs.agents.learning.rule_set import RuleSet, species_of
 from npa_envs.checks import check_fraction, check_non_negative, check_positive, check_word
-from npa_envs.training.ranks import ALONE, Ranks, restart, world_streams
+from npa_envs.training.process_group import ALONE, ProcessGroup, restart, world_streams
 from npa_envs.world.randomness import Randomness, WorldRandom, normal_draws
 
 
@@ -254,7 +254,7 @@ class Critic(nn.Module):
         return self.scale * values
 
     @torch.no_grad()
-    def observe(self, observation: Tensor, ranks: Ranks = ALONE) -> None:
+    def observe(self, observation: Tensor, ranks: ProcessGroup = ALONE) -> None:
         """Update the moments of inputs by observations [..., P] of all processes."""
         rate = self._rate(0)
         rows = observation.flatten(0, -2)
@@ -264,7 +264,7 @@ class Critic(nn.Module):
         self.square.lerp_(square, rate)
 
     @torch.no_grad()
-    def rescale(self, targets: Tensor, ranks: Ranks = ALONE) -> None:
+    def rescale(self, targets: Tensor, ranks: ProcessGroup = ALONE) -> None:
         """Update the scale by targets; the network is changed so that values stay the same."""
         before = self.scale.clone()
         square = targets.square().mean()
@@ -289,7 +289,7 @@ def seeded_critic(progress: Progress, input_dim: int, kind: CriticKind) -> Criti
 
 def learner_random(progress: Progress, total: int, indices: Tensor) -> Randomness:
     """Return a learner's random source: with several processes one stream a world."""
-    if progress.ranks.together:
+    if progress.ranks.distributed:
         return world_streams((progress.seed,), total, indices, progress.device)
     return torch.Generator(progress.device).manual_seed(progress.seed)
 

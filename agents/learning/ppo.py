@@ -37,7 +37,7 @@ from npa_envs.agents.learning.rule_set import RuleSet
 from npa_envs.checks import check_flag, check_positive, check_word
 from npa_envs.envs.core.world_state import free_bytes, needed_bytes
 from npa_envs.errors import NPAError
-from npa_envs.training.ranks import ALONE, Ranks, registered, restart
+from npa_envs.training.process_group import ALONE, ProcessGroup, registered, restart
 from npa_envs.world.cuda_graph import GraphedCallable
 from npa_envs.wrappers.base import own_rewards
 
@@ -179,7 +179,9 @@ class PPOLearner:
         graphed = partial(GraphedCallable, device=device)
         self._graphed_draw_actions = graphed(self._draw_actions, generator=registered(self.random))
         self._graphed_find_values = graphed(self._find_values)
-        self._graphed_find_advantages = graphed(self._find_advantages, recorded=not ranks.together)
+        self._graphed_find_advantages = graphed(
+            self._find_advantages, recorded=not ranks.distributed
+        )
         pool = torch.cuda.graph_pool_handle() if device.type == "cuda" else None
         self._graphed_sum_weights = graphed(self._sum_weights, pool=pool)
         self._graphed_find_gradients = [
@@ -477,7 +479,7 @@ def over_particles(values: Tensor, weights: Tensor) -> Tensor:
     return total / weights.sum(dim=-1, keepdim=True).clamp(min=1e-8)
 
 
-def standardised(values: Tensor, weights: Tensor, ranks: Ranks = ALONE) -> Tensor:
+def standardised(values: Tensor, weights: Tensor, ranks: ProcessGroup = ALONE) -> Tensor:
     """Subtract each step's weighted mean from values, and divide by the standard deviation of all.
 
     Means are by step, as the mean over worlds depends on the step of the episode, which a critic
@@ -514,7 +516,7 @@ def world_count(
     options: PPOOptions,
     device: torch.device,
     budget: Budget,
-    ranks: Ranks = ALONE,
+    ranks: ProcessGroup = ALONE,
 ) -> int:
     """Return the worlds B of all processes, as `PPOOptions.worlds` defines them."""
     if options.worlds is not None:

@@ -22,7 +22,7 @@ from npa_envs.devices import check_device
 from npa_envs.errors import DivergedError, NPAError, shown
 from npa_envs.training.checkpoint import check_content, unusable_checkpoint
 from npa_envs.training.optimiser import load_moments
-from npa_envs.training.ranks import Ranks
+from npa_envs.training.process_group import ProcessGroup
 from npa_envs.training.run_folder import Run, RunFolder
 from npa_envs.world.randomness import Randomness, WorldRandom
 
@@ -161,7 +161,7 @@ class Progress:
         """Particle-steps spent so far."""
         self.log: list[CurvePoint] = []
         """Evaluations so far."""
-        self.ranks = Ranks.current()
+        self.ranks = ProcessGroup.current()
         """The processes that share the run."""
         self._evaluation_seeds = checked_seeds("evaluation_seeds", evaluation_seeds)
         check_count("entries", entries, ": try 20")
@@ -228,12 +228,12 @@ class Progress:
             self.look(rules, force=True)
             self._save(rules, learner)
 
-        with self._run.held(begin=True):
-            content, self._run.content = self._run.content, None
+        with self._run.locked(begin=True):
+            content = self._run.take_content()
             if content is not None:
                 assert learner is not None, "methods whose runs are kept are learners"
                 self._restore(learner, content)
-            self._run.go(step, begin=begin, over=lambda: self.over, end=end)
+            self._run.repeat(step, begin=begin, over=lambda: self.over, end=end)
         return rules
 
     def start(self, actor: RuleSet | Callable[[Any], Any]) -> None:
@@ -257,7 +257,7 @@ class Progress:
     @property
     def share(self) -> float:
         """Fraction of the budget that is spent; the last iteration may take it above 1."""
-        seconds = self._agreed_seconds if self.ranks.together else self.seconds
+        seconds = self._agreed_seconds if self.ranks.distributed else self.seconds
         return self.budget.share(seconds, self.particle_steps)
 
     @property
@@ -352,7 +352,7 @@ class Progress:
             curve = [asdict(entry) for entry in self.log]
             state |= {"learner": self._settings, "curve": curve, "iteration": self._run.iteration}
             state |= {"part": self._part, "seconds": self._agreed_seconds}
-            self._run.keep(state | {"particle_steps": self.particle_steps})
+            self._run.write_checkpoint(state | {"particle_steps": self.particle_steps})
             rules.save(folder.path)
             lines = [" ".join(json_text(line).split()) for line in curve]
             write_text(folder.log, "\n".join(lines) + "\n")

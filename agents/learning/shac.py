@@ -29,7 +29,7 @@ from npa_envs.agents.learning.progress import Progress, annealed
 from npa_envs.agents.learning.rule_set import RuleSet
 from npa_envs.checks import check_fraction, check_non_negative, check_positive, check_word
 from npa_envs.training.optimiser import normalise_gradients
-from npa_envs.training.ranks import restart
+from npa_envs.training.process_group import restart
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import WorldRandom
 from npa_envs.world.rollout import Memory

@@ -15,7 +15,7 @@ from npa_envs.errors import NPAError
 
 if TYPE_CHECKING:
     from npa_envs.agents.learning import CurvePoint, Problem
-    from npa_envs.training.ranks import Ranks
+    from npa_envs.training.process_group import ProcessGroup
 
 
 WORLDS = 16
@@ -69,10 +69,14 @@ class LearnOptions(common.RunOptions):
 
 def main(arguments: Sequence[str]) -> int:
     """Learn; return 130 if it was stopped."""
-    from npa_envs.training.process_launcher import launch, print_once, requested_processes
-    from npa_envs.training.ranks import joined_ranks
+    from npa_envs.training.process_launcher import (
+        joined_processes,
+        launch,
+        print_once,
+        requested_processes,
+    )
 
-    with joined_ranks() as ranks:
+    with joined_processes() as ranks:
         request = None
         if ranks.first:
             resolved = common.resolve_run(arguments, lambda words: parse(words).out)
@@ -81,7 +85,7 @@ def main(arguments: Sequence[str]) -> int:
         assert request is not None, "broadcast by the first process"
         resolved, options = request
         count = requested_processes(options.gpus, options.processes, options.device) or 1
-        if count > 1 and not ranks.together:
+        if count > 1 and not ranks.distributed:
             return launch(count, ("learn", *resolved), options.out, options.device)
         with print_once(ranks):
             return run(options, ranks)
@@ -94,7 +98,7 @@ def parse(arguments: Sequence[str]) -> LearnOptions:
     return options
 
 
-def run(options: LearnOptions, ranks: Ranks) -> int:
+def run(options: LearnOptions, ranks: ProcessGroup) -> int:
     """Learn as one of the processes that share the run, and return the exit code."""
     from npa_envs.agents.learning import Budget, train
     from npa_envs.agents.learning.problem import FIRST_EVALUATION_SEED

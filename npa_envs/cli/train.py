@@ -32,9 +32,14 @@ from npa_envs.training import (
     task_entry,
     train,
 )
-from npa_envs.training.checkpoint import check_task, drawn_by_world, load_checkpoint
-from npa_envs.training.process_launcher import launch, print_once, requested_processes
-from npa_envs.training.ranks import Ranks, joined_ranks
+from npa_envs.training.checkpoint import check_task, has_per_world_streams, load_checkpoint
+from npa_envs.training.process_group import ProcessGroup
+from npa_envs.training.process_launcher import (
+    joined_processes,
+    launch,
+    print_once,
+    requested_processes,
+)
 
 VIEWER = ("starlette", "uvicorn")
 """Packages that `npa-envs view` needs."""
@@ -304,7 +309,7 @@ def main(arguments: Sequence[str]) -> int:
         raise NPAError(f"train needs a task first: {', '.join(TASKS)}")
     task_name = arguments[0]
     task_entry(task_name)
-    with joined_ranks() as ranks:
+    with joined_processes() as ranks:
         request = None
         if ranks.first:
             resolved = resolve_task(task_name, arguments[1:])
@@ -314,7 +319,7 @@ def main(arguments: Sequence[str]) -> int:
         assert request is not None, "broadcast by the first process"
         resolved, options, config = request
         count = process_count(task_name, options, config)
-        if count > 1 and not ranks.together:
+        if count > 1 and not ranks.distributed:
             command = ["train", task_name, *resolved]
             if options.processes is None and options.gpus is None:
                 command += ["--processes", str(count)]
@@ -328,7 +333,7 @@ def run(
     options: TrainOptions,
     config: TrainConfig[Any],
     arguments: Sequence[str],
-    ranks: Ranks,
+    ranks: ProcessGroup,
 ) -> int:
     """Train as one of the processes that share the run, and return the exit code.
 
@@ -429,10 +434,12 @@ def process_count(task_name: str, options: TrainOptions, config: TrainConfig[Any
     idle = thread_count(config) < torch.get_num_threads() and dist.is_available()
     if not idle or seconds is None or seconds < 60.0:
         return 1
-    if options.resume and not drawn_by_world(load_checkpoint(RunFolder(config.out).checkpoint)):
+    if options.resume and not has_per_world_streams(
+        load_checkpoint(RunFolder(config.out).checkpoint)
+    ):
         return 1
     try:
-        Ranks(0, 2).check(config)
+        ProcessGroup(0, 2).check(config)
     except NPAError:
         return 1
     return 2

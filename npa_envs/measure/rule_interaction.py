@@ -122,15 +122,18 @@ def verdict(change: float, mixing: float, margin: float = MARGIN) -> str:
     return f"{word}, mixes" if mixing >= MIXED else word
 
 
-def ratio_interval(above: Tensor, below: Tensor) -> tuple[float, float]:
-    """Return the 95 % bootstrap interval, over worlds, of mean(above) / mean(below).
+def ratio_interval(numerators: Tensor, denominators: Tensor) -> tuple[float, float]:
+    """Return the 95 % bootstrap interval, over worlds, of mean(numerators) / mean(denominators).
 
-    `above` [B] may be infinite, `below` [B] is finite and not negative; the ratio to 0 is infinite.
+    Numerators [B] may be infinite. Denominators [B] are finite and not negative; a ratio to 0 is
+    infinite.
     """
-    count = len(above)
+    count = len(numerators)
     draws = np.random.default_rng(0).integers(count, size=(2000, count))
-    tops, bases = (values.double().cpu().numpy()[draws].mean(axis=1) for values in (above, below))
-    ratios = np.divide(tops, bases, out=np.full_like(tops, np.inf), where=bases > 0.0)
+    above, below = (
+        values.double().cpu().numpy()[draws].mean(axis=1) for values in (numerators, denominators)
+    )
+    ratios = np.divide(above, below, out=np.full_like(above, np.inf), where=below > 0.0)
     # Without interpolation, which between two infinite numbers is NaN.
     low, high = np.quantile(ratios, (0.025, 0.975), method="nearest")
     return float(low), float(high)

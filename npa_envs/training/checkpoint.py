@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import os
 import sys
 from collections.abc import Iterator, Mapping
@@ -23,38 +24,18 @@ CHECKPOINT_FORMAT = "npa-envs checkpoint"
 CHECKPOINT_VERSION = 1
 """Incremented when the content of checkpoints changes."""
 
-MAY_DIFFER = frozenset(
-    {
-        "out",
-        "repeats",
-        "log_interval",
-        "picture_interval",
-        "checkpoint_interval",
-        "tensorboard",
-        "cuda_graph",
-    }
-)
+MAY_DIFFER = {"out", "repeats", "tensorboard", "cuda_graph"}
+MAY_DIFFER |= {"log_interval", "picture_interval", "checkpoint_interval"}
 """Configuration fields that a resumed run may change."""
 
-NEEDED: dict[str, Any] = {
+READ_FIRST: dict[str, Any] = {
     "task_name": str,
     "config": dict,
-    "iteration": int,
-    "seconds": int | float,
     "rule_hyper_parameters": dict,
-    "rule": dict,
-    "optimiser": dict,
-    "pool": dict,
-    "meter": dict,
-    "random_states": dict,
+    "iteration": 0,
+    "seconds": 0.0,
 }
-"""Entries that a run is resumed from, and their types."""
-
-NOT_NEGATIVE = {
-    *("iteration", "seconds", "replaced", "count", "step_sum", "goal", "age"),
-    *("step", "exp_avg_sq"),  # AdamW's
-}
-"""Names of numbers and tensors in a checkpoint that must not be negative."""
+"""Entries that are needed before the run is built, as `check_content` takes them."""
 
 
 def save_checkpoint(path: Path, content: dict[str, Any]) -> None:
@@ -95,8 +76,8 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     return content
 
 
-def drawn_by_world(content: Mapping[str, Any]) -> bool:
-    """Return whether a checkpoint is of a run with random streams by world."""
+def has_per_world_streams(content: Mapping[str, Any]) -> bool:
+    """Return whether a checkpoint is of a run with random streams of each world."""
     states = content.get("random_states")
     return isinstance(states, dict) and states.keys() == {"schedule"}
 
@@ -114,18 +95,12 @@ def check_same_run(
     content: dict[str, Any], task_name: str, config: TrainConfig[Any], path: Path
 ) -> None:
     """Check that a checkpoint belongs to the run that is to be resumed."""
-    # The entries that are needed before the run is built.
-    needed = [(name, content.get(name), cls) for name, cls in NEEDED.items()]
-    if isinstance(content.get("config"), dict):
-        needed.append(("config.task", content["config"].get("task"), dict))
-    wrong = [name for name, value, cls in needed if not isinstance(value, cls)]
-    if not wrong and not _is_plain(content["config"]):
-        wrong = ["config"]
-    if wrong:
-        raise unusable_checkpoint(path, f"{', '.join(wrong)} is missing or of a wrong type")
-    check_content(content, {"iteration": 0, "seconds": 0.0}, path)
+    check_content(content, READ_FIRST, path)
     check_task(content, task_name, path)
-    theirs = _flat(content["config"])
+    try:
+        theirs = _flat(json.loads(json.dumps(content["config"])))
+    except (TypeError, ValueError, KeyError, AttributeError, RecursionError) as error:
+        raise unusable_checkpoint(path, f"config cannot be read ({shown(error)})") from error
     ours = _flat(config_to_dict(config))
     differences = [
         f"{name}: {shown(theirs.get(name, 'absent'))} there, {shown(ours.get(name, 'absent'))} here"
@@ -148,7 +123,11 @@ def check_same_run(
 
 
 def check_content(content: dict[str, Any], expected: Mapping[str, Any], path: Path) -> None:
-    """Check that a checkpoint has the keys, types and shapes of `expected`."""
+    """Check that a checkpoint has the keys, types and shapes of `expected`.
+
+    Numbers must be finite, those outside of tensors also not negative. `expected` may have types
+    in place of values.
+    """
     wrong = [
         what for name, like in expected.items() for what in _wrong(name, content.get(name), like)
     ]
@@ -167,7 +146,10 @@ def unusable_checkpoint(path: Path, reason: str) -> NPAError:
 
 def _wrong(name: str, value: Any, like: Any) -> Iterator[str]:
     """Yield a message for each difference of a value of a checkpoint from the expected `like`."""
-    if isinstance(like, Mapping):
+    if isinstance(like, type):
+        if not isinstance(value, like):
+            yield f"{name} must be a {like.__name__}"
+    elif isinstance(like, Mapping):
         if not isinstance(value, Mapping) or value.keys() != like.keys():
             names = ", ".join(map(str, like)) or "nothing"
             yield f"{name} must be a dict of {names}"
@@ -175,13 +157,10 @@ def _wrong(name: str, value: Any, like: Any) -> Iterator[str]:
         for key in like:
             yield from _wrong(f"{name}.{key}", value[key], like[key])
     elif isinstance(like, Tensor):
-        if not isinstance(value, Tensor) or _form_of(value) != _form_of(like):
-            got = f"of {_form_of(value)}" if isinstance(value, Tensor) else type(value).__name__
-            yield f"{name} must be a tensor of {_form_of(like)}, got {got}"
+        if _form_of(value) != _form_of(like):
+            yield f"{name} must be a {_form_of(like)}, got a {_form_of(value)}"
         elif not bool(torch.isfinite(value).all()):
             yield f"{name} must be finite"
-        elif name.rpartition(".")[2] in NOT_NEGATIVE and bool((value < 0).any()):
-            yield f"{name} must not be negative"
     elif isinstance(like, int | float):
         right = is_whole(value) if isinstance(like, int) else is_real(value)
         if not right or value < 0:
@@ -189,20 +168,12 @@ def _wrong(name: str, value: Any, like: Any) -> Iterator[str]:
             yield f"{name} must be a {rule} number of at least 0, got {str(value)[:40]}"
 
 
-def _form_of(tensor: Tensor) -> str:
-    usual = tensor.layout == torch.strided and not tensor.is_meta
-    return f"{'' if usual else 'odd '}{str(tensor.dtype)[6:]} {tuple(tensor.shape)}"
-
-
-def _is_plain(value: Any) -> bool:
-    """Return whether a value consists of JSON's types, as configurations in checkpoints do."""
-    if isinstance(value, dict):
-        return all(isinstance(key, str) and _is_plain(inner) for key, inner in value.items())
-    if isinstance(value, list):
-        return all(map(_is_plain, value))
-    return value is None or isinstance(value, str | int | float)
+def _form_of(value: Any) -> str:
+    if not isinstance(value, Tensor):
+        return type(value).__name__
+    return f"{str(value.dtype)[6:]} tensor of shape {tuple(value.shape)}"
 
 
 def _flat(config: dict[str, Any]) -> dict[str, Any]:
-    own = {name: value for name, value in config.items() if name != "task"}
-    return own | {f"task.{name}": value for name, value in config["task"].items()}
+    run = {name: value for name, value in config.items() if name != "task"}
+    return run | {f"task.{name}": value for name, value in config["task"].items()}

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -19,15 +18,22 @@ from npa_envs.errors import NPAError
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Task
 from npa_envs.tasks.train_config import TrainConfig
-from npa_envs.training.iteration import EagerIteration, GraphedIteration, LossMeter, Rollout
+from npa_envs.training.iteration import EagerIteration, GraphedIteration, Rollout
+from npa_envs.training.loss_statistics import LossStatistics
 from npa_envs.training.optimiser import RuleOptimiser
-from npa_envs.training.ranks import ALONE, Ranks, RunRandomness, registered, restart
+from npa_envs.training.process_group import (
+    ALONE,
+    ProcessGroup,
+    RunRandomness,
+    registered,
+    restart,
+)
 from npa_envs.world.cuda_graph import GraphedCallable
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness, WorldRandom, uniform_draws
 
-RUNAWAY_LIMIT = 10.0
-"""A world with a larger |x| or |s| is replaced by a seed."""
+LARGEST_VALUE = 10.0
+"""A world with a larger |x| or |s| has diverged and is replaced by a seed."""
 
 
 class WorldPool:
@@ -35,7 +41,7 @@ class WorldPool:
 
     Args:
         worlds: The W worlds of this process.
-        runaway_limit: A world with a larger |x| or |s|, or one that is not finite, is replaced.
+        largest_value: A world with a larger |x| or |s|, or one that is not finite, is replaced.
         max_age_range: Lifetimes of the first and the last world [steps]; those between are spaced
             geometrically. None: worlds have no lifetime.
         indices: Indices of these worlds among the `total` of all processes, int64, shape [W].
@@ -45,7 +51,7 @@ class WorldPool:
         self,
         worlds: Particles,
         *,
-        runaway_limit: float,
+        largest_value: float,
         max_age_range: tuple[int, int] | None = None,
         indices: Tensor | slice = slice(None),
         total: int | None = None,
@@ -62,7 +68,7 @@ class WorldPool:
             lo, hi = map(math.log, max_age_range)
             logarithms = torch.linspace(lo, hi, total or len(x), dtype=torch.float64)
             self.lifetime = logarithms[indices].exp().round().to(x.device, torch.int64)
-        self._runaway_limit = runaway_limit
+        self._largest_value = largest_value
 
     def tensors(self) -> dict[str, Tensor]:
         """Return the tensors of a checkpoint by name."""
@@ -86,7 +92,7 @@ class WorldPool:
         return first + keys.view(world_count, size).argmax(dim=1)
 
     def ages_of(self, index: Tensor) -> tuple[Tensor, Tensor]:
-        """Return worlds' ages, and whether they have reached their lifetimes, shape [B] each."""
+        """Return worlds' ages [steps], and whether their lifetimes are over, shape [B] each."""
         assert self.age is not None
         assert self.lifetime is not None
         age = self.age.index_select(0, index)
@@ -95,13 +101,13 @@ class WorldPool:
     def write(
         self, index: Tensor, worlds: Particles, fresh: Particles, age: Tensor | None = None
     ) -> Tensor:
-        """Store worlds and their ages, or `fresh` worlds where they are not finite or run away.
+        """Store worlds and their ages, or `fresh` worlds in place of those that have diverged.
 
-        Returns a bool for each world, True where it was replaced, shape [B].
+        Returns which worlds were replaced, bool, shape [B].
         """
-        farthest = torch.maximum(_largest(worlds.x), _largest(worlds.s))
-        # A comparison with NaN is false, so what is not finite is not kept either.
-        keep = farthest <= self._runaway_limit
+        largest = torch.maximum(_largest(worlds.x), _largest(worlds.s))
+        # A comparison with NaN is false, so worlds that are not finite are replaced too.
+        keep = largest <= self._largest_value
         self.worlds.put_(index, worlds.where(keep, fresh))
         if self.age is not None and age is not None:
             self.age.index_copy_(0, index, age.masked_fill(~keep, 0))
@@ -117,7 +123,8 @@ def _largest(worlds: Tensor) -> Tensor:
 class TrainingCycle:
     """One iteration of training, and all of its state but the rule.
 
-    `by_world`: each world has its own random streams, as runs of several processes need.
+    `per_world_streams`: as of `RunRandomness`. Each world of the batch then comes from its own
+    section of the pool.
     """
 
     def __init__(
@@ -129,35 +136,34 @@ class TrainingCycle:
         schedule: torch.Generator,
         rollout: Rollout | None = None,
         *,
-        ranks: Ranks = ALONE,
-        by_world: bool = False,
+        processes: ProcessGroup = ALONE,
+        per_world_streams: bool = False,
     ) -> None:
         self.task = task.for_rule(rule)
         _check_varied_eps(self.task, rule, config)
         self._config = config
-        self._ranks = ranks
-        whole_pool, whole_batch = config.pool_size, config.world_count
-        # By world, each world of the batch draws from its own section of the pool.
-        self._section = whole_pool // whole_batch if by_world else whole_pool
-        if by_world:
-            ranks.check(config)
-            self.random = RunRandomness.by_world(config, device, schedule, ranks)
-        else:
-            self.random = RunRandomness.of_batch(config, device, schedule)
-        pool_indices = ranks.indices(whole_pool, self._section)
-        batch_indices = ranks.indices(whole_batch)
+        self._processes = processes
+        self._per_world_streams = per_world_streams
+        self._section = config.pool_size
+        """Worlds in a section of the pool; without per-world streams there is one section."""
+        if per_world_streams:
+            processes.check(config)
+            self._section = config.pool_size // config.world_count
+        self.random = RunRandomness(
+            config, device, schedule, processes, per_world_streams=per_world_streams
+        )
+        pool_indices = processes.indices(config.pool_size, self._section)
+        batch_indices = processes.indices(config.world_count)
         self._pool_indices = pool_indices.to(device)
         self._batch_indices = batch_indices.to(device)
         seeds = self._seeds(len(pool_indices), self.random.pool)
         self.pool = WorldPool(
             seeds,
-            runaway_limit=RUNAWAY_LIMIT,
+            largest_value=LARGEST_VALUE,
             max_age_range=config.max_age_range if config.ages else None,
             indices=pool_indices,
-            total=whole_pool,
+            total=config.pool_size,
         )
-        # By world, seeds replace all worlds of the batch in turn, and so come into all sections.
-        self._turns = math.ceil(whole_batch / config.fresh_count) if by_world else 1
         count = len(batch_indices)
         batch = seeds.map(lambda value: value[:count])
         graphed = device.type == "cuda" and config.cuda_graph
@@ -169,10 +175,10 @@ class TrainingCycle:
             batch,
             self.random.masks,
             npa_envs.world.rollout.rollout if rollout is None else rollout,
-            mean_over_processes=None if ranks.count == 1 else ranks.mean,
+            take_means=None if processes.count == 1 else processes.reduce,
         )
         self.optimiser = RuleOptimiser(self.batch.parameters, config, rule)
-        self.meter = LossMeter(self.batch)
+        self.statistics = LossStatistics(self.batch)
         self._index = torch.zeros(count, dtype=torch.int64, device=device)
         self._age = torch.zeros_like(self._index)
         self._steps = torch.zeros_like(self._index[0])
@@ -186,55 +192,62 @@ class TrainingCycle:
     def run(self, iteration: int, share: float = 0.0) -> int:
         """Train for one iteration, and return the number of steps of its rollout.
 
-        share: The least fraction of the schedule "cosine" that is over.
+        share: Lower bound on the schedule's progress, in [0, 1].
         """
-        config, batch = self._config, self.batch
-        lo, hi = config.steps
+        batch = self.batch
+        lo, hi = self._config.steps
         steps = int(torch.randint(lo, hi, (), generator=self.random.schedule))
         self.task.begin(iteration)
         self._draw()
-        if not config.ages and iteration % config.seed_interval == 0:
-            turn = iteration // config.seed_interval % self._turns
-            offset = self._batch_indices - turn * config.fresh_count
-            is_fresh = offset % config.world_count < config.fresh_count
+        is_fresh = self._seeded_worlds(iteration)
+        if is_fresh is not None:
             batch.start.copy_(self._fresh_worlds.where(is_fresh, batch.start))
         batch.run(steps)
-        self.meter.begin(iteration + 1, steps)
+        self.statistics.begin(iteration + 1, steps)
         self._steps.fill_(steps)
         self._keep()
         # Not inside a graph: torch watches NCCL only there for processes that do not answer.
-        self._ranks.reduce([*batch.gradients, batch.terms], self._replaced)
+        self._processes.reduce([*batch.gradients, batch.terms], self._replaced)
         self._record()
         self.optimiser.step(iteration, share)
         return steps
 
+    def _seeded_worlds(self, iteration: int) -> Tensor | None:
+        """Return which worlds of the batch start as fresh seeds, bool, shape [B]; None: none.
+
+        Every `seed_interval` iterations there are `fresh_count` of them: the first of the batch.
+        With per-world streams each world of the batch stays in its own section of the pool. Then
+        the seeds are the first `fresh_count` worlds, the next time the next `fresh_count`, and so
+        on, so that seeds come into all sections.
+        """
+        config = self._config
+        if config.ages or iteration % config.seed_interval != 0:
+            return None
+        first = 0
+        if self._per_world_streams:
+            groups = math.ceil(config.world_count / config.fresh_count)
+            first = iteration // config.seed_interval % groups * config.fresh_count
+        return (self._batch_indices - first) % config.world_count < config.fresh_count
+
     def state_dict(self) -> dict[str, Any]:
         """Return the state for a checkpoint without the rule, on rank 0 of all processes."""
-        collected = self._ranks.collected
-        return self._state(self.optimiser.state_dict(), lambda part: collected(part, self._section))
-
-    def state_like(self, iteration: int) -> dict[str, Any]:
-        """Return a dict with the keys, shapes and types of `state_dict` after `iteration`."""
-        moments = self.optimiser.moments_like() if iteration > 0 else {}
-        size = self._config.pool_size
-        return self._state({"state": moments}, lambda part: part[:1].expand(size, *part.shape[1:]))
-
-    def _state(
-        self, optimiser: dict[str, Any], pooled: Callable[[Tensor], Tensor]
-    ) -> dict[str, Any]:
+        pool = {
+            name: self._processes.gathered(local, self._section)
+            for name, local in self.pool.tensors().items()
+        }
         return {
-            "optimiser": optimiser,
-            "pool": {name: pooled(part) for name, part in self.pool.tensors().items()},
-            "meter": self.meter.state_dict(),
+            "optimiser": self.optimiser.state_dict(),
+            "pool": pool,
+            "meter": self.statistics.state_dict(),
             "random_states": self.random.state_dict(),
         }
 
     def load_state_dict(self, state: dict[str, Any], iteration: int) -> None:
         """Restore what `state_dict` returned after `iteration`; to be called before `run`."""
         self.optimiser.load_state_dict(state["optimiser"])
-        for name, part in self.pool.tensors().items():
-            part.copy_(self._ranks.local(state["pool"][name], self._section))
-        self.meter.load_state_dict(state["meter"])
+        for name, local in self.pool.tensors().items():
+            local.copy_(self._processes.local(state["pool"][name], self._section))
+        self.statistics.load_state_dict(state["meter"])
         self.random.load_state_dict(state["random_states"], iteration)
 
     @torch.no_grad()
@@ -252,8 +265,8 @@ class TrainingCycle:
             self.batch.grown.copy_((self._age >= config.stillness_min_age) & ~damaged)
             if config.damage_and_keep_share > 0.0:
                 chance = uniform_draws(worlds, (len(expired), 1), start.x)[:, 0]
-                kept = expired & (chance < config.damage_and_keep_share)
-                expired, damaged = expired & ~kept, damaged | kept
+                renewed = expired & (chance < config.damage_and_keep_share)
+                expired, damaged = expired & ~renewed, damaged | renewed
         if config.damages:
             after = self.task.damage(start, worlds)
             start = after if config.damage_share == 1.0 else after.where(damaged, start)
@@ -272,8 +285,8 @@ class TrainingCycle:
 
     @torch.no_grad()
     def _record_iteration(self) -> None:
-        """Add the losses of all processes to the meter, and prepare the gradients."""
-        self.meter.observe(self._replaced)
+        """Add the losses of all processes to the statistics, and prepare the gradients."""
+        self.statistics.add(self._replaced)
         self._replaced.zero_()
         self.optimiser.prepare_gradients()
 
@@ -293,13 +306,13 @@ def _check_varied_eps(task: Task, rule: NPARule, config: TrainConfig[Any]) -> No
         return
     if not isinstance(rule, NPARule):
         raise NPAError("vary_eps is for runs of one rule, got several: leave it out")
-    if task.box is not None or rule.static:
-        raise NPAError(
-            "vary_eps needs particles that move in open space, got a task in a box or whose "
-            "particles stay: leave it out"
-        )
-    if rule.divides:
-        raise NPAError(
-            "vary_eps needs seeds of more than one particle, whose size it varies, got a rule that "
-            "divides: leave it out"
-        )
+    reasons = {
+        "a periodic box": task.box is not None,
+        "particles that stay": rule.static,
+        "a rule that divides, whose seeds are single particles": rule.divides,
+    }
+    for reason, applies in reasons.items():
+        if applies:
+            raise NPAError(
+                f"vary_eps needs particles that move in open space, got {reason}: leave it out"
+            )

@@ -74,60 +74,57 @@ class RuleOptimiser:
     def step(self, iteration: int, share: float = 0.0) -> None:
         """Take a step along the prepared gradients; a new repeat begins with zero moments.
 
-        share: The least fraction of the schedule "cosine" that is over.
+        share: Lower bound on the schedule's progress, in [0, 1].
         """
         if iteration > 0 and iteration % self._config.iterations == 0:
             self._optimisers = self._fresh(self._parameters)
         rate = self._config.learning_rate_at(iteration, share)
-        for optimiser, _ in self._optimisers:
+        for optimiser in self._optimisers:
             for group in optimiser.param_groups:
                 group["lr"] = rate * group.get("rate_factor", 1.0)
             optimiser.step()
 
     def state_dict(self) -> dict[str, Any]:
         """Return moments and step counts by the index of a parameter, for a checkpoint."""
-        return {"state": _moments(self._optimisers)}
-
-    def moments_like(self) -> dict[int, dict[str, Tensor]]:
-        """Return moments and step counts after one step with zero gradients, by parameter."""
-        copies = [nn.Parameter(torch.zeros_like(p)) for p in self._parameters]
-        optimisers = self._fresh(copies)
-        for parameter in copies:
-            parameter.grad = torch.zeros_like(parameter)
-        for optimiser, _ in optimisers:
-            optimiser.step()
-        return _moments(optimisers)
+        indices = self._indices()
+        states = [item for optimiser in self._optimisers for item in optimiser.state.items()]
+        return {"state": {indices[id(parameter)]: state for parameter, state in states}}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore what `state_dict` returned."""
-        moments = state["state"]
-        for optimiser, indices in self._optimisers:
-            own = {at: moments[index] for at, index in enumerate(indices) if index in moments}
-            load_moments(optimiser, own)
+        moments, indices = state["state"], self._indices()
+        for optimiser in self._optimisers:
+            own = [indices[id(p)] for group in optimiser.param_groups for p in group["params"]]
+            load_moments(optimiser, {k: moments[i] for k, i in enumerate(own) if i in moments})
 
-    def _fresh(self, parameters: list[nn.Parameter]) -> list[tuple[Optimizer, list[int]]]:
-        """Return new optimisers, each with the indices of its parameters."""
+    def _indices(self) -> dict[int, int]:
+        """Return the index of each parameter by its `id`."""
+        return {id(parameter): index for index, parameter in enumerate(self._parameters)}
+
+    def _fresh(self, parameters: list[nn.Parameter]) -> list[Optimizer]:
+        """Return new optimisers, whose moments are zero."""
         decay = self._config.weight_decay
-        optimisers: list[tuple[Optimizer, list[int]]] = []
-        indices = [index for index, orthogonal in enumerate(self._orthogonal) if orthogonal]
-        if indices:
+        optimisers: list[Optimizer] = []
+        orthogonal = list(itertools.compress(parameters, self._orthogonal))
+        if orthogonal:
             # Steps of AdamW's length, so that one learning rate serves both.
-            muon = torch.optim.Muon(
-                [parameters[index] for index in indices],
-                weight_decay=decay,
-                momentum=MUON_MOMENTUM,
-                adjust_lr_fn="match_rms_adamw",
+            optimisers.append(
+                torch.optim.Muon(
+                    orthogonal,
+                    weight_decay=decay,
+                    momentum=MUON_MOMENTUM,
+                    adjust_lr_fn="match_rms_adamw",
+                )
             )
-            optimisers.append((muon, indices))
-        indices = [index for index, orthogonal in enumerate(self._orthogonal) if not orthogonal]
+        indices = [index for index, flag in enumerate(self._orthogonal) if not flag]
         if indices:
             groups = [
                 {"rate_factor": factor, "params": [parameters[index] for index in group]}
                 for factor, group in itertools.groupby(indices, self._rate_factors.__getitem__)
             ]
             # One kernel for all parameters; a loop is as fast on a CPU.
-            adamw = torch.optim.AdamW(groups, weight_decay=decay, fused=parameters[0].is_cuda)
-            optimisers.append((adamw, indices))
+            fused = parameters[0].is_cuda
+            optimisers.append(torch.optim.AdamW(groups, weight_decay=decay, fused=fused))
         return optimisers
 
 
@@ -135,12 +132,3 @@ def load_moments(optimiser: Optimizer, state: dict[int, Any]) -> None:
     """Load an optimiser's state without its parameter groups, which stay as they are."""
     groups = optimiser.state_dict()["param_groups"]
     optimiser.load_state_dict({"state": state, "param_groups": groups})
-
-
-def _moments(optimisers: list[tuple[Optimizer, list[int]]]) -> dict[int, dict[str, Tensor]]:
-    """Return the states of all parameters, by index."""
-    return {
-        indices[at]: state
-        for optimiser, indices in optimisers
-        for at, state in optimiser.state_dict()["state"].items()
-    }

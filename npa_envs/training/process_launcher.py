@@ -1,22 +1,24 @@
-"""Runs one command in several processes on this machine, by torchrun's launcher."""
+"""Starts, joins and watches the processes of a run, by torchrun's launcher."""
 
 from __future__ import annotations
 
 import contextlib
+import gc
 import logging
 import os
 import signal
 import sys
+import threading
 import uuid
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 import torch.distributed as dist
 
 from npa_envs.errors import LostProcessError, NPAError, shown
-from npa_envs.training.ranks import Ranks
+from npa_envs.training.process_group import ProcessGroup
 from npa_envs.training.run_folder import RunFolder
 
 if TYPE_CHECKING:
@@ -34,10 +36,6 @@ def launch(count: int, arguments: Sequence[str], out: Path, device: str) -> int:
         raise NPAError(
             f"processes must be at most the {device_count} CUDA devices that torch sees, got "
             f"{count}: take fewer, or --device cpu"
-        )
-    if not dist.is_available():
-        raise NPAError(
-            f"processes must be 1 with a torch that has no torch.distributed, got {count}"
         )
     # These imports are slow, and only runs of several processes need them.
     from torch.distributed.elastic.multiprocessing.api import SignalException
@@ -108,16 +106,16 @@ def requested_processes(gpus: int | None, processes: int | None, device: str) ->
 
 
 @contextlib.contextmanager
-def print_once(ranks: Ranks) -> Iterator[None]:
-    """Print an error on the first rank; pass those of others to the launcher."""
+def print_once(processes: ProcessGroup) -> Iterator[None]:
+    """Print an error on the first process; pass those of others to the launcher."""
     try:
         yield
     except NPAError as error:
-        if ranks.together and not isinstance(error, LostProcessError):
+        if processes.distributed and not isinstance(error, LostProcessError):
             from torch.distributed.elastic.multiprocessing.errors import get_error_handler
 
             get_error_handler().record_exception(error)
-        if not ranks.first:
+        if not processes.first:
             raise SystemExit(2) from error
         raise
 
@@ -127,3 +125,123 @@ def _message_of(failure: ProcessFailure) -> str:
     content = failure.error_file_data["message"]
     # Torch writes the error's class before it.
     return str(content["message"]).partition(": ")[2] if isinstance(content, dict) else ""
+
+
+@contextlib.contextmanager
+def joined_processes() -> Iterator[ProcessGroup]:
+    """Join the other processes that torchrun has started, within the block.
+
+    Each process sees one CUDA device, by its local rank; call this before anything uses CUDA.
+    Within the block, a process that is lost ends all others (see `Heartbeat`), so the process that
+    hosts the store must leave last. Without torchrun there is a single process.
+    """
+    if not dist.is_available() or not dist.is_torchelastic_launched():
+        yield ProcessGroup()
+        return
+    # CUDA builds of torch have NCCL, but it fails on machines without a GPU. device_count asks
+    # NVML, which does not initialise CUDA.
+    has_gpus = torch.cuda.device_count() >= int(os.environ["LOCAL_WORLD_SIZE"])
+    backend = "cpu:gloo,cuda:nccl" if dist.is_nccl_available() and has_gpus else "gloo"
+    if torch.cuda.device_count() > 0:
+        rank, visible = int(os.environ["LOCAL_RANK"]), os.environ.get("CUDA_VISIBLE_DEVICES")
+        devices = [str(rank)] if visible is None else visible.split(",")[rank : rank + 1]
+        os.environ["CUDA_VISIBLE_DEVICES"] = ",".join(devices)
+    try:
+        dist.init_process_group(backend)
+        processes = ProcessGroup.current()
+        heartbeat = None
+        if processes.count > 1:
+            # A separate connection: that of the group blocks while the group waits.
+            address, port = os.environ["MASTER_ADDR"], int(os.environ["MASTER_PORT"])
+            store = dist.TCPStore(address, port, wait_for_workers=False)  # type: ignore[attr-defined]
+            # Torchrun may keep the store when it restarts processes.
+            prefix = processes.broadcast(uuid.uuid4().hex)
+            store = dist.PrefixStore(prefix, store)  # type: ignore[attr-defined]
+            heartbeat = Heartbeat(store, processes.rank, processes.count)
+    except (RuntimeError, ValueError) as error:
+        raise NPAError(
+            f"the processes that torchrun starts must reach each other, but this one cannot "
+            f"({shown(error)}): see its options --rdzv-endpoint and --master-addr"
+        ) from error
+    finished = False
+    try:
+        yield processes
+        finished = True
+    finally:
+        if heartbeat is not None:
+            heartbeat.end(finished=finished)
+    # Not after an error: others may be gone. Recorded graphs keep references to the group.
+    gc.collect()
+    dist.destroy_process_group()
+
+
+BEAT_SECONDS = 5.0
+"""Time between two heartbeats [s]."""
+
+SILENT_BEATS = 8
+"""Number of missed heartbeats after which a process is lost."""
+
+LOST_CODE = 2
+"""Exit code of a process that has lost another one, that of errors on the command line."""
+
+_FINISHED = -(2**62)
+
+
+class Heartbeat:
+    """Ends this process, with a message, when another one sends no heartbeats.
+
+    Collectives would wait up to NCCL's timeout of 10 minutes for a process that was stopped or
+    whose machine is gone. Time is counted in this process's own heartbeats, so that a process that
+    was suspended does not blame others. Threads send heartbeats while a process waits or computes.
+    """
+
+    def __init__(self, store: Any, rank: int, count: int) -> None:
+        self._store, self._rank = store, rank
+        self._beats = [0] * count
+        self._ended = threading.Event()
+        self._finished = False
+        # Two threads, as a store that does not answer blocks the one that reads it.
+        self._threads = [
+            threading.Thread(target=task, daemon=True) for task in (self._beat, self._watch)
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    def end(self, *, finished: bool) -> None:
+        """Stop watching; with `finished`, let the others go on without this process."""
+        self._finished = finished
+        self._ended.set()
+        for thread in self._threads:
+            thread.join(BEAT_SECONDS)
+
+    def _beat(self) -> None:
+        # Without its store, all processes that have not left seem silent.
+        with contextlib.suppress(RuntimeError):
+            while not self._ended.is_set():
+                for other in range(len(self._beats)):
+                    self._beats[other] = self._store.add(str(other), int(other == self._rank))
+                self._ended.wait(BEAT_SECONDS)
+            if self._finished:
+                self._store.add(str(self._rank), _FINISHED)
+
+    def _watch(self) -> None:
+        count = len(self._beats)
+        last, silent = self._beats.copy(), [0] * count
+        while not self._ended.wait(BEAT_SECONDS):
+            beats = self._beats.copy()
+            for other in range(count):
+                alive = other == self._rank or beats[other] != last[other] or beats[other] < 0
+                silent[other] = 0 if alive else silent[other] + 1
+            last = beats
+            lost = [str(other) for other in range(count) if silent[other] >= SILENT_BEATS]
+            if lost:
+                print(
+                    f"npa-envs: error: process {self._rank} of {count} has heard nothing from "
+                    f"process {', '.join(lost)} for {SILENT_BEATS * BEAT_SECONDS:.0f} s, "
+                    "which was killed or stopped, or cannot be reached: the last checkpoint is "
+                    "intact; resume it",
+                    file=sys.stderr,
+                    flush=True,
+                )
+                # The main thread may block in a collective for ever.
+                os._exit(LOST_CODE)

@@ -1,4 +1,4 @@
-"""Training runs in a folder: files, lock, checkpoints, log, and a clean stop on signals."""
+"""Training runs in a folder: files, lock, checkpoints, log and pictures; clean stop on signals."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ from npa_envs.atomic_files import (
     write_text,
 )
 from npa_envs.checks import is_real, is_whole
-from npa_envs.errors import MissingDependencyError, NPAError, shown
+from npa_envs.errors import NPAError, shown
 from npa_envs.render.colours import to_uint8
 from npa_envs.render.picture_files import encode_frame
 from npa_envs.training.checkpoint import load_checkpoint, save_checkpoint
-from npa_envs.training.ranks import Ranks
+from npa_envs.training.process_group import ProcessGroup
 
 try:
     import fcntl
@@ -42,9 +42,6 @@ except ImportError:  # Windows
 ONE_REQUEST = 1.0
 """Signals within this time are one request to stop [s]: a scheduler may signal both a run and its
 launcher, which forwards it."""
-
-Check = Callable[[dict[str, Any], Path], None]
-"""Raises NPAError if a checkpoint, given with its path, is of another run."""
 
 
 def check_choice(*, resume: bool, overwrite: bool) -> None:
@@ -57,12 +54,12 @@ def check_choice(*, resume: bool, overwrite: bool) -> None:
 
 
 class Run:
-    """A run of any learner; rank 0 reads and writes its files.
+    """A run of any learner, whose first process reads and writes its files.
 
     Args:
         folder: Its files; None: nothing is written, and no signal stops it.
-        ranks: Its processes.
-        check: Checks the checkpoint of a resumed run.
+        processes: Its processes.
+        check: Raises NPAError if a checkpoint, given with its path, is of another run.
         resume: Continue from the checkpoint in the folder.
         overwrite: Remove the files of an earlier run in the folder.
 
@@ -74,27 +71,46 @@ class Run:
     def __init__(
         self,
         folder: RunFolder | None,
-        ranks: Ranks,
-        check: Check,
+        processes: ProcessGroup,
+        check: Callable[[dict[str, Any], Path], None],
         *,
         resume: bool = False,
         overwrite: bool = False,
     ) -> None:
         self.folder = folder
         self.iteration = 0
-        self._ranks = ranks
+        self._processes = processes
         self._overwrite = overwrite
         content = None
-        if folder is not None and ranks.first:
+        if folder is not None and processes.first:
             check_choice(resume=resume, overwrite=overwrite)
-            content = self._opened(folder, check, resume)
-        self.content: dict[str, Any] | None = ranks.broadcast(content)
-        """The checkpoint of a resumed run; set it to None after reading, to free its memory."""
+            folder.note_checkpoint()
+            path = folder.checkpoint
+            exists = path.exists()
+            if exists:
+                # Raises if another run is active in the folder, before anything is created.
+                with folder.locked():
+                    pass
+            if resume:
+                content = load_checkpoint(path)
+                check(content, path)
+            elif exists and not overwrite:
+                raise NPAError(
+                    f"out must be a folder without a run, but {shown(str(folder.path))} holds one: "
+                    "resume it (--resume), choose another folder (--out), or overwrite it "
+                    "(--overwrite)"
+                )
+        self._content: dict[str, Any] | None = processes.broadcast(content)
+
+    def take_content(self) -> dict[str, Any] | None:
+        """Return the checkpoint of a resumed run once; its memory is then the caller's to free."""
+        content, self._content = self._content, None
+        return content
 
     @contextlib.contextmanager
-    def held(self, *, begin: bool = False) -> Iterator[None]:
+    def locked(self, *, begin: bool = False) -> Iterator[None]:
         """Lock the folder inside; with `begin`, remove unfinished and overwritten files."""
-        folder = self.folder if self._ranks.first else None
+        folder = self.folder if self._processes.first else None
         with contextlib.nullcontext() if folder is None else folder.locked():
             if begin and folder is not None:
                 folder.tidy()
@@ -102,7 +118,7 @@ class Run:
                     folder.clear()
             yield
 
-    def go(
+    def repeat(
         self,
         step: Callable[[], None],
         *,
@@ -123,46 +139,25 @@ class Run:
         Returns:
             Whether a signal came.
         """
+        requests: contextlib.AbstractContextManager[threading.Event]
+        requests = stop_flag(patient=self._processes.distributed)
         if self.folder is None:
-            begin()
-            while not over():
-                step()
-            end(False)
-            return False
-        with stop_flag(patient=self._ranks.together) as stop:
+            requests = contextlib.nullcontext(threading.Event())
+        with requests as stop:
             begin()
             stopped = False
             while not stopped and not over():
-                requested = stop.is_set() or late()
-                stopped = self._ranks.agree_to_stop(requested, self.iteration)
+                stopped = self._processes.agree_to_stop(stop.is_set() or late())
                 if not stopped:
                     step()
             end(stopped)
-            return self._ranks.any(stop.is_set())
+            return self._processes.any(stop.is_set())
 
-    def keep(self, content: dict[str, Any]) -> None:
+    def write_checkpoint(self, content: dict[str, Any]) -> None:
         """Write the checkpoint; to be called on rank 0."""
         assert self.folder is not None, "the run has a folder"
         save_checkpoint(self.folder.checkpoint, content)
         self.folder.note_checkpoint()
-
-    def _opened(self, folder: RunFolder, check: Check, resume: bool) -> dict[str, Any] | None:
-        folder.note_checkpoint()
-        path = folder.checkpoint
-        if path.exists():
-            # Raises if another run is active in the folder, before anything is created.
-            with folder.locked():
-                pass
-        if resume:
-            content = load_checkpoint(path)
-            check(content, path)
-            return content
-        if path.exists() and not self._overwrite:
-            raise NPAError(
-                f"out must be a folder without a run, but {shown(str(folder.path))} holds one: "
-                "resume it (--resume), choose another folder (--out), or overwrite it (--overwrite)"
-            )
-        return None
 
 
 @contextlib.contextmanager
@@ -344,22 +339,12 @@ class JsonlLog:
         self.path = path
 
     def append(self, record: dict[str, Any]) -> None:
-        """Write a line without a buffer, so that a kill right after it does not lose it.
-
-        If that fails, the file is truncated to its former size.
-        """
+        """Write a line without a buffer, so that a kill right after it does not lose it."""
         line = (json.dumps(record, allow_nan=False) + "\n").encode()
         try:
-            # Without a buffer, which would be written again when the file closes.
             with self.path.open("ab", buffering=0) as file:
-                size = file.tell()
-                try:
-                    while line:
-                        line = line[file.write(line) :]
-                except OSError:
-                    with contextlib.suppress(OSError):
-                        file.truncate(size)
-                    raise
+                while line:
+                    line = line[file.write(line) :]
         except OSError as error:
             raise NPAError(
                 f"cannot write the log {str(self.path)!r} ({error.strerror or error}): free disk "
@@ -407,28 +392,6 @@ def _parsed_record(line: str) -> dict[str, Any] | None:
     return record if sound else None
 
 
-def open_tensorboard(folder: RunFolder, iteration: int) -> Any:
-    """Return a TensorBoard writer that hides events of an earlier process after `iteration`."""
-    # TensorBoard imports TensorFlow if it is installed; this silences it.
-    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError as error:
-        raise MissingDependencyError(
-            "tensorboard=True needs TensorBoard: pip install tensorboard, "
-            "or train with tensorboard=False (the JSONL log has the same numbers)"
-        ) from error
-    try:
-        return SummaryWriter(
-            str(folder.tensorboard), purge_step=iteration + 1 if iteration else None
-        )
-    except OSError as error:
-        raise NPAError(
-            f"cannot write to {str(folder.tensorboard)!r} ({error}): change its permissions or "
-            "train with tensorboard=False"
-        ) from error
-
-
 PICTURE_HEIGHT = 256
 """Least height of the pictures [pixels]; pixels of smaller ones are repeated."""
 
@@ -436,26 +399,62 @@ PICTURE_GAP = 8
 """Pixels between the worlds of a picture."""
 
 
-def write_batch_picture(path: Path, picture: Tensor, board: Any, iteration: int) -> None:
-    """Write target and worlds of a batch side by side as a PNG, and as a JPEG to TensorBoard."""
-    repeats = math.ceil(PICTURE_HEIGHT / picture.shape[1])
-    frames = to_uint8(picture).repeat(repeats, axis=1).repeat(repeats, axis=2)
-    frames = np.pad(frames, ((0, 0), (0, 0), (0, PICTURE_GAP), (0, 0)), constant_values=255)
-    frame = np.concatenate(list(frames), axis=1)[:, :-PICTURE_GAP]
-    write_bytes(path, encode_frame(frame, "PNG"))
-    if board is None:
-        return
-    # Imported here: only runs with TensorBoard need it.
-    from tensorboard.compat.proto.summary_pb2 import Summary
+class RunLog:
+    """The log lines and pictures of a run: in its folder, and for TensorBoard while opened."""
 
-    # The writer's add_image makes a PNG, whose checksum TensorBoard computes in Python, byte by
-    # byte, which takes longer than all the rest.
-    height, width, channels = frame.shape
-    image = Summary.Image(
-        height=height,
-        width=width,
-        colorspace=channels,
-        encoded_image_string=encode_frame(frame, "JPEG"),
-    )
-    summary = Summary(value=[Summary.Value(tag="batch", image=image)])
-    board.file_writer.add_summary(summary, iteration)
+    def __init__(self, folder: RunFolder) -> None:
+        self._folder = folder
+        self.lines = JsonlLog(folder.log)
+        self._board: Any = None
+
+    @contextlib.contextmanager
+    def opened(self, tensorboard: bool, iteration: int) -> Iterator[None]:
+        """Within the block, also write to TensorBoard, if `tensorboard`.
+
+        Events of an earlier process after `iteration` are hidden.
+        """
+        if tensorboard:
+            # TensorBoard imports TensorFlow if it is installed; this silences it.
+            os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+            from torch.utils.tensorboard import SummaryWriter
+
+            purge_step = iteration + 1 if iteration else None
+            self._board = SummaryWriter(str(self._folder.tensorboard), purge_step=purge_step)
+        try:
+            yield
+        finally:
+            if self._board is not None:
+                self._board.close()
+                self._board = None
+
+    def add(self, record: dict[str, Any]) -> None:
+        """Add a line of numbers, with its `iteration`."""
+        self.lines.append(record)
+        if self._board is not None:
+            for name, value in record.items():
+                if name != "iteration":
+                    self._board.add_scalar(name, value, record["iteration"])
+
+    def add_picture(self, picture: Tensor, iteration: int) -> None:
+        """Add target and worlds of a batch side by side: a PNG file, for TensorBoard a JPEG."""
+        repeats = math.ceil(PICTURE_HEIGHT / picture.shape[1])
+        frames = to_uint8(picture).repeat(repeats, axis=1).repeat(repeats, axis=2)
+        frames = np.pad(frames, ((0, 0), (0, 0), (0, PICTURE_GAP), (0, 0)), constant_values=255)
+        frame = np.concatenate(list(frames), axis=1)[:, :-PICTURE_GAP]
+        write_bytes(self._folder.picture(iteration), encode_frame(frame, "PNG"))
+        if self._board is None:
+            return
+        # Imported here: only runs with TensorBoard need it.
+        from tensorboard.compat.proto.summary_pb2 import Summary
+
+        # The writer's add_image makes a PNG, whose checksum TensorBoard computes in Python, byte by
+        # byte, which takes longer than all the rest.
+        height, width, channels = frame.shape
+        image = Summary.Image(
+            height=height,
+            width=width,
+            colorspace=channels,
+            encoded_image_string=encode_frame(frame, "JPEG"),
+        )
+        summary = Summary(value=[Summary.Value(tag="batch", image=image)])
+        self._board.file_writer.add_summary(summary, iteration)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -57,27 +58,23 @@ def task_of_rule(
     Raises:
         NPAError: The rule does not fit the task, or a field is wrong.
     """
-    path = rule_file(source)
-    metadata = rule_metadata(path) if path.suffix == ".safetensors" else {}
+    path, metadata = _file_of(source)
     task_name = metadata.get("task", "morphogenesis2d")
     entry = task_entry(task_name)
-    still = task_name == "point_classification"
-    if rule.space_dim != entry.space_dim or rule.static != still:
+    if rule.space_dim != entry.space_dim or rule.static != entry.static:
         raise NPAError(
-            f"the command line runs {'static' if still else 'moving'} rules in the "
+            f"the command line runs {'static' if entry.static else 'moving'} rules in the "
             f"{entry.space_dim}D worlds of {task_name}, got space_dim={rule.space_dim}, "
             f"static={rule.static}: run this one in Python with npa_envs.rollout"
         )
-    own: dict[str, Any] = {
-        "state_dim": rule.state_dim - rule.code_dim,
-        "hidden_dim": rule.hidden_dim,
-    }
-    own |= {"eps": rule.eps0} | ({} if rule.static else {"alpha": rule.alpha})
     known = "config" in metadata
-    if not known:
-        config = override(preset("paper", task_name, **own), **_world_of(path, metadata))
-    else:
+    if known:
         config = trained_config(path, metadata)
+    else:
+        sizes = {"state_dim": rule.state_dim - rule.code_dim, "hidden_dim": rule.hidden_dim}
+        physics = {"eps": rule.eps0} | ({} if rule.static else {"alpha": rule.alpha})
+        config = preset("paper", task_name, **sizes, **physics)
+        config = override(config, **_world_of(path, metadata))
     config = override(config, **{k: v for k, v in fields.items() if v is not None})
     if particle_count is not None:
         config = override(config, task=config.task.with_particle_count(particle_count))
@@ -89,20 +86,24 @@ def task_of_rule(
         config = override(config, targets=(), target=named)
     doubt = None if known or chosen else "its file does not say what it grows"
     try:
-        task = entry.make(config.task, device).held_out()
-        return TrainedTask(task.for_rule(rule), doubt, task_name)
+        task = entry.make(config.task, device).held_out().for_rule(rule)
     except NPAError as error:
         if chosen or not entry.targets():
             raise
-        stand_in = override(config, target=entry.targets()[0])
-        task = entry.make(stand_in.task, device)
-        if rule.codes is not None:
-            target = cast(Morphogenesis2D, task).target
-            task = Morphogenesis2D(
-                stand_in.task, target=replace(target, name=rule.codes.names[0]), device=device
-            )
         doubt = f"its target cannot be loaded: {error}"
-        return TrainedTask(task.for_rule(rule), doubt, task_name)
+        config = override(config, target=entry.targets()[0])
+        task = entry.make(config.task, device)
+        if rule.codes is not None:
+            target = replace(cast(Morphogenesis2D, task).target, name=rule.codes.names[0])
+            task = Morphogenesis2D(config.task, target=target, device=device)
+        task = task.for_rule(rule)
+    return TrainedTask(task, doubt, task_name)
+
+
+def _file_of(source: str) -> tuple[Path, Mapping[str, str]]:
+    """Return the path and the metadata of a rule's file."""
+    path = rule_file(source)
+    return path, rule_metadata(path) if path.suffix == ".safetensors" else {}
 
 
 def task_for_film(
@@ -147,10 +148,9 @@ def tasks_of_codes(
 
 def _world_of(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
     """Return configuration fields of the world in which a search found a rule."""
-    try:
+    fields = None
+    with contextlib.suppress(NPAError):
         fields = parse_json(metadata.get("world", "{}"))
-    except NPAError:
-        fields = None
     if not isinstance(fields, dict):
         raise NPAError(
             f"the metadata's world of {str(path)!r} must be a JSON object, got "
@@ -163,8 +163,7 @@ def _world_of(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
 
 def sources_of_codes(source: str, codes: Codes) -> dict[str, str]:
     """Return the source of each code's picture: name -> argument of `load_target`."""
-    path = rule_file(source)
-    metadata = rule_metadata(path) if path.suffix == ".safetensors" else {}
+    path, metadata = _file_of(source)
     targets = trained_config(path, metadata).task.targets if "config" in metadata else ()
     sources = _named(targets)
     return {name: sources.get(name, name) for name in codes.names}

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 import torch
 
 from npa_envs.atomic_files import checked_path, parse_json, read_bytes
-from npa_envs.errors import MissingDependencyError, NPAError, shown, suggest
+from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.tasks.base import Task
 from npa_envs.tasks.co_morphogenesis2d import CO_MORPHOGENESIS2D_PRESETS, CoMorphogenesis2D
 from npa_envs.tasks.many_pictures import ManyPictures
@@ -49,6 +49,8 @@ class TaskEntry:
     """Duration with two processes as a fraction of that with one, for small batches."""
     space_dim: int = 2
     """Space dimension D of its worlds."""
+    static: bool = False
+    """Whether particles never move."""
     joint: bool = False
     """Whether several rules are trained, one for each species, by `train_together`."""
 
@@ -64,7 +66,7 @@ class TaskEntry:
 
 def _particle_steps(config: TrainConfig[Any]) -> int:
     species = getattr(config.task, "species", (config.task,))
-    particles: int = sum(own.particle_count for own in species)
+    particles: int = sum(one.particle_count for one in species)
     return config.total_iterations * config.world_count * particles * sum(config.steps)
 
 
@@ -110,6 +112,7 @@ TASKS: Mapping[str, TaskEntry] = {
         make=lambda config, device: PointClassification(config, device=device),
         targets=tuple,
         fast_seconds=200.0,
+        static=True,
     ),
 }
 """Every task that can be trained, by its name on the command line and in checkpoints."""
@@ -170,27 +173,24 @@ def override(config: TrainConfig[TaskConfigT], /, **fields: Any) -> TrainConfig[
     Raises:
         NPAError: A name is unknown, or a value has the wrong type or lies outside its range.
     """
-    own, task_types = _field_types(config), _field_types(config.task)
-    task: Any = config.task
-    changes: dict[str, Any] = {}
-    task_changes: dict[str, Any] = {}
-    for name, value in fields.items():
-        if name == "task" and isinstance(value, Mapping):
-            task_changes |= value
-        elif name == "task":
-            if type(value) is not type(task):
-                raise NPAError(
-                    f"task must be a {type(task).__name__} or a mapping of its fields, "
-                    f"got {shown(value)}"
-                )
-            task = value
-        elif name in own:
-            changes[name] = _convert(name, value, own[name], getattr(config, name))
-        elif name in task_types:
-            task_changes[name] = value
-        else:
-            raise NPAError(f"unknown field {shown(name)}: {suggest(name, [*own, *task_types])}")
-    return dataclasses.replace(config, task=_replaced("task", task, task_changes), **changes)
+    run_types, task_types = _field_types(config), _field_types(config.task)
+    known = [*run_types, *task_types]
+    for name in fields:
+        if name not in known:
+            raise NPAError(f"unknown field {shown(name)}: {suggest(name, known)}")
+    run_fields = {name: value for name, value in fields.items() if name in run_types}
+    task_fields = {name: value for name, value in fields.items() if name not in run_types}
+    task: Any = run_fields.pop("task", config.task)
+    if isinstance(task, Mapping):
+        task, task_fields = config.task, {**task, **task_fields}
+    elif type(task) is not type(config.task):
+        raise NPAError(
+            f"task must be a {type(config.task).__name__} or a mapping of its fields, "
+            f"got {shown(task)}"
+        )
+    config = dataclasses.replace(config, task=_replaced("task", task, task_fields))
+    result: TrainConfig[TaskConfigT] = _replaced("config", config, run_fields)
+    return result
 
 
 def load_config(
@@ -212,26 +212,34 @@ def load_config(
     Raises:
         NPAError: The file cannot be read, is no such file, names an unknown field, or gives a
             value of the wrong type or outside its range.
-        MissingDependencyError: The file is YAML and PyYAML is not installed.
     """
     path = checked_path(path)
     try:
         text = read_bytes(path, limit=MAX_FILE).decode("utf-8")
     except (NPAError, UnicodeDecodeError) as error:
         raise NPAError(f"cannot read the configuration file {shown(str(path))}: {error}") from error
-    fields = _parse(path, text)
+    parse = PARSERS.get(path.suffix.lower())
+    if parse is None:
+        raise NPAError(
+            f"a configuration file must end in {', '.join(PARSERS)}, got {shown(str(path))}"
+        )
+    try:
+        fields = parse(text)
+    except Exception as error:
+        # Parsers raise exceptions of many kinds.
+        raise NPAError(f"{shown(str(path))} cannot be parsed: {shown(error)}") from error
     if not isinstance(fields, Mapping) or not all(isinstance(key, str) for key in fields):
         raise NPAError(
             f"the configuration file {shown(str(path))} must hold field names and values at its "
             f"top level, got {type(fields).__name__}: for example 'iterations: 500'"
         )
-    own = dict(fields)
+    fields = dict(fields)
     try:
-        if presets is not None and (name := own.pop("preset", None)) is not None:
+        if presets is not None and (name := fields.pop("preset", None)) is not None:
             if not isinstance(name, str) or name not in presets:
                 raise NPAError(f"unknown preset {name!r}: {suggest(name, presets)}")
             base = presets[name]
-        return override(base, **own)
+        return override(base, **fields)
     except NPAError as error:
         raise NPAError(f"in the configuration file {shown(str(path))}: {error}") from error
 
@@ -245,34 +253,9 @@ def config_to_dict(config: TrainConfig[Any]) -> dict[str, Any]:
     return result
 
 
-def _parse(path: Path, text: str) -> Any:
-    suffix = path.suffix.lower()
-    try:
-        if suffix == ".toml":
-            return tomllib.loads(text)
-        if suffix == ".json":
-            return parse_json(text)
-        if suffix in (".yaml", ".yml"):
-            return _parse_yaml(text)
-    except MissingDependencyError:
-        raise
-    except Exception as error:
-        # Parsers raise exceptions of many kinds.
-        raise NPAError(
-            f"{shown(str(path))} is not valid {suffix[1:].upper()}: {shown(error)}"
-        ) from error
-    raise NPAError(
-        f"a configuration file must end in .yaml, .yml, .toml or .json, got {shown(str(path))}"
-    )
-
-
 def _parse_yaml(text: str) -> Any:
-    try:
-        import yaml
-    except ImportError as error:
-        raise MissingDependencyError(
-            "reading YAML needs PyYAML: pip install pyyaml, or write the file as TOML"
-        ) from error
+    # Imported here: most runs do not need it.
+    import yaml
 
     class Loader(yaml.SafeLoader):
         """YAML's safe loader with a limit on merged mappings."""
@@ -284,6 +267,15 @@ def _parse_yaml(text: str) -> Any:
 
     # An empty file sets nothing.
     return yaml.load(text, Loader) or {}
+
+
+PARSERS: Mapping[str, Callable[[str], Any]] = {
+    ".yaml": _parse_yaml,
+    ".yml": _parse_yaml,
+    ".toml": tomllib.loads,
+    ".json": parse_json,
+}
+"""Parsers of configuration files by suffix."""
 
 
 def _field_types(config: Any) -> dict[str, Any]:

@@ -23,7 +23,7 @@ from npa_envs.measure.accuracy.check_runner import (
     Skipped,
 )
 from npa_envs.measure.accuracy.scenes import scenes
-from npa_envs.measure.accuracy.trained_rule_checks import habitat
+from npa_envs.measure.accuracy.trained_rule_checks import rule_worlds
 from npa_envs.rule.files import load_rule, rule_digest, rule_file, rule_metadata, save_rule
 from npa_envs.training import preset, train
 
@@ -218,13 +218,13 @@ def test_no_limit_is_more_than_a_scene_asks_for():
 )
 def test_a_rule_that_blows_up_is_found_out(factor, count, verdict, device, monkeypatch):
     def tampered(*arguments, **options):
-        home = habitat(*arguments, **options)
-        rule = copy.deepcopy(home.rule)
+        start = rule_worlds(*arguments, **options)
+        rule = copy.deepcopy(start.rule)
         with torch.no_grad():
             rule.output.weight *= factor
-        return home._replace(rule=rule, worlds=home.worlds.map(lambda part: part[:, :count]))
+        return start._replace(rule=rule, worlds=start.worlds.map(lambda part: part[:, :count]))
 
-    monkeypatch.setattr(trained_rule_checks, "habitat", tampered)
+    monkeypatch.setattr(trained_rule_checks, "rule_worlds", tampered)
     entry = check_runner.run_check(
         CHECKS["time/heart" if count == 1 else "time/dots"], session(device)
     )

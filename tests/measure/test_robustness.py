@@ -158,7 +158,7 @@ def test_a_course_counts_its_seeds():
     losses = ((3.0, 1.0, 1.0), (3.0, 2.0, 1.0), (3.0, 1.05, 2.0), (3.0, 2.0, 2.0))
     course = trials.LossCurve("wipe", (0, 16, 32), losses, twins)
     assert course.recovery_steps() == [16, 32, 16, None]
-    assert (course.recovered(), course.median_step(), course.within_at_end()) == (3, 16, 2)
+    assert (course.recovered(), course.median_step(), course.recovered_at_end()) == (3, 16, 2)
     assert course.ratios(-1) == [1.0, 1.0, 2.0, 2.0]
     others = [dataclasses.replace(course, damage=name) for name in (trials.CONTROL, "side")]
     assert report.recovered_counts([record(course, *others)], ["wipe", "cut"]) == (3, 2, 4)
@@ -228,15 +228,15 @@ def test_damaged_worlds_go_beside_twins_with_the_same_masks(name, device):
         trials.CONTROL,
         *(n for n, d in trials.DAMAGES.items() if d.static or not static),
     }
-    twins = found["wipe"].twins
-    assert twins == found[trials.CONTROL].twins == found["noise"].twins
+    twins = found["wipe"].undamaged
+    assert twins == found[trials.CONTROL].undamaged == found["noise"].undamaged
     assert tuple(curve[0] for curve in twins) == pytest.approx(trained.losses, rel=1e-6)
     # At first the control is its twin; then masks are others.
     assert found[trials.CONTROL].ratios(0) == [1.0, 1.0]
     if not static:
         assert found[trials.CONTROL].losses != twins
         assert all(value != 1.0 for value in found["noise"].ratios(0))
-    assert found["half"].twins == found["side"].twins != twins
+    assert found["half"].undamaged == found["side"].undamaged != twins
     # What twins do is what the worlds do that go on alone.
     _, losses = trial.run(grown, trial.random(1001), trial.plan.heal_steps)
     alone = trial.by_seed(losses).T

@@ -9,7 +9,7 @@ from circle_task import STATE_DIM, CircleTask, circle_config, plain_rollout
 from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
 from npa_envs.tasks.base import untrained_rule
 from npa_envs.training import DivergedError, Trainer
-from npa_envs.training.iteration import bad_worlds
+from npa_envs.training.loss_statistics import diverged_worlds
 
 GOAL = torch.tensor([0.9, -0.7])
 
@@ -62,9 +62,9 @@ def test_divergence_is_looked_for_with_the_rule_as_it_was(tmp_path):
     good = torch.nn.utils.parameters_to_vector(rule.parameters()).detach()
     x, s, *_ = ReadOutTask().seed(3, generator=torch.Generator(), device=torch.device("cpu"))
     snapshot = {"x": x, "s": s, "parameters": good}
-    assert bad_worlds(ReadOutTask(), rule, snapshot) == []
+    assert diverged_worlds(ReadOutTask(), rule, snapshot) == []
     snapshot["parameters"] = good * torch.nan
-    assert bad_worlds(ReadOutTask(), rule, snapshot) == [0, 1, 2]
+    assert diverged_worlds(ReadOutTask(), rule, snapshot) == [0, 1, 2]
     assert rule.readout[0].weight.isfinite().all()
 
 

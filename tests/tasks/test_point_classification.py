@@ -138,7 +138,7 @@ def cycle_of(folder, tmp_path, **fields):
 def test_classes_stay_with_their_worlds(
     folder, tmp_path, monkeypatch, mutated_share, runaway_limit
 ):
-    monkeypatch.setattr("npa_envs.training.cycle.RUNAWAY_LIMIT", runaway_limit)
+    monkeypatch.setattr("npa_envs.training.cycle.LARGEST_VALUE", runaway_limit)
     cycle, _ = cycle_of(folder, tmp_path, mutated_share=mutated_share, world_count=6)
     before = cycle.pool.worlds.x.clone()
     for iteration in range(5):

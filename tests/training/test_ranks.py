@@ -15,10 +15,11 @@ from worlds import assert_same
 
 from npa_envs.errors import NPAError
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
-from npa_envs.training import TASKS, Trainer, override, preset, ranks, train
+from npa_envs.training import TASKS, Trainer, override, preset, process_launcher, train
 from npa_envs.training.checkpoint import load_checkpoint
 from npa_envs.training.cycle import TrainingCycle
-from npa_envs.training.ranks import LOST_CODE, Heartbeat, Ranks, joined_ranks
+from npa_envs.training.process_group import ProcessGroup
+from npa_envs.training.process_launcher import LOST_CODE, Heartbeat, joined_processes
 
 LIVELY = {"max_age_range": (4, 400), "stillness_weight": 1.0, "stillness_min_age": 4}
 LIVELY |= {"damage_share": 0.5, "world_count": 4, "pool_size": 16, "picture_interval": 2}
@@ -28,7 +29,7 @@ SEEDED = {"seed_interval": 3, "fresh_share": 0.7, "damage_share": 0.5}
 SEEDED |= {"world_count": 4, "pool_size": 8}
 """Batches with several fresh seeds; worlds of some places are damaged."""
 
-STRAYING = {"escape_share": 0.1, "escape_weight": 10.0, "world_count": 4, "pool_size": 8}
+ESCAPING = {"escape_share": 0.1, "escape_weight": 10.0, "world_count": 4, "pool_size": 8}
 """Worlds that lose particles, some more than others."""
 
 
@@ -69,7 +70,7 @@ def make_cycle(config):
     rule = task.make_rule(torch.Generator().manual_seed(0)).double()
     torch.nn.init.zeros_(rule.output.weight)
     cpu = torch.device("cpu")
-    return TrainingCycle(task, rule, config, cpu, torch.Generator(), by_world=True)
+    return TrainingCycle(task, rule, config, cpu, torch.Generator(), per_world_streams=True)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -81,7 +82,7 @@ def loaded_kernels(tmp_path_factory):
 
 
 CASES = [
-    *(("morphogenesis2d", fields, 1e-10) for fields in ({}, LIVELY, SEEDED, STRAYING)),
+    *(("morphogenesis2d", fields, 1e-10) for fields in ({}, LIVELY, SEEDED, ESCAPING)),
     # Its 16-bit numbers would differ between processes that did not step together.
     ("morphogenesis2d", {"optimiser": "muon", "learning_rate": 5e-3}, 1e-2),
     *(pytest.param(task, FEW | SEEDED, 1e-10, marks=pytest.mark.slow) for task in TASKS),
@@ -153,7 +154,7 @@ def test_parameters_that_differ_are_refused_and_the_checkpoint_stays(tmp_path):
 
     def drift():
         trainer = trainer_of(config)
-        if not Ranks.current().first:
+        if not ProcessGroup.current().first:
             with torch.no_grad():
                 next(trainer.rule.parameters())[0, 0] += 0.5
         trainer.iterate()
@@ -166,13 +167,13 @@ def test_parameters_that_differ_are_refused_and_the_checkpoint_stays(tmp_path):
 
 
 def kill_other():
-    if not Ranks.current().first:
+    if not ProcessGroup.current().first:
         os.kill(os.getpid(), signal.SIGKILL)
 
 
 def fill_disk():
     # The log has room for its line, a checkpoint has not.
-    if Ranks.current().first:
+    if ProcessGroup.current().first:
         resource = pytest.importorskip("resource")
         resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, resource.RLIM_INFINITY))
 
@@ -200,25 +201,11 @@ def test_what_ends_one_process_ends_the_others_and_the_run_goes_on_from_its_chec
     assert log_of(tmp_path / "run")[-1]["iteration"] == 30
 
 
-def test_processes_whose_iterations_take_long_ask_each_other_in_every_one(tmp_path, monkeypatch):
-    monkeypatch.setattr("npa_envs.training.ranks.AGREE_SECONDS", 0.05)
-
-    def slow():
-        ranks = Ranks.current()
-        for iteration in range(30):
-            if ranks.agree_to_stop(iteration >= 4 and not ranks.first, iteration):
-                return iteration
-            time.sleep(0.06)
-        return None
-
-    assert on_ranks(2, slow, tmp_path) == [4, 4]
-
-
 def test_all_processes_stop_after_the_same_iteration_where_one_is_asked_to(tmp_path):
     config = tiny(tmp_path / "run", iterations=60)
 
     def stop():
-        if Ranks.current().first:
+        if ProcessGroup.current().first:
             return
         # Twice: torchrun passes on what a terminal has sent already.
         os.kill(os.getpid(), signal.SIGTERM)
@@ -251,7 +238,7 @@ def test_processes_meet_through_nccl_only_where_each_has_a_gpu(gpus, backend, mo
     variables = {"LOCAL_RANK": "0", "LOCAL_WORLD_SIZE": "2", "CUDA_VISIBLE_DEVICES": "0,1"}
     for name, value in variables.items():
         monkeypatch.setenv(name, value)
-    with pytest.raises(NPAError, match="must reach each other"), joined_ranks():
+    with pytest.raises(NPAError, match="must reach each other"), joined_processes():
         pass
     assert backends == [backend]
 
@@ -261,7 +248,7 @@ def test_worlds_of_all_processes_are_diagnosed_when_the_loss_is_not_finite(tmp_p
 
     def diverge():
         trainer = trainer_of(config)
-        if not Ranks.current().first:
+        if not ProcessGroup.current().first:
             trainer.pool.worlds.s[:] = 1e200
         trainer.run(progress=False)
 
@@ -273,22 +260,22 @@ def test_worlds_of_all_processes_are_diagnosed_when_the_loss_is_not_finite(tmp_p
 
 
 def test_what_cannot_be_shared_out_is_refused():
-    assert Ranks(1, 4).indices(16, 2).tolist() == [2, 3, 10, 11]
-    parts = [Ranks(rank, 4).local(torch.arange(16), 2) for rank in range(4)]
+    assert ProcessGroup(1, 4).indices(16, 2).tolist() == [2, 3, 10, 11]
+    parts = [ProcessGroup(rank, 4).local(torch.arange(16), 2) for rank in range(4)]
     assert sorted(torch.cat(parts).tolist()) == list(range(16))
     for worlds, pool, message in (
         (6, 12, "multiple of the number of processes, got 6 and 4: .*=4"),
         (4, 10, "pool_size must be a multiple .* 10 and 4: set pool_size=8"),
     ):
         with pytest.raises(NPAError, match=message):
-            Ranks(0, 4).check(tiny("x", world_count=worlds, pool_size=pool))
+            ProcessGroup(0, 4).check(tiny("x", world_count=worlds, pool_size=pool))
     # Alone, nothing is touched.
     numbers = torch.ones(2)
-    alone = Ranks.current()
+    alone = ProcessGroup.current()
     alone.reduce([numbers], numbers[0])
     alone.check_same([numbers])
-    assert not alone.together
-    assert alone.collected(numbers, 1) is numbers
+    assert not alone.distributed
+    assert alone.gathered(numbers, 1) is numbers
     assert_same(numbers, torch.ones(2))
 
 
@@ -299,15 +286,15 @@ def test_what_cannot_be_shared_out_is_refused():
 def codes(monkeypatch):
     """Exit codes with which a process would have ended; its pauses are short."""
     ended = []
-    monkeypatch.setattr(ranks, "BEAT_SECONDS", 0.05)
-    monkeypatch.setattr(ranks.os, "_exit", ended.append)
+    monkeypatch.setattr(process_launcher, "BEAT_SECONDS", 0.05)
+    monkeypatch.setattr(process_launcher.os, "_exit", ended.append)
     return ended
 
 
 def test_nobody_is_missed_who_lives_or_has_left(codes, monkeypatch):
     # No load gives a thread sixty pauses and another one none.
-    monkeypatch.setattr(ranks, "BEAT_SECONDS", 0.02)
-    monkeypatch.setattr(ranks, "SILENT_BEATS", 60)
+    monkeypatch.setattr(process_launcher, "BEAT_SECONDS", 0.02)
+    monkeypatch.setattr(process_launcher, "SILENT_BEATS", 60)
     store = dist.HashStore()
     first, second = (Heartbeat(store, rank, 2) for rank in (0, 1))
     time.sleep(2.0)
@@ -334,7 +321,7 @@ class Store:
     ("make", "message"),
     [
         (dist.HashStore, "process 0 of 3 has heard nothing from process 2 for"),
-        (lambda: Store(fails=True), "s, as the store of the processes is gone"),
+        (lambda: Store(fails=True), "has heard nothing from process 1"),
         (lambda: Store(fails=False), "has heard nothing from process 1"),
     ],
 )

@@ -1,6 +1,7 @@
 """A run's folder: killed while it is made, used by two, with damaged files in it."""
 
 import json
+import math
 import os
 import signal
 import subprocess
@@ -130,30 +131,18 @@ def test_what_killed_writes_left_behind_is_removed_by_the_next_start_and_nothing
 BAD_STATE = torch.full((5056,), 255, dtype=torch.uint8)
 DAMAGES = {
     "iteration": [-5, True, 1.0, None],
-    "seconds": [float("nan"), -1.0, True, "1"],
-    "config": [{1: 2, "task": {}}, {"task": {"target": torch.zeros(2)}}],
-    "rule": [{}, {"bias": 3}],
-    "rule/weight": [torch.zeros(3, 3), torch.zeros(16, 20).double(), 3],
-    "optimiser": [{}, {"state": {}}, {"state": 3}],
-    "optimiser/state/0/exp_avg": [torch.zeros(2), None],
-    "optimiser/state/0/exp_avg_sq": ["negative", "nan"],
-    "pool/x": [3, torch.zeros(8, 12, 3), "nan", "sparse", "meta"],
-    "pool": [{}, {"x": torch.zeros(8, 12, 2)}],
-    "meter/count": [-1, True, 0.5],
-    "meter/sums": ["nan", torch.zeros(1)],
+    "seconds": [math.nan, -1.0, True, "1", None],
+    "task_name": [None],
+    "rule_hyper_parameters": [None],
+    "config": [None, {}, {"task": {"target": torch.zeros(2)}}],
+    "rule": [None, {}, {"bias": 3}],
+    "optimiser": [None, {}, {"state": 3}],
+    "pool/x": [3, torch.zeros(8, 12, 3)],
+    "pool": [None, {}],
+    "meter": [None],
     "random_states/schedule": [BAD_STATE, BAD_STATE[:10], BAD_STATE.float(), b"x"],
-    "random_states": [{}],
+    "random_states": [None, {}],
 }
-
-
-def damaged(word, present):
-    """What stands in a checkpoint instead of a tensor."""
-    match word:
-        case "sparse":
-            return present.to_sparse()
-        case "meta":
-            return present.to("meta")
-    return present - 1.0 if word == "negative" else present * float("nan")
 
 
 @pytest.fixture(scope="module")
@@ -179,28 +168,15 @@ def resumed(finished, monkeypatch):
 
 
 @pytest.mark.parametrize("place", DAMAGES)
-def test_a_checkpoint_with_something_wrong_in_it_is_refused_by_name(finished, resumed, place):
+def test_a_checkpoint_with_something_wrong_in_it_is_refused(finished, resumed, place):
     for value in DAMAGES[place]:
         content = load_checkpoint(finished / "checkpoint.pt")
         *outer, last = place.split("/")
-        there = content
-        for name in outer:
-            there = there[int(name) if name.isdigit() else name]
-        if last == "weight":
-            last = next(name for name, weight in there.items() if weight.ndim == 2)
-        words = ("negative", "nan", "sparse", "meta")
-        there[last] = damaged(value, there[last]) if value in words else value
-        resumed(content, rf"checkpoint\.pt' .*{place.split('/')[0]}.*: start a")
-
-
-def test_a_checkpoint_must_hold_all_that_is_read(finished, resumed):
-    whole = load_checkpoint(finished / "checkpoint.pt")
-    names = "task_name config iteration seconds rule optimiser pool meter random_states"
-    for name in ("rule_hyper_parameters", *names.split()):
-        for content in ({key: whole[key] for key in whole if key != name}, whole | {name: None}):
-            resumed(content, rf"checkpoint\.pt' .*but {name} is missing or")
-    del whole["config"]["task"]
-    resumed(whole, r"but config\.task is missing or")
+        inner = content[outer[0]] if outer else content
+        inner[last] = value
+        resumed(content, r"checkpoint\.pt' must hold all that a run needs, but .*: start a")
+        del inner[last]
+        resumed(content, r"checkpoint\.pt' must hold all that a run needs, but .*: start a")
 
 
 @pytest.mark.parametrize(

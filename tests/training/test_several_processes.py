@@ -174,15 +174,3 @@ def test_the_error_of_any_process_is_printed(tmp_path, monkeypatch):
     assert run.returncode == 2
     assert output.count("npa-envs: error: memory is full: take less") == 1
     assert load_checkpoint(tmp_path / "run" / "checkpoint.pt")["iteration"] == 0
-
-
-def test_a_small_batch_is_shared_unasked(tmp_path, monkeypatch):
-    # As on a machine of two cores.
-    monkeypatch.setenv("OMP_NUM_THREADS", "2")
-    command = [sys.executable, "-m", "npa_envs", "train", "morphogenesis2d", "--max-seconds", "1"]
-    command += ["--target", "ring", "--no-report", "--out", str(tmp_path / "run")]
-    options = {"text": True, "timeout": 120, "encoding": "utf-8"}
-    output = subprocess.check_output(command, **options)
-    assert "on 2 processes (cpu)" in output
-    assert "--resume --processes 2" in output
-    assert "learns ring (goes on)" in subprocess.check_output([*command, "--resume"], **options)

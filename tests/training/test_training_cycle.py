@@ -29,7 +29,9 @@ def tiny_cycle(tmp_path, **fields):
 def world_cycle(tmp_path, **fields):
     """Worlds that draw by themselves, as several processes need it."""
     config = preset("tiny", out=tmp_path, steps=(2, 4), seed_interval=3, **fields)
-    return make_cycle(config, Morphogenesis2D(config.task), rollout=jittered, by_world=True)
+    return make_cycle(
+        config, Morphogenesis2D(config.task), rollout=jittered, per_world_streams=True
+    )
 
 
 def jittered(rule, x, s, steps, generator, **options):
@@ -41,13 +43,13 @@ def jittered(rule, x, s, steps, generator, **options):
     return x + 0.01 * generator.normal(*x.shape[1:], dtype=x.dtype), s, torch.zeros_like(x[..., 0])
 
 
-def clouds_cycle(tmp_path, by_world=False, **fields):
+def clouds_cycle(tmp_path, per_world_streams=False, **fields):
     """Worlds with goals, which mutate and are varied."""
     data = {"data": str(write_idx(tmp_path / "idx")), "class_count": 3}
     data |= {"steps": (2, 4)}
     varied = {"mutated_share": 0.3, "rotation": 20.0, "stretch": 0.1, "jitter": 0.01}
     config = preset("tiny", "point_classification", out=tmp_path, **data, **varied, **fields)
-    return make_cycle(config, PointClassification(config.task), by_world=by_world)
+    return make_cycle(config, PointClassification(config.task), per_world_streams=per_world_streams)
 
 
 @pytest.mark.parametrize(
@@ -64,7 +66,7 @@ def clouds_cycle(tmp_path, by_world=False, **fields):
         (tiny_cycle, {"vary_eps": (0.5, 2.0)}),
         (world_cycle, {"damage_share": 0.5}),
         (world_cycle, {"max_age_range": (4, 400), "vary_eps": (0.5, 2.0)}),
-        (clouds_cycle, {"by_world": True, "pool_size": 16}),
+        (clouds_cycle, {"per_world_streams": True, "pool_size": 16}),
     ],
 )
 def test_replayed_operations_train_the_same_rule_as_called_ones(tmp_path, make, fields):
@@ -74,8 +76,8 @@ def test_replayed_operations_train_the_same_rule_as_called_ones(tmp_path, make, 
     for iteration in range(8):
         for cycle in (called, replayed):
             cycle.run(iteration)
-            cycle.meter.send()
-        assert replayed.meter.receive() == called.meter.receive()
+            cycle.statistics.send()
+        assert replayed.statistics.receive() == called.statistics.receive()
         assert_same(replayed.batch.start, called.batch.start)
         assert_same(replayed_rule.state_dict(), called_rule.state_dict())
     assert_same(replayed.state_dict(), called.state_dict())
@@ -86,8 +88,8 @@ def test_replayed_operations_train_the_same_rule_as_called_ones(tmp_path, make, 
 
 @pytest.mark.gpu
 def test_recorded_iterations_take_means_over_processes_where_eager_ones_do(tmp_path):
-    straying = {"escape_share": 0.2, "escape_weight": 10.0, "cuda_graph": False}
-    config = preset("tiny", out=tmp_path, device="cuda", **straying)
+    escaping = {"escape_share": 0.2, "escape_weight": 10.0, "cuda_graph": False}
+    config = preset("tiny", out=tmp_path, device="cuda", **escaping)
     task = Morphogenesis2D(config.task, device="cuda")
     device = torch.device("cuda")
     rule = task.make_rule(torch.Generator().manual_seed(1)).to(device)
@@ -100,16 +102,16 @@ def test_recorded_iterations_take_means_over_processes_where_eager_ones_do(tmp_p
     for cls in (EagerIteration, GraphedIteration):
         counts = []
 
-        def mean(count, counts=counts):
-            counts.append(float(count))
-            return 2.0 * count
+        def take_means(values, counts=counts):
+            counts.append(float(values[0]))
+            values[0] *= 2.0
 
         arguments = task, rule, config, Particles(x, s), generator, npa_envs.rollout
-        iteration = cls(*arguments, mean_over_processes=mean)
+        iteration = cls(*arguments, take_means=take_means)
         for number in range(3):
-            strayed = x.clone()
-            strayed[:, : 5 + number] += 3.0
-            iteration.start.x.copy_(strayed)
+            escaped = x.clone()
+            escaped[:, : 5 + number] += 3.0
+            iteration.start.x.copy_(escaped)
             generator.manual_seed(number)
             iteration.run(6 + number % 2)
             rows = [*iteration.gradients, iteration.terms, iteration.end.x, iteration.end.s]
@@ -141,8 +143,8 @@ def test_seeds_are_as_large_as_eps_makes_them(tmp_path):
 @pytest.mark.parametrize(
     ("task", "fields", "message"),
     [
-        ("texture", {}, "vary_eps needs particles that move in open space"),
-        ("morphogenesis2d", {"division": True}, "vary_eps needs seeds of more than one particle"),
+        ("texture", {}, "vary_eps needs particles that move in open space, got a periodic box"),
+        ("morphogenesis2d", {"division": True}, "vary_eps needs .*, got a rule that divides"),
         ("co_morphogenesis2d", {}, "vary_eps is for runs of one rule"),
     ],
 )

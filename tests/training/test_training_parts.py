@@ -1,4 +1,4 @@
-"""Pool, optimiser, iteration and meter, each by itself."""
+"""Pool, optimiser, iteration and loss statistics, each by itself."""
 
 import itertools
 import math
@@ -7,24 +7,23 @@ import pytest
 import torch
 from circle_task import CircleTask, circle_config, plain_rollout
 from torch import nn
-from training_runs import full_disk
 
 from npa_envs.devices import check_device, parse_device
 from npa_envs.errors import NPAError
 from npa_envs.rule.rule import NPARule, fate_parameters
 from npa_envs.training.checkpoint import load_checkpoint, save_checkpoint
 from npa_envs.training.cycle import WorldPool
-from npa_envs.training.iteration import EagerIteration, Interval, LossMeter, power_mean
+from npa_envs.training.iteration import EagerIteration, power_mean
+from npa_envs.training.loss_statistics import LossStatistics
 from npa_envs.training.optimiser import FATE_RATE, RuleOptimiser, layer_weights, normalise_gradients
-from npa_envs.training.ranks import RunRandomness
-from npa_envs.training.run_folder import JsonlLog
+from npa_envs.training.process_group import ALONE, RunRandomness
 from npa_envs.world.particles import Particles
 
 
 def make_pool(pool_size=6, particle_count=4, limit=10.0, device="cpu"):
     x = torch.arange(pool_size, dtype=torch.float32, device=device)
     x = x[:, None, None].repeat(1, particle_count, 2)
-    return WorldPool(Particles(x, x[..., :1].repeat(1, 1, 3)), runaway_limit=limit)
+    return WorldPool(Particles(x, x[..., :1].repeat(1, 1, 3)), largest_value=limit)
 
 
 def test_pool_draws_different_worlds_and_all_of_them_in_the_long_run():
@@ -47,7 +46,7 @@ def test_pool_draws_different_worlds_and_all_of_them_in_the_long_run():
 
 def test_a_pool_with_lifetimes_draws_one_world_of_each_section():
     x = torch.zeros(12, 2, 2)
-    pool = WorldPool(Particles(x, x.clone()), runaway_limit=1.0, max_age_range=(10, 1000))
+    pool = WorldPool(Particles(x, x.clone()), largest_value=1.0, max_age_range=(10, 1000))
     lifetimes = pool.lifetime.tolist()
     assert (lifetimes[0], lifetimes[-1]) == (10, 1000)
     ratios = [b / a for a, b in itertools.pairwise(lifetimes)]
@@ -60,7 +59,7 @@ def test_a_pool_with_lifetimes_draws_one_world_of_each_section():
 
 def test_worlds_age_and_are_new_when_they_run_away():
     x = torch.zeros(4, 2, 2)
-    pool = WorldPool(Particles(x, x.clone()), runaway_limit=1.0, max_age_range=(5, 40))
+    pool = WorldPool(Particles(x, x.clone()), largest_value=1.0, max_age_range=(5, 40))
     index = torch.tensor([0, 2, 3])
     after = torch.tensor([0.0, 0.0, 3.0])[:, None, None].expand(3, 2, 2)
     pool.write(index, Particles(after, after), Particles(x[:3], x[:3]), age=torch.tensor([7, 8, 9]))
@@ -186,7 +185,7 @@ def test_iteration_leaves_the_worlds_the_terms_and_the_gradients(tmp_path):
 
 
 @pytest.mark.parametrize("power", [1.0, 2.0, 4.0])
-def test_grown_worlds_are_to_rest(tmp_path, power):
+def test_the_stillness_loss_is_of_grown_worlds(tmp_path, power):
     fields = {"dtype": "float64", "max_age_range": (8, 64), "pool_size": 9}
     _, _, plain = make_iteration(circle_config(tmp_path, **fields))
     fields |= {"stillness_weight": 0.5, "stillness_power": power}
@@ -201,9 +200,9 @@ def test_grown_worlds_are_to_rest(tmp_path, power):
     way = (iteration.end.x - iteration.start.x)[1].norm(dim=-1) / task.eps
     change = (iteration.end.s - iteration.start.s)[1].abs()
     way, change = (each.pow(power).mean() ** (1.0 / power) for each in (way, change))
-    rest = 3.0 * iteration.terms[-1]
-    assert rest >= way + change - 1e-12
-    assert rest < 3.0 * (way + change)
+    stillness = 3.0 * iteration.terms[-1]
+    assert stillness >= way + change - 1e-12
+    assert stillness < 3.0 * (way + change)
     torch.testing.assert_close(iteration.terms[0], plain.terms[0] + 0.5 * iteration.terms[-1])
 
 
@@ -217,7 +216,7 @@ def test_power_means_of_small_motions_are_right_in_float32(power):
 
 
 @pytest.mark.parametrize("power", [1.0, 2.0, 4.0])
-def test_worlds_that_do_not_move_have_finite_gradients_of_rest(tmp_path, power):
+def test_worlds_that_do_not_move_have_finite_gradients_of_stillness(tmp_path, power):
     config = circle_config(
         tmp_path, max_age_range=(8, 64), pool_size=9, stillness_weight=0.5, stillness_power=power
     )
@@ -241,51 +240,50 @@ def test_a_parameter_outside_the_loss_gets_a_zero_gradient(tmp_path):
     assert rule.unused.grad.tolist() == [0.0, 0.0]
 
 
-def interval(iteration, mean, steps, replaced):
-    terms = dict.fromkeys(iteration.term_names, mean)
-    return Interval(terms | {"steps": steps, "replaced_worlds": replaced}, None)
-
-
-def test_meter_gives_the_means_of_the_interval(tmp_path, device):
+def test_statistics_are_the_means_of_the_interval(tmp_path, device):
     _, _, iteration = make_iteration(circle_config(tmp_path), device=device)
-    meter, resumed = LossMeter(iteration), LossMeter(iteration)
+    statistics, resumed = LossStatistics(iteration), LossStatistics(iteration)
+
+    def expected(mean, steps, replaced):
+        terms = dict.fromkeys(iteration.term_names, mean)
+        return terms | {"steps": steps, "replaced_worlds": replaced}, True
+
     for number, value in enumerate([1.0, 2.0, 6.0], start=1):
         iteration.terms.fill_(value)
-        meter.begin(number, 4 * number)
-        meter.observe(torch.tensor([number == 2, False], device=device))
-    resumed.load_state_dict(meter.state_dict())
-    meter.send()
-    # What is observed before the numbers are received belongs to the next interval.
+        statistics.begin(number, 4 * number)
+        statistics.add(torch.tensor([number == 2, False], device=device))
+    resumed.load_state_dict(statistics.state_dict())
+    statistics.send()
+    # What is added before the numbers are received belongs to the next interval.
     iteration.terms.fill_(5.0)
-    meter.begin(4, 7)
-    meter.observe(torch.tensor([False], device=device))
-    assert meter.receive() == interval(iteration, 3.0, 8.0, 1)
-    meter.send()
-    assert meter.receive() == interval(iteration, 5.0, 7.0, 0)
+    statistics.begin(4, 7)
+    statistics.add(torch.tensor([False], device=device))
+    assert statistics.receive() == expected(3.0, 8.0, 1)
+    statistics.send()
+    assert statistics.receive() == expected(5.0, 7.0, 0)
     resumed.send()
-    assert resumed.receive() == interval(iteration, 3.0, 8.0, 1)
+    assert resumed.receive() == expected(3.0, 8.0, 1)
 
 
 def test_worlds_and_masks_are_drawn_independently(tmp_path):
-    drawn = RunRandomness.of_batch(
-        circle_config(tmp_path), torch.device("cpu"), torch.Generator().manual_seed(0)
-    )
+    schedule = torch.Generator().manual_seed(0)
+    cpu, config = torch.device("cpu"), circle_config(tmp_path)
+    drawn = RunRandomness(config, cpu, schedule, ALONE, per_world_streams=False)
     assert torch.rand(4, generator=drawn.worlds).ne(torch.rand(4, generator=drawn.masks)).all()
 
 
-def test_meter_keeps_the_first_bad_iteration_and_not_a_later_one(tmp_path, device):
+def test_the_snapshot_is_of_the_first_bad_iteration_and_not_of_a_later_one(tmp_path, device):
     _, _, iteration = make_iteration(circle_config(tmp_path), device=device)
-    meter = LossMeter(iteration)
+    statistics = LossStatistics(iteration)
     for number, (term, mark) in enumerate([(1.0, 10.0), (math.nan, 20.0), (math.inf, 30.0)], 1):
         iteration.terms.fill_(1.0)
         iteration.terms[2] = term
         iteration.start.x.fill_(mark)
-        meter.begin(number, 100 + number)
-        meter.observe(torch.tensor([False], device=device))
-        meter.send()
-        assert meter.receive().bad_iteration == (None if number == 1 else 2)
-    assert meter.bad_iteration() == 2
-    snapshot = meter.snapshot()
+        statistics.begin(number, 100 + number)
+        statistics.add(torch.tensor([False], device=device))
+        statistics.send()
+        assert statistics.receive()[1] == (number == 1) == statistics.all_finite()
+    snapshot = statistics.snapshot()
     assert (snapshot["iteration"], snapshot["steps"]) == (2, 102)
     assert math.isnan(snapshot["terms"]["state"])
     assert snapshot["terms"]["distance"] == 1.0
@@ -371,15 +369,3 @@ def test_what_is_no_checkpoint_is_refused_and_never_run(tmp_path, case):
     with pytest.raises(NPAError, match=message):
         load_checkpoint(tmp_path / "checkpoint.pt")
     assert [path.name for path in tmp_path.iterdir()] == ["checkpoint.pt"]
-
-
-def test_a_line_that_does_not_fit_on_the_disk_leaves_the_log_as_it_was(tmp_path):
-    log = JsonlLog(tmp_path / "log.jsonl")
-    log.append({"iteration": 1})
-    before = log.path.read_bytes()
-    # Part of the second line fits, and is written.
-    with full_disk(len(before) + 10), pytest.raises(NPAError, match=r"cannot write the log .*log"):
-        log.append({"iteration": 2, "loss": 0.25})
-    assert log.path.read_bytes() == before
-    log.append({"iteration": 2})
-    assert log.records() == [{"iteration": 1}, {"iteration": 2}]

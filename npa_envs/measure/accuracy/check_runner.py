@@ -39,7 +39,7 @@ class Skipped(Exception):
 
 @dataclass(frozen=True)
 class CheckResult:
-    """Figures of a check by name, and limits of some of them."""
+    """Measured errors and other numbers of a check by name (`figures`), and limits of some."""
 
     figures: Mapping[str, float] = field(default_factory=dict)
     limits: Mapping[str, float] = field(default_factory=dict)
@@ -177,7 +177,7 @@ def chosen_checks(checks: Sequence[Check], names: Sequence[str]) -> list[Check]:
 
 
 class StressRecord(Record[CheckResult]):
-    """Entries of a run, in the order of `names`."""
+    """Check results of a run, in the order of `names`."""
 
     command = "stress"
 
@@ -198,9 +198,9 @@ class StressRecord(Record[CheckResult]):
                 fields[name] = {key: float(value) for key, value in fields[name].items()}
         return [CheckResult(**fields) for fields in content["checks"]]
 
-    def put(self, entry: CheckResult) -> None:
+    def put(self, result: CheckResult) -> None:
         """Add a check's result, or replace the earlier one of its name, and write the file."""
-        self.rows = [row for row in self.rows if row.name != entry.name] + [entry]
+        self.rows = [row for row in self.rows if row.name != result.name] + [result]
         self.rows.sort(key=lambda row: self._order.get(row.name, len(self._order)))
         self.write()
 
@@ -216,35 +216,35 @@ class StressRecord(Record[CheckResult]):
 
     def counts(self) -> dict[str, int]:
         """Return the number of checks with each verdict."""
-        counts = Counter(entry.verdict for entry in self.rows)
+        counts = Counter(result.verdict for result in self.rows)
         return {verdict: counts[verdict] for verdict in ("pass", "range", "fail", "skipped")}
 
     def failed(self) -> list[CheckResult]:
-        """Return the entries of the checks that failed."""
-        return [entry for entry in self.rows if entry.verdict == "fail"]
+        """Return the results that failed."""
+        return [result for result in self.rows if result.verdict == "fail"]
 
     def by_group(self) -> dict[str, list[CheckResult]]:
-        """Return the entries of each group."""
+        """Return the results of each group."""
         groups: dict[str, list[CheckResult]] = {}
-        for entry in self.rows:
-            groups.setdefault(entry.name.partition("/")[0], []).append(entry)
+        for result in self.rows:
+            groups.setdefault(result.name.partition("/")[0], []).append(result)
         return groups
 
     def text(self) -> str:
         """Return a table of each group, and the expectations of the checks that failed."""
         parts = []
-        for entries in self.by_group().values():
-            texts = [entry.holds or entry.worst() or entry.note for entry in entries]
+        for results in self.by_group().values():
+            texts = [result.holds or result.worst() or result.note for result in results]
             width = max(map(len, texts))
             lines = [["check", "verdict", "seconds", "found"]]
-            for entry, text in zip(entries, texts, strict=True):
-                seconds = f"{round(entry.seconds, 2):.4g}"
-                lines.append([entry.name, entry.verdict, seconds, text.ljust(width)])
+            for result, text in zip(results, texts, strict=True):
+                seconds = f"{round(result.seconds, 2):.4g}"
+                lines.append([result.name, result.verdict, seconds, text.ljust(width)])
             parts.append("\n".join(aligned(lines)))
         parts += [
-            f"{entry.name} failed: {entry.worst() or entry.note}\n  expected: {entry.expected}"
-            + (f"\n  {entry.note}" if entry.note and entry.worst() else "")
-            for entry in self.failed()
+            f"{result.name} failed: {result.worst() or result.note}\n  expected: {result.expected}"
+            + (f"\n  {result.note}" if result.note and result.worst() else "")
+            for result in self.failed()
         ]
         counts = ", ".join(f"{count} {verdict}" for verdict, count in self.counts().items())
         return "\n\n".join([*parts, counts])
@@ -267,9 +267,9 @@ def run_checks(
     max_seconds: float | None = None,
     progress: Callable[[int], None] = lambda done: None,
 ) -> None:
-    """Run checks that are not done, and put their entries into the record.
+    """Run checks that are not done, and put their results into the record.
 
-    No check starts after `max_seconds`; those without an entry are then skipped. After each check
+    No check starts after `max_seconds`; those without a result are then skipped. After each check
     `progress` is called with 1.
     """
     time_is_up = time_limit(max_seconds)
@@ -307,15 +307,15 @@ def heat_maps(record: StressRecord) -> dict[str, bytes]:
     from matplotlib.colors import LogNorm
 
     drawn = {}
-    for group, entries in record.by_group().items():
-        limited = [entry for entry in entries if entry.figures and entry.limits]
+    for group, results in record.by_group().items():
+        limited = [result for result in results if result.figures and result.limits]
         if not limited:
             continue
-        rows = [entry.name.partition("/")[2] for entry in limited]
-        columns = list(dict.fromkeys(name for entry in limited for name in entry.limits))
+        rows = [result.name.partition("/")[2] for result in limited]
+        columns = list(dict.fromkeys(name for result in limited for name in result.limits))
         fractions = [
-            [entry.fraction(name) if name in entry.limits else None for name in columns]
-            for entry in limited
+            [result.fraction(name) if name in result.limits else None for name in columns]
+            for result in limited
         ]
         size = 3.0 + 0.6 * len(columns), 1.6 + 0.26 * len(rows)
         figure, ((panel,),) = new_figure(1, 1, size)

@@ -418,22 +418,19 @@ TWO_ERRORS = 2.0
 """Allowed distance of two results, in errors that the group `geometry` allows for one."""
 
 
-def _every_scene(space_dim: int, session: CheckSession) -> Iterator[Scene]:
+def _every_scene(space_dim: int, session: CheckSession) -> Iterator[tuple[Scene, Tensor, Tensor]]:
+    """Yield every scene, with its positions and states in float32 on the device."""
     for periodic in (False, True):
-        yield from scenes(space_dim, periodic=periodic, seed=session.seed)
-
-
-def _on(scene: Scene, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Return positions and states of a scene in float32."""
-    return scene.x.to(device, torch.float32), scene.s.to(device, torch.float32)
+        for scene in scenes(space_dim, periodic=periodic, seed=session.seed):
+            x, s = (tensor.to(session.device, torch.float32) for tensor in (scene.x, scene.s))
+            yield scene, x, s
 
 
 @check("precision/order", 2, 3)
 def _run_order(space_dim: int, session: CheckSession) -> CheckResult:
     """Particles in another order perceive the same up to rounding, in every hard scene."""
     fractions = {}
-    for scene in _every_scene(space_dim, session):
-        x, s = _on(scene, session.device)
+    for scene, x, s in _every_scene(space_dim, session):
         order = torch.randperm(x.shape[1], generator=torch.Generator().manual_seed(7))
         order = order.to(session.device)
         weights = functional_weights(x, s)
@@ -457,8 +454,7 @@ def _run_order(space_dim: int, session: CheckSession) -> CheckResult:
 def _run_repeated(space_dim: int, session: CheckSession) -> CheckResult:
     """Perception and gradients of every hard scene are the same bits when repeated."""
     figures = dict.fromkeys(PerceptionOutcome._fields, 0.0)
-    for scene in _every_scene(space_dim, session):
-        x, s = _on(scene, session.device)
+    for scene, x, s in _every_scene(space_dim, session):
         first, second = (perceived(x, s, scene.box) for _ in range(2))
         for what, a, b in zip(PerceptionOutcome._fields, first, second, strict=True):
             figures[what] += differing(a, b)

@@ -38,7 +38,7 @@ MIN_VIEWS: dict[str, Any] = {"resolution": 16, "training_views": 1, "held_out_vi
 """Fields of 3D tasks whose target is not used, as large views take long to make."""
 
 
-class Habitat(NamedTuple):
+class RuleWorlds(NamedTuple):
     """A float32 rule, its task, and worlds of it with their goals, if any."""
 
     rule: NPARule
@@ -57,9 +57,9 @@ def task_name(rule: str) -> str:
     return metadata["task"]
 
 
-def habitat(
+def rule_worlds(
     session: CheckSession, name: str, *, world_count: int = 1, particles: float = 1.0
-) -> Habitat:
+) -> RuleWorlds:
     """Return a rule, shipped or of a file, with fresh worlds of its task.
 
     `particles` is a factor on the trained number, in a quick run on at most `QUICK_PARTICLES`.
@@ -76,7 +76,7 @@ def habitat(
         session.cache[name, particles] = rule, trained.task
     rule, task = session.cache[name, particles]
     x, s, _, goal = task.seed(world_count, generator=session.generator(), device=session.device)
-    return Habitat(rule, task.toward(goal), Particles(x.float(), s.float(), goal=goal))
+    return RuleWorlds(rule, task.toward(goal), Particles(x.float(), s.float(), goal=goal))
 
 
 # The group `time`: every shipped rule for 100 000 steps.
@@ -138,21 +138,21 @@ def _run(name: str, session: CheckSession) -> CheckResult:
     """No number becomes infinite or NaN; the extent at most doubles, updates have at most four
     times the energy of the settled world's, states stay within 8 and on average within 1.1, the
     centroid moves by an extent at most."""
-    home = habitat(session, name)
+    start = rule_worlds(session, name)
     steps = QUICK_STEPS if session.quick else STEPS
     settled = min(SETTLED, steps // 2)
     # Evenly spread on a logarithmic scale.
     marks = [round(settled * (steps / settled) ** (k / MARKS)) for k in range(MARKS + 1)]
     runner, energy_runner = (
-        RuleRunner(home.rule, home.task, session.generator(number)) for number in (1, 2)
+        RuleRunner(start.rule, start.task, session.generator(number)) for number in (1, 2)
     )
-    open_space = home.task.box is None and not home.rule.static
-    figures: dict[str, float] = {"steps": float(steps), "particles": float(home.worlds.x.shape[1])}
+    open_space = start.task.box is None and not start.rule.static
+    figures: dict[str, float] = {"steps": float(steps), "particles": float(start.worlds.x.shape[1])}
     limits = {key: limit for key, limit in BOUNDS.items() if key != "drift" or open_space}
     first: dict[str, float] = {}
-    centroid = home.worlds.x.mean(1)
+    centroid = start.worlds.x.mean(1)
     note = ""
-    for step, worlds in runner.at(marks, home.worlds):
+    for step, worlds in runner.at(marks, start.worlds):
         current = measured(energy_runner, worlds)
         x = worlds.x
         if not first and not current["not_finite"]:
@@ -197,21 +197,23 @@ def powers_of_two(most: int) -> list[int]:
     return [2**k for k in range(int(math.log2(most)) + 1)]
 
 
-def outcome(home: Habitat, session: CheckSession, steps: int, dtype: torch.dtype) -> RolloutOutcome:
+def outcome(
+    start: RuleWorlds, session: CheckSession, steps: int, dtype: torch.dtype
+) -> RolloutOutcome:
     """Run a rollout and return worlds and gradients; masks do not depend on the dtype."""
-    rule = NPARule(**home.rule.hyper_parameters()).to(home.worlds.x.device)
-    rule.load_state_dict(home.rule.state_dict())
+    rule = NPARule(**start.rule.hyper_parameters()).to(start.worlds.x.device)
+    rule.load_state_dict(start.rule.state_dict())
     rule.to(dtype)
-    start = home.worlds.s.to(dtype).requires_grad_()
+    first_states = start.worlds.s.to(dtype).requires_grad_()
     x, s, lengths = rollout(
         rule,
-        home.worlds.x.to(dtype),
-        start,
+        start.worlds.x.to(dtype),
+        first_states,
         steps,
         generator=session.generator(1),
         memory="minimal" if steps > 8 else "store",
         return_path_length=True,
-        **home.task.rollout_options,
+        **start.task.rollout_options,
     )
     weights = torch.Generator().manual_seed(3)
     worlds = torch.cat((x, s, lengths[..., None]), dim=2)
@@ -219,24 +221,24 @@ def outcome(home: Habitat, session: CheckSession, steps: int, dtype: torch.dtype
     terms = worlds * torch.randn(worlds.shape, generator=weights).to(worlds)
     loss = terms.sum(-1).mean()
     network = [*rule.hidden.parameters(), *rule.output.parameters()]
-    by_states, *by_weights = torch.autograd.grad(loss, [start, *network])
+    by_states, *by_weights = torch.autograd.grad(loss, [first_states, *network])
     flat = [gradient.flatten() for gradient in by_weights]
     return RolloutOutcome(x.detach(), s.detach(), torch.cat(flat)[None], by_states)
 
 
-def _home(session: CheckSession, name: str) -> Habitat:
-    return habitat(session, name, particles=0.25 if session.quick else 1.0)
+def _gradient_worlds(session: CheckSession, name: str) -> RuleWorlds:
+    return rule_worlds(session, name, particles=0.25 if session.quick else 1.0)
 
 
 @check("gradients/norm", registry=RULE_CHECKS)
 def _run_norm(name: str, session: CheckSession) -> CheckResult:
     """Gradients of a functional by weights and by states at the start are finite whatever the
     number of steps; their norms are reported."""
-    home = _home(session, name)
+    start = _gradient_worlds(session, name)
     figures: dict[str, float] = {}
     not_finite = 0.0
     for steps in powers_of_two(QUICK_GRADIENT_STEPS if session.quick else GRADIENT_STEPS):
-        result = outcome(home, session, steps, torch.float32)
+        result = outcome(start, session, steps, torch.float32)
         figures[f"weights_{steps}"] = float(result.by_weights.norm())
         figures[f"states_{steps}"] = float(result.by_states.norm())
         for gradient in (result.by_weights, result.by_states):
@@ -248,15 +250,15 @@ def _run_norm(name: str, session: CheckSession) -> CheckResult:
 def _run_float32(name: str, session: CheckSession) -> CheckResult:
     """One step in float32 is within 1e-5 of one in float64, also its gradients; after how many
     steps they still agree to 1e-2 is reported."""
-    home = _home(session, name)
-    if home.rule.divides:
+    start = _gradient_worlds(session, name)
+    if start.rule.divides:
         raise Skipped("particles divide by draws that are others in float64")
     counts = powers_of_two(QUICK_GRADIENT_STEPS if session.quick else 128)
     figures: dict[str, float] = {}
     usable = dict.fromkeys(RolloutOutcome._fields, 0)
     for steps in counts:
-        single = outcome(home, session, steps, torch.float32)
-        exact = outcome(home, session, steps, torch.float64)
+        single = outcome(start, session, steps, torch.float32)
+        exact = outcome(start, session, steps, torch.float64)
         for what, value, right in zip(RolloutOutcome._fields, single, exact, strict=True):
             figures[f"{what}_{steps}"] = error = relative_error(value, right)
             if error <= 1e-2 and usable[what] in (0, steps // 2):
@@ -272,11 +274,11 @@ def _run_graph(session: CheckSession) -> CheckResult:
     """A rollout of 16 steps recorded in a CUDA graph has the bits of one that is not."""
     if not session.cuda:
         raise Skipped("graphs are CUDA's: run it with --device cuda")
-    home = habitat(session, "gecko", world_count=3)
-    worlds = home.worlds
+    start = rule_worlds(session, "gecko", world_count=3)
+    worlds = start.worlds
     random = WorldRandom([0, 1, 2], device=session.device)
     result = worlds.map(torch.empty_like)
-    runner = RuleRunner(home.rule, home.task, random)
+    runner = RuleRunner(start.rule, start.task, random)
 
     def run() -> None:
         result.copy_(runner.run(worlds, 16))

@@ -8,6 +8,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from dataclasses import asdict, dataclass
 from datetime import date
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import torch
@@ -93,7 +94,10 @@ class RuleRecord(Record[Response]):
 
     def content(self) -> dict[str, Any]:
         """Return the file's fields except the facts: settings and versions of the measurement."""
-        curves = [asdict(c) | {"recovery_steps": c.recovery_steps()} for c in self.curves]
+        curves = [asdict(curve) for curve in self.curves]
+        for fields, curve in zip(curves, self.curves, strict=True):
+            fields["twins"] = fields.pop("undamaged")
+            fields["recovery_steps"] = curve.recovery_steps()
         return {**self.about, "courses": curves, "responses": as_objects(self.rows)}
 
     def parse(self, content: dict[str, Any]) -> list[Response]:
@@ -104,8 +108,8 @@ class RuleRecord(Record[Response]):
 
         self.curves = []
         for row in content.pop("courses"):
-            losses, twins = (tuple(map(numbers, row[name])) for name in ("losses", "twins"))
-            self.curves.append(LossCurve(row["damage"], tuple(row["steps"]), losses, twins))
+            losses, undamaged = (tuple(map(numbers, row[name])) for name in ("losses", "twins"))
+            self.curves.append(LossCurve(row["damage"], tuple(row["steps"]), losses, undamaged))
         rows = content.pop("responses")
         del content["facts"]
         self.about = content
@@ -129,8 +133,8 @@ def measure_rule(
 ) -> None:
     """Measure what a rule's record lacks; save it after the damage curves and after each value.
 
-    Values of conditions that need more than `most_particles` particles are left out. If `enough`
-    returns True before a value, the measurement stops, and the record stays unfinished.
+    Values of conditions that need more than `most_particles` particles are left out. Once `enough`
+    returns True, no further value is measured, and the record stays unfinished.
     """
     begin = time.perf_counter() - record.about["seconds"]
     grown, trained = grow(trial)
@@ -259,7 +263,7 @@ def recovered_counts(
     """Return the seeds of all rules that recovered, that are recovered at the end, and all."""
     curves = [c for record in records for c in record.curves if c.damage in damages]
     recovered = sum(curve.recovered() for curve in curves)
-    at_end = sum(curve.within_at_end() for curve in curves)
+    at_end = sum(curve.recovered_at_end() for curve in curves)
     return recovered, at_end, sum(len(curve.losses) for curve in curves)
 
 
@@ -296,14 +300,12 @@ def _time(curve: LossCurve) -> str:
 
 def _size(curve: LossCurve) -> str:
     first, last = _median(curve.ratios(0)), _median(curve.ratios(-1))
-    return f"{short(first)} → {short(last)} ({curve.within_at_end()}/{len(curve.losses)})"
+    return f"{short(first)} → {short(last)} ({curve.recovered_at_end()}/{len(curve.losses)})"
 
 
 def _median(values: Sequence[float]) -> float:
     """Return the median; NaN counts as infinite."""
-    ordered = sorted(math.inf if math.isnan(value) else value for value in values)
-    low, high = ordered[(len(ordered) - 1) // 2], ordered[len(ordered) // 2]
-    return low if low == high else 0.5 * (low + high)
+    return median(math.inf if math.isnan(value) else value for value in values)
 
 
 def _by_damage(records: Sequence[RuleRecord], cell: Callable[[LossCurve], str]) -> str:

@@ -1,6 +1,7 @@
 """Test worlds of a rule from seeds unseen in training, conditions, damage, and recovery.
 
-The twin of a damaged world is the same world without the damage, run with the same masks.
+A damaged world is compared with its undamaged copy: the same world without the damage, run with the
+same masks.
 """
 
 from __future__ import annotations
@@ -237,8 +238,8 @@ class RuleTrial:
         for k in sorted(set(pictures.tolist())):
             yield tasks[k], (pictures == k).nonzero()[:, 0]
 
-    def coded(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return states with each world's target code, if any, restored in the first channels."""
+    def with_codes_restored(self, x: Tensor, s: Tensor) -> Tensor:
+        """Return states whose first channels have their world's target code again, if any."""
         s = s.clone()
         for task, index in self._by_task(x):
             s[index] = task.coded(s[index])
@@ -256,7 +257,7 @@ class RuleTrial:
             # Trained worlds fill their box, so there is no trained radius.
             radius = self.task.config.seed_radius if box is None else 0.25 * min(box)
             x = SHAPES[shape](count, self.rule.space_dim, float(radius), random)
-        return Particles(x.float(), self.coded(x, s.float()), goal=goal)
+        return Particles(x.float(), self.with_codes_restored(x, s.float()), goal=goal)
 
     @torch.no_grad()
     def run(
@@ -388,18 +389,19 @@ DAMAGES = {
 # Recovery
 
 RECOVERED = 1.1
-"""A world has recovered once its loss is at most this many times its twin's at the same step."""
+"""A world has recovered once its loss is at most this many times its undamaged copy's at that step.
+"""
 
 CONTROL = "nothing"
-"""Name of the control: worlds without damage, with other masks than their twins."""
+"""Name of the control: undamaged worlds with other masks than the undamaged copies."""
 
-AFTERWARDS, OTHERWISE = 1001, 1002
-"""Random streams of the masks after the damage, and of the control's masks."""
+MASKS_AFTER_DAMAGE, MASKS_OF_CONTROL = 1001, 1002
+"""Random streams of the update masks after the damage, and of the control's."""
 
 
 @dataclass(frozen=True)
 class LossCurve:
-    """Losses of all seeds at `steps` after a damage, and those of their twins without the damage.
+    """Losses of all seeds at `steps` after a damage, and those of their `undamaged` copies.
 
     The loss of a world that is not finite is NaN.
     """
@@ -407,19 +409,19 @@ class LossCurve:
     damage: str
     steps: tuple[int, ...]
     losses: tuple[tuple[float, ...], ...]
-    twins: tuple[tuple[float, ...], ...]
+    undamaged: tuple[tuple[float, ...], ...]
 
     def recovery_steps(self) -> list[int | None]:
         """Return for each seed the first of `steps` at which it has recovered, or None."""
         first: list[int | None] = []
-        for losses, twins in zip(self.losses, self.twins, strict=True):
+        for losses, undamaged in zip(self.losses, self.undamaged, strict=True):
             # Comparisons with NaN are false.
-            rows = zip(self.steps, losses, twins, strict=True)
+            rows = zip(self.steps, losses, undamaged, strict=True)
             first.append(next((step for step, a, b in rows if a <= RECOVERED * b), None))
         return first
 
     def recovered(self) -> int:
-        """Return the number of seeds that have recovered."""
+        """Return the number of seeds that have recovered at any step."""
         return sum(step is not None for step in self.recovery_steps())
 
     def median_step(self) -> float | None:
@@ -428,64 +430,70 @@ class LossCurve:
         return median(steps) if steps else None
 
     def ratios(self, index: int) -> list[float]:
-        """Return for each seed the loss over its twin's at an index of `steps`."""
-        pairs = zip(self.losses, self.twins, strict=True)
-        return [ratio(loss[index], twin[index]) for loss, twin in pairs]
+        """Return for each seed its loss over that of its undamaged copy, at an index of `steps`."""
+        pairs = zip(self.losses, self.undamaged, strict=True)
+        return [ratio(losses[index], undamaged[index]) for losses, undamaged in pairs]
 
-    def within_at_end(self) -> int:
-        """Return the number of seeds that are recovered at the last step."""
+    def recovered_at_end(self) -> int:
+        """Return the number of seeds whose loss at the last step counts as recovered."""
         return sum(value <= RECOVERED for value in self.ratios(-1))
 
 
-def ratio(loss: float, twin: float) -> float:
-    """Return a loss over a twin's; 1 if both are 0."""
-    if twin == 0.0:
+def ratio(loss: float, reference: float) -> float:
+    """Return a loss over a reference loss; 1 if both are 0."""
+    if reference == 0.0:
         return 1.0 if loss == 0.0 else math.nan if math.isnan(loss) else math.inf
-    return loss / twin
+    return loss / reference
 
 
 @torch.no_grad()
 def healing(trial: RuleTrial, grown: Particles) -> list[LossCurve]:
     """Damage grown worlds in every way; return a curve for the control and for each damage.
 
-    If half of the particles are removed, twins are worlds that were grown from half as many.
+    Where a damage removes half of the particles, the undamaged copies are worlds that were grown
+    from half as many.
     """
-    damages = {n: d for n, d in DAMAGES.items() if d.static or not trial.rule.static}
     growth = trial.random(StreamId.GROWTH)
     smaller, _ = trial.run(trial.initial_worlds(0.5), growth, [trial.plan.grow_steps])
-    whole, halved = (
-        {name: damage for name, damage in damages.items() if damage.halves == halves}
-        for halves in (False, True)
-    )
-    return [
-        *_with_twins(trial, grown, grown, whole, control=True),
-        *_with_twins(trial, grown, smaller, halved, control=False),
-    ]
+    curves = []
+    for halves, undamaged in ((False, grown), (True, smaller)):
+        damages = {
+            name: damage
+            for name, damage in DAMAGES.items()
+            if damage.halves == halves and (damage.static or not trial.rule.static)
+        }
+        curves += _loss_curves(trial, grown, undamaged, damages, control=not halves)
+    return curves
 
 
-def _with_twins(
+def _loss_curves(
     trial: RuleTrial,
     grown: Particles,
-    twins: Particles,
+    undamaged: Particles,
     damages: Mapping[str, Damage],
     *,
     control: bool,
 ) -> list[LossCurve]:
-    """Return damaged worlds' loss curves; `control` puts that of twins with other masks first."""
+    """Run undamaged copies and damaged worlds as one batch; return the loss curve of each damage.
+
+    `control`: the first curve is that of undamaged worlds with other masks.
+    """
     steps = trial.plan.heal_steps
-    masks, other_masks = (trial.random(stream).keys for stream in (AFTERWARDS, OTHERWISE))
-    copies = {"twins": (twins, masks)}
+    masks, other_masks = (
+        trial.random(stream).keys for stream in (MASKS_AFTER_DAMAGE, MASKS_OF_CONTROL)
+    )
+    batch = {"undamaged": (undamaged, masks)}
     if control:
-        copies[CONTROL] = twins, other_masks
+        batch[CONTROL] = undamaged, other_masks
     for name, damage in damages.items():
         random = trial.random(StreamId.DAMAGE)
         x, s = damage.apply(grown.x, grown.s, random, trial.task.box)
-        copies[name] = twins._replace(x=x, s=trial.coded(x, s)), masks
-    worlds, keys = zip(*copies.values(), strict=True)
+        batch[name] = undamaged._replace(x=x, s=trial.with_codes_restored(x, s)), masks
+    worlds, keys = zip(*batch.values(), strict=True)
     random = WorldRandom.from_keys(torch.cat(keys))
     _, losses = trial.run(combined(torch.cat, worlds), random, steps)
-    # One row for each copy and seed.
-    rows = trial.by_seed(losses.view(len(steps), len(copies), -1)).permute(1, 2, 0).tolist()
-    twin, *others = (tuple(map(tuple, row)) for row in rows)
-    names = list(copies)[1:]
-    return [LossCurve(name, steps, row, twin) for name, row in zip(names, others, strict=True)]
+    # One row for each world of the batch's parts and each seed.
+    rows = trial.by_seed(losses.view(len(steps), len(batch), -1)).permute(1, 2, 0).tolist()
+    reference, *others = (tuple(map(tuple, row)) for row in rows)
+    names = list(batch)[1:]
+    return [LossCurve(name, steps, row, reference) for name, row in zip(names, others, strict=True)]

@@ -32,7 +32,7 @@ from npa_envs.measure.speed.timing import (
 )
 from npa_envs.rule.rule import NPARule
 from npa_envs.world.graphed_rollouts import release_recordings
-from npa_envs.world.rollout import Memory
+from npa_envs.world.rollout import Memory, rollout
 from npa_envs.world.species import rollout_species
 
 # Suite `paper`: inference and training, storing and recomputing.
@@ -336,9 +336,18 @@ def _species_row(
     session: TimingSession, workload: Workload, train: bool, graph: bool
 ) -> OneSpeciesRow:
     x, s = workload.worlds(session.device)
-    make: Callable[..., Any] = partial(rollout_call, workload, x, s, train=train)
+
+    def roll_species(rule: NPARule, *arguments: Any, **options: Any) -> tuple[Tensor, Tensor]:
+        count = [workload.particle_count]
+        worlds: tuple[Tensor, Tensor] = rollout_species(
+            [rule], *arguments, counts=count, density_counts=count, **options
+        )
+        return worlds
+
     # Both draw the same masks.
-    alone, species = make(), make(roll=roll_one_species)
+    alone, species = (
+        rollout_call(workload, x, s, train=train, roll=roll) for roll in (rollout, roll_species)
+    )
     # A ratio of nearly 1 needs more readings than other tables.
     repeats = 3 * session.repeats
     first, second, ratio = compare(alone, species, session.device, repeats=repeats, graph=graph)
@@ -350,17 +359,6 @@ def _species_row(
         second.divided(workload.steps),
         ratio,
     )
-
-
-def roll_one_species(
-    rule: NPARule, x: Tensor, s: Tensor, steps: int, **options: Any
-) -> tuple[Tensor, Tensor]:
-    """Run `rollout_species` with all particles as one species."""
-    count = [x.shape[1]]
-    worlds: tuple[Tensor, Tensor] = rollout_species(
-        [rule], x, s, steps, counts=count, density_counts=count, **options
-    )
-    return worlds
 
 
 # The suites
