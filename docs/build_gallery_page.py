@@ -22,7 +22,7 @@ OPENING = """\
 The rules that come with the library. Each film is made by one rule: particles start as a blank
 disk, ball or random cloud, and know nothing of their places. A rule's name stands for its file in
 commands and in `npa_envs.load_rule`. `npa-envs view NAME` opens a rule in the browser, and
-`npa-envs export-web --gallery -o gallery.html` writes one page that runs all 2D rules.
+`npa-envs export-web --gallery --out gallery.html` writes one page that runs all 2D rules.
 
 Figures are means over seeds that training never saw; a lower loss is better. A card says how the
 rule was trained, and all that was measured."""

@@ -28,22 +28,22 @@ EXAMPLES = """\
 bench --quick
 bench --suite scaling --out results --plots
 compare --quick --out quick
-compare --seconds 60 --methods gradient ppo --tasks morphogenesis2d
+compare --learning-seconds 60 --methods gradient ppo --tasks morphogenesis2d
 compare --suite npa-bench-small-v0 --out bench --jobs 2
 demo
 demo --target star --train-seconds 60 --out star
 doctor
 evaluate gecko --healing
 evaluate runs/heart --seed-count 2
-export-web gecko heart -o page.html
-export-web --gallery -o gallery.html
+export-web gecko heart --out page.html
+export-web --gallery --out gallery.html
 interact gecko heart
 interact --quick
 learn ppo npa/Morphogenesis2D-v0 --keywords target=heart --particle-steps 1e9 --device cuda
-learn shac npa/Mixing-v0 --seconds 600 --gpus 2 --out runs/mixing
+learn shac npa/Mixing-v0 --learning-seconds 600 --gpus 2 --out runs/mixing
 list
-record npa/Morphogenesis2D-v0 --policy gecko --options target=gecko --dataset npa/gecko-v0
-record npa/Gardener2DSmall-v0 --policy scripted --dataset npa/gardener/scripted-v0
+record-dataset npa/Morphogenesis2D-v0 --policy gecko --keywords target=gecko --dataset npa/gecko-v0
+record-dataset npa/Gardener2DSmall-v0 --policy scripted --dataset npa/gardener/scripted-v0
 robustness heart --quick
 robustness --device cuda --out results
 rollout gecko --damage 300:cut 500:wipe --steps 700

@@ -32,7 +32,7 @@ QUICK_EPISODES, QUICK_STEPS = 4, 200_000
 QUICK: dict[str, Any] = {
     "tasks": ("morphogenesis2d",),
     "methods": ("gradient", "evolution", "zero"),
-    "seeds": 1,
+    "seed_count": 1,
 }
 """Defaults of a quick comparison."""
 
@@ -59,9 +59,9 @@ class CompareOptions(common.PartOptions, common.MeasureOptions):
     """Methods of npa_envs.agents.learning; default: those of the suite, or all but `clone`, which
     imitates the run of `gradient` from the same seed. NAME=METHOD gives one a new name, for other
     options (bold=ppo), or runs your function (mine=module:function)."""
-    seeds: int | None = None
+    seed_count: int | None = None
     """Number of seeds 0, 1, ... for each method and task; default: 3, in a suite 5, quick 1."""
-    seconds: float | None = None
+    learning_seconds: float | None = None
     """Compare for equal wall time: seconds of learning of each run, without evaluations."""
     particle_steps: float | None = None
     """Compare for equal particle-steps: how many each run may learn from, for example 1e8."""
@@ -75,8 +75,8 @@ class CompareOptions(common.PartOptions, common.MeasureOptions):
     devices: tuple[str, ...] = ()
     """Devices to distribute the runs over, for example cuda:0 cuda:1; default: --device."""
     jobs: int | None = None
-    """Runs at the same time; default: one for each device. With --seconds each device must have the
-    same number, as runs on one device share its time."""
+    """Runs at the same time; default: one for each device. With --learning-seconds each device must
+    have the same number, as runs on one device share its time."""
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -139,16 +139,16 @@ def make_plan(options: CompareOptions) -> ComparisonPlan:
     from npa_envs.agents.learning import METHODS
     from npa_envs.agents.learning.problem import RUNS
 
-    common.check_numbers(options, seeds=1, episodes=1, jobs=1, threads=1)
-    if options.seeds is not None and options.seeds > RUNS:
+    common.check_numbers(options, seed_count=1, episodes=1, jobs=1, threads=1)
+    if options.seed_count is not None and options.seed_count > RUNS:
         raise NPAError(
-            f"seeds must be at most {RUNS}, got {options.seeds}: later runs would learn in the "
-            "worlds of evaluations"
+            f"seed_count must be at most {RUNS}, got {options.seed_count}: later runs would learn "
+            "in the worlds of evaluations"
         )
     quick = options.quick
     suite = None if options.suite is None else npa_bench.SUITES[options.suite]
     if suite:
-        for name in ("seconds", "particle_steps", "episodes"):
+        for name in ("learning_seconds", "particle_steps", "episodes"):
             if getattr(options, name) is not None:
                 raise NPAError(
                     f"--{name.replace('_', '-')} must not be given with --suite, whose protocol is "
@@ -190,7 +190,7 @@ def make_plan(options: CompareOptions) -> ComparisonPlan:
     return ComparisonPlan(
         tasks={name: json.loads(problem.to_json()) for name, problem in problems.items()},
         methods=methods,
-        seeds=tuple(range(options.seeds or seeds)),
+        seeds=tuple(range(options.seed_count or seeds)),
         budgets=budgets,
         options=chosen,
         own=own,
@@ -201,14 +201,14 @@ def make_plan(options: CompareOptions) -> ComparisonPlan:
 
 
 def _budgets(options: CompareOptions) -> dict[Axis, float]:
-    seconds, steps = options.seconds, options.particle_steps
+    seconds, steps = options.learning_seconds, options.particle_steps
     if options.quick and steps is None and seconds is None:
         steps = QUICK_STEPS
     limits: dict[Axis, float | None] = {"seconds": seconds, "particle-steps": steps}
     budgets = {axis: limit for axis, limit in limits.items() if limit is not None}
     if not budgets:
         raise NPAError(
-            "a comparison needs a budget: give --seconds 60, --particle-steps 1e8 or both"
+            "a comparison needs a budget: give --learning-seconds 60, --particle-steps 1e8 or both"
         )
     for axis, value in budgets.items():
         if not (0.0 < value < math.inf and (axis == "seconds" or value >= 1.0)):
@@ -278,10 +278,10 @@ def _method_options(
 
 
 def _jobs(options: CompareOptions) -> int:
-    """Return the number of runs at the same time; with --seconds, equal on all devices."""
+    """Return the number of runs at the same time; with --learning-seconds, equal on all devices."""
     count = len(options.devices or (options.device,))
     jobs = count if options.jobs is None else options.jobs
-    if options.seconds is not None and jobs % count:
+    if options.learning_seconds is not None and jobs % count:
         raise NPAError(
             f"jobs must be a multiple of the number of devices, {count}, where wall time is equal, "
             f"got {jobs}: give --jobs {-(-jobs // count) * count}, or leave it out"

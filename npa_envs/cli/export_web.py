@@ -23,7 +23,7 @@ class ExportOptions:
 
     rules: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RULE")] = ()
     """Shipped rules (`npa-envs list`), folders of runs, or files of rules."""
-    out: Annotated[Path, tyro.conf.arg(aliases=("-o",))] = Path("page.html")
+    out: Path = Path("page.html")
     """The file to write."""
     gallery: bool = False
     """Begin with pictures to choose from; default of RULE: all shipped 2D rules."""

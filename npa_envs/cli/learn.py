@@ -47,11 +47,11 @@ class LearnOptions(common.RunOptions):
     """Seed of everything random, from 0 to 99."""
     particle_steps: float | None = None
     """Budget in particle-steps (steps of the worlds times their particles), for example 1e8."""
-    seconds: float | None = None
+    learning_seconds: float | None = None
     """Budget in seconds of learning, without start and evaluations."""
     episodes: int = 16
     """Episodes that evaluate each point of the curve."""
-    entries: int = 20
+    points: int = 20
     """Points of the curve after the first, and checkpoints."""
     out: Path = Path("runs/learn")
     """Folder for checkpoint, rules and curve."""
@@ -90,7 +90,7 @@ def main(arguments: Sequence[str]) -> int:
 def parse(arguments: Sequence[str]) -> LearnOptions:
     """Return the options of `npa-envs learn`."""
     options = common.parse_options(LearnOptions, "learn", arguments)
-    common.check_numbers(options, worlds=1, episodes=1, entries=1)
+    common.check_numbers(options, worlds=1, episodes=1, points=1)
     return options
 
 
@@ -101,8 +101,10 @@ def run(options: LearnOptions, ranks: Ranks) -> int:
     from npa_envs.cli import INTERRUPTED
 
     steps = options.particle_steps
-    if steps is None and options.seconds is None:
-        raise NPAError("learn needs a budget: give --particle-steps 1e8, --seconds 600 or both")
+    if steps is None and options.learning_seconds is None:
+        raise NPAError(
+            "learn needs a budget: give --particle-steps 1e8, --learning-seconds 600 or both"
+        )
     if steps is not None and not math.isfinite(steps):
         raise NPAError(f"particle_steps must be finite, got {steps}: try 1e8")
 
@@ -118,7 +120,9 @@ def run(options: LearnOptions, ranks: Ranks) -> int:
     if options.method == "shac" and options.worlds is not None:
         kwargs.setdefault("world_count", options.worlds)
     stopped: list[bool] = []
-    budget = Budget(seconds=options.seconds, particle_steps=None if steps is None else int(steps))
+    budget = Budget(
+        seconds=options.learning_seconds, particle_steps=None if steps is None else int(steps)
+    )
     train(
         options.method,
         problem_of(options),
@@ -126,7 +130,7 @@ def run(options: LearnOptions, ranks: Ranks) -> int:
         options.seed,
         device=options.device,
         evaluation_seeds=range(FIRST_EVALUATION_SEED, FIRST_EVALUATION_SEED + options.episodes),
-        entries=options.entries,
+        entries=options.points,
         on_entry=show,
         on_stop=lambda: stopped.append(True),
         out=options.out,

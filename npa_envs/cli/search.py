@@ -17,8 +17,8 @@ class SearchOptions(common.RunOptions, SearchWorld):
     """Search for rules that differ from each other and stay alive.
 
     An archive keeps the best candidate of each kind: by speed, by how crowded particles stand, and
-    by how colours mix. Best is whose colours change most while states and positions
-    stay within [-1, 1]. The folder gets every elite as a rule's file that
+    by how colours mix. The best are those whose colours change most while states and positions stay
+    within [-1, 1]. The folder gets every elite as a rule's file that
     `view` and `rollout` open, a page that shows them, and a record. The same command goes on where
     a search was stopped, and further with a larger budget.
     """
