@@ -19,6 +19,10 @@ class ExportOptions:
 
     It needs no server and no network. If the name ends in .json, it writes a collection for the
     authors' web demo instead, without title or gallery.
+
+    Examples:
+      npa-envs export-web gecko heart --out page.html
+      npa-envs export-web --gallery --out gallery.html
     """
 
     rules: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RULE")] = ()

@@ -28,6 +28,10 @@ class LearnOptions(common.RunOptions):
 
     Each point of the learning curve prints a line and writes a checkpoint. A run that was stopped
     by SIGTERM, Ctrl-C or a kill continues with `--resume`, on any number of processes.
+
+    Examples:
+      npa-envs learn ppo npa/Morphogenesis2D-v0 --keywords target=heart --particle-steps 1e9
+      npa-envs learn shac npa/Mixing-v0 --learning-seconds 600 --gpus 2 --out runs/mixing
     """
 
     method: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="METHOD")]

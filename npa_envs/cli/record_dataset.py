@@ -27,6 +27,10 @@ class RecordOptions(common.RunOptions):
 
     `minari.load_dataset` reads it; `npa_envs.agents.learning.train("clone", ..., dataset=ID)`
     learns from it.
+
+    Examples:
+      npa-envs record-dataset npa/Morphogenesis2D-v0 --keywords target=heart --dataset npa/a-v0
+      npa-envs record-dataset npa/Gardener2D-v0 --policy scripted --dataset npa/gardener/scripted-v0
     """
 
     env: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="ENV")]
@@ -63,13 +67,13 @@ def main(arguments: Sequence[str]) -> int:
     returns: list[float] = []
     if options.root is not None:
         os.environ[ROOT] = str(common.writable_folder(options.root, "root").resolve())
-    with common.StepBar(options.episodes, show=options.progress, unit="episode") as bar:
+    with common.progress_bar(options.episodes, show=options.progress, unit="episode") as advance:
 
         def episodes() -> Iterator[Any]:
             for episode in record_episodes(envs, policy, seeds):
                 returns.append(float(sum(episode.rewards)))
                 yield episode
-                bar.advance(1)
+                advance(1)
 
         folder = write_dataset(
             options.dataset,

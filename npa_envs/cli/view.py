@@ -33,6 +33,11 @@ class ViewOptions(common.DeviceOptions):
 
     The page has brushes, sliders, damage and films. A run's world follows its newest checkpoint.
     The server answers only this computer; with another --host it prints a link with a token.
+
+    Examples:
+      npa-envs view gecko
+      npa-envs view runs/heart
+      npa-envs view npa/Morphogenesis2D-v0 --policy gecko
     """
 
     what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RULE|RUN|ENV")] = "gecko"

@@ -43,15 +43,13 @@ def to_uint8(picture: Tensor, background: Background = "white") -> NDArray[np.ui
     check_dense("picture", picture)
     behind = background_colour(background)
     fields = picture.detach().float()
-    valid = fields.isfinite().all(dim=-1, keepdim=True)
-    fields = torch.where(valid, fields, torch.zeros_like(fields))
+    fields = fields.where(fields.isfinite().all(dim=-1, keepdim=True), 0.0)
     sums, density = fields[..., :3], fields[..., 3:]
+    covered = (sums / density.clamp(min=1)).unbind(-1)
+    uncovered = 1 - density[..., 0].clamp(0, 1)
     # By channel: a tensor of the background would be copied to the device for each frame.
-    visible = sums / density.clamp(min=1)
-    uncovered = 1 - density.clamp(0, 1)
-    visible = torch.stack(
-        [visible[..., k] + uncovered[..., 0] * behind[k] for k in range(3)], dim=-1
-    )
+    channels = [c + uncovered * level for c, level in zip(covered, behind, strict=True)]
+    visible = torch.stack(channels, dim=-1)
     pixels = (visible.clamp(0, 1) * 255).round().to(torch.uint8).flip(-3)
     return pixels.cpu().numpy()
 

@@ -139,9 +139,7 @@ def draw_worlds(
 
 def _middle(centre: Tensor | Sequence[float] | None, x: Tensor) -> Tensor:
     world_count, _, space_dim = x.shape
-    if centre is None:
-        return x.new_zeros(space_dim)
-    middle = number_tensor("centre", centre).to(x)
+    middle = number_tensor("centre", [0.0] * space_dim if centre is None else centre).to(x)
     if middle.shape not in ((space_dim,), (world_count, space_dim)):
         raise NPAError(
             f"centre must have shape [{space_dim}] or [{world_count}, {space_dim}], "
