@@ -106,9 +106,8 @@ def named_rules(arguments: Iterable[str]) -> dict[str, str]:
 
     arguments = list(arguments)
     known = list(dict.fromkeys([*shipped_rules(), *preset_rules()]))
-    files = [
-        w for w in arguments if w not in known and (w.endswith(".safetensors") or Path(w).is_dir())
-    ]
+    others = [word for word in arguments if word not in known]
+    files = [word for word in others if word.endswith(".safetensors") or Path(word).is_dir()]
     names = [word for word in arguments if word not in files]
     sources = {name: name for name in (chosen_names("rule", names, known) if names else ())}
     for source in files:
@@ -159,6 +158,23 @@ class PartOptions:
     each, all with the same --out on a shared disk."""
     max_seconds: float = math.inf
     """No run starts after this time [s]; the next call continues."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SharedRunOptions:
+    """Options of runs that are resumed, and shared by processes."""
+
+    processes: int | None = None
+    """Processes that share the run, on CUDA one GPU each; by default 1, but 2 for small batches of
+    `train` on a CPU with enough cores. `torchrun --nproc-per-node=4 -m npa_envs ...` does the
+    same."""
+    gpus: int | None = None
+    """GPUs that share the run: `--gpus 4` means `--device cuda --processes 4`."""
+    resume: bool = False
+    """Continue from the checkpoint in the folder `out`, `train` with the configuration of that
+    folder. `--resume auto`: if there is one; else start."""
+    overwrite: bool = False
+    """Start again even if the folder `out` contains a run; the run's files are removed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -263,7 +279,11 @@ def progress_bar(
 ) -> Iterator[Callable[[int], None]]:
     """Show a progress bar; yield a function that is called with the steps since its last call."""
     with tqdm(total=total, disable=not show, unit=unit) as bar:
-        yield lambda steps: bar.update(steps)
+
+        def advance(steps: int) -> None:
+            bar.update(steps)
+
+        yield advance
 
 
 @contextlib.contextmanager

@@ -23,7 +23,7 @@ WORLDS = 16
 
 
 @dataclass(frozen=True, kw_only=True)
-class LearnOptions(common.RunOptions):
+class LearnOptions(common.SharedRunOptions, common.RunOptions):
     """Learn an environment by reinforcement learning, and write the run to a folder.
 
     Each point of the learning curve prints a line and writes a checkpoint. A run that was stopped
@@ -59,16 +59,6 @@ class LearnOptions(common.RunOptions):
     """Points of the curve after the first, and checkpoints."""
     out: Path = Path("runs/learn")
     """Folder for checkpoint, rules and curve."""
-    processes: int | None = None
-    """Processes that share the run, on CUDA one GPU each; by default 1. `torchrun
-    --nproc-per-node=4 -m npa_envs learn ...` does the same."""
-    gpus: int | None = None
-    """GPUs that share the run: `--gpus 4` means `--device cuda --processes 4`."""
-    resume: bool = False
-    """Continue from the checkpoint in the folder `out`. `--resume auto`: if there is one; else
-    start."""
-    overwrite: bool = False
-    """Start again even if the folder `out` contains a run; the run's files are removed."""
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -15,7 +15,6 @@ import torch.distributed as dist
 import tyro
 
 from npa_envs.cli import INTERRUPTED, common
-from npa_envs.cli.train_report import Training, write_report
 from npa_envs.errors import NPAError, shown
 from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2DConfig
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2DConfig
@@ -77,7 +76,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrainOptions:
+class TrainOptions(common.SharedRunOptions):
     """How a run starts and ends."""
 
     preset: str = ""
@@ -86,16 +85,6 @@ class TrainOptions:
     default `best` on CUDA if the task has it, else `fast`."""
     config: Path | None = None
     """YAML, TOML or JSON file of fields and values, also `preset`; overrides the preset."""
-    processes: int | None = None
-    """Processes that share the run, on CUDA one GPU each; by default 1, but 2 for small batches on
-    a CPU with enough cores. `torchrun --nproc-per-node=4 -m npa_envs train ...` does the same."""
-    gpus: int | None = None
-    """GPUs that share the run: `--gpus 4` means `--device cuda --processes 4`."""
-    resume: bool = False
-    """Continue from the checkpoint in the folder `out`, with the configuration of that folder.
-    `--resume auto`: if there is one; else start."""
-    overwrite: bool = False
-    """Start again even if the folder `out` contains a run; the run's files are removed."""
     max_seconds: float | None = None
     """Stop after this time [s]; the run can be resumed."""
     progress: bool = True
@@ -110,21 +99,24 @@ def resolve_task(task_name: str, arguments: Sequence[str]) -> list[str]:
 
 
 def parse_run(task_name: str, arguments: Sequence[str]) -> tuple[TrainOptions, TrainConfig[Any]]:
-    """Return the launch options and the configuration of a command line."""
-    return parse(task_name, starting_configuration(task_name, arguments), arguments)
+    """Return the launch options and the configuration of a command line.
+
+    Ends the process after `--help`, which shows the most used options, and `--help-all`.
+    """
+    base = starting_configuration(task_name, arguments)
+    if isinstance(base, JointTrainConfig):
+        return parse_joint(task_name, base, arguments)
+    return _parse_over(base, task_name, arguments)
 
 
 def _check_preset(
     name: str, run: TrainConfig[Any], task_name: str, folder: RunFolder, arguments: Sequence[str]
 ) -> None:
     """Check that a resumed run was started with the preset of the arguments."""
-    presets = {
-        preset_name: _fields_of(preset(preset_name, task_name))
-        for preset_name in task_entry(task_name).presets
-    }
-    values = _fields_of(run)
+    presets = {name: config_to_dict(one) for name, one in task_entry(task_name).presets.items()}
+    values = config_to_dict(run)
     changed = {word.partition("=")[0].lstrip("-").replace("-", "_") for word in arguments}
-    changed |= {word.removeprefix("no_") for word in changed} | {"out", "device"}
+    changed |= {word.removeprefix("no_") for word in changed} | {"out", "device", "task"}
     others = [
         f"{field}: {shown(values.get(field))}"
         for field, value in presets[name].items()
@@ -137,11 +129,6 @@ def _check_preset(
             f"preset must be the one that the run in {shown(str(folder.path))} was begun with, "
             f"but {name!r} differs from it ({', '.join(others)} there): leave --preset out"
         )
-
-
-def _fields_of(config: TrainConfig[Any]) -> dict[str, Any]:
-    """Return the fields of a configuration without its task."""
-    return {name: value for name, value in config_to_dict(config).items() if name != "task"}
 
 
 def starting_configuration(task_name: str, arguments: Sequence[str]) -> TrainConfig[Any]:
@@ -179,18 +166,6 @@ def default_preset(task_name: str, device: str) -> str:
     return "best" if cuda and "best" in task_entry(task_name).presets else "fast"
 
 
-def parse(
-    task_name: str, base: TrainConfig[Any], arguments: Sequence[str]
-) -> tuple[TrainOptions, TrainConfig[Any]]:
-    """Return the launch options, and the configuration changed by the others.
-
-    Ends the process after `--help`, which shows the most used options, and `--help-all`.
-    """
-    if isinstance(base, JointTrainConfig):
-        return parse_joint(task_name, base, arguments)
-    return _parse_over(base, task_name, arguments)
-
-
 ConfigT = TypeVar("ConfigT", bound=TrainConfig[Any])
 
 
@@ -212,9 +187,9 @@ def _parse_over(
         defaults = _with_common_fields(defaults)
     examples = "".join(f"\n  npa-envs train {task_name} {words}" for words in EXAMPLES[task_name])
     cls: Any = type(defaults)
-    config_type = cls[type(defaults.task)] if getattr(cls, "__parameters__", ()) else cls
+    command_type: Any = Command
     command = common.parse_options(
-        Command[config_type],
+        command_type[cls[type(defaults.task)] if cls.__parameters__ else cls],
         f"train {task_name}",
         ["--help" if word == "--help-all" else word for word in arguments],
         description=f"{description}\n\nExamples:{examples}",
@@ -271,30 +246,32 @@ def parse_joint(
 ) -> tuple[TrainOptions, JointTrainConfig[CoMorphogenesis2DConfig]]:
     """Return the command line's configuration of a run of several species."""
     task = base.task
+    shared_fields = {
+        "targets": tuple(one.target for one in task.species),
+        "distance": task.distance,
+    }
     # Parsed once for each species, so that fields without an option keep each species' value.
-    launch, shared = _parse_over(_flat(base, task, 0), task_name, arguments)
-    targets = shared.task.targets
+    parsed = []
+    for species in task.species:
+        species_options = _of_type(SpeciesOptions, species, **shared_fields)
+        defaults: JointOptions = _of_type(JointOptions, base, task=species_options)
+        parsed.append(_parse_over(defaults, task_name, arguments))
+    launch, first = parsed[0]
+    targets = first.task.targets
     if len(targets) < 2:
         raise NPAError(f"targets must be two or more, got {len(targets)}: --targets ring heart")
-    species = []
-    for number, target in enumerate(targets):
-        defaults = _flat(base, task, min(number, len(task.species) - 1))
-        _, config = _parse_over(defaults, task_name, arguments)
-        species.append(
-            _of_type(Morphogenesis2DConfig, replace(config.task, target=target, targets=()))
+    configs = tuple(
+        # Targets without a species take the options of the last one.
+        _of_type(
+            Morphogenesis2DConfig,
+            parsed[min(k, len(parsed) - 1)][1].task,
+            target=target,
+            targets=(),
         )
-    together = replace(task, species=tuple(species), distance=shared.task.distance)
-    return launch, _of_type(JointTrainConfig, shared, task=together)
-
-
-def _flat(
-    base: JointTrainConfig[CoMorphogenesis2DConfig], task: CoMorphogenesis2DConfig, number: int
-) -> JointOptions:
-    """Return the options of a configuration, with the fields of species `number`."""
-    others = {"targets": tuple(one.target for one in task.species), "distance": task.distance}
-    options = _of_type(SpeciesOptions, task.species[number], **others)
-    flat: JointOptions = _of_type(JointOptions, base, task=options)
-    return flat
+        for k, target in enumerate(targets)
+    )
+    together = replace(task, species=configs, distance=first.task.distance)
+    return launch, _of_type(JointTrainConfig, first, task=together)
 
 
 def _of_type(cls: Any, source: Any, **others: Any) -> Any:
@@ -395,6 +372,8 @@ def run(
         print(f"  rule        {rule}")
     print(f"  log         {folder.log}\n  pictures    {folder.pictures}/")
     if options.report and result.iteration > 0 and not result.interrupted:
+        from npa_envs.cli.train_report import Training, write_report
+
         command = ("train", *arguments)
         if options.resume:  # The run's file has the options that these arguments leave out.
             command = ("train", task_name, "--config", str(folder.config))

@@ -54,18 +54,19 @@ class Shown:
 
     def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> dict[str, Any]:
         """Return a JPEG, which is smaller than a PNG, or a WebP film in HTML."""
-        shown: dict[str, Any] = {"text/plain": repr(self)}
+        bundle: dict[str, Any] = {"text/plain": repr(self)}
         if len(self.frames) == 1:
             picture = encode_frame(self.frames[0], "JPEG")
-            return shown | {"image/jpeg": base64.b64encode(picture).decode()}
+            return bundle | {"image/jpeg": base64.b64encode(picture).decode()}
         film = base64.b64encode(encode_webp(self.frames, self.fps)).decode()
-        return shown | {"text/html": f'<img alt="{self!r}" src="data:image/webp;base64,{film}">'}
+        return bundle | {"text/html": f'<img alt="{self!r}" src="data:image/webp;base64,{film}">'}
 
 
 def show(frames: Frame | Iterable[Frame], *, fps: float = 25.0) -> Shown:
     """Return a picture [H, W, 3], such as `env.render()`, or several as a film, for a notebook."""
-    one = isinstance(frames, np.ndarray) and frames.ndim == 3
-    return Shown([frames] if one else frames, fps)
+    if isinstance(frames, np.ndarray) and frames.ndim == 3:
+        frames = [frames]
+    return Shown(frames, fps)
 
 
 def show_worlds(
@@ -132,7 +133,7 @@ def _spacing(x: Tensor) -> float:
 _NO_SCREEN = ("offscreen", "dummy")
 """SDL's drivers without a screen, which `SDL_VIDEODRIVER` may select."""
 
-_shown: Window | None = None
+_open_window: Window | None = None
 """The open window: pygame allows one for each process."""
 
 
@@ -151,7 +152,7 @@ class Window:
     """
 
     def __init__(self, title: str, size: int = 512, *, fps: float | None = None) -> None:
-        global _shown
+        global _open_window
         if fps is not None:
             check_rate(fps)
         self.size = (checked_side("size", size),) * 2
@@ -170,11 +171,11 @@ class Window:
             self._pygame = importlib.import_module("pygame")
         self._clock = self._pygame.time.Clock()
         self._surface: Any = None
-        if _shown is not None:
-            _shown.close()
+        if _open_window is not None:
+            _open_window.close()
         reason = self._open(title)
         if reason is None:
-            _shown = self
+            _open_window = self
         else:
             warnings.warn(
                 f"there is no screen to open a window on ({reason}): nothing will be shown; for "
@@ -203,11 +204,11 @@ class Window:
 
     def close(self) -> None:
         """Close the window; closing it again does nothing."""
-        global _shown
+        global _open_window
         self.closed = True
         if self._surface is not None:
             self._surface = None
-            _shown = None
+            _open_window = None
             self._pygame.display.quit()
 
     def _open(self, title: str) -> str | None:

@@ -412,18 +412,6 @@ def test_rollout_repeats_itself_and_makes_about_150_frames(tmp_path, rule):
         assert (film.size, film.n_frames) == ((16, 16), 152)
 
 
-def test_rollout_runs_a_rule_whose_file_names_no_task(tmp_path, capsys):
-    save_rule(NPARule(2, 8, 16, eps0=0.2), tmp_path / "rule.safetensors")
-    words = ["rollout", str(tmp_path / "rule.safetensors"), "--steps", "2", "--no-progress"]
-    words += ["--particle-count", "100", "--resolution", "24", "--out", str(tmp_path)]
-    assert main(words) == 0
-    text = capsys.readouterr().out
-    assert "PSNR" not in text
-    assert "its file does not say what it grows" in text
-    with Image.open(tmp_path / "growth.gif") as film:
-        assert np.asarray(film.convert("RGB")).min() < 250
-
-
 def test_a_film_to_share_has_the_style_and_the_background_that_were_asked_for(
     tmp_path, rule, capsys
 ):
@@ -478,7 +466,7 @@ def test_a_rule_with_damaged_metadata_is_refused(config, tmp_path, capsys):
     assert f"the metadata of '{path}'" in capsys.readouterr().err
 
 
-def test_a_rule_outlives_the_picture_that_it_was_trained_on(tmp_path, capsys):
+def test_a_rule_without_a_target_grows_without_figures(tmp_path, capsys):
     picture = tmp_path / "square.png"
     pixels = np.zeros((16, 16, 4), dtype=np.uint8)
     pixels[4:12, 4:12] = (200, 30, 30, 255)
@@ -486,12 +474,21 @@ def test_a_rule_outlives_the_picture_that_it_was_trained_on(tmp_path, capsys):
     words = ["train", *TINY, "--milestones", "--target", str(picture), "--out"]
     assert main([*words, str(tmp_path / "run")]) == 0
     picture.unlink()
-    rule = str(tmp_path / "run" / "rule.safetensors")
-    words = ["rollout", rule, "--steps", "2", "--no-progress", "--out", str(tmp_path)]
-    assert main(words) == 0
-    assert "its target cannot be loaded" in capsys.readouterr().out
+    rule, plain = str(tmp_path / "run" / "rule.safetensors"), str(tmp_path / "plain.safetensors")
+    save_rule(NPARule(2, 8, 16, eps0=0.2), plain)
+    words = ["--steps", "2", "--particle-count", "100", "--no-progress", "--out", str(tmp_path)]
+    for source, doubt in (
+        (rule, "its target cannot be loaded"),
+        (plain, "its file does not say what it grows"),
+    ):
+        assert main(["rollout", source, *words]) == 0
+        text = capsys.readouterr().out
+        assert doubt in text
+        assert "PSNR" not in text
+        with Image.open(tmp_path / "growth.gif") as film:
+            assert np.asarray(film.convert("RGB")).min() < 250
     assert "square.png" in error_of(capsys, ["evaluate", rule, "--no-progress"])
-    assert main([*words, "--target", "ring"]) == 0
+    assert main(["rollout", rule, *words, "--target", "ring"]) == 0
     assert "PSNR" in capsys.readouterr().out
 
 
