@@ -215,7 +215,7 @@ def read_pairs(dataset_id: str) -> tuple[Tensor, Tensor]:
     except (FileNotFoundError, ValueError) as error:
         raise NPAError(
             f"there is no dataset {shown(dataset_id)} in {shown(str(get_dataset_path()))}: record "
-            "one with npa-envs record, or set MINARI_DATASETS_PATH"
+            "one with npa-envs record-dataset, or set MINARI_DATASETS_PATH"
         ) from error
     observations, actions = [], []
     for episode in dataset.iterate_episodes():

@@ -2,7 +2,7 @@
 
 There are two suites, one for a GPU and a small one for a laptop. A row contains the results of one
 method in a suite: for each problem the returns of at least `MIN_SEEDS` runs. It is a JSON file by
-`npa_bench_v0.schema.json`. `docs/npa_bench_rows.py` checks rows and computes scores from them.
+`npa_bench_v0.schema.json`. `docs/scripts/npa_bench_rows.py` checks rows and computes their scores.
 """
 
 from __future__ import annotations

@@ -27,7 +27,7 @@ GROUPS = {
     "learn": {
         "learn": "reinforcement learning of an environment, on one GPU or several",
         "compare": "compare reinforcement learning, evolution and the gradient on equal tasks",
-        "record": "write episodes of a policy as a Minari dataset",
+        "record-dataset": "write episodes of a policy as a Minari dataset",
     },
     "measure": {
         "evaluate": "loss, PSNR, overflow and extent of a rule over thousands of steps",

@@ -13,7 +13,12 @@ from npa_envs.errors import NPAError
 
 @dataclass(frozen=True, kw_only=True)
 class BenchOptions(common.MeasureOptions):
-    """Measure the paper's table, scaling and other times; or list the kernels of a step."""
+    """Measure the paper's table, scaling and other times; or list the kernels of a step.
+
+    Examples:
+      npa-envs bench --quick
+      npa-envs bench --suite scaling --out results --plots
+    """
 
     suite: str | None = None
     """quick (the default), paper, scaling, skips, species or kernels."""
@@ -78,12 +83,12 @@ def main(arguments: Sequence[str]) -> int:
     folder = None if options.out is None else common.writable_folder(options.out)
     if options.plots:
         plots.check_matplotlib()
-    with common.measuring(options, None, "row") as bar:
+    with common.measuring(options, None, "row") as advance:
         session = timing.TimingSession(
             device=device,
             repeats=options.repeats,
             small=options.quick,
-            progress=bar.advance,
+            progress=advance,
             enough=benchmark_records.time_limit(options.max_seconds),
         )
         tables = suites.SUITES[name](session)

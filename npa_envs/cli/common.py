@@ -24,60 +24,6 @@ if TYPE_CHECKING:
 
 OptionsT = TypeVar("OptionsT")
 
-EXAMPLES = """\
-bench --quick
-bench --suite scaling --out results --plots
-compare --quick --out quick
-compare --seconds 60 --methods gradient ppo --tasks morphogenesis2d
-compare --suite npa-bench-small-v0 --out bench --jobs 2
-demo
-demo --target star --train-seconds 60 --out star
-doctor
-evaluate gecko --healing
-evaluate runs/heart --seed-count 2
-export-web gecko heart -o page.html
-export-web --gallery -o gallery.html
-interact gecko heart
-interact --quick
-learn ppo npa/Morphogenesis2D-v0 --keywords target=heart --particle-steps 1e9 --device cuda
-learn shac npa/Mixing-v0 --seconds 600 --gpus 2 --out runs/mixing
-list
-record npa/Morphogenesis2D-v0 --policy gecko --options target=gecko --dataset npa/gecko-v0
-record npa/Gardener2DSmall-v0 --policy scripted --dataset npa/gardener/scripted-v0
-robustness heart --quick
-robustness --device cuda --out results
-rollout gecko --damage 300:cut 500:wipe --steps 700
-rollout runs/heart
-rollout gecko --resolution 512 --style points --background black
-search
-search --method cma-me --budget 5e7 --out runs/alive
-stress --quick
-stress --only geometry --out results
-sweep --over target=heart,ring seed=0,1,2 --devices cuda:0 cuda:1 -- morphogenesis2d
-view gecko
-view runs/heart
-view npa/Morphogenesis2D-v0 --policy gecko
-warmup
-warmup --device cuda --space-dims 2 3
-train morphogenesis2d --target heart --out runs/heart
-train morphogenesis2d --preset paper --target lizard.png --device cuda
-train morphogenesis2d --preset paper --target lizard.png --gpus 4
-train co_morphogenesis2d --targets ring heart
-train co_morphogenesis2d --preset paper --targets gecko heart --device cuda
-train morphogenesis3d --target duck --out runs/duck
-train morphogenesis3d --preset paper --target statue.obj --device cuda
-train texture --target dots --out runs/dots
-train texture --target wall.png --loss filter_swd
-train point_classification --out runs/digits
-train point_classification --preset paper --data mnist --device cuda
-"""
-"""Examples that the help of each command shows, a line each."""
-
-
-def examples_of(command: str) -> list[str]:
-    """Return the examples of a command."""
-    return [line for line in EXAMPLES.splitlines() if f"{line} ".startswith(f"{command} ")]
-
 
 def parse_options(
     cls: type[OptionsT],
@@ -92,12 +38,11 @@ def parse_options(
     Ends the process after `--help`, and with code 2 for a wrong argument. The help begins with
     `description` or the dataclass's docstring.
     """
-    shown = "\n".join(f"  npa-envs {example}" for example in examples_of(command) or [command])
     kwargs: dict[str, Any] = {} if default is None else {"default": default}
     options: OptionsT = tyro.cli(
         cls,
         prog=f"npa-envs {command}",
-        description=f"{description or inspect.getdoc(cls)}\n\nExamples:\n{shown}",
+        description=description or inspect.getdoc(cls),
         args=arguments,
         config=(tyro.conf.OmitArgPrefixes, tyro.conf.DisallowNone, tyro.conf.SuppressFixed),
         **kwargs,
@@ -161,9 +106,8 @@ def named_rules(arguments: Iterable[str]) -> dict[str, str]:
 
     arguments = list(arguments)
     known = list(dict.fromkeys([*shipped_rules(), *preset_rules()]))
-    files = [
-        w for w in arguments if w not in known and (w.endswith(".safetensors") or Path(w).is_dir())
-    ]
+    others = [word for word in arguments if word not in known]
+    files = [word for word in others if word.endswith(".safetensors") or Path(word).is_dir()]
     names = [word for word in arguments if word not in files]
     sources = {name: name for name in (chosen_names("rule", names, known) if names else ())}
     for source in files:
@@ -214,6 +158,23 @@ class PartOptions:
     each, all with the same --out on a shared disk."""
     max_seconds: float = math.inf
     """No run starts after this time [s]; the next call continues."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SharedRunOptions:
+    """Options of runs that are resumed, and shared by processes."""
+
+    processes: int | None = None
+    """Processes that share the run, on CUDA one GPU each; by default 1, but 2 for small batches of
+    `train` on a CPU with enough cores. `torchrun --nproc-per-node=4 -m npa_envs ...` does the
+    same."""
+    gpus: int | None = None
+    """GPUs that share the run: `--gpus 4` means `--device cuda --processes 4`."""
+    resume: bool = False
+    """Continue from the checkpoint in the folder `out`, `train` with the configuration of that
+    folder. `--resume auto`: if there is one; else start."""
+    overwrite: bool = False
+    """Start again even if the folder `out` contains a run; the run's files are removed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -312,25 +273,26 @@ def torch_threads(count: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-class StepBar:
-    """A progress bar, as a context manager."""
+@contextlib.contextmanager
+def progress_bar(
+    total: int | None, *, show: bool, unit: str = "step"
+) -> Iterator[Callable[[int], None]]:
+    """Show a progress bar; yield a function that is called with the steps since its last call."""
+    with tqdm(total=total, disable=not show, unit=unit) as bar:
 
-    def __init__(self, total: int | None, *, show: bool, unit: str = "step") -> None:
-        self._bar = tqdm(total=total, disable=not show, unit=unit)
+        def advance(steps: int) -> None:
+            bar.update(steps)
 
-    def advance(self, steps: int) -> None:
-        """Count steps done since the last call."""
-        self._bar.update(steps)
-
-    def __enter__(self) -> StepBar:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.close()
+        yield advance
 
 
 @contextlib.contextmanager
-def measuring(options: Any, total: int | None, unit: str = "step") -> Iterator[StepBar]:
+def measuring(
+    options: Any, total: int | None, unit: str = "step"
+) -> Iterator[Callable[[int], None]]:
     """Show a progress bar and use `options.threads` CPU threads within the block."""
-    with StepBar(total, show=options.progress, unit=unit) as bar, torch_threads(options.threads):
-        yield bar
+    with (
+        progress_bar(total, show=options.progress, unit=unit) as advance,
+        torch_threads(options.threads),
+    ):
+        yield advance

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 import json
 import math
 import re
 import sys
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -32,7 +31,7 @@ QUICK_EPISODES, QUICK_STEPS = 4, 200_000
 QUICK: dict[str, Any] = {
     "tasks": ("morphogenesis2d",),
     "methods": ("gradient", "evolution", "zero"),
-    "seeds": 1,
+    "seed_count": 1,
 }
 """Defaults of a quick comparison."""
 
@@ -44,6 +43,11 @@ class CompareOptions(common.PartOptions, common.MeasureOptions):
     Each run learns in its own process. A failed run is recorded with its error, and the others
     continue. A stopped comparison continues and repeats failed runs. The exit code is 1 if a run
     failed.
+
+    Examples:
+      npa-envs compare --quick --out quick
+      npa-envs compare --learning-seconds 60 --methods gradient ppo --tasks morphogenesis2d
+      npa-envs compare --suite npa-bench-small-v0 --out bench --jobs 2
     """
 
     out: Path = Path("comparison")
@@ -59,9 +63,9 @@ class CompareOptions(common.PartOptions, common.MeasureOptions):
     """Methods of npa_envs.agents.learning; default: those of the suite, or all but `clone`, which
     imitates the run of `gradient` from the same seed. NAME=METHOD gives one a new name, for other
     options (bold=ppo), or runs your function (mine=module:function)."""
-    seeds: int | None = None
+    seed_count: int | None = None
     """Number of seeds 0, 1, ... for each method and task; default: 3, in a suite 5, quick 1."""
-    seconds: float | None = None
+    learning_seconds: float | None = None
     """Compare for equal wall time: seconds of learning of each run, without evaluations."""
     particle_steps: float | None = None
     """Compare for equal particle-steps: how many each run may learn from, for example 1e8."""
@@ -75,8 +79,8 @@ class CompareOptions(common.PartOptions, common.MeasureOptions):
     devices: tuple[str, ...] = ()
     """Devices to distribute the runs over, for example cuda:0 cuda:1; default: --device."""
     jobs: int | None = None
-    """Runs at the same time; default: one for each device. With --seconds each device must have the
-    same number, as runs on one device share its time."""
+    """Runs at the same time; default: one for each device. With --learning-seconds each device must
+    have the same number, as runs on one device share its time."""
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -89,6 +93,8 @@ def main(arguments: Sequence[str]) -> int:
     from npa_envs.process_queue import Slots
 
     command = command_text("compare", arguments, "--out")
+    # Methods of the user are imported from the current folder, as in the runs' processes.
+    sys.path.insert(0, str(Path.cwd()))
     plan = make_plan(options)
     folder = common.writable_folder(options.out)
     # Read before any run, so that a record of other settings is refused at once.
@@ -96,19 +102,19 @@ def main(arguments: Sequence[str]) -> int:
     if options.suite is not None:
         check_rows(SUITES[options.suite], plan, folder / ROWS)
     jobs = plan.jobs()
-    mine = plan.part(options.part)
-    missing = [job for job in mine if job not in records]
+    part_jobs = plan.part(options.part)
+    missing = [job for job in part_jobs if job not in records]
 
-    def whole() -> list[RunRecord]:
+    def done_records() -> list[RunRecord]:
         return [records[job] for job in jobs if job in records]
 
-    def written(record: RunRecord) -> None:
+    def add_record(record: RunRecord) -> None:
         records[record.job] = record
-        write_table(plan, whole(), folder, command)
-        bar.advance(1)
+        write_table(plan, done_records(), folder, command)
+        advance(1)
 
     slots = Slots((options.devices or (options.device,)), _jobs(options), options.threads)
-    with common.StepBar(len(missing), show=options.progress, unit="run") as bar:
+    with common.progress_bar(len(missing), show=options.progress, unit="run") as advance:
         run_jobs(
             plan,
             missing,
@@ -116,18 +122,18 @@ def main(arguments: Sequence[str]) -> int:
             slots,
             command=command,
             max_seconds=options.max_seconds,
-            written=written,
+            written=add_record,
         )
-    lines = [write_table(plan, whole(), folder, command), *write_pictures(whole(), folder)]
+    done = done_records()
+    lines = [write_table(plan, done, folder, command), *write_pictures(done, folder)]
     if options.suite is not None:
-        rows = write_rows(
-            SUITES[options.suite], plan, whole(), common.writable_folder(folder / ROWS), command
-        )
+        rows_folder = common.writable_folder(folder / ROWS)
+        rows = write_rows(SUITES[options.suite], plan, done, rows_folder, command)
         lines += [f"wrote {path}" for path in rows]
-    failed = [record for record in whole() if record.status == "failed"]
+    failed = [record for record in done if record.status == "failed"]
     lines += [f"{record.job} failed: {record.error}" for record in failed]
-    left = sum(job not in records for job in mine)
-    lines += [f"{left} runs are left: call again with the same options"] if left else []
+    if remaining := sum(job not in records for job in part_jobs):
+        lines.append(f"{remaining} runs are left: call again with the same options")
     print("\n".join(lines))
     return 1 if failed else 0
 
@@ -139,30 +145,30 @@ def make_plan(options: CompareOptions) -> ComparisonPlan:
     from npa_envs.agents.learning import METHODS
     from npa_envs.agents.learning.problem import RUNS
 
-    common.check_numbers(options, seeds=1, episodes=1, jobs=1, threads=1)
-    if options.seeds is not None and options.seeds > RUNS:
+    common.check_numbers(options, seed_count=1, episodes=1, jobs=1, threads=1)
+    if options.seed_count is not None and options.seed_count > RUNS:
         raise NPAError(
-            f"seeds must be at most {RUNS}, got {options.seeds}: later runs would learn in the "
-            "worlds of evaluations"
+            f"seed_count must be at most {RUNS}, got {options.seed_count}: later runs would learn "
+            "in the worlds of evaluations"
         )
     quick = options.quick
     suite = None if options.suite is None else npa_bench.SUITES[options.suite]
     if suite:
-        for name in ("seconds", "particle_steps", "episodes"):
+        for name in ("learning_seconds", "particle_steps", "episodes"):
             if getattr(options, name) is not None:
                 raise NPAError(
                     f"--{name.replace('_', '-')} must not be given with --suite, whose protocol is "
                     "frozen: leave it out, or compare without a suite"
                 )
     elif quick:
-        few = {name: getattr(options, name) or value for name, value in QUICK.items()}
-        options = replace(options, **few)
+        changes = {name: getattr(options, name) or value for name, value in QUICK.items()}
+        options = replace(options, **changes)
     tasks = common.chosen_names("task", options.tasks, suite.tasks if suite else PROBLEMS)
     if suite and quick and not options.tasks:
         tasks = tasks[:1]
     methods, own = _chosen_methods(options.methods, suite.methods if suite else METHODS)
-    chosen = _method_options(options.options, methods, own) if suite else {}
-    for name in chosen.keys() - own.keys():
+    changed_options = _method_options(options.options, methods, own) if suite else {}
+    for name in changed_options.keys() - own.keys():
         raise NPAError(
             f"options of {name!r} are frozen in {options.suite}: give it a name of its own, "
             f"--methods my_{name}={name} --options my_{name}.NAME=VALUE"
@@ -183,16 +189,16 @@ def make_plan(options: CompareOptions) -> ComparisonPlan:
         if not options.methods:
             methods = [name for name in methods if name != "clone"]  # It needs a teacher.
         problems = {name: make_problem(name, quick=quick) for name in tasks}
-        budgets = {axis: dict.fromkeys(tasks, held) for axis, held in _budgets(options).items()}
-        chosen = _method_options(options.options, methods, own)
+        budgets = {axis: dict.fromkeys(tasks, limit) for axis, limit in _budgets(options).items()}
+        changed_options = _method_options(options.options, methods, own)
         left_out = [] if options.methods else list(LEFT_OUT)
         seeds, episodes = 3, 32
     return ComparisonPlan(
         tasks={name: json.loads(problem.to_json()) for name, problem in problems.items()},
         methods=methods,
-        seeds=tuple(range(options.seeds or seeds)),
+        seeds=tuple(range(options.seed_count or seeds)),
         budgets=budgets,
-        options=chosen,
+        options=changed_options,
         own=own,
         left_out=left_out,
         episodes=options.episodes or (QUICK_EPISODES if quick else episodes),
@@ -201,14 +207,14 @@ def make_plan(options: CompareOptions) -> ComparisonPlan:
 
 
 def _budgets(options: CompareOptions) -> dict[Axis, float]:
-    seconds, steps = options.seconds, options.particle_steps
+    seconds, steps = options.learning_seconds, options.particle_steps
     if options.quick and steps is None and seconds is None:
         steps = QUICK_STEPS
     limits: dict[Axis, float | None] = {"seconds": seconds, "particle-steps": steps}
     budgets = {axis: limit for axis, limit in limits.items() if limit is not None}
     if not budgets:
         raise NPAError(
-            "a comparison needs a budget: give --seconds 60, --particle-steps 1e8 or both"
+            "a comparison needs a budget: give --learning-seconds 60, --particle-steps 1e8 or both"
         )
     for axis, value in budgets.items():
         if not (0.0 < value < math.inf and (axis == "seconds" or value >= 1.0)):
@@ -235,21 +241,9 @@ def _chosen_methods(
                 "a method's own name must be new and of small letters, digits and _, got "
                 f"{name!r}: my_{method.rpartition(':')[2]}={method}"
             )
-        with _this_folder_searched():
-            method_options(method)
+        method_options(method)
     plain = [word for word in arguments if "=" not in word]
     return [*(common.chosen_names("method", plain, known) if plain or not own else []), *own], own
-
-
-@contextlib.contextmanager
-def _this_folder_searched() -> Iterator[None]:
-    """Let Python import modules of the current folder within the block, as in runs' processes."""
-    before = list(sys.path)
-    sys.path.insert(0, str(Path.cwd()))
-    try:
-        yield
-    finally:
-        sys.path[:] = before
 
 
 def _method_options(
@@ -267,8 +261,7 @@ def _method_options(
             )
         if method not in methods:
             raise NPAError(f"unknown method {method!r} in {word!r}: {suggest(method, methods)}")
-        with _this_folder_searched():
-            known = method_options(own.get(method, method))
+        known = method_options(own.get(method, method))
         if option not in known:
             raise NPAError(f"unknown option {option!r} in {word!r}: {suggest(option, known)}")
         options_of.setdefault(method, {}).update(
@@ -278,10 +271,10 @@ def _method_options(
 
 
 def _jobs(options: CompareOptions) -> int:
-    """Return the number of runs at the same time; with --seconds, equal on all devices."""
+    """Return the number of runs at the same time; with --learning-seconds, equal on all devices."""
     count = len(options.devices or (options.device,))
     jobs = count if options.jobs is None else options.jobs
-    if options.seconds is not None and jobs % count:
+    if options.learning_seconds is not None and jobs % count:
         raise NPAError(
             f"jobs must be a multiple of the number of devices, {count}, where wall time is equal, "
             f"got {jobs}: give --jobs {-(-jobs // count) * count}, or leave it out"

@@ -36,7 +36,12 @@ SMALL_RUN: dict[str, Any] = {
 @dataclass(frozen=True, kw_only=True)
 class DemoOptions(common.RunOptions):
     """Grow a shipped rule from its seed, damage it twice and let it heal; then train a small rule
-    from a picture."""
+    from a picture.
+
+    Examples:
+      npa-envs demo
+      npa-envs demo --target star --train-seconds 60 --out star
+    """
 
     out: Path = Path("demo")
     """Folder to write to; created where missing."""
@@ -87,12 +92,12 @@ def grow_and_heal(options: DemoOptions, device: torch.device) -> Iterator[str]:
     task = trained.task.toward(worlds.goal)
     yield f"{options.rule}: {worlds.x.shape[1]} particles, {rule.weight_count} weights"
     figures, film, step = [], WorldFilm(), 0
-    with common.StepBar(GROW_STEPS + 2 * HEAL_STEPS, show=options.progress) as bar:
+    with common.progress_bar(GROW_STEPS + 2 * HEAL_STEPS, show=options.progress) as advance:
         for kind, steps in ((None, GROW_STEPS), ("cut", HEAL_STEPS), ("wipe", HEAL_STEPS)):
             damages = [] if kind is None else [DamageEvent(step, kind)]
             worlds, film = film_world(
                 rule, task, worlds, steps, generator=generator, damages=damages, every=FRAME_STEPS,
-                first_step=step, film=film, progress=bar.advance,
+                first_step=step, film=film, progress=advance,
             )  # fmt: skip
             step += steps
             text = "grown" if kind is None else f"healed after {damages[0].text}"

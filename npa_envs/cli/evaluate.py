@@ -21,6 +21,10 @@ class EvaluateOptions(common.RuleOptions):
     For a rule that classifies point clouds: the accuracy on clouds that it was not trained on, also
     after they are cut or replaced. For a rule of many pictures, unless `--target` names one of
     them: loss and PSNR of each picture, and the loss with the code of another.
+
+    Examples:
+      npa-envs evaluate gecko --healing
+      npa-envs evaluate runs/heart --seed-count 2
     """
 
     data_folder: str | None = None
@@ -68,8 +72,8 @@ def main(arguments: Sequence[str]) -> int:
             )
         tasks = tasks_of_codes(options.rule, rule, device, **options.world)
         kwargs["checkpoints"] = options.checkpoints or quality.PICTURE_CHECKPOINTS
-        with common.StepBar(None, show=options.progress) as bar:
-            rows = quality.picture_rows(rule, tasks, progress=bar.advance, **kwargs)
+        with common.progress_bar(None, show=options.progress) as advance:
+            rows = quality.picture_rows(rule, tasks, progress=advance, **kwargs)
         tables = {"pictures": rows}
         metric = tasks[0].metric_name
         what = f"{len(tasks)} pictures, {options.seed_count} worlds each"
@@ -87,8 +91,8 @@ def main(arguments: Sequence[str]) -> int:
         kwargs["judge"] = TextureJudge(task) if options.judge else None
         kwargs["changed"] = task.classifies or options.healing
         total = None if kwargs["changed"] else max(checkpoints)
-        with common.StepBar(total, show=options.progress) as bar:
-            tables = quality.tables_of(rule, task, progress=bar.advance, **kwargs)
+        with common.progress_bar(total, show=options.progress) as advance:
+            tables = quality.tables_of(rule, task, progress=advance, **kwargs)
         what, metric = f"{options.seed_count} worlds", task.metric_name
         if task.classifies:
             clouds = cast("PointClassification", task)

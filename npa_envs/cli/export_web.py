@@ -19,11 +19,15 @@ class ExportOptions:
 
     It needs no server and no network. If the name ends in .json, it writes a collection for the
     authors' web demo instead, without title or gallery.
+
+    Examples:
+      npa-envs export-web gecko heart --out page.html
+      npa-envs export-web --gallery --out gallery.html
     """
 
     rules: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RULE")] = ()
     """Shipped rules (`npa-envs list`), folders of runs, or files of rules."""
-    out: Annotated[Path, tyro.conf.arg(aliases=("-o",))] = Path("page.html")
+    out: Path = Path("page.html")
     """The file to write."""
     gallery: bool = False
     """Begin with pictures to choose from; default of RULE: all shipped 2D rules."""

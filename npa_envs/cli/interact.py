@@ -48,6 +48,10 @@ class InteractOptions(common.RunOptions, InteractionSettings):
     "cooperates": the loss falls by more than the margin; "disrupted": it rises by more; "mixes":
     the mixing index is 0.25 or more. Densities of each rule are divided by its own particles. The
     folder gets a JSON file, a heat map, and a filmstrip of each pair. A stopped run continues.
+
+    Examples:
+      npa-envs interact gecko heart
+      npa-envs interact --quick
     """
 
     rules: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RULE")] = ()
@@ -64,8 +68,8 @@ def main(arguments: Sequence[str]) -> int:
     """Grow pairs of rules that have no record yet; write record and pictures, print a table."""
     options = common.parse_options(InteractOptions, "interact", arguments)
     if options.quick:
-        few = InteractOptions(**QUICK)
-        options = common.parse_options(InteractOptions, "interact", arguments, default=few)
+        defaults = InteractOptions(**QUICK)
+        options = common.parse_options(InteractOptions, "interact", arguments, default=defaults)
     shipped = list(shipped_rules(TASK))[: 2 if options.quick else None]
     rules = _rules(options.rules or shipped, options.checked_device())
     pairs: dict[str, tuple[RuleUnderTest, RuleUnderTest]] = {}
@@ -79,12 +83,14 @@ def main(arguments: Sequence[str]) -> int:
             f"rules must be two or more without itself, got {rules[0].name}: name another one, "
             "or leave out --no-itself"
         )
-    with common.StepBar(None, show=options.progress) as bar:
-        encounters = Encounters(rules, options, bar.advance)
+    with common.progress_bar(None, show=options.progress) as advance:
+        encounters = Encounters(rules, options, advance)
         folder = common.writable_folder(options.out)
         record = InteractionRecord(_facts(encounters, rules), folder / "interactions.json").read()
         done = {(row.rule, row.beside) for row in record.rows}
-        missing = {n: (a, b) for n, (a, b) in pairs.items() if (a.name, b.name) not in done}
+        missing = {
+            name: pair for name, pair in pairs.items() if tuple(r.name for r in pair) not in done
+        }
         if done:
             print(f"{len(pairs) - len(missing)} of {len(pairs)} pairs were measured before")
         for name, pair in missing.items():

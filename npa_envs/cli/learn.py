@@ -23,11 +23,15 @@ WORLDS = 16
 
 
 @dataclass(frozen=True, kw_only=True)
-class LearnOptions(common.RunOptions):
+class LearnOptions(common.SharedRunOptions, common.RunOptions):
     """Learn an environment by reinforcement learning, and write the run to a folder.
 
     Each point of the learning curve prints a line and writes a checkpoint. A run that was stopped
     by SIGTERM, Ctrl-C or a kill continues with `--resume`, on any number of processes.
+
+    Examples:
+      npa-envs learn ppo npa/Morphogenesis2D-v0 --keywords target=heart --particle-steps 1e9
+      npa-envs learn shac npa/Mixing-v0 --learning-seconds 600 --gpus 2 --out runs/mixing
     """
 
     method: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="METHOD")]
@@ -47,24 +51,14 @@ class LearnOptions(common.RunOptions):
     """Seed of everything random, from 0 to 99."""
     particle_steps: float | None = None
     """Budget in particle-steps (steps of the worlds times their particles), for example 1e8."""
-    seconds: float | None = None
+    learning_seconds: float | None = None
     """Budget in seconds of learning, without start and evaluations."""
     episodes: int = 16
     """Episodes that evaluate each point of the curve."""
-    entries: int = 20
+    points: int = 20
     """Points of the curve after the first, and checkpoints."""
     out: Path = Path("runs/learn")
     """Folder for checkpoint, rules and curve."""
-    processes: int | None = None
-    """Processes that share the run, on CUDA one GPU each; by default 1. `torchrun
-    --nproc-per-node=4 -m npa_envs learn ...` does the same."""
-    gpus: int | None = None
-    """GPUs that share the run: `--gpus 4` means `--device cuda --processes 4`."""
-    resume: bool = False
-    """Continue from the checkpoint in the folder `out`. `--resume auto`: if there is one; else
-    start."""
-    overwrite: bool = False
-    """Start again even if the folder `out` contains a run; the run's files are removed."""
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -94,7 +88,7 @@ def main(arguments: Sequence[str]) -> int:
 def parse(arguments: Sequence[str]) -> LearnOptions:
     """Return the options of `npa-envs learn`."""
     options = common.parse_options(LearnOptions, "learn", arguments)
-    common.check_numbers(options, worlds=1, episodes=1, entries=1)
+    common.check_numbers(options, worlds=1, episodes=1, points=1)
     return options
 
 
@@ -105,8 +99,10 @@ def run(options: LearnOptions, ranks: ProcessGroup) -> int:
     from npa_envs.cli import INTERRUPTED
 
     steps = options.particle_steps
-    if steps is None and options.seconds is None:
-        raise NPAError("learn needs a budget: give --particle-steps 1e8, --seconds 600 or both")
+    if steps is None and options.learning_seconds is None:
+        raise NPAError(
+            "learn needs a budget: give --particle-steps 1e8, --learning-seconds 600 or both"
+        )
     if steps is not None and not math.isfinite(steps):
         raise NPAError(f"particle_steps must be finite, got {steps}: try 1e8")
 
@@ -122,7 +118,9 @@ def run(options: LearnOptions, ranks: ProcessGroup) -> int:
     if options.method == "shac" and options.worlds is not None:
         kwargs.setdefault("world_count", options.worlds)
     stopped: list[bool] = []
-    budget = Budget(seconds=options.seconds, particle_steps=None if steps is None else int(steps))
+    budget = Budget(
+        seconds=options.learning_seconds, particle_steps=None if steps is None else int(steps)
+    )
     train(
         options.method,
         problem_of(options),
@@ -130,7 +128,7 @@ def run(options: LearnOptions, ranks: ProcessGroup) -> int:
         options.seed,
         device=options.device,
         evaluation_seeds=range(FIRST_EVALUATION_SEED, FIRST_EVALUATION_SEED + options.episodes),
-        entries=options.entries,
+        entries=options.points,
         on_entry=show,
         on_stop=lambda: stopped.append(True),
         out=options.out,

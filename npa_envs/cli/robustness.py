@@ -21,6 +21,10 @@ class RobustnessOptions(common.MeasureOptions):
 
     The result is a table of figures over seeds; `npa-envs stress` is the command with verdicts.
     With --out a rule's JSON file is written after each value, and a stopped run continues there.
+
+    Examples:
+      npa-envs robustness heart --quick
+      npa-envs robustness --device cuda --out results
     """
 
     rules: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RULES")] = ()
@@ -61,11 +65,11 @@ def main(arguments: Sequence[str]) -> int:
         # One of each task.
         names = list({task_name(name): name for name in reversed(names)}.values())[::-1]
     device = options.checked_device()
-    most = options.most_particles or report.MAX_PARTICLES[device.type]
+    max_particles = options.most_particles or report.MAX_PARTICLES[device.type]
     count = options.seed_count or (QUICK_SEEDS if options.quick else 8)
     seeds = range(options.first_seed, options.first_seed + count)
     facts = measured_facts(
-        device, options.commit, quick=options.quick, seeds=list(seeds), most_particles=most
+        device, options.commit, quick=options.quick, seeds=list(seeds), most_particles=max_particles
     )
     folder = None if options.out is None else common.writable_folder(options.out)
     records = {}
@@ -79,15 +83,15 @@ def main(arguments: Sequence[str]) -> int:
             done=False,
             command=command_text("robustness", arguments, "--out"),
         ).read()
-    with common.measuring(options, len(names), "rule") as bar:
+    with common.measuring(options, len(names), "rule") as advance:
         for name, record in records.items():
             if not record.done and not enough():
                 task = task_name(sources[name])
                 plan = quick_plan(task) if options.quick else PLANS[task]
                 small = QUICK_PARTICLES if options.quick else None
                 trial = RuleTrial(sources[name], device, plan, seeds, small)
-                report.measure_rule(record, trial, most, enough=enough)
-            bar.advance(1)
+                report.measure_rule(record, trial, max_particles, enough=enough)
+            advance(1)
     done = [record for record in records.values() if record.done]
     lines = []
     if done:
@@ -96,9 +100,9 @@ def main(arguments: Sequence[str]) -> int:
         # Written before printing, which fails if the reader of a pipe has ended.
         write_text(folder / "robustness.md", lines[0])
         lines.append(f"wrote {folder}: robustness.md and a record for each rule")
-        place = folder / "robustness_*.png"
-        lines += write_plots(lambda: report.pictures(done), place, "curves")
-    if left := len(names) - len(done):
-        lines.append(f"{left} rules are left: call again with the same options")
+        plots = folder / "robustness_*.png"
+        lines += write_plots(lambda: report.pictures(done), plots, "curves")
+    if remaining := len(names) - len(done):
+        lines.append(f"{remaining} rules are left: call again with the same options")
     print("\n".join(lines))
     return 0

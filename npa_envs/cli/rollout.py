@@ -19,6 +19,11 @@ class RolloutCommand(common.RuleOptions):
 
     A 3D world also gets a turntable GIF, and files of the grown cloud as points (PLY) and as
     Gaussians (PLY, .splat).
+
+    Examples:
+      npa-envs rollout gecko --damage 300:cut 500:wipe --steps 700
+      npa-envs rollout runs/heart
+      npa-envs rollout gecko --resolution 512 --style points --background black
     """
 
     steps: int = 512
@@ -84,7 +89,7 @@ def main(arguments: Sequence[str]) -> int:
     worlds = task.seed(1, generator=generator, device=device)
     goal = worlds.goal
     task = task.toward(goal)
-    with stop_flag() as stop, common.StepBar(options.steps, show=options.progress) as bar:
+    with stop_flag() as stop, common.progress_bar(options.steps, show=options.progress) as advance:
         worlds, film = film_world(
             rule,
             film_task,
@@ -94,7 +99,7 @@ def main(arguments: Sequence[str]) -> int:
             damages=damages,
             every=options.every,
             film=WorldFilm(background=options.background),
-            progress=bar.advance,
+            progress=advance,
             stop=stop.is_set,
         )
     done = max(film.steps.values())

@@ -17,10 +17,14 @@ class SearchOptions(common.RunOptions, SearchWorld):
     """Search for rules that differ from each other and stay alive.
 
     An archive keeps the best candidate of each kind: by speed, by how crowded particles stand, and
-    by how colours mix. Best is whose colours change most while states and positions
-    stay within [-1, 1]. The folder gets every elite as a rule's file that
+    by how colours mix. The best are those whose colours change most while states and positions stay
+    within [-1, 1]. The folder gets every elite as a rule's file that
     `view` and `rollout` open, a page that shows them, and a record. The same command goes on where
     a search was stopped, and further with a larger budget.
+
+    Examples:
+      npa-envs search
+      npa-envs search --method cma-me --budget 5e7 --out runs/alive
     """
 
     method: Literal["map-elites", "cma-me", "cma-es", "random"] = "map-elites"
@@ -71,9 +75,9 @@ def main(arguments: Sequence[str]) -> int:
     if search.evaluations:
         print(f"{search.evaluations} candidates were tried before")
     budget = int(options.budget)
-    with common.measuring(options, budget, "particle-step") as bar:
-        bar.advance(search.particle_steps)
-        search.run(budget, enough=enough, progress=bar.advance)
+    with common.measuring(options, budget, "particle-step") as advance:
+        advance(search.particle_steps)
+        search.run(budget, enough=enough, progress=advance)
         if not search.growth:
             print("nothing was tried: raise --max-seconds")
             return 0

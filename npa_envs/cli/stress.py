@@ -19,6 +19,10 @@ class StressOptions(common.MeasureOptions):
     Every check has an expectation, figures and a verdict: pass, fail, a range in which a property
     is true, or skipped. With --out a JSON file is written after each check, and a stopped run
     continues: checks that passed are not repeated.
+
+    Examples:
+      npa-envs stress --quick
+      npa-envs stress --only geometry --out results
     """
 
     rules: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RULES")] = ()
@@ -68,13 +72,13 @@ def main(arguments: Sequence[str]) -> int:
     done = sum(map(record.is_done, chosen))
     if done:
         print(f"{done} of {len(chosen)} checks were done before")
-    with common.measuring(options, len(chosen), "check") as bar:
+    with common.measuring(options, len(chosen), "check") as advance:
         check_runner.run_checks(
             chosen,
             check_runner.CheckSession(device, quick=options.quick, seed=options.seed),
             record,
             max_seconds=options.max_seconds,
-            progress=bar.advance,
+            progress=advance,
         )
     print(record.text())
     if path is not None:

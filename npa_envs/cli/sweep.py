@@ -41,6 +41,9 @@ class SweepOptions(common.PartOptions):
     continues: finished runs stay as they are, started ones resume from their checkpoints, failed
     ones are tried again. Ctrl-C or SIGTERM lets runs write checkpoints; a second one ends them at
     once. The exit code is 1 if a run failed.
+
+    Examples:
+      npa-envs sweep --over target=heart,ring seed=0,1,2 --devices cuda:0 cuda:1 -- morphogenesis2d
     """
 
     over: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=A,B,C")]
@@ -106,8 +109,8 @@ class SweepRun(Child):
         """Write its arguments, exit code and wall time [s]."""
         assert self.process is not None, "it is over"
         seconds = time.perf_counter() - self.start_time
-        held = {"code": int(self.process.returncode), "seconds": seconds}
-        write_record(self.folder / RECORD, {"facts": {"words": self.arguments}, **held})
+        result = {"code": int(self.process.returncode), "seconds": seconds}
+        write_record(self.folder / RECORD, {"facts": {"words": self.arguments}, **result})
 
     def record(self) -> tuple[int, float] | None:
         """Return the recorded exit code and time, or None; refuses those of other arguments."""
@@ -121,28 +124,27 @@ class SweepRun(Child):
     @property
     def done(self) -> bool:
         """Whether its record says that it ended without an error."""
-        held = self.record()
-        return held is not None and held[0] == 0
+        record = self.record()
+        return record is not None and record[0] == 0
 
 
 def main(arguments: Sequence[str]) -> int:
     """Run what is missing, print and write; return 1 if a run failed."""
-    words = list(arguments)
-    split = words.index("--") if "--" in words else len(words)
-    options = common.parse_options(SweepOptions, "sweep", words[:split])
+    split = arguments.index("--") if "--" in arguments else len(arguments)
+    options = common.parse_options(SweepOptions, "sweep", arguments[:split])
     common.check_numbers(options, jobs=1, threads=1)
     folder = common.writable_folder(options.out)
-    runs = combinations(options.over, words[split + 1 :], folder, options.threads)
-    mine = part_of(runs, options.part, lambda run: run.folder.name)
-    waiting = [run for run in mine if not run.done]
+    runs = combinations(options.over, arguments[split + 1 :], folder, options.threads)
+    part_runs = part_of(runs, options.part, lambda run: run.folder.name)
+    waiting = [run for run in part_runs if not run.done]
     slots = Slots(options.devices, options.jobs or len(options.devices), options.threads)
-    again = "runs are left: call again with the same arguments"
-    with common.StepBar(len(waiting), show=options.progress, unit="run") as bar:
+    hint = "runs are left: call again with the same arguments"
+    with common.progress_bar(len(waiting), show=options.progress, unit="run") as advance:
 
         def finished(run: SweepRun) -> None:
             run.write()
             write_text(folder / TABLE, table(runs))
-            bar.advance(1)
+            advance(1)
 
         try:
             run_children(
@@ -153,18 +155,18 @@ def main(arguments: Sequence[str]) -> int:
                 max_seconds=options.max_seconds,
             )
         except KeyboardInterrupt:
-            print(f"interrupted; {sum(not run.done for run in mine)} {again}")
+            print(f"interrupted; {sum(not run.done for run in part_runs)} {hint}")
             raise
     text = table(runs)
     write_text(folder / TABLE, text)
     print(text, end="")
-    left = [run for run in mine if not run.done]
-    failed = [run for run in left if (run.folder / RECORD).exists()]
+    unfinished = [run for run in part_runs if not run.done]
+    failed = [run for run in unfinished if (run.folder / RECORD).exists()]
     for run in failed:
         output = (run.folder / OUTPUT).read_text("utf-8", errors="replace").strip()[-SHOWN:]
         print(f"{run.folder.name} failed: {' '.join(output.split())}")
-    if len(left) > len(failed):
-        print(f"{len(left) - len(failed)} {again}")
+    if len(unfinished) > len(failed):
+        print(f"{len(unfinished) - len(failed)} {hint}")
     return 1 if failed else 0
 
 
@@ -194,11 +196,11 @@ def combinations(
         if name in used:
             raise NPAError(f"--{name} must not be given to the runs: a sweep does so by itself")
     runs = []
-    for one in itertools.product(*values.values()):
-        chosen = dict(zip(values, one, strict=True))
-        varied = [word for option, value in chosen.items() for word in (f"--{option}", value)]
-        name = ",".join(f"{option}={quote(value, safe='')}" for option, value in chosen.items())
-        runs.append(SweepRun(chosen, [*task_words, *varied], folder / name, threads))
+    for combination in itertools.product(*values.values()):
+        run_values = dict(zip(values, combination, strict=True))
+        options = [word for name, value in run_values.items() for word in (f"--{name}", value)]
+        name = ",".join(f"{name}={quote(value, safe='')}" for name, value in run_values.items())
+        runs.append(SweepRun(run_values, [*task_words, *options], folder / name, threads))
     return runs
 
 
@@ -214,10 +216,10 @@ def table(runs: Sequence[SweepRun]) -> str:
     rows = []
     for run in runs:
         state, seconds, scores = "not run", NONE, NONE
-        held = run.record()
-        if held is not None:
-            state = "done" if held[0] == 0 else f"failed with code {held[0]}"
-            seconds = f"{held[1]:.0f}"
+        record = run.record()
+        if record is not None:
+            state = "done" if record[0] == 0 else f"failed with code {record[0]}"
+            seconds = f"{record[1]:.0f}"
             reports = sorted((run.folder / "report").glob("rule*.json"))
             scores = "; ".join(score_line(read_json(report)) for report in reports) or NONE
         rows.append([*run.values.values(), state, seconds, scores])

@@ -5,17 +5,16 @@ from __future__ import annotations
 import importlib.util
 import math
 import shlex
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, make_dataclass, replace
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any, Generic, TypeVar, get_type_hints
 
 import torch
 import torch.distributed as dist
 import tyro
 
 from npa_envs.cli import INTERRUPTED, common
-from npa_envs.cli.train_report import Training, write_report
 from npa_envs.errors import NPAError, shown
 from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2DConfig
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2DConfig
@@ -27,7 +26,6 @@ from npa_envs.training import (
     check_device,
     config_to_dict,
     load_config,
-    override,
     preset,
     task_entry,
     train,
@@ -47,10 +45,8 @@ VIEWER = ("starlette", "uvicorn")
 THREADED_BATCH = 4096
 """From this number of particles of a batch on, two threads are faster than one."""
 
-COMMON = ("target", "iterations", "device", "out")
-"""Fields of configurations that are options of `TrainOptions`."""
-
 SHOWN = {
+    *("target", "iterations", "device", "out"),
     *("initial_rule", "initial_rules", "frozen", "repeats", "world_count", "pool_size", "steps"),
     *("learning_rate", "seed", "targets", "distance", "particle_count", "hidden_dim", "eps"),
     *("resolution", "loss", "data"),
@@ -58,34 +54,42 @@ SHOWN = {
 """Fields of configurations that `--help` shows; `--help-all` shows all of them."""
 
 
+EXAMPLES: dict[str, tuple[str, ...]] = {
+    "morphogenesis2d": (
+        "--target heart --out runs/heart",
+        "--preset paper --target lizard.png --device cuda",
+        "--preset paper --target lizard.png --gpus 4",
+    ),
+    "co_morphogenesis2d": (
+        "--targets ring heart",
+        "--preset paper --targets gecko heart --device cuda",
+    ),
+    "morphogenesis3d": (
+        "--target duck --out runs/duck",
+        "--preset paper --target statue.obj --device cuda",
+    ),
+    "texture": (
+        "--target dots --out runs/dots",
+        "--target wall.png --loss filter_swd",
+    ),
+    "point_classification": (
+        "--out runs/digits",
+        "--preset paper --data mnist --device cuda",
+    ),
+}
+"""Options that the help of each task shows as examples."""
+
+
 @dataclass(frozen=True, kw_only=True)
-class TrainOptions:
-    """The most common options."""
+class TrainOptions(common.SharedRunOptions):
+    """How a run starts and ends."""
 
     preset: str = ""
     """Configuration to start from: `paper`, `fast` (minutes on a CPU), `tiny` (seconds), or for
     pictures and textures `best` (minutes on a GPU); `npa-envs list` prints sizes and times. By
     default `best` on CUDA if the task has it, else `fast`."""
-    target: str = ""
-    """The target: a built-in name (`npa-envs list`), a file, or for morphogenesis2d an emoji."""
-    iterations: int = 0
-    """Optimiser steps in one repeat."""
-    device: str = "cpu"
-    """Where to train: cpu, cuda, cuda:1."""
-    out: Path = Path()
-    """Folder for log, pictures, checkpoint and rule; created where missing."""
     config: Path | None = None
     """YAML, TOML or JSON file of fields and values, also `preset`; overrides the preset."""
-    processes: int | None = None
-    """Processes that share the run, on CUDA one GPU each; by default 1, but 2 for small batches on
-    a CPU with enough cores. `torchrun --nproc-per-node=4 -m npa_envs train ...` does the same."""
-    gpus: int | None = None
-    """GPUs that share the run: `--gpus 4` means `--device cuda --processes 4`."""
-    resume: bool = False
-    """Continue from the checkpoint in the folder `out`, with the configuration of that folder.
-    `--resume auto`: if there is one; else start."""
-    overwrite: bool = False
-    """Start again even if the folder `out` contains a run; the run's files are removed."""
     max_seconds: float | None = None
     """Stop after this time [s]; the run can be resumed."""
     progress: bool = True
@@ -100,21 +104,24 @@ def resolve_task(task_name: str, arguments: Sequence[str]) -> list[str]:
 
 
 def parse_run(task_name: str, arguments: Sequence[str]) -> tuple[TrainOptions, TrainConfig[Any]]:
-    """Return the launch options and the configuration of a command line."""
-    return parse(task_name, starting_configuration(task_name, arguments), arguments)
+    """Return the launch options and the configuration of a command line.
+
+    Ends the process after `--help`, which shows the most used options, and `--help-all`.
+    """
+    base = starting_configuration(task_name, arguments)
+    if isinstance(base, JointTrainConfig):
+        return parse_joint(task_name, base, arguments)
+    return _parse_over(base, task_name, arguments)
 
 
 def _check_preset(
     name: str, run: TrainConfig[Any], task_name: str, folder: RunFolder, arguments: Sequence[str]
 ) -> None:
     """Check that a resumed run was started with the preset of the arguments."""
-    presets = {
-        preset_name: _fields_of(preset(preset_name, task_name))
-        for preset_name in task_entry(task_name).presets
-    }
-    values = _fields_of(run)
+    presets = {name: config_to_dict(one) for name, one in task_entry(task_name).presets.items()}
+    values = config_to_dict(run)
     changed = {word.partition("=")[0].lstrip("-").replace("-", "_") for word in arguments}
-    changed |= {word.removeprefix("no_") for word in changed} | {"out", "device"}
+    changed |= {word.removeprefix("no_") for word in changed} | {"out", "device", "task"}
     others = [
         f"{field}: {shown(values.get(field))}"
         for field, value in presets[name].items()
@@ -127,11 +134,6 @@ def _check_preset(
             f"preset must be the one that the run in {shown(str(folder.path))} was begun with, "
             f"but {name!r} differs from it ({', '.join(others)} there): leave --preset out"
         )
-
-
-def _fields_of(config: TrainConfig[Any]) -> dict[str, Any]:
-    """Return the fields of a configuration without its task."""
-    return {name: value for name, value in config_to_dict(config).items() if name != "task"}
 
 
 def starting_configuration(task_name: str, arguments: Sequence[str]) -> TrainConfig[Any]:
@@ -169,65 +171,52 @@ def default_preset(task_name: str, device: str) -> str:
     return "best" if cuda and "best" in task_entry(task_name).presets else "fast"
 
 
-def parse(
-    task_name: str, base: TrainConfig[Any], arguments: Sequence[str]
-) -> tuple[TrainOptions, TrainConfig[Any]]:
-    """Return the launch options, and the configuration changed by the others.
-
-    Ends the process after `--help`, which shows the most used options, and `--help-all`.
-    """
-    # An option that is hidden from the help cannot be parsed, so only the help hides any.
-    whole = not {"-h", "--help"} & set(arguments)
-    arguments = ["--help" if word == "--help-all" else word for word in arguments]
-
-    def read(defaults: Any) -> tuple[TrainOptions, Any]:
-        # These fields are options of `TrainOptions`, and hidden among those of the configuration.
-        shared = {
-            name: getattr(holder, name)
-            for name in COMMON
-            for holder in (defaults, defaults.task)
-            if hasattr(holder, name)
-            and not (name == "target" and isinstance(holder, SpeciesOptions))
-        }
-        launch = _without(TrainOptions(**shared), set(COMMON) - shared.keys())
-        task = _without(defaults.task, shared, whole=whole)
-        training = _without(replace(defaults, task=task), shared, whole=whole)
-        groups = [("common", type(launch)), ("training", type(training))]
-        command = make_dataclass("Command", groups, frozen=True)
-        parsed: Any = common.parse_options(
-            command,
-            f"train {task_name}",
-            arguments,
-            description=f"Train on {task_name}. Defaults shown are those of the preset."
-            + ("" if whole else f" All options: npa-envs train {task_name} --help-all"),
-            default=command(launch, training),
-        )
-        task = _of_type(type(defaults.task), parsed.training.task)
-        config = _of_type(type(defaults), parsed.training, task=task)
-        return _of_type(TrainOptions, parsed.common), override(
-            config, **{name: getattr(parsed.common, name) for name in shared}
-        )
-
-    return parse_joint(base, read) if isinstance(base, JointTrainConfig) else read(base)
+ConfigT = TypeVar("ConfigT", bound=TrainConfig[Any])
 
 
-def _without(source: Any, names: Iterable[str], *, whole: bool = True) -> Any:
-    """Return a dataclass in which the fields `names` are no options.
+@dataclass(frozen=True)
+class Command(Generic[ConfigT]):
+    """All options of a command line, in the groups of its help."""
 
-    Unless `whole`, fields that are not in `SHOWN` are hidden too.
-    """
-    cls: Any = type(source)
-    fixed: Any = tyro.conf.Fixed
-    hidden: Any = tyro.conf.Suppress
+    run: TrainOptions
+    training: ConfigT
+
+
+def _parse_over(
+    defaults: ConfigT, task_name: str, arguments: Sequence[str]
+) -> tuple[TrainOptions, ConfigT]:
+    """Return the launch options and the configuration, whose options change `defaults`."""
+    description = f"Train on {task_name}. Defaults shown are those of the preset."
+    if {"-h", "--help"} & set(arguments):
+        description += f" All options: npa-envs train {task_name} --help-all"
+        defaults = _with_common_fields(defaults)
+    examples = "".join(f"\n  npa-envs train {task_name} {words}" for words in EXAMPLES[task_name])
+    cls: Any = type(defaults)
+    command_type: Any = Command
+    command = common.parse_options(
+        command_type[cls[type(defaults.task)] if cls.__parameters__ else cls],
+        f"train {task_name}",
+        ["--help" if word == "--help-all" else word for word in arguments],
+        description=f"{description}\n\nExamples:{examples}",
+        default=Command(TrainOptions(), defaults),
+    )
+    return command.run, command.training
+
+
+def _with_common_fields(config: Any) -> Any:
+    """Return a configuration whose fields that are not in `SHOWN` are hidden from the help."""
+    cls: Any = type(config)
     hints = get_type_hints(cls, include_extras=True)
-    changed = {} if whole else {name: hidden[hints[name]] for name in hints.keys() - SHOWN}
-    changed |= {name: fixed[hints[name]] for name in names if name in hints}
-    if "task" in hints:
-        changed["task"] = type(source.task)
-    options = [(name, hint, field(default=getattr(source, name))) for name, hint in changed.items()]
-    base = cls[changed["task"]] if getattr(cls, "__parameters__", ()) else cls
-    narrow = make_dataclass(cls.__name__, options, bases=(base,), frozen=True, kw_only=True)
-    return _of_type(narrow, source)
+    suppress: Any = tyro.conf.Suppress
+    types = {name: suppress[hint] for name, hint in hints.items() if name not in SHOWN}
+    values = {name: getattr(config, name) for name in types}
+    if "task" in types:
+        values["task"] = _with_common_fields(config.task)
+        types["task"] = type(values["task"])
+        cls = cls[types["task"]] if cls.__parameters__ else cls
+    hidden = [(name, types[name], field(default=value)) for name, value in values.items()]
+    narrow = make_dataclass(type(config).__name__, hidden, bases=(cls,), frozen=True, kw_only=True)
+    return _of_type(narrow, config, **values)
 
 
 # Options of tasks of several species: one level, although their configurations nest.
@@ -258,34 +247,36 @@ class JointOptions(JointTrainConfig[SpeciesOptions]):
 
 
 def parse_joint(
-    base: JointTrainConfig[CoMorphogenesis2DConfig],
-    read: Callable[[JointOptions], tuple[TrainOptions, JointOptions]],
+    task_name: str, base: JointTrainConfig[CoMorphogenesis2DConfig], arguments: Sequence[str]
 ) -> tuple[TrainOptions, JointTrainConfig[CoMorphogenesis2DConfig]]:
     """Return the command line's configuration of a run of several species."""
     task = base.task
+    shared_fields = {
+        "targets": tuple(one.target for one in task.species),
+        "distance": task.distance,
+    }
     # Parsed once for each species, so that fields without an option keep each species' value.
-    launch, shared = read(_flat(base, task, 0))
-    targets = shared.task.targets
+    parsed = []
+    for species in task.species:
+        species_options = _of_type(SpeciesOptions, species, **shared_fields)
+        defaults: JointOptions = _of_type(JointOptions, base, task=species_options)
+        parsed.append(_parse_over(defaults, task_name, arguments))
+    launch, first = parsed[0]
+    targets = first.task.targets
     if len(targets) < 2:
         raise NPAError(f"targets must be two or more, got {len(targets)}: --targets ring heart")
-    species = []
-    for number, target in enumerate(targets):
-        _, own = read(_flat(base, task, min(number, len(task.species) - 1)))
-        species.append(
-            _of_type(Morphogenesis2DConfig, replace(own.task, target=target, targets=()))
+    configs = tuple(
+        # Targets without a species take the options of the last one.
+        _of_type(
+            Morphogenesis2DConfig,
+            parsed[min(k, len(parsed) - 1)][1].task,
+            target=target,
+            targets=(),
         )
-    together = replace(task, species=tuple(species), distance=shared.task.distance)
-    return launch, _of_type(JointTrainConfig, shared, task=together)
-
-
-def _flat(
-    base: JointTrainConfig[CoMorphogenesis2DConfig], task: CoMorphogenesis2DConfig, number: int
-) -> JointOptions:
-    """Return the options of a configuration, with the fields of species `number`."""
-    others = {"targets": tuple(own.target for own in task.species), "distance": task.distance}
-    options = _of_type(SpeciesOptions, task.species[number], **others)
-    flat: JointOptions = _of_type(JointOptions, base, task=options)
-    return flat
+        for k, target in enumerate(targets)
+    )
+    together = replace(task, species=configs, distance=first.task.distance)
+    return launch, _of_type(JointTrainConfig, first, task=together)
 
 
 def _of_type(cls: Any, source: Any, **others: Any) -> Any:
@@ -369,12 +360,12 @@ def run(
     if not ranks.first:
         return INTERRUPTED if result.interrupted else 0
     rules = [folder.rule]
-    meet = ""
+    interact_command = ""
     if task_entry(task_name).joint:
         rules = [folder.rule_of(number) for number in range(len(config.task.species))]
-        meet = f"npa-envs interact {shlex.join(map(str, rules))}"
-        meet += f" --distances {config.task.distance:g}"
-        meet += f" --particle-count {sum(config.task.counts[:2])}"
+        interact_command = f"npa-envs interact {shlex.join(map(str, rules))}"
+        interact_command += f" --distances {config.task.distance:g}"
+        interact_command += f" --particle-count {sum(config.task.counts[:2])}"
     loss = result.record.get("loss")
     figures = "" if loss is None else f", training loss {loss:.4g}"
     if result.finished:
@@ -386,6 +377,8 @@ def run(
         print(f"  rule        {rule}")
     print(f"  log         {folder.log}\n  pictures    {folder.pictures}/")
     if options.report and result.iteration > 0 and not result.interrupted:
+        from npa_envs.cli.train_report import Training, write_report
+
         command = ("train", *arguments)
         if options.resume:  # The run's file has the options that these arguments leave out.
             command = ("train", task_name, "--config", str(folder.config))
@@ -405,8 +398,8 @@ def run(
             except NPAError as error:
                 # The rule is written in any case; a bad one may diverge while it is measured.
                 print(f"  no report   {error}")
-    if meet:
-        print(f"  together    {meet}")
+    if interact_command:
+        print(f"  together    {interact_command}")
     shown_path = shlex.quote(str(folder.path))
     if any(importlib.util.find_spec(name) is None for name in VIEWER):
         print(f"  look at it  npa-envs rollout {shown_path} (live: pip install 'npa-envs[view]')")
@@ -417,7 +410,7 @@ def run(
 
 def thread_count(config: TrainConfig[Any]) -> int:
     """Return the number of CPU threads for training: 1 for batches below `THREADED_BATCH`."""
-    batch = config.world_count * sum(own.particle_count for own in _species(config))
+    batch = config.world_count * sum(task.particle_count for task in _species(config))
     return 1 if batch < THREADED_BATCH else torch.get_num_threads()
 
 
@@ -455,8 +448,8 @@ def announcement(
 ) -> tuple[str, str]:
     """Return two lines: a run's targets, and its size and expected time."""
     species = _species(config)
-    goals = [goal for own in species for goal in getattr(own, "targets", ()) or (own.goal_text,)]
-    particles = " and ".join(str(own.particle_count) for own in species)
+    goals = [goal for task in species for goal in getattr(task, "targets", ()) or (task.goal_text,)]
+    particles = " and ".join(str(task.particle_count) for task in species)
     named = options.preset or default_preset(task_name, config.device)
     source = f"preset {named}" if options.config is None else str(options.config)
     expected = task_entry(task_name).expected_seconds(config)

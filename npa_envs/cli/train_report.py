@@ -87,7 +87,7 @@ def write_report(
     seeds = range(FIRST_SEED, FIRST_SEED + (8 if thorough else 2))
     judge = TextureJudge(task) if task.has_judge else None
     not_filmed = ""
-    with common.StepBar(None, show=progress) as bar:
+    with common.progress_bar(None, show=progress) as advance:
         tables = tables_of(
             rule,
             task,
@@ -95,7 +95,7 @@ def write_report(
             seeds=seeds,
             changed=thorough and (clouds or task.aligned),
             device=device,
-            progress=bar.advance,
+            progress=advance,
             judge=judge,
         )
         generator = torch.Generator(device).manual_seed(FIRST_SEED)
@@ -108,7 +108,7 @@ def write_report(
             FILM_STEPS,
             generator=generator,
             damages=FILM_DAMAGES if task.aligned else (),
-            progress=bar.advance,
+            progress=advance,
         )
         try:
             if task.has_views:

@@ -33,6 +33,11 @@ class ViewOptions(common.DeviceOptions):
 
     The page has brushes, sliders, damage and films. A run's world follows its newest checkpoint.
     The server answers only this computer; with another --host it prints a link with a token.
+
+    Examples:
+      npa-envs view gecko
+      npa-envs view runs/heart
+      npa-envs view npa/Morphogenesis2D-v0 --policy gecko
     """
 
     what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RULE|RUN|ENV")] = "gecko"
@@ -40,7 +45,7 @@ class ViewOptions(common.DeviceOptions):
     environment such as npa/Texture-v0."""
     policy: str = "zero"
     """The policy in an environment: "zero", "random", or a rule for it."""
-    options: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE")] = ()
+    keywords: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE")] = ()
     """Keywords of the environment, for example target=dots eps=0.3 eps0=0.3."""
     particle_count: int | None = None
     """Particles N; default: as trained."""
@@ -98,13 +103,14 @@ def world_maker(options: ViewOptions, device: torch.device) -> Callable[[], Live
 
     if options.what.startswith("npa/"):
         policy = options.policy
-        keywords = common.named_values("options", options.options)
+        keywords = common.named_values("keywords", options.keywords)
         for name in RESERVED:
             if name in keywords:
                 is_option = name in ("device", "policy")
                 hint = f"say --{name} {keywords[name]}" if is_option else "leave it out"
                 raise NPAError(
-                    f"options must leave {name} to the command, got {name}={keywords[name]}: {hint}"
+                    f"keywords must leave {name} to the command, got {name}={keywords[name]}: "
+                    f"{hint}"
                 )
         keywords = {"particle_count": options.particle_count} | keywords
 
@@ -113,8 +119,8 @@ def world_maker(options: ViewOptions, device: torch.device) -> Callable[[], Live
             return EnvironmentWorld(env, acting, seed=options.seed)
 
         return make_world
-    if options.policy != "zero" or options.options:
-        name = "options" if options.options else "policy"
+    if options.policy != "zero" or options.keywords:
+        name = "keywords" if options.keywords else "policy"
         raise NPAError(
             f"{name} is for environments, got --{name} with a rule or a run: leave it out"
         )

@@ -13,7 +13,12 @@ from npa_envs.errors import NPAError
 
 @dataclass(frozen=True, kw_only=True)
 class WarmupOptions(common.DeviceOptions):
-    """Compile the kernels ahead of time, into Warp's cache (`npa-envs doctor` prints where)."""
+    """Compile the kernels ahead of time, into Warp's cache (`npa-envs doctor` prints where).
+
+    Examples:
+      npa-envs warmup
+      npa-envs warmup --device cuda --space-dims 2 3
+    """
 
     space_dims: tuple[int, ...] = (2,)
     """Space dimensions: 2, 3 or both."""

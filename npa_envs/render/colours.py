@@ -41,17 +41,15 @@ def to_uint8(picture: Tensor, background: Background = "white") -> NDArray[np.ui
             f"got {picture.dtype} {tuple(picture.shape)}: give what splat returns"
         )
     check_dense("picture", picture)
-    behind = background_colour(background)
+    background_rgb = background_colour(background)
     fields = picture.detach().float()
-    valid = fields.isfinite().all(dim=-1, keepdim=True)
-    fields = torch.where(valid, fields, torch.zeros_like(fields))
+    fields = fields.where(fields.isfinite().all(dim=-1, keepdim=True), 0.0)
     sums, density = fields[..., :3], fields[..., 3:]
+    covered = (sums / density.clamp(min=1)).unbind(-1)
+    uncovered = 1 - density[..., 0].clamp(0, 1)
     # By channel: a tensor of the background would be copied to the device for each frame.
-    visible = sums / density.clamp(min=1)
-    uncovered = 1 - density.clamp(0, 1)
-    visible = torch.stack(
-        [visible[..., k] + uncovered[..., 0] * behind[k] for k in range(3)], dim=-1
-    )
+    channels = [c + uncovered * level for c, level in zip(covered, background_rgb, strict=True)]
+    visible = torch.stack(channels, dim=-1)
     pixels = (visible.clamp(0, 1) * 255).round().to(torch.uint8).flip(-3)
     return pixels.cpu().numpy()
 
@@ -67,8 +65,8 @@ def background_colour(background: Background) -> tuple[float, float, float]:
                 "give 'white', 'black', another name of CSS, or '#rrggbb'"
             ) from error
         return red / 255, green / 255, blue / 255
-    several = entries(background) or []
-    channels = [checked_number("a channel of background", part) for part in several]
+    parts = entries(background) or []
+    channels = [checked_number("a channel of background", part) for part in parts]
     if len(channels) != 3 or not all(0 <= channel <= 1 for channel in channels):
         raise NPAError(
             f"background must be red, green and blue in [0, 1], got {shown(background)}: "

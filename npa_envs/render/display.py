@@ -41,32 +41,32 @@ class Shown:
         fps: Frames a second of a film.
     """
 
-    def __init__(self, frames: list[Frame], fps: float) -> None:
-        self.frames = frames
+    def __init__(self, frames: Iterable[Frame], fps: float) -> None:
+        check_rate(fps)
+        self.frames = checked_frames(frames)
         self.fps = fps
 
     def __repr__(self) -> str:
         height, width, _ = self.frames[0].shape
-        if len(self.frames) == 1:
-            return f"a picture of {width} × {height} pixels"
-        return f"a film of {len(self.frames)} pictures of {width} × {height} pixels"
+        count = len(self.frames)
+        what = "a picture" if count == 1 else f"a film of {count} pictures"
+        return f"{what} of {width} × {height} pixels"
 
     def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> dict[str, Any]:
         """Return a JPEG, which is smaller than a PNG, or a WebP film in HTML."""
-        shown: dict[str, Any] = {"text/plain": repr(self)}
+        bundle: dict[str, Any] = {"text/plain": repr(self)}
         if len(self.frames) == 1:
-            return shown | {"image/jpeg": _base64(encode_frame(self.frames[0], "JPEG"))}
-        film = _base64(encode_webp(self.frames, self.fps))
-        return shown | {"text/html": f'<img alt="{self!r}" src="data:image/webp;base64,{film}">'}
+            picture = encode_frame(self.frames[0], "JPEG")
+            return bundle | {"image/jpeg": base64.b64encode(picture).decode()}
+        film = base64.b64encode(encode_webp(self.frames, self.fps)).decode()
+        return bundle | {"text/html": f'<img alt="{self!r}" src="data:image/webp;base64,{film}">'}
 
 
 def show(frames: Frame | Iterable[Frame], *, fps: float = 25.0) -> Shown:
-    """Return one picture [H, W, 3], such as `env.render()`, or several as a film, for a
-    notebook."""
-    check_rate(fps)
+    """Return a picture [H, W, 3], such as `env.render()`, or several as a film, for a notebook."""
     if isinstance(frames, np.ndarray) and frames.ndim == 3:
-        return Shown(checked_frames([frames]), fps)
-    return Shown(checked_frames(frames), fps)
+        frames = [frames]
+    return Shown(frames, fps)
 
 
 def show_worlds(
@@ -84,14 +84,12 @@ def show_worlds(
         drawing: Other arguments of `draw_worlds`.
     """
     check_rate(fps)
-    if not (isinstance(x, Tensor) and isinstance(s, Tensor) and x.ndim == s.ndim):
+    tensors = isinstance(x, Tensor) and isinstance(s, Tensor)
+    if not tensors or x.ndim != s.ndim or (x.ndim == 4 and len(x) != len(s)):
+        sizes = [tuple(each.shape) if isinstance(each, Tensor) else shown(each) for each in (x, s)]
         raise NPAError(
-            "x and s must be tensors of shape [B, N, D] and [B, N, C], or with one dimension "
-            "more at the front: give what rollout returns"
-        )
-    if x.ndim == 4 and len(x) != len(s):
-        raise NPAError(
-            f"x and s must have as many steps, got {len(x)} and {len(s)}: give what rollout returns"
+            "x and s must be tensors of shape [B, N, D] and [B, N, C], or with the same number of "
+            f"steps in front, got {sizes[0]} and {sizes[1]}: give what rollout returns"
         )
     steps = [(x, s)] if x.ndim != 4 else list(zip(x, s, strict=True))
     if not steps or 0 in x.shape:
@@ -106,20 +104,14 @@ def show_worlds(
 
 def side_by_side(pictures: NDArray[np.uint8]) -> Frame:
     """Return pictures [B, R, R, 3] as one picture, in a nearly square grid."""
-    count, height, width, _ = pictures.shape
+    count = len(pictures)
     across = math.ceil(math.sqrt(count))
     down = math.ceil(count / across)
-    sheet = np.full(
-        (down * (height + _GAP) - _GAP, across * (width + _GAP) - _GAP, 3), 255, np.uint8
-    )
-    for k, picture in enumerate(pictures):
-        top, left = (k // across) * (height + _GAP), (k % across) * (width + _GAP)
-        sheet[top : top + height, left : left + width] = picture
-    return sheet
-
-
-def _base64(content: bytes) -> str:
-    return base64.b64encode(content).decode("ascii")
+    padding = ((0, across * down - count), (0, _GAP), (0, _GAP), (0, 0))
+    cells = np.pad(pictures, padding, constant_values=255)
+    _, height, width, _ = cells.shape
+    rows = cells.reshape(down, across, height, width, 3).swapaxes(1, 2)
+    return rows.reshape(down * height, across * width, 3)[:-_GAP, :-_GAP]
 
 
 def _spacing(x: Tensor) -> float:
@@ -141,7 +133,7 @@ def _spacing(x: Tensor) -> float:
 _NO_SCREEN = ("offscreen", "dummy")
 """SDL's drivers without a screen, which `SDL_VIDEODRIVER` may select."""
 
-_shown: Window | None = None
+_open_window: Window | None = None
 """The open window: pygame allows one for each process."""
 
 
@@ -160,7 +152,7 @@ class Window:
     """
 
     def __init__(self, title: str, size: int = 512, *, fps: float | None = None) -> None:
-        global _shown
+        global _open_window
         if fps is not None:
             check_rate(fps)
         self.size = (checked_side("size", size),) * 2
@@ -169,14 +161,21 @@ class Window:
         """Largest number of frames a second; None: no limit."""
         self.closed = False
         """Whether it was closed, by the user, `close` or a new window."""
-        self._pygame = _import_pygame()
+        os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+        # SDL would turn SIGTERM into a QUIT event of the window.
+        os.environ.setdefault("SDL_NO_SIGNAL_HANDLERS", "1")
+        hint = "pip install 'npa-envs[human]', or use render_mode='rgb_array'"
+        with importing("pygame", "a window", hint), warnings.catch_warnings():
+            # pygame's use of setuptools is deprecated.
+            warnings.simplefilter("ignore")
+            self._pygame = importlib.import_module("pygame")
         self._clock = self._pygame.time.Clock()
         self._surface: Any = None
-        if _shown is not None:
-            _shown.close()
+        if _open_window is not None:
+            _open_window.close()
         reason = self._open(title)
         if reason is None:
-            _shown = self
+            _open_window = self
         else:
             warnings.warn(
                 f"there is no screen to open a window on ({reason}): nothing will be shown; for "
@@ -187,8 +186,12 @@ class Window:
     def show(self, frame: Frame) -> None:
         """Show a frame, uint8, shape [H, W, 3]; handle events, and wait as `fps` requires."""
         (pixels,) = checked_frames([frame])
-        self._handle_events()
         if self._surface is None:
+            return
+        # Another library of the process may have shut the display down.
+        shut_down = not self._pygame.display.get_init()
+        if shut_down or any(event.type == self._pygame.QUIT for event in self._pygame.event.get()):
+            self.close()
             return
         # pygame counts columns first.
         picture = self._pygame.surfarray.make_surface(pixels.swapaxes(0, 1))
@@ -199,21 +202,13 @@ class Window:
         if self.fps is not None:
             self._clock.tick(self.fps)
 
-    def _handle_events(self) -> None:
-        if self._surface is None:
-            return
-        # Another library of the process may have shut the display down.
-        shut_down = not self._pygame.display.get_init()
-        if shut_down or any(event.type == self._pygame.QUIT for event in self._pygame.event.get()):
-            self.close()
-
     def close(self) -> None:
         """Close the window; closing it again does nothing."""
-        global _shown
+        global _open_window
         self.closed = True
         if self._surface is not None:
             self._surface = None
-            _shown = None
+            _open_window = None
             self._pygame.display.quit()
 
     def _open(self, title: str) -> str | None:
@@ -231,15 +226,3 @@ class Window:
             reason = str(error)
         display.quit()
         return reason
-
-
-def _import_pygame() -> Any:
-    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
-    # SDL would turn SIGTERM into a QUIT event of the window.
-    os.environ.setdefault("SDL_NO_SIGNAL_HANDLERS", "1")
-    hint = "pip install 'npa-envs[human]', or use render_mode='rgb_array'"
-    with importing("pygame", "a window", hint), warnings.catch_warnings():
-        # pygame's use of setuptools is deprecated.
-        warnings.simplefilter("ignore")
-        pygame = importlib.import_module("pygame")
-    return pygame

@@ -173,15 +173,21 @@ def write_filmstrip(
     """
     pictures = checked_frames(frames)
     count = len(pictures)
-    captions = [] if captions is None else _checked_captions(captions, count)
+    texts: list[Any] = [] if captions is None else entries(captions) or []
+    right = len(texts) == count and all(isinstance(text, str) for text in texts)
+    if captions is not None and not right:
+        raise NPAError(
+            f"captions must be texts, one for each of the {count} frames, got {shown(captions)}: "
+            "give a list of str, or None"
+        )
     across = min(count, 8) if columns is None else columns
     check_count("columns", across, ": try 4")
     across = min(across, count)
     height, width, _ = pictures[0].shape
-    font = _caption_font(captions, width)
+    font = _caption_font(texts, width)
     _, top, _, bottom = font.getbbox("Ågjy")
-    text_height = math.ceil(bottom - top) + _MARGIN if captions else 0
-    cell = max([width, *(math.ceil(font.getlength(caption)) for caption in captions)])
+    text_height = math.ceil(bottom - top) + _MARGIN if texts else 0
+    cell = max([width, *(math.ceil(font.getlength(text)) for text in texts)])
     pitch_x, pitch_y = cell + _MARGIN, height + text_height + _MARGIN
     down = -(-count // across)
     red, green, blue = (round(255 * part) for part in background_colour(background))
@@ -192,24 +198,14 @@ def write_filmstrip(
     for k, picture in enumerate(pictures):
         left, upper = _MARGIN + (k % across) * pitch_x, _MARGIN + (k // across) * pitch_y
         strip.paste(Image.fromarray(picture), (left + (cell - width) // 2, upper))
-        if captions:
+        if texts:
             middle = (left + cell / 2, upper + height + _MARGIN / 2)
-            draw.text(middle, captions[k], fill=ink, font=font, anchor="ma")
+            draw.text(middle, texts[k], fill=ink, font=font, anchor="ma")
     with atomic_path(path) as temporary:
         if Path(path).suffix.lower() == ".webp":
             strip.save(temporary, format="WebP", quality=88, method=6)
         else:
             strip.save(temporary, format="PNG", optimize=True)
-
-
-def _checked_captions(captions: Any, count: int) -> list[str]:
-    texts = entries(captions) or []
-    if len(texts) != count or not all(isinstance(text, str) for text in texts):
-        raise NPAError(
-            f"captions must be texts, one for each of the {count} frames, got {shown(captions)}: "
-            "give a list of str, or None"
-        )
-    return texts
 
 
 def check_rate(fps: float, *, highest: float = 1000) -> None:
@@ -220,16 +216,13 @@ def check_rate(fps: float, *, highest: float = 1000) -> None:
 
 def checked_frames(frames: Iterable[Frame]) -> list[Frame]:
     """Return pictures as a list, after checking their number, shapes and dtype."""
-    several: Any = frames
-    if not isinstance(several, Iterable) or getattr(several, "ndim", 1) == 0:
-        raise NPAError(
-            f"frames must be a sequence of pictures, got {type(several).__name__}: "
-            "give [frame] for one"
-        )
     try:
-        pictures = [np.ascontiguousarray(frame) for frame in several]
+        pictures = [np.ascontiguousarray(frame) for frame in frames]
     except (TypeError, ValueError, RuntimeError) as error:
-        raise NPAError(f"frames must be uint8 [H, W, 3] arrays, got others ({error})") from error
+        raise NPAError(
+            f"frames must be a sequence of uint8 [H, W, 3] arrays, got others ({error}): give "
+            "[frame] for one"
+        ) from error
     if not pictures:
         raise NPAError(
             "frames must hold at least one picture, got none: give uint8 [H, W, 3] arrays"
@@ -276,8 +269,7 @@ def _shared_palette(pictures: list[Frame]) -> tuple[Image.Image, Frame, int]:
 def _caption_font(
     captions: Sequence[str], width: int
 ) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
-    largest = max(12, min(28, width // 12))
-    for size in range(largest, 9, -1):
+    for size in range(max(12, min(28, width // 12)), 10, -1):
         font = ImageFont.load_default(size)
         if all(font.getlength(caption) <= width for caption in captions):
             return font

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +13,6 @@ from npa_envs.atomic_files import write_bytes
 from npa_envs.errors import NPAError
 from npa_envs.tasks.gaussian_outputs import FLAT, Gaussians
 
-Columns = dict[str, NDArray[np.generic]]
-
 MIN_OPACITY = 1e-6
 """Opacities are clipped to this distance from 0 and 1, so that logits are finite."""
 
@@ -21,10 +20,10 @@ MIN_OPACITY = 1e-6
 def write_points(path: str | Path, x: Tensor, gaussians: Gaussians) -> None:
     """Write one world, x [1, N, 3], as a binary PLY file: x, y, z and red, green, blue."""
     positions = _checked(x)
-    columns: Columns = {name: positions[:, k] for k, name in enumerate("xyz")}
-    colours = (255.0 * _colours(gaussians)).round().astype(np.uint8)
-    columns |= {name: colours[:, k] for k, name in enumerate(("red", "green", "blue"))}
-    write_bytes(path, _ply(columns))
+    rows = np.zeros(len(positions), np.dtype([("position", "<f4", 3), ("colour", "u1", 3)]))
+    rows["position"], rows["colour"] = positions, (255.0 * _colours(gaussians)).round()
+    header = _ply_header(len(rows), float=("x", "y", "z"), uchar=("red", "green", "blue"))
+    write_bytes(path, header + rows.tobytes())
 
 
 def write_gaussians(path: str | Path, x: Tensor, gaussians: Gaussians) -> None:
@@ -35,16 +34,18 @@ def write_gaussians(path: str | Path, x: Tensor, gaussians: Gaussians) -> None:
     positions = _checked(x)
     harmonics = _numpy(gaussians.colours)
     opacity = _numpy(gaussians.opacities).clip(MIN_OPACITY, 1.0 - MIN_OPACITY)
-    columns: Columns = {name: positions[:, k] for k, name in enumerate("xyz")}
-    columns |= {f"n{name}": np.zeros(len(positions), np.float32) for name in "xyz"}
-    columns |= {f"f_dc_{k}": harmonics[:, 0, k] for k in range(3)}
-    rest = harmonics[:, 1:].transpose(0, 2, 1).reshape(len(positions), 9)
-    columns |= {f"f_rest_{k}": rest[:, k] for k in range(9)}
-    columns["opacity"] = np.log(opacity / (1.0 - opacity))
-    scales, rotations = np.log(_numpy(gaussians.scales)), _rotations(gaussians)
-    columns |= {f"scale_{k}": scales[:, k] for k in range(3)}
-    columns |= {f"rot_{k}": rotations[:, k] for k in range(4)}
-    write_bytes(path, _ply(columns))
+    columns = {
+        ("x", "y", "z"): positions,
+        ("nx", "ny", "nz"): np.zeros_like(positions),
+        tuple(f"f_dc_{k}" for k in range(3)): harmonics[:, 0],
+        tuple(f"f_rest_{k}" for k in range(9)): harmonics[:, 1:].transpose(0, 2, 1).reshape(-1, 9),
+        ("opacity",): np.log(opacity / (1.0 - opacity))[:, None],
+        tuple(f"scale_{k}" for k in range(3)): np.log(_numpy(gaussians.scales)),
+        tuple(f"rot_{k}" for k in range(4)): _rotations(gaussians),
+    }
+    table = np.concatenate(list(columns.values()), axis=1).astype("<f4")
+    header = _ply_header(len(table), float=[name for names in columns for name in names])
+    write_bytes(path, header + table.tobytes())
 
 
 def write_splat(path: str | Path, x: Tensor, gaussians: Gaussians) -> None:
@@ -68,16 +69,11 @@ def write_splat(path: str | Path, x: Tensor, gaussians: Gaussians) -> None:
     write_bytes(path, rows[order].tobytes())
 
 
-def _ply(columns: Columns) -> bytes:
-    """Return a binary PLY file with one property for each column, as bytes."""
-    kinds = {name: "u1" if c.dtype == np.uint8 else "<f4" for name, c in columns.items()}
-    types = {"u1": "uchar", "<f4": "float"}
-    rows = np.zeros(len(columns["x"]), np.dtype(list(kinds.items())))
-    for name, column in columns.items():
-        rows[name] = column
-    properties = [f"property {types[kind]} {name}" for name, kind in kinds.items()]
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
-    return "\n".join((*header, *properties, "end_header\n")).encode() + rows.tobytes()
+def _ply_header(count: int, **properties: Sequence[str]) -> bytes:
+    """Return the header of a binary PLY file: the names of its properties by their type."""
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
+    lines += [f"property {kind} {name}" for kind, names in properties.items() for name in names]
+    return "\n".join((*lines, "end_header\n")).encode()
 
 
 def _checked(x: Tensor) -> NDArray[np.float32]:

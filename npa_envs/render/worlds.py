@@ -106,7 +106,7 @@ def draw_worlds(
     )
     if periodic and x.shape[2] != 2:
         raise NPAError(f"periodic pictures are of 2D worlds, got D = {x.shape[2]}: leave it out")
-    behind = background_colour(background)
+    background_rgb = background_colour(background)
     with torch.no_grad():
         points = (x - _middle(centre, x)).float()
         colour = _colours(s.float(), style)
@@ -128,20 +128,18 @@ def draw_worlds(
             density = draw(points, colour, sigma=sigma)[..., 3]
             if depth is not None:
                 density = density * (pixel_size / half_width)
-            return density_colours(density.flip(-2), behind)
+            return density_colours(density.flip(-2), background_rgb)
         if depth is None:
-            return to_uint8(draw(points, colour, sigma=sigma), behind)
+            return to_uint8(draw(points, colour, sigma=sigma), background_rgb)
         depth = depth.where(visible, 0.0)
         light = 1.0 - SHADE * (0.5 - 0.5 * depth / half_width).clamp(0.0, 1.0)
         beads = partial(draw, sigma=BEAD * sigma)
-        return to_uint8(_stack_layers(beads, points, depth, colour * light), behind)
+        return to_uint8(_stack_layers(beads, points, depth, colour * light), background_rgb)
 
 
 def _middle(centre: Tensor | Sequence[float] | None, x: Tensor) -> Tensor:
     world_count, _, space_dim = x.shape
-    if centre is None:
-        return x.new_zeros(space_dim)
-    middle = number_tensor("centre", centre).to(x)
+    middle = number_tensor("centre", [0.0] * space_dim if centre is None else centre).to(x)
     if middle.shape not in ((space_dim,), (world_count, space_dim)):
         raise NPAError(
             f"centre must have shape [{space_dim}] or [{world_count}, {space_dim}], "
@@ -181,15 +179,15 @@ def _stack_layers(
     order = depth.argsort(dim=1, descending=True, stable=True)
     points = points.gather(1, order.expand_as(points))
     colour = colour.gather(1, order.expand_as(colour))
-    picture, through = points.new_zeros(()), points.new_ones(())
+    picture, transmittance = points.new_zeros(()), points.new_ones(())
     layers = min(LAYERS, points.shape[1])
     for part, tint in zip(
         points.tensor_split(layers, 1), colour.tensor_split(layers, 1), strict=True
     ):
         layer = draw(part, tint)
         density = layer[..., 3:]
-        passing = torch.exp(-OPACITY * density)
-        covering = through * (1.0 - passing)
-        picture = picture + covering * layer / density.clamp(min=torch.finfo(density.dtype).tiny)
-        through = through * passing
+        passed = torch.exp(-OPACITY * density)
+        weight = transmittance * (1.0 - passed)
+        picture = picture + weight * layer / density.clamp(min=torch.finfo(density.dtype).tiny)
+        transmittance = transmittance * passed
     return picture

@@ -101,6 +101,8 @@ INVASION, DYING = species("npa/Invasion-v0", seed_distance=0.5), species(deaths=
 ADVANCES = "must be a whole number from 0 to 99, .* got"
 LISTED = "gains must be a list of finite numbers"
 WARM = ("ppo", "ppo_world", "evolution", "gradient")
+TIMED = {"learning_seconds": 1.0}
+
 REFUSED = {
     fitted: [
         ({"rule": {}, "eps0": 0.2}, "eps0, 0.2, got 0.1: make .* with eps0=0.1"),
@@ -227,20 +229,20 @@ REFUSED = {
     part: [({"words": words}, "must be K/N") for words in ("0/2", "3/2", "2", "a/b", "1/-2")],
     compared: [
         ({}, "needs a budget"),
-        ({"seconds": 0.0}, "seconds must be positive"),
+        ({"learning_seconds": 0.0}, "seconds must be positive"),
         ({"particle_steps": 0.5}, "particle-steps must be positive"),
-        ({"seconds": 1.0, "seeds": 0}, "seeds must be at least 1"),
-        ({"seconds": 1.0, "seeds": 101}, "seeds must be at most 100, got 101"),
-        ({"seconds": 1.0, "methods": ("a=zero", "a=random")}, "got a=zero and a=random: rename"),
-        ({"seconds": 1.0, "tasks": ("mixin",)}, "did you mean 'mixing'"),
-        ({"seconds": 1.0, "methods": ("pp",)}, "did you mean 'ppo'"),
-        ({"seconds": 1.0, "options": ("evolution=3",)}, "METHOD.NAME=VALUE"),
-        ({"seconds": 1.0, "options": ("evolutio.sigma=3",)}, "did you mean 'evolution'"),
-        ({"seconds": 1.0, "options": ("evolution.sigmas=3",)}, "did you mean 'sigma'"),
-        ({"seconds": 1.0, "device": "tpu"}, "tpu"),
+        (TIMED | {"seed_count": 0}, "seed_count must be at least 1"),
+        (TIMED | {"seed_count": 101}, "seed_count must be at most 100, got 101"),
+        (TIMED | {"methods": ("a=zero", "a=random")}, "got a=zero and a=random: rename"),
+        (TIMED | {"tasks": ("mixin",)}, "did you mean 'mixing'"),
+        (TIMED | {"methods": ("pp",)}, "did you mean 'ppo'"),
+        (TIMED | {"options": ("evolution=3",)}, "METHOD.NAME=VALUE"),
+        (TIMED | {"options": ("evolutio.sigma=3",)}, "did you mean 'evolution'"),
+        (TIMED | {"options": ("evolution.sigmas=3",)}, "did you mean 'sigma'"),
+        (TIMED | {"device": "tpu"}, "tpu"),
     ],
     benched: [
-        ({"seconds": 1.0}, "--seconds must not be given with --suite"),
+        ({"learning_seconds": 1.0}, "--learning-seconds must not be given with --suite"),
         ({"particle_steps": 1.0}, "--particle-steps must not"),
         ({"episodes": 3}, "--episodes must not"),
         ({"options": ("sac.gamma=0.5",)}, "options of 'sac' are frozen"),

@@ -154,7 +154,7 @@ def test_every_method_runs_on_every_task_from_every_seed_in_every_budget():
 
 def test_the_command_line_becomes_a_plan():
     options = ("evolution.population=8",)
-    made = make_plan(CompareOptions(seconds=2.0, particle_steps=1e6, options=options))
+    made = make_plan(CompareOptions(learning_seconds=2.0, particle_steps=1e6, options=options))
     assert list(made.tasks) == list(PROBLEMS)
     assert list(made.methods) == [name for name in METHODS if name != "clone"]
     assert made.budgets["seconds"] == dict.fromkeys(PROBLEMS, 2.0)
@@ -164,12 +164,12 @@ def test_the_command_line_becomes_a_plan():
     assert (facts["budget"], facts["options"]) == (1e6, {"population": 8})
     assert facts["problem"]["env_id"] == "npa/Mixing-v0"
     assert made.facts(dataclasses.replace(job, method="ppo"))["options"] == {}
-    named = make_plan(CompareOptions(seconds=2.0, methods=("zero", "clone")))
+    named = make_plan(CompareOptions(learning_seconds=2.0, methods=("zero", "clone")))
     assert (list(named.methods), set(named.left_out)) == (["clone", "zero"], set())
     quick = make_plan(CompareOptions(quick=True))
     assert (list(quick.tasks), quick.seeds) == (["morphogenesis2d"], (0,))
     assert set(quick.methods) == {"gradient", "evolution", "zero"}
-    quick = make_plan(CompareOptions(quick=True, tasks=("mixing",), seeds=2))
+    quick = make_plan(CompareOptions(quick=True, tasks=("mixing",), seed_count=2))
     assert (list(quick.tasks), quick.seeds) == (["mixing"], (0, 1))
     for name, quick in itertools.product(PROBLEMS, (True, False)):
         problem = make_problem(name, quick=quick)
@@ -180,13 +180,13 @@ def test_the_command_line_becomes_a_plan():
 def test_every_device_has_a_run_and_none_more_than_another_where_times_are_compared():
     common = {"methods": ("zero",), "devices": ("cpu", "cpu")}
     for changes, counts in (
-        ({"seconds": 1.0}, (2, 1)),
-        ({"seconds": 1.0, "jobs": 4}, (4, 2)),
+        ({"learning_seconds": 1.0}, (2, 1)),
+        ({"learning_seconds": 1.0, "jobs": 4}, (4, 2)),
         ({"particle_steps": 1e6, "jobs": 3}, (3, 2)),
     ):
         options = CompareOptions(**common, **changes)
         assert (jobs_of(options), make_plan(options).settings["runs_at_once"]) == counts
-    uneven = CompareOptions(**common, seconds=1.0, jobs=3)
+    uneven = CompareOptions(**common, learning_seconds=1.0, jobs=3)
     refused(r"multiple of the number of devices, 2.*give --jobs 4", jobs_of, uneven)
 
 
@@ -360,7 +360,7 @@ def test_no_run_begins_once_the_time_is_over_and_who_waits_leaves_nothing(
 @pytest.mark.parametrize("line", [b"", b"cpu\n"], ids=["that waits", "that learns"])
 def test_the_process_of_a_run_ends_with_the_comparison(tmp_path, line):
     # On a device, it would learn for ten minutes.
-    request_of("mixing", "gradient", tmp_path, seconds=600.0)
+    request_of("mixing", "gradient", tmp_path, learning_seconds=600.0)
     process = subprocess.Popen(
         [*one_run.PROGRAM, str(tmp_path)], stdin=subprocess.PIPE, stderr=subprocess.PIPE
     )
@@ -512,7 +512,7 @@ def test_a_picture_shows_the_end_of_the_episode_and_not_the_next_start(name, dev
 def quick_words(methods: str, particle_steps: int, options: str) -> list[str]:
     """Words of a quick comparison; the options begin with one of evolution."""
     return (
-        f"compare --quick --tasks morphogenesis2d --seeds 1 --no-progress --methods {methods} "
+        f"compare --quick --tasks morphogenesis2d --seed-count 1 --no-progress --methods {methods} "
         f"--particle-steps {particle_steps} --options evolution.{options}"
     ).split()
 

@@ -17,7 +17,7 @@ from npa_envs.training.checkpoint import load_checkpoint
 from npa_envs.training.run_folder import Run
 
 WORDS = ["learn", "ppo", "npa/Morphogenesis2DSmall-v0", "--keywords", "target=ring"]
-WORDS += ["--worlds", "2", "--episode-steps", "4", "--episodes", "1", "--entries", "2"]
+WORDS += ["--worlds", "2", "--episode-steps", "4", "--episodes", "1", "--points", "2"]
 WORDS += ["--options", "steps=4"]
 ROUND = 4 * 2 * 64
 
@@ -39,15 +39,15 @@ def learned(out, rounds, *words):
 def test_a_run_begins_and_goes_on_with_the_same_words(tmp_path, capsys):
     assert learned(tmp_path, 2, "--resume", "auto") == (0, [0, 1, 2])
     assert learned(tmp_path, 4, "--resume", "auto") == (0, [0, 1, 2, 4])
-    told = capsys.readouterr().out
-    assert told.count("return") == 4
-    assert f"finished: rules, curve and checkpoint are in {tmp_path}/" in told
+    output = capsys.readouterr().out
+    assert output.count("return") == 4
+    assert f"finished: rules, curve and checkpoint are in {tmp_path}/" in output
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs Linux's /proc")
 def test_a_killed_process_ends_a_run_and_a_signal_stops_it(tmp_path):
-    words = [*WORDS, "--particle-steps", "1e9", "--seconds", "60", "--entries", "60"]
+    words = [*WORDS, "--particle-steps", "1e9", "--learning-seconds", "60", "--points", "60"]
     words += ["--out", str(tmp_path), "--processes", "2", "--resume", "auto"]
 
     def begun(count):
@@ -65,15 +65,15 @@ def test_a_killed_process_ends_a_run_and_a_signal_stops_it(tmp_path):
     run = begun(2)
     workers = Path(f"/proc/{run.pid}/task/{run.pid}/children").read_text(encoding="utf-8").split()
     os.kill(int(workers[1]), signal.SIGKILL)
-    said, _ = run.communicate(timeout=60)
+    output, _ = run.communicate(timeout=60)
     assert run.returncode == 2
-    assert "process 1 of 2 was ended by SIGKILL" in said
+    assert "process 1 of 2 was ended by SIGKILL" in output
     done = load_checkpoint(tmp_path / "checkpoint.pt")["iteration"]
     run = begun(len(points(tmp_path)) + 1)
     run.terminate()
-    said, _ = run.communicate(timeout=60)
+    output, _ = run.communicate(timeout=60)
     assert run.returncode == 130
-    assert "stopped; the same arguments with --resume continue" in said
+    assert "stopped; the same arguments with --resume continue" in output
     assert load_checkpoint(tmp_path / "checkpoint.pt")["iteration"] > done > 0
 
 
@@ -91,7 +91,7 @@ def test_a_killed_process_ends_a_run_and_a_signal_stops_it(tmp_path):
         (["--resume", "auto", "--overwrite"], "resume and overwrite exclude each other"),
     ],
 )
-def test_mistakes_are_told(words, message, tmp_path, capsys):
+def test_mistakes_are_refused(words, message, tmp_path, capsys):
     assert main([*WORDS, "--particle-steps", "9", "--out", str(tmp_path), *words]) == 2
     assert message in capsys.readouterr().err
     assert main([*WORDS, "--out", str(tmp_path)]) == 2
@@ -108,10 +108,10 @@ def test_episodes_are_as_long_as_registered(env, steps):
     assert problem_of(parse([*words, "--episode-steps", "5"])).episode_steps == 5
 
 
-def test_worlds_are_those_of_shac_where_they_are_told(tmp_path):
+def test_worlds_are_those_of_shac_when_given(tmp_path):
     words = ["learn", "shac", "npa/MixingSmall-v0", "--particle-steps", "1", "--episodes", "1"]
-    words += ["--entries", "1", "--episode-steps", "2", "--no-progress", "--out"]
-    for name, worlds, count in (("told", ["--worlds", "3"], 3), ("default", [], 8)):
+    words += ["--points", "1", "--episode-steps", "2", "--no-progress", "--out"]
+    for name, worlds, count in (("three", ["--worlds", "3"], 3), ("default", [], 8)):
         assert main([*words, str(tmp_path / name), *worlds]) == 0
         assert points(tmp_path / name)[-1]["particle_steps"] == count * 2 * 64
 
@@ -125,7 +125,7 @@ def test_what_is_written_takes_no_time_and_what_is_over_has_finished(tmp_path, m
         write(run, content)
 
     monkeypatch.setattr(Run, "keep", slow)
-    words = [*WORDS, "--seconds", "0.5", "--no-progress", "--out", str(tmp_path)]
+    words = [*WORDS, "--learning-seconds", "0.5", "--no-progress", "--out", str(tmp_path)]
     assert main(words) == 0
     seconds = [point["seconds"] for point in points(tmp_path)]
     assert 0.5 <= seconds[-1] < 1.0

@@ -38,8 +38,8 @@ def words_of(task, folder):
 def test_a_run_of_every_task_ends_with_a_card_of_each_rule(task, tmp_path, capsys):
     words = words_of(task, tmp_path)
     assert main(words) == 0
-    told = capsys.readouterr().out
-    assert told.splitlines()[-1].split() == f"look at it npa-envs view {words[-1]}".split()
+    output = capsys.readouterr().out
+    assert output.splitlines()[-1].split() == f"look at it npa-envs view {words[-1]}".split()
     run = tmp_path / "run"
     rules = sorted(run.glob("rule*.safetensors"))
     assert len(rules) == (2 if TASKS[task].joint else 1)
@@ -63,7 +63,7 @@ def test_a_run_of_every_task_ends_with_a_card_of_each_rule(task, tmp_path, capsy
         with Image.open(run / "report" / f"{stem}.gif") as film:
             assert film.n_frames == 7
             assert min(film.size) >= 256
-        (said,) = re.findall(rf"report +{re.escape(str(run / 'report' / stem))}\.md: (.*)", told)
+        (said,) = re.findall(rf"report +{re.escape(str(run / 'report' / stem))}\.md: (.*)", output)
         assert said
     assert {path.name for path in (run / "report").iterdir()} == expected
 

@@ -59,17 +59,17 @@ def test_every_combination_is_a_run_with_its_own_words():
         (["seed=0"], [], "must begin with a task"),
     ],
 )
-def test_mistakes_are_told(over, common, words):
+def test_mistakes_are_refused(over, common, words):
     with pytest.raises(NPAError, match=words):
         combinations(over, common)
 
 
 def test_a_run_that_fails_is_tried_again_and_those_that_are_over_are_left(tmp_path, child, capsys):
     assert call(tmp_path, "--devices", "cpu", "cpu") == 1
-    told = capsys.readouterr().out
-    assert "| 0 | a | done |" in told
-    assert "| 1 | b | failed with code 1 |" in told
-    assert "seed=1,target=a failed: out of luck" in told
+    output = capsys.readouterr().out
+    assert "| 0 | a | done |" in output
+    assert "| 1 | b | failed with code 1 |" in output
+    assert "seed=1,target=a failed: out of luck" in output
     assert call(tmp_path) == 0
     assert capsys.readouterr().out.count("| done |") == 4
     begun = {path.parent.name: path.read_text("utf-8") for path in tmp_path.glob("*/begun")}
@@ -155,10 +155,10 @@ def test_a_sweep_that_is_stopped_lets_its_runs_save_what_they_have(tmp_path, sen
             assert time.monotonic() < end
             time.sleep(0.05)
         send(run.pid, number)
-        said, _ = run.communicate(timeout=300)
+        output, _ = run.communicate(timeout=300)
     finally:
         run.kill()
     assert run.returncode == 130
-    assert "3 runs are left: call again with the same arguments" in said
+    assert "3 runs are left: call again with the same arguments" in output
     assert {path.parent.name for path in tmp_path.glob("*/saved")} == {"seed=0", "seed=1"}
     assert not list(tmp_path.glob("*/run.json"))

@@ -29,9 +29,11 @@ ACCEPTED = {
 def start(tree, folder, only):
     """Run the scenes of a tree; they are written to `out.npz` in a folder."""
     folder.mkdir()
-    paths = os.pathsep.join(map(str, (tree, tree / "tests", tree / "tests" / "golden")))
+    tests = tree / "tests"
+    # In older commits the modules of `support` are in `tests` itself.
+    paths = os.pathsep.join(map(str, (tree, tests / "support", tests, tests / "golden")))
     variables = os.environ | {"PYTHONPATH": paths, "OMP_NUM_THREADS": "1", "COLUMNS": "200"}
-    script = str(tree / "tests" / "golden" / "wide.py")
+    script = str(tests / "golden" / "wide.py")
     command = [sys.executable, "-P", "-W", "ignore", script, str(folder / "out.npz"), only]
     return subprocess.Popen(command, cwd=folder, env=variables)
 

@@ -407,8 +407,8 @@ def test_the_code_about_datasets_runs(folder, monkeypatch):
     pytest.importorskip("h5py")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(folder))
     small = ["target=heart", "particle_count=32", "eps=0.3", "eps0=0.1", "resolution=16"]
-    words = ["record", "npa/Morphogenesis2D-v0", "--policy", "heart", "--episodes", "2"]
-    words += ["--dataset", "npa/heart/shipped-v0", "--no-progress", "--options", *small]
+    words = ["record-dataset", "npa/Morphogenesis2D-v0", "--policy", "heart", "--episodes", "2"]
+    words += ["--dataset", "npa/heart/shipped-v0", "--no-progress", "--keywords", *small]
     assert main(words) == 0
     names = run_code("datasets", blocks=slice(1))
     observation, _ = names["env"].reset(seed=0)

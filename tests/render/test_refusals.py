@@ -87,7 +87,7 @@ REFUSED = [
     (partial(show_worlds, X[:, :0], S[:, :0]), "at least one particle"),
     (
         partial(show_worlds, torch.stack([X] * 3), torch.stack([S] * 2)),
-        r"as many steps, got 3 and 2: give what rollout returns",
+        r"same number of steps in front, got \(3, 3, 8, 2\) and \(2, .*: give what rollout returns",
     ),
     (partial(show_worlds, X, S, fps=0), "fps must be in"),
     (partial(show, np.zeros((4, 4, 3))), "must be uint8"),

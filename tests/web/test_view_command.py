@@ -43,7 +43,7 @@ def test_the_environment_and_the_policy_of_the_commands_examples_fit():
 
 def test_an_environment_gets_the_keywords_that_a_rule_needs():
     keywords = ("target=dots", "eps=0.3", "eps0=0.3")
-    assert type(make("npa/Texture-v0", policy="dots", options=keywords)) is EnvironmentWorld
+    assert type(make("npa/Texture-v0", policy="dots", keywords=keywords)) is EnvironmentWorld
     with pytest.raises(NPAError, match="must have the environment's eps0"):
         make("npa/Texture-v0", policy="dots")
 
@@ -57,19 +57,19 @@ def test_an_environment_gets_the_keywords_that_a_rule_needs():
         (["npa/Texture-v0", "--policy", "digits"], "got one of static particles"),
         (["nowhere.safetensors"], "the file 'nowhere.safetensors' does not exist"),
         (["gecko", "--policy", "random"], "policy is for environments"),
-        (["gecko", "--options", "eps=0.2"], "options is for environments"),
-        (["npa/Texture-v0", "--options", "eps"], "options must be NAME=VALUE, got 'eps'"),
-        (["npa/Texture-v0", "--options", "epps=0.2"], "epps"),
-        (["npa/Texture-v0", "--options", "device=cuda"], "must leave device to the command"),
-        (["npa/Texture-v0", "--options", "policy=zero"], "say --policy zero"),
-        (["npa/Texture-v0", "--options", "output=numpy"], "must leave output to the command"),
-        (["npa/Texture-v0", "--options", "id=x"], "must leave id to the command"),
-        (["npa/Texture-v0", "--options", "disable_env_checker=true"], "to the command"),
+        (["gecko", "--keywords", "eps=0.2"], "keywords is for environments"),
+        (["npa/Texture-v0", "--keywords", "eps"], "keywords must be NAME=VALUE, got 'eps'"),
+        (["npa/Texture-v0", "--keywords", "epps=0.2"], "epps"),
+        (["npa/Texture-v0", "--keywords", "device=cuda"], "must leave device to the command"),
+        (["npa/Texture-v0", "--keywords", "policy=zero"], "say --policy zero"),
+        (["npa/Texture-v0", "--keywords", "output=numpy"], "must leave output to the command"),
+        (["npa/Texture-v0", "--keywords", "id=x"], "must leave id to the command"),
+        (["npa/Texture-v0", "--keywords", "disable_env_checker=true"], "to the command"),
         (
-            ["npa/Texture-v0", "--options", "max_episode_steps=abc"],
+            ["npa/Texture-v0", "--keywords", "max_episode_steps=abc"],
             "max_episode_steps must be a whole number of at least 1, got 'abc'",
         ),
-        (["npa/Texture-v0", "--options", "max_episode_steps=0"], "at least 1, got 0"),
+        (["npa/Texture-v0", "--keywords", "max_episode_steps=0"], "at least 1, got 0"),
         (["gecko", "--threads", "0"], "threads must be in [1, 256], got 0"),
         (["gecko", "--port", "-1"], "port must be in [0, 65535], got -1"),
         (["gecko", "--device", "tpu"], "device must name a device"),

@@ -11,8 +11,8 @@ from refusals import refused
 from npa_envs.agents import evaluate_policy
 from npa_envs.agents.learning import Budget, train
 from npa_envs.agents.learning.problem import registered, world_seeds
-from npa_envs.cli import main, record
-from npa_envs.cli.record import RecordOptions
+from npa_envs.cli import main
+from npa_envs.cli.record_dataset import RecordOptions, policy_of, problem_of
 from npa_envs.errors import DivergedError, NPAError
 
 minari = pytest.importorskip("minari")
@@ -115,8 +115,9 @@ def test_rules_learn_from_a_dataset_without_a_world(monkeypatch):
 
 def recording(env, policy, dataset, words):
     """Return the exit status of a command that records small worlds."""
-    command = f"record npa/{env}-v0 --policy {policy} --no-progress --dataset npa/{dataset} {words}"
-    return main([*command.split(), "--options", "particle_count=32", "seed_pool=1"])
+    command = f"record-dataset npa/{env}-v0 --policy {policy} --dataset npa/{dataset} {words}"
+    command += " --no-progress --keywords particle_count=32 seed_pool=1"
+    return main(command.split())
 
 
 @pytest.mark.parametrize(
@@ -159,7 +160,15 @@ def test_episodes_of_an_environment_of_ones_own_are_as_long_as_it_is_registered(
     )
     try:
         assert registered("mine/Growth-v0").steps == 3
-        words = ["record", "mine/Growth-v0", "--policy", "zero", "--episodes", "2", "--no-progress"]
+        words = [
+            "record-dataset",
+            "mine/Growth-v0",
+            "--policy",
+            "zero",
+            "--episodes",
+            "2",
+            "--no-progress",
+        ]
         assert main([*words, "--dataset", "npa/own-v0"]) == 0
         assert minari.load_dataset("npa/own-v0").total_steps == 6
     finally:
@@ -180,9 +189,6 @@ def test_a_scripted_policy_is_chosen_in_worlds_that_are_not_recorded(
     )
     fields = {"env": "npa/Morphogenesis2DSmall-v0", "dataset": "a/b-v0", "policy": "scripted"}
     options = RecordOptions(**fields, first_seed=first, episodes=count)
-    record.policy_of(options, record.problem_of(options))
+    policy_of(options, problem_of(options))
     assert seeds == [seed]
     assert set(world_seeds(seed, 16)).isdisjoint(range(first, first + count))
-    endless = RecordOptions(**fields, episodes=10**6)
-    problem = record.problem_of(endless)
-    refused("leave 10000 seeds below 1000000", record.policy_of, endless, problem)

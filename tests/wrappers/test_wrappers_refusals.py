@@ -161,7 +161,7 @@ GROWTH, GARDEN = "npa/Morphogenesis2D-v0", "npa/Gardener2DSmall-v0"
     [
         ("npa/Morphogenesis2D-v1", "did you mean 'npa/Morphogenesis2D-v0'"),
         ("npa/Mixing-v0", "must be of one species"),
-        (f"{GROWTH} --options target", "NAME=VALUE"),
+        (f"{GROWTH} --keywords target", "NAME=VALUE"),
         (f"{GROWTH} --episodes 0", "episodes must be at least 1"),
         ("npa/Gardener2DSmal-v0", "did you mean 'npa/Gardener2DSmall-v0'"),
         (f"{GARDEN} --policy heart", "policy must be one of"),
@@ -173,5 +173,5 @@ GROWTH, GARDEN = "npa/Morphogenesis2D-v0", "npa/Gardener2DSmall-v0"
 )
 def test_what_cannot_be_recorded_is_named(words, message, capsys):
     pytest.importorskip("minari")
-    assert main(["record", "--dataset", "npa/test-v0", *words.split()]) == 2
+    assert main(["record-dataset", "--dataset", "npa/test-v0", *words.split()]) == 2
     assert message in capsys.readouterr().err

@@ -1,7 +1,7 @@
 """Write the tables of NPA-Bench, `docs/npa_bench.md`, from the rows' files.
 
-    python docs/build_npa_bench_page.py          write the tables and the curves' picture
-    python docs/build_npa_bench_page.py --check  fail where the page is not current
+    python docs/scripts/build_npa_bench_page.py          write the tables and the curves' picture
+    python docs/scripts/build_npa_bench_page.py --check  fail where the page is not current
 
 Rows are the files of a suite's folder, such as `benchmarks/results/npa_bench_small_v0/`, each of
 which is checked. Tables stand between marks in the page; all else in it is written by hand.
@@ -22,7 +22,7 @@ from npa_envs.agents.comparison.plan import NOTHING, YARDSTICK
 from npa_envs.measure.benchmark_records import NONE
 from npa_envs.measure.plots import draw_band, legend_of, new_figure, png
 
-DOCS = Path(__file__).resolve().parent
+DOCS = Path(__file__).resolve().parents[1]
 ROWS = DOCS.parent / "benchmarks" / "results"
 PAGE = "npa_bench.md"
 PANELS = 3

@@ -1,7 +1,7 @@
 """Write the measured tables of the pages from the records in `benchmarks/results/`.
 
-    python docs/build_tables.py          write all pages
-    python docs/build_tables.py --check  fail where a page is not current
+    python docs/scripts/build_tables.py          write all pages
+    python docs/scripts/build_tables.py --check  fail where a page is not current
 
 A page has the table, and a line with its record, machine, commit, date and command, between two
 marks:
@@ -43,7 +43,7 @@ from typing import Any
 
 from page_parts import table, write_or_check
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "benchmarks" / "results"
 SPECS = ROOT / "docs" / "tables.txt"
 TABLE = re.compile(r"(<!-- table: (?P<name>[\w-]+) -->\n).*?(<!-- /table -->)", re.S)

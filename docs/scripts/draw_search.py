@@ -1,6 +1,6 @@
 """Draw what a search found, `docs/images/search_elites.webp`: a strip of frames for each elite.
 
-    python docs/draw_search.py runs/search/elites/3-4-1.safetensors ...
+    python docs/scripts/draw_search.py runs/search/elites/3-4-1.safetensors ...
 
 Worlds are those of seeds that the search did not see, and go on four times as long.
 """
@@ -19,7 +19,7 @@ from npa_envs.render import draw_worlds, write_filmstrip
 from npa_envs.rule.files import rule_metadata
 from npa_envs.tasks.seeds import uniform_ball
 
-IMAGE = Path(__file__).resolve().parent / "images" / "search_elites.webp"
+IMAGE = Path(__file__).resolve().parents[1] / "images" / "search_elites.webp"
 SEED = 1_000_000
 STEPS = (16, 64, 96, 128, 256, 512)
 

@@ -14,7 +14,7 @@ import npa_envs
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Task
 
-IMAGES = Path(__file__).resolve().parent / "images"
+IMAGES = Path(__file__).resolve().parents[1] / "images"
 FPS = 20.0
 STILL = 8
 """Frames for which a film holds its breath before something happens."""

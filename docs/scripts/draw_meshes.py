@@ -1,6 +1,6 @@
 """Draw the built-in targets of 3D morphogenesis, `docs/images/meshes.webp`: each from four sides.
 
-python docs/draw_meshes.py
+python docs/scripts/draw_meshes.py
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from npa_envs.render import to_uint8, write_filmstrip
 from npa_envs.tasks.targets.meshes import builtin_meshes, draw_mesh, load_mesh
 from npa_envs.tasks.targets.views import ANGLE, DISTANCE
 
-PICTURE = Path(__file__).resolve().parent / "images" / "meshes.webp"
+PICTURE = Path(__file__).resolve().parents[1] / "images" / "meshes.webp"
 RESOLUTION = 160
 SIDES = 4
 

@@ -1,6 +1,6 @@
 """Draw the pictures and films of the environments' pages: a shipped rule at work.
 
-    python docs/draw_environment_pictures.py [NAME ...]
+    python docs/scripts/draw_environment_pictures.py [NAME ...]
 
 It writes `docs/images/env_*_strip.webp` and `docs/images/env_*.webp` and takes five minutes on a
 CPU. Draw anew when an environment changes.

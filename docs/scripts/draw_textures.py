@@ -1,6 +1,6 @@
 """Draw the built-in textures, `docs/images/textures.webp`: each as two by two tiles.
 
-python docs/draw_textures.py
+python docs/scripts/draw_textures.py
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 from npa_envs.render import to_uint8, write_filmstrip
 from npa_envs.tasks.targets.textures import builtin_textures, load_texture
 
-PICTURE = Path(__file__).resolve().parent / "images" / "textures.webp"
+PICTURE = Path(__file__).resolve().parents[1] / "images" / "textures.webp"
 RESOLUTION = 128
 
 

@@ -1,6 +1,6 @@
 """Draw the picture and the film of the page on several species, `docs/images/env_multispecies.*`.
 
-    python docs/draw_species_pictures.py
+    python docs/scripts/draw_species_pictures.py
 
 It takes half a minute on a CPU. Draw anew when an environment changes.
 """

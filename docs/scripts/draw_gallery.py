@@ -1,6 +1,6 @@
 """Draw the films of the gallery, `docs/images/gallery/NAME.webp`: every shipped rule at work.
 
-    python docs/draw_gallery.py [NAME ...]
+    python docs/scripts/draw_gallery.py [NAME ...]
 
 It takes ten minutes on a CPU. Draw anew when a rule changes.
 """

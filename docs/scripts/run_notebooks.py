@@ -1,6 +1,6 @@
 """Run the notebooks of `docs/notebooks/` and keep what they print and show.
 
-    python docs/run_notebooks.py [NAME ...]
+    python docs/scripts/run_notebooks.py [NAME ...]
 
 It takes five minutes on a CPU, and needs nbclient and ipykernel, which the extra `docs` brings.
 """
@@ -13,7 +13,7 @@ from pathlib import Path
 import nbformat
 from nbclient import NotebookClient
 
-FOLDER = Path(__file__).resolve().parent / "notebooks"
+FOLDER = Path(__file__).resolve().parents[1] / "notebooks"
 
 
 def run(path: Path) -> None:

@@ -1,6 +1,6 @@
 """Draw the figures of the page on concepts, `docs/images/concept_*.webp`, from a growing gecko.
 
-    python docs/draw_concepts.py
+    python docs/scripts/draw_concepts.py
 
 It takes half a minute on a CPU and needs matplotlib. Draw anew when the gecko's rule changes.
 """

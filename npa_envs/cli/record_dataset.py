@@ -1,8 +1,9 @@
-"""`npa-envs record`: writes episodes of a policy as a Minari dataset."""
+"""`npa-envs record-dataset`: writes episodes of a policy as a Minari dataset."""
 
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +27,10 @@ class RecordOptions(common.RunOptions):
 
     `minari.load_dataset` reads it; `npa_envs.agents.learning.train("clone", ..., dataset=ID)`
     learns from it.
+
+    Examples:
+      npa-envs record-dataset npa/Morphogenesis2D-v0 --keywords target=heart --dataset npa/a-v0
+      npa-envs record-dataset npa/Gardener2D-v0 --policy scripted --dataset npa/gardener/scripted-v0
     """
 
     env: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="ENV")]
@@ -41,7 +46,7 @@ class RecordOptions(common.RunOptions):
     """The first one's seed; the others follow."""
     worlds: int = 16
     """Worlds that run at the same time."""
-    options: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE")] = ()
+    keywords: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE")] = ()
     """Keywords of the environment, values as JSON or plain text: target=heart."""
     root: Path | None = None
     """Folder of datasets; default: Minari's, which MINARI_DATASETS_PATH sets."""
@@ -49,7 +54,7 @@ class RecordOptions(common.RunOptions):
 
 def main(arguments: Sequence[str]) -> int:
     """Record the episodes and write the dataset."""
-    options = common.parse_options(RecordOptions, "record", arguments)
+    options = common.parse_options(RecordOptions, "record-dataset", arguments)
     common.check_numbers(options, episodes=1, worlds=1)
     from npa_envs.agents.evaluation import policy_in
     from npa_envs.measure.benchmark_records import command_text
@@ -62,20 +67,20 @@ def main(arguments: Sequence[str]) -> int:
     returns: list[float] = []
     if options.root is not None:
         os.environ[ROOT] = str(common.writable_folder(options.root, "root").resolve())
-    with common.StepBar(options.episodes, show=options.progress, unit="episode") as bar:
+    with common.progress_bar(options.episodes, show=options.progress, unit="episode") as advance:
 
         def episodes() -> Iterator[Any]:
             for episode in record_episodes(envs, policy, seeds):
                 returns.append(float(sum(episode.rewards)))
                 yield episode
-                bar.advance(1)
+                advance(1)
 
         folder = write_dataset(
             options.dataset,
             spec_of(problem.env_id, dict(problem.keywords), problem.episode_steps),
             episodes(),
             algorithm=options.policy,
-            description=command_text("record", arguments, "--root"),
+            description=command_text("record-dataset", arguments, "--root"),
         )
     print(f"{options.episodes} episodes, mean return {sum(returns) / len(returns):.3f}: {folder}")
     return 0
@@ -88,7 +93,7 @@ def problem_of(options: RecordOptions) -> Problem:
     worlds = min(options.worlds, options.episodes)
     problem = Problem(
         env_id=options.env,
-        keywords=common.named_values("options", options.options),
+        keywords=common.named_values("keywords", options.keywords),
         episode_steps=registered(options.env).steps,
         num_envs=worlds,
     )
@@ -102,17 +107,24 @@ def problem_of(options: RecordOptions) -> Problem:
 def policy_of(options: RecordOptions, problem: Problem) -> Callable[[Any], Any]:
     """Return the policy that the options name."""
     from npa_envs.agents.learning import Budget, RuleSet, train
+    from npa_envs.agents.learning.problem import WORLDS_PER_SEED
 
     known = (*UNTRAINED, "gradient") if problem.actor == "brushes" else UNTRAINED
     if options.policy in known:
-        # These learn nothing: `train` only chooses among them, by seeds that are not recorded.
+        # These learn nothing: `train` plays each scripted policy once and returns the best.
+        seed = 0
+        if options.policy == "scripted" and options.first_seed < WORLDS_PER_SEED:
+            # The next seed after those of the recorded worlds.
+            last = options.first_seed + options.episodes - 1
+            seed = last // WORLDS_PER_SEED + 1
+        evaluation_seeds = [2**31]  # Its episode only checks that the policy runs.
         return train(
             options.policy,
             problem,
-            Budget(particle_steps=10**12),
-            _choice_seed(options) if options.policy == "scripted" else 0,
+            Budget(particle_steps=sys.maxsize),
+            seed,
             device=options.device,
-            evaluation_seeds=[2**31],  # Its episode only checks that the policy runs.
+            evaluation_seeds=evaluation_seeds,
             entries=1,
         ).policy
     source = options.policy
@@ -125,17 +137,3 @@ def policy_of(options: RecordOptions, problem: Problem) -> Callable[[Any], Any]:
             f"policy must be one of {known} or a file sac.zip or ppo.zip, got {source!r}"
         )
     return RuleSet.of(problem, source).to(options.device).policy()
-
-
-def _choice_seed(options: RecordOptions) -> int:
-    """Return the seed of a run whose worlds are none of the recorded ones."""
-    from npa_envs.agents.learning.problem import RUNS, WORLDS_PER_SEED
-
-    first, last = options.first_seed, options.first_seed + options.episodes - 1
-    for seed in range(RUNS):
-        if last < seed * WORLDS_PER_SEED or first >= (seed + 1) * WORLDS_PER_SEED:
-            return seed
-    raise NPAError(
-        f"episodes must leave {WORLDS_PER_SEED} seeds below {RUNS * WORLDS_PER_SEED} to choose a "
-        f"scripted policy by, got seeds {first} to {last}: record fewer"
-    )

@@ -1,6 +1,6 @@
 """Draw the film at the top of README, `docs/images/gecko.webp`: growth, a cut, erasure, healing.
 
-    python docs/draw_film.py
+    python docs/scripts/draw_film.py
 
 It takes a minute on a CPU. Draw anew when the gecko's rule changes.
 """

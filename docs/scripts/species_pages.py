@@ -21,7 +21,7 @@ from npa_envs.envs.core.config import WorldConfig
 from npa_envs.envs.multi import TASKS, SpeciesConfig
 from npa_envs.envs.multi.parallel import CrowdEnv
 
-MADE = NOTE.format(script="docs/build_environment_pages.py", source="docstrings")
+MADE = NOTE.format(script="build_environment_pages.py", source="docstrings")
 MODULES = {"MultiSpecies": multispecies_v0, "Particles": particles_v0}
 """Modules by the names of their pages."""
 

@@ -1,6 +1,6 @@
 """The page of `npa_envs.envs.gardeners_v0`, and its film.
 
-    python docs/gardeners_page.py       draw `docs/images/env_gardeners.*`
+    python docs/scripts/gardeners_page.py       draw `docs/images/env_gardeners.*`
 
 `build_environment_pages.py` writes the page. Drawing takes a minute on a CPU. Draw anew when the
 environment changes.
@@ -57,7 +57,7 @@ def page() -> str:
             ("Functions", "`parallel_env`, `env`, `raw_env`"),
         ],
     )
-    made = NOTE.format(script="docs/build_environment_pages.py", source="docstrings")
+    made = NOTE.format(script="build_environment_pages.py", source="docstrings")
     shown = film_and_strip(CAPTION, FILM.name, IMAGE.name)
     opening = ("# npa_envs.envs.gardeners_v0", text.pop(""), shown, facts, EXAMPLE)
     body = [f"## {heading}\n\n{content}" for heading, content in text.items()]

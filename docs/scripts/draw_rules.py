@@ -1,6 +1,6 @@
 """Draw what the shipped rules grow, `docs/images/rules_*.webp`, each beside its target.
 
-    python docs/draw_rules.py [--only {2d,3d,textures} ...]
+    python docs/scripts/draw_rules.py [--only {2d,3d,textures} ...]
 
 It takes some minutes on a CPU, textures half an hour. Draw anew when a rule changes.
 """
@@ -22,7 +22,7 @@ from npa_envs.rule.files import shipped_rules
 from npa_envs.tasks.targets.views import over
 from npa_envs.training.task_of_rule import task_of_rule
 
-IMAGES = Path(__file__).resolve().parent / "images"
+IMAGES = Path(__file__).resolve().parents[1] / "images"
 SEED = 1_000_000
 CPU = torch.device("cpu")
 

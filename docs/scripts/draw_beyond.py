@@ -1,11 +1,11 @@
 """Draw what rules do that go beyond the paper, `docs/images/beyond_*.webp`.
 
-    python docs/draw_beyond.py directions PLAIN EQUIVARIANT    # files of rules
-    python docs/draw_beyond.py directions_upright RULE ...      # --seed-across 0.5 --angles 0
-    python docs/draw_beyond.py sizes TRAINED VARIED
-    python docs/draw_beyond.py division RULE
-    python docs/draw_beyond.py pictures MANY
-    python docs/draw_beyond.py sixty MANY                       # whose pictures lie where they lay
+    python docs/scripts/draw_beyond.py directions PLAIN EQUIVARIANT  # files of rules
+    python docs/scripts/draw_beyond.py directions_upright RULE ...  # --seed-across 0.5 --angles 0
+    python docs/scripts/draw_beyond.py sizes TRAINED VARIED
+    python docs/scripts/draw_beyond.py division RULE
+    python docs/scripts/draw_beyond.py pictures MANY
+    python docs/scripts/draw_beyond.py sixty MANY               # whose pictures lie where they lay
 
 It takes a minute or two on a CPU.
 """
@@ -29,7 +29,7 @@ from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, turned, turns
 from npa_envs.training.task_of_rule import task_of_rule, tasks_of_codes
 from npa_envs.world.division import living
 
-IMAGES = Path(__file__).resolve().parent / "images"
+IMAGES = Path(__file__).resolve().parents[1] / "images"
 SEEDS = (1_000_000, 1_000_001, 1_000_002)
 CPU = torch.device("cpu")
 GROWN, AFTER, AGES = 128, 128, (512, 2048)

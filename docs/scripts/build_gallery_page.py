@@ -1,7 +1,7 @@
 """Write the gallery of shipped rules, `docs/gallery.md`, from their cards and scores.
 
-python docs/build_gallery_page.py          write the page
-python docs/build_gallery_page.py --check  fail where it is not current
+python docs/scripts/build_gallery_page.py          write the page
+python docs/scripts/build_gallery_page.py --check  fail where it is not current
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from page_parts import NOTE, write_or_check
 from npa_envs.measure.quality import score_line, scores
 from npa_envs.rule.files import shipped_rules
 
-DOCS = Path(__file__).resolve().parent
+DOCS = Path(__file__).resolve().parents[1]
 CARDS = DOCS.parent / "npa_envs" / "rule" / "shipped"
 OPENING = """\
 # Gallery
@@ -22,7 +22,7 @@ OPENING = """\
 The rules that come with the library. Each film is made by one rule: particles start as a blank
 disk, ball or random cloud, and know nothing of their places. A rule's name stands for its file in
 commands and in `npa_envs.load_rule`. `npa-envs view NAME` opens a rule in the browser, and
-`npa-envs export-web --gallery -o gallery.html` writes one page that runs all 2D rules.
+`npa-envs export-web --gallery --out gallery.html` writes one page that runs all 2D rules.
 
 Figures are means over seeds that training never saw; a lower loss is better. A card says how the
 rule was trained, and all that was measured."""
@@ -64,7 +64,10 @@ def entry(task: str, name: str) -> str:
 
 def page() -> str:
     """Return the page, Markdown."""
-    parts = [NOTE.format(script="docs/build_gallery_page.py", source="cards and scores"), OPENING]
+    parts = [
+        NOTE.format(script="build_gallery_page.py", source="cards and scores"),
+        OPENING,
+    ]
     for task, heading in HEADINGS.items():
         parts += [f"## {heading}", f"```sh\n{COMMANDS[task]}\n```"]
         parts += [entry(task, name) for name in shipped_rules(task)]

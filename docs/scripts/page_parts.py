@@ -15,7 +15,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
 
-NOTE = "<!-- Made by {script} from the {source}: edit those. -->"
+NOTE = "<!-- Made by docs/scripts/{script} from the {source}: edit those. -->"
 
 
 def sections(env_class: type) -> dict[str, str]:

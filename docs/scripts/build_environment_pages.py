@@ -1,7 +1,7 @@
 """Write the pages of the environments, `docs/environments/`, from docstrings and configurations.
 
-    python docs/build_environment_pages.py          write the pages
-    python docs/build_environment_pages.py --check  fail where a page is not current
+    python docs/scripts/build_environment_pages.py          write the pages
+    python docs/scripts/build_environment_pages.py --check  fail where a page is not current
 
 A page is the docstring of an environment's class. Added are the spaces' numbers, which are computed
 from the default configuration, and the tables of arguments, whose meanings are the docstrings of
@@ -40,7 +40,7 @@ from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.envs.garden.base import GardenEnv, RuleDrivenWorlds
 from npa_envs.registration import CODED, ENVIRONMENTS, GARDENS, SIZES, SMALL, Registration
 
-DOCS = Path(__file__).resolve().parent
+DOCS = Path(__file__).resolve().parents[1]
 PAGES = DOCS / "environments"
 EXAMPLE = """\
 ```python

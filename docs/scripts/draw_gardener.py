@@ -1,7 +1,7 @@
 """Draw the film of the tutorial of gardeners: the same weather, with nobody and with what learned.
 
     python benchmarks/garden_learning.py npa/Gardener2DSmall-v0 ppo --steps 30000 --seeds 0 --save
-    python docs/draw_gardener.py runs/gardens/ppo_0.zip
+    python docs/scripts/draw_gardener.py runs/gardens/ppo_0.zip
 
 It writes `docs/images/tutorial_gardener.webp` and takes some seconds on a CPU.
 """
