@@ -24,6 +24,7 @@ from npa_envs.cli import main
 from npa_envs.errors import NPAError
 from npa_envs.rule.files import load_rule, save_rule
 from npa_envs.rule.rule import NPARule
+from npa_envs.tasks.damage import DAMAGE_SIZES
 from npa_envs.tasks.point_classification import class_colours
 from npa_envs.web.export import (
     PAGE,
@@ -35,7 +36,7 @@ from npa_envs.web.export import (
     page_rule,
     page_text,
 )
-from npa_envs.web.live_world import ColouredWorld, Colouring
+from npa_envs.web.live_world import TOOLS, ColouredWorld, Colouring
 from npa_envs.web.rule_world import RuleWorld
 from npa_envs.world.brushes import nearest_image
 
@@ -124,11 +125,11 @@ def test_a_live_world_moves_and_the_same_seed_gives_the_same_world(run, settings
 
 PAUSE = {"type": "play", "on": False}
 BRUSHES = {
-    "remove": {}, "push": {"move": [0.05, -0.1]}, "clump": {}, "cut": {"move": [0.1, 0.2]},
+    "remove": {}, "pull": {"move": [0.05, -0.1]}, "clump": {}, "cut": {"move": [0.1, 0.2]},
     "inject": {"source": [-0.1, 0.1]}, "inject nothing": {"source": [5.0, 5.0]},
     "graft": {},
 }  # fmt: skip
-
+"""Fields of their messages; "add", which draws positions, is tested below."""
 
 GRAFTED = {"gecko": "heart", "dots": "dots", "duck": "duck"}
 """A rule that may join the world of each rule; the second one is periodic, the last one 3D."""
@@ -140,6 +141,9 @@ def test_brushes_of_a_page_are_those_of_the_viewer(run, settings, rule, name):
     script = [{"type": "set", "name": "rule", "value": rule}, *[ADVANCE] * 9, PAUSE]
     message = {"type": "brush", "tool": name.split()[0], "at": [0.1, 0.0], "radius": 0.15}
     message |= {"strength": 0.4, "move": [0.0, 0.0], "rule": GRAFTED[rule]} | BRUSHES[name]
+    if rule == "dots":
+        # Across the edge of the box.
+        message["at"] = [0.95, 0.0]
     if rule == "duck":
         vectors = {"at": [0.1, 0.0, 0.0], "move": [0.1, 0.2, -0.1], "source": [-0.1, 0.1, 0.1]}
         message |= vectors | {"view": [0.6, 0.0, 0.8], "radius": 0.5}
@@ -158,6 +162,14 @@ def test_brushes_of_a_page_are_those_of_the_viewer(run, settings, rule, name):
     same = torch.equal(world.x, x) and torch.equal(world.s, s)
     unchanged = (("gecko", "inject nothing"), ("dots", "graft"), ("duck", "graft"))
     assert same == ((rule, name) in unchanged)
+
+
+def test_every_kind_of_damage_and_every_brush_is_one_of_a_page(run, settings):
+    damages = [{"type": "damage", "name": name} for name in (*DAMAGE_SIZES, "luck")]
+    assert live(run, settings, ADVANCE, *damages)["errors"] == ["no damage is called luck"]
+    assert {name.split()[0] for name in BRUSHES} | {"add"} == set(TOOLS)
+    unknown = {"type": "brush", "tool": "luck", "at": [0, 0], "radius": 1, "strength": 1}
+    assert live(run, settings, unknown)["errors"] == ["no brush is called luck"]
 
 
 def test_a_world_without_particles_goes_on(run, settings):
@@ -197,11 +209,11 @@ def test_settings_reach_the_world_and_wrong_messages_are_told(run, settings):
     assert float(unpacked(texture["x"], (200, 2)).abs().max()) <= 1.0
     wrong = live(
         run, settings, set_to("eps", 9), set_to("rule", "nobody"), set_to("show", "nothing"),
-        {"type": "damage", "name": "luck"}, {"type": "fly"}
+        {"type": "fly"}
     )  # fmt: skip
     assert wrong["errors"] == [
         "eps must lie in [0.04, 0.25], got 9", "no rule is called nobody",
-        "nothing to show is called nothing", "no damage is called luck", "no message is called fly"
+        "nothing to show is called nothing", "no message is called fly"
     ]  # fmt: skip
     whole = live(run, settings, *[ADVANCE] * 3)
     x = unpacked(whole["x"], (300, 2))
@@ -210,6 +222,20 @@ def test_settings_reach_the_world_and_wrong_messages_are_told(run, settings):
         moved = (unpacked(damaged["x"], (300, 2)) - x).norm(dim=-1).max()
         assert 0.5 * farthest <= float(moved) <= farthest + 1e-6
         assert (damaged["s"] != whole["s"]) == (name == "wipe")
+
+
+def test_damage_of_a_page_continues_across_the_edges_of_a_box(run, settings):
+    texture = {"type": "set", "name": "rule", "value": "dots"}
+    wipe = [*[ADVANCE] * 20, PAUSE, {"type": "damage", "name": "wipe"}]
+    is_disk = []
+    for seed in range(8):
+        result = live(run, settings, texture, {"type": "reset", "seed": seed}, *wipe)
+        x, s = unpacked(result["x"], (200, 2)), unpacked(result["s"], (200, -1))
+        away = x[:, None] - x
+        disks = [v.norm(dim=-1) <= 0.2 for v in (away, nearest_image(away, (2.0, 2.0)))]
+        wiped = (s == 0.0).all(dim=-1)
+        is_disk.append(tuple(bool((disk == wiped).all(dim=-1).any()) for disk in disks))
+    assert set(is_disk) == {(False, True), (True, True)}
 
 
 @pytest.mark.parametrize(

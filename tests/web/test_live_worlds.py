@@ -193,7 +193,7 @@ def test_a_world_that_divides_shows_its_living_particles(tmp_path, device):
     rule, path = dividing(load_rule("gecko")), tmp_path / "dividing.safetensors"
     world = world_of(rule, path, device, division=True, particle_count=64)
     assert len(world.frame().positions) == 1
-    assert not {"inject", "graft", "add"} & {tool["name"] for tool in world.describe()["tools"]}
+    assert not {"inject", "graft", "add"} & set(world.describe()["tools"])
     put(world, speed=8)
     for show in ("colours", "mask", "speed", "density", "components", "species", "state 3"):
         put(world, show=show)
@@ -222,9 +222,9 @@ def test_what_is_added_to_a_world_of_a_rule_with_codes_carries_one(device):
     assert torch.equal(world.s[0, :, :8], code.expand(world.s.shape[1], 8))
 
 
-def test_push_carries_particles_along_and_clump_and_cut_move_them(world):
+def test_pull_carries_particles_along_and_clump_and_cut_move_them(world):
     before = world.x.clone()
-    world.handle(brush("push", move=[0.05, 0.0], radius=0.2, strength=1.0))
+    world.handle(brush("pull", move=[0.05, 0.0], radius=0.2, strength=1.0))
     moved = world.x - before
     assert float(moved[..., 0].max()) > 0.03
     assert float(moved[..., 0].min()) >= 0.0
@@ -361,9 +361,9 @@ def test_the_loss_is_computed_only_where_it_is_wanted(world, monkeypatch):
         (brush("remove", at=[0.0, float("inf")]), "at must be 2 finite numbers"),
         (brush("remove", at="00"), "at must be 2 finite numbers"),
         (brush("remove", radius=-1), "radius must be a number in"),
-        (brush("push", move=[1e9, 0.0]), "move must be 2 finite numbers"),
+        (brush("pull", move=[1e9, 0.0]), "move must be 2 finite numbers"),
         (brush("inject", source=[0.0]), "source must be 2 finite numbers"),
-        (brush("push", strength=2), "strength must be a number in"),
+        (brush("pull", strength=2), "strength must be a number in"),
         (brush("graft", rule="worm"), "unknown rule 'worm'"),
         (brush("graft", rule="duck"), "duck cannot live in a world of gecko"),
     ],
@@ -687,7 +687,7 @@ def test_episodes_follow_each_other(episodes):
 
 def test_hands_reach_into_environments(episodes):
     before = episodes.frame().positions.copy()
-    episodes.handle(brush("push", move=[0.1, 0.0], radius=0.3, strength=1.0))
+    episodes.handle(brush("pull", move=[0.1, 0.0], radius=0.3, strength=1.0))
     after = episodes.frame().positions
     assert (after - before)[:, 0].max() > 0.05
     episodes.handle({"type": "damage", "name": "noise"})
