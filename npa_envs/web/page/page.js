@@ -44,7 +44,7 @@
 //   {type: "error", message}
 //
 // index.html loads server_engine.js. npa_envs/web/export.py joins worker_engine.js and its imports into one
-// script, in which all names of modules must differ.
+// script, and page_world.js and its imports into that of the worker.
 //
 // `show`: "colours", "density", "species", "speed", "mask", "components" (the first three principal
 // components of the state as red, green and blue), "state 0", "state 1", ...
