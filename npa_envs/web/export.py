@@ -217,7 +217,7 @@ def preview(source: str, *, particle_count: int | None = None) -> str:
     live.speed = PREVIEW_STEPS if live.task.aligned else PREVIEW_STEPS // 2
     live.advance()
     with torch.no_grad():
-        fields = live.task.picture(live.x, live.s)[0].flip(0)
+        fields = live.task.picture(*live.particles[:2])[0].flip(0)
     colour = fields[..., :3] / fields[..., 3:].clamp_min(1e-6)
     pixels = torch.cat((colour, fields[..., 3:]), dim=-1).clamp(0.0, 1.0)
     picture = Image.fromarray((pixels * 255.0).round().to(torch.uint8).numpy(), "RGBA")

@@ -98,6 +98,9 @@ class Range(NamedTuple):
 class LiveWorld(ABC):
     """A world that a page shows and changes while it runs."""
 
+    particles: Particles
+    """The world, as a batch of one."""
+
     def __init__(self, seed: int) -> None:
         self.seed = checked_seed(seed)
         self.playing = True
@@ -137,7 +140,7 @@ class LiveWorld(ABC):
             case "set":
                 return self._set(str(message.get("name")), message.get("value"))
             case "brush":
-                return self._brush(Touch.read(message, self._particles().x))
+                return self._brush(Touch.read(message, self.particles.x))
             case "damage":
                 check_damage(name := message.get("name"))
                 self._damage(str(name))
@@ -187,14 +190,6 @@ class LiveWorld(ABC):
     def _run(self, steps: int) -> None: ...
 
     @abstractmethod
-    def _particles(self) -> Particles:
-        """Return the world as a batch of one."""
-
-    @abstractmethod
-    def _place(self, particles: Particles) -> None:
-        """Replace positions and states."""
-
-    @abstractmethod
     def _coloured(self) -> ColouredWorld: ...
 
     @abstractmethod
@@ -208,13 +203,12 @@ class LiveWorld(ABC):
     def _shows(self) -> list[str]: ...
 
     def _damage(self, name: str) -> None:
-        particles = self._particles()
-        x, s = damage_worlds(particles.x, particles.s, kind=name, box=self.box)
-        self._place(particles._replace(x=x, s=s))
+        x, s = damage_worlds(self.particles.x, self.particles.s, kind=name, box=self.box)
+        self.particles = self.particles._replace(x=x, s=s)
 
     def _brush(self, touch: Touch) -> bool:
         """Apply a brush, and return whether `describe` has changed."""
-        self._place(brushed(self._particles(), touch, self.box))
+        self.particles = brushed(self.particles, touch, self.box)
         return False
 
     def _set(self, name: str, value: Any) -> bool:
@@ -284,29 +278,29 @@ class Touch(NamedTuple):
 
 def brushed(particles: Particles, touch: Touch, box: tuple[float, ...] | None) -> Particles:
     """Return particles after pull, clump, cut or inject, which keep their number."""
-    x, s = particles.x, particles.s
+    x, s, *_ = particles
     disk: dict[str, Any] = {"radius": touch.radius, "box": box}
     match touch.tool:
         case "pull":
             strength = min(1.0, MIN_PULL + touch.strength)
             x = push(x, centre=touch.at, move=touch.move, strength=strength, **disk)
-            return Particles(x, s)
         case "clump":
             factor = CLUMP_RATE * touch.strength
-            return Particles(*clump(x, s, centre=touch.at, factor=factor, **disk))
+            x, s = clump(x, s, centre=touch.at, factor=factor, **disk)
         case "cut":
             half = 0.5 * touch.move
             line: dict[str, Any] = {"centre": touch.at + half, "normal": _normal(touch)}
-            return Particles(*cut(x, s, along=half, gap=touch.radius, box=box, **line))
+            x, s = cut(x, s, along=half, gap=touch.radius, box=box, **line)
         case "inject":
             state, exists = state_around(x, s, centre=touch.source, **disk)
             weight = INJECT_RATE * touch.strength * exists.to(x.dtype)
             s = inject(x, s, centre=touch.at, state=state, strength=weight, **disk)
-            return Particles(x, s)
-    raise NPAError(
-        f"this world keeps its particles, so that the brush {shown(touch.tool)} does nothing: take "
-        "pull, clump, cut or inject"
-    )
+        case _:
+            raise NPAError(
+                f"this world keeps its particles, so that the brush {shown(touch.tool)} does "
+                "nothing: take pull, clump, cut or inject"
+            )
+    return particles._replace(x=x, s=s)
 
 
 def _normal(touch: Touch) -> Tensor:

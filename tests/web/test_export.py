@@ -36,6 +36,7 @@ from npa_envs.web.export import (
 from npa_envs.web.live_world import TOOLS, ColouredWorld, Colouring
 from npa_envs.web.rule_world import RuleWorld
 from npa_envs.world.brushes import nearest_image
+from npa_envs.world.particles import Particles
 
 NODE_SECONDS = 60
 
@@ -147,16 +148,16 @@ def test_brushes_of_a_page_are_those_of_the_viewer(run, settings, rule, name):
     before = live(run, settings, *script)
     after = live(run, settings, *script, message)
     world = RuleWorld(rule, device=torch.device("cpu"), particle_count=len(before["species"]))
-    x = world.x = unpacked(before["x"], world.x.shape)
-    s = world.s = unpacked(before["s"], world.s.shape)
+    x, s = (unpacked(before[field], getattr(world.particles, field).shape) for field in "xs")
+    world.particles = Particles(x, s)
     world.handle(message)
     assert world.counts == [after["species"].count(k) for k in sorted(set(after["species"]))]
     order = torch.tensor(after["species"]).argsort(stable=True)
     got_x = unpacked(after["x"], (1, -1, x.shape[2]))[:, order]
     got_s = unpacked(after["s"], (1, -1, s.shape[2]))[:, order]
-    assert float(nearest_image(got_x - world.x, world.box).abs().max()) < 1e-6
-    assert float((got_s - world.s).abs().max()) < 1e-5
-    same = torch.equal(world.x, x) and torch.equal(world.s, s)
+    assert float(nearest_image(got_x - world.particles.x, world.box).abs().max()) < 1e-6
+    assert float((got_s - world.particles.s).abs().max()) < 1e-5
+    same = torch.equal(world.particles.x, x) and torch.equal(world.particles.s, s)
     unchanged = (("gecko", "inject nothing"), ("dots", "graft"), ("duck", "graft"))
     assert same == ((rule, name) in unchanged)
 
