@@ -88,12 +88,6 @@ class Range(NamedTuple):
             )
         return int(value) if self.whole else float(value)
 
-    def to_dict(self, value: float) -> dict[str, Any]:
-        """Return the range and the present value as JSON for the page."""
-        optional = {"scale": self.scale, "whole": self.whole}
-        fields = {name: option for name, option in optional.items() if option}
-        return {"value": value, "low": self.low, "high": self.high} | fields
-
 
 class LiveWorld(ABC):
     """A world that a page shows and changes while it runs."""
@@ -118,7 +112,10 @@ class LiveWorld(ABC):
             "tools": [tool for tool, need in TOOLS.items() if need in self._allowed()],
             "shows": self._shows(),
             "show": self.show,
-            "settings": {k: r.to_dict(getattr(self, k)) for k, r in self._ranges().items()},
+            "settings": {
+                name: {"value": getattr(self, name)} | limits._asdict()
+                for name, limits in self._ranges().items()
+            },
             "playing": self.playing,
             "seed": self.seed,
             "box": None if self.box is None else list(self.box),

@@ -30,8 +30,8 @@
 //       once, and after changes. note: a sentence for the user, or ""; box: sides [length units] or
 //       null; centre, half_width: the first view; spot: standard deviation of a particle's spot
 //       [length units]; rules: choices of `rule`; others: choices of graft and add; species: names of
-//       the rules of the world's particles; settings: {name: {value, low, high, scale?: "log",
-//       whole?: true}}, names: eps, update_prob, noise, count, speed (steps a frame);
+//       the rules of the world's particles; settings: {name: {value, low, high, scale: "log" or
+//       null, whole: true or false}}, names: eps, update_prob, noise, count, speed (steps a frame);
 //       tools: names of TOOLS that the world offers; capabilities: some of "film", "loss".
 //       `BLANK` below has the defaults of missing keys.
 //   {type: "frame", step, positions, colours, milliseconds, loss?}
