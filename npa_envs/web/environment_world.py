@@ -101,13 +101,13 @@ class EnvironmentWorld(LiveWorld):
 
     def _run(self, steps: int) -> None:
         for _ in range(steps):
-            before = self._particles().x if self.show == "speed" else None
+            before = self.particles.x if self.show == "speed" else None
             action = self._policy(self._observation)
             self._observation, reward, ended, truncated, self._info = self._env.step(action)
             self.step += 1
             self._return += float(reward)
             if before is not None:
-                moved = nearest_image(self._particles().x - before, self.box)
+                moved = nearest_image(self.particles.x - before, self.box)
                 self._travelled = moved.norm(dim=-1) / max(self._physics.max_displacement, 1e-12)
             if ended or truncated:
                 self._ended = (
@@ -121,15 +121,18 @@ class EnvironmentWorld(LiveWorld):
                 self._events.append(self.describe())
                 return
 
-    def _particles(self) -> Particles:
+    @property
+    def particles(self) -> Particles:
+        """The environment's particles, as a batch of one; settable."""
         x, s = self._inner.particles()
         return Particles(x[None], s[None])
 
-    def _place(self, particles: Particles) -> None:
+    @particles.setter
+    def particles(self, particles: Particles) -> None:
         self._observation = self._inner.place_particles(particles.x[0], particles.s[0])
 
     def _coloured(self) -> ColouredWorld:
-        x, s, *_ = self._particles()
+        x, s, *_ = self.particles
         eps, count = self._physics.eps, x.shape[1]
         return ColouredWorld(
             x, s, self._rule_colours, eps, self.box, [count], count, self._travelled, None

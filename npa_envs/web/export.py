@@ -23,7 +23,7 @@ from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule, check_rule
 from npa_envs.tasks.damage import CLUMP_FACTOR, DAMAGE_SIZES
 from npa_envs.tasks.point_classification import PALETTE, UNDECIDED, PointClassification
-from npa_envs.web.live_world import CLUMP_RATE, INJECT_RATE, MIN_PUSH, checked_seed, colour_ramp
+from npa_envs.web.live_world import CLUMP_RATE, INJECT_RATE, MIN_PULL, checked_seed, colour_ramp
 from npa_envs.web.rule_world import MIN_SEED, SEED_FRACTION, RuleWorld, name_of
 from npa_envs.world.species import AGREEMENTS
 
@@ -51,24 +51,36 @@ CONSTANTS = {
     "CLUMP_RATE": CLUMP_RATE,
     "DAMAGE_SIZES": DAMAGE_SIZES,
     "INJECT_RATE": INJECT_RATE,
-    "MIN_PUSH": MIN_PUSH,
+    "MIN_PULL": MIN_PULL,
     "MIN_SEED": MIN_SEED,
     "SEED_FRACTION": SEED_FRACTION,
 }
 """Numbers and names of the Python worlds that page_world.js also needs."""
 
-PAGE_MODULES = ("drawing.js", "plots.js", "page.js", "worker_engine.js")
-WORKER_MODULES = (
-    *("physics.js", "kernels_simd.js", "physics_gpu.js", "brushes.js", "colours.js"),
-    "page_world.js",
-)
-"""Modules of the page and of its worker, each after those that it imports."""
+IMPORT = re.compile(r'^import (\{[^}]*\}) from "\./([\w.]+)";', re.MULTILINE)
+EXPORT = re.compile(r"^export (?=(?:async )?(?:function|class|const) (\w+))", re.MULTILINE)
+"""The only forms of imports and exports in the page's modules."""
 
 
-def joined_modules(names: Sequence[str]) -> str:
-    """Return JavaScript modules as one script of one scope: all their names must differ."""
-    text = "\n".join((PAGE / name).read_text(encoding="utf-8") for name in names)
-    return '"use strict";\n' + re.sub(r"^import [^;]*;\n|^export ", "", text, flags=re.MULTILINE)
+def joined_modules(name: str) -> str:
+    """Return a module of the page and all that it imports as one script without imports.
+
+    Each module becomes a function that runs once, after those that it imports, so that its names
+    stay its own. `modules` of the script has their exports by file name.
+    """
+    functions: dict[str, str] = {}
+
+    def add(name: str) -> None:
+        text = (PAGE / name).read_text(encoding="utf-8")
+        for _, imported in IMPORT.findall(text):
+            if imported not in functions:
+                add(imported)
+        exports = ", ".join(EXPORT.findall(text))
+        body = EXPORT.sub("", IMPORT.sub(r'const \1 = modules["\2"];', text))
+        functions[name] = f'modules["{name}"] = (() => {{\n{body}return {{ {exports} }};\n}})();'
+
+    add(name)
+    return "\n".join(('"use strict";', "const modules = {};", *functions.values(), ""))
 
 
 def export_web(
@@ -205,7 +217,7 @@ def preview(source: str, *, particle_count: int | None = None) -> str:
     live.speed = PREVIEW_STEPS if live.task.aligned else PREVIEW_STEPS // 2
     live.advance()
     with torch.no_grad():
-        fields = live.task.picture(live.x, live.s)[0].flip(0)
+        fields = live.task.picture(*live.particles[:2])[0].flip(0)
     colour = fields[..., :3] / fields[..., 3:].clamp_min(1e-6)
     pixels = torch.cat((colour, fields[..., 3:]), dim=-1).clamp(0.0, 1.0)
     picture = Image.fromarray((pixels * 255.0).round().to(torch.uint8).numpy(), "RGBA")
@@ -231,7 +243,8 @@ def page_text(
     }
     # With "<" a rule's text could end the script element.
     data = json.dumps(settings, separators=(",", ":")).replace("<", "\\u003c")
-    code = f"{joined_modules(PAGE_MODULES)}\nbegin();\n"
+    code = joined_modules("worker_engine.js") + 'modules["worker_engine.js"].begin();\n'
+    worker = joined_modules("page_world.js") + 'modules["page_world.js"].serve(self);\n'
     style = (PAGE / "page.css").read_text(encoding="utf-8")
     policy = POLICY.format(scripts=_digest(code), styles=_digest(style))
     page = (PAGE / "index.html").read_text(encoding="utf-8")
@@ -247,8 +260,7 @@ def page_text(
             '<script type="module" src="server_engine.js"></script>',
             f"{_gallery(title, previews) if previews else ''}"
             f'<script type="application/json" id="rules">{data}</script>\n'
-            f'<script type="text/plain" id="worker">{joined_modules(WORKER_MODULES)}\n'
-            "serve(self);\n</script>\n"
+            f'<script type="text/plain" id="worker">{worker}</script>\n'
             f'<script type="module">{code}</script>',
         ),
     ):

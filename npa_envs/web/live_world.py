@@ -26,8 +26,8 @@ from npa_envs.world.particles import Particles
 MAX_STEPS = 64
 """Most steps between two frames."""
 
-MIN_PUSH = 0.5
-"""Fraction of the pointer's movement by which the brush `push` of strength 0 moves particles."""
+MIN_PULL = 0.5
+"""Fraction of the pointer's movement by which the brush `pull` of strength 0 moves particles."""
 
 CLUMP_RATE = 0.25
 """Fraction of a particle's distance that a message of the brush `clump` of strength 1 removes."""
@@ -42,42 +42,17 @@ MAX_RADIUS = 10.0
 """Largest radius of a brush [length units]."""
 
 
-class Tool(NamedTuple):
-    """A brush of the page."""
-
-    name: str
-    """What messages call it."""
-    label: str
-    """Its tooltip."""
-    needs: str
-    """What a world must allow to offer it: "moves", "states", "removal", "species" or "growth"."""
-    sends: str
-    """When a stroke sends messages: "frame" (in each frame), "motion" (in frames in which the
-    pointer moves), "place" (at each new place), "once" (at its start) or "line" (at its end)."""
-    takes: str
-    """Other content of its messages: "source", "rule" or ""."""
-    icon: str
-    """Path of its picture, in SVG, on a square of side 24."""
-
-
-TOOLS = (
-    Tool("remove", "Remove", "removal", "frame", "", "M4 15l8-9 7 6-7 8H8zM9 20h11"),
-    Tool("push", "Pull with the pointer", "moves", "motion", "",
-         "M12 20c-4 0-6-3-7-7 2-1 3 0 4 2V6a1.4 1.4 0 0 1 3 0v5a1.4 1.4 0 0 1 3 0v1a1.4 1.4 0 0 1 "
-         "3 0v3c0 3-2 5-6 5z"),
-    Tool("clump", "Clump", "moves", "frame", "",
-         "M4 4l5 5M20 4l-5 5M4 20l5-5M20 20l-5-5M9 6v3H6M15 6v3h3M9 18v-3H6M15 18v-3h3"),
-    Tool("cut", "Cut along a line", "moves", "line", "",
-         "M5 19L19 5M6 8a2 2 0 1 0 0-.1M16 18a2 2 0 1 0 0-.1M8 9l8 8"),
-    Tool("inject", "Inject: the state of where you press spreads to where you drag", "states",
-         "frame", "source",
-         "M4 20l3-1 8-8-2-2-8 8zM12 8l4 4M14 10l3-4a1.8 1.8 0 0 1 3 0 1.8 1.8 0 0 1-1 3l-4 2"),
-    Tool("graft", "Graft: particles take another rule", "species", "place", "rule",
-         "M12 21v-9M12 12c0-5 3-7 8-7 0 5-3 7-8 7zM12 15c0-4-3-6-8-6 0 4 3 6 8 6z"),
-    Tool("add", "Add a seed of another rule", "growth", "once", "rule",
-         "M12 4a8 8 0 1 0 .1 0M12 8v8M8 12h8"),
-)  # fmt: skip
-"""All brushes. `brushed`, `RuleWorld._brush` and `brush` of page_world.js apply them."""
+TOOLS = {
+    "remove": "removal",
+    "pull": "moves",
+    "clump": "moves",
+    "cut": "moves",
+    "inject": "states",
+    "graft": "species",
+    "add": "growth",
+}
+"""All brushes, and what a world must allow to offer each. `brushed`, `RuleWorld._brush` and
+`BRUSHES` of page_world.js apply them; `TOOLS` of page.js has their icons."""
 
 
 class WorldView(NamedTuple):
@@ -113,15 +88,12 @@ class Range(NamedTuple):
             )
         return int(value) if self.whole else float(value)
 
-    def to_dict(self, value: float) -> dict[str, Any]:
-        """Return the range and the present value as JSON for the page."""
-        optional = {"scale": self.scale, "whole": self.whole}
-        fields = {name: option for name, option in optional.items() if option}
-        return {"value": value, "low": self.low, "high": self.high} | fields
-
 
 class LiveWorld(ABC):
     """A world that a page shows and changes while it runs."""
+
+    particles: Particles
+    """The world, as a batch of one."""
 
     def __init__(self, seed: int) -> None:
         self.seed = checked_seed(seed)
@@ -137,10 +109,13 @@ class LiveWorld(ABC):
         """Return the event "world"."""
         return {
             "type": "world",
-            "tools": [tool._asdict() for tool in TOOLS if tool.needs in self._allowed()],
+            "tools": [tool for tool, need in TOOLS.items() if need in self._allowed()],
             "shows": self._shows(),
             "show": self.show,
-            "settings": {k: r.to_dict(getattr(self, k)) for k, r in self._ranges().items()},
+            "settings": {
+                name: {"value": getattr(self, name)} | limits._asdict()
+                for name, limits in self._ranges().items()
+            },
             "playing": self.playing,
             "seed": self.seed,
             "box": None if self.box is None else list(self.box),
@@ -162,7 +137,7 @@ class LiveWorld(ABC):
             case "set":
                 return self._set(str(message.get("name")), message.get("value"))
             case "brush":
-                return self._brush(Touch.read(message, self._particles().x))
+                return self._brush(Touch.read(message, self.particles.x))
             case "damage":
                 check_damage(name := message.get("name"))
                 self._damage(str(name))
@@ -212,14 +187,6 @@ class LiveWorld(ABC):
     def _run(self, steps: int) -> None: ...
 
     @abstractmethod
-    def _particles(self) -> Particles:
-        """Return the world as a batch of one."""
-
-    @abstractmethod
-    def _place(self, particles: Particles) -> None:
-        """Replace positions and states."""
-
-    @abstractmethod
     def _coloured(self) -> ColouredWorld: ...
 
     @abstractmethod
@@ -227,18 +194,18 @@ class LiveWorld(ABC):
 
     @abstractmethod
     def _allowed(self) -> set[str]:
-        """Return what brushes may do in this world, in the terms of `Tool.needs`."""
+        """Return what brushes may do in this world: some of the values of `TOOLS`."""
 
     @abstractmethod
     def _shows(self) -> list[str]: ...
 
     def _damage(self, name: str) -> None:
-        particles = self._particles()
-        self._place(Particles(*damage_worlds(particles.x, particles.s, kind=name)))
+        x, s = damage_worlds(self.particles.x, self.particles.s, kind=name, box=self.box)
+        self.particles = self.particles._replace(x=x, s=s)
 
     def _brush(self, touch: Touch) -> bool:
         """Apply a brush, and return whether `describe` has changed."""
-        self._place(brushed(self._particles(), touch, self.box))
+        self.particles = brushed(self.particles, touch, self.box)
         return False
 
     def _set(self, name: str, value: Any) -> bool:
@@ -291,12 +258,11 @@ class Touch(NamedTuple):
     def read(cls, message: Mapping[str, Any], x: Tensor) -> Touch:
         """Parse the brush of a message for a world with positions x [1, N, D]."""
         name = message.get("tool")
-        names = [tool.name for tool in TOOLS]
-        if name not in names:
-            raise NPAError(f"unknown tool {shown(name)}: {suggest(name, names)}")
+        if not isinstance(name, str) or name not in TOOLS:
+            raise NPAError(f"unknown tool {shown(name)}: {suggest(name, TOOLS)}")
         at, view = message.get("at"), message.get("view")
         return cls(
-            str(name),
+            name,
             _checked_vector("at", at, x),
             _checked_vector("move", message.get("move", [0.0] * x.shape[2]), x),
             Range(1e-4, MAX_RADIUS).checked("radius", message.get("radius")),
@@ -308,30 +274,30 @@ class Touch(NamedTuple):
 
 
 def brushed(particles: Particles, touch: Touch, box: tuple[float, ...] | None) -> Particles:
-    """Return particles after push, clump, cut or inject, which keep their number."""
-    x, s = particles.x, particles.s
+    """Return particles after pull, clump, cut or inject, which keep their number."""
+    x, s, *_ = particles
     disk: dict[str, Any] = {"radius": touch.radius, "box": box}
     match touch.tool:
-        case "push":
-            strength = min(1.0, MIN_PUSH + touch.strength)
+        case "pull":
+            strength = min(1.0, MIN_PULL + touch.strength)
             x = push(x, centre=touch.at, move=touch.move, strength=strength, **disk)
-            return Particles(x, s)
         case "clump":
             factor = CLUMP_RATE * touch.strength
-            return Particles(*clump(x, s, centre=touch.at, factor=factor, **disk))
+            x, s = clump(x, s, centre=touch.at, factor=factor, **disk)
         case "cut":
             half = 0.5 * touch.move
             line: dict[str, Any] = {"centre": touch.at + half, "normal": _normal(touch)}
-            return Particles(*cut(x, s, along=half, gap=touch.radius, box=box, **line))
+            x, s = cut(x, s, along=half, gap=touch.radius, box=box, **line)
         case "inject":
             state, exists = state_around(x, s, centre=touch.source, **disk)
             weight = INJECT_RATE * touch.strength * exists.to(x.dtype)
             s = inject(x, s, centre=touch.at, state=state, strength=weight, **disk)
-            return Particles(x, s)
-    raise NPAError(
-        f"this world keeps its particles, so that the brush {shown(touch.tool)} does nothing: take "
-        "push, clump, cut or inject"
-    )
+        case _:
+            raise NPAError(
+                f"this world keeps its particles, so that the brush {shown(touch.tool)} does "
+                "nothing: take pull, clump, cut or inject"
+            )
+    return particles._replace(x=x, s=s)
 
 
 def _normal(touch: Touch) -> Tensor:

@@ -31,9 +31,9 @@ from npa_envs.web.live_world import (
     Touch,
     shows_of,
 )
-from npa_envs.world.brushes import inside_ball, removed, wipe_state
+from npa_envs.world.brushes import inside_ball, wipe_state
 from npa_envs.world.division import living
-from npa_envs.world.particles import Particles
+from npa_envs.world.particles import Particles, combined
 from npa_envs.world.rollout import at_rest, rollout
 from npa_envs.world.species import AGREEMENTS, rollout_species
 
@@ -126,9 +126,10 @@ class RuleWorld(LiveWorld):
         """Start a fresh world in which all particles follow the chosen rule."""
         super()._begin(seed)
         self._generator = torch.Generator(self._device).manual_seed(self.seed)
-        seeds = self.task.seed(1, generator=self._generator, device=self._device)
-        self.x, self.s, self._goal = seeds.x, seeds.s, seeds.goal
-        self.count = self.x.shape[1]
+        seed_world = self.task.seed(1, generator=self._generator, device=self._device)
+        # The goal is the world's: it is no field of particles that come and go.
+        self.particles, self._goal = seed_world._replace(goal=None), seed_world.goal
+        self.count = self._present
         """Particles of a fresh world."""
         self.live_rules = [replace(self.main, count=self.count, divisor=float(self.count))]
         self._colouring = Colouring()
@@ -139,6 +140,11 @@ class RuleWorld(LiveWorld):
     def task(self) -> Task:
         """The task of the chosen rule."""
         return self.trained.task
+
+    @property
+    def _present(self) -> int:
+        """Particles in the world now."""
+        return self.particles.x.shape[1]
 
     @property
     def counts(self) -> list[int]:
@@ -222,7 +228,7 @@ class RuleWorld(LiveWorld):
     @torch.no_grad()
     def _run(self, steps: int) -> None:
         self.step += steps
-        if self.x.shape[1] == 0:
+        if self._present == 0:
             return
         watched = self.show in ("mask", "speed")
         if not watched and self._rests():
@@ -234,12 +240,12 @@ class RuleWorld(LiveWorld):
         if watched and steps > 1:
             # The last step runs by itself, as masks and speeds are those of one step.
             self._rollout(steps - 1, options)
-        before = self.s
+        before = self.particles.s
         path_length = self._rollout(1 if watched else steps, options)
         if watched:
             longest = max(live_rule.rule.alpha for live_rule in self.live_rules) * self.eps
             self._travelled = path_length / longest
-            self._updated = (self.s != before).any(dim=-1)
+            self._updated = (self.particles.s != before).any(dim=-1)
         if self._device.type == "cuda":
             torch.cuda.synchronize(self._device)
 
@@ -249,7 +255,8 @@ class RuleWorld(LiveWorld):
         can_rest = rule.dead_zone and not rule.divides and not self.noise and self._is_unchanged()
         if can_rest and not self._resting and self.step >= self._next_rest_check:
             self._next_rest_check = self.step + REST_CHECK_STEPS
-            self._resting = bool(at_rest(rule, self.x, self.s, eps=self.eps, box=self.box))
+            x, s, *_ = self.particles
+            self._resting = bool(at_rest(rule, x, s, eps=self.eps, box=self.box))
         return self._resting
 
     def _is_unchanged(self) -> bool:
@@ -260,28 +267,23 @@ class RuleWorld(LiveWorld):
     def _rollout(self, steps: int, options: Mapping[str, Any]) -> Tensor:
         """Run steps and return the path length of each particle."""
         rules = [live_rule.rule for live_rule in self.live_rules]
+        x, s, *_ = self.particles
         if self._is_unchanged():
-            self.x, self.s, path_length = rollout(
-                rules[0], self.x, self.s, steps, return_path_length=True, **options
-            )
+            x, s, path_length = rollout(rules[0], x, s, steps, return_path_length=True, **options)
         else:
             # Divided by the particles of a fresh world: particles that a brush adds or removes
             # change only the densities around them.
             divisors = [live_rule.divisor for live_rule in self.live_rules]
-            self.x, self.s, path_length = rollout_species(
-                rules, self.x, self.s, steps, counts=self.counts, density_counts=divisors,
+            x, s, path_length = rollout_species(
+                rules, x, s, steps, counts=self.counts, density_counts=divisors,
                 return_path_length=True, **options,
             )  # fmt: skip
+        self.particles = self.particles._replace(x=x, s=s)
         return path_length
 
-    def _particles(self) -> Particles:
-        return Particles(self.x, self.s)
-
-    def _place(self, particles: Particles) -> None:
-        self.x, self.s = particles.x, particles.s
-
     def _coloured(self) -> ColouredWorld:
-        x, s, travelled, updated = self.x, self.s, self._travelled, self._updated
+        x, s, *_ = self.particles
+        travelled, updated = self._travelled, self._updated
         counts = self.counts
         if self.main.rule.divides:
             alive = living(s)[0]
@@ -302,29 +304,31 @@ class RuleWorld(LiveWorld):
     def _loss(self) -> float | None:
         """Return the metric, or None where it has no meaning, or too early (`LOSS_FRACTION`)."""
         start = time.perf_counter()
-        comparable = self.trained.doubt is None and len(self.live_rules) == 1 and self.x.shape[1]
+        comparable = self.trained.doubt is None and len(self.live_rules) == 1 and self._present
         if not comparable or start < self._loss_due:
             return None
-        loss = float(self.task.toward(self._goal).metric(self.x, self.s))
+        loss = float(self.task.toward(self._goal).metric(*self.particles[:2]))
         self._loss_due = start + (time.perf_counter() - start) / LOSS_FRACTION
         return loss
 
     @torch.no_grad()
     def _damage(self, name: str) -> None:
-        if self.x.shape[1]:
-            self.x, s = damage_worlds(self.x, self.s, kind=name, generator=self._generator)
-            self.s = self._all_coded(s)
+        if self._present:
+            x, s, *_ = self.particles
+            x, s = damage_worlds(x, s, kind=name, box=self.box, generator=self._generator)
+            self.particles = self.particles._replace(x=x, s=self._all_coded(s))
 
     @torch.no_grad()
     def _brush(self, touch: Touch) -> bool:
         before = [live_rule.name for live_rule in self.live_rules]
+        x, s, *_ = self.particles
         ball: dict[str, Any] = {"centre": touch.at, "radius": touch.radius}
         match touch.tool:
             case "remove" if self.main.rule.divides:
-                self.s = wipe_state(self.x, self.s, **ball)
+                self.particles = self.particles._replace(s=wipe_state(x, s, **ball))
             case "remove":
-                gone = inside_ball(self.x, box=self.box, **ball)
-                self._arrange(*removed(self.x, self.s, gone=gone), self._species()[~gone[0]])
+                outside = ~inside_ball(x, box=self.box, **ball)[0]
+                self._arrange(_taken(self.particles, outside), self._species()[outside])
             case "graft":
                 self._graft(touch, self._joining(touch.rule))
             case "add" if not self.main.rule.static:
@@ -334,27 +338,29 @@ class RuleWorld(LiveWorld):
         return before != [live_rule.name for live_rule in self.live_rules]
 
     def _graft(self, touch: Touch, live_rule: LiveRule) -> None:
-        inside = inside_ball(self.x, centre=touch.at, radius=touch.radius, box=self.box)
+        x, s, *_ = self.particles
+        inside = inside_ball(x, centre=touch.at, radius=touch.radius, box=self.box)
         # Grafted particles divide densities by the same number as their neighbours.
         index = self._species_index(live_rule, float(self.count))
-        s = torch.where(inside[..., None], self._coded(live_rule, self.s), self.s)
-        self._arrange(self.x, s, torch.where(inside[0], index, self._species()))
+        s = torch.where(inside[..., None], self._coded(live_rule, s), s)
+        species = torch.where(inside[0], index, self._species())
+        self._arrange(self.particles._replace(s=s), species)
 
     def _add(self, touch: Touch, live_rule: LiveRule) -> None:
         count = max(MIN_SEED, round(touch.strength * SEED_FRACTION * self.count))
-        room = MAX_PARTICLES[self._device.type] - self.x.shape[1]
+        room = MAX_PARTICLES[self._device.type] - self._present
         if count > room:
             raise NPAError(f"the world has room for {max(room, 0)} particles more, got {count}")
+        zeros = self.particles.map(lambda value: value.new_zeros(1, count, *value.shape[2:]))
         ball = uniform_ball(
-            1, count, self.x.shape[2], touch.radius, generator=self._generator,
-            device=self._device, dtype=self.x.dtype,
+            1, count, zeros.x.shape[2], touch.radius, generator=self._generator,
+            device=self._device, dtype=zeros.x.dtype,
         )  # fmt: skip
+        fresh = zeros._replace(x=ball + touch.at[:, None], s=self._coded(live_rule, zeros.s))
         # A new species divides densities by its own number of particles, as in a world alone.
         index = self._species_index(live_rule, float(count))
-        x = torch.cat((self.x, ball + touch.at[:, None]), dim=1)
-        fresh = self._coded(live_rule, self.s.new_zeros(1, count, self.s.shape[2]))
-        s = torch.cat((self.s, fresh), dim=1)
-        self._arrange(x, s, torch.nn.functional.pad(self._species(), (0, count), value=index))
+        species = torch.nn.functional.pad(self._species(), (0, count), value=index)
+        self._arrange(_joined([self.particles, fresh]), species)
 
     def _all_coded(self, s: Tensor) -> Tensor:
         """Return states of all particles, each with the code of its species."""
@@ -391,18 +397,28 @@ class RuleWorld(LiveWorld):
         indices = torch.arange(len(self.counts))
         return indices.repeat_interleave(torch.tensor(self.counts)).to(self._device)
 
-    def _arrange(self, x: Tensor, s: Tensor, species: Tensor) -> None:
+    def _arrange(self, particles: Particles, species: Tensor) -> None:
         """Set the world's particles, sorted by species."""
         order = species.argsort(stable=True)
-        if not torch.equal(order, torch.arange(self.x.shape[1], device=order.device)):
+        if not torch.equal(order, torch.arange(self._present, device=order.device)):
             # The page's tracers follow particles by their index.
             self._events.append({"type": "reordered"})
-        self.x, self.s = x[:, order], s[:, order]
+        self.particles = _taken(particles, order)
         counts = torch.bincount(species, minlength=len(self.live_rules)).tolist()
         for live_rule, count in zip(self.live_rules, counts, strict=True):
             live_rule.count = count
         present = [live_rule for live_rule in self.live_rules if live_rule.count]
         self.live_rules = present or self.live_rules[:1]
+
+
+def _taken(particles: Particles, indices: Tensor) -> Particles:
+    """Return some particles of every world, by indices or a mask, shape [N]."""
+    return particles.map(lambda value: value[:, indices])
+
+
+def _joined(worlds: Sequence[Particles]) -> Particles:
+    """Return the particles of several worlds as one world."""
+    return combined(functools.partial(torch.cat, dim=1), worlds)
 
 
 def name_of(source: str) -> str:
@@ -456,12 +472,13 @@ class RunWorld(RuleWorld):
         worlds = []
         for live_rule, centre in zip(self.live_rules, self._centres, strict=True):
             task = self._trained(live_rule.name, self._each).task
-            x, s, *_ = task.seed(1, generator=self._generator, device=self._device)
-            x[..., 0] += centre
-            worlds.append((x, s))
+            world = task.seed(1, generator=self._generator, device=self._device)
+            world.x[..., 0] += centre
+            worlds.append(world._replace(goal=None))
             # As in training, each species divides densities by its own number of particles.
-            live_rule.count, live_rule.divisor = x.shape[1], float(x.shape[1])
-        self.x, self.s = (torch.cat(tensors, dim=1) for tensors in zip(*worlds, strict=True))
+            live_rule.count = world.x.shape[1]
+            live_rule.divisor = float(live_rule.count)
+        self.particles = _joined(worlds)
         self.count = sum(self.counts)
 
     def describe(self) -> dict[str, Any]:
@@ -537,7 +554,8 @@ class RunWorld(RuleWorld):
             task = self.task.for_rule(self.main.rule)
             self.trained = replace(self.trained, task=task)
             with torch.no_grad():
-                self.s = self._all_coded(self.s)
+                s = self._all_coded(self.particles.s)
+            self.particles = self.particles._replace(s=s)
         else:
             # Another run was started in the folder.
             self._rules.clear()

@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image
 
 from npa_envs.atomic_files import made_folder
@@ -398,24 +399,24 @@ class ViewerSession:
     def _add_picture(self, data: bytes) -> None:
         # Pictures that arrive after the film's end are ignored.
         if self._pictures is not None:
-            check_picture(data)
             self._pictures.append(data)
             if len(self._pictures) >= MAX_PICTURES:
                 self._send_event({"type": "film", "action": "stop"})
                 self._end_film(self._pictures)
 
 
-def check_picture(data: bytes) -> None:
-    """Check a picture of a film, a JPEG file."""
+def picture_of(data: bytes) -> NDArray[np.uint8]:
+    """Return the pixels of a film's picture, a JPEG file, uint8, shape [H, W, 3]."""
     try:
-        with Image.open(io.BytesIO(data), formats=["JPEG"]) as picture:
-            size = picture.size
+        picture = Image.open(io.BytesIO(data), formats=["JPEG"])
+        if max(picture.size) > MAX_PICTURE:
+            raise NPAError(
+                f"a film's picture must have at most {MAX_PICTURE} pixels on each side, "
+                f"got {picture.size}"
+            )
+        return np.asarray(picture.convert("RGB"))
     except (OSError, ValueError, Image.DecompressionBombError) as error:
-        raise NPAError(f"a film's picture must be a JPEG, got {shown(error)}") from error
-    if max(size) > MAX_PICTURE:
-        raise NPAError(
-            f"a film's picture must have at most {MAX_PICTURE} pixels on each side, got {size}"
-        )
+        raise NPAError(f"a film's picture must be a whole JPEG, got {shown(error)}") from error
 
 
 def write_film(pictures: Sequence[bytes], folder: Path) -> Iterator[Path]:
@@ -424,11 +425,8 @@ def write_film(pictures: Sequence[bytes], folder: Path) -> Iterator[Path]:
         raise NPAError("the film has no pictures: let the world move while it records")
     # Random, as several films may end within the same second.
     name = f"{time.strftime('film-%Y%m%d-%H%M%S')}-{secrets.token_hex(3)}"
+    frames = [picture_of(data) for data in pictures]
     try:
-        frames = [
-            np.asarray(Image.open(io.BytesIO(data), formats=["JPEG"]).convert("RGB"))
-            for data in pictures
-        ]
         with made_folder(folder):
             # The GIF comes first, as it needs no ffmpeg.
             for suffix, write in ((".gif", write_gif), (".mp4", write_mp4)):
@@ -456,11 +454,9 @@ def open_port(host: str, port: int | None) -> socket.socket:
         ) from error
     reason = ""
     for number in ports:
-        # "::" listens to IPv4 as well.
-        both = family == socket.AF_INET6 and socket.has_dualstack_ipv6()
         try:
             return socket.create_server(
-                (address[0], number, *address[2:]), family=family, backlog=128, dualstack_ipv6=both
+                (address[0], number, *address[2:]), family=family, backlog=128
             )
         except OSError as error:
             reason = os.strerror(error.errno or 0)

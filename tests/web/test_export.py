@@ -24,20 +24,19 @@ from npa_envs.cli import main
 from npa_envs.errors import NPAError
 from npa_envs.rule.files import load_rule, save_rule
 from npa_envs.rule.rule import NPARule
+from npa_envs.tasks.damage import DAMAGE_SIZES
 from npa_envs.tasks.point_classification import class_colours
 from npa_envs.web.export import (
-    PAGE,
-    PAGE_MODULES,
-    WORKER_MODULES,
     check_browser_rule,
     export_web,
     joined_modules,
     page_rule,
     page_text,
 )
-from npa_envs.web.live_world import ColouredWorld, Colouring
+from npa_envs.web.live_world import TOOLS, ColouredWorld, Colouring
 from npa_envs.web.rule_world import RuleWorld
 from npa_envs.world.brushes import nearest_image
+from npa_envs.world.particles import Particles
 
 NODE_SECONDS = 60
 
@@ -124,11 +123,11 @@ def test_a_live_world_moves_and_the_same_seed_gives_the_same_world(run, settings
 
 PAUSE = {"type": "play", "on": False}
 BRUSHES = {
-    "remove": {}, "push": {"move": [0.05, -0.1]}, "clump": {}, "cut": {"move": [0.1, 0.2]},
+    "remove": {}, "pull": {"move": [0.05, -0.1]}, "clump": {}, "cut": {"move": [0.1, 0.2]},
     "inject": {"source": [-0.1, 0.1]}, "inject nothing": {"source": [5.0, 5.0]},
     "graft": {},
 }  # fmt: skip
-
+"""Fields of their messages; "add", which draws positions, is tested below."""
 
 GRAFTED = {"gecko": "heart", "dots": "dots", "duck": "duck"}
 """A rule that may join the world of each rule; the second one is periodic, the last one 3D."""
@@ -140,24 +139,35 @@ def test_brushes_of_a_page_are_those_of_the_viewer(run, settings, rule, name):
     script = [{"type": "set", "name": "rule", "value": rule}, *[ADVANCE] * 9, PAUSE]
     message = {"type": "brush", "tool": name.split()[0], "at": [0.1, 0.0], "radius": 0.15}
     message |= {"strength": 0.4, "move": [0.0, 0.0], "rule": GRAFTED[rule]} | BRUSHES[name]
+    if rule == "dots":
+        # Across the edge of the box.
+        message["at"] = [0.95, 0.0]
     if rule == "duck":
         vectors = {"at": [0.1, 0.0, 0.0], "move": [0.1, 0.2, -0.1], "source": [-0.1, 0.1, 0.1]}
         message |= vectors | {"view": [0.6, 0.0, 0.8], "radius": 0.5}
     before = live(run, settings, *script)
     after = live(run, settings, *script, message)
     world = RuleWorld(rule, device=torch.device("cpu"), particle_count=len(before["species"]))
-    x = world.x = unpacked(before["x"], world.x.shape)
-    s = world.s = unpacked(before["s"], world.s.shape)
+    x, s = (unpacked(before[field], getattr(world.particles, field).shape) for field in "xs")
+    world.particles = Particles(x, s)
     world.handle(message)
     assert world.counts == [after["species"].count(k) for k in sorted(set(after["species"]))]
     order = torch.tensor(after["species"]).argsort(stable=True)
     got_x = unpacked(after["x"], (1, -1, x.shape[2]))[:, order]
     got_s = unpacked(after["s"], (1, -1, s.shape[2]))[:, order]
-    assert float(nearest_image(got_x - world.x, world.box).abs().max()) < 1e-6
-    assert float((got_s - world.s).abs().max()) < 1e-5
-    same = torch.equal(world.x, x) and torch.equal(world.s, s)
+    assert float(nearest_image(got_x - world.particles.x, world.box).abs().max()) < 1e-6
+    assert float((got_s - world.particles.s).abs().max()) < 1e-5
+    same = torch.equal(world.particles.x, x) and torch.equal(world.particles.s, s)
     unchanged = (("gecko", "inject nothing"), ("dots", "graft"), ("duck", "graft"))
     assert same == ((rule, name) in unchanged)
+
+
+def test_every_kind_of_damage_and_every_brush_is_one_of_a_page(run, settings):
+    damages = [{"type": "damage", "name": name} for name in (*DAMAGE_SIZES, "luck")]
+    assert live(run, settings, ADVANCE, *damages)["errors"] == ["no damage is called luck"]
+    assert {name.split()[0] for name in BRUSHES} | {"add"} == set(TOOLS)
+    unknown = {"type": "brush", "tool": "luck", "at": [0, 0], "radius": 1, "strength": 1}
+    assert live(run, settings, unknown)["errors"] == ["no brush is called luck"]
 
 
 def test_a_world_without_particles_goes_on(run, settings):
@@ -197,11 +207,11 @@ def test_settings_reach_the_world_and_wrong_messages_are_told(run, settings):
     assert float(unpacked(texture["x"], (200, 2)).abs().max()) <= 1.0
     wrong = live(
         run, settings, set_to("eps", 9), set_to("rule", "nobody"), set_to("show", "nothing"),
-        {"type": "damage", "name": "luck"}, {"type": "fly"}
+        {"type": "fly"}
     )  # fmt: skip
     assert wrong["errors"] == [
         "eps must lie in [0.04, 0.25], got 9", "no rule is called nobody",
-        "nothing to show is called nothing", "no damage is called luck", "no message is called fly"
+        "nothing to show is called nothing", "no message is called fly"
     ]  # fmt: skip
     whole = live(run, settings, *[ADVANCE] * 3)
     x = unpacked(whole["x"], (300, 2))
@@ -210,6 +220,20 @@ def test_settings_reach_the_world_and_wrong_messages_are_told(run, settings):
         moved = (unpacked(damaged["x"], (300, 2)) - x).norm(dim=-1).max()
         assert 0.5 * farthest <= float(moved) <= farthest + 1e-6
         assert (damaged["s"] != whole["s"]) == (name == "wipe")
+
+
+def test_damage_of_a_page_continues_across_the_edges_of_a_box(run, settings):
+    texture = {"type": "set", "name": "rule", "value": "dots"}
+    wipe = [*[ADVANCE] * 20, PAUSE, {"type": "damage", "name": "wipe"}]
+    is_disk = []
+    for seed in range(8):
+        result = live(run, settings, texture, {"type": "reset", "seed": seed}, *wipe)
+        x, s = unpacked(result["x"], (200, 2)), unpacked(result["s"], (200, -1))
+        away = x[:, None] - x
+        disks = [v.norm(dim=-1) <= 0.2 for v in (away, nearest_image(away, (2.0, 2.0)))]
+        wiped = (s == 0.0).all(dim=-1)
+        is_disk.append(tuple(bool((disk == wiped).all(dim=-1).any()) for disk in disks))
+    assert set(is_disk) == {(False, True), (True, True)}
 
 
 @pytest.mark.parametrize(
@@ -296,16 +320,15 @@ def test_a_page_is_one_small_file_that_asks_for_nothing(tmp_path):
     assert '"name":"\\u003cb>"' in text
 
 
-@pytest.mark.parametrize("modules", [PAGE_MODULES, WORKER_MODULES])
-def test_modules_follow_those_that_they_import_and_all_their_names_differ(modules):
-    names = []
-    for k, module in enumerate(modules):
-        text = (PAGE / module).read_text(encoding="utf-8")
-        assert set(re.findall(r'from "\./([\w.]+)"', text)) <= set(modules[:k])
-        declared = r"^(?:export )?(?:async )?(?:function|class|const|let) (\S+)"
-        names += re.findall(declared, text, re.MULTILINE)
-    assert len(set(names)) == len(names) > 30
-    assert not re.search(r"^(import|export)\b", joined_modules(modules), re.MULTILINE)
+@pytest.mark.usefixtures("modules")
+@pytest.mark.parametrize(
+    ("name", "count"), [("worker_engine.js", 4), ("page_world.js", 6), ("physics_gpu.js", 2)]
+)
+def test_a_joined_script_is_that_of_a_module_after_its_imports(name, count):
+    script = joined_modules(name) + "console.log(Object.keys(modules).join())"
+    names = subprocess.check_output(["node", "-e", script], text=True).strip().split(",")
+    assert (len(names), names[-1]) == (count, name)
+    assert not re.search(r"^(import|export)\b", script, re.MULTILINE)
 
 
 class OwnNetwork(NPARule):

@@ -23,7 +23,6 @@ from npa_envs.web.environment_world import EnvironmentWorld, make_environment
 from npa_envs.web.live_world import ColouredWorld, Colouring, signed_colours, species_colours
 from npa_envs.web.rule_world import RuleWorld, RunWorld
 from npa_envs.world.division import living
-from npa_envs.world.particles import Particles
 
 CPU = torch.device("cpu")
 COUNT = 96
@@ -68,7 +67,7 @@ def world(gecko) -> RuleWorld:
 
 def test_a_live_world_is_the_rollout_of_its_rule(world):
     put(world, speed=3)
-    device = world.x.device
+    device = world.particles.x.device
     rule = load_rule("gecko", device=device).float()
     generator = torch.Generator(device).manual_seed(0)
     x, s, *_ = world.task.seed(1, generator=generator, device=device)
@@ -98,8 +97,8 @@ def test_what_is_shown_does_not_change_the_world(gecko):
             put(world, speed=2)
             world.advance()
         assert watched.frame().colours.shape == (COUNT, 3)
-        assert torch.equal(plain.x, watched.x)
-        assert torch.equal(plain.s, watched.s)
+        assert torch.equal(plain.particles.x, watched.particles.x)
+        assert torch.equal(plain.particles.s, watched.particles.s)
 
 
 def test_the_mask_shows_about_as_many_as_are_updated(device):
@@ -134,8 +133,8 @@ def test_the_same_seed_gives_the_same_world_and_the_next_one_another(world):
 def test_remove_takes_particles_and_the_others_feel_it_nearby_only(world, gecko):
     other = gecko()
     for live in (world, other):
-        live.x = 4.0 * live.x
-    far = world.x[0, :, 0] > 0.25
+        live.particles = live.particles._replace(x=4.0 * live.particles.x)
+    far = world.particles.x[0, :, 0] > 0.25
     assert not world.handle(brush("remove", at=[-0.2, 0.0], radius=0.15))
     frame = world.frame()
     assert 0 < len(frame.positions) < COUNT
@@ -148,7 +147,7 @@ def test_remove_takes_particles_and_the_others_feel_it_nearby_only(world, gecko)
         # All are updated, so that both draw nothing.
         put(live, update_prob=1.0, eps=0.05)
         live.advance()
-    apart = (world.x[0][:, None] - other.x[0]).norm(dim=-1).min(dim=0).values
+    apart = (world.particles.x[0][:, None] - other.particles.x[0]).norm(dim=-1).min(dim=0).values
     assert float(apart[far].max()) < 1e-6
 
 
@@ -179,7 +178,7 @@ def test_a_world_at_rest_is_not_stepped_until_something_changes_it(tmp_path, dev
     advance(world, 8)
     assert step_counts == [16] * 3
     assert world.step == 128
-    world.s[0, 3] = 1e4
+    world.particles.s[0, 3] = 1e4
     put(world, show="colours")
     world.advance()
     assert step_counts == [16] * 4
@@ -193,19 +192,19 @@ def test_a_world_that_divides_shows_its_living_particles(tmp_path, device):
     rule, path = dividing(load_rule("gecko")), tmp_path / "dividing.safetensors"
     world = world_of(rule, path, device, division=True, particle_count=64)
     assert len(world.frame().positions) == 1
-    assert not {"inject", "graft", "add"} & {tool["name"] for tool in world.describe()["tools"]}
+    assert not {"inject", "graft", "add"} & set(world.describe()["tools"])
     put(world, speed=8)
     for show in ("colours", "mask", "speed", "density", "components", "species", "state 3"):
         put(world, show=show)
         world.advance()
-        alive = living(world.s)[0]
+        alive = living(world.particles.s)[0]
         frame = world.frame()
-        np.testing.assert_array_equal(frame.positions, world.x[0, alive].cpu().numpy())
+        np.testing.assert_array_equal(frame.positions, world.particles.x[0, alive].cpu().numpy())
         assert frame.colours.shape == (int(alive.sum()), 3)
     assert int(alive.sum()) == 64
     world.handle(brush("remove", radius=9.0))
     world.advance()
-    assert world.x.shape == (1, 64, 2)
+    assert world.particles.x.shape == (1, 64, 2)
     assert len(world.frame().positions) == 0
     with pytest.raises(NPAError, match="and not divide"):
         world.handle(brush("graft", rule="gecko"))
@@ -215,41 +214,41 @@ def test_what_is_added_to_a_world_of_a_rule_with_codes_carries_one(device):
     world = RuleWorld("seven-pictures", device=device, particle_count=64)
     code = world.main.rule.codes["gecko"]
     world.handle(brush("add", rule="seven-pictures", at=[0.5, 0.0]))
-    assert world.x.shape[1] > 64
+    assert world.particles.x.shape[1] > 64
     for damage in DAMAGE_SIZES:
         world.handle({"type": "damage", "name": damage})
     world.handle(brush("graft", rule="seven-pictures"))
-    assert torch.equal(world.s[0, :, :8], code.expand(world.s.shape[1], 8))
+    assert torch.equal(world.particles.s[0, :, :8], code.expand(world.particles.s.shape[1], 8))
 
 
-def test_push_carries_particles_along_and_clump_and_cut_move_them(world):
-    before = world.x.clone()
-    world.handle(brush("push", move=[0.05, 0.0], radius=0.2, strength=1.0))
-    moved = world.x - before
+def test_pull_carries_particles_along_and_clump_and_cut_move_them(world):
+    before = world.particles.x.clone()
+    world.handle(brush("pull", move=[0.05, 0.0], radius=0.2, strength=1.0))
+    moved = world.particles.x - before
     assert float(moved[..., 0].max()) > 0.03
     assert float(moved[..., 0].min()) >= 0.0
     assert float(moved[..., 1].abs().max()) == 0.0
-    before = world.x.clone()
+    before = world.particles.x.clone()
     world.handle(brush("clump", radius=0.3, strength=1.0))
-    assert world.x.norm(dim=-1).mean() < before.norm(dim=-1).mean()
+    assert world.particles.x.norm(dim=-1).mean() < before.norm(dim=-1).mean()
     world.handle(brush("cut", at=[-1.0, 0.0], move=[2.0, 0.0], radius=0.05))
-    assert float(world.x[..., 1].abs().min()) >= 0.025 - 1e-6
+    assert float(world.particles.x[..., 1].abs().min()) >= 0.025 - 1e-6
 
 
 def test_a_state_is_injected_elsewhere(world):
-    world.s[..., 0] = (world.x[..., 0] < 0).to(world.s)
-    x, s = world.x.clone(), world.s.clone()
+    world.particles.s[..., 0] = (world.particles.x[..., 0] < 0).to(world.particles.s)
+    x, s = world.particles.x.clone(), world.particles.s.clone()
     there = {"at": [0.1, 0.0], "radius": 0.08, "strength": 1.0}
     world.handle(brush("inject", source=[-0.1, 0.0], **there))
-    gained = world.s[0, :, 0] - s[0, :, 0]
+    gained = world.particles.s[0, :, 0] - s[0, :, 0]
     inside = (x[0] - x.new_tensor([0.1, 0.0])).norm(dim=-1) < 0.08
     assert float(gained[inside].max()) > 0.3
     assert float(gained[~inside].abs().max()) == 0.0
-    assert torch.equal(world.x, x)
-    after = world.s.clone()
+    assert torch.equal(world.particles.x, x)
+    after = world.particles.s.clone()
     # Without a source, particles become like those around them.
     world.handle(brush("inject", at=[0.0, 0.0], radius=0.2, strength=1.0))
-    assert float(world.s[..., 0].std()) < float(after[..., 0].std())
+    assert float(world.particles.s[..., 0].std()) < float(after[..., 0].std())
 
 
 def test_grafts_follow_the_other_rule(world):
@@ -275,36 +274,55 @@ def test_a_seed_that_is_added_grows_as_it_would_alone(world):
     put(world, update_prob=1.0)
     world.handle(brush("add", rule="heart", at=[30.0, 0.0], radius=0.2, strength=1.0))
     assert world.counts == [COUNT, COUNT // 2]
-    heart = world.x[:, COUNT:].clone(), world.s[:, COUNT:].clone()
+    heart = world.particles.x[:, COUNT:].clone(), world.particles.s[:, COUNT:].clone()
     advance(world, 2)
-    rule = load_rule("heart", device=world.x.device).float()
+    rule = load_rule("heart", device=world.particles.x.device).float()
     with torch.no_grad():
         x, s = rollout(rule, *heart, 2, update_prob=1.0)
-    torch.testing.assert_close(world.x[:, COUNT:], x, rtol=0.0, atol=2e-5)
-    torch.testing.assert_close(world.s[:, COUNT:], s, rtol=0.0, atol=1e-3)
+    torch.testing.assert_close(world.particles.x[:, COUNT:], x, rtol=0.0, atol=2e-5)
+    torch.testing.assert_close(world.particles.s[:, COUNT:], s, rtol=0.0, atol=1e-3)
+
+
+def test_every_field_of_particles_lives_through_steps_brushes_and_damage(world):
+    velocity = torch.rand(1, COUNT, device=world.particles.x.device)
+    world.particles = world.particles._replace(path_length=velocity)
+    world.handle(brush("graft", rule="heart", radius=0.15))
+    order = [(world.particles.path_length[0] == value).nonzero().item() for value in velocity[0]]
+    x = world.particles.x
+    assert sorted(order) == list(range(COUNT))
+    world.handle(brush("add", rule="heart", at=[30.0, 0.0]))
+    added = world.particles.path_length.shape[1] - COUNT
+    assert added == world.particles.x.shape[1] - COUNT > 0
+    for tool in ("pull", "clump", "cut", "inject"):
+        world.handle(brush(tool))
+    world.handle({"type": "damage", "name": "wipe"})
+    world.advance()
+    world.handle(brush("remove", at=[30.0, 0.0], radius=1.0))
+    assert torch.equal(world.particles.path_length[:, order], velocity)
+    assert world.particles.x.shape == x.shape
 
 
 @pytest.mark.parametrize("name", DAMAGE_SIZES)
 def test_damage_changes_the_world(world, name):
     advance(world, 3)
-    x, s = world.x.clone(), world.s.clone()
+    x, s = world.particles.x.clone(), world.particles.s.clone()
     world.handle({"type": "damage", "name": name})
-    assert not (torch.equal(x, world.x) and torch.equal(s, world.s))
+    assert not (torch.equal(x, world.particles.x) and torch.equal(s, world.particles.s))
 
 
 def test_settings_change_the_world_and_its_description(world):
     for name, value in (("eps", 0.12), ("update_prob", 0.05), ("noise", 0.01), ("speed", 4)):
         assert put(world, **{name: value})
         assert world.describe()["settings"][name]["value"] == value
-    before = world.x.clone()
+    before = world.particles.x.clone()
     world.advance()
     assert world.step == 4
     # Noise also moves particles that are not updated.
-    assert bool((world.x != before).any(dim=-1).all())
+    assert bool((world.particles.x != before).any(dim=-1).all())
     put(world, noise=0.0, speed=1)
-    before = world.x.clone()
+    before = world.particles.x.clone()
     world.advance()
-    assert int((world.x != before).any(dim=-1).sum()) < COUNT // 2
+    assert int((world.particles.x != before).any(dim=-1).sum()) < COUNT // 2
     put(world, count=64)
     assert len(world.frame().positions) == 64
     assert world.describe()["settings"]["eps"]["value"] == 0.12
@@ -330,7 +348,7 @@ def test_the_loss_is_computed_only_where_it_is_wanted(world, monkeypatch):
     put(world, loss=True)
     world.advance()
     loss = world.frame().loss
-    assert loss == pytest.approx(float(world.task.metric(world.x, world.s)))
+    assert loss == pytest.approx(float(world.task.metric(world.particles.x, world.particles.s)))
     assert world.frame().loss is None
 
 
@@ -361,19 +379,18 @@ def test_the_loss_is_computed_only_where_it_is_wanted(world, monkeypatch):
         (brush("remove", at=[0.0, float("inf")]), "at must be 2 finite numbers"),
         (brush("remove", at="00"), "at must be 2 finite numbers"),
         (brush("remove", radius=-1), "radius must be a number in"),
-        (brush("push", move=[1e9, 0.0]), "move must be 2 finite numbers"),
+        (brush("pull", move=[1e9, 0.0]), "move must be 2 finite numbers"),
         (brush("inject", source=[0.0]), "source must be 2 finite numbers"),
-        (brush("push", strength=2), "strength must be a number in"),
+        (brush("pull", strength=2), "strength must be a number in"),
         (brush("graft", rule="worm"), "unknown rule 'worm'"),
         (brush("graft", rule="duck"), "duck cannot live in a world of gecko"),
     ],
 )
 def test_a_wrong_message_is_refused_and_changes_nothing(shared, message, error):
-    x, s, description = shared.x, shared.s, shared.describe()
+    particles, description = shared.particles, shared.describe()
     with pytest.raises(NPAError, match=error):
         shared.handle(message)
-    assert shared.x is x
-    assert shared.s is s
+    assert shared.particles is particles
     assert shared.describe() == description
 
 
@@ -508,7 +525,7 @@ def test_a_run_is_followed(tmp_path, followed):
     assert description["title"] == tmp_path.name
     assert world.take_events() == []
     world.advance()
-    x = world.x
+    x = world.particles.x
     newer = trained_on("gecko")
     write_run(tmp_path, rule=newer)
     log(tmp_path, 10, 12)
@@ -517,7 +534,7 @@ def test_a_run_is_followed(tmp_path, followed):
     assert description["note"] == "a training run, iteration 11"
     assert torch.equal(world.main.rule.hidden.weight, newer.hidden.weight)
     # The world lives on.
-    assert world.x is x
+    assert world.particles.x is x
     assert world.step == 1
     assert polled(world) == []
 
@@ -534,7 +551,7 @@ def test_a_run_of_several_rules_is_one_world_of_them(tmp_path):
     curve, _ = world.take_events()
     assert len(curve["points"]) > 1
     rules = [load_rule(folder / f"rule-{k}.safetensors").float() for k in (0, 1)]
-    x, s, generator = world.x, world.s, torch.Generator()
+    x, s, generator = world.particles.x, world.particles.s, torch.Generator()
     generator.set_state(world._generator.get_state())
     world.advance()
     with torch.no_grad():
@@ -542,7 +559,7 @@ def test_a_run_of_several_rules_is_one_world_of_them(tmp_path):
             rules, x, s, 1, counts=[128, 128], density_counts=[128, 128], eps=0.3,
             update_prob=0.5, generator=generator,
         )  # fmt: skip
-    assert torch.equal(world.x, x)
+    assert torch.equal(world.particles.x, x)
     # A newer checkpoint.
     path = folder / "rule-1.safetensors"
     metadata = {name: rule_metadata(path)[name] for name in ("task", "config")}
@@ -579,14 +596,14 @@ def test_particles_carry_the_codes_of_the_newest_rule(tmp_path):
     world.advance()
     newer = trained_on("seven-pictures")
     code = newer.codes.table[0].detach()
-    assert not torch.equal(world.s[0, 0, :8], code)
-    rest = world.s[..., 8:].clone()
+    assert not torch.equal(world.particles.s[0, 0, :8], code)
+    rest = world.particles.s[..., 8:].clone()
     write_run(tmp_path, "seven-pictures", newer)
     polled(world)
-    assert torch.equal(world.s[0, :, :8], code.expand(64, 8))
-    assert torch.equal(world.s[..., 8:], rest)
+    assert torch.equal(world.particles.s[0, :, :8], code.expand(64, 8))
+    assert torch.equal(world.particles.s[..., 8:], rest)
     world.handle({"type": "reset"})
-    assert torch.equal(world.s[0, :, :8], code.expand(64, 8))
+    assert torch.equal(world.particles.s[0, :, :8], code.expand(64, 8))
 
 
 def test_a_log_that_begins_anew_or_goes_back_is_told_from_its_start(tmp_path, followed):
@@ -649,13 +666,12 @@ def test_the_speed_of_a_step_across_an_edge_of_the_box_is_that_of_the_step():
     action = np.zeros(env.action_space.shape, np.float32)
     action[:, 0] = 1.0
     world = EnvironmentWorld(env, lambda observation: action)
-    x, s = world._inner.particles()
-    x[:, 0] = 1.0 - 1e-4
-    world._place(Particles(x[None], s[None]))
+    particles = world.particles
+    particles.x[..., 0] = 1.0 - 1e-4
+    world.particles = particles
     put(world, show="speed")
     world.advance()
-    after = world._inner.particles()[0]
-    assert int((after[:, 0] < 0).sum()) > 10
+    assert int((world.particles.x[..., 0] < 0).sum()) > 10
     assert 0.0 < float(world._travelled.max()) <= 1.0 + 1e-5
     world.close()
 
@@ -687,16 +703,16 @@ def test_episodes_follow_each_other(episodes):
 
 def test_hands_reach_into_environments(episodes):
     before = episodes.frame().positions.copy()
-    episodes.handle(brush("push", move=[0.1, 0.0], radius=0.3, strength=1.0))
+    episodes.handle(brush("pull", move=[0.1, 0.0], radius=0.3, strength=1.0))
     after = episodes.frame().positions
     assert (after - before)[:, 0].max() > 0.05
     episodes.handle({"type": "damage", "name": "noise"})
     assert not np.array_equal(episodes.frame().positions, after)
-    x, states = episodes._inner.particles()
-    states[:, 0] = x[:, 0]
-    episodes._place(Particles(x[None], states[None]))
+    particles = episodes.particles
+    particles.s[..., 0] = particles.x[..., 0]
+    episodes.particles = particles
     episodes.handle(brush("inject", source=[0.1, 0.0], radius=0.2, strength=1.0))
-    assert not torch.equal(episodes._inner.particles()[1], states)
+    assert not torch.equal(episodes.particles.s, particles.s)
     with pytest.raises(NPAError, match="keeps its particles, so that the brush 'remove'"):
         episodes.handle(brush("remove"))
     put(episodes, loss=True)

@@ -10,14 +10,8 @@ from pathlib import Path
 import pytest
 
 SETUP = """
-const usual = { takes: "", label: "", icon: "" };
 const world = {
-  type: "world", title: "t", dimension: 2,
-  tools: [
-    { ...usual, name: "remove", sends: "frame", takes: "source" },
-    { ...usual, name: "push", sends: "motion" }, { ...usual, name: "graft", sends: "place" },
-    { ...usual, name: "add", sends: "once" }, { ...usual, name: "cut", sends: "line" },
-  ],
+  type: "world", title: "t", dimension: 2, tools: ["inject", "pull", "graft", "add", "cut"],
   capabilities: ["film"],
 };
 const frame = (step, places = [0, 0, 1, 1]) => ({
@@ -63,7 +57,7 @@ def test_each_frame_is_answered_once_it_or_a_later_one_is_drawn(run):
 def test_each_brush_sends_its_messages_at_its_time(run):
     strokes = run("""
         const strokes = {};
-        for (const { name } of world.tools) {
+        for (const name of world.tools) {
           page.choose(name);
           sent.length = 0;
           const event = (type, clientX) =>
@@ -81,8 +75,8 @@ def test_each_brush_sends_its_messages_at_its_time(run):
     """)
     # In tens of pixels from the middle: position, movement, and where the stroke began.
     assert strokes == {
-        "remove": [[-1, 0, -1], [-1, 0, -1], [-1, 2, -1], [1, 0, -1]],
-        "push": [[-1, 0, None], [-1, 2, None]],
+        "inject": [[-1, 0, -1], [-1, 0, -1], [-1, 2, -1], [1, 0, -1]],
+        "pull": [[-1, 0, None], [-1, 2, None]],
         "graft": [[-1, 0, None], [1, 0, None]],
         "add": [[-1, 0, None]],
         "cut": [[-1, 2, None]],

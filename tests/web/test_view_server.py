@@ -417,10 +417,10 @@ def test_without_ffmpeg_there_is_a_gif(client, site, monkeypatch):
 @pytest.mark.parametrize(
     ("pictures", "error"),
     [
-        ([b"no picture"], "a film's picture must be a JPEG"),
+        ([b"no picture"], "a film's picture must be a whole JPEG"),
         ([jpeg((2000, 8))], r"at most 1024 pixels on each side, got (2000, 8)"),
         ([], "the film has no pictures"),
-        ([jpeg()[:-8]], "the film cannot be written"),
+        ([jpeg()[:-8]], "a film's picture must be a whole JPEG"),
         ([jpeg(), jpeg((16, 16))], "frames must all have one size"),
     ],
 )

@@ -1,11 +1,11 @@
-// Brushes, by the formulas of npa_envs/world/brushes.py, in place.
+// Brushes, by the formulas of npa_envs/world/brushes.py, in place: a change there is made here as well.
 //
-// x: positions [length units], s: states, particle by particle; box: sides of the periodic box [length
-// units], in which distances are those to the nearest image, or null.
+// world: {x, s, dimension, channels, box}. x: positions [length units], s: states, particle by particle;
+// box: sides of the periodic box [length units], in which distances are those to the nearest image, or null.
 
 // Calls visit(i, offset, square) for each particle: its offset from `centre`, which is valid only during
 // the call, and the square of the offset's length.
-function forEach(x, dimension, centre, box, visit) {
+function forEach({ x, dimension, box }, centre, visit) {
   const offset = new Float64Array(dimension);
   const count = x.length / dimension;
   for (let i = 0; i < count; i++) {
@@ -21,32 +21,33 @@ function forEach(x, dimension, centre, box, visit) {
 }
 
 // Returns the indices of particles in a ball.
-export function insideBall(x, dimension, centre, radius, box) {
+export function insideBall(world, centre, radius) {
   const indices = [];
-  forEach(x, dimension, centre, box, (i, _, square) => {
+  forEach(world, centre, (i, _, square) => {
     if (Math.sqrt(square) <= radius) indices.push(i);
   });
   return indices;
 }
 
-export function wipeState(x, s, dimension, centre, radius, box) {
-  const channels = (s.length / x.length) * dimension;
-  for (const i of insideBall(x, dimension, centre, radius, box)) s.fill(0, i * channels, (i + 1) * channels);
+export function wipeState(world, centre, radius) {
+  const { s, channels } = world;
+  for (const i of insideBall(world, centre, radius)) s.fill(0, i * channels, (i + 1) * channels);
 }
 
 // Moves particles by a fraction of `move`, in the centre `strength`, less towards the rim.
-export function push(x, dimension, centre, move, radius, strength, box) {
-  forEach(x, dimension, centre, box, (i, _, square) => {
+export function push(world, centre, move, radius, strength) {
+  const { x, dimension } = world;
+  forEach(world, centre, (i, _, square) => {
     const weight = strength * softness(square, radius);
     for (let d = 0; d < dimension; d++) x[i * dimension + d] += weight * move[d];
   });
 }
 
 // Returns the mean state under a soft brush, or null if there is no particle.
-export function stateAround(x, s, dimension, centre, radius, box) {
-  const channels = (s.length / x.length) * dimension, mean = new Float64Array(channels);
+export function stateAround(world, centre, radius) {
+  const { s, channels } = world, mean = new Float64Array(channels);
   let total = 0;
-  forEach(x, dimension, centre, box, (i, _, square) => {
+  forEach(world, centre, (i, _, square) => {
     const weight = softness(square, radius);
     total += weight;
     for (let c = 0; c < channels; c++) mean[c] += weight * s[i * channels + c];
@@ -55,9 +56,9 @@ export function stateAround(x, s, dimension, centre, radius, box) {
 }
 
 // Mixes a state into those of particles, in the centre by the fraction `strength`.
-export function inject(x, s, dimension, centre, radius, state, strength, box) {
-  const channels = state.length;
-  forEach(x, dimension, centre, box, (i, _, square) => {
+export function inject(world, centre, radius, state, strength) {
+  const { s, channels } = world;
+  forEach(world, centre, (i, _, square) => {
     const weight = strength * softness(square, radius);
     for (let c = 0; c < channels; c++) s[i * channels + c] += weight * (state[c] - s[i * channels + c]);
   });
@@ -69,8 +70,9 @@ function softness(square, radius) {
 }
 
 // Moves particles towards the centre by the fraction `factor` of their distance.
-export function clump(x, dimension, centre, radius, factor, box) {
-  forEach(x, dimension, centre, box, (i, offset, square) => {
+export function clump(world, centre, radius, factor) {
+  const { x, dimension } = world;
+  forEach(world, centre, (i, offset, square) => {
     if (Math.sqrt(square) > radius) return;
     for (let d = 0; d < dimension; d++) x[i * dimension + d] -= factor * offset[d];
   });
@@ -78,11 +80,12 @@ export function clump(x, dimension, centre, radius, factor, box) {
 
 // Opens a gap along a line (a plane in 3D) with a `normal`; `along` is the vector from its centre to an
 // end, or null for an endless one.
-export function cut(x, dimension, centre, normal, gap, along, box) {
+export function cut(world, centre, normal, gap, along = null) {
+  const { x, dimension } = world;
   const length = Math.hypot(...normal) || 1;
-  const direction = normal.map((part) => part / length);
+  const direction = normal.map((component) => component / length);
   const half = along === null ? Infinity : inner(along, along);
-  forEach(x, dimension, centre, box, (i, offset) => {
+  forEach(world, centre, (i, offset) => {
     const height = inner(offset, direction);
     const shift = (height >= 0 ? 0.5 : -0.5) * Math.max(0, gap - Math.abs(height));
     if (along !== null && Math.abs(inner(offset, along)) > half) return;
@@ -90,7 +93,7 @@ export function cut(x, dimension, centre, normal, gap, along, box) {
   });
 }
 
-export function inner(a, b) {
+function inner(a, b) {
   let sum = 0;
   for (let d = 0; d < b.length; d++) sum += a[d] * b[d];
   return sum;

@@ -1,4 +1,5 @@
-// Colours of particles by state, density, species, speed or update mask, as npa_envs/web/live_world.py.
+// Colours of particles by state, density, species, speed or update mask. This file follows `Colouring` of
+// npa_envs/web/live_world.py.
 
 // Of npa_envs/render/colours.py and npa_envs/web/live_world.py.
 const COLOUR_OFFSET = 0.5;

@@ -1,5 +1,6 @@
 // The kernels of physics.js in WebAssembly with 128-bit vectors, assembled here: no compiler, no
-// binary file. Four channels, or four hidden units, are added up at a time, in float32.
+// binary file. Four channels, or four hidden units, are added up at a time, in float32. Each kernel follows its
+// namesake in `plainKernels`, whose changes are made here as well.
 //
 // The kernels are written with the assembler's functions. Instructions and module format:
 // https://webassembly.github.io/spec/core/binary/.

@@ -12,8 +12,8 @@
 //   {type: "set", name, value}         name: a key of the world's `settings`, or "rule", "show",
 //                                      "loss" (true while its plot is open: else it is not computed)
 //   {type: "brush", tool, at, move, radius, strength, source?, rule?, view?}
-//                                      tool: the name of one of the world's `tools`, whose `sends`
-//                                      says when; at, move: [x, y] or [x, y, z] [length units];
+//                                      tool: one of the world's `tools`; `sends` of TOOLS below says
+//                                      when; at, move: [x, y] or [x, y, z] [length units];
 //                                      radius: of cut, whose line leads from `at` to `at + move`,
 //                                      its half-width; strength in [0, 1]; source (inject): where the
 //                                      state comes from; rule (graft, add): a name of `rules`;
@@ -30,10 +30,9 @@
 //       once, and after changes. note: a sentence for the user, or ""; box: sides [length units] or
 //       null; centre, half_width: the first view; spot: standard deviation of a particle's spot
 //       [length units]; rules: choices of `rule`; others: choices of graft and add; species: names of
-//       the rules of the world's particles; settings: {name: {value, low, high, scale?: "log",
-//       whole?: true}}, names: eps, update_prob, noise, count, speed (steps a frame);
-//       tools: [{name, label, icon, sends, takes}], the rows of TOOLS in npa_envs/web/live_world.py;
-//       capabilities: some of "film", "loss".
+//       the rules of the world's particles; settings: {name: {value, low, high, scale: "log" or
+//       null, whole: true or false}}, names: eps, update_prob, noise, count, speed (steps a frame);
+//       tools: names of TOOLS that the world offers; capabilities: some of "film", "loss".
 //       `BLANK` below has the defaults of missing keys.
 //   {type: "frame", step, positions, colours, milliseconds, loss?}
 //       positions: Float32Array, count * dimension; colours: Uint8Array, count * 3 (red, green, blue);
@@ -45,7 +44,7 @@
 //   {type: "error", message}
 //
 // index.html loads server_engine.js. npa_envs/web/export.py joins worker_engine.js and its imports into one
-// script, in which all names of modules must differ.
+// script, and page_world.js and its imports into that of the worker.
 //
 // `show`: "colours", "density", "species", "speed", "mask", "components" (the first three principal
 // components of the state as red, green and blue), "state 0", "state 1", ...
@@ -59,10 +58,33 @@ const BLANK = {
   capabilities: [], playing: true, seed: 0,
 };
 
-// The page's own tool; a world says which brushes it offers.
-const LOOK = {
-  name: "look", sends: "", takes: "", label: "Look: drag to move, wheel or pinch to zoom, double click to see all",
-  icon: "M12 5v14M5 12h14M12 5l-2 2M12 5l2 2M12 19l-2-2M12 19l2-2M5 12l2-2M5 12l2 2M19 12l-2-2M19 12l-2 2",
+// The tools; "look" is the page's own, and a world offers some of the others. Icons are SVG paths on a square of
+// side 24. sends: when a stroke sends messages: "frame", in each frame; "motion", in frames in which the pointer
+// moves; "place", at each new place; "once", at its start; "line", at its end. takes: further content of its messages.
+const TOOLS = {
+  look: {
+    label: "Look: drag to move, wheel or pinch to zoom, double click to see all",
+    icon: "M12 5v14M5 12h14M12 5l-2 2M12 5l2 2M12 19l-2-2M12 19l2-2M5 12l2-2M5 12l2 2M19 12l-2-2M19 12l-2 2",
+  },
+  remove: { label: "Remove", sends: "frame", icon: "M4 15l8-9 7 6-7 8H8zM9 20h11" },
+  pull: {
+    label: "Pull with the pointer", sends: "motion",
+    icon: "M12 20c-4 0-6-3-7-7 2-1 3 0 4 2V6a1.4 1.4 0 0 1 3 0v5a1.4 1.4 0 0 1 3 0v1a1.4 1.4 0 0 1 3 0v3c0 3-2 5-6 5z",
+  },
+  clump: {
+    label: "Clump", sends: "frame",
+    icon: "M4 4l5 5M20 4l-5 5M4 20l5-5M20 20l-5-5M9 6v3H6M15 6v3h3M9 18v-3H6M15 18v-3h3",
+  },
+  cut: { label: "Cut along a line", sends: "line", icon: "M5 19L19 5M6 8a2 2 0 1 0 0-.1M16 18a2 2 0 1 0 0-.1M8 9l8 8" },
+  inject: {
+    label: "Inject: the state of where you press spreads to where you drag", sends: "frame", takes: "source",
+    icon: "M4 20l3-1 8-8-2-2-8 8zM12 8l4 4M14 10l3-4a1.8 1.8 0 0 1 3 0 1.8 1.8 0 0 1-1 3l-4 2",
+  },
+  graft: {
+    label: "Graft: particles take another rule", sends: "place", takes: "rule",
+    icon: "M12 21v-9M12 12c0-5 3-7 8-7 0 5-3 7-8 7zM12 15c0-4-3-6-8-6 0 4 3 6 8 6z",
+  },
+  add: { label: "Add a seed of another rule", sends: "once", takes: "rule", icon: "M12 4a8 8 0 1 0 .1 0M12 8v8M8 12h8" },
 };
 
 const ICONS = {
@@ -106,7 +128,7 @@ class Page {
     const wanted = new URLSearchParams(location.search).get("painter");
     this.painter = makePainter(this.canvas, wanted ?? "auto");
     this.tracers = new Tracers();
-    this.tool = LOOK;
+    this.tool = "look"; // a name of TOOLS
     this.pointers = new Map();
     this.recording = null;
     this.frameTimes = [];
@@ -148,10 +170,9 @@ class Page {
       this.frame = null;
       // Also for undrawn frames of the former world: the engine waits for each.
       this.reportDrawn();
-      const has = (tool) => world.tools.some(({ name }) => name === tool);
-      const first = has("remove") && world.dimension === 2 ? "remove" : LOOK.name;
-      const keeps = before.dimension === world.dimension && has(this.tool.name);
-      this.choose(keeps ? this.tool.name : first);
+      const first = world.tools.includes("remove") && world.dimension === 2 ? "remove" : "look";
+      const keeps = before.dimension === world.dimension && world.tools.includes(this.tool);
+      this.choose(keeps ? this.tool : first);
     }
     if (before.rule !== world.rule || before.seed !== world.seed) {
       this.tracers.clear();
@@ -168,7 +189,7 @@ class Page {
     options($("other"), world.others, other);
     options($("show"), world.shows, world.show);
     $("rule-field").hidden = world.rules.length < 2;
-    $("other-field").hidden = !world.tools.some(({ takes }) => takes === "rule");
+    $("other-field").hidden = !world.tools.some((name) => TOOLS[name].takes === "rule");
     $("brush").hidden = !world.tools.length;
     this.plots.loss.figure.hidden = !world.capabilities.includes("loss");
     this.showTools();
@@ -257,28 +278,28 @@ class Page {
   }
 
   showTools() {
-    const tools = [LOOK, ...this.world.tools], names = tools.map(({ name }) => name).join();
-    if ($("tools").dataset.names === names) return;
-    $("tools").dataset.names = names;
-    $("tools").replaceChildren(...tools.map(({ name, label, icon: path }, k) => {
+    const names = ["look", ...this.world.tools];
+    if ($("tools").dataset.names === names.join()) return;
+    $("tools").dataset.names = names.join();
+    $("tools").replaceChildren(...names.map((name, k) => {
       const button = document.createElement("button");
-      button.innerHTML = icon(path);
-      button.title = `${label} (${k + 1})`;
+      button.innerHTML = icon(TOOLS[name].icon);
+      button.title = `${TOOLS[name].label} (${k + 1})`;
       button.dataset.tool = name;
       button.setAttribute("role", "radio");
       button.setAttribute("aria-label", name);
       button.onclick = () => this.choose(name);
       return button;
     }));
-    this.choose(this.tool.name);
+    this.choose(this.tool);
   }
 
   choose(name) {
-    this.tool = this.world.tools.find((tool) => tool.name === name) ?? LOOK;
+    this.tool = this.world.tools.includes(name) ? name : "look";
     for (const button of $("tools").children)
-      button.setAttribute("aria-checked", String(button.dataset.tool === name));
-    if (this.tool === LOOK) $("cursor").hidden = true;
-    this.canvas.style.cursor = this.tool === LOOK ? "grab" : "crosshair";
+      button.setAttribute("aria-checked", String(button.dataset.tool === this.tool));
+    if (this.tool === "look") $("cursor").hidden = true;
+    this.canvas.style.cursor = this.tool === "look" ? "grab" : "crosshair";
   }
 
   showDamages() {
@@ -345,7 +366,7 @@ class Page {
     canvas.onpointermove = (event) => this.move(event);
     canvas.onpointerup = canvas.onpointercancel = (event) => this.release(event);
     canvas.onpointerleave = () => { if (!this.pointers.size) $("cursor").hidden = true; };
-    canvas.ondblclick = () => { if (this.tool === LOOK) this.fit(); };
+    canvas.ondblclick = () => { if (this.tool === "look") this.fit(); };
     canvas.oncontextmenu = (event) => event.preventDefault();
     canvas.addEventListener("wheel", (event) => {
       event.preventDefault();
@@ -370,14 +391,14 @@ class Page {
     this.canvas.setPointerCapture(event.pointerId);
     const place = this.place(event);
     this.pointers.set(event.pointerId, place);
-    this.looking = this.tool === LOOK || event.button === 2 || event.shiftKey || this.pointers.size > 1;
+    this.looking = this.tool === "look" || event.button === 2 || event.shiftKey || this.pointers.size > 1;
     if (this.looking) {
       this.stroke = null;
       return;
     }
     const near = this.nearness(place);
     this.stroke = { near, from: place, at: place, sent: place };
-    if (this.tool.sends !== "line") this.brush(place, [0, 0]);
+    if (this.sends !== "line") this.brush(place, [0, 0]);
     this.showCursor(place);
   }
 
@@ -406,7 +427,7 @@ class Page {
   release(event) {
     const { stroke } = this;
     this.pointers.delete(event.pointerId);
-    if (stroke && this.tool.sends === "line" && event.type === "pointerup") {
+    if (stroke && this.sends === "line" && event.type === "pointerup") {
       const move = [stroke.at[0] - stroke.from[0], stroke.at[1] - stroke.from[1]];
       if (Math.hypot(...move) > 4) this.brush(stroke.from, move);
     }
@@ -432,7 +453,7 @@ class Page {
 
   // Sends the brush at a place on the canvas, with its movement in pixels.
   brush(place, pixels) {
-    const { camera, canvas, stroke, tool } = this, { dimension, box } = this.world;
+    const { camera, canvas, stroke, tool } = this, { dimension, box } = this.world, { takes } = TOOLS[tool];
     const width = canvas.clientWidth, height = canvas.clientHeight;
     const near = stroke?.near ?? 0;
     const at = camera.position(...place, width, height, near).slice(0, dimension);
@@ -440,29 +461,34 @@ class Page {
     const wrapped = box ? at.map((v, k) => v - box[k] * Math.round(v / box[k])) : at;
     if (stroke) stroke.source ??= wrapped;
     const message = {
-      type: "brush", tool: tool.name, at: wrapped, move,
+      type: "brush", tool, at: wrapped, move,
       radius: this.radius(), strength: +$("strength").value,
     };
-    if (tool.takes === "source") message.source = stroke?.source ?? wrapped;
-    if (tool.takes === "rule") message.rule = $("other").value;
+    if (takes === "source") message.source = stroke?.source ?? wrapped;
+    if (takes === "rule") message.rule = $("other").value;
     if (dimension === 3) message.view = camera.axes[2];
     this.send(message);
   }
 
+  // When a stroke of the tool sends messages.
+  get sends() {
+    return TOOLS[this.tool].sends;
+  }
+
   // The brush's radius [length units]; for a line the width of its gap.
   radius() {
-    return +$("radius").value * (this.tool.sends === "line" ? 0.4 : 1);
+    return +$("radius").value * (this.sends === "line" ? 0.4 : 1);
   }
 
   showCursor([column, row]) {
     const { canvas, stroke } = this, knife = $("knife"), cursor = $("cursor");
     const unit = this.camera.unit(canvas.clientWidth, canvas.clientHeight);
-    cursor.hidden = this.tool === LOOK;
+    cursor.hidden = this.tool === "look";
     const size = (2 * this.radius()) / unit;
     cursor.style.width = cursor.style.height = `${size}px`;
     cursor.style.transform = `translate(${column - size / 2}px, ${row - size / 2}px)`;
     cursor.classList.toggle("pressed", Boolean(stroke));
-    knife.hidden = !(stroke && this.tool.sends === "line");
+    knife.hidden = !(stroke && this.sends === "line");
     if (!knife.hidden) {
       const across = column - stroke.from[0], down = row - stroke.from[1];
       knife.style.width = `${Math.hypot(across, down)}px`;
@@ -475,7 +501,7 @@ class Page {
 
   drawIfNeeded() {
     requestAnimationFrame(() => this.drawIfNeeded());
-    const { stroke, tool: { sends } } = this;
+    const { stroke, sends } = this;
     if (stroke) {
       const move = [stroke.at[0] - stroke.sent[0], stroke.at[1] - stroke.sent[1]], moved = Math.hypot(...move) > 0;
       if (sends === "frame" || (sends === "motion" && moved)) this.brush(stroke.sent, move);

@@ -1,5 +1,5 @@
-// The world of the exported page, as RuleWorld of npa_envs/web/rule_world.py. page.js lists messages and
-// events.
+// The world of the exported page, which follows RuleWorld of npa_envs/web/rule_world.py. page.js lists messages
+// and events.
 
 import { clump, cut, wipeState, inject, insideBall, push, stateAround } from "./brushes.js";
 import { Colouring, Look } from "./colours.js";
@@ -13,6 +13,39 @@ const FRAMES_AHEAD = 2;
 // Steps for which the GPU is tried, and the largest difference from the CPU's results.
 const TRIAL_STEPS = 4;
 const TRIAL_TOLERANCE = 1e-3;
+
+// Brushes by name. Each applies a message of page.js to a LiveWorld.
+const BRUSHES = {
+  remove: (live, { at, radius }) => live.remove(new Set(insideBall(live.world, at, radius))),
+  pull: ({ world, constants }, { at, move, radius, strength }) =>
+    push(world, at, move, radius, Math.min(1, constants.MIN_PULL + strength)),
+  clump: ({ world, constants }, { at, radius, strength }) => clump(world, at, radius, constants.CLUMP_RATE * strength),
+  cut({ world, dimension }, { at, move, radius, view }) {
+    const half = move.map((component) => component / 2);
+    const normal = dimension === 2 ? [-move[1], move[0]] : cross(view ?? [0, 0, 1], move);
+    cut(world, at.map((coordinate, d) => coordinate + half[d]), normal, radius, half);
+  },
+  inject({ world, constants }, { at, radius, strength, source }) {
+    const state = stateAround(world, source ?? at, radius);
+    if (state !== null) inject(world, at, radius, state, constants.INJECT_RATE * strength);
+  },
+  graft(live, { at, radius, rule }) {
+    const index = live.speciesOf(rule, live.full);
+    for (const i of insideBall(live.world, at, radius)) live.world.species[i] = index;
+  },
+  add(live, { at, radius, strength, rule }) {
+    const { MIN_SEED, SEED_FRACTION } = live.constants;
+    live.add(at, radius, Math.max(MIN_SEED, Math.round(strength * SEED_FRACTION * live.full)), rule);
+  },
+};
+
+// Damage by name, as `damage_worlds` of npa_envs/tasks/damage.py. `centre`: the position of a random particle.
+const DAMAGES = {
+  wipe: ({ world }, size, centre) => wipeState(world, centre, size),
+  cut: ({ world, random }, size) => cut(world, meanOf(world), random.direction(world.dimension), size),
+  clump: ({ world, constants }, size, centre) => clump(world, centre, size, constants.CLUMP_FACTOR),
+  noise: ({ world: { x }, random }, size) => random.normals(x.length, size).forEach((offset, k) => (x[k] += offset)),
+};
 
 export class LiveWorld {
   // settings: {rules, seed, ramp, constants} as npa_envs/web/export.py writes them; the first rule is shown
@@ -87,8 +120,8 @@ export class LiveWorld {
 
   // Replaces the particles of the world.
   setParticles(x, s, species) {
-    const count = species.length;
-    this.world = { count, x, s, species };
+    const count = species.length, { dimension, channels, box } = this;
+    this.world = { count, x, s, species, dimension, channels, box };
     // Each particle's path in the last step over the longest possible one, and whether it was updated.
     this.travelled = new Float32Array(count);
     this.updated = new Uint8Array(count);
@@ -172,8 +205,7 @@ export class LiveWorld {
       brush: () => this.brush(message),
       damage: () => this.damage(message.name),
     };
-    if (!Object.hasOwn(acts, message.type)) throw Error(`no message is called ${message.type}`);
-    await acts[message.type]();
+    await entry(acts, message.type, "message")();
     if (message.type !== "drawn" && message.type !== "play") this.changed = true;
   }
 
@@ -197,30 +229,9 @@ export class LiveWorld {
   }
 
   // Applies a brush; page.js describes the message.
-  brush({ tool, at, move, radius, strength, source, rule, view }) {
-    const { dimension, box, constants } = this;
-    const { x, s, species } = this.world;
-    if (tool === "remove") {
-      this.remove(new Set(insideBall(x, dimension, at, radius, box)));
-    } else if (tool === "push") {
-      push(x, dimension, at, move, radius, Math.min(1, constants.MIN_PUSH + strength), box);
-    } else if (tool === "clump") {
-      clump(x, dimension, at, radius, constants.CLUMP_RATE * strength, box);
-    } else if (tool === "cut") {
-      const half = move.map((part) => part / 2);
-      const normal = dimension === 2 ? [-move[1], move[0]] : cross(view ?? [0, 0, 1], move);
-      cut(x, dimension, at.map((part, d) => part + half[d]), normal, radius, half, box);
-    } else if (tool === "inject") {
-      const state = stateAround(x, s, dimension, source ?? at, radius, box);
-      if (state !== null) inject(x, s, dimension, at, radius, state, constants.INJECT_RATE * strength, box);
-    } else if (tool === "graft") {
-      const index = this.speciesOf(rule, this.full);
-      for (const i of insideBall(x, dimension, at, radius, box)) species[i] = index;
-    } else if (tool === "add") {
-      const count = Math.round(strength * constants.SEED_FRACTION * this.full);
-      this.add(at, radius, Math.max(constants.MIN_SEED, count), rule);
-    } else throw Error(`no brush is called ${tool}`);
-    if (box !== null) wrap(this.world.x, this.world.count, box);
+  brush(message) {
+    entry(BRUSHES, message.tool, "brush")(this, message);
+    this.wrapPositions();
   }
 
   // Removes the particles of a set of indices.
@@ -266,20 +277,20 @@ export class LiveWorld {
     return this.constants.AGREEMENTS.every((field) => rule[field] === this.rule[field]);
   }
 
-  // Damage at a random place, or through the middle at a random angle.
+  // Damages the world by its name, at a random particle or through the middle at a random angle.
   damage(name) {
-    const { dimension, random, constants } = this;
-    const { x, s, count } = this.world;
-    const size = constants.DAMAGE_SIZES[name];
-    if (size === undefined) throw Error(`no damage is called ${name}`);
+    const apply = entry(DAMAGES, name, "damage");
+    const { dimension, world: { x, count } } = this;
     if (count === 0) return;
-    const particle = random.below(count);
+    const particle = this.random.below(count);
     const centre = x.slice(particle * dimension, (particle + 1) * dimension);
-    if (name === "wipe") wipeState(x, s, dimension, centre, size, null);
-    if (name === "clump") clump(x, dimension, centre, size, constants.CLUMP_FACTOR, null);
-    if (name === "cut") cut(x, dimension, meanOf(x, dimension), random.direction(dimension), size, null, null);
-    if (name === "noise") random.normals(x.length, size).forEach((part, k) => (x[k] += part));
-    if (this.box !== null) wrap(x, count, this.box);
+    apply(this, this.constants.DAMAGE_SIZES[name], centre);
+    this.wrapPositions();
+  }
+
+  // Moves particles that have left a periodic box back into it.
+  wrapPositions() {
+    if (this.box !== null) wrap(this.world.x, this.world.count, this.box);
   }
 
   // Whether there is a new frame to show, and the page is ready for it.
@@ -319,6 +330,12 @@ export class LiveWorld {
   }
 }
 
+// Returns a row of a table; an unknown name is an error.
+function entry(table, name, what) {
+  if (!Object.hasOwn(table, name)) throw Error(`no ${what} is called ${name}`);
+  return table[name];
+}
+
 function alike(world, other) {
   const close = (a, b) => a.every((value, k) => Math.abs(value - b[k]) <= TRIAL_TOLERANCE);
   return close(world.x, other.x) && close(world.s, other.s);
@@ -331,7 +348,7 @@ function joined(first, second) {
   return both;
 }
 
-function meanOf(x, dimension) {
+function meanOf({ x, dimension }) {
   const mean = new Array(dimension).fill(0);
   for (let k = 0; k < x.length; k++) mean[k % dimension] += (x[k] * dimension) / x.length;
   return mean;

@@ -1,5 +1,6 @@
 // The step of Neural Particle Automata in plain JavaScript: the same formulas, in the same order, as
-// npa_envs/reference.py and docs/mathematics.md.
+// npa_envs/reference.py and docs/mathematics.md, which this file follows. kernels_simd.js and physics_gpu.js
+// follow this file. tests/web/test_export.py and test_export_browser.py compare all three with Python.
 //
 // Particles are sorted by cell, densities are summed over pairs in double precision, and only active
 // particles perceive. Most of the time goes into sums over neighbours and the network, the `kernels`:

@@ -1,5 +1,6 @@
 // The step of physics.js with densities, perception and networks on the GPU, through WebGPU. The CPU sorts the
-// particles before, and moves them after; both are a small part of the time.
+// particles before, and moves them after; both are a small part of the time. The shaders follow
+// `computeDensities`, `perceive` and the kernels of physics.js, whose changes are made here as well.
 
 import {
   CELLS_PER_RADIUS, MAX_CELLS, MOMENT_SOFTENING, MOMENT_THRESHOLD, smoothingNorm, spikyNorm,

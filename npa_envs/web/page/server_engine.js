@@ -1,4 +1,5 @@
-// The engine of the viewer: a server sends frames and events over a WebSocket. See page.js.
+// The engine of the viewer. An engine runs the world that a page shows: it takes the page's messages and sends it
+// frames and other events, which page.js lists. This one is a server, npa_envs/web/server.py, over a WebSocket.
 
 import { start } from "./page.js";
 

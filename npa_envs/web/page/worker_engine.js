@@ -1,4 +1,6 @@
-// The engine of an exported page: a worker in the page; and the gallery to choose a rule. See page.js.
+// The engine of an exported page, and the gallery to choose a rule. An engine runs the world that a page shows: it
+// takes the page's messages and sends it frames and other events, which page.js lists. This one is a worker in the
+// page, which runs the LiveWorld of page_world.js.
 
 import { start } from "./page.js";
 
