@@ -22,8 +22,6 @@ from npa_envs.world.randomness import StreamId, WorldRandom
 class Gardener2DEnvConfig(GardenConfig):
     """Adds the disturbances: gusts, which move particles, and blights, which wipe states."""
 
-    episode_steps: int = 32
-
     position_noise: float = 0.002
     """Standard deviation of the noise added to every position in a step of the rule
     [length units]."""

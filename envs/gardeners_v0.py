@@ -11,7 +11,6 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 from gymnasium.spaces import Box
-from gymnasium.wrappers import TimeLimit
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -111,12 +110,11 @@ class GardenersEnv(KnownAgents):
     }
 
     def __init__(self, max_cycles: int = 32, **config: Any) -> None:
-        calm = {"gust_chance": 0.0, "blight_chance": 0.0}
-        self.garden = _SharedGarden(**(calm | config))
-        """The world as a Gymnasium environment, whose actions are dicts with both agents'."""
         self.max_cycles = checked_count("max_cycles", max_cycles)
         """Steps of an episode."""
-        self._episodes = TimeLimit(self.garden, self.max_cycles)
+        calm = {"gust_chance": 0.0, "blight_chance": 0.0}
+        self.garden = _SharedGarden(**(calm | config | {"episode_steps": self.max_cycles}))
+        """The world as a Gymnasium environment, whose actions are dicts with both agents'."""
         self.render_mode = self.garden.render_mode
         self.possible_agents = list(AGENTS)
         self.agents: list[str] = []
@@ -127,7 +125,7 @@ class GardenersEnv(KnownAgents):
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
         """Start an episode; return both agents' observations and infos."""
-        observation, info = self._episodes.reset(seed=seed)
+        observation, info = self.garden.reset(seed=seed)
         self.agents = list(AGENTS)
         return _for_both(observation), {agent: dict(info) for agent in AGENTS}
 
@@ -140,7 +138,7 @@ class GardenersEnv(KnownAgents):
                 f"actions must be given for the agents {self.agents}, got some for "
                 f"{shown(list(actions))}: call reset where there are none"
             )
-        observation, reward, terminated, truncated, info = self._episodes.step(actions)
+        observation, reward, terminated, truncated, info = self.garden.step(actions)
         if terminated or truncated:
             self.agents = []
         return (

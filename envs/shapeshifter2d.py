@@ -51,7 +51,6 @@ class Shapeshifter2DEnvConfig(PictureConfig):
     reward: GardenReward = "dense"
     """"dense": the closeness to the goal in each step; "sparse": that of the last step only."""
 
-    episode_steps: int = 64
     particle_count: int = 256
     state_dim: int = 24
     eps: float = 0.2

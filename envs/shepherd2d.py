@@ -33,8 +33,6 @@ class Shepherd2DEnvConfig(GardenConfig):
 
     words = GardenConfig.words | {"aim": get_args(Aim)}
 
-    episode_steps: int = 32
-
     reward: GardenReward = "dense"
     """"dense": minus the distance to the goal; "sparse": 0 at the goal and -1 elsewhere."""
 

@@ -195,7 +195,7 @@ def write_dataset(
 def spec_of(env_id: str, keywords: dict[str, Any], episode_steps: int) -> EnvSpec:
     """Return the spec of a single environment with keywords and a step limit."""
     spec = deepcopy(gymnasium.spec(env_id))
-    spec.kwargs = {**spec.kwargs, **keywords}
+    spec.kwargs = {**spec.kwargs, **keywords, "episode_steps": episode_steps}
     spec.max_episode_steps = episode_steps
     spec.vector_entry_point = None
     return spec

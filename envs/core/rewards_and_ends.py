@@ -11,7 +11,7 @@ from torch import Tensor
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.task import EnvTask, Start, check_finite, checked_losses, checked_tensor
 from npa_envs.envs.core.world_state import WorldState
-from npa_envs.errors import shown
+from npa_envs.errors import NPAError, shown
 from npa_envs.world.cuda_graph import makes_plain_tensors, pinned_like
 from npa_envs.world.environment_steps import (
     DIVERGED,
@@ -154,8 +154,15 @@ class RewardedWorlds(WorldState):
         extra, count = task_type.extra_bytes(config, world_count), config.particle_count
         super().__init__(config, task_type, world_count, count, extra)
         self.task: Any = task_type(config, self.device)
-        self.episode_steps = episode_steps
+        limits = [steps for steps in (episode_steps, config.episode_steps) if steps is not None]
+        self.episode_steps = min(limits, default=None)
         """Steps after which an episode is truncated; None: never."""
+        if self.rewards_last_step_only and self.episode_steps is None:
+            raise NPAError(
+                "episode_steps must be given where reward='sparse' comes in the last step, got "
+                "None: for example episode_steps=64, and the same number as max_episode_steps of "
+                "gymnasium.make"
+            )
 
         def zeros(dtype: torch.dtype = torch.float32) -> Tensor:
             return torch.zeros(world_count, dtype=dtype, device=self.device)
@@ -284,8 +291,7 @@ class RewardedWorlds(WorldState):
 
     def _make_evaluation(self) -> EpisodeUpdate:
         config = self.task.config
-        sparse = config.reward == "sparse"
-        rewarded_step = (self.episode_steps or config.episode_steps) if sparse else None
+        rewarded_step = self.episode_steps if config.reward == "sparse" else None
         return EpisodeUpdate(
             EpisodeRules(self.episode_steps, rewarded_step, config.on_divergence),
             enabled=self.enabled,

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import sys
 import warnings
 from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
 import torch
-from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -33,7 +31,7 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
     | `reward` | Reward of step t |
     |---|---|
     | `"dense"` | L before the step minus L after it |
-    | `"sparse"` | 0, and minus L in the last step, also where that is a time limit |
+    | `"sparse"` | 0, and minus L in the last step; needs `episode_steps`, see below |
     | `"particle"` | as dense; `info["particle_reward"]` is the fall of each particle's loss |
     | `"marginal"` | as dense; `info["particle_reward"]` is each action's contribution |
 
@@ -59,11 +57,11 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
     |---|---|---|
     | the loss is at most `success_loss` | terminated | `"success"` |
     | a particle has left the world, or its state has run away | terminated | `"diverged"` |
-    | `max_episode_steps` steps are done | truncated | `"time limit"` |
+    | `episode_steps` or, of a vector, `max_episode_steps` are done | truncated | `"time limit"` |
 
     A particle has left the world if a coordinate is beyond ±`position_limit`. Its state has run
-    away if a channel is beyond ±`observation_limit`. Where another library limits the steps,
-    `reward="sparse"` needs their number as `episode_steps`.
+    away if a channel is beyond ±`observation_limit`. `max_episode_steps` of `gym.make` gives no
+    reason, and `reward="sparse"` needs its number as `episode_steps` as well.
 
     ## Info
 
@@ -126,8 +124,7 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
         self.action_space = self.form.action_space
         self._world = torch.zeros(1, dtype=torch.int64, device=self.task.device)
         self._keyed_from: np.random.Generator | None = None
-        self._unrewarded_steps = 0
-        self._warned = False
+        self._is_unrewarded = False
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -144,8 +141,14 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
         seed = plain_seed(seed)
         check_options(options, ())
         super().reset(seed=seed)
-        self._warn_of_missing_rewards()
-        self.worlds.limit_steps(_step_limit(self))
+        if self._is_unrewarded:
+            warnings.warn(
+                "an episode ended before its sparse reward, which comes in step episode_steps="
+                f"{self.config.episode_steps}: give that number to gymnasium.make as "
+                "max_episode_steps as well",
+                stacklevel=2,
+            )
+        self._is_unrewarded = False
         # A new generator, by `seed` or because the caller set `np_random`, begins a new sequence.
         keys = None
         if seed is not None or self.np_random is not self._keyed_from:
@@ -169,7 +172,7 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
         """
         if not self._started:
             raise NPAError("step needs a world: call reset first")
-        worlds, config = self.worlds, self.config
+        worlds = self.worlds
         checked = self.form.action(action, None)
         with worlds.device_context():
             endings, observation = worlds.step(checked)
@@ -182,10 +185,7 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
         if terminated or truncated:
             info["reason"] = reason(ending)
         info |= self._extra_info() | self._of_world(worlds.step_info())
-        if worlds.rewards_last_step_only:
-            last = int(worlds.elapsed[0]) == config.episode_steps
-            rewarded = terminated or truncated or last
-            self._unrewarded_steps = 0 if rewarded else self._unrewarded_steps + 1
+        self._is_unrewarded = worlds.rewards_last_step_only and not (terminated or truncated)
         self._show()
         returned = self.form.returned(worlds.host_observation(observation)[0])
         return returned, numbers[0], terminated, truncated, info
@@ -226,36 +226,3 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
             name: self._out(value[0].clone()) if value.ndim > 1 else value[0].item()
             for name, value in values.items()
         }
-
-    def _warn_of_missing_rewards(self) -> None:
-        """Warn once if an episode was ended by a limit that the environment does not know of."""
-        if self._unrewarded_steps > 0 and not self._warned:
-            self._warned = True
-            warnings.warn(
-                f"an episode ended {self._unrewarded_steps} steps after the last sparse reward, "
-                f"which comes at step episode_steps={self.config.episode_steps}: give the number "
-                "of steps as max_episode_steps to gymnasium.make, or as episode_steps as well",
-                stacklevel=3,
-            )
-        self._unrewarded_steps = 0
-
-
-def _step_limit(env: NPAEnv) -> int | None:
-    """Return the limit of the `TimeLimit` wrappers around an environment, or None.
-
-    They are found among the callers of `reset`. Limits around other wrappers, which may take
-    several steps at once, do not count.
-    """
-    # Gymnasium refuses registered wrappers, which would know the limit, with a vector entry point.
-    limits, frame = [], sys._getframe(1).f_back
-    inner: gymnasium.Env[Any, Any] = env
-    while frame is not None:
-        caller = frame.f_locals.get("self")
-        if isinstance(caller, gymnasium.Wrapper) and caller.env is inner:
-            inner = caller
-            if isinstance(caller, TimeLimit):
-                limits.append(caller._max_episode_steps)
-            elif not isinstance(caller, OrderEnforcing | PassiveEnvChecker):
-                break
-        frame = frame.f_back
-    return min(limits, default=None)

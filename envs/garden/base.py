@@ -118,10 +118,7 @@ class RuleDrivenWorlds(BatchedWorlds):
         reward = self.task.reward(self.particles, self.loss, self.context)
         if self.rewards_last_step_only:
             terminated, truncated = self.report.endings[:2]
-            last = terminated | truncated
-            if self.episode_steps is None:
-                last = last | (self.elapsed == self.task.config.episode_steps)
-            reward = torch.where(last, reward, 0.0)
+            reward = torch.where(terminated | truncated, reward, 0.0)
         self.task.next_goals(self.elapsed, self.context, self.goal)
         self.report.reward.copy_(reward)
 

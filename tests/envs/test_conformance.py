@@ -124,6 +124,8 @@ class TestEveryEnvironment:
         if mode == "next-step":
             keywords |= {"reward": "sparse"}
         envs = self.make_vec(3, autoreset_mode=mode, **keywords)
+        if not self.is_species:
+            keywords |= {"episode_steps": 4}
         singles = [self.make(**keywords) for _ in range(3)]
         reasons, _ = assert_batch_of_singles(envs, singles, self.sampled(envs, 10), mode)
         assert "time limit" in reasons

@@ -241,7 +241,8 @@ class OneWorld(Played):
     @classmethod
     def make(cls, name: str, draw: random.Random) -> Played:
         fields = one_species_fields(name, draw)
-        return cls(gymnasium.make(name, disable_env_checker=True, **fields), fields)
+        steps = {"episode_steps": fields["max_episode_steps"]}
+        return cls(gymnasium.make(name, disable_env_checker=True, **fields, **steps), fields)
 
     def expect_reset(self, observation: Any, info: Any) -> None:
         super().expect_reset(observation, info)
