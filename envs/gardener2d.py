@@ -71,7 +71,8 @@ class GardenerTask(GardenTask[Gardener2DEnvConfig]):
         centre = random_particle(x, draws)
         happens = chance[:, 1] < config.blight_chance
         radius = torch.where(happens, config.blight_radius, -1.0)
-        return Particles(x, wipe_state(x, s, centre=centre, radius=radius, box=box))
+        s = wipe_state(x, s, centre=centre, radius=radius, box=box)
+        return particles._replace(x=x, s=s)
 
     def reward(self, particles: Particles, loss: Tensor, context: Tensor) -> Tensor:
         """Return 1 for worlds as at their start, 0 for worlds as bad as grey, shape [B]."""

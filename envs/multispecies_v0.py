@@ -75,7 +75,7 @@ class MultiSpeciesEnv(CrowdEnv):
 
     Each species k has a loss L_k, and its reward is L_k before the step minus L_k after it.
 
-    | Task | L_k | Parts |
+    | Task | L_k | Terms |
     |---|---|---|
     | mixing | 1 minus the mean entropy around its particles | `separation` |
     | segregation | the mean entropy around its particles | `mixture` |
@@ -92,14 +92,14 @@ class MultiSpeciesEnv(CrowdEnv):
     There is one reward for each species. Rewards of single particles (`reward="particle"` and
     `"marginal"`), and `tell_updated`, are for environments of one species, and are refused.
 
-    With `reward="team"` every live agent gets the mean of all rewards; the parts in `info` stay its
+    With `reward="team"` every live agent gets the mean of all rewards; the terms in `info` stay its
     own. In an invasion rewards sum to zero: species 0 gains as much as the live invaders lose, in
     equal parts. There "team" is refused.
 
-    Rewards telescope, except at deaths: taking particles out changes the losses of others, and this
-    change is not rewarded. In the step in which a species leaves the world, L_k counts as at least
-    its value at the start plus what deaths added to it, so that leaving is never rewarded. The
-    parts in `info` are not changed by this.
+    Rewards of an episode sum to its decrease of L_k, except at deaths: taking particles out changes
+    the losses of others, and this change is not rewarded. In the step in which a species leaves the
+    world, L_k counts as at least its value at the start plus what deaths added to it, so that
+    leaving is never rewarded. The terms in `info` are not changed by this.
 
     ## Starting state
 
@@ -130,8 +130,8 @@ class MultiSpeciesEnv(CrowdEnv):
     |---|---|---|
     | `species` | reset, step | the agent's species, from 0 on |
     | `loss` | reset, step | the current loss L_k |
-    | `loss_separation`, ... | reset, step | its parts, by their names above |
-    | `reward_separation`, ... | step | how much each part fell in this step |
+    | `loss_separation`, ... | reset, step | its terms, by their names above |
+    | `reward_separation`, ... | step | decrease of each term in this step |
     | `reason` | last step | why the agent's episode ended, see above |
 
     ## State

@@ -55,9 +55,9 @@ class ParticlesEnv(CrowdEnv):
 
     ## Reward
 
-    Each particle has its own loss, and its reward is the fall of this loss in the step.
+    Each particle has its own loss, and its reward is the decrease of this loss in the step.
 
-    | Task | Loss of a particle | Part |
+    | Task | Loss of a particle | Term |
     |---|---|---|
     | mixing | 1 minus the entropy around it | `separation` |
     | segregation | the entropy around it | `mixture` |
@@ -81,8 +81,8 @@ class ParticlesEnv(CrowdEnv):
     |---|---|---|
     | `species` | reset, step | the particle's species, from 0 on |
     | `loss` | reset, step | its current loss |
-    | `loss_separation`, ... | reset, step | the same by the name of its part, see above |
-    | `reward_separation`, ... | step | how much it fell in this step |
+    | `loss_separation`, ... | reset, step | the same by the name of its term, see above |
+    | `reward_separation`, ... | step | its decrease in this step |
     | `reason` | last step | why the particle's episode ended |
 
     ## Arguments

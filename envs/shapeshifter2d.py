@@ -19,7 +19,7 @@ from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import Start
 from npa_envs.envs.core.vector import vector_class
 from npa_envs.envs.garden.base import RuleDriven
-from npa_envs.envs.garden.brushes import GardenReward
+from npa_envs.envs.garden.brushes import OBSERVATION_LIMIT, GardenReward
 from npa_envs.envs.grown_worlds import check_rule_driven, check_runs, grow, run_rule
 from npa_envs.envs.morphogenesis2d import PictureConfig, PictureEnvTask
 from npa_envs.errors import NPAError
@@ -33,20 +33,17 @@ from npa_envs.world.environment_steps import Physics
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import WorldRandom
 
-OBSERVATION_LIMIT = 8.0
-"""Observations are clipped to plus and minus this (dimensionless)."""
-
 GOAL_COUNT = 8
 """Goals of an episode; after the last one follows the first."""
 
-Actions = Literal["code", "choice"]
+CodeActions = Literal["code", "choice"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Shapeshifter2DEnvConfig(PictureConfig):
     """Adds the rule of many pictures and how its goals change."""
 
-    words = EnvConfig.words | {"reward": get_args(GardenReward), "actions": get_args(Actions)}
+    words = EnvConfig.words | {"reward": get_args(GardenReward), "actions": get_args(CodeActions)}
 
     reward: GardenReward = "dense"
     """"dense": the closeness to the goal in each step; "sparse": that of the last step only."""
@@ -59,7 +56,7 @@ class Shapeshifter2DEnvConfig(PictureConfig):
     rule: str = "seven-pictures"
     """A rule of many pictures, by name or file; its pictures are the goals."""
 
-    actions: Actions = "code"
+    actions: CodeActions = "code"
     """Form of actions: "code", the vector of a code; "choice", the index of one of the rule's."""
 
     rule_steps: int = 8
@@ -111,8 +108,7 @@ class CodeForm(ParticleSpaces):
         self._chosen = config.actions == "choice"
         self._output = config.output
         count, dim = self._table.shape
-        shape = (8 * config.picture_size**2,)
-        limit = OBSERVATION_LIMIT
+        limit, shape = OBSERVATION_LIMIT, (8 * config.picture_size**2,)
         self.observation_space: Space[Any] = Box(-limit, limit, shape, np.float32)
         self.action_space: Space[Any] = (
             Discrete(count) if self._chosen else Box(-1.0, 1.0, (dim,), np.float32)
@@ -139,7 +135,7 @@ class ShapeshifterTask(RuleDriven, PictureEnvTask[Shapeshifter2DEnvConfig]):
 
     config_type = Shapeshifter2DEnvConfig
     form_type = CodeForm
-    actor = "codes"
+    controls = "codes"
     context_count = 1 + GOAL_COUNT
     grows = True
     pixel_bytes = 48
@@ -172,11 +168,11 @@ class ShapeshifterTask(RuleDriven, PictureEnvTask[Shapeshifter2DEnvConfig]):
 
     def fresh(self, random: WorldRandom) -> Start:
         """Return grown worlds of random pictures, with another picture as their goal."""
-        x, s, _, grown = self.task.seed(random.world_count, generator=random, device=self.device)
-        assert grown is not None, "worlds of many pictures have goals"
-        seeds = Particles(x, self.rule.with_code(s, self.codes.table[grown][:, None]))
+        x, s, _, picture = self.task.seed(random.world_count, generator=random, device=self.device)
+        assert picture is not None, "worlds of many pictures have goals"
+        seeds = Particles(x, self.rule.with_code(s, self.codes.table[picture][:, None]))
         x, s, *_ = grow(self.rule, self.config, seeds, random)
-        return Start(x, s, goal=self._another(grown, random))
+        return Start(x, s, goal=self._another(picture, random))
 
     def _another(self, goal: Tensor, random: WorldRandom) -> Tensor:
         """Return random goals that differ from the given ones, int64, shape [B]."""
@@ -285,8 +281,8 @@ class Shapeshifter2DEnv(NPAEnv):
     |---|---|---|
     | `goal` | reset, step | index of the goal's code |
     | `loss` | reset, step | current loss L; of a step, for the goal observed before it |
-    | `loss_density`, `loss_colour` | reset, step | the parts of the loss |
-    | `reward_density`, `reward_colour` | step | how much each part fell, whatever the goals were |
+    | `loss_density`, `loss_colour` | reset, step | the terms of the loss |
+    | `reward_density`, `reward_colour` | step | decrease of each term, whatever the goals were |
     | `success`, `diverged` | step | whether the world succeeded or diverged in it, bool |
     | `reason` | last step | why the episode ended, see above; None for worlds that go on |
     """

@@ -17,7 +17,7 @@ class NumericInfos(BaseParallelWrapper):  # type: ignore[misc]
     """Keep only the infos that `reset` returns, which are numbers, in every step.
 
     TorchRL's `PettingZooWrapper` expects the entries of `reset` in every step, and makes a tensor
-    of each. Losses and their parts stay; entries of steps only (`reward_...`, `reason`) are
+    of each. Losses and their terms stay; entries of steps only (`reward_...`, `reason`) are
     dropped.
 
     Args:

@@ -44,9 +44,7 @@ class ParticleRows(ParticleRowsBase, AnyVectorEnv):
 
     def __init__(self, env: AnyVectorEnv) -> None:
         base = vector_env(env, type(self).__name__)
-        check_autoreset(
-            autoreset_mode(env), "next-step", "restart worlds in the step after the last one"
-        )
+        check_autoreset(autoreset_mode(env), "next-step")
         self.set_env(env, base)
         self.metadata = env.metadata
         self.render_mode = env.render_mode

@@ -241,7 +241,7 @@ class EnvConfig(WorldConfig):
     reward: Reward = "dense"
     """"dense": each step's improvement of the loss; "sparse": minus the loss at the episode's end;
     "particle" and "marginal": as dense, with each particle's reward in `info["particle_reward"]`:
-    the fall of its own loss, or the contribution of its action to the fall of the world's loss."""
+    the decrease of its own loss, or what its action contributed to the decrease of the world's."""
 
     tell_updated: bool = False
     """Report in `info["updated"]` which particles the step updated. The others ignored their

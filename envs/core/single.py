@@ -32,19 +32,19 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
     |---|---|
     | `"dense"` | L before the step minus L after it |
     | `"sparse"` | 0, and minus L in the last step; needs `episode_steps`, see below |
-    | `"particle"` | as dense; `info["particle_reward"]` is the fall of each particle's loss |
+    | `"particle"` | as dense; `info["particle_reward"]` is the decrease of each particle's loss |
     | `"marginal"` | as dense; `info["particle_reward"]` is each action's contribution |
 
-    Dense rewards telescope: their sum over an episode is L at its start minus L at its end. The
-    mean of all particles' rewards is the dense reward, up to rounding, as long as the episode
-    lasts. In a step that diverges, L counts as at least its value at the start, so that diverging
-    is never rewarded; the parts in `info` are not changed by this.
+    Dense rewards of an episode sum to L at its start minus L at its end. The mean of all particles'
+    rewards is the dense reward, up to rounding, as long as the episode lasts. In a step that
+    diverges, L counts as at least its value at the start, so that diverging is never rewarded; the
+    terms in `info` are not changed by this.
 
     With `"marginal"` a particle's reward is −N times its change in the step, times the gradient of
-    L in the middle of the step: to second order, N times what its action contributed to the fall
-    of L, averaged over being the first and the last to act. The remainder of the dense reward is
-    spread equally. So a particle is rewarded for its own action alone; with `"particle"` it is also
-    rewarded for what the actions of others do to its pixels.
+    L in the middle of the step: to second order, N times what its action contributed to the
+    decrease of L, averaged over being the first and the last to act. The remainder of the dense
+    reward is spread equally. So a particle is rewarded for its own action alone; with `"particle"`
+    it is also rewarded for what the actions of others do to its pixels.
 
     ## Starting state
 
@@ -56,11 +56,11 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
     | Cause | Returned as | `info["reason"]` |
     |---|---|---|
     | the loss is at most `success_loss` | terminated | `"success"` |
-    | a particle has left the world, or its state has run away | terminated | `"diverged"` |
+    | a particle has left the world, or its state has diverged | terminated | `"diverged"` |
     | `episode_steps` or, of a vector, `max_episode_steps` are done | truncated | `"time limit"` |
 
-    A particle has left the world if a coordinate is beyond ±`position_limit`. Its state has run
-    away if a channel is beyond ±`observation_limit`. `max_episode_steps` of `gym.make` gives no
+    A particle has left the world if a coordinate is beyond ±`position_limit`. Its state has
+    diverged if a channel is beyond ±`observation_limit`. `max_episode_steps` of `gym.make` gives no
     reason, and `reward="sparse"` needs its number as `episode_steps` as well.
 
     ## Info
@@ -129,7 +129,7 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Start an episode; return the observation, shape [N, P], and the loss with its parts.
+        """Start an episode; return the observation, shape [N, P], and the loss with its terms.
 
         A seed begins its sequence of episodes; None starts the next episode of the current
         sequence. There are no options.
@@ -154,7 +154,7 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
         if seed is not None or self.np_random is not self._keyed_from:
             self._keyed_from = self.np_random
             keys = rng_keys(None, 1, self.np_random)
-        observation = self._begin(self._world, keys)
+        observation = self._change_worlds(self.worlds.start, self._world, keys)
         info = self.losses_of(self.worlds.report.numbers[:, 0].tolist())
         return self.form.returned(observation[0]), info | self._extra_info()
 
@@ -215,7 +215,8 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
             raise NPAError("particles need a world: call reset first")
         x, s = number_tensor("x", x)[None], number_tensor("s", s)[None]
         placed = self.worlds.checked_particles(x, s, 1, self.config.particle_count)
-        return self.form.returned(self._place(placed, self._world)[0])
+        observation = self._change_worlds(self.worlds.place, self._world, placed)
+        return self.form.returned(observation[0])
 
     def _extra_info(self) -> dict[str, Any]:
         """Return the entries of infos that the task adds in every call."""

@@ -97,7 +97,7 @@ class NPAVectorEnv(WorldsEnv, VectorEnv[Any, Any, Any]):
         seed: int | Sequence[int] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[Any, dict[str, Any]]:
-        """Start episodes; return all observations, [B, N, P], and the losses with their parts.
+        """Start episodes; return all observations, [B, N, P], and the losses with their terms.
 
         Args:
             seed: World k begins the sequence of episodes of seed + k, or of the k-th seed of a
@@ -115,7 +115,7 @@ class NPAVectorEnv(WorldsEnv, VectorEnv[Any, Any, Any]):
         if seed is not None or not self._started:
             keys = rng_keys(seed, self.num_envs, self.np_random)[chosen]
         worlds = torch.from_numpy(chosen).to(self.task.device)
-        observation = self._begin(worlds, keys, self._buffer)
+        observation = self._change_worlds(self.worlds.start, worlds, keys, self._buffer)
         if not self.copies:
             self._buffer = observation
         self._ended[chosen] = False
@@ -209,7 +209,8 @@ class NPAVectorEnv(WorldsEnv, VectorEnv[Any, Any, Any]):
         everyone = torch.arange(self.num_envs)
         chosen = everyone if worlds is None else checked_worlds(worlds, self.num_envs)
         placed = self.worlds.checked_particles(x, s, len(chosen), self.config.particle_count)
-        observation = self._place(placed, chosen.to(self.task.device), self._buffer)
+        index = chosen.to(self.task.device)
+        observation = self._change_worlds(self.worlds.place, index, placed, self._buffer)
         return self.form.returned(observation)
 
     def _report(

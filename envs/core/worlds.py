@@ -103,7 +103,7 @@ class BatchedWorlds(RewardedWorlds):
         random = self.next_streams(worlds, keys)
         check_default_dtype()
         # The first start is not recorded as a graph, so that it can synchronise for checks.
-        task, first = self.task, not self.part_names
+        task, first = self.task, not self.term_names
         draws, check = global_draws(self.device) if first else {}, first or not self.x.is_cuda
         start: Start = task.start(random)
         check_start(task, start, len(worlds), (self.x.shape, self.s.shape))

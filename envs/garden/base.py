@@ -113,7 +113,7 @@ class RuleDrivenWorlds(BatchedWorlds):
         draws = self.random.take(worlds).substream(StreamId.GOAL)
         self.context[worlds] = self.task.episode_context(start, self.loss[worlds], draws)
 
-    def settle_rewards(self) -> None:
+    def replace_rewards(self) -> None:
         """Write the task's rewards into the report, then change goals that are due."""
         reward = self.task.reward(self.particles, self.loss, self.context)
         if self.rewards_last_step_only:
@@ -194,7 +194,7 @@ class GardenTask(RuleDriven, GrownTask[Config]):
 
     config_type: ClassVar[type[GardenConfig]] = GardenConfig
     form_type: ClassVar[Any] = BrushSpaces
-    actor = "brushes"
+    controls = "brushes"
     context_count = 2
 
     def __init__(self, config: Config, device: torch.device) -> None:
@@ -230,10 +230,10 @@ class GardenTask(RuleDriven, GrownTask[Config]):
             return run(particles, config.rule_steps)
         box = config.periodic_sides
         for _ in range(config.rule_steps):
-            x, s, *_ = particles
-            new_x, new_s, *_ = run(particles, 1)
-            x = x + rate * nearest_image(new_x - x, box)
-            particles = Particles(nearest_image(x, box), s + rate * (new_s - s))
+            (x, s, *_), stepped = particles, run(particles, 1)
+            x = x + rate * nearest_image(stepped.x - x, box)
+            s = s + rate * (stepped.s - s)
+            particles = stepped._replace(x=nearest_image(x, box), s=s)
         return particles
 
     def disturb(self, particles: Particles, random: WorldRandom) -> Particles:
@@ -350,8 +350,8 @@ class GardenEnv(NPAEnv):
     | Key | In | Value |
     |---|---|---|
     | `loss` | reset, step | the current loss L of the picture |
-    | `loss_density`, `loss_colour` | reset, step | the parts of the loss |
-    | `reward_density`, `reward_colour` | step | how much each part fell in this step |
+    | `loss_density`, `loss_colour` | reset, step | the terms of the loss |
+    | `reward_density`, `reward_colour` | step | decrease of each term in this step |
     | `success`, `diverged` | step | whether the world succeeded or diverged in it, bool |
     | `reason` | last step | why the episode ended, see above; None for worlds that go on |
 

@@ -61,7 +61,7 @@ class CrowdEnv(AgentsEnv, KnownAgents):
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], Infos]:
-        """Start an episode with all agents; return observations, and losses with their parts.
+        """Start an episode with all agents; return observations, and losses with their terms.
 
         A seed begins its sequence of episodes; None starts the next episode of the current
         sequence. There are no options.
