@@ -29,7 +29,7 @@ class RecognisingShapeshifter:
                 "with gymnasium.make('npa/Shapeshifter2D-v0')"
             )
         self._chosen = task.config.actions == "choice"
-        self._actions = inner.form.actions_of_codes()
+        self._actions = inner.spaces.actions_of_codes()
         goals = torch.arange(len(task.codes), device=task.device)
         x = torch.zeros(len(goals), 1, 2, device=task.device)
         s = x.new_zeros(len(goals), 1, task.config.state_dim)

@@ -10,7 +10,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from gymnasium.spaces import Box
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -23,17 +22,17 @@ from npa_envs.errors import NPAError, shown
 AGENTS = ("keeper_0", "raider_0")
 
 
-class _BothHands(BrushSpaces):
+class _BothSpaces(BrushSpaces):
     """Spaces of one gardener, and conversion of both gardeners' actions to rows of brushes."""
 
     def action(self, action: Any, world_count: int | None) -> Tensor:
         """Return the rows of both gardeners' brushes, shape [B, 2 K, W]."""
-        both = [super(_BothHands, self).action(action[agent], world_count) for agent in AGENTS]
+        both = [super(_BothSpaces, self).action(action[agent], world_count) for agent in AGENTS]
         return torch.cat(both, dim=1)
 
 
 class _SharedTask(GardenerTask):
-    form_type = _BothHands
+    spaces_type = _BothSpaces
 
 
 class _SharedGarden(Gardener2DEnv):
@@ -169,15 +168,7 @@ def parallel_env(max_cycles: int = 32, **config: Any) -> GardenersEnv:
     return GardenersEnv(max_cycles, **config)
 
 
-def raw_env(max_cycles: int = 32, **config: Any) -> Any:
-    """Return `parallel_env` with agents that act in turn, and the world after the raider."""
-    return in_turns(parallel_env(max_cycles, **config))
-
-
-def env(max_cycles: int = 32, **config: Any) -> Any:
-    """Return `raw_env`, with actions clipped into their spaces if these are boxes."""
-    both = parallel_env(max_cycles, **config)
-    return in_turns(both, clips=isinstance(both.action_space("keeper_0"), Box))
+raw_env, env = in_turns(parallel_env)
 
 
 register("npa/Gardeners-v0", __name__, {})

@@ -8,9 +8,9 @@ from __future__ import annotations
 from typing import Any
 
 from npa_envs.envs.multi.parallel import CrowdEnv, in_turns, register
-from npa_envs.envs.multi.tasks import ENVIRONMENTS, task_settings
+from npa_envs.envs.multi.tasks import ENVIRONMENTS as ENVIRONMENTS
+from npa_envs.envs.multi.tasks import SETTINGS, task_settings
 from npa_envs.envs.multi.vector import MultiSpeciesVectorEnv
-from npa_envs.registration import SPECIES_SIZES
 
 
 class MultiSpeciesEnv(CrowdEnv):
@@ -211,14 +211,7 @@ def batched(
     )
 
 
-def raw_env(task: str = "mixing", species_count: int | None = None, **config: Any) -> Any:
-    """Return `parallel_env` with species that act in turn; a step runs after the last of them."""
-    return in_turns(parallel_env(task, species_count, **config))
-
-
-def env(task: str = "mixing", species_count: int | None = None, **config: Any) -> Any:
-    """Return `raw_env` with actions clipped into their spaces."""
-    return in_turns(parallel_env(task, species_count, **config), clips=True)
+raw_env, env = in_turns(parallel_env)
 
 
 def settings(task: str, species_count: int | None, config: dict[str, Any]) -> dict[str, Any]:
@@ -229,5 +222,5 @@ def settings(task: str, species_count: int | None, config: dict[str, Any]) -> di
     return {"task": name, "species_count": 2} | keywords | config
 
 
-for _id in (*ENVIRONMENTS, *(size.id for size in SPECIES_SIZES)):
+for _id in SETTINGS:
     register(_id, __name__, {"task": _id})

@@ -131,14 +131,7 @@ def parallel_env(task: str = "mixing", species_count: int = 2, **config: Any) ->
     return ParticlesEnv(task, species_count=species_count, **config)
 
 
-def raw_env(task: str = "mixing", species_count: int = 2, **config: Any) -> Any:
-    """Return `parallel_env` with particles that act in turn, and the world after the last one."""
-    return in_turns(parallel_env(task, species_count, **config))
-
-
-def env(task: str = "mixing", species_count: int = 2, **config: Any) -> Any:
-    """Return `raw_env` with actions clipped into their spaces."""
-    return in_turns(parallel_env(task, species_count, **config), clips=True)
+raw_env, env = in_turns(parallel_env)
 
 
 for _id, _task in ENVIRONMENTS.items():

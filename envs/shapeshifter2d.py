@@ -98,7 +98,7 @@ def rule_of(config: Shapeshifter2DEnvConfig, device: torch.device) -> tuple[NPAR
     return rule, rule.codes
 
 
-class CodeForm(ParticleSpaces):
+class CodeSpaces(ParticleSpaces):
     """Spaces: observe a coarse picture and the goal's; act by a code or by the index of one."""
 
     def __init__(self, physics: Physics, config: Shapeshifter2DEnvConfig) -> None:
@@ -134,7 +134,7 @@ class ShapeshifterTask(RuleDriven, PictureEnvTask[Shapeshifter2DEnvConfig]):
     """A picture has to become others; a context has the current goal, then all goals in order."""
 
     config_type = Shapeshifter2DEnvConfig
-    form_type = CodeForm
+    spaces_type = CodeSpaces
     controls = "codes"
     context_count = 1 + GOAL_COUNT
     grows = True

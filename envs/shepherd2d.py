@@ -104,7 +104,7 @@ class ShepherdTask(GardenTask[Shepherd2DEnvConfig]):
     """A grown picture, the creature, with a position, an angle or a shape as its goal."""
 
     config_type = Shepherd2DEnvConfig
-    form_type = GoalBrushes
+    spaces_type = GoalBrushes
     # The intact loss and its rise, the goal, then mean and second moments at the start.
     context_count = 2 + 2 + 5
     rewards_each_step = True

@@ -63,12 +63,12 @@ class RunningMoments:
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Set the state that `state_dict` returned."""
-        wanted = {"mean": self.mean.shape, "var": self.var.shape, "count": torch.Size()}
-        for name in state.keys() ^ wanted.keys():
+        expected = {"mean": self.mean.shape, "var": self.var.shape, "count": torch.Size()}
+        for name in state.keys() ^ expected.keys():
             fault = "unknown" if name in state else "missing"
-            raise NPAError(f"{fault} statistic {shown(name)}: {suggest(name, wanted)}")
-        values = {name: torch.as_tensor(state[name], dtype=torch.float64) for name in wanted}
-        for name, shape in wanted.items():
+            raise NPAError(f"{fault} statistic {shown(name)}: {suggest(name, expected)}")
+        values = {name: torch.as_tensor(state[name], dtype=torch.float64) for name in expected}
+        for name, shape in expected.items():
             if values[name].shape != shape:
                 raise NPAError(
                     f"{name} must have shape {tuple(shape)}, got {tuple(values[name].shape)}: "
@@ -101,10 +101,10 @@ class _PerceptionNormalizer(WrapperBase):
         # Of the states, smoothed states, state gradients (C each) and the density gradient.
         self.statistics = RunningMoments(3 * self._physics.state_dim + 1)
         shape: tuple[int, ...] = getattr(env, self.space_name).shape or ()
-        wanted = self._physics.perception_dim
-        if len(shape) != 2 or shape[1] != wanted:
+        expected = self._physics.perception_dim
+        if len(shape) != 2 or shape[1] != expected:
             raise NPAError(
-                f"observations must be perception vectors, shape [N, {wanted}], got shape "
+                f"observations must be perception vectors, shape [N, {expected}], got shape "
                 f"{shape}: normalise before other wrappers change them"
             )
         setattr(self, self.space_name, Box(-self.clip, self.clip, shape, np.float32))

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from functools import cached_property
 from typing import Any
 
 import numpy as np
-from gymnasium.spaces import Space
-from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from npa_envs.envs.core.vector import BatchedSpaces
 from npa_envs.wrappers.base import (
     AnyVectorEnv,
     ParticleRowsBase,
@@ -21,7 +19,7 @@ from npa_envs.wrappers.base import (
 )
 
 
-class ParticleRows(ParticleRowsBase, AnyVectorEnv):
+class ParticleRows(ParticleRowsBase, BatchedSpaces):
     """The particles of a vector environment as the rows of another one, with NumPy arrays.
 
     Row w N + i is particle i of world w: it observes that particle's perception, shape [P], gives
@@ -51,16 +49,6 @@ class ParticleRows(ParticleRowsBase, AnyVectorEnv):
         self.single_observation_space = row_space(env.single_observation_space)
         self.single_action_space = row_space(env.single_action_space)
         self.closed = False
-
-    @cached_property
-    def observation_space(self) -> Space[Any]:  # type: ignore[override]
-        """Space of all rows' observations, [B N, P]; large, so made at the first use."""
-        return batch_space(self.single_observation_space, self.num_envs)
-
-    @cached_property
-    def action_space(self) -> Space[Any]:  # type: ignore[override]
-        """Space of all rows' actions, [B N, A]; large, so made at the first use."""
-        return batch_space(self.single_action_space, self.num_envs)
 
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None

@@ -66,8 +66,8 @@ def batch_tensor(
     action: Any, world_count: int | None, shape: tuple[int, ...], letters: str
 ) -> Tensor:
     """Return checked actions of B worlds, or of one (None), float32, shape [B, *shape]."""
-    wanted, letters = _batch_shape(world_count, shape, letters)
-    checked = action_tensor("action", action, wanted, "env.action_space", letters)
+    expected, letters = _batch_shape(world_count, shape, letters)
+    checked = action_tensor("action", action, expected, "env.action_space", letters)
     return checked[None] if world_count is None else checked
 
 
@@ -75,11 +75,11 @@ def batch_choices(
     action: Any, world_count: int | None, shape: tuple[int, ...], letters: str
 ) -> Tensor:
     """Return checked whole numbers of B worlds, or of one (None), int64, shape [B, *shape]."""
-    wanted, letters = _batch_shape(world_count, shape, letters)
+    expected, letters = _batch_shape(world_count, shape, letters)
     choices = number_tensor("action", action)
-    if tuple(choices.shape) != wanted or choices.is_floating_point():
+    if tuple(choices.shape) != expected or choices.is_floating_point():
         raise NPAError(
-            f"action must be whole numbers of shape {letters}{wanted}, got "
+            f"action must be whole numbers of shape {letters}{expected}, got "
             f"{tuple(choices.shape)} of {choices.dtype}: see env.action_space"
         )
     return choices.long().view(-1, *shape)
@@ -95,10 +95,10 @@ def _batch_shape(
 
 
 def action_tensor(
-    name: str, action: Any, wanted: tuple[int, ...], space: str, letters: str = ""
+    name: str, action: Any, expected: tuple[int, ...], space: str, letters: str = ""
 ) -> Tensor:
     """Return a checked action as a float32 tensor on its own device."""
-    came = ""
+    actual = ""
     if not isinstance(action, Tensor):
         try:
             array = np.asanyarray(action)
@@ -107,15 +107,15 @@ def action_tensor(
             # Torch needs writable arrays.
             action = torch.from_numpy(np.require(array, np.float32, ("C", "W")))
         except (TypeError, ValueError, OverflowError):
-            came = type(action).__name__
-            came += f" of {action.dtype}" if isinstance(action, np.ndarray) else ""
-    if not came and (tuple(action.shape) != wanted or action.dtype.is_complex):
-        came = f"{tuple(action.shape)} of {action.dtype}"
-    elif not came and (action.layout != torch.strided or action.is_meta):
-        came = f"a tensor that is {action.layout} on {action.device}"
-    if came:
+            actual = type(action).__name__
+            actual += f" of {action.dtype}" if isinstance(action, np.ndarray) else ""
+    if not actual and (tuple(action.shape) != expected or action.dtype.is_complex):
+        actual = f"{tuple(action.shape)} of {action.dtype}"
+    elif not actual and (action.layout != torch.strided or action.is_meta):
+        actual = f"a tensor that is {action.layout} on {action.device}"
+    if actual:
         raise NPAError(
-            f"{name} must be real numbers of shape {letters}{wanted}, got {came}: see {space}"
+            f"{name} must be real numbers of shape {letters}{expected}, got {actual}: see {space}"
         )
     checked: Tensor = action.detach().to(torch.float32)
     return checked
@@ -197,8 +197,8 @@ class WorldsEnv(ShownEnv):
         worlds_type = self.task_type.worlds_type or BatchedWorlds
         self.worlds = worlds_type(self.task_type, self.config, world_count, steps)
         self.task = self.worlds.task
-        form_type = self.task_type.form_type or ParticleSpaces
-        self.form: ParticleSpaces = form_type(self.worlds.physics, self.config)
+        spaces_type = self.task_type.spaces_type or ParticleSpaces
+        self.spaces: ParticleSpaces = spaces_type(self.worlds.physics, self.config)
 
     def _change_worlds(
         self, change: Callable[..., Any], worlds: Tensor, values: Any, buffer: Tensor | None = None

@@ -59,7 +59,7 @@ class StepReport(NamedTuple):
     """Reward, loss, its K terms, and each term's decrease in the last step, shape [2 + 2 K, B]."""
     endings: Tensor
     """Terminated, truncated, success, diverged, bool, shape [4, B]."""
-    everyone: Tensor
+    all_worlds: Tensor
     """True for every world, bool, shape [B]: the mask of infos that all worlds have."""
 
     @classmethod
@@ -68,7 +68,7 @@ class StepReport(NamedTuple):
         rows = 4 * (2 + 2 * term_count) + FLAG_ROWS
         buffer = torch.zeros(rows * world_count, dtype=torch.uint8, device=device)
         report = cls.from_buffer(buffer, world_count)
-        report.everyone.fill_(True)
+        report.all_worlds.fill_(True)
         return report
 
     @classmethod
@@ -81,11 +81,11 @@ class StepReport(NamedTuple):
 
     def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
         # Unpickled views would not share the buffer's memory.
-        return StepReport.from_buffer, (self.buffer, len(self.everyone))
+        return StepReport.from_buffer, (self.buffer, len(self.all_worlds))
 
     def copy(self) -> StepReport:
         """Return a copy that later steps do not overwrite."""
-        return self.from_buffer(self.buffer.clone(), len(self.everyone))
+        return self.from_buffer(self.buffer.clone(), len(self.all_worlds))
 
     @property
     def reward(self) -> Tensor:
@@ -276,19 +276,25 @@ class RewardedWorlds(WorldState):
             gains = torch.where(by_world[:, None], reward[:, None], gains)
             gains = torch.where(self.enabled.bool(), gains, particle_rewards.reward)
             particle_rewards.reward.copy_(gains)
-        self.replace_rewards()
+        rewards = self.task_rewards()
+        if rewards is not None:
+            if self.rewards_last_step_only:
+                terminated, truncated = self.report.endings[:2]
+                rewards = torch.where(terminated | truncated, rewards, 0.0)
+            self.report.reward.copy_(rewards)
         if self.x.is_cuda:
             self.host_endings.copy_(self._endings, non_blocking=True)
             if self.world_count == 1:
                 self.host_numbers.copy_(self.report.numbers, non_blocking=True)
         self.enabled.fill_(1)
 
-    def replace_rewards(self) -> None:
-        """Write other rewards than the decrease of the loss into the report; by default none."""
+    def task_rewards(self) -> Tensor | None:
+        """Return the rewards of a step, [B], where they are no decrease of the loss, else None."""
+        return None
 
     def _make_evaluation(self) -> EpisodeUpdate:
         config = self.task.config
-        rewarded_step = self.episode_steps if config.reward == "sparse" else None
+        rewarded_step = self.episode_steps if self.rewards_last_step_only else None
         return EpisodeUpdate(
             EpisodeRules(self.episode_steps, rewarded_step, config.on_divergence),
             enabled=self.enabled,

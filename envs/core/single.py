@@ -120,8 +120,8 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
 
     def __init__(self, **keywords: Any) -> None:
         self._make_worlds(keywords, 1, None)
-        self.observation_space = self.form.observation_space
-        self.action_space = self.form.action_space
+        self.observation_space = self.spaces.observation_space
+        self.action_space = self.spaces.action_space
         self._world = torch.zeros(1, dtype=torch.int64, device=self.task.device)
         self._keyed_from: np.random.Generator | None = None
         self._is_unrewarded = False
@@ -156,7 +156,7 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
             keys = rng_keys(None, 1, self.np_random)
         observation = self._change_worlds(self.worlds.start, self._world, keys)
         info = self.losses_of(self.worlds.report.numbers[:, 0].tolist())
-        return self.form.returned(observation[0]), info | self._extra_info()
+        return self.spaces.returned(observation[0]), info | self._extra_info()
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Apply an action, shape [N, A], in [-1, 1].
@@ -173,7 +173,7 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
         if not self._started:
             raise NPAError("step needs a world: call reset first")
         worlds = self.worlds
-        checked = self.form.action(action, None)
+        checked = self.spaces.action(action, None)
         with worlds.device_context():
             endings, observation = worlds.step(checked)
             diverged = bool(endings[0] & DIVERGED)
@@ -187,7 +187,7 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
         info |= self._extra_info() | self._of_world(worlds.step_info())
         self._is_unrewarded = worlds.rewards_last_step_only and not (terminated or truncated)
         self._show()
-        returned = self.form.returned(worlds.host_observation(observation)[0])
+        returned = self.spaces.returned(worlds.host_observation(observation)[0])
         return returned, numbers[0], terminated, truncated, info
 
     def render(self) -> NDArray[np.uint8] | None:
@@ -216,7 +216,7 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
         x, s = number_tensor("x", x)[None], number_tensor("s", s)[None]
         placed = self.worlds.checked_particles(x, s, 1, self.config.particle_count)
         observation = self._change_worlds(self.worlds.place, self._world, placed)
-        return self.form.returned(observation[0])
+        return self.spaces.returned(observation[0])
 
     def _extra_info(self) -> dict[str, Any]:
         """Return the entries of infos that the task adds in every call."""

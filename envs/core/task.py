@@ -123,7 +123,7 @@ class EnvTask(WorldTask[Config]):
     """Class that steps and observes the worlds; None: `BatchedWorlds`, particles act and perceive.
     Tasks whose particles a rule moves take `RuleDrivenWorlds`."""
 
-    form_type: ClassVar[type[ParticleSpaces] | None] = None
+    spaces_type: ClassVar[type[ParticleSpaces] | None] = None
     """Class of the spaces; None: `ParticleSpaces`, a row for each particle."""
 
     grows: ClassVar[bool] = False
@@ -361,10 +361,10 @@ def checked_losses(
     """Return the checked terms of worlds' losses, shape [B] each, without synchronising."""
     name = f"{type(task).__name__}.losses"
     if not isinstance(losses, Mapping) or not losses or not all(type(n) is str for n in losses):
-        came = list(losses) if isinstance(losses, Mapping) else type(losses).__name__
+        actual = list(losses) if isinstance(losses, Mapping) else type(losses).__name__
         raise NPAError(
-            f"{name} must return the terms of each world's loss by name, at least one, got {came}: "
-            "for example {'distance': distance}, of shape [B]"
+            f"{name} must return the terms of each world's loss by name, at least one, got "
+            f"{actual}: for example {{'distance': distance}}, of shape [B]"
         )
     if names and tuple(losses) != names:
         raise NPAError(
@@ -388,14 +388,14 @@ def checked_tensor(
     """Return a tensor that a method of a task returned, if it has this shape and type."""
     device = task.device
     if not isinstance(value, Tensor):
-        came = f"a {type(value).__name__}"
+        actual = f"a {type(value).__name__}"
     elif tuple(value.shape) != shape or value.dtype != dtype or value.device.type != device.type:
-        came = f"{value.dtype} of shape {tuple(value.shape)} on {value.device}"
+        actual = f"{value.dtype} of shape {tuple(value.shape)} on {value.device}"
     else:
         return value
     raise NPAError(
         f"{field} of {type(task).__name__}.{method} must be a {dtype} tensor of shape {shape} on "
-        f"{device}, got {came}: reshape or convert it there"
+        f"{device}, got {actual}: reshape or convert it there"
     )
 
 

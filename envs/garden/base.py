@@ -113,14 +113,11 @@ class RuleDrivenWorlds(BatchedWorlds):
         draws = self.random.take(worlds).substream(StreamId.GOAL)
         self.context[worlds] = self.task.episode_context(start, self.loss[worlds], draws)
 
-    def replace_rewards(self) -> None:
-        """Write the task's rewards into the report, then change goals that are due."""
-        reward = self.task.reward(self.particles, self.loss, self.context)
-        if self.rewards_last_step_only:
-            terminated, truncated = self.report.endings[:2]
-            reward = torch.where(terminated | truncated, reward, 0.0)
+    def task_rewards(self) -> Tensor:
+        """Return the task's rewards of a step, [B], then change goals that are due."""
+        rewards: Tensor = self.task.reward(self.particles, self.loss, self.context)
         self.task.next_goals(self.elapsed, self.context, self.goal)
-        self.report.reward.copy_(reward)
+        return rewards
 
     def extra_info(self) -> dict[str, Tensor]:
         """Return further entries of infos, shape [B, ...] each."""
@@ -136,11 +133,11 @@ class TargetDeficit:
         self._scale = torch.ones(VALUES_PER_PLACE, device=places.device)
         middle = places.new_zeros(1, 2)
         whole = Particles(target.points[None], target.colours[None] - COLOUR_OFFSET)
-        wanted = self._weighted(whole, middle)
+        target_sums = self._weighted(whole, middle)
         # Brushes may be too small to cover any point.
-        mean_count = wanted[..., 0].mean().clamp_min(1.0 / len(target.points))
+        mean_count = target_sums[..., 0].mean().clamp_min(1.0 / len(target.points))
         self._scale = torch.tensor(DEFICIT_SCALES, device=places.device) / mean_count
-        self._wanted = self._scale * wanted
+        self._target_sums = self._scale * target_sums
 
     def __call__(self, particles: Particles, middle: Tensor) -> Tensor:
         """Return the target's weighted sums at each place minus the worlds' own, [B, P, 6].
@@ -149,7 +146,7 @@ class TargetDeficit:
         of red, green and blue. They are multiples of the mean sum of 1 over the target's places,
         times `DEFICIT_SCALES`.
         """
-        return self._wanted - self._weighted(particles, middle)
+        return self._target_sums - self._weighted(particles, middle)
 
     def _weighted(self, particles: Particles, middle: Tensor) -> Tensor:
         x = particles.x
@@ -193,7 +190,7 @@ class GardenTask(RuleDriven, GrownTask[Config]):
     """A grown picture that its rule keeps stepping; differentiable in the brushes."""
 
     config_type: ClassVar[type[GardenConfig]] = GardenConfig
-    form_type: ClassVar[Any] = BrushSpaces
+    spaces_type: ClassVar[Any] = BrushSpaces
     controls = "brushes"
     context_count = 2
 

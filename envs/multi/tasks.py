@@ -315,22 +315,25 @@ TASKS: dict[str, type[SpeciesTask]] = {
 }
 """Tasks by the names that environments take."""
 
-
 ENVIRONMENTS = SPECIES
 """Tasks by the ids that `pettingzoo.make` takes."""
+
+SETTINGS: dict[str, tuple[str, Mapping[str, Any]]] = {
+    **{name: (task, {}) for name, task in SPECIES.items()},
+    **{size.id: (size.task, size.keywords) for size in SPECIES_SIZES},
+}
+"""Name and keywords of a task by all ids."""
 
 
 def task_settings(name: str) -> tuple[str, dict[str, Any]]:
     """Return the task's name and the keywords of an id; names of tasks are returned unchanged."""
-    for size in SPECIES_SIZES:
-        if isinstance(name, str) and name == size.id:
-            return size.task, dict(size.keywords)
-    return (ENVIRONMENTS.get(name, name) if isinstance(name, str) else name), {}
+    task, keywords = SETTINGS.get(name, (name, {})) if isinstance(name, str) else (name, {})
+    return task, dict(keywords)
 
 
 def task_type(name: str) -> type[SpeciesTask]:
     """Return a task's class."""
     if not isinstance(name, str) or name not in TASKS:
-        known = [*TASKS, *ENVIRONMENTS, *(size.id for size in SPECIES_SIZES)]
+        known = [*TASKS, *SETTINGS]
         raise NPAError(f"task must be a known word, got {shown(name)}: {suggest(name, known)}")
     return TASKS[name]

@@ -246,8 +246,8 @@ class MultiSpeciesVectorEnv(AgentsEnv):
     def _infos(self, numbers: dict[str, Tensor], acted: NDArray[np.bool_]) -> Infos:
         """Return infos of all species, with zeros in worlds where they did not act."""
         mask = to_device_async(acted, self.worlds.device)
-        everyone = torch.stack(list(numbers.values())).float()
-        rows = self._out(torch.where(mask, everyone, 0.0).movedim(2, 0).contiguous())
+        all_numbers = torch.stack(list(numbers.values())).float()
+        rows = self._out(torch.where(mask, all_numbers, 0.0).movedim(2, 0).contiguous())
         live = self._columns(self.worlds.live)
         return {
             agent: {"species": k, "live": live[agent]} | dict(zip(numbers, rows[k], strict=True))
