@@ -195,14 +195,8 @@ def batched(
 ) -> MultiSpeciesVectorEnv:
     """Return many worlds, stepped together on one device; world k is `parallel_env` by itself.
 
-    Args:
-        task: As `species_count` and `config` for `parallel_env`; device="cuda" and output="torch"
-            keep all arrays on a GPU.
-        world_count: Worlds B.
-        autoreset_mode: "same-step" or "disabled".
-
-    Raises:
-        NPAError: As `parallel_env`, or the worlds do not fit into memory.
+    Arguments and errors are those of `parallel_env` and `MultiSpeciesVectorEnv`. `device="cuda"`
+    and `output="torch"` keep all arrays on a GPU.
     """
     return MultiSpeciesVectorEnv(
         world_count=world_count,

@@ -92,8 +92,8 @@ class PicturesTask(PictureEnvTask[Pictures2DEnvConfig]):
         super().__init__(config, device)
         self.names = self.task.names
         """Names of the pictures of the split, by their indices."""
-        all_pictures = torch.arange(len(self.names), device=device)
-        pictures = self.task.toward(all_pictures).target_picture.permute(0, 3, 1, 2)
+        everyone = torch.arange(len(self.names), device=device)
+        pictures = self.task.toward(everyone).target_picture.permute(0, 3, 1, 2)
         small = F.avg_pool2d(pictures, config.resolution // config.picture_size)
         limit = config.observation_limit
         if config.observe_target:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 import torch
@@ -130,13 +130,22 @@ class CodeSpaces(ParticleSpaces):
         return self._table / self._limit
 
 
+class PictureGoals(NamedTuple):
+    """Goals of B episodes, as indices of the rule's pictures, int64."""
+
+    goal: Tensor
+    """The current goal, shape [B]."""
+
+    in_turn: Tensor
+    """All goals of the episode in their order, shape [B, G]."""
+
+
 class ShapeshifterTask(RuleDriven, PictureEnvTask[Shapeshifter2DEnvConfig]):
-    """A picture has to become others; a context has the current goal, then all goals in order."""
+    """A picture that a rule has grown has to become others."""
 
     config_type = Shapeshifter2DEnvConfig
     spaces_type = CodeSpaces
     controls = "codes"
-    context_count = 1 + GOAL_COUNT
     grows = True
     pixel_bytes = 48
     task: ManyPictures
@@ -179,15 +188,15 @@ class ShapeshifterTask(RuleDriven, PictureEnvTask[Shapeshifter2DEnvConfig]):
         count = len(self.codes)
         return (goal + 1 + random.integers(count - 1, 1)[:, 0]) % count
 
-    def episode_context(self, start: Start, loss: Tensor, random: WorldRandom) -> Tensor:
-        """Return an episode's current goal, then all of its goals in turn, [B, 1 + G]."""
+    def episode_context(self, start: Start, loss: Tensor, random: WorldRandom) -> PictureGoals:
+        """Return the episodes' first goals, and random ones that follow them."""
         assert start.goal is not None, "made with goals"
         goals = [start.goal]
         while len(goals) < GOAL_COUNT:
             goals.append(self._another(goals[-1], random))
         # The last one is followed by the first.
         goals[-1] = torch.where(goals[-1] == goals[0], self._another(goals[0], random), goals[-1])
-        return torch.stack([start.goal, *goals], dim=1).to(loss)
+        return PictureGoals(start.goal, torch.stack(goals, dim=1))
 
     def step(
         self, x: Tensor, s: Tensor, action: Tensor, random: WorldRandom
@@ -197,24 +206,24 @@ class ShapeshifterTask(RuleDriven, PictureEnvTask[Shapeshifter2DEnvConfig]):
         x, s, *_ = run_rule(self.rule, self.config, coded, self.config.rule_steps, random)
         return x, s
 
-    def reward(self, particles: Particles, loss: Tensor, context: Tensor) -> Tensor:
+    def reward(self, particles: Particles, loss: Tensor, context: PictureGoals) -> Tensor:
         """Return 1 at the goal, 0 for a loss as of an empty picture, shape [B]."""
-        blank = self.blank_losses.index_select(0, context[:, 0].long())
+        blank = self.blank_losses.index_select(0, context.goal)
         return (1.0 - loss / blank).clamp_min(-1.0)
 
-    def next_goals(self, elapsed: Tensor, context: Tensor, goal: Tensor) -> None:
+    def next_goals(self, elapsed: Tensor, context: PictureGoals, goal: Tensor) -> None:
         """Change the worlds' goals in place every `hold_steps` steps."""
         turn = (elapsed.long() // self.config.hold_steps) % GOAL_COUNT
-        context[:, :1] = context.gather(1, 1 + turn[:, None])
-        goal.copy_(context[:, 0].long())
+        context.goal.copy_(context.in_turn.gather(1, turn[:, None])[:, 0])
+        goal.copy_(context.goal)
 
-    def context_info(self, particles: Particles, context: Tensor) -> dict[str, Tensor]:
+    def context_info(self, particles: Particles, context: PictureGoals) -> dict[str, Tensor]:
         """Return the index of each world's goal, shape [B]."""
-        return {"goal": context[:, 0].long()}
+        return {"goal": context.goal.clone()}
 
-    def observe(self, particles: Particles, loss: Tensor, context: Tensor) -> Tensor:
+    def observe(self, particles: Particles, loss: Tensor, context: PictureGoals) -> Tensor:
         """Return coarse pictures of worlds and of their goals, shape [B, 8 G²]."""
-        goal_task = self.task.toward(context[:, 0].long())
+        goal_task = self.task.toward(context.goal)
         picture = goal_task.picture(particles.x, particles.s)
         both = torch.cat((picture, goal_task.target_picture), dim=-1)
         pixels = self.config.resolution // self.config.picture_size

@@ -104,8 +104,8 @@ RESTARTS = {
 def check_autoreset(mode: AutoresetMode, name: str) -> None:
     """Check that an environment's autoreset mode is the one of this name."""
     if mode is not AUTORESET_MODES[name]:
-        rule, hint = RESTARTS[name], f"make it with autoreset_mode={shown(name)}"
-        raise NPAError(f"env must {rule}, got {mode}: {hint}")
+        hint = f"make it with autoreset_mode={shown(name)}"
+        raise NPAError(f"env must {RESTARTS[name]}, got {mode}: {hint}")
 
 
 def as_tensor(values: Any) -> Tensor:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -51,8 +51,8 @@ class RuleDrivenWorlds(BatchedWorlds):
     """
 
     def _prepare_actions(self) -> None:
-        self.context = self.x.new_zeros(self.world_count, self.task.context_count)
-        """Values from the start of each episode that observations and rewards use, [B, M]."""
+        self.context: Any = None
+        """What the task's `episode_context` returned at the start of each world's episode."""
 
     @torch.no_grad()
     @makes_plain_tensors
@@ -111,7 +111,12 @@ class RuleDrivenWorlds(BatchedWorlds):
         """Begin episodes in some worlds, and store the task's context of their starts."""
         super().begin(worlds, start, check=check)
         draws = self.random.take(worlds).substream(StreamId.GOAL)
-        self.context[worlds] = self.task.episode_context(start, self.loss[worlds], draws)
+        context = self.task.episode_context(start, self.loss[worlds], draws)
+        if self.context is None:
+            shapes = ((self.world_count, *value.shape[1:]) for value in context)
+            self.context = type(context)(*map(Tensor.new_zeros, context, shapes))
+        for stored, value in zip(self.context, context, strict=True):
+            stored[worlds] = value
 
     def task_rewards(self) -> Tensor:
         """Return the task's rewards of a step, [B], then change goals that are due."""
@@ -164,26 +169,36 @@ class RuleDriven:
 
     worlds_type: ClassVar[type[BatchedWorlds] | None] = RuleDrivenWorlds
 
-    context_count: ClassVar[int]
-    """Values in an episode's context, M."""
-
     rewards_each_step: ClassVar[bool] = False
     """Whether `reward="sparse"` also rewards each step."""
 
-    def episode_context(self, start: Start, loss: Tensor, random: WorldRandom) -> Tensor:
-        """Return the context that episodes keep from their start, [B, M]; `loss` is theirs, [B]."""
+    def episode_context(self, start: Start, loss: Tensor, random: WorldRandom) -> Any:
+        """Return what observations and rewards need of the starts of B episodes.
+
+        It is a named tuple of tensors, [B, ...]; `loss` are the losses at the starts, [B].
+        """
         raise NotImplementedError
 
-    def reward(self, particles: Particles, loss: Tensor, context: Tensor) -> Tensor:
-        """Return the rewards of a step, [B], from the losses [B] and the context [B, M]."""
+    def reward(self, particles: Particles, loss: Tensor, context: Any) -> Tensor:
+        """Return the rewards of a step, [B], from the particles and losses, [B], after it."""
         raise NotImplementedError
 
-    def next_goals(self, elapsed: Tensor, context: Tensor, goal: Tensor) -> None:
+    def next_goals(self, elapsed: Tensor, context: Any, goal: Tensor) -> None:
         """Change goals in place after the rewards of a step, by the steps since the start, [B]."""
 
-    def context_info(self, particles: Particles, context: Tensor) -> dict[str, Tensor]:
+    def context_info(self, particles: Particles, context: Any) -> dict[str, Tensor]:
         """Return further entries of infos, shape [B, ...] each."""
         return {}
+
+
+class GardenContext(NamedTuple):
+    """The picture at the start of B episodes."""
+
+    intact_loss: Tensor
+    """Loss of the intact picture, shape [B]."""
+
+    rise: Tensor
+    """Rise of this loss if the picture turns grey, shape [B]."""
 
 
 class GardenTask(RuleDriven, GrownTask[Config]):
@@ -192,7 +207,6 @@ class GardenTask(RuleDriven, GrownTask[Config]):
     config_type: ClassVar[type[GardenConfig]] = GardenConfig
     spaces_type: ClassVar[Any] = BrushSpaces
     controls = "brushes"
-    context_count = 2
 
     def __init__(self, config: Config, device: torch.device) -> None:
         super().__init__(config, device)
@@ -237,22 +251,23 @@ class GardenTask(RuleDriven, GrownTask[Config]):
         """Return worlds after the disturbances at the end of a step; by default none."""
         return particles
 
-    def episode_context(self, start: Start, loss: Tensor, random: WorldRandom) -> Tensor:
-        """Return the loss of intact pictures, and its rise if they turn grey, shape [B, 2]."""
+    def episode_context(self, start: Start, loss: Tensor, random: WorldRandom) -> Any:
+        """Return the loss of intact pictures, and its rise if they turn grey."""
         blank = torch.zeros_like(start.s)
         grey = sum(self.losses(start.x, blank).values(), torch.zeros_like(loss))
         # The loss of a picture that did not grow may not rise at all.
-        return torch.stack((loss, (grey - loss).maximum(MIN_RISE * loss)), dim=1)
+        return GardenContext(loss, (grey - loss).maximum(MIN_RISE * loss))
 
-    def lost_fraction(self, loss: Tensor, context: Tensor) -> Tensor:
+    def lost_fraction(self, loss: Tensor, context: Any) -> Tensor:
         """Return the fraction of pictures that is lost: 0 if intact, 1 if grey, shape [B]."""
-        return (loss - context[:, 0]) / context[:, 1]
+        fraction: Tensor = (loss - context.intact_loss) / context.rise
+        return fraction
 
     def middle(self, x: Tensor) -> Tensor:
         """Return the origin of brushes' places: the mean position minus the target's, [B, 2]."""
         return world_mean(x) - self.task.target.points.mean(dim=0)
 
-    def observe(self, particles: Particles, loss: Tensor, context: Tensor) -> Tensor:
+    def observe(self, particles: Particles, loss: Tensor, context: Any) -> Tensor:
         """Return observations, shape [B, O], in the form that `observe` names."""
         if self.config.observe == "grid":
             observed = self.deficit(particles, self.middle(particles.x))

@@ -143,6 +143,7 @@ class TestEveryEnvironment:
         for action in self.sampled(ours, 7):
             left, right = ours.step(action), theirs.step(action)
             assert_same(left[:4], right[:4])
+            assert [part.dtype for part in left[1:4]] == [part.dtype for part in right[1:4]]
             for key, value in right[4].items():
                 if key != "final_info":
                     assert_same(list(left[4][key]), list(value))
