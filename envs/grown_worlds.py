@@ -129,7 +129,7 @@ def grow(
     One after the other: a rule's matrix products depend in the last bit on the number of worlds.
     """
     worlds = []
-    for one in torch.arange(len(seeds.x), device=seeds.x.device).split(1):
+    for one in torch.split(torch.arange(len(seeds.x), device=seeds.x.device), 1):
         stream = random.take(one).substream(StreamId.GROWTH)
         worlds.append(run_rule(rule, config, seeds.take(one), config.grow_steps, stream, **changes))
     return combined(torch.cat, worlds)

@@ -130,7 +130,8 @@ class ShepherdTask(GardenTask[Shepherd2DEnvConfig]):
             goal = direction(drawn[:, :1])
         else:
             goal = 1.0 + drawn
-        return ShepherdContext(*super().episode_context(start, loss, random), goal, moments)
+        intact = super().episode_context(start, loss, random)
+        return ShepherdContext(intact.intact_loss, intact.rise, goal, moments)
 
     def achieved(self, particles: Particles, context: ShepherdContext) -> Tensor:
         """Return the achieved goal: its two values and the lost fraction, shape [B, 3]."""

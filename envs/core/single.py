@@ -13,8 +13,9 @@ from torch import Tensor
 
 from npa_envs.checks import number_tensor
 from npa_envs.envs.core.base import WorldsEnv
+from npa_envs.envs.core.config import plain
 from npa_envs.envs.core.rewards_and_ends import reason
-from npa_envs.envs.core.vector import check_options, plain_seed, rng_keys
+from npa_envs.envs.core.vector import check_options, rng_keys
 from npa_envs.errors import NPAError
 from npa_envs.world.environment_steps import DIVERGED, SUCCESS, TIME_LIMIT
 
@@ -138,7 +139,7 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
             gymnasium.error.Error: The seed is no integer of at least 0.
             NPAError: An option is given.
         """
-        seed = plain_seed(seed)
+        seed = plain(seed)
         check_options(options, ())
         super().reset(seed=seed)
         if self._is_unrewarded:

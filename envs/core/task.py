@@ -266,10 +266,10 @@ class EnvTask(WorldTask[Config]):
         style = self.config.render_style
         if self.space_dim == 2:
             return self.draw_particles(particles, style)
-        worlds = zip(torch.arange(len(steps), device=self.device).split(1), steps, strict=True)
+        indices = torch.split(torch.arange(len(steps), device=self.device), 1)
         pictures = [
             self.draw_particles(particles.take(world), style, TURN * float(step))
-            for world, step in worlds
+            for world, step in zip(indices, steps, strict=True)
         ]
         return np.concatenate(pictures)
 

@@ -111,7 +111,7 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
         Raises:
             NPAError: The mask or the seeds have a wrong shape.
         """
-        seed = plain_seed(seed)
+        seed = plain(seed)
         super().reset(seed=seed if isinstance(seed, int) else None)
         chosen = worlds_to_reset(options, self.num_envs, started=self._started)
         keys = None
@@ -283,11 +283,6 @@ def checked_mode(mode: str | AutoresetMode) -> AutoresetMode:
             f"{suggest(mode, AUTORESET_MODES)}"
         )
     return by_name[mode]
-
-
-def plain_seed(seed: Any) -> Any:
-    """Return a NumPy integer as Python's, which Gymnasium needs, and anything else unchanged."""
-    return int(seed) if isinstance(seed, np.integer) else seed
 
 
 def check_options(options: Any, known: tuple[str, ...]) -> None:
