@@ -135,7 +135,8 @@ def _run(env: Any, policy: Callable[[Any], Any], seeds: list[int]) -> tuple[NDAr
             final = infos.get("final_info", infos)
             final_losses[over] = _host(final["loss"])[over]
             for k in np.flatnonzero(over):
-                endings[k] = _ending({name: final[name][k] for name in _REASONS & final.keys()})
+                info = {name: final[name][k] for name in _REASONS & final.keys()}
+                endings[k] = _ending(info, bool(terminated[k]))
             running &= ~over
         if not resets_itself and ended.any() and running.any():
             observation, _ = env.reset(options={"reset_mask": ended})
@@ -157,13 +158,13 @@ def _run_single(
         action = policy(batch)[0]
         observation, reward, terminated, truncated, info = env.step(action)
         total, steps, over = total + float(reward), steps + 1, terminated or truncated
-    ending = np.array([_ending(info)], dtype=object)
+    ending = np.array([_ending(info, terminated)], dtype=object)
     return *(np.array([n]) for n in (total, start_loss, info["loss"], steps)), ending
 
 
-def _ending(info: Mapping[str, Any]) -> str:
+def _ending(info: Mapping[str, Any], terminated: bool) -> str:
     """Return why an episode ended, from the infos of its last step."""
-    flags = [name for name in ("diverged", "success") if info.get(name)]
+    flags = [name for name in ("diverged", "success") if terminated and info.get(name)]
     return str(info.get("reason") or next(iter(flags), TIME_LIMIT))
 
 

@@ -34,7 +34,7 @@ class BrushPolicy:
             )
         self.config = self.task.config
         self.columns = BrushLayout.of(self.config)
-        self.shape = inner.form.rows_shape
+        self.shape = inner.spaces.rows_shape
         """Shape of a world's actions, (K, W)."""
 
     def __call__(self, observation: Any) -> Any:

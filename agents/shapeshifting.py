@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.agents.policies import unwrapped
-from npa_envs.envs.shapeshifter2d import ShapeshifterTask
+from npa_envs.envs.shapeshifter2d import PictureGoals, ShapeshifterTask
 from npa_envs.errors import NPAError
 from npa_envs.world.particles import Particles
 
@@ -29,12 +29,12 @@ class RecognisingShapeshifter:
                 "with gymnasium.make('npa/Shapeshifter2D-v0')"
             )
         self._chosen = task.config.actions == "choice"
-        self._actions = inner.form.actions_of_codes()
+        self._actions = inner.spaces.actions_of_codes()
         goals = torch.arange(len(task.codes), device=task.device)
         x = torch.zeros(len(goals), 1, 2, device=task.device)
         s = x.new_zeros(len(goals), 1, task.config.state_dim)
         # The second half of an observation is the goal's picture.
-        observation = task.observe(Particles(x, s), x[:, 0, 0], goals[:, None].to(x))
+        observation = task.observe(Particles(x, s), x[:, 0, 0], PictureGoals(goals, goals[:, None]))
         self._goals = observation.chunk(2, dim=1)[1].cpu()
 
     def __call__(self, observation: Any) -> Any:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from npa_envs.checks import check_fraction, check_non_negative, check_positive
 from npa_envs.envs.core.vector import vector_class
-from npa_envs.envs.garden.base import GardenEnv, GardenTask
+from npa_envs.envs.garden.base import GardenContext, GardenEnv, GardenTask
 from npa_envs.envs.garden.brushes import GardenConfig
 from npa_envs.tasks.damage import random_particle
 from npa_envs.world.brushes import push, wipe_state
@@ -21,8 +21,6 @@ from npa_envs.world.randomness import StreamId, WorldRandom
 @dataclass(frozen=True, kw_only=True)
 class Gardener2DEnvConfig(GardenConfig):
     """Adds the disturbances: gusts, which move particles, and blights, which wipe states."""
-
-    episode_steps: int = 32
 
     position_noise: float = 0.002
     """Standard deviation of the noise added to every position in a step of the rule
@@ -73,9 +71,10 @@ class GardenerTask(GardenTask[Gardener2DEnvConfig]):
         centre = random_particle(x, draws)
         happens = chance[:, 1] < config.blight_chance
         radius = torch.where(happens, config.blight_radius, -1.0)
-        return Particles(x, wipe_state(x, s, centre=centre, radius=radius, box=box))
+        s = wipe_state(x, s, centre=centre, radius=radius, box=box)
+        return particles._replace(x=x, s=s)
 
-    def reward(self, particles: Particles, loss: Tensor, context: Tensor) -> Tensor:
+    def reward(self, particles: Particles, loss: Tensor, context: GardenContext) -> Tensor:
         """Return 1 for worlds as at their start, 0 for worlds as bad as grey, shape [B]."""
         return (1.0 - self.lost_fraction(loss, context)).clamp_min(-1.0)
 

@@ -10,8 +10,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from gymnasium.spaces import Box
-from gymnasium.wrappers import TimeLimit
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -24,17 +22,17 @@ from npa_envs.errors import NPAError, shown
 AGENTS = ("keeper_0", "raider_0")
 
 
-class _BothHands(BrushSpaces):
+class _BothSpaces(BrushSpaces):
     """Spaces of one gardener, and conversion of both gardeners' actions to rows of brushes."""
 
     def action(self, action: Any, world_count: int | None) -> Tensor:
         """Return the rows of both gardeners' brushes, shape [B, 2 K, W]."""
-        both = [super(_BothHands, self).action(action[agent], world_count) for agent in AGENTS]
+        both = [super(_BothSpaces, self).action(action[agent], world_count) for agent in AGENTS]
         return torch.cat(both, dim=1)
 
 
 class _SharedTask(GardenerTask):
-    form_type = _BothHands
+    spaces_type = _BothSpaces
 
 
 class _SharedGarden(Gardener2DEnv):
@@ -111,12 +109,11 @@ class GardenersEnv(KnownAgents):
     }
 
     def __init__(self, max_cycles: int = 32, **config: Any) -> None:
-        calm = {"gust_chance": 0.0, "blight_chance": 0.0}
-        self.garden = _SharedGarden(**(calm | config))
-        """The world as a Gymnasium environment, whose actions are dicts with both agents'."""
         self.max_cycles = checked_count("max_cycles", max_cycles)
         """Steps of an episode."""
-        self._episodes = TimeLimit(self.garden, self.max_cycles)
+        calm = {"gust_chance": 0.0, "blight_chance": 0.0}
+        self.garden = _SharedGarden(**(calm | config | {"episode_steps": self.max_cycles}))
+        """The world as a Gymnasium environment, whose actions are dicts with both agents'."""
         self.render_mode = self.garden.render_mode
         self.possible_agents = list(AGENTS)
         self.agents: list[str] = []
@@ -127,7 +124,7 @@ class GardenersEnv(KnownAgents):
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
         """Start an episode; return both agents' observations and infos."""
-        observation, info = self._episodes.reset(seed=seed)
+        observation, info = self.garden.reset(seed=seed)
         self.agents = list(AGENTS)
         return _for_both(observation), {agent: dict(info) for agent in AGENTS}
 
@@ -140,7 +137,7 @@ class GardenersEnv(KnownAgents):
                 f"actions must be given for the agents {self.agents}, got some for "
                 f"{shown(list(actions))}: call reset where there are none"
             )
-        observation, reward, terminated, truncated, info = self._episodes.step(actions)
+        observation, reward, terminated, truncated, info = self.garden.step(actions)
         if terminated or truncated:
             self.agents = []
         return (
@@ -171,15 +168,7 @@ def parallel_env(max_cycles: int = 32, **config: Any) -> GardenersEnv:
     return GardenersEnv(max_cycles, **config)
 
 
-def raw_env(max_cycles: int = 32, **config: Any) -> Any:
-    """Return `parallel_env` with agents that act in turn, and the world after the raider."""
-    return in_turns(parallel_env(max_cycles, **config))
-
-
-def env(max_cycles: int = 32, **config: Any) -> Any:
-    """Return `raw_env`, with actions clipped into their spaces if these are boxes."""
-    both = parallel_env(max_cycles, **config)
-    return in_turns(both, clips=isinstance(both.action_space("keeper_0"), Box))
+raw_env, env = in_turns(parallel_env)
 
 
 register("npa/Gardeners-v0", __name__, {})

@@ -117,7 +117,8 @@ def run_rule(
     """
     names = ("eps", "box", "boundary", "update_prob", "dt", "position_noise")
     constants = {name: getattr(config, name) for name in names} | changes
-    return Particles(*rollout(rule, particles.x, particles.s, steps, generator=random, **constants))
+    x, s = rollout(rule, particles.x, particles.s, steps, generator=random, **constants)
+    return particles._replace(x=x, s=s)
 
 
 def grow(
@@ -128,10 +129,9 @@ def grow(
     One after the other: a rule's matrix products depend in the last bit on the number of worlds.
     """
     worlds = []
-    for k in range(len(seeds.x)):
-        one, stream = slice(k, k + 1), random.take(slice(k, k + 1)).substream(StreamId.GROWTH)
-        seed = Particles(seeds.x[one], seeds.s[one])
-        worlds.append(run_rule(rule, config, seed, config.grow_steps, stream, **changes))
+    for one in torch.split(torch.arange(len(seeds.x), device=seeds.x.device), 1):
+        stream = random.take(one).substream(StreamId.GROWTH)
+        worlds.append(run_rule(rule, config, seeds.take(one), config.grow_steps, stream, **changes))
     return combined(torch.cat, worlds)
 
 

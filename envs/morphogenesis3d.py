@@ -180,8 +180,8 @@ class Morphogenesis3DEnv(NPAEnv):
 
     | Key | In | Value |
     |---|---|---|
-    | `loss_views` | reset, step | equal to L, its only part |
-    | `reward_views` | step | how much it improved in this step |
+    | `loss_views` | reset, step | equal to L, its only term |
+    | `reward_views` | step | its decrease in this step |
 
     ## Rendering
 

@@ -8,9 +8,9 @@ from __future__ import annotations
 from typing import Any
 
 from npa_envs.envs.multi.parallel import CrowdEnv, in_turns, register
-from npa_envs.envs.multi.tasks import ENVIRONMENTS, task_settings
+from npa_envs.envs.multi.tasks import ENVIRONMENTS as ENVIRONMENTS
+from npa_envs.envs.multi.tasks import SETTINGS, task_settings
 from npa_envs.envs.multi.vector import MultiSpeciesVectorEnv
-from npa_envs.registration import SPECIES_SIZES
 
 
 class MultiSpeciesEnv(CrowdEnv):
@@ -75,7 +75,7 @@ class MultiSpeciesEnv(CrowdEnv):
 
     Each species k has a loss L_k, and its reward is L_k before the step minus L_k after it.
 
-    | Task | L_k | Parts |
+    | Task | L_k | Terms |
     |---|---|---|
     | mixing | 1 minus the mean entropy around its particles | `separation` |
     | segregation | the mean entropy around its particles | `mixture` |
@@ -92,14 +92,14 @@ class MultiSpeciesEnv(CrowdEnv):
     There is one reward for each species. Rewards of single particles (`reward="particle"` and
     `"marginal"`), and `tell_updated`, are for environments of one species, and are refused.
 
-    With `reward="team"` every live agent gets the mean of all rewards; the parts in `info` stay its
+    With `reward="team"` every live agent gets the mean of all rewards; the terms in `info` stay its
     own. In an invasion rewards sum to zero: species 0 gains as much as the live invaders lose, in
     equal parts. There "team" is refused.
 
-    Rewards telescope, except at deaths: taking particles out changes the losses of others, and this
-    change is not rewarded. In the step in which a species leaves the world, L_k counts as at least
-    its value at the start plus what deaths added to it, so that leaving is never rewarded. The
-    parts in `info` are not changed by this.
+    Rewards of an episode sum to its decrease of L_k, except at deaths: taking particles out changes
+    the losses of others, and this change is not rewarded. In the step in which a species leaves the
+    world, L_k counts as at least its value at the start plus what deaths added to it, so that
+    leaving is never rewarded. The terms in `info` are not changed by this.
 
     ## Starting state
 
@@ -130,8 +130,8 @@ class MultiSpeciesEnv(CrowdEnv):
     |---|---|---|
     | `species` | reset, step | the agent's species, from 0 on |
     | `loss` | reset, step | the current loss L_k |
-    | `loss_separation`, ... | reset, step | its parts, by their names above |
-    | `reward_separation`, ... | step | how much each part fell in this step |
+    | `loss_separation`, ... | reset, step | its terms, by their names above |
+    | `reward_separation`, ... | step | decrease of each term in this step |
     | `reason` | last step | why the agent's episode ended, see above |
 
     ## State
@@ -195,14 +195,8 @@ def batched(
 ) -> MultiSpeciesVectorEnv:
     """Return many worlds, stepped together on one device; world k is `parallel_env` by itself.
 
-    Args:
-        task: As `species_count` and `config` for `parallel_env`; device="cuda" and output="torch"
-            keep all arrays on a GPU.
-        world_count: Worlds B.
-        autoreset_mode: "same-step" or "disabled".
-
-    Raises:
-        NPAError: As `parallel_env`, or the worlds do not fit into memory.
+    Arguments and errors are those of `parallel_env` and `MultiSpeciesVectorEnv`. `device="cuda"`
+    and `output="torch"` keep all arrays on a GPU.
     """
     return MultiSpeciesVectorEnv(
         world_count=world_count,
@@ -211,14 +205,7 @@ def batched(
     )
 
 
-def raw_env(task: str = "mixing", species_count: int | None = None, **config: Any) -> Any:
-    """Return `parallel_env` with species that act in turn; a step runs after the last of them."""
-    return in_turns(parallel_env(task, species_count, **config))
-
-
-def env(task: str = "mixing", species_count: int | None = None, **config: Any) -> Any:
-    """Return `raw_env` with actions clipped into their spaces."""
-    return in_turns(parallel_env(task, species_count, **config), clips=True)
+raw_env, env = in_turns(parallel_env)
 
 
 def settings(task: str, species_count: int | None, config: dict[str, Any]) -> dict[str, Any]:
@@ -229,5 +216,5 @@ def settings(task: str, species_count: int | None, config: dict[str, Any]) -> di
     return {"task": name, "species_count": 2} | keywords | config
 
 
-for _id in (*ENVIRONMENTS, *(size.id for size in SPECIES_SIZES)):
+for _id in SETTINGS:
     register(_id, __name__, {"task": _id})

@@ -55,9 +55,9 @@ class ParticlesEnv(CrowdEnv):
 
     ## Reward
 
-    Each particle has its own loss, and its reward is the fall of this loss in the step.
+    Each particle has its own loss, and its reward is the decrease of this loss in the step.
 
-    | Task | Loss of a particle | Part |
+    | Task | Loss of a particle | Term |
     |---|---|---|
     | mixing | 1 minus the entropy around it | `separation` |
     | segregation | the entropy around it | `mixture` |
@@ -81,8 +81,8 @@ class ParticlesEnv(CrowdEnv):
     |---|---|---|
     | `species` | reset, step | the particle's species, from 0 on |
     | `loss` | reset, step | its current loss |
-    | `loss_separation`, ... | reset, step | the same by the name of its part, see above |
-    | `reward_separation`, ... | step | how much it fell in this step |
+    | `loss_separation`, ... | reset, step | the same by the name of its term, see above |
+    | `reward_separation`, ... | step | its decrease in this step |
     | `reason` | last step | why the particle's episode ended |
 
     ## Arguments
@@ -131,14 +131,7 @@ def parallel_env(task: str = "mixing", species_count: int = 2, **config: Any) ->
     return ParticlesEnv(task, species_count=species_count, **config)
 
 
-def raw_env(task: str = "mixing", species_count: int = 2, **config: Any) -> Any:
-    """Return `parallel_env` with particles that act in turn, and the world after the last one."""
-    return in_turns(parallel_env(task, species_count, **config))
-
-
-def env(task: str = "mixing", species_count: int = 2, **config: Any) -> Any:
-    """Return `raw_env` with actions clipped into their spaces."""
-    return in_turns(parallel_env(task, species_count, **config), clips=True)
+raw_env, env = in_turns(parallel_env)
 
 
 for _id, _task in ENVIRONMENTS.items():

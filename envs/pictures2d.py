@@ -161,8 +161,8 @@ class Pictures2DEnv(NPAEnv):
 
     | Key | In | Value |
     |---|---|---|
-    | `loss_density`, `loss_colour` | reset, step | the parts of the loss |
-    | `reward_density`, `reward_colour` | step | how much each part improved in this step |
+    | `loss_density`, `loss_colour` | reset, step | the terms of the loss |
+    | `reward_density`, `reward_colour` | step | decrease of each term in this step |
     | `target` | reset, step | index of the picture; `env.unwrapped.task.names` has its name |
     """
 

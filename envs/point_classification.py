@@ -53,7 +53,7 @@ class PointClassificationEnvConfig(EnvConfig):
     """Split of the data: "train", or "test", whose clouds are not augmented."""
 
     score: Score = "error"
-    """First part of the loss: "error", the mean squared error of particles' outputs;
+    """First term of the loss: "error", the mean squared error of particles' outputs;
     "cross_entropy" of softmax(`sharpness` × outputs); or "accuracy", the fraction of particles
     whose largest output is of another class."""
 
@@ -115,7 +115,7 @@ class PointClassificationTask(TargetEnvTask[PointClassificationEnvConfig]):
         return self._scores(s) + self.config.overflow_weight * self.task.overflows(s)
 
     def particle_gains(self, before: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor]) -> Tensor:
-        """Return the fall of each particle's loss, which no other particle's action changes."""
+        """Return the decrease of each particle's loss, which no other particle's action changes."""
         return self.particle_losses(*before) - self.particle_losses(*after)
 
     def extra_info(self, s: Tensor) -> dict[str, Tensor]:
@@ -133,7 +133,7 @@ class PointClassificationTask(TargetEnvTask[PointClassificationEnvConfig]):
         """Return pictures of the unit square with a margin, in the colours of predicted classes."""
         x, s, *_ = particles
         s = torch.cat((s[..., :-3], class_colours(self.task.outputs(s)) - COLOUR_OFFSET), dim=-1)
-        return super().draw(Particles(MAGNIFICATION * (x - 0.5), s), steps)
+        return super().draw(particles._replace(x=MAGNIFICATION * (x - 0.5), s=s), steps)
 
     @property
     def pixel_size(self) -> float:
@@ -183,11 +183,11 @@ class PointClassificationEnv(NPAEnv):
 
     The loss L is the mean squared difference of all particles' outputs and the right ones, plus
     `overflow_weight` times the mean of |s − clip(s, −1, 1)|. Blank states have
-    L = 1 / `class_count`. With `score="cross_entropy"` or `"accuracy"` the first part is the mean
+    L = 1 / `class_count`. With `score="cross_entropy"` or `"accuracy"` the first term is the mean
     cross-entropy of softmax(`sharpness` × outputs), or the fraction of particles whose largest
     output is of another class; ties go to the first class.
 
-    A particle's reward is the fall of its own loss.
+    A particle's reward is the decrease of its own loss.
 
     ## Starting state
 
@@ -202,12 +202,12 @@ class PointClassificationEnv(NPAEnv):
 
     | Key | In | Value |
     |---|---|---|
-    | `loss_error`, `loss_overflow` | reset, step | the parts of the loss |
-    | `reward_error`, `reward_overflow` | step | how much each part improved in this step |
+    | `loss_error`, `loss_overflow` | reset, step | the terms of the loss |
+    | `reward_error`, `reward_overflow` | step | decrease of each term in this step |
     | `label` | reset, step | the digit's class, a whole number |
     | `accuracy` | reset, step | fraction of particles whose largest output is of this class |
 
-    With another `score` than "error" the first part has its name.
+    With another `score` than "error" the first term has its name.
 
     ## Rendering
 

@@ -44,9 +44,6 @@ class Regeneration2DEnvConfig(GrownConfig):
 
     without_rule = f", or rule={shown(PICTURE)} to start from the target's own points"
 
-    episode_steps: int = 128
-    """As elsewhere; it equals the registered `max_episode_steps`."""
-
     damage: str = RANDOM_DAMAGE
     """Kind of damage: "wipe", "cut", "clump", "noise", or "random" for one of the first three."""
 

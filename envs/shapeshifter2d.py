@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 import torch
@@ -19,7 +19,7 @@ from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import Start
 from npa_envs.envs.core.vector import vector_class
 from npa_envs.envs.garden.base import RuleDriven
-from npa_envs.envs.garden.brushes import GardenReward
+from npa_envs.envs.garden.brushes import OBSERVATION_LIMIT, GardenReward
 from npa_envs.envs.grown_worlds import check_rule_driven, check_runs, grow, run_rule
 from npa_envs.envs.morphogenesis2d import PictureConfig, PictureEnvTask
 from npa_envs.errors import NPAError
@@ -33,25 +33,21 @@ from npa_envs.world.environment_steps import Physics
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import WorldRandom
 
-OBSERVATION_LIMIT = 8.0
-"""Observations are clipped to plus and minus this (dimensionless)."""
-
 GOAL_COUNT = 8
 """Goals of an episode; after the last one follows the first."""
 
-Actions = Literal["code", "choice"]
+CodeActions = Literal["code", "choice"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Shapeshifter2DEnvConfig(PictureConfig):
     """Adds the rule of many pictures and how its goals change."""
 
-    words = EnvConfig.words | {"reward": get_args(GardenReward), "actions": get_args(Actions)}
+    words = EnvConfig.words | {"reward": get_args(GardenReward), "actions": get_args(CodeActions)}
 
     reward: GardenReward = "dense"
     """"dense": the closeness to the goal in each step; "sparse": that of the last step only."""
 
-    episode_steps: int = 64
     particle_count: int = 256
     state_dim: int = 24
     eps: float = 0.2
@@ -60,7 +56,7 @@ class Shapeshifter2DEnvConfig(PictureConfig):
     rule: str = "seven-pictures"
     """A rule of many pictures, by name or file; its pictures are the goals."""
 
-    actions: Actions = "code"
+    actions: CodeActions = "code"
     """Form of actions: "code", the vector of a code; "choice", the index of one of the rule's."""
 
     rule_steps: int = 8
@@ -102,7 +98,7 @@ def rule_of(config: Shapeshifter2DEnvConfig, device: torch.device) -> tuple[NPAR
     return rule, rule.codes
 
 
-class CodeForm(ParticleSpaces):
+class CodeSpaces(ParticleSpaces):
     """Spaces: observe a coarse picture and the goal's; act by a code or by the index of one."""
 
     def __init__(self, physics: Physics, config: Shapeshifter2DEnvConfig) -> None:
@@ -112,8 +108,7 @@ class CodeForm(ParticleSpaces):
         self._chosen = config.actions == "choice"
         self._output = config.output
         count, dim = self._table.shape
-        shape = (8 * config.picture_size**2,)
-        limit = OBSERVATION_LIMIT
+        limit, shape = OBSERVATION_LIMIT, (8 * config.picture_size**2,)
         self.observation_space: Space[Any] = Box(-limit, limit, shape, np.float32)
         self.action_space: Space[Any] = (
             Discrete(count) if self._chosen else Box(-1.0, 1.0, (dim,), np.float32)
@@ -135,13 +130,22 @@ class CodeForm(ParticleSpaces):
         return self._table / self._limit
 
 
+class PictureGoals(NamedTuple):
+    """Goals of B episodes, as indices of the rule's pictures, int64."""
+
+    goal: Tensor
+    """The current goal, shape [B]."""
+
+    in_turn: Tensor
+    """All goals of the episode in their order, shape [B, G]."""
+
+
 class ShapeshifterTask(RuleDriven, PictureEnvTask[Shapeshifter2DEnvConfig]):
-    """A picture has to become others; a context has the current goal, then all goals in order."""
+    """A picture that a rule has grown has to become others."""
 
     config_type = Shapeshifter2DEnvConfig
-    form_type = CodeForm
-    actor = "codes"
-    context_count = 1 + GOAL_COUNT
+    spaces_type = CodeSpaces
+    controls = "codes"
     grows = True
     pixel_bytes = 48
     task: ManyPictures
@@ -173,26 +177,26 @@ class ShapeshifterTask(RuleDriven, PictureEnvTask[Shapeshifter2DEnvConfig]):
 
     def fresh(self, random: WorldRandom) -> Start:
         """Return grown worlds of random pictures, with another picture as their goal."""
-        x, s, _, grown = self.task.seed(random.world_count, generator=random, device=self.device)
-        assert grown is not None, "worlds of many pictures have goals"
-        seeds = Particles(x, self.rule.with_code(s, self.codes.table[grown][:, None]))
+        x, s, _, picture = self.task.seed(random.world_count, generator=random, device=self.device)
+        assert picture is not None, "worlds of many pictures have goals"
+        seeds = Particles(x, self.rule.with_code(s, self.codes.table[picture][:, None]))
         x, s, *_ = grow(self.rule, self.config, seeds, random)
-        return Start(x, s, goal=self._another(grown, random))
+        return Start(x, s, goal=self._another(picture, random))
 
     def _another(self, goal: Tensor, random: WorldRandom) -> Tensor:
         """Return random goals that differ from the given ones, int64, shape [B]."""
         count = len(self.codes)
         return (goal + 1 + random.integers(count - 1, 1)[:, 0]) % count
 
-    def episode_context(self, start: Start, loss: Tensor, random: WorldRandom) -> Tensor:
-        """Return an episode's current goal, then all of its goals in turn, [B, 1 + G]."""
+    def episode_context(self, start: Start, loss: Tensor, random: WorldRandom) -> PictureGoals:
+        """Return the episodes' first goals, and random ones that follow them."""
         assert start.goal is not None, "made with goals"
         goals = [start.goal]
         while len(goals) < GOAL_COUNT:
             goals.append(self._another(goals[-1], random))
         # The last one is followed by the first.
         goals[-1] = torch.where(goals[-1] == goals[0], self._another(goals[0], random), goals[-1])
-        return torch.stack([start.goal, *goals], dim=1).to(loss)
+        return PictureGoals(start.goal, torch.stack(goals, dim=1))
 
     def step(
         self, x: Tensor, s: Tensor, action: Tensor, random: WorldRandom
@@ -202,24 +206,24 @@ class ShapeshifterTask(RuleDriven, PictureEnvTask[Shapeshifter2DEnvConfig]):
         x, s, *_ = run_rule(self.rule, self.config, coded, self.config.rule_steps, random)
         return x, s
 
-    def reward(self, particles: Particles, loss: Tensor, context: Tensor) -> Tensor:
+    def reward(self, particles: Particles, loss: Tensor, context: PictureGoals) -> Tensor:
         """Return 1 at the goal, 0 for a loss as of an empty picture, shape [B]."""
-        blank = self.blank_losses.index_select(0, context[:, 0].long())
+        blank = self.blank_losses.index_select(0, context.goal)
         return (1.0 - loss / blank).clamp_min(-1.0)
 
-    def next_goals(self, elapsed: Tensor, context: Tensor, goal: Tensor) -> None:
+    def next_goals(self, elapsed: Tensor, context: PictureGoals, goal: Tensor) -> None:
         """Change the worlds' goals in place every `hold_steps` steps."""
         turn = (elapsed.long() // self.config.hold_steps) % GOAL_COUNT
-        context[:, :1] = context.gather(1, 1 + turn[:, None])
-        goal.copy_(context[:, 0].long())
+        context.goal.copy_(context.in_turn.gather(1, turn[:, None])[:, 0])
+        goal.copy_(context.goal)
 
-    def context_info(self, particles: Particles, context: Tensor) -> dict[str, Tensor]:
+    def context_info(self, particles: Particles, context: PictureGoals) -> dict[str, Tensor]:
         """Return the index of each world's goal, shape [B]."""
-        return {"goal": context[:, 0].long()}
+        return {"goal": context.goal.clone()}
 
-    def observe(self, particles: Particles, loss: Tensor, context: Tensor) -> Tensor:
+    def observe(self, particles: Particles, loss: Tensor, context: PictureGoals) -> Tensor:
         """Return coarse pictures of worlds and of their goals, shape [B, 8 G²]."""
-        goal_task = self.task.toward(context[:, 0].long())
+        goal_task = self.task.toward(context.goal)
         picture = goal_task.picture(particles.x, particles.s)
         both = torch.cat((picture, goal_task.target_picture), dim=-1)
         pixels = self.config.resolution // self.config.picture_size
@@ -286,8 +290,8 @@ class Shapeshifter2DEnv(NPAEnv):
     |---|---|---|
     | `goal` | reset, step | index of the goal's code |
     | `loss` | reset, step | current loss L; of a step, for the goal observed before it |
-    | `loss_density`, `loss_colour` | reset, step | the parts of the loss |
-    | `reward_density`, `reward_colour` | step | how much each part fell, whatever the goals were |
+    | `loss_density`, `loss_colour` | reset, step | the terms of the loss |
+    | `reward_density`, `reward_colour` | step | decrease of each term, whatever the goals were |
     | `success`, `diverged` | step | whether the world succeeded or diverged in it, bool |
     | `reason` | last step | why the episode ended, see above; None for worlds that go on |
     """

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, assert_never, get_args
+from typing import Any, Literal, NamedTuple, assert_never, get_args
 
 import numpy as np
 import torch
@@ -32,8 +32,6 @@ class Shepherd2DEnvConfig(GardenConfig):
     """Adds the goals."""
 
     words = GardenConfig.words | {"aim": get_args(Aim)}
-
-    episode_steps: int = 32
 
     reward: GardenReward = "dense"
     """"dense": minus the distance to the goal; "sparse": 0 at the goal and -1 elsewhere."""
@@ -102,17 +100,28 @@ class GoalBrushes(BrushSpaces):
         return last
 
 
+class ShepherdContext(NamedTuple):
+    """The creature at the start of B episodes, and its goal."""
+
+    intact_loss: Tensor
+    rise: Tensor
+
+    goal: Tensor
+    """First two values of the desired goal, shape [B, 2]."""
+
+    moments: Tensor
+    """The creature's `moments_of`, shape [B, 5]."""
+
+
 class ShepherdTask(GardenTask[Shepherd2DEnvConfig]):
     """A grown picture, the creature, with a position, an angle or a shape as its goal."""
 
     config_type = Shepherd2DEnvConfig
-    form_type = GoalBrushes
-    # The intact loss and its rise, the goal, then mean and second moments at the start.
-    context_count = 2 + 2 + 5
+    spaces_type = GoalBrushes
     rewards_each_step = True
 
-    def episode_context(self, start: Start, loss: Tensor, random: WorldRandom) -> Tensor:
-        """Return the intact loss and its rise, the goal, and the creature's first moments."""
+    def episode_context(self, start: Start, loss: Tensor, random: WorldRandom) -> ShepherdContext:
+        """Return the intact loss and its rise, a drawn goal, and the creature's moments."""
         moments, reach = moments_of(start.x), self.config.goal_reach
         drawn = uniform_ball(len(loss), 1, 2, reach, generator=random, device=self.device)[:, 0]
         if self.config.aim == "move":
@@ -121,12 +130,13 @@ class ShepherdTask(GardenTask[Shepherd2DEnvConfig]):
             goal = direction(drawn[:, :1])
         else:
             goal = 1.0 + drawn
-        return torch.cat((super().episode_context(start, loss, random), goal, moments), dim=1)
+        intact = super().episode_context(start, loss, random)
+        return ShepherdContext(intact.intact_loss, intact.rise, goal, moments)
 
-    def achieved(self, particles: Particles, context: Tensor) -> Tensor:
+    def achieved(self, particles: Particles, context: ShepherdContext) -> Tensor:
         """Return the achieved goal: its two values and the lost fraction, shape [B, 3]."""
         x, s, *_ = particles
-        first, now = context[:, 4:], moments_of(x)
+        first, now = context.moments, moments_of(x)
         if self.config.aim == "move":
             values, aligned = now[:, :2], x
         elif self.config.aim == "turn":
@@ -139,11 +149,10 @@ class ShepherdTask(GardenTask[Shepherd2DEnvConfig]):
         loss = sum(self.losses(aligned, s).values(), torch.zeros_like(values[:, 0]))
         return torch.cat((values, self.lost_fraction(loss, context)[:, None]), dim=1)
 
-    def desired(self, context: Tensor) -> Tensor:
+    def desired(self, context: ShepherdContext) -> Tensor:
         """Return the desired goal: its two values and `lost_limit`, shape [B, 3]."""
-        return torch.cat(
-            (context[:, 2:4], torch.full_like(context[:, :1], self.config.lost_limit)), 1
-        )
+        limit = torch.full_like(context.goal[:, :1], self.config.lost_limit)
+        return torch.cat((context.goal, limit), dim=1)
 
     def goal_reward(self, achieved: Tensor, desired: Tensor) -> Tensor:
         """Return the rewards, shape [...], for achieved and desired goals, [..., 3]."""
@@ -160,19 +169,19 @@ class ShepherdTask(GardenTask[Shepherd2DEnvConfig]):
             case unknown:
                 assert_never(unknown)
 
-    def reward(self, particles: Particles, loss: Tensor, context: Tensor) -> Tensor:
+    def reward(self, particles: Particles, loss: Tensor, context: ShepherdContext) -> Tensor:
         """Return rewards [B] of a step, from the particles after it and the goals in `context`."""
         achieved = self.achieved(particles, context)
         return self.goal_reward(achieved, self.desired(context)).to(torch.float32)
 
-    def context_info(self, particles: Particles, context: Tensor) -> dict[str, Tensor]:
+    def context_info(self, particles: Particles, context: ShepherdContext) -> dict[str, Tensor]:
         """Return whether worlds are intact at their goals, distances, and lost fractions, [B]."""
         achieved, desired = self.achieved(particles, context), self.desired(context)
         distance = (achieved - desired)[:, :2].square().sum(dim=1).sqrt()
         success = (distance <= self.config.tolerance) & (achieved[:, 2] <= desired[:, 2])
         return {"is_success": success, "distance": distance, "lost": achieved[:, 2]}
 
-    def observe(self, particles: Particles, loss: Tensor, context: Tensor) -> Tensor:
+    def observe(self, particles: Particles, loss: Tensor, context: ShepherdContext) -> Tensor:
         """Return the observation, then the achieved and the desired goal, [B, O + 6]."""
         observed = super().observe(particles, loss, context)
         goals = torch.cat((self.achieved(particles, context), self.desired(context)), dim=1)

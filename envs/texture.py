@@ -80,7 +80,7 @@ class TextureEnv(NPAEnv):
     patches of several sizes (`"patch_swd"`), responses of random filters (`"filter_swd"`), or
     features of VGG16 (`"vgg_ot"`). The loss L is `colour_weight` times the loss of the colour image
     plus `density_weight` times the loss of the density image. 0 is the same texture. Joint losses
-    such as `"patch_ot"` see both images at once. Their part of the density is 0. Formulas:
+    such as `"patch_ot"` see both images at once. Their density term is 0. Formulas:
     [textures](../mathematics.md#textures).
 
     A particle's own loss is what its part of the picture adds to the texture loss, to first order.
@@ -97,8 +97,8 @@ class TextureEnv(NPAEnv):
 
     | Key | In | Value |
     |---|---|---|
-    | `loss_colour`, `loss_density` | reset, step | the parts of the loss |
-    | `reward_colour`, `reward_density` | step | how much each part improved in this step |
+    | `loss_colour`, `loss_density` | reset, step | the terms of the loss |
+    | `reward_colour`, `reward_density` | step | decrease of each term in this step |
 
     ## Vectorized environment
 

@@ -10,20 +10,16 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from npa_envs.wrappers.damage import DamageEvents as DamageEvents
     from npa_envs.wrappers.damage import VectorDamageEvents as VectorDamageEvents
+    from npa_envs.wrappers.normalize import NormalizePerception as NormalizePerception
+    from npa_envs.wrappers.normalize import TorchNormalizeObservation as TorchNormalizeObservation
+    from npa_envs.wrappers.normalize import TorchNormalizeReward as TorchNormalizeReward
+    from npa_envs.wrappers.normalize import VectorNormalizePerception as VectorNormalizePerception
     from npa_envs.wrappers.numeric_infos import NumericInfos as NumericInfos
     from npa_envs.wrappers.particle_rows import ParticleRows as ParticleRows
-    from npa_envs.wrappers.rsl_rl import RslRlParticleEnv as RslRlParticleEnv
-    from npa_envs.wrappers.running_statistics import NormalizePerception as NormalizePerception
-    from npa_envs.wrappers.running_statistics import (
-        TorchNormalizeObservation as TorchNormalizeObservation,
-    )
-    from npa_envs.wrappers.running_statistics import TorchNormalizeReward as TorchNormalizeReward
-    from npa_envs.wrappers.running_statistics import (
+    from npa_envs.wrappers.record_episodes import (
         TorchRecordEpisodeStatistics as TorchRecordEpisodeStatistics,
     )
-    from npa_envs.wrappers.running_statistics import (
-        VectorNormalizePerception as VectorNormalizePerception,
-    )
+    from npa_envs.wrappers.rsl_rl import RslRlParticleEnv as RslRlParticleEnv
     from npa_envs.wrappers.sb3 import ParticleVecEnv as ParticleVecEnv
     from npa_envs.wrappers.sb3 import RowPolicy as RowPolicy
     from npa_envs.wrappers.sb3 import SpeciesVecEnv as SpeciesVecEnv
@@ -44,14 +40,14 @@ ON_REQUEST = {
 }
 MODULES = {
     "DamageEvents": "damage",
-    "NormalizePerception": "running_statistics",
+    "NormalizePerception": "normalize",
     "ParticleRows": "particle_rows",
     "SpeciesTags": "species_tags",
-    "TorchNormalizeObservation": "running_statistics",
-    "TorchNormalizeReward": "running_statistics",
-    "TorchRecordEpisodeStatistics": "running_statistics",
+    "TorchNormalizeObservation": "normalize",
+    "TorchNormalizeReward": "normalize",
+    "TorchRecordEpisodeStatistics": "record_episodes",
     "VectorDamageEvents": "damage",
-    "VectorNormalizePerception": "running_statistics",
+    "VectorNormalizePerception": "normalize",
     "VectorSpeciesTags": "species_tags",
 }
 __all__ = [*MODULES]

@@ -93,15 +93,19 @@ def autoreset_mode(env: AnyVectorEnv) -> AutoresetMode:
     return AutoresetMode(env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP))
 
 
-def check_autoreset(mode: AutoresetMode, word: str, rule: str) -> None:
-    """Raise NPAError unless `mode` is the mode named `word`; the message says env must `rule`."""
-    if mode is not AUTORESET_MODES[word]:
-        raise NPAError(f"env must {rule}, got {mode}: make it with autoreset_mode={shown(word)}")
+RESTARTS = {
+    "same-step": "restart worlds in the step that ends their episodes",
+    "next-step": "restart worlds in the step after the last one",
+    "disabled": "leave restarts to the adapter",
+}
+"""What environments of each autoreset mode do."""
 
 
-def check_same_step(mode: AutoresetMode) -> None:
-    """Check that worlds restart in the step that ends their episodes."""
-    check_autoreset(mode, "same-step", "restart worlds in the step that ends their episodes")
+def check_autoreset(mode: AutoresetMode, name: str) -> None:
+    """Check that an environment's autoreset mode is the one of this name."""
+    if mode is not AUTORESET_MODES[name]:
+        hint = f"make it with autoreset_mode={shown(name)}"
+        raise NPAError(f"env must {RESTARTS[name]}, got {mode}: {hint}")
 
 
 def as_tensor(values: Any) -> Tensor:
@@ -117,6 +121,15 @@ def like(result: Tensor, values: Any) -> Any:
 def to_host(values: Any) -> NDArray[Any]:
     """Return an array or tensor as an array; synchronises with the device."""
     return values.cpu().numpy() if isinstance(values, Tensor) else np.asarray(values)
+
+
+def check_tensor(values: Any, wrapper: str) -> None:
+    """Check that an environment returned a tensor to a wrapper."""
+    if not isinstance(values, Tensor):
+        raise NPAError(
+            f"{wrapper} needs torch tensors, got {type(values).__name__}: make the environment "
+            f"with output='torch', or use gymnasium.wrappers.vector.{wrapper.removeprefix('Torch')}"
+        )
 
 
 def world_indices(mask: NDArray[np.bool_], device: torch.device) -> Tensor:
@@ -241,7 +254,7 @@ class EpisodeClock:
 class ChangesObservations:
     """Mixin of wrappers that change observations, of one world or many."""
 
-    def count(self, observations: Any) -> None:
+    def update(self, observations: Any) -> None:
         """Add new observations, [N, P] or [M, N, P], to the wrapper's statistics."""
 
     @abstractmethod
@@ -253,8 +266,8 @@ class Observations(ChangesObservations, AnyObservationWrapper):
     """Base class of wrappers that change the observations of one world."""
 
     def observation(self, observation: Any) -> Any:
-        """Return an observation counted and changed, for Gymnasium's `reset` and `step`."""
-        self.count(observation)
+        """Update with an observation and return it changed, for Gymnasium's `reset` and `step`."""
+        self.update(observation)
         return self.changed(observation)
 
 
@@ -295,6 +308,43 @@ class EpisodeWrapper(AnyVectorWrapper):
         """Return the results of a step, after the clock's update."""
 
 
+class RewardSums(EpisodeWrapper):
+    """Base class of wrappers with a sum of the rewards of each running episode."""
+
+    gamma = 1.0
+    """Factor on the sum in each step (dimensionless)."""
+
+    sums: Tensor | None = None
+    """Sums of the rewards, float64, shape [B]."""
+
+    @abstractmethod
+    def summed(self, rewards: Tensor, sums: Tensor) -> tuple[Tensor, dict[str, Any]]:
+        """Return the rewards, [B], changed, and entries for infos; before sums are reset."""
+
+    def after_reset(self, observations: Any, infos: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
+        """Set the sums of new episodes to zero."""
+        self.reset_sums(self.clock.restarted)
+        return observations, infos
+
+    def after_step(self, outcome: VectorStep) -> VectorStep:
+        """Add the rewards to the sums."""
+        observations, rewards, terminations, truncations, infos = outcome
+        check_tensor(rewards, type(self).__name__)
+        sums = rewards.double()
+        if self.sums is not None:
+            sums = self.sums * self.gamma + sums
+        self.sums = sums
+        rewards, entries = self.summed(rewards, sums)
+        # With next-step autoreset the step that restarts belongs to no episode.
+        self.reset_sums(self.clock.restarted)
+        return observations, rewards, terminations, truncations, infos | entries
+
+    def reset_sums(self, worlds: NDArray[np.bool_]) -> None:
+        """Set the sums of some worlds to zero."""
+        if self.sums is not None and worlds.any():
+            self.sums = self.sums.index_fill(0, world_indices(worlds, self.sums.device), 0.0)
+
+
 class VectorObservations(ChangesObservations, EpisodeWrapper):
     """Base class of wrappers that change observations of many worlds, final ones included."""
 
@@ -319,11 +369,11 @@ class VectorObservations(ChangesObservations, EpisodeWrapper):
         """Return observations changed, after counting those of worlds that are new."""
         observed: Any = self.clock.observed
         if observed.all():
-            self.count(observations)
+            self.update(observations)
         else:
             if isinstance(observations, Tensor):
                 observed = world_indices(observed, observations.device)
-            self.count(observations[observed])
+            self.update(observations[observed])
         return self.changed(observations)
 
 

@@ -82,7 +82,7 @@ class DamageEvents(_DamagesWorlds, AnyWrapper):
     is not damaged, so put the wrapper around the result of `gym.make`, which includes the step
     limit.
 
-    On such steps `info["loss_damage"]` is the rise of the loss; `info["loss"]`, its parts and
+    On such steps `info["loss_damage"]` is the rise of the loss; `info["loss"]`, its terms and
     further entries are those of the damaged world. Nested wrappers act as one with all their
     events, the innermost first.
 

@@ -24,7 +24,7 @@ from gymnasium.envs.registration import EnvSpec
 from torch import Tensor
 
 from npa_envs.errors import NPAError, importing, shown
-from npa_envs.wrappers.base import as_tensor, autoreset_mode, check_same_step, vector_env
+from npa_envs.wrappers.base import as_tensor, autoreset_mode, check_autoreset, vector_env
 
 with importing("Minari", "a dataset of episodes", "pip install 'npa-envs[minari]'"):
     import h5py  # noqa: F401
@@ -58,7 +58,7 @@ def record_episodes(
         NPAError: The environment is another one, or there are no seeds.
     """
     vector_env(env, "record_episodes")
-    check_same_step(autoreset_mode(env))
+    check_autoreset(autoreset_mode(env), "same-step")
     if not len(seeds):
         raise NPAError("seeds must have at least one seed, got none: give seeds=range(8)")
     for first in range(0, len(seeds), env.num_envs):
@@ -195,7 +195,7 @@ def write_dataset(
 def spec_of(env_id: str, keywords: dict[str, Any], episode_steps: int) -> EnvSpec:
     """Return the spec of a single environment with keywords and a step limit."""
     spec = deepcopy(gymnasium.spec(env_id))
-    spec.kwargs = {**spec.kwargs, **keywords}
+    spec.kwargs = {**spec.kwargs, **keywords, "episode_steps": episode_steps}
     spec.max_episode_steps = episode_steps
     spec.vector_entry_point = None
     return spec

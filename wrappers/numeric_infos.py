@@ -17,7 +17,7 @@ class NumericInfos(BaseParallelWrapper):  # type: ignore[misc]
     """Keep only the infos that `reset` returns, which are numbers, in every step.
 
     TorchRL's `PettingZooWrapper` expects the entries of `reset` in every step, and makes a tensor
-    of each. Losses and their parts stay; entries of steps only (`reward_...`, `reason`) are
+    of each. Losses and their terms stay; entries of steps only (`reward_...`, `reason`) are
     dropped.
 
     Args:
@@ -29,11 +29,11 @@ class NumericInfos(BaseParallelWrapper):  # type: ignore[misc]
     ) -> tuple[dict[str, Any], Infos]:
         """Start an episode; as for the environment itself."""
         observations, infos = self.env.reset(seed=seed, options=options)
-        self._kept = {agent: tuple(info) for agent, info in infos.items()}
+        self._names = {agent: tuple(info) for agent, info in infos.items()}
         return observations, infos
 
     def step(self, actions: Mapping[str, Any]) -> tuple[Any, ...]:
         """Step; as for the environment itself."""
         *outcome, infos = self.env.step(actions)
-        kept = {a: {name: info[name] for name in self._kept[a]} for a, info in infos.items()}
-        return (*outcome, kept)
+        numeric = {a: {name: info[name] for name in self._names[a]} for a, info in infos.items()}
+        return (*outcome, numeric)

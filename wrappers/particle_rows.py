@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from functools import cached_property
 from typing import Any
 
 import numpy as np
-from gymnasium.spaces import Space
-from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from npa_envs.envs.core.vector import BatchedSpaces
 from npa_envs.wrappers.base import (
     AnyVectorEnv,
     ParticleRowsBase,
@@ -21,7 +19,7 @@ from npa_envs.wrappers.base import (
 )
 
 
-class ParticleRows(ParticleRowsBase, AnyVectorEnv):
+class ParticleRows(ParticleRowsBase, BatchedSpaces):
     """The particles of a vector environment as the rows of another one, with NumPy arrays.
 
     Row w N + i is particle i of world w: it observes that particle's perception, shape [P], gives
@@ -44,25 +42,13 @@ class ParticleRows(ParticleRowsBase, AnyVectorEnv):
 
     def __init__(self, env: AnyVectorEnv) -> None:
         base = vector_env(env, type(self).__name__)
-        check_autoreset(
-            autoreset_mode(env), "next-step", "restart worlds in the step after the last one"
-        )
+        check_autoreset(autoreset_mode(env), "next-step")
         self.set_env(env, base)
         self.metadata = env.metadata
         self.render_mode = env.render_mode
         self.single_observation_space = row_space(env.single_observation_space)
         self.single_action_space = row_space(env.single_action_space)
         self.closed = False
-
-    @cached_property
-    def observation_space(self) -> Space[Any]:  # type: ignore[override]
-        """Space of all rows' observations, [B N, P]; large, so made at the first use."""
-        return batch_space(self.single_observation_space, self.num_envs)
-
-    @cached_property
-    def action_space(self) -> Space[Any]:  # type: ignore[override]
-        """Space of all rows' actions, [B N, A]; large, so made at the first use."""
-        return batch_space(self.single_action_space, self.num_envs)
 
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None

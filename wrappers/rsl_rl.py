@@ -12,7 +12,7 @@ from npa_envs.wrappers.base import (
     AnyVectorEnv,
     ParticleRowsBase,
     autoreset_mode,
-    check_same_step,
+    check_autoreset,
     torch_env,
 )
 
@@ -45,7 +45,7 @@ class RslRlParticleEnv(ParticleRowsBase, VecEnv):  # type: ignore[misc]
 
     def __init__(self, env: AnyVectorEnv, *, seed: int | None = None) -> None:
         base = torch_env(env, type(self).__name__)
-        check_same_step(autoreset_mode(env))
+        check_autoreset(autoreset_mode(env), "same-step")
         self.set_env(env, base)
         self.num_actions = base.worlds.physics.action_dim
         self.max_episode_length = base.worlds.episode_steps or 2**31 - 1

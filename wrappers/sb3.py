@@ -20,8 +20,8 @@ from npa_envs.wrappers.base import (
     AnyVectorEnv,
     as_tensor,
     autoreset_mode,
+    check_autoreset,
     check_row_actions,
-    check_same_step,
     own_rewards,
     row_space,
     vector_env,
@@ -273,7 +273,7 @@ class ParticleVecEnv(_EpisodeRows):
 
     def __init__(self, env: AnyVectorEnv, *, bootstrap: bool = True) -> None:
         base = vector_env(env, type(self).__name__)
-        check_same_step(autoreset_mode(env))
+        check_autoreset(autoreset_mode(env), "same-step")
         self.bootstrap = bootstrap
         self.particle_count = base.config.particle_count
         """Particles N of a world."""
@@ -312,7 +312,7 @@ class WorldVecEnv(_EpisodeRows):
     def __init__(self, env: Any) -> None:
         if not hasattr(env, "single_action_space"):
             raise NPAError(f"env must be a vector environment, got {env}: {MAKE_VECTOR}")
-        check_same_step(autoreset_mode(env))
+        check_autoreset(autoreset_mode(env), "same-step")
         super().__init__(
             env, env.num_envs, 1, env.single_observation_space, env.single_action_space
         )
@@ -389,7 +389,7 @@ class SpeciesVecEnv(RowVecEnv):
                 f"env must be a batch of worlds of several species, got {type(env).__name__}: "
                 "make one with npa_envs.envs.multispecies_v0.batched"
             )
-        check_same_step(env.autoreset_mode)
+        check_autoreset(env.autoreset_mode, "same-step")
         self.others = dict(others or {})
         """Policies of species that are not rows."""
         for name, policy in self.others.items():

@@ -45,7 +45,7 @@ class NPATorchRLEnv(EnvBase):  # type: ignore[misc]
 
     def __init__(self, env: AnyVectorEnv, *, rows: bool = False) -> None:
         base = torch_env(env, type(self).__name__)
-        check_autoreset(autoreset_mode(env), "disabled", "leave restarts to TorchRL")
+        check_autoreset(autoreset_mode(env), "disabled")
         worlds, count = base.num_envs, base.config.particle_count
         batch = (worlds, count) if rows else (worlds,)
         super().__init__(device=base.worlds.x.device, batch_size=torch.Size(batch))

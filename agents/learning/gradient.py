@@ -152,7 +152,7 @@ class EnvironmentTask(ParticleTask[Any]):
         self._clamped: tuple[RuleSet, list[ClampedRule]] | None = None
         if not isinstance(task, SpeciesTask):
             return
-        if type(task).settle is not SpeciesTask.settle:
+        if type(task).final_rewards is not SpeciesTask.final_rewards:
             raise NPAError(
                 "a method that follows gradients must have one loss to descend, but in "
                 f"{problem.env_id} species gain rewards at each other's expense: learn by 'ppo' "

@@ -24,7 +24,7 @@ from npa_envs.agents.policies import Interface, spans_of
 from npa_envs.checks import check_positive, is_whole
 from npa_envs.devices import check_device
 from npa_envs.envs.core.config import EnvConfig
-from npa_envs.envs.core.task import Actor, EnvTask
+from npa_envs.envs.core.task import Controls, EnvTask
 from npa_envs.envs.core.vector import NPAVectorEnv, worlds_to_reset
 from npa_envs.envs.multi.base import SpeciesConfig, SpeciesTask
 from npa_envs.envs.multi.tasks import ENVIRONMENTS as SPECIES_TASKS
@@ -130,9 +130,9 @@ class Problem:
         return hash(self.to_json())
 
     @property
-    def actor(self) -> Actor:
+    def actor(self) -> Controls:
         """What acts: "particles", those of several "species", "brushes", or "codes" of a rule."""
-        return self.task_type.actor
+        return self.task_type.controls
 
     @cached_property
     def registered(self) -> Registered:

@@ -203,8 +203,11 @@ def page(registration: Registration) -> str:
     config = task.config_type()
     physics = config.physics(task.space_dim, static=task.static)
     count = config.particle_count
-    form = (task.form_type or ParticleSpaces)(physics, config)
-    spaces = {"Observation space": form.observation_space, "Action space": form.action_space}
+    described = (task.spaces_type or ParticleSpaces)(physics, config)
+    spaces = {
+        "Observation space": described.observation_space,
+        "Action space": described.action_space,
+    }
     letters = {"C": config.state_dim, "D": task.space_dim, "N": count}
     text = resolved_sections(env_class)
     if task.worlds_type is not RuleDrivenWorlds:

@@ -6,6 +6,7 @@ Users give and get NumPy arrays or torch tensors; worlds take float32 tensors.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import gymnasium
@@ -17,6 +18,7 @@ from torch import Tensor
 
 from npa_envs.checks import number_tensor
 from npa_envs.envs.core.config import EnvConfig
+from npa_envs.envs.core.rewards_and_ends import named_terms
 from npa_envs.envs.core.task import EnvTask
 from npa_envs.envs.core.worlds import BatchedWorlds
 from npa_envs.errors import NPAError
@@ -24,7 +26,6 @@ from npa_envs.render import Window, show
 from npa_envs.render.display import side_by_side
 from npa_envs.world.cuda_graph import to_device_async
 from npa_envs.world.environment_steps import Physics
-from npa_envs.world.particles import Particles
 
 SHOWN_ACROSS = 4
 """Worlds in a row of the window, at most; it shows at most as many rows."""
@@ -65,8 +66,8 @@ def batch_tensor(
     action: Any, world_count: int | None, shape: tuple[int, ...], letters: str
 ) -> Tensor:
     """Return checked actions of B worlds, or of one (None), float32, shape [B, *shape]."""
-    wanted, letters = _batch_shape(world_count, shape, letters)
-    checked = action_tensor("action", action, wanted, "env.action_space", letters)
+    expected, letters = _batch_shape(world_count, shape, letters)
+    checked = action_tensor("action", action, expected, "env.action_space", letters)
     return checked[None] if world_count is None else checked
 
 
@@ -74,11 +75,11 @@ def batch_choices(
     action: Any, world_count: int | None, shape: tuple[int, ...], letters: str
 ) -> Tensor:
     """Return checked whole numbers of B worlds, or of one (None), int64, shape [B, *shape]."""
-    wanted, letters = _batch_shape(world_count, shape, letters)
+    expected, letters = _batch_shape(world_count, shape, letters)
     choices = number_tensor("action", action)
-    if tuple(choices.shape) != wanted or choices.is_floating_point():
+    if tuple(choices.shape) != expected or choices.is_floating_point():
         raise NPAError(
-            f"action must be whole numbers of shape {letters}{wanted}, got "
+            f"action must be whole numbers of shape {letters}{expected}, got "
             f"{tuple(choices.shape)} of {choices.dtype}: see env.action_space"
         )
     return choices.long().view(-1, *shape)
@@ -94,10 +95,10 @@ def _batch_shape(
 
 
 def action_tensor(
-    name: str, action: Any, wanted: tuple[int, ...], space: str, letters: str = ""
+    name: str, action: Any, expected: tuple[int, ...], space: str, letters: str = ""
 ) -> Tensor:
     """Return a checked action as a float32 tensor on its own device."""
-    came = ""
+    actual = ""
     if not isinstance(action, Tensor):
         try:
             array = np.asanyarray(action)
@@ -106,15 +107,15 @@ def action_tensor(
             # Torch needs writable arrays.
             action = torch.from_numpy(np.require(array, np.float32, ("C", "W")))
         except (TypeError, ValueError, OverflowError):
-            came = type(action).__name__
-            came += f" of {action.dtype}" if isinstance(action, np.ndarray) else ""
-    if not came and (tuple(action.shape) != wanted or action.dtype.is_complex):
-        came = f"{tuple(action.shape)} of {action.dtype}"
-    elif not came and (action.layout != torch.strided or action.is_meta):
-        came = f"a tensor that is {action.layout} on {action.device}"
-    if came:
+            actual = type(action).__name__
+            actual += f" of {action.dtype}" if isinstance(action, np.ndarray) else ""
+    if not actual and (tuple(action.shape) != expected or action.dtype.is_complex):
+        actual = f"{tuple(action.shape)} of {action.dtype}"
+    elif not actual and (action.layout != torch.strided or action.is_meta):
+        actual = f"a tensor that is {action.layout} on {action.device}"
+    if actual:
         raise NPAError(
-            f"{name} must be real numbers of shape {letters}{wanted}, got {came}: see {space}"
+            f"{name} must be real numbers of shape {letters}{expected}, got {actual}: see {space}"
         )
     checked: Tensor = action.detach().to(torch.float32)
     return checked
@@ -196,33 +197,32 @@ class WorldsEnv(ShownEnv):
         worlds_type = self.task_type.worlds_type or BatchedWorlds
         self.worlds = worlds_type(self.task_type, self.config, world_count, steps)
         self.task = self.worlds.task
-        form_type = self.task_type.form_type or ParticleSpaces
-        self.form: ParticleSpaces = form_type(self.worlds.physics, self.config)
+        spaces_type = self.task_type.spaces_type or ParticleSpaces
+        self.spaces: ParticleSpaces = spaces_type(self.worlds.physics, self.config)
 
-    def _begin(self, worlds: Tensor, keys: Tensor | None, out: Tensor | None = None) -> Tensor:
-        """Start the next episodes of M worlds, or those of `keys`; return all B observations."""
+    def _change_worlds(
+        self, change: Callable[..., Any], worlds: Tensor, values: Any, buffer: Tensor | None = None
+    ) -> Tensor:
+        """Call `start` or `place` of the worlds for M of them, by their indices, int64, [M].
+
+        Returns:
+            New observations of all B worlds, written to `buffer` if it is given, shape [B, ...].
+        """
         with self.worlds.device_context():
-            self.worlds.start(worlds, keys)
-            observation: Tensor = self.worlds.perceive(out)
+            change(worlds, values)
+            observation: Tensor = self.worlds.perceive(buffer)
         self._started = True
         self._show()
         return observation
 
-    def _place(self, particles: Particles, worlds: Tensor, out: Tensor | None = None) -> Tensor:
-        """Replace particles in worlds of indices [M]; return all worlds' observations, [B, ...]."""
-        with self.worlds.device_context():
-            self.worlds.place(worlds, particles)
-            observation: Tensor = self.worlds.perceive(out)
-        self._show()
-        return observation
-
     def losses_of(self, numbers: Any) -> dict[str, Any]:
-        """Return the loss and its parts by their names in infos, from the rows of a report."""
-        return dict(zip(self.worlds.loss_names, numbers[1:], strict=False))
+        """Return the loss and its terms by their names in infos, from the rows of a report."""
+        names = self.worlds.term_names
+        return {"loss": numbers[1]} | named_terms("loss", names, numbers[2 : 2 + len(names)])
 
     def _improvements(self, numbers: Any) -> dict[str, Any]:
-        names = self.worlds.improvement_names
-        return dict(zip(names, numbers[len(numbers) - len(names) :], strict=True))
+        names = self.worlds.term_names
+        return named_terms("reward", names, numbers[2 + len(names) :])
 
     def _show(self) -> None:
         self._show_in_window(self.spec.id if self.spec is not None else type(self).__name__)

@@ -241,14 +241,15 @@ class EnvConfig(WorldConfig):
     reward: Reward = "dense"
     """"dense": each step's improvement of the loss; "sparse": minus the loss at the episode's end;
     "particle" and "marginal": as dense, with each particle's reward in `info["particle_reward"]`:
-    the fall of its own loss, or the contribution of its action to the fall of the world's loss."""
+    the decrease of its own loss, or what its action contributed to the decrease of the world's."""
 
     tell_updated: bool = False
     """Report in `info["updated"]` which particles the step updated. The others ignored their
     action, so learners can mask their likelihoods."""
 
-    episode_steps: int = 256
-    """Length of an episode where reward is "sparse" and there is no `max_episode_steps`."""
+    episode_steps: int | None = None
+    """Steps after which the environment itself truncates an episode; None: never. Needed where
+    reward is "sparse", except by `make_vec`, which has `max_episode_steps`."""
 
     success_loss: float | None = None
     """The episode ends in success once the loss is at most this; None: as the task decides."""
@@ -259,7 +260,8 @@ class EnvConfig(WorldConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_positive(self, int, "episode_steps")
+        if self.episode_steps is not None:
+            check_positive(self, int, "episode_steps")
         check_flag(self, "tell_updated")
         check_positive(self, int, "seed_pool", at_least=0)
         if self.success_loss is not None:
@@ -282,17 +284,6 @@ class EnvConfig(WorldConfig):
     def per_particle_reward(self) -> bool:
         """Whether `info` has a reward for each particle."""
         return self.reward in ("particle", "marginal")
-
-    @classmethod
-    def from_keywords(cls, keywords: dict[str, Any]) -> Self:
-        """As `WorldConfig.from_keywords`; refuses `episode_steps` where it would do nothing."""
-        config = super().from_keywords(keywords)
-        if "episode_steps" in keywords and config.reward != "sparse":
-            raise NPAError(
-                "episode_steps serves reward='sparse' alone: for longer or shorter episodes give "
-                "max_episode_steps"
-            )
-        return config
 
 
 def check_picture_size(config: Any) -> None:

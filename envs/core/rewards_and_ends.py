@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -11,7 +12,7 @@ from torch import Tensor
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.task import EnvTask, Start, check_finite, checked_losses, checked_tensor
 from npa_envs.envs.core.world_state import WorldState
-from npa_envs.errors import shown
+from npa_envs.errors import NPAError, shown
 from npa_envs.world.cuda_graph import makes_plain_tensors, pinned_like
 from npa_envs.world.environment_steps import (
     DIVERGED,
@@ -30,15 +31,17 @@ FLAG_ROWS = 2 + len(FLAGS) + 1
 """Rows of flags in a report: terminated, truncated, `FLAGS`, and one that is always True."""
 
 
-def total(parts: Tensor) -> Tensor:
-    """Return the sum of the parts of a loss, [K, B], one after the other.
+def total(terms: Tensor) -> Tensor:
+    """Return the sum of the terms of a loss, [K, B], one after the other.
 
     `torch.sum` may add in another order, which depends on the number of worlds.
     """
-    first, *rest = parts.unbind()
-    for part in rest:
-        first = first + part
-    return first
+    return functools.reduce(torch.add, terms.unbind())
+
+
+def named_terms(prefix: str, names: tuple[str, ...], rows: Any) -> dict[str, Any]:
+    """Return the terms of a loss, or their decreases, by their names in infos."""
+    return {f"{prefix}_{name}": row for name, row in zip(names, rows, strict=True)}
 
 
 def reason(ending: int) -> str | None:
@@ -53,19 +56,19 @@ class StepReport(NamedTuple):
     buffer: Tensor
     """The memory of the fields below, uint8."""
     numbers: Tensor
-    """Reward, loss, its K parts, and each part's decrease in the last step, shape [2 + 2 K, B]."""
+    """Reward, loss, its K terms, and each term's decrease in the last step, shape [2 + 2 K, B]."""
     endings: Tensor
     """Terminated, truncated, success, diverged, bool, shape [4, B]."""
-    everyone: Tensor
+    all_worlds: Tensor
     """True for every world, bool, shape [B]: the mask of infos that all worlds have."""
 
     @classmethod
-    def empty(cls, world_count: int, part_count: int, device: torch.device) -> StepReport:
-        """Return a report of zeros, of B worlds whose loss has K parts."""
-        rows = 4 * (2 + 2 * part_count) + FLAG_ROWS
+    def empty(cls, world_count: int, term_count: int, device: torch.device) -> StepReport:
+        """Return a report of zeros, of B worlds whose loss has K terms."""
+        rows = 4 * (2 + 2 * term_count) + FLAG_ROWS
         buffer = torch.zeros(rows * world_count, dtype=torch.uint8, device=device)
         report = cls.from_buffer(buffer, world_count)
-        report.everyone.fill_(True)
+        report.all_worlds.fill_(True)
         return report
 
     @classmethod
@@ -78,11 +81,11 @@ class StepReport(NamedTuple):
 
     def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
         # Unpickled views would not share the buffer's memory.
-        return StepReport.from_buffer, (self.buffer, len(self.everyone))
+        return StepReport.from_buffer, (self.buffer, len(self.all_worlds))
 
     def copy(self) -> StepReport:
         """Return a copy that later steps do not overwrite."""
-        return self.from_buffer(self.buffer.clone(), len(self.everyone))
+        return self.from_buffer(self.buffer.clone(), len(self.all_worlds))
 
     @property
     def reward(self) -> Tensor:
@@ -95,13 +98,13 @@ class StepReport(NamedTuple):
         return self.numbers[1]
 
     @property
-    def parts(self) -> Tensor:
-        """The parts of each loss, shape [K, B]."""
+    def terms(self) -> Tensor:
+        """The terms of each loss, shape [K, B]."""
         return self.numbers[2 : 1 + len(self.numbers) // 2]
 
     @property
     def improvements(self) -> Tensor:
-        """Decrease of each part of the loss in the last step, shape [K, B]."""
+        """Decrease of each term of the loss in the last step, shape [K, B]."""
         return self.numbers[1 + len(self.numbers) // 2 :]
 
 
@@ -154,8 +157,15 @@ class RewardedWorlds(WorldState):
         extra, count = task_type.extra_bytes(config, world_count), config.particle_count
         super().__init__(config, task_type, world_count, count, extra)
         self.task: Any = task_type(config, self.device)
-        self.episode_steps = episode_steps
+        limits = [steps for steps in (episode_steps, config.episode_steps) if steps is not None]
+        self.episode_steps = min(limits, default=None)
         """Steps after which an episode is truncated; None: never."""
+        if self.rewards_last_step_only and self.episode_steps is None:
+            raise NPAError(
+                "episode_steps must be given where reward='sparse' comes in the last step, got "
+                "None: for example episode_steps=64, and the same number as max_episode_steps of "
+                "gymnasium.make"
+            )
 
         def zeros(dtype: torch.dtype = torch.float32) -> Tensor:
             return torch.zeros(world_count, dtype=dtype, device=self.device)
@@ -177,12 +187,8 @@ class RewardedWorlds(WorldState):
         """1 where a position or state of the world left its bounds in the last step, shape [B]."""
         self.enabled = torch.ones(1, dtype=torch.uint8, device=self.device)
         """0 if the last actions were not finite and so not applied, shape [1]."""
-        self.part_names: tuple[str, ...] = ()
-        """Names of the parts of the loss, known once worlds have been placed."""
-        self.loss_names: tuple[str, ...] = ()
-        """Names in `info` of the loss and its parts."""
-        self.improvement_names: tuple[str, ...] = ()
-        """Names in `info` of how much each part fell."""
+        self.term_names: tuple[str, ...] = ()
+        """Names of the terms of the loss, known once worlds have been placed."""
         self.report = StepReport.empty(world_count, 0, self.device)
         """What a step returns apart from the observation."""
         # Each world's ending, then whether the actions were finite.
@@ -231,18 +237,16 @@ class RewardedWorlds(WorldState):
         Worlds keep their goals if `placed` has none.
         """
         task, goal = self.task, placed.goal
-        placed = Particles(placed.x.contiguous(), placed.s.contiguous())
+        placed = placed._replace(goal=None).map(Tensor.contiguous)
         if self.goal_task is not task:
             goal = self.goal[worlds] if goal is None else goal
             self.goal.index_copy_(0, worlds, goal)
             task = task.toward(goal)
-        parts = task.losses(placed.x, placed.s)
-        values = torch.stack(checked_losses(task, parts, len(placed.x), self.part_names))
-        if not self.part_names:
-            self.part_names = tuple(parts)
-            self.loss_names = ("loss", *(f"loss_{name}" for name in parts))
-            self.improvement_names = tuple(f"reward_{name}" for name in parts)
-            self.report = StepReport.empty(self.world_count, len(parts), self.device)
+        terms = task.losses(placed.x, placed.s)
+        values = torch.stack(checked_losses(task, terms, len(placed.x), self.term_names))
+        if not self.term_names:
+            self.term_names = tuple(terms)
+            self.report = StepReport.empty(self.world_count, len(terms), self.device)
             self._make_host_copies()
         self.particles.put_(worlds, placed)
         zeros = torch.zeros_like(values)
@@ -256,14 +260,14 @@ class RewardedWorlds(WorldState):
         """Write rewards, losses and endings for the current particles into `report`."""
         task, particle_rewards = self.goal_task, self.particle_rewards
         losses = task.losses(self.x, self.s)
-        parts = torch.stack(checked_losses(task, losses, len(self.x), self.part_names))
+        terms = torch.stack(checked_losses(task, losses, len(self.x), self.term_names))
         if self._evaluation is None:
             self._evaluation = self._make_evaluation()
         if particle_rewards is None:
-            self._evaluation(parts)
+            self._evaluation(terms)
         else:
             gains = particle_rewards.gains(task, self.particles)
-            self._evaluation(parts, (~torch.isfinite(gains).all(dim=1)).byte())
+            self._evaluation(terms, (~torch.isfinite(gains).all(dim=1)).byte())
             reward = self.report.reward
             if task.config.reward == "marginal":
                 gains = with_mean_reward(gains, reward)
@@ -272,20 +276,25 @@ class RewardedWorlds(WorldState):
             gains = torch.where(by_world[:, None], reward[:, None], gains)
             gains = torch.where(self.enabled.bool(), gains, particle_rewards.reward)
             particle_rewards.reward.copy_(gains)
-        self.settle_rewards()
+        rewards = self.task_rewards()
+        if rewards is not None:
+            if self.rewards_last_step_only:
+                terminated, truncated = self.report.endings[:2]
+                rewards = torch.where(terminated | truncated, rewards, 0.0)
+            self.report.reward.copy_(rewards)
         if self.x.is_cuda:
             self.host_endings.copy_(self._endings, non_blocking=True)
             if self.world_count == 1:
                 self.host_numbers.copy_(self.report.numbers, non_blocking=True)
         self.enabled.fill_(1)
 
-    def settle_rewards(self) -> None:
-        """Overwrite `report.reward` where rewards are not the fall of the loss; by default none."""
+    def task_rewards(self) -> Tensor | None:
+        """Return the rewards of a step, [B], where they are no decrease of the loss, else None."""
+        return None
 
     def _make_evaluation(self) -> EpisodeUpdate:
         config = self.task.config
-        sparse = config.reward == "sparse"
-        rewarded_step = (self.episode_steps or config.episode_steps) if sparse else None
+        rewarded_step = self.episode_steps if self.rewards_last_step_only else None
         return EpisodeUpdate(
             EpisodeRules(self.episode_steps, rewarded_step, config.on_divergence),
             enabled=self.enabled,
@@ -300,8 +309,8 @@ class RewardedWorlds(WorldState):
 
     def check_losses(self, worlds: Tensor) -> None:
         """Check that the losses of some worlds, int64, shape [M], are finite."""
-        parts = zip(self.part_names, self.report.parts[:, worlds], strict=True)
-        check_finite(self.task, "losses", {f"part {shown(name)}": part for name, part in parts})
+        terms = zip(self.term_names, self.report.terms[:, worlds], strict=True)
+        check_finite(self.task, "losses", {f"term {shown(name)}": term for name, term in terms})
         if self.particle_rewards is not None and self.particle_rewards.loss is not None:
             losses = self.particle_rewards.loss[worlds]
             check_finite(self.task, "particle_losses", {"losses": losses})

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import sys
 import warnings
 from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
 import torch
-from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
 from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.checks import number_tensor
 from npa_envs.envs.core.base import WorldsEnv
+from npa_envs.envs.core.config import plain
 from npa_envs.envs.core.rewards_and_ends import reason
-from npa_envs.envs.core.vector import check_options, plain_seed, rng_keys
+from npa_envs.envs.core.vector import check_options, rng_keys
 from npa_envs.errors import NPAError
 from npa_envs.world.environment_steps import DIVERGED, SUCCESS, TIME_LIMIT
 
@@ -33,20 +32,20 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
     | `reward` | Reward of step t |
     |---|---|
     | `"dense"` | L before the step minus L after it |
-    | `"sparse"` | 0, and minus L in the last step, also where that is a time limit |
-    | `"particle"` | as dense; `info["particle_reward"]` is the fall of each particle's loss |
+    | `"sparse"` | 0, and minus L in the last step; needs `episode_steps`, see below |
+    | `"particle"` | as dense; `info["particle_reward"]` is the decrease of each particle's loss |
     | `"marginal"` | as dense; `info["particle_reward"]` is each action's contribution |
 
-    Dense rewards telescope: their sum over an episode is L at its start minus L at its end. The
-    mean of all particles' rewards is the dense reward, up to rounding, as long as the episode
-    lasts. In a step that diverges, L counts as at least its value at the start, so that diverging
-    is never rewarded; the parts in `info` are not changed by this.
+    Dense rewards of an episode sum to L at its start minus L at its end. The mean of all particles'
+    rewards is the dense reward, up to rounding, as long as the episode lasts. In a step that
+    diverges, L counts as at least its value at the start, so that diverging is never rewarded; the
+    terms in `info` are not changed by this.
 
     With `"marginal"` a particle's reward is −N times its change in the step, times the gradient of
-    L in the middle of the step: to second order, N times what its action contributed to the fall
-    of L, averaged over being the first and the last to act. The remainder of the dense reward is
-    spread equally. So a particle is rewarded for its own action alone; with `"particle"` it is also
-    rewarded for what the actions of others do to its pixels.
+    L in the middle of the step: to second order, N times what its action contributed to the
+    decrease of L, averaged over being the first and the last to act. The remainder of the dense
+    reward is spread equally. So a particle is rewarded for its own action alone; with `"particle"`
+    it is also rewarded for what the actions of others do to its pixels.
 
     ## Starting state
 
@@ -58,12 +57,12 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
     | Cause | Returned as | `info["reason"]` |
     |---|---|---|
     | the loss is at most `success_loss` | terminated | `"success"` |
-    | a particle has left the world, or its state has run away | terminated | `"diverged"` |
-    | `max_episode_steps` steps are done | truncated | `"time limit"` |
+    | a particle has left the world, or its state has diverged | terminated | `"diverged"` |
+    | `episode_steps` or, of a vector, `max_episode_steps` are done | truncated | `"time limit"` |
 
-    A particle has left the world if a coordinate is beyond ±`position_limit`. Its state has run
-    away if a channel is beyond ±`observation_limit`. Where another library limits the steps,
-    `reward="sparse"` needs their number as `episode_steps`.
+    A particle has left the world if a coordinate is beyond ±`position_limit`. Its state has
+    diverged if a channel is beyond ±`observation_limit`. `max_episode_steps` of `gym.make` gives no
+    reason, and `reward="sparse"` needs its number as `episode_steps` as well.
 
     ## Info
 
@@ -122,17 +121,16 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
 
     def __init__(self, **keywords: Any) -> None:
         self._make_worlds(keywords, 1, None)
-        self.observation_space = self.form.observation_space
-        self.action_space = self.form.action_space
+        self.observation_space = self.spaces.observation_space
+        self.action_space = self.spaces.action_space
         self._world = torch.zeros(1, dtype=torch.int64, device=self.task.device)
         self._keyed_from: np.random.Generator | None = None
-        self._unrewarded_steps = 0
-        self._warned = False
+        self._is_unrewarded = False
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Start an episode; return the observation, shape [N, P], and the loss with its parts.
+        """Start an episode; return the observation, shape [N, P], and the loss with its terms.
 
         A seed begins its sequence of episodes; None starts the next episode of the current
         sequence. There are no options.
@@ -141,19 +139,25 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
             gymnasium.error.Error: The seed is no integer of at least 0.
             NPAError: An option is given.
         """
-        seed = plain_seed(seed)
+        seed = plain(seed)
         check_options(options, ())
         super().reset(seed=seed)
-        self._warn_of_missing_rewards()
-        self.worlds.limit_steps(_step_limit(self))
+        if self._is_unrewarded:
+            warnings.warn(
+                "an episode ended before its sparse reward, which comes in step episode_steps="
+                f"{self.config.episode_steps}: give that number to gymnasium.make as "
+                "max_episode_steps as well",
+                stacklevel=2,
+            )
+        self._is_unrewarded = False
         # A new generator, by `seed` or because the caller set `np_random`, begins a new sequence.
         keys = None
         if seed is not None or self.np_random is not self._keyed_from:
             self._keyed_from = self.np_random
             keys = rng_keys(None, 1, self.np_random)
-        observation = self._begin(self._world, keys)
+        observation = self._change_worlds(self.worlds.start, self._world, keys)
         info = self.losses_of(self.worlds.report.numbers[:, 0].tolist())
-        return self.form.returned(observation[0]), info | self._extra_info()
+        return self.spaces.returned(observation[0]), info | self._extra_info()
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Apply an action, shape [N, A], in [-1, 1].
@@ -169,8 +173,8 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
         """
         if not self._started:
             raise NPAError("step needs a world: call reset first")
-        worlds, config = self.worlds, self.config
-        checked = self.form.action(action, None)
+        worlds = self.worlds
+        checked = self.spaces.action(action, None)
         with worlds.device_context():
             endings, observation = worlds.step(checked)
             diverged = bool(endings[0] & DIVERGED)
@@ -182,12 +186,9 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
         if terminated or truncated:
             info["reason"] = reason(ending)
         info |= self._extra_info() | self._of_world(worlds.step_info())
-        if worlds.rewards_last_step_only:
-            last = int(worlds.elapsed[0]) == config.episode_steps
-            rewarded = terminated or truncated or last
-            self._unrewarded_steps = 0 if rewarded else self._unrewarded_steps + 1
+        self._is_unrewarded = worlds.rewards_last_step_only and not (terminated or truncated)
         self._show()
-        returned = self.form.returned(worlds.host_observation(observation)[0])
+        returned = self.spaces.returned(worlds.host_observation(observation)[0])
         return returned, numbers[0], terminated, truncated, info
 
     def render(self) -> NDArray[np.uint8] | None:
@@ -215,7 +216,8 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
             raise NPAError("particles need a world: call reset first")
         x, s = number_tensor("x", x)[None], number_tensor("s", s)[None]
         placed = self.worlds.checked_particles(x, s, 1, self.config.particle_count)
-        return self.form.returned(self._place(placed, self._world)[0])
+        observation = self._change_worlds(self.worlds.place, self._world, placed)
+        return self.spaces.returned(observation[0])
 
     def _extra_info(self) -> dict[str, Any]:
         """Return the entries of infos that the task adds in every call."""
@@ -226,36 +228,3 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
             name: self._out(value[0].clone()) if value.ndim > 1 else value[0].item()
             for name, value in values.items()
         }
-
-    def _warn_of_missing_rewards(self) -> None:
-        """Warn once if an episode was ended by a limit that the environment does not know of."""
-        if self._unrewarded_steps > 0 and not self._warned:
-            self._warned = True
-            warnings.warn(
-                f"an episode ended {self._unrewarded_steps} steps after the last sparse reward, "
-                f"which comes at step episode_steps={self.config.episode_steps}: give the number "
-                "of steps as max_episode_steps to gymnasium.make, or as episode_steps as well",
-                stacklevel=3,
-            )
-        self._unrewarded_steps = 0
-
-
-def _step_limit(env: NPAEnv) -> int | None:
-    """Return the limit of the `TimeLimit` wrappers around an environment, or None.
-
-    They are found among the callers of `reset`. Limits around other wrappers, which may take
-    several steps at once, do not count.
-    """
-    # Gymnasium refuses registered wrappers, which would know the limit, with a vector entry point.
-    limits, frame = [], sys._getframe(1).f_back
-    inner: gymnasium.Env[Any, Any] = env
-    while frame is not None:
-        caller = frame.f_locals.get("self")
-        if isinstance(caller, gymnasium.Wrapper) and caller.env is inner:
-            inner = caller
-            if isinstance(caller, TimeLimit):
-                limits.append(caller._max_episode_steps)
-            elif not isinstance(caller, OrderEnforcing | PassiveEnvChecker):
-                break
-        frame = frame.f_back
-    return min(limits, default=None)

@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 AnyConfig = TypeVar("AnyConfig", bound=WorldConfig)
 Config = TypeVar("Config", bound=EnvConfig)
 
-Actor = Literal["particles", "species", "brushes", "codes"]
-"""What an environment's actions are of."""
+Controls = Literal["particles", "species", "brushes", "codes"]
+"""What the actions of an environment control."""
 
 SHARPNESS = 0.7
 """Standard deviation of a particle's Gaussian in pictures, in distances between particles."""
@@ -59,8 +59,8 @@ class WorldTask(Generic[AnyConfig]):
     config_type: ClassVar[type[WorldConfig]] = WorldConfig
     """The configuration's class: its fields are the environment's keywords."""
 
-    actor: ClassVar[Actor] = "particles"
-    """What the actions are of."""
+    controls: ClassVar[Controls] = "particles"
+    """What actions control."""
 
     space_dim: ClassVar[int] = 2
     """Space dimension D."""
@@ -123,7 +123,7 @@ class EnvTask(WorldTask[Config]):
     """Class that steps and observes the worlds; None: `BatchedWorlds`, particles act and perceive.
     Tasks whose particles a rule moves take `RuleDrivenWorlds`."""
 
-    form_type: ClassVar[type[ParticleSpaces] | None] = None
+    spaces_type: ClassVar[type[ParticleSpaces] | None] = None
     """Class of the spaces; None: `ParticleSpaces`, a row for each particle."""
 
     grows: ClassVar[bool] = False
@@ -175,7 +175,7 @@ class EnvTask(WorldTask[Config]):
         return self
 
     def losses(self, x: Tensor, s: Tensor) -> Mapping[str, Tensor]:
-        """Return the named parts of each world's loss, shape [B] each; their sum is the loss."""
+        """Return the terms of each world's loss by name, shape [B] each; their sum is the loss."""
         raise NotImplementedError
 
     def extra_info(self, s: Tensor) -> dict[str, Tensor]:
@@ -194,7 +194,7 @@ class EnvTask(WorldTask[Config]):
         )
 
     def particle_gains(self, before: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor]) -> Tensor:
-        """Return N times what each particle's action contributed to the fall of the loss, [B, N].
+        """Return N times what each particle's action contributed to the loss's decrease, [B, N].
 
         `before` and `after` are positions and states around a step. The default estimates it from
         the gradient of `losses` by `marginal_gains`.
@@ -266,9 +266,10 @@ class EnvTask(WorldTask[Config]):
         style = self.config.render_style
         if self.space_dim == 2:
             return self.draw_particles(particles, style)
-        worlds = zip(torch.split(particles.x, 1), torch.split(particles.s, 1), steps, strict=True)
+        indices = torch.split(torch.arange(len(steps), device=self.device), 1)
         pictures = [
-            self.draw_particles(Particles(x, s), style, TURN * float(step)) for x, s, step in worlds
+            self.draw_particles(particles.take(world), style, TURN * float(step))
+            for world, step in zip(indices, steps, strict=True)
         ]
         return np.concatenate(pictures)
 
@@ -344,42 +345,42 @@ def check_start(task: EnvTask[Any], start: Start, world_count: int, shapes: Any)
             f"{type(task).__name__}.{name} must return a Start, got a {type(start).__name__}: "
             "return npa_envs.envs.Start(x, s)"
         )
-    for part, value, shape in zip(("positions", "states"), start, shapes, strict=False):
-        checked_tensor(task, name, part, value, (world_count, *shape[1:]))
-    for part, value, dtype in (
+    for field, value, shape in zip(("positions", "states"), start, shapes, strict=False):
+        checked_tensor(task, name, field, value, (world_count, *shape[1:]))
+    for field, value, dtype in (
         ("success_loss", start.success_loss, torch.float32),
         ("goal", start.goal, torch.int64),
     ):
         if value is not None:
-            checked_tensor(task, name, part, value, (world_count,), dtype)
+            checked_tensor(task, name, field, value, (world_count,), dtype)
 
 
 def checked_losses(
     task: EnvTask[Any], losses: Any, world_count: int, names: tuple[str, ...]
 ) -> list[Tensor]:
-    """Return the checked parts of worlds' losses, shape [B] each, without synchronising."""
+    """Return the checked terms of worlds' losses, shape [B] each, without synchronising."""
     name = f"{type(task).__name__}.losses"
     if not isinstance(losses, Mapping) or not losses or not all(type(n) is str for n in losses):
-        came = list(losses) if isinstance(losses, Mapping) else type(losses).__name__
+        actual = list(losses) if isinstance(losses, Mapping) else type(losses).__name__
         raise NPAError(
-            f"{name} must return the parts of each world's loss by name, at least one, got {came}: "
-            "for example {'distance': distance}, of shape [B]"
+            f"{name} must return the terms of each world's loss by name, at least one, got "
+            f"{actual}: for example {{'distance': distance}}, of shape [B]"
         )
     if names and tuple(losses) != names:
         raise NPAError(
-            f"{name} must return the same parts in the same order in each call, got "
-            f"{list(losses)} after {list(names)}: return zeros for a part that does not count"
+            f"{name} must return the same terms in the same order in each call, got "
+            f"{list(losses)} after {list(names)}: return zeros for a term that does not count"
         )
     return [
-        checked_tensor(task, "losses", f"part {shown(part)}", value, (world_count,))
-        for part, value in losses.items()
+        checked_tensor(task, "losses", f"term {shown(term)}", value, (world_count,))
+        for term, value in losses.items()
     ]
 
 
 def checked_tensor(
     task: EnvTask[Any],
     method: str,
-    part: str,
+    field: str,
     value: Any,
     shape: tuple[int, ...],
     dtype: torch.dtype = torch.float32,
@@ -387,25 +388,25 @@ def checked_tensor(
     """Return a tensor that a method of a task returned, if it has this shape and type."""
     device = task.device
     if not isinstance(value, Tensor):
-        came = f"a {type(value).__name__}"
+        actual = f"a {type(value).__name__}"
     elif tuple(value.shape) != shape or value.dtype != dtype or value.device.type != device.type:
-        came = f"{value.dtype} of shape {tuple(value.shape)} on {value.device}"
+        actual = f"{value.dtype} of shape {tuple(value.shape)} on {value.device}"
     else:
         return value
     raise NPAError(
-        f"{part} of {type(task).__name__}.{method} must be a {dtype} tensor of shape {shape} on "
-        f"{device}, got {came}: reshape or convert it there"
+        f"{field} of {type(task).__name__}.{method} must be a {dtype} tensor of shape {shape} on "
+        f"{device}, got {actual}: reshape or convert it there"
     )
 
 
-def check_finite(task: EnvTask[Any], method: str, parts: Mapping[str, Tensor]) -> None:
+def check_finite(task: EnvTask[Any], method: str, values: Mapping[str, Tensor]) -> None:
     """Check that tensors with one row for each world are finite; synchronises."""
-    for part, value in parts.items():
+    for field, value in values.items():
         bad = ~torch.isfinite(value.flatten(1) if value.ndim > 1 else value[:, None]).all(dim=1)
         if bool(bad.any()):
             worlds = bad.nonzero()[:, 0].tolist()
             raise NPAError(
-                f"{part} of {type(task).__name__}.{method} must be finite, got NaN or infinite "
+                f"{field} of {type(task).__name__}.{method} must be finite, got NaN or infinite "
                 f"numbers in {len(worlds)} of {len(bad)} worlds, first in world {worlds[0]}: "
                 "divide and take roots of positive numbers only"
             )

@@ -15,8 +15,9 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.checks import is_whole, number_tensor
+from npa_envs.checks import check_count, number_tensor
 from npa_envs.envs.core.base import WorldsEnv
+from npa_envs.envs.core.config import plain
 from npa_envs.envs.core.rewards_and_ends import FLAGS, StepReport, reason
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.world.cuda_graph import to_device_async
@@ -30,7 +31,21 @@ REASONS = np.array([reason(ending) for ending in range(2 * TIME_LIMIT)], dtype=o
 """`info["reason"]` for each combination of the flags of an ending."""
 
 
-class NPAVectorEnv(WorldsEnv, VectorEnv[Any, Any, Any]):
+class BatchedSpaces(VectorEnv[Any, Any, Any]):
+    """Base class of vector environments that make their large spaces at the first use."""
+
+    @cached_property
+    def observation_space(self) -> Space[Any]:  # type: ignore[override]
+        """Space of all observations, [B, ...]."""
+        return batch_space(self.single_observation_space, self.num_envs)
+
+    @cached_property
+    def action_space(self) -> Space[Any]:  # type: ignore[override]
+        """Space of all actions, [B, ...]."""
+        return batch_space(self.single_action_space, self.num_envs)
+
+
+class NPAVectorEnv(WorldsEnv, BatchedSpaces):
     """B worlds of a task, stepped together; subclasses set `task_type`.
 
     World k, reset with `seed`, is the single environment reset with `seed + k`, bit for bit.
@@ -66,30 +81,18 @@ class NPAVectorEnv(WorldsEnv, VectorEnv[Any, Any, Any]):
     ) -> None:
         num_envs = checked_count("num_envs", num_envs)
         # Gymnasium takes -1 for no limit.
-        if max_episode_steps is not None and max_episode_steps != -1:
-            episode_steps = checked_count("max_episode_steps", max_episode_steps)
-        else:
-            episode_steps = None
+        is_limited = max_episode_steps is not None and max_episode_steps != -1
+        steps = checked_count("max_episode_steps", max_episode_steps) if is_limited else None
         self.autoreset_mode = checked_mode(autoreset_mode)
         self.metadata = {**type(self).metadata, "autoreset_mode": self.autoreset_mode}
         self.num_envs = num_envs
-        self._make_worlds(keywords, num_envs, episode_steps)
-        self.single_observation_space = self.form.observation_space
-        self.single_action_space = self.form.action_space
+        self._make_worlds(keywords, num_envs, steps)
+        self.single_observation_space = self.spaces.observation_space
+        self.single_action_space = self.spaces.action_space
         self.copies = copy
         """Whether returned arrays are new, and not overwritten by the next step."""
         self._buffer: Tensor | None = None
         self._ended = np.zeros(num_envs, dtype=bool)
-
-    @cached_property
-    def observation_space(self) -> Space[Any]:  # type: ignore[override]
-        """Space of all worlds' observations, [B, N, P]; large, so made at the first use."""
-        return batch_space(self.single_observation_space, self.num_envs)
-
-    @cached_property
-    def action_space(self) -> Space[Any]:  # type: ignore[override]
-        """Space of all worlds' actions, [B, N, A]; large, so made at the first use."""
-        return batch_space(self.single_action_space, self.num_envs)
 
     def reset(
         self,
@@ -97,7 +100,7 @@ class NPAVectorEnv(WorldsEnv, VectorEnv[Any, Any, Any]):
         seed: int | Sequence[int] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[Any, dict[str, Any]]:
-        """Start episodes; return all observations, [B, N, P], and the losses with their parts.
+        """Start episodes; return all observations, [B, N, P], and the losses with their terms.
 
         Args:
             seed: World k begins the sequence of episodes of seed + k, or of the k-th seed of a
@@ -108,14 +111,14 @@ class NPAVectorEnv(WorldsEnv, VectorEnv[Any, Any, Any]):
         Raises:
             NPAError: The mask or the seeds have a wrong shape.
         """
-        seed = plain_seed(seed)
+        seed = plain(seed)
         super().reset(seed=seed if isinstance(seed, int) else None)
         chosen = worlds_to_reset(options, self.num_envs, started=self._started)
         keys = None
         if seed is not None or not self._started:
             keys = rng_keys(seed, self.num_envs, self.np_random)[chosen]
         worlds = torch.from_numpy(chosen).to(self.task.device)
-        observation = self._begin(worlds, keys, self._buffer)
+        observation = self._change_worlds(self.worlds.start, worlds, keys, self._buffer)
         if not self.copies:
             self._buffer = observation
         self._ended[chosen] = False
@@ -124,7 +127,7 @@ class NPAVectorEnv(WorldsEnv, VectorEnv[Any, Any, Any]):
         losses = self.losses_of(self._report_rows(self.worlds.report.copy()))
         extra = self._returned_values(self.worlds.extra_info())
         infos = masked(losses, self._mask(which)) | masked(extra, self._mask(which))
-        return self.form.returned(observation), infos
+        return self.spaces.returned(observation), infos
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Apply actions, shape [B, N, A], in [-1, 1]; errors are those of `NPAEnv.step`.
@@ -134,7 +137,7 @@ class NPAVectorEnv(WorldsEnv, VectorEnv[Any, Any, Any]):
         """
         if not self._started:
             raise NPAError("step needs worlds: call reset first")
-        action = self.form.action(actions, self.num_envs)
+        action = self.spaces.action(actions, self.num_envs)
         with self.worlds.device_context():
             return self._step(action)
 
@@ -172,7 +175,7 @@ class NPAVectorEnv(WorldsEnv, VectorEnv[Any, Any, Any]):
             self.worlds.restart(np.flatnonzero(ended), observation)
             _, _, infos = self._report(~ended, copy=self.copies)
             infos |= {
-                "final_obs": self.form.returned_final(final_observation, ended),
+                "final_obs": self.spaces.returned_final(final_observation, ended),
                 "_final_obs": which,
             }
             infos |= {"final_info": final_infos, "_final_info": self._mask(ended)}
@@ -181,7 +184,7 @@ class NPAVectorEnv(WorldsEnv, VectorEnv[Any, Any, Any]):
             if ended.any():
                 infos |= {"reason": REASONS[endings], "_reason": self._mask(ended)}
         self._show()
-        return self.form.returned(observation), rows[0], flags[0], flags[1], infos
+        return self.spaces.returned(observation), rows[0], flags[0], flags[1], infos
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Return a picture of each world, shape [R, R, 3], with the render mode "rgb_array"."""
@@ -206,11 +209,12 @@ class NPAVectorEnv(WorldsEnv, VectorEnv[Any, Any, Any]):
         """
         if not self._started:
             raise NPAError("particles need worlds: call reset first")
-        everyone = torch.arange(self.num_envs)
-        chosen = everyone if worlds is None else checked_worlds(worlds, self.num_envs)
+        all_worlds = torch.arange(self.num_envs)
+        chosen = all_worlds if worlds is None else checked_worlds(worlds, self.num_envs)
         placed = self.worlds.checked_particles(x, s, len(chosen), self.config.particle_count)
-        observation = self._place(placed, chosen.to(self.task.device), self._buffer)
-        return self.form.returned(observation)
+        index = chosen.to(self.task.device)
+        observation = self._change_worlds(self.worlds.place, index, placed, self._buffer)
+        return self.spaces.returned(observation)
 
     def _report(
         self, stepped: NDArray[np.bool_] | None, *, copy: bool
@@ -219,12 +223,12 @@ class NPAVectorEnv(WorldsEnv, VectorEnv[Any, Any, Any]):
         worlds = self.worlds
         report = worlds.report.copy() if copy else worlds.report
         rows, flags = self._report_rows(report), list(self._out(report.endings))
-        everyone = self._out(report.everyone if copy else report.everyone.clone())
-        which = everyone if stepped is None else self._mask(stepped)
+        all_worlds = self._out(report.all_worlds if copy else report.all_worlds.clone())
+        which = all_worlds if stepped is None else self._mask(stepped)
         of_all = self.losses_of(rows) | self._returned_values(worlds.extra_info(), copy=copy)
         of_step = self._improvements(rows) | dict(zip(FLAGS, flags[2:], strict=True))
         of_step |= self._returned_values(worlds.step_info(), copy=copy)
-        return rows, flags, masked(of_all, everyone) | masked(of_step, which)
+        return rows, flags, masked(of_all, all_worlds) | masked(of_step, which)
 
     def _returned_values(self, values: dict[str, Tensor], *, copy: bool = True) -> dict[str, Any]:
         return {n: self._out(v.clone() if copy else v) for n, v in values.items()}
@@ -263,13 +267,9 @@ def vector_class(env_type: type[WorldsEnv]) -> type[NPAVectorEnv]:
 
 def checked_count(name: str, value: Any) -> int:
     """Return the argument of this name, checked: a whole number of at least 1."""
-    if isinstance(value, np.integer):
-        value = int(value)
-    if not is_whole(value) or value < 1:
-        raise NPAError(
-            f"{name} must be a whole number of at least 1, got {shown(value)}: for example {name}=8"
-        )
-    return int(value)
+    count = plain(value)
+    check_count(name, count, f": for example {name}=8")
+    return int(count)
 
 
 def checked_mode(mode: str | AutoresetMode) -> AutoresetMode:
@@ -283,11 +283,6 @@ def checked_mode(mode: str | AutoresetMode) -> AutoresetMode:
             f"{suggest(mode, AUTORESET_MODES)}"
         )
     return by_name[mode]
-
-
-def plain_seed(seed: Any) -> Any:
-    """Return a NumPy integer as Python's, which Gymnasium needs, and anything else unchanged."""
-    return int(seed) if isinstance(seed, np.integer) else seed
 
 
 def check_options(options: Any, known: tuple[str, ...]) -> None:

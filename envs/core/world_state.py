@@ -138,10 +138,10 @@ class WorldState:
             ("s", s, physics.state_dim, physics.limits.state, "observation_limit"),
         ):
             tensor = number_tensor(name, value).to(self.device, torch.float32)
-            wanted = (world_count, particle_count, width)
-            if tuple(tensor.shape) != wanted:
+            expected = (world_count, particle_count, width)
+            if tuple(tensor.shape) != expected:
                 raise NPAError(
-                    f"{name} must have shape {wanted} (worlds, particles, entries), "
+                    f"{name} must have shape {expected} (worlds, particles, entries), "
                     f"got {tuple(tensor.shape)}: see env.unwrapped.particles()"
                 )
             if not bool((tensor.abs() <= limit).all()):

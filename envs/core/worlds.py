@@ -74,7 +74,8 @@ class BatchedWorlds(RewardedWorlds):
         """Whether the copy belongs to the last step, and no world restarted since."""
         self._neighbours: NeighbourState | None = None
         self._prepare_actions()
-        self._make_graphs()
+        self._evaluate_graph = GraphedCallable(self._evaluate_and_sort, self.device)
+        self._step_graph = GraphedCallable(self._act_and_evaluate, self.device)
         self._resets = GraphedResets(
             self._start_and_sort, world_count, self.device, recorded=self.task.start_is_short
         )
@@ -85,20 +86,10 @@ class BatchedWorlds(RewardedWorlds):
         self._actions = Actions(self.x, self.s, self.physics, self.random, **flags)
         self._draw = GraphedCallable(self._actions.draw, self.device)
 
-    def _make_graphs(self) -> None:
-        self._evaluate_graph = GraphedCallable(self._evaluate_and_sort, self.device)
-        self._step_graph = GraphedCallable(self._act_and_evaluate, self.device)
-
     def __getstate__(self) -> dict[str, Any]:
         # The next step makes these again.
         none = dict.fromkeys(("_neighbours", "_perceived", "_host_perceived"))
         return super().__getstate__() | none | {"_host_is_current": False}
-
-    def limit_steps(self, episode_steps: int | None) -> None:
-        """Set the steps after which episodes are truncated; None: never."""
-        if episode_steps != self.episode_steps:
-            self.episode_steps, self._evaluation = episode_steps, None
-            self._make_graphs()
 
     @property
     def target_dim(self) -> int:
@@ -112,7 +103,7 @@ class BatchedWorlds(RewardedWorlds):
         random = self.next_streams(worlds, keys)
         check_default_dtype()
         # The first start is not recorded as a graph, so that it can synchronise for checks.
-        task, first = self.task, not self.part_names
+        task, first = self.task, not self.term_names
         draws, check = global_draws(self.device) if first else {}, first or not self.x.is_cuda
         start: Start = task.start(random)
         check_start(task, start, len(worlds), (self.x.shape, self.s.shape))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -51,8 +51,8 @@ class RuleDrivenWorlds(BatchedWorlds):
     """
 
     def _prepare_actions(self) -> None:
-        self.context = self.x.new_zeros(self.world_count, self.task.context_count)
-        """Values from the start of each episode that observations and rewards use, [B, M]."""
+        self.context: Any = None
+        """What the task's `episode_context` returned at the start of each world's episode."""
 
     @torch.no_grad()
     @makes_plain_tensors
@@ -111,19 +111,18 @@ class RuleDrivenWorlds(BatchedWorlds):
         """Begin episodes in some worlds, and store the task's context of their starts."""
         super().begin(worlds, start, check=check)
         draws = self.random.take(worlds).substream(StreamId.GOAL)
-        self.context[worlds] = self.task.episode_context(start, self.loss[worlds], draws)
+        context = self.task.episode_context(start, self.loss[worlds], draws)
+        if self.context is None:
+            shapes = ((self.world_count, *value.shape[1:]) for value in context)
+            self.context = type(context)(*map(Tensor.new_zeros, context, shapes))
+        for stored, value in zip(self.context, context, strict=True):
+            stored[worlds] = value
 
-    def settle_rewards(self) -> None:
-        """Write the task's rewards into the report, then change goals that are due."""
-        reward = self.task.reward(self.particles, self.loss, self.context)
-        if self.rewards_last_step_only:
-            terminated, truncated = self.report.endings[:2]
-            last = terminated | truncated
-            if self.episode_steps is None:
-                last = last | (self.elapsed == self.task.config.episode_steps)
-            reward = torch.where(last, reward, 0.0)
+    def task_rewards(self) -> Tensor:
+        """Return the task's rewards of a step, [B], then change goals that are due."""
+        rewards: Tensor = self.task.reward(self.particles, self.loss, self.context)
         self.task.next_goals(self.elapsed, self.context, self.goal)
-        self.report.reward.copy_(reward)
+        return rewards
 
     def extra_info(self) -> dict[str, Tensor]:
         """Return further entries of infos, shape [B, ...] each."""
@@ -139,11 +138,11 @@ class TargetDeficit:
         self._scale = torch.ones(VALUES_PER_PLACE, device=places.device)
         middle = places.new_zeros(1, 2)
         whole = Particles(target.points[None], target.colours[None] - COLOUR_OFFSET)
-        wanted = self._weighted(whole, middle)
+        target_sums = self._weighted(whole, middle)
         # Brushes may be too small to cover any point.
-        mean_count = wanted[..., 0].mean().clamp_min(1.0 / len(target.points))
+        mean_count = target_sums[..., 0].mean().clamp_min(1.0 / len(target.points))
         self._scale = torch.tensor(DEFICIT_SCALES, device=places.device) / mean_count
-        self._wanted = self._scale * wanted
+        self._target_sums = self._scale * target_sums
 
     def __call__(self, particles: Particles, middle: Tensor) -> Tensor:
         """Return the target's weighted sums at each place minus the worlds' own, [B, P, 6].
@@ -152,7 +151,7 @@ class TargetDeficit:
         of red, green and blue. They are multiples of the mean sum of 1 over the target's places,
         times `DEFICIT_SCALES`.
         """
-        return self._wanted - self._weighted(particles, middle)
+        return self._target_sums - self._weighted(particles, middle)
 
     def _weighted(self, particles: Particles, middle: Tensor) -> Tensor:
         x = particles.x
@@ -170,35 +169,44 @@ class RuleDriven:
 
     worlds_type: ClassVar[type[BatchedWorlds] | None] = RuleDrivenWorlds
 
-    context_count: ClassVar[int]
-    """Values in an episode's context, M."""
-
     rewards_each_step: ClassVar[bool] = False
     """Whether `reward="sparse"` also rewards each step."""
 
-    def episode_context(self, start: Start, loss: Tensor, random: WorldRandom) -> Tensor:
-        """Return the context that episodes keep from their start, [B, M]; `loss` is theirs, [B]."""
+    def episode_context(self, start: Start, loss: Tensor, random: WorldRandom) -> Any:
+        """Return what observations and rewards need of the starts of B episodes.
+
+        It is a named tuple of tensors, [B, ...]; `loss` are the losses at the starts, [B].
+        """
         raise NotImplementedError
 
-    def reward(self, particles: Particles, loss: Tensor, context: Tensor) -> Tensor:
-        """Return the rewards of a step, [B], from the losses [B] and the context [B, M]."""
+    def reward(self, particles: Particles, loss: Tensor, context: Any) -> Tensor:
+        """Return the rewards of a step, [B], from the particles and losses, [B], after it."""
         raise NotImplementedError
 
-    def next_goals(self, elapsed: Tensor, context: Tensor, goal: Tensor) -> None:
+    def next_goals(self, elapsed: Tensor, context: Any, goal: Tensor) -> None:
         """Change goals in place after the rewards of a step, by the steps since the start, [B]."""
 
-    def context_info(self, particles: Particles, context: Tensor) -> dict[str, Tensor]:
+    def context_info(self, particles: Particles, context: Any) -> dict[str, Tensor]:
         """Return further entries of infos, shape [B, ...] each."""
         return {}
+
+
+class GardenContext(NamedTuple):
+    """The picture at the start of B episodes."""
+
+    intact_loss: Tensor
+    """Loss of the intact picture, shape [B]."""
+
+    rise: Tensor
+    """Rise of this loss if the picture turns grey, shape [B]."""
 
 
 class GardenTask(RuleDriven, GrownTask[Config]):
     """A grown picture that its rule keeps stepping; differentiable in the brushes."""
 
     config_type: ClassVar[type[GardenConfig]] = GardenConfig
-    form_type: ClassVar[Any] = BrushSpaces
-    actor = "brushes"
-    context_count = 2
+    spaces_type: ClassVar[Any] = BrushSpaces
+    controls = "brushes"
 
     def __init__(self, config: Config, device: torch.device) -> None:
         super().__init__(config, device)
@@ -233,32 +241,33 @@ class GardenTask(RuleDriven, GrownTask[Config]):
             return run(particles, config.rule_steps)
         box = config.periodic_sides
         for _ in range(config.rule_steps):
-            x, s, *_ = particles
-            new_x, new_s, *_ = run(particles, 1)
-            x = x + rate * nearest_image(new_x - x, box)
-            particles = Particles(nearest_image(x, box), s + rate * (new_s - s))
+            (x, s, *_), stepped = particles, run(particles, 1)
+            x = x + rate * nearest_image(stepped.x - x, box)
+            s = s + rate * (stepped.s - s)
+            particles = stepped._replace(x=nearest_image(x, box), s=s)
         return particles
 
     def disturb(self, particles: Particles, random: WorldRandom) -> Particles:
         """Return worlds after the disturbances at the end of a step; by default none."""
         return particles
 
-    def episode_context(self, start: Start, loss: Tensor, random: WorldRandom) -> Tensor:
-        """Return the loss of intact pictures, and its rise if they turn grey, shape [B, 2]."""
+    def episode_context(self, start: Start, loss: Tensor, random: WorldRandom) -> Any:
+        """Return the loss of intact pictures, and its rise if they turn grey."""
         blank = torch.zeros_like(start.s)
         grey = sum(self.losses(start.x, blank).values(), torch.zeros_like(loss))
         # The loss of a picture that did not grow may not rise at all.
-        return torch.stack((loss, (grey - loss).maximum(MIN_RISE * loss)), dim=1)
+        return GardenContext(loss, (grey - loss).maximum(MIN_RISE * loss))
 
-    def lost_fraction(self, loss: Tensor, context: Tensor) -> Tensor:
+    def lost_fraction(self, loss: Tensor, context: Any) -> Tensor:
         """Return the fraction of pictures that is lost: 0 if intact, 1 if grey, shape [B]."""
-        return (loss - context[:, 0]) / context[:, 1]
+        fraction: Tensor = (loss - context.intact_loss) / context.rise
+        return fraction
 
     def middle(self, x: Tensor) -> Tensor:
         """Return the origin of brushes' places: the mean position minus the target's, [B, 2]."""
         return world_mean(x) - self.task.target.points.mean(dim=0)
 
-    def observe(self, particles: Particles, loss: Tensor, context: Tensor) -> Tensor:
+    def observe(self, particles: Particles, loss: Tensor, context: Any) -> Tensor:
         """Return observations, shape [B, O], in the form that `observe` names."""
         if self.config.observe == "grid":
             observed = self.deficit(particles, self.middle(particles.x))
@@ -353,8 +362,8 @@ class GardenEnv(NPAEnv):
     | Key | In | Value |
     |---|---|---|
     | `loss` | reset, step | the current loss L of the picture |
-    | `loss_density`, `loss_colour` | reset, step | the parts of the loss |
-    | `reward_density`, `reward_colour` | step | how much each part fell in this step |
+    | `loss_density`, `loss_colour` | reset, step | the terms of the loss |
+    | `reward_density`, `reward_colour` | step | decrease of each term in this step |
     | `success`, `diverged` | step | whether the world succeeded or diverged in it, bool |
     | `reason` | last step | why the episode ended, see above; None for worlds that go on |
 

@@ -25,7 +25,7 @@ OBSERVATION_LIMIT = 8.0
 VALUES_PER_PLACE = 6
 """Observed values at a place of the grid: count, x, y, red, green, blue."""
 
-Actions = Literal["grid", "free", "discrete"]
+BrushActions = Literal["grid", "free", "discrete"]
 Observe = Literal["grid", "picture", "moments"]
 GardenReward = Literal["dense", "sparse"]
 
@@ -39,7 +39,7 @@ class GardenConfig(GrownConfig):
 
     words = GrownConfig.words | {
         "reward": get_args(GardenReward),
-        "actions": get_args(Actions),
+        "actions": get_args(BrushActions),
         "observe": get_args(Observe),
     }
 
@@ -72,7 +72,7 @@ class GardenConfig(GrownConfig):
     inject_channels: tuple[int, ...] = (-3, -2, -1)
     """State channels that brushes inject; the last three are the colour."""
 
-    actions: Actions = "grid"
+    actions: BrushActions = "grid"
     """Form of actions: "grid", a brush at each place of a grid; "free", brushes whose positions are
     part of the action; or "discrete", a place of the grid, a tool and a strength for each brush, as
     Gymnasium's MultiDiscrete."""
@@ -201,7 +201,7 @@ def apply_brushes(
         index = torch.tensor(channels, device=s.device)
         s = s.index_add(2, index, config.state_scale * total[..., columns.inject])
     rate = (1.0 + total[..., columns.rate]).clamp(0.0, 2.0) if "rate" in config.tools else None
-    return Particles(x, s), rate
+    return particles._replace(x=x, s=s), rate
 
 
 def tool_table(config: GardenConfig) -> Tensor:

@@ -189,11 +189,11 @@ class Population(NamedTuple):
 class SpeciesTask(WorldTask[Any]):
     """A task of several species, with a loss for each species and each particle.
 
-    An agent's reward is the fall of its loss in a step.
+    An agent's reward is the decrease of its loss in a step.
     """
 
     config_type: ClassVar[type[SpeciesConfig]] = SpeciesConfig
-    actor = "species"
+    controls = "species"
 
     least_species: ClassVar[int] = 2
     """Smallest number of species."""
@@ -220,7 +220,7 @@ class SpeciesTask(WorldTask[Any]):
         return x, x.new_zeros(*shape, config.state_dim)
 
     def losses(self, population: Population) -> Mapping[str, Tensor]:
-        """Return the named parts of each species' loss, shape [B, K] each; their sum is its loss.
+        """Return the terms of each species' loss by name, shape [B, K] each; their sum is its loss.
 
         The losses of a world must not depend on the others, and nothing may synchronise. Losses of
         removed species are not read.
@@ -228,14 +228,14 @@ class SpeciesTask(WorldTask[Any]):
         raise NotImplementedError
 
     def particle_losses(self, population: Population) -> Mapping[str, Tensor]:
-        """Return the named parts of each particle's loss, [B, N] each; their sum is its loss."""
+        """Return the terms of each particle's loss by name, [B, N] each; their sum is its loss."""
         raise NotImplementedError
 
     def played(self, action: Tensor, population: Population, random: WorldRandom) -> Tensor:
         """Return the actions of all particles, those of the environment's opponent included."""
         return action
 
-    def settle(self, rewards: Tensor, live: Tensor, species: Tensor) -> Tensor:
+    def final_rewards(self, rewards: Tensor, live: Tensor, species: Tensor) -> Tensor:
         """Return the agents' final rewards, [B, A]; by default unchanged."""
         return rewards
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, ParamSpec
 
 import numpy as np
 import torch
+from gymnasium.spaces import Box
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -23,6 +24,7 @@ except ImportError as error:
         "pip install 'npa-envs[envs]'"
     ) from error
 
+Arguments = ParamSpec("Arguments")
 Flags = dict[str, bool]
 Infos = dict[str, dict[str, Any]]
 Outcome = tuple[dict[str, Any], dict[str, float], Flags, Flags, Infos]
@@ -61,7 +63,7 @@ class CrowdEnv(AgentsEnv, KnownAgents):
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], Infos]:
-        """Start an episode with all agents; return observations, and losses with their parts.
+        """Start an episode with all agents; return observations, and losses with their terms.
 
         A seed begins its sequence of episodes; None starts the next episode of the current
         sequence. There are no options.
@@ -144,10 +146,10 @@ class CrowdEnv(AgentsEnv, KnownAgents):
         count = self.worlds.particle_count
         if len(action) == count:
             return action[None]
-        everyone = action.new_zeros(1, count, action.shape[1])
+        all_rows = action.new_zeros(1, count, action.shape[1])
         live = np.isin(self.worlds.owner, self._live)
-        everyone[0, torch.from_numpy(live).to(action.device)] = action
-        return everyone
+        all_rows[0, torch.from_numpy(live).to(action.device)] = action
+        return all_rows
 
     def _infos(self, numbers: dict[str, Tensor]) -> Infos:
         """Return the infos of live agents: species and losses."""
@@ -168,10 +170,22 @@ class CrowdEnv(AgentsEnv, KnownAgents):
         }
 
 
-def in_turns(parallel: Any, *, clips: bool = False) -> Any:
-    """Return a parallel environment as one whose agents act in turn, in a checked order."""
-    turns = parallel_to_aec(parallel)
-    return OrderEnforcingWrapper(ClipOutOfBoundsWrapper(turns)) if clips else turns
+def in_turns(
+    parallel_env: Callable[Arguments, KnownAgents],
+) -> tuple[Callable[Arguments, Any], Callable[Arguments, Any]]:
+    """Return the functions `raw_env` and `env` for a module's `parallel_env`."""
+
+    def raw_env(*args: Arguments.args, **config: Arguments.kwargs) -> Any:
+        """Return `parallel_env` with agents that act in turn; a step runs after the last one."""
+        return parallel_to_aec(parallel_env(*args, **config))
+
+    def env(*args: Arguments.args, **config: Arguments.kwargs) -> Any:
+        """Return `raw_env` in a checked order, with actions clipped into spaces that are boxes."""
+        turns = raw_env(*args, **config)
+        is_box = isinstance(turns.action_space(turns.possible_agents[0]), Box)
+        return OrderEnforcingWrapper(ClipOutOfBoundsWrapper(turns)) if is_box else turns
+
+    return raw_env, env
 
 
 def register(name: str, module: str, keywords: dict[str, Any]) -> None:

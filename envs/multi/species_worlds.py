@@ -14,7 +14,7 @@ from torch import Tensor
 
 from npa_envs import world_mean
 from npa_envs.checks import number_tensor
-from npa_envs.envs.core.rewards_and_ends import total
+from npa_envs.envs.core.rewards_and_ends import named_terms, total
 from npa_envs.envs.core.world_state import OBSERVATION_COPIES, WorldState
 from npa_envs.envs.multi.base import Population, SpeciesTask
 from npa_envs.envs.multi.tasks import task_type
@@ -29,15 +29,14 @@ from npa_envs.world.divergence import MAX_REPORT
 from npa_envs.world.environment_steps import (
     Actions,
     NeighbourState,
-    Physics,
     build_neighbours,
     perceive_each_species,
 )
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import WorldRandom
 
-Parts = dict[str, Tensor]
-"""Named parts of every agent's loss, shape [B, A] each."""
+LossTerms = dict[str, Tensor]
+"""Terms of every agent's loss by name, shape [B, A] each."""
 
 REMOVED, LEFT, ALONE = 1, 2, 3
 """Causes that terminate an agent's episode; 0: none."""
@@ -55,7 +54,7 @@ class AgentOutcome(NamedTuple):
     """Rewards, 0 for agents that did not act, float64, shape [B, A]."""
 
     numbers: dict[str, Tensor]
-    """Losses, their parts, and the fall of each part, float64, shape [B, A] each."""
+    """Losses, their terms, and the decrease of each term, float64, shape [B, A] each."""
 
     acted: NDArray[np.bool_]
     """Whether each agent acted in this step, shape [B, A]."""
@@ -74,44 +73,44 @@ class AgentOutcome(NamedTuple):
 
 
 class AgentReturns:
-    """Losses of all agents in B worlds, and their rewards: the fall of the losses in each step."""
+    """Losses of all agents in B worlds, and their rewards: the decrease of the losses in a step."""
 
     def __init__(self, task: SpeciesTask, species: Tensor, world_count: int, *, team: bool) -> None:
         self._task = task
         self._species = species
         self._team = team
-        self.part_names: tuple[str, ...] = ()
-        """Names of the parts of the loss; empty before the first episode."""
+        self.term_names: tuple[str, ...] = ()
+        """Names of the terms of the loss; empty before the first episode."""
         shape = world_count, len(species)
         zeros = torch.zeros(shape, dtype=torch.float64, device=species.device)
         self.loss = zeros
         """Every agent's loss, float64, shape [B, A]."""
-        self._parts = self._before = zeros[None]
+        self._terms = self._before = zeros[None]
         self._at_start = self._carried = zeros
 
-    def begin(self, parts: Parts, worlds: Tensor) -> None:
-        """Begin episodes in some worlds, int64, [M], by parts of all agents there, [M, A] each."""
-        opened = _stacked(parts)
-        if not self.part_names:
-            self.part_names = tuple(parts)
-            self._parts = self._before = self.loss.expand(len(parts), -1, -1)
-        loss = total(opened)
-        self._parts = self._parts.index_copy(1, worlds, opened)
-        self._before = self._before.index_copy(1, worlds, opened)
+    def begin(self, terms: LossTerms, worlds: Tensor) -> None:
+        """Begin episodes in some worlds, int64, [M], by terms of all agents there, [M, A] each."""
+        first = _stacked(terms)
+        if not self.term_names:
+            self.term_names = tuple(terms)
+            self._terms = self._before = self.loss.expand(len(terms), -1, -1)
+        loss = total(first)
+        self._terms = self._terms.index_copy(1, worlds, first)
+        self._before = self._before.index_copy(1, worlds, first)
         self.loss = self.loss.index_copy(0, worlds, loss)
         self._at_start = self._at_start.index_copy(0, worlds, loss)
         self._carried = self._carried.index_fill(0, worlds, 0.0)
 
-    def carry_over(self, parts: Parts) -> None:
+    def replace(self, terms: LossTerms) -> None:
         """Replace the losses without a reward; those of agents that ended are not used again."""
-        self._parts = self._before = _stacked(parts)
-        loss = total(self._parts)
+        self._terms = self._before = _stacked(terms)
+        loss = total(self._terms)
         self._carried = self._carried + (loss - self.loss)
         self.loss = loss
 
-    def step_rewards(self, parts: Parts, live: Tensor, diverged: Tensor) -> Tensor:
+    def step_rewards(self, terms: LossTerms, live: Tensor, diverged: Tensor) -> Tensor:
         """Store the losses after a step; return rewards, 0 if not live, float64, [B, A]."""
-        now = _stacked(parts)
+        now = _stacked(terms)
         loss = total(now)
         # Leaving the world must not be rewarded, even if an empty picture is better than the start;
         # nor may it undo what a death added without a reward.
@@ -122,22 +121,19 @@ class AgentReturns:
             agents_per_live = live.shape[1] / live.sum(dim=1).clamp_min(1)
             mean = world_mean(rewards[..., None])[:, 0] * agents_per_live
             rewards = torch.where(live, mean[:, None], 0.0)
-        self._parts, self._before, self.loss = now, self._parts, loss
-        return self._task.settle(rewards, live, self._species)
+        self._terms, self._before, self.loss = now, self._terms, loss
+        return self._task.final_rewards(rewards, live, self._species)
 
-    def numbers(self) -> dict[str, Tensor]:
-        """Return the entries of `info` about losses, float64, shape [B, A] each."""
-        names = (f"loss_{name}" for name in self.part_names)
-        return {"loss": self.loss} | dict(zip(names, self._parts, strict=True))
-
-    def step_numbers(self) -> dict[str, Tensor]:
-        """Return the entries of `numbers`, and the fall of each part in the step."""
-        names = (f"reward_{name}" for name in self.part_names)
-        return self.numbers() | dict(zip(names, self._before - self._parts, strict=True))
+    def numbers(self, *, stepped: bool = False) -> dict[str, Tensor]:
+        """Return the entries of `info` about losses, after a step or a reset, float64, [B, A]."""
+        numbers = {"loss": self.loss} | named_terms("loss", self.term_names, self._terms)
+        if stepped:
+            numbers |= named_terms("reward", self.term_names, self._before - self._terms)
+        return numbers
 
 
-def _stacked(parts: Parts) -> Tensor:
-    return torch.stack(list(parts.values())).double()
+def _stacked(terms: LossTerms) -> Tensor:
+    return torch.stack(list(terms.values())).double()
 
 
 class SpeciesWorlds(WorldState):
@@ -199,8 +195,8 @@ class SpeciesWorlds(WorldState):
             self.live.shape, dtype=torch.bool, device="cpu", pin_memory=device.type == "cuda"
         )
         # Its graphs are kept on CUDA: worlds return to it when their next episodes start.
-        everything = np.arange(world_count), np.arange(count), self.particles, self.random
-        self._whole = Cohort(self.task, self.physics, self.owner, by_particle, *everything)
+        everything = np.arange(world_count), np.arange(count)
+        self._whole = Cohort(self, *everything, self.particles, self.random)
         self._cohorts: list[Cohort] | None = None
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -226,9 +222,8 @@ class SpeciesWorlds(WorldState):
         self.live[worlds] = self.present[worlds] = self.running[worlds] = True
         self.elapsed[worlds] = 0
         population = self._whole.population._replace(x=x.contiguous(), s=s)
-        parts, perceived = self._whole.measured(population), self._whole.perceived(population)
-        self.agent_returns.begin(parts, index)
-        return perceived
+        self.agent_returns.begin(self._whole.measured(population), index)
+        return self._whole.perceived(population)
 
     @torch.no_grad()
     @makes_plain_tensors
@@ -253,9 +248,9 @@ class SpeciesWorlds(WorldState):
         self._host_diverged.copy_(diverged, non_blocking=True)
         if self._side_stream is not None:
             self._side_stream.mark()
-        live, parts = to_device_async(acted, self.device), self.measured(stepped=True)
-        rewards = self.agent_returns.step_rewards(parts, live, diverged & live)
-        numbers = self.agent_returns.step_numbers()
+        live, terms = to_device_async(acted, self.device), self.measured(stepped=True)
+        rewards = self.agent_returns.step_rewards(terms, live, diverged & live)
+        numbers = self.agent_returns.numbers(stepped=True)
         observation = self.perceived(stepped=True)
         # The device continues while the host reads who diverged.
         if self._side_stream is not None:
@@ -286,15 +281,15 @@ class SpeciesWorlds(WorldState):
             perceived[cohort.indices] = cohort.perceived(stepped=stepped)
         return perceived
 
-    def measured(self, *, stepped: bool = False) -> dict[str, Tensor]:
-        """Return the parts of every agent's loss, float32, [B, A] each; 0 for agents that ended."""
-        parts: dict[str, Tensor] = {}
+    def measured(self, *, stepped: bool = False) -> LossTerms:
+        """Return the terms of every agent's loss, float32, [B, A] each; 0 for agents that ended."""
+        terms: LossTerms = {}
         for cohort in self.cohorts:
-            for name, part in (cohort.parts if stepped else cohort.measured()).items():
-                if name not in parts:
-                    parts[name] = part.new_zeros(self.live.shape)
-                parts[name].index_copy_(0, cohort.worlds, part)
-        return parts
+            for name, term in (cohort.terms if stepped else cohort.measured()).items():
+                if name not in terms:
+                    terms[name] = term.new_zeros(self.live.shape)
+                terms[name].index_copy_(0, cohort.worlds, term)
+        return terms
 
     @torch.no_grad()
     @makes_plain_tensors
@@ -306,11 +301,11 @@ class SpeciesWorlds(WorldState):
         placed = self.checked_particles(x, s, 1, population.x.shape[1])
         population.x.copy_(placed.x)
         population.s.copy_(placed.s)
-        return self._carry_over()
+        return self._measured_again()
 
-    def _carry_over(self) -> Tensor:
+    def _measured_again(self) -> Tensor:
         """Measure the losses again without a reward, and return what particles perceive."""
-        self.agent_returns.carry_over(self.measured())
+        self.agent_returns.replace(self.measured())
         perceived: Tensor = self.perceived()
         return perceived
 
@@ -377,7 +372,7 @@ class SpeciesWorlds(WorldState):
         if not self.running.any():
             return observation
         # A death changes the losses of others; this is not rewarded.
-        perceived = self._carry_over()
+        perceived = self._measured_again()
         stays = (endings == 0) & self.running[:, None]
         where = to_device_async(stays, self.device)[:, self._owner, None]
         return torch.where(where, perceived, observation)
@@ -398,14 +393,14 @@ class SpeciesWorlds(WorldState):
         if not len(running):
             return []
         groups, group_of = np.unique(self.present[running], axis=0, return_inverse=True)
-        cohorts, parts = [], (self.task, self.physics, self.owner, self.by_particle)
+        cohorts = []
         for k, present in enumerate(groups):
             worlds = running[group_of.reshape(-1) == k]
             columns = np.flatnonzero(present[self.owner])
             index = to_device_async(worlds, self.device)
             indices = index[:, None], to_device_async(columns, self.device)
             particles = Particles(self.x[indices], self.s[indices])
-            cohorts.append(Cohort(*parts, worlds, columns, particles, self.random.take(index)))
+            cohorts.append(Cohort(self, worlds, columns, particles, self.random.take(index)))
         return cohorts
 
     def _disband(self) -> None:
@@ -430,36 +425,34 @@ class Cohort:
 
     def __init__(
         self,
-        task: SpeciesTask,
-        physics: Physics,
-        owner: NDArray[np.int64],
-        by_particle: bool,
+        batch: SpeciesWorlds,
         worlds: NDArray[np.int64],
         columns: NDArray[np.int64],
         particles: Particles,
         random: WorldRandom,
     ) -> None:
-        device, config = particles.x.device, task.config
-        self._task, self._physics, self._by_particle = task, physics, by_particle
+        device = particles.x.device
+        self._task, self._physics, self._by_particle = batch.task, batch.physics, batch.by_particle
         self.random = random
         self.worlds = to_device_async(worlds, device)
         self._columns = to_device_async(columns, device)
         self.indices = self.worlds[:, None], self._columns
         """Index of the particles in tensors of the batch, [B, N, ...]."""
-        species = np.repeat(np.arange(config.species_count), config.counts)[columns]
-        self.population = population_of(particles, species, config.species_count)
+        species_count = batch.config.species_count
+        self.population = population_of(particles, batch.species[columns], species_count)
         """The particles."""
-        self.parts: dict[str, Tensor] = {}
-        """Parts of every agent's loss after the last step, shape [M, A] each."""
-        self._agent_count = int(owner[-1]) + 1
+        self.terms: LossTerms = {}
+        """Terms of every agent's loss after the last step, shape [M, A] each."""
+        self._agent_count = len(batch.agent_species)
         self.diverged = torch.zeros(len(worlds), self._agent_count, dtype=torch.bool, device=device)
         """Which agents have no particle within bounds after the last step, shape [M, A]."""
-        self._owners = to_device_async(owner[columns], device)
+        self._owners = to_device_async(batch.owner[columns], device)
         self._neighbours: NeighbourState | None = None
         enabled = torch.ones(1, dtype=torch.uint8, device=device)
         diverged = torch.zeros(len(worlds), dtype=torch.uint8, device=device)
         x, s, *_ = particles
-        self._actions = Actions(x, s, physics, random, enabled=enabled, diverged=diverged)
+        flags = {"enabled": enabled, "diverged": diverged}
+        self._actions = Actions(x, s, batch.physics, random, **flags)
         self._draw = GraphedCallable(self._actions.draw, device)
         self._evaluate_graph = GraphedCallable(self._evaluate, device)
 
@@ -474,8 +467,8 @@ class Cohort:
         self._actions.apply(action)
         self._evaluate_graph()
 
-    def measured(self, population: Population | None = None) -> dict[str, Tensor]:
-        """Return the parts of every agent's loss, float32, [M, A] each; 0 for removed agents.
+    def measured(self, population: Population | None = None) -> LossTerms:
+        """Return the terms of every agent's loss, float32, [M, A] each; 0 for removed agents.
 
         `population`: other positions and states of the same particles; None: the current ones.
         """
@@ -510,7 +503,7 @@ class Cohort:
         # Sums of ones are exact in any order.
         count = torch.zeros(len(inside), self._agent_count, device=inside.device)
         self.diverged = count.index_add_(1, self._owners, inside.float()) == 0.0
-        self.parts = self.measured()
+        self.terms = self.measured()
         self._neighbours = build_neighbours(x, s, physics)
 
 

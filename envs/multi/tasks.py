@@ -134,7 +134,7 @@ class PictureLossTask(SpeciesTask):
         self.task = self.tasks[0]
         """The first of them, whose target scripted policies use."""
 
-    def picture_parts(self, k: int, x: Tensor, s: Tensor) -> dict[str, Tensor]:
+    def picture_terms(self, k: int, x: Tensor, s: Tensor) -> dict[str, Tensor]:
         """Return density error and weighted colour error against picture k, shape [B] each."""
         density, colour = self.tasks[k].splat_losses(x, s)
         return {"density": density, "colour": self.config.colour_weight * colour}
@@ -191,8 +191,8 @@ class CoMorphogenesisTask(PictureLossTask):
 
     def losses(self, population: Population) -> Mapping[str, Tensor]:
         """Return the density error and the weighted colour error of each species' picture."""
-        parts = [self.picture_parts(k, *population.of(k)) for k in _present(population)]
-        return {name: by_species([part[name] for part in parts], population) for name in parts[0]}
+        terms = [self.picture_terms(k, *population.of(k)) for k in _present(population)]
+        return {name: by_species([term[name] for term in terms], population) for name in terms[0]}
 
     def particle_losses(self, population: Population) -> Mapping[str, Tensor]:
         """Return each particle's share of its species' splat loss, shape [B, N]."""
@@ -231,12 +231,12 @@ class InvasionTask(PictureLossTask):
         super().__init__(config, device, (config.target, config.counts[0]))
 
     def losses(self, population: Population) -> Mapping[str, Tensor]:
-        """Return the parts of species 0's splat loss, and minus an equal share for each other."""
+        """Return the terms of species 0's splat loss, and minus an equal share for each other."""
         invaders = population.counts[1:]
         present = max(sum(count > 0 for count in invaders), 1)
         return {
             name: torch.stack([loss, *[-loss / present] * len(invaders)], dim=1)
-            for name, loss in self.picture_parts(0, *population.of(0)).items()
+            for name, loss in self.picture_terms(0, *population.of(0)).items()
         }
 
     def particle_losses(self, population: Population) -> Mapping[str, Tensor]:
@@ -253,7 +253,7 @@ class InvasionTask(PictureLossTask):
         drawn = 2.0 * random.substream(StreamId.OPPONENT).uniform(*action.shape[1:]) - 1.0
         return torch.where((population.species > 0)[:, None], drawn, action)
 
-    def settle(self, rewards: Tensor, live: Tensor, species: Tensor) -> Tensor:
+    def final_rewards(self, rewards: Tensor, live: Tensor, species: Tensor) -> Tensor:
         """Return rewards that sum to zero: invaders lose what species 0 gains, in equal parts."""
         invading = species > 0
         gained = torch.where(invading, 0.0, rewards).sum(dim=1, keepdim=True)
@@ -283,9 +283,9 @@ class SymbiosisTask(PictureLossTask):
 
     def losses(self, population: Population) -> Mapping[str, Tensor]:
         """Return the density error and the weighted colour error, the same for every species."""
-        parts = self.picture_parts(0, population.x, population.s)
+        terms = self.picture_terms(0, population.x, population.s)
         count = len(population.counts)
-        return {name: loss[:, None].expand(-1, count) for name, loss in parts.items()}
+        return {name: loss[:, None].expand(-1, count) for name, loss in terms.items()}
 
     def particle_losses(self, population: Population) -> Mapping[str, Tensor]:
         """Return each particle's share of the splat loss, shape [B, N]."""
@@ -315,22 +315,25 @@ TASKS: dict[str, type[SpeciesTask]] = {
 }
 """Tasks by the names that environments take."""
 
-
 ENVIRONMENTS = SPECIES
 """Tasks by the ids that `pettingzoo.make` takes."""
+
+SETTINGS: dict[str, tuple[str, Mapping[str, Any]]] = {
+    **{name: (task, {}) for name, task in SPECIES.items()},
+    **{size.id: (size.task, size.keywords) for size in SPECIES_SIZES},
+}
+"""Name and keywords of a task by all ids."""
 
 
 def task_settings(name: str) -> tuple[str, dict[str, Any]]:
     """Return the task's name and the keywords of an id; names of tasks are returned unchanged."""
-    for size in SPECIES_SIZES:
-        if isinstance(name, str) and name == size.id:
-            return size.task, dict(size.keywords)
-    return (ENVIRONMENTS.get(name, name) if isinstance(name, str) else name), {}
+    task, keywords = SETTINGS.get(name, (name, {})) if isinstance(name, str) else (name, {})
+    return task, dict(keywords)
 
 
 def task_type(name: str) -> type[SpeciesTask]:
     """Return a task's class."""
     if not isinstance(name, str) or name not in TASKS:
-        known = [*TASKS, *ENVIRONMENTS, *(size.id for size in SPECIES_SIZES)]
+        known = [*TASKS, *SETTINGS]
         raise NPAError(f"task must be a known word, got {shown(name)}: {suggest(name, known)}")
     return TASKS[name]

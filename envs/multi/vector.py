@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.envs.core.base import ShownEnv, action_tensor
+from npa_envs.envs.core.config import plain
 from npa_envs.envs.core.vector import (
     checked_count,
     checked_mode,
-    plain_seed,
     rng_keys,
     worlds_to_reset,
 )
@@ -86,7 +86,7 @@ class AgentsEnv(ShownEnv):
         keys, batch = None, self.worlds
         # The first reset may have failed, so that there are no sequences of episodes yet.
         if seed is not None or not self._started:
-            self.np_random, _ = seeding.np_random(plain_seed(first))
+            self.np_random, _ = seeding.np_random(plain(first))
             keys = rng_keys(seed, batch.world_count, self.np_random)[worlds]
         with batch.device_context():
             observation: Tensor = batch.start(worlds, keys)
@@ -246,8 +246,8 @@ class MultiSpeciesVectorEnv(AgentsEnv):
     def _infos(self, numbers: dict[str, Tensor], acted: NDArray[np.bool_]) -> Infos:
         """Return infos of all species, with zeros in worlds where they did not act."""
         mask = to_device_async(acted, self.worlds.device)
-        everyone = torch.stack(list(numbers.values())).float()
-        rows = self._out(torch.where(mask, everyone, 0.0).movedim(2, 0).contiguous())
+        all_numbers = torch.stack(list(numbers.values())).float()
+        rows = self._out(torch.where(mask, all_numbers, 0.0).movedim(2, 0).contiguous())
         live = self._columns(self.worlds.live)
         return {
             agent: {"species": k, "live": live[agent]} | dict(zip(numbers, rows[k], strict=True))

@@ -112,7 +112,7 @@ class EnvironmentWorld(LiveWorld):
             if ended or truncated:
                 self._ended = (
                     f"; the last one ended after {self.step} steps: "
-                    f"{self._info.get('reason')}, return {self._return:.3g}"
+                    f"{self._info.get('reason', 'time limit')}, return {self._return:.3g}"
                 )
                 point = [self._episode, self._return]
                 curve = {"type": "curve", "name": "Return", "points": [point]}

@@ -124,6 +124,8 @@ class TestEveryEnvironment:
         if mode == "next-step":
             keywords |= {"reward": "sparse"}
         envs = self.make_vec(3, autoreset_mode=mode, **keywords)
+        if not self.is_species:
+            keywords |= {"episode_steps": 4}
         singles = [self.make(**keywords) for _ in range(3)]
         reasons, _ = assert_batch_of_singles(envs, singles, self.sampled(envs, 10), mode)
         assert "time limit" in reasons
@@ -141,6 +143,7 @@ class TestEveryEnvironment:
         for action in self.sampled(ours, 7):
             left, right = ours.step(action), theirs.step(action)
             assert_same(left[:4], right[:4])
+            assert [part.dtype for part in left[1:4]] == [part.dtype for part in right[1:4]]
             for key, value in right[4].items():
                 if key != "final_info":
                     assert_same(list(left[4][key]), list(value))

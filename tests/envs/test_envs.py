@@ -41,28 +41,23 @@ def test_ids_are_found_in_a_fresh_process(program):
     subprocess.run(command, check=True)
 
 
-@pytest.mark.filterwarnings("ignore:an episode ended")
-def test_sparse_reward_is_paid_at_whatever_limit_stands_around_the_environment():
-    inner = make(IDS[0], reward="sparse", max_episode_steps=-1, episode_steps=2)
-    limited = gymnasium.wrappers.TimeLimit(inner, 3)
-    for env, last in ((inner, 2), (limited, 3), (inner, 2)):
+@pytest.mark.parametrize("limit", [-1, 2, 3])
+def test_an_environment_with_episode_steps_rewards_and_ends_its_last_step(limit):
+    env = make(IDS[0], reward="sparse", max_episode_steps=limit, episode_steps=2)
+    for _ in range(2):
         env.reset(seed=0)
-        paid = [env.step(action)[1] != 0.0 for action in actions(env, 4, scale=0.2)]
-        assert paid == [step + 1 == last for step in range(4)]
+        first, last = (env.step(action) for action in actions(env, 2, scale=0.2))
+        assert (first[1], first[3], "reason" in first[4]) == (0.0, False, False)
+        assert (last[1], last[3], last[4]["reason"]) == (-last[4]["loss"], True, "time limit")
 
 
-class Repeated(gymnasium.Wrapper):
-    """Takes each action twice, as wrappers for video games do."""
-
-    def step(self, action):
-        self.env.step(action)
-        return self.env.step(action)
-
-
-def test_a_limit_that_counts_other_steps_ends_nothing_early():
-    env = begun(gymnasium.wrappers.TimeLimit(Repeated(make(IDS[0], max_episode_steps=-1)), 3))
-    ends = [env.step(action)[3] for action in actions(env, 3, scale=0.2)]
-    assert ends == [False, False, True]
+def test_sparse_rewards_are_refused_without_the_step_that_they_come_in():
+    fault, sparse = "episode_steps must be given.*max_episode_steps", {"reward": "sparse"}
+    for limit in (None, -1, 64):
+        refused(fault, make, IDS[0], max_episode_steps=limit, **sparse)
+    refused(fault, make_vec, IDS[0], 2, max_episode_steps=-1, **sparse)
+    envs = make_vec(IDS[0], 2, max_episode_steps=3, episode_steps=2, **sparse)
+    assert envs.unwrapped.worlds.episode_steps == 2
 
 
 @every_id

@@ -23,7 +23,7 @@ OF_ALL = [
     ({"particle_coumt": 5}, "argument 'particle_coumt': did you mean 'particle_count'"),
     ({"seed": 3}, "unexpected keyword argument 'seed': give it to reset"),
     ({"max_episode_step": 3}, "did you mean 'max_episode_steps'"),
-    ({"episode_steps": 5}, "for longer or shorter episodes give max_episode_steps"),
+    ({"episode_steps": 0}, "episode_steps must be a whole number of at least 1, got 0"),
     ({"particle_count": 0}, "particle_count must be a whole number of at least 1, got 0"),
     ({"particle_count": 10**9}, "particle_count (is too large|must be at most 16777216)"),
     ({"device": "cuda:99"}, "device must be one that torch sees"),
@@ -110,7 +110,7 @@ OF_ONE = {
         ({"picture_size": 5}, "picture_size must divide"),
     ],
     gardeners_v0.parallel_env: [
-        ({"max_cycles": number}, "max_cycles must be a whole number of at least 1")
+        ({"max_cycles": number}, "max_cycles must be an integer of at least 1")
         for number in (0, -1, 1.5, None, True, "3")
     ],
     multispecies_v0.parallel_env: [
@@ -139,7 +139,7 @@ OF_ONE = {
         ({"on_divergence": "reset"}, "on_divergence must be a known word, got 'reset'"),
     ],
     multispecies_v0.batched: [
-        ({"world_count": 0}, "world_count must be a whole number of at least 1, got 0"),
+        ({"world_count": 0}, "world_count must be an integer of at least 1, got 0"),
         ({"autoreset_mode": "next-step"}, "autoreset_mode must be 'same-step' or 'disabled'"),
         ({"world_count": 10**7, "particle_count": 10**4}, "particle_count is too large"),
     ],

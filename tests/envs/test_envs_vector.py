@@ -46,7 +46,7 @@ def test_vector_equals_single_over_six_episodes_with_autoresets(name, changes, d
         keywords |= {"success_loss": 0.0909 if "3D" in name else 1.2}
     envs = make_vec(name, 3, **keywords)
     mode = keywords.pop("autoreset_mode", "same-step")
-    singles = [make(name, **keywords) for _ in range(3)]
+    singles = [make(name, episode_steps=13, **keywords) for _ in range(3)]
     actions = batches(envs, 6 * 13)
     for t, action in enumerate(actions):
         # One world in three lives to the step limit, one may succeed, one soon diverges.

@@ -15,8 +15,10 @@ import npa_envs
 from npa_envs.agents.gardening import ScriptedGardener
 from npa_envs.agents.shapeshifting import RecognisingShapeshifter
 from npa_envs.envs import gardeners_v0
+from npa_envs.envs.garden.base import GardenContext
 from npa_envs.envs.garden.brushes import BrushLayout, apply_brushes, grid_places
 from npa_envs.envs.gardener2d import Gardener2DEnv
+from npa_envs.envs.shapeshifter2d import PictureGoals
 from npa_envs.registration import GARDENS
 from npa_envs.world.particles import Particles
 
@@ -230,12 +232,12 @@ def test_rewards_of_goals_are_those_of_steps_and_of_any_other_goals(reward):
     [("npa/Morphogenesis2D-v0", True), (GARDENER, True), (SHEPHERD, False)],
 )
 def test_only_rewards_that_come_in_the_last_step_can_be_missed(name, warned):
-    env = begun(make(name, reward="sparse", max_episode_steps=-1))
+    env = begun(make(name, reward="sparse", episode_steps=2))
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         _, reward, *_ = env.step(env.action_space.sample())
         env.reset()
-    assert any("1 steps after the last sparse" in str(one.message) for one in told) == warned
+    assert any("before its sparse reward" in str(one.message) for one in told) == warned
     # Away from its goal a creature is paid -1 in each step.
     assert reward == (0.0 if warned else -1.0)
 
@@ -275,7 +277,8 @@ def test_the_reward_is_one_for_a_whole_picture_and_zero_for_a_grey_one():
     grey = sum(task.losses(worlds.x, torch.zeros_like(worlds.s)).values())
     assert grey > 1.2 * info["loss"]
     losses = torch.cat((grey, torch.tensor([info["loss"], info["loss"] - 1.0, 1e3])))
-    earned = task.reward(worlds.particles, losses, worlds.context.expand(4, -1))
+    context = GardenContext(*(value.expand(4) for value in worlds.context))
+    earned = task.reward(worlds.particles, losses, context)
     better = 1.0 + 1.0 / float(grey - info["loss"])
     assert torch.allclose(earned, torch.tensor([0.0, 1.0, better, -1.0]), rtol=1e-4, atol=1e-5)
 
@@ -382,7 +385,7 @@ def test_a_step_is_paid_by_the_goal_that_was_seen_before_it(coded):
 def test_a_goal_itself_earns_one_and_an_empty_picture_nothing(coded):
     task = make(SHAPESHIFTER, **coded, resolution=32).unwrapped.task
     single = task.task.toward(torch.tensor([1]))
-    context = torch.tensor([[1.0]])
+    context = PictureGoals(torch.tensor([1]), torch.tensor([[1]]))
     no_loss, blank = torch.zeros(1), task.blank_losses[1:2]
     nothing = Particles(torch.zeros(1, 1, 2), torch.zeros(1, 1, 1))
     assert task.reward(nothing, no_loss, context).tolist() == [1.0]

@@ -75,13 +75,13 @@ FIRST = {
         r"goal of MyTask\.fresh must be a torch\.int64",
     ),
     "no mapping": ("losses", lambda a: a["away"], r"MyTask\.losses .* by name, .* got Tensor"),
-    "no part": ("losses", lambda a: {}, r"MyTask\.losses .* at least one, got \[\]"),
+    "no term": ("losses", lambda a: {}, r"MyTask\.losses .* at least one, got \[\]"),
     "no name": ("losses", lambda a: {1: a["away"]}, r"MyTask\.losses .* by name"),
-    "one loss for all": ("losses", away(torch.mean), r"part 'away' of MyTask\.losses must .*\(\)"),
-    "a column": ("losses", away(lambda a: a[:, None]), r"part 'away' of .*got .* shape \(\d, 1\)"),
-    "a double loss": ("losses", away(torch.Tensor.double), "part 'away' of .*got torch.float64"),
-    "a float": ("losses", away(lambda a: 1.0), "part 'away' of .* got a float"),
-    "NaN": ("losses", away(lambda a: (a - 9.0).sqrt()), r"part 'away' of MyTask\.losses .* finite"),
+    "one loss for all": ("losses", away(torch.mean), r"term 'away' of MyTask\.losses must .*\(\)"),
+    "a column": ("losses", away(lambda a: a[:, None]), r"term 'away' of .*got .* shape \(\d, 1\)"),
+    "a double loss": ("losses", away(torch.Tensor.double), "term 'away' of .*got torch.float64"),
+    "a float": ("losses", away(lambda a: 1.0), "term 'away' of .* got a float"),
+    "NaN": ("losses", away(lambda a: (a - 9.0).sqrt()), r"term 'away' of MyTask\.losses .* finite"),
     "torch draws": (
         "seed",
         drawing(lambda: torch.rand(3)),
@@ -125,7 +125,7 @@ def test_losses_that_are_not_finite_later_are_an_error_of_the_step(output, devic
         if action.ndim == 2:
             action[:, 2] = 1.0
         env.step(action)
-        refused(r"part 'late' of Late\.losses must be finite.* 1 of", env.step, action)
+        refused(r"term 'late' of Late\.losses must be finite.* 1 of", env.step, action)
         env.reset(seed=0)
         env.step(action)
 
@@ -140,5 +140,5 @@ def test_losses_keep_their_names(device):
 
     for env in environments(Fickle, device):
         env.reset(seed=0)
-        with pytest.raises(NPAError, match=r"same parts .* got \['far'\] after \['away'\]"):
+        with pytest.raises(NPAError, match=r"same terms .* got \['far'\] after \['away'\]"):
             env.step(np.zeros(env.action_space.shape, np.float32))

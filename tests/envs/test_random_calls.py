@@ -1,4 +1,4 @@
-"""Random calls, right and wrong, of every environment in every form, by a model of what they owe.
+"""Random calls, right and wrong, of every single environment, by a model of what they owe.
 
 What is refused leaves the worlds as they were; what is not keeps the documented types, shapes,
 limits, rewards, episode ends and reasons. Many worlds have no model of their own, as they equal
@@ -24,8 +24,8 @@ from small_envs import small as small_keywords
 from npa_envs import DivergedError, NPAError
 from npa_envs.envs import multispecies_v0, particles_v0
 
-QUICK, THOROUGH = 60, 20_000
-"""Calls of each id; its forms share them."""
+QUICK, THOROUGH = 30, 10_000
+"""Calls of each environment."""
 
 FIRST_SEED = int(os.environ.get("NPA_ENVS_FUZZ_SEED", "0"))
 
@@ -241,7 +241,8 @@ class OneWorld(Played):
     @classmethod
     def make(cls, name: str, draw: random.Random) -> Played:
         fields = one_species_fields(name, draw)
-        return cls(gymnasium.make(name, disable_env_checker=True, **fields), fields)
+        steps = {"episode_steps": fields["max_episode_steps"]}
+        return cls(gymnasium.make(name, disable_env_checker=True, **fields, **steps), fields)
 
     def expect_reset(self, observation: Any, info: Any) -> None:
         super().expect_reset(observation, info)
@@ -262,7 +263,8 @@ class OneWorld(Played):
         assert np.isfinite(reward)
         if not (diverged and way == "reset"):
             self.check_reward(np.float32(reward), np.float32(loss), info, terminated)
-        self.loss, self.is_over = np.float32(loss), ends_by_divergence
+        self.loss = np.float32(loss)
+        self.is_over = diverged and (terminated or truncated)
 
     def check_reward(self, reward: Any, loss: Any, info: Any, terminated: bool) -> None:
         if self.fields["reward"] == "sparse":
@@ -358,94 +360,31 @@ class Crowd(Played):
             assert self.env.state_space.contains(host(state))
 
 
-class Batch(Played):
-    """Many worlds of one species or of several."""
-
-    @classmethod
-    def make(cls, name: str, draw: random.Random) -> Played:
-        modes = ("same-step", "disabled")
-        if name in IDS:
-            fields = one_species_fields(name, draw) | {"copy": draw.random() < 0.7}
-            fields |= {"autoreset_mode": draw.choice((*modes, "next-step"))}
-            worlds = draw.choice((1, 2, 3))
-            return cls(gymnasium.make_vec(name, worlds, "vector_entry_point", **fields), fields)
-        fields = species_fields(multispecies_v0.ENVIRONMENTS[name], draw, by_particle=False)
-        fields |= {"world_count": draw.choice((1, 2, 3)), "autoreset_mode": draw.choice(modes)}
-        return cls(multispecies_v0.batched(**fields), fields)
-
-    def __init__(self, env: Any, fields: dict[str, Any]) -> None:
-        super().__init__(env, fields)
-        self.worlds = self.inner.worlds.world_count
-
-    def snapshot(self) -> Any:
-        return self.inner.particles() if "" in self.action_shapes else self.env.state()
-
-    def options(self, draw: random.Random) -> tuple[Any, bool]:
-        if draw.random() < 0.4:
-            mask = [draw.random() < 0.6 for _ in range(self.worlds)]
-            return {"reset_mask": np.array(mask)}, True
-        return super().options(draw)
-
-    def expect_reset(self, observation: Any, info: Any) -> None:
-        super().expect_reset(observation, info)
-        self.check_infos(info)
-
-    def expect_step(self, rewards: Any, terminated: Any, truncated: Any, infos: Any) -> None:
-        is_plain = "" in self.action_shapes and self.fields["output"] == "numpy"
-        dtypes = (np.float64 if is_plain else np.float32, bool, bool)
-        for values, dtype in zip((rewards, terminated, truncated), dtypes, strict=True):
-            for array in map(host, by_agent(values).values()):
-                assert (array.dtype, array.shape) == (dtype, (self.worlds,))
-                assert np.isfinite(array).all()
-        self.check_infos(infos)
-        flags = (*by_agent(terminated).values(), *by_agent(truncated).values())
-        if self.fields["autoreset_mode"] == "disabled" and any(host(f).any() for f in flags):
-            self.settle()
-
-    def check_infos(self, infos: Any) -> None:
-        for info in [infos] if "" in self.action_shapes else infos.values():
-            assert checked_loss(info).shape == (self.worlds,)
-
-    def place(self, draw: random.Random) -> None:
-        if "" in self.action_shapes:
-            super().place(draw)
+PLAYED: dict[str, type[Any]] = dict.fromkeys(IDS, OneWorld)
+PLAYED |= dict.fromkeys((*multispecies_v0.ENVIRONMENTS, *particles_v0.ENVIRONMENTS), Crowd)
+"""Models of all environments, by the ids of both registries."""
 
 
-PLAYED: dict[str, type[Any]] = {
-    "single": OneWorld,
-    "vector": Batch,
-    "parallel": Crowd,
-    "batched": Batch,
-}
-FORMS: dict[str, tuple[str, ...]] = dict.fromkeys(IDS, ("single", "vector"))
-FORMS |= dict.fromkeys(multispecies_v0.ENVIRONMENTS, ("parallel", "batched"))
-FORMS |= dict.fromkeys(particles_v0.ENVIRONMENTS, ("parallel",))
-"""All environments, by the ids of both registries, and their forms."""
-
-
-def make(name: str, form: str, draw: random.Random) -> Played:
+def make(name: str, draw: random.Random) -> Played:
     """Return an environment; a choice of keywords that is refused is drawn anew."""
     while True:
         try:
-            return PLAYED[form].make(name, draw)
+            return PLAYED[name].make(name, draw)
         except NPAError:
             continue
 
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("total", [QUICK, pytest.param(THOROUGH, marks=pytest.mark.slow)])
-@pytest.mark.parametrize(("name", "form"), [(n, f) for n, forms in FORMS.items() for f in forms])
-def test_whatever_an_environment_is_given_it_keeps_its_contract(
-    name: str, form: str, total: int
-) -> None:
-    count = total // len(FORMS[name])
-    for first in range(0, count, LIFE):
+@pytest.mark.parametrize("name", PLAYED)
+def test_whatever_an_environment_is_given_it_keeps_its_contract(name: str, total: int) -> None:
+    for first in range(0, total, LIFE):
         seed = FIRST_SEED + first
-        draw = random.Random(f"{name} {form} {seed}")
+        draw = random.Random(f"{name} {seed}")
         torch.manual_seed(seed)
-        made = make(name, form, draw)
+        made = make(name, draw)
         try:
-            for call in range(min(LIFE, count - first)):
+            for call in range(min(LIFE, total - first)):
                 try:
                     made.call(draw)
                 except Exception as error:

@@ -159,7 +159,7 @@ def test_rllib_knows_every_id():
     ("name", "keywords", "message"),
     [
         ("npa/Texure-v0", {}, "name must be a known id, got 'npa/Texure-v0': did you mean"),
-        ("npa/Texture-v0", {"world_count": 0}, "world_count must be a whole number of at least 1"),
+        ("npa/Texture-v0", {"world_count": 0}, "world_count must be an integer of at least 1"),
         ("npa/MixingParticles-v0", {}, "'npa/MixingParticles-v0': take rllib_config for it"),
         ("npa/Morphogenesis2D-v0", {"targets": "heart"}, "did you mean 'target'"),
     ],

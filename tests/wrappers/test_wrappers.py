@@ -176,7 +176,7 @@ WRAPPERS = {
 def test_world_k_is_as_the_single_environment_over_autoresets(kind, output, mode):
     (one, many), arguments = WRAPPERS[kind]
     envs = many(batched(autoreset_mode=mode, output=output), *arguments)
-    singles = [one(single(), *arguments) for _ in range(3)]
+    singles = [one(single(episode_steps=STEPS), *arguments) for _ in range(3)]
     envs.action_space.seed(0)
     actions = [envs.action_space.sample() for _ in range(2 * STEPS + 1)]
     reasons, _ = assert_batch_of_singles(envs, singles, actions, mode)

@@ -1,4 +1,4 @@
-"""Wrappers with running statistics of perception, observations, rewards and episodes.
+"""Wrappers that normalise perception, observations and rewards by running statistics.
 
 "Torch..." wrappers are those of `gymnasium.wrappers.vector` for tensors on a device, with all three
 autoreset modes.
@@ -6,29 +6,25 @@ autoreset modes.
 
 from __future__ import annotations
 
-import time
-from abc import abstractmethod
-from collections import deque
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import torch
 from gymnasium.spaces import Box
-from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.checks import check_count, checked_positive, is_real
+from npa_envs.checks import checked_positive, is_real
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.world.environment_steps import Physics
 from npa_envs.wrappers.base import (
     AnyVectorEnv,
-    EpisodeWrapper,
     Observations,
+    RewardSums,
     VectorObservations,
-    VectorStep,
     WrapperBase,
     as_tensor,
+    check_tensor,
     like,
     world_indices,
 )
@@ -67,12 +63,12 @@ class RunningMoments:
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Set the state that `state_dict` returned."""
-        wanted = {"mean": self.mean.shape, "var": self.var.shape, "count": torch.Size()}
-        for name in state.keys() ^ wanted.keys():
+        expected = {"mean": self.mean.shape, "var": self.var.shape, "count": torch.Size()}
+        for name in state.keys() ^ expected.keys():
             fault = "unknown" if name in state else "missing"
-            raise NPAError(f"{fault} statistic {shown(name)}: {suggest(name, wanted)}")
-        values = {name: torch.as_tensor(state[name], dtype=torch.float64) for name in wanted}
-        for name, shape in wanted.items():
+            raise NPAError(f"{fault} statistic {shown(name)}: {suggest(name, expected)}")
+        values = {name: torch.as_tensor(state[name], dtype=torch.float64) for name in expected}
+        for name, shape in expected.items():
             if values[name].shape != shape:
                 raise NPAError(
                     f"{name} must have shape {tuple(shape)}, got {tuple(values[name].shape)}: "
@@ -82,7 +78,7 @@ class RunningMoments:
         self.count = float(values["count"])
 
 
-class _NormalizesPerception(WrapperBase):
+class _PerceptionNormalizer(WrapperBase):
     """Mixin that normalises perception vectors z = [s; s̄; L(∇s); L(∇ρ)], of one world or many.
 
     There is one scale for each channel of the states, the smoothed states and the state gradients,
@@ -105,10 +101,10 @@ class _NormalizesPerception(WrapperBase):
         # Of the states, smoothed states, state gradients (C each) and the density gradient.
         self.statistics = RunningMoments(3 * self._physics.state_dim + 1)
         shape: tuple[int, ...] = getattr(env, self.space_name).shape or ()
-        wanted = self._physics.perception_dim
-        if len(shape) != 2 or shape[1] != wanted:
+        expected = self._physics.perception_dim
+        if len(shape) != 2 or shape[1] != expected:
             raise NPAError(
-                f"observations must be perception vectors, shape [N, {wanted}], got shape "
+                f"observations must be perception vectors, shape [N, {expected}], got shape "
                 f"{shape}: normalise before other wrappers change them"
             )
         setattr(self, self.space_name, Box(-self.clip, self.clip, shape, np.float32))
@@ -121,7 +117,7 @@ class _NormalizesPerception(WrapperBase):
         """Set the statistics that another wrapper's `state_dict` returned."""
         self.statistics.load_state_dict(state)
 
-    def count(self, observations: Any) -> None:
+    def update(self, observations: Any) -> None:
         """While training, add new observations to the statistics."""
         if not self.training:
             return
@@ -153,7 +149,7 @@ class _NormalizesPerception(WrapperBase):
         return torch.cat((statistics[:centred], gradients))
 
 
-class NormalizePerception(_NormalizesPerception, Observations):
+class NormalizePerception(_PerceptionNormalizer, Observations):
     """Normalise perception by running statistics that all particles share.
 
     The environment's spec has the arguments, not the statistics: save those with `state_dict`.
@@ -173,118 +169,13 @@ class NormalizePerception(_NormalizesPerception, Observations):
     """
 
 
-class VectorNormalizePerception(_NormalizesPerception, VectorObservations):
+class VectorNormalizePerception(_PerceptionNormalizer, VectorObservations):
     """`NormalizePerception` for vector environments, of NumPy arrays or tensors on a device.
 
     Final observations are normalised and not counted, nor are repeated ones after a reset of some
     worlds. Nothing synchronises. Arguments, errors and attributes are those of
     `NormalizePerception`, except `env`, a vector environment of this package.
     """
-
-
-class _SumsRewards(EpisodeWrapper):
-    """Base class of wrappers with a sum of the rewards of each running episode."""
-
-    gamma = 1.0
-    """Factor on the sum in each step (dimensionless)."""
-
-    sums: Tensor | None = None
-    """Sums of the rewards, float64, shape [B]."""
-
-    @abstractmethod
-    def summed(self, rewards: Tensor, sums: Tensor) -> tuple[Tensor, dict[str, Any]]:
-        """Return the rewards, [B], changed, and entries for infos; before sums restart."""
-
-    def after_reset(self, observations: Any, infos: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
-        """Set the sums of new episodes to zero."""
-        self.restart(self.clock.restarted)
-        return observations, infos
-
-    def after_step(self, outcome: VectorStep) -> VectorStep:
-        """Add the rewards to the sums."""
-        observations, rewards, terminations, truncations, infos = outcome
-        check_tensor(rewards, type(self).__name__)
-        sums = rewards.double()
-        if self.sums is not None:
-            sums = self.sums * self.gamma + sums
-        self.sums = sums
-        rewards, entries = self.summed(rewards, sums)
-        # With next-step autoreset the step that restarts belongs to no episode.
-        self.restart(self.clock.restarted)
-        return observations, rewards, terminations, truncations, infos | entries
-
-    def restart(self, worlds: NDArray[np.bool_]) -> None:
-        """Set the sums of some worlds to zero."""
-        if self.sums is not None and worlds.any():
-            self.sums = self.sums.index_fill(0, world_indices(worlds, self.sums.device), 0.0)
-
-
-class TorchRecordEpisodeStatistics(_SumsRewards):
-    """Keep track of returns and lengths of episodes.
-
-    A step in which episodes end has `infos["episode"]` with the tensors `r` (returns), `l` (lengths
-    in steps) and `t` (time [s]), shape [B], 0 for the other worlds, and `infos["_episode"]`, True
-    where an episode ended.
-
-    Args:
-        env: A vector environment with torch tensors.
-        buffer_length: Episodes in the queues.
-        stats_key: The key in `infos`.
-
-    Raises:
-        NPAError: `env` is no vector environment, or `buffer_length` no integer of at least 1.
-    """
-
-    def __init__(
-        self, env: AnyVectorEnv, buffer_length: int = 100, stats_key: str = "episode"
-    ) -> None:
-        super().__init__(env)
-        check_count("buffer_length", buffer_length, at_most=2**31 - 1)
-        self._key = stats_key
-        self.episode_count = 0
-        """Episodes that have ended."""
-        self.length_queue: deque[int] = deque(maxlen=buffer_length)
-        """Lengths of the last episodes [steps]."""
-        self.time_queue: deque[float] = deque(maxlen=buffer_length)
-        """Times that the last episodes took [s]."""
-        # On the device; each entry has at least one episode.
-        self._returns: deque[Tensor] = deque(maxlen=buffer_length)
-        self._began = np.full(env.num_envs, time.perf_counter())
-
-    @property
-    def episode_returns(self) -> Tensor | None:
-        """Sum of the rewards of each running episode, float64, shape [B]."""
-        return self.sums
-
-    @property
-    def return_queue(self) -> deque[float]:
-        """Returns of the last episodes; reading it synchronises."""
-        returns = torch.cat(tuple(self._returns)).tolist() if self._returns else []
-        return deque(returns, maxlen=self._returns.maxlen)
-
-    def summed(self, rewards: Tensor, sums: Tensor) -> tuple[Tensor, dict[str, Any]]:
-        """Return the rewards, and the statistics of the episodes that ended."""
-        ended, device = self.clock.ended, sums.device
-        if not ended.any():
-            return rewards, {}
-        lengths = np.where(ended, self.clock.lengths, 0)
-        seconds = np.where(ended, np.round(time.perf_counter() - self._began, 6), 0.0)
-        mask = torch.from_numpy(ended).to(device)
-        self.episode_count += int(ended.sum())
-        self.length_queue.extend(lengths[ended].tolist())
-        self.time_queue.extend(seconds[ended].tolist())
-        self._returns.append(sums[world_indices(ended, device)])
-        episode = {
-            "r": torch.where(mask, sums, 0.0),
-            "l": torch.from_numpy(lengths).to(device),
-            "t": torch.from_numpy(seconds).to(device),
-        }
-        return rewards, {self._key: episode, f"_{self._key}": mask}
-
-    def restart(self, worlds: NDArray[np.bool_]) -> None:
-        """Set sums and times of some worlds to zero."""
-        super().restart(worlds)
-        self._began[worlds] = time.perf_counter()
 
 
 class TorchNormalizeObservation(VectorObservations):
@@ -313,7 +204,7 @@ class TorchNormalizeObservation(VectorObservations):
         self.update_running_mean = True
         """Whether new observations update the statistics."""
 
-    def count(self, observations: Any) -> None:
+    def update(self, observations: Any) -> None:
         """Add new observations to the statistics unless they are frozen."""
         check_tensor(observations, type(self).__name__)
         if self.update_running_mean:
@@ -325,7 +216,7 @@ class TorchNormalizeObservation(VectorObservations):
         return (observations - self.obs_rms.mean.to(observations)) * scale
 
 
-class TorchNormalizeReward(_SumsRewards):
+class TorchNormalizeReward(RewardSums):
     """Divide rewards by the running standard deviation of the discounted return.
 
     The return restarts at zero with each episode.
@@ -363,12 +254,3 @@ class TorchNormalizeReward(_SumsRewards):
         if self.update_running_mean and len(sums):
             self.return_rms.update_from(sums)
         return rewards * (self.return_rms.var + self.epsilon).rsqrt().to(rewards), {}
-
-
-def check_tensor(values: Any, wrapper: str) -> None:
-    """Check that an environment returned a tensor to a wrapper."""
-    if not isinstance(values, Tensor):
-        raise NPAError(
-            f"{wrapper} needs torch tensors, got {type(values).__name__}: make the environment "
-            f"with output='torch', or use gymnasium.wrappers.vector.{wrapper.removeprefix('Torch')}"
-        )
