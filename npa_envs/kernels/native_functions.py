@@ -59,13 +59,16 @@ def func_native(*parameters: Any) -> Callable[[Any], Any]:
     return lambda stub: _native(stub, stub.__name__, parameters)
 
 
-def call_of(kernel: wp.Kernel, name: str, *parameters: Any) -> Any:
-    """Return a Warp function of the C++ function `npa::name`, with the arguments of a kernel."""
+def generic(name: str, argument_count: int, *parameters: Any) -> Any:
+    """Return a Warp function of the C++ function `npa::name`, with arguments of any types."""
 
     def stub(): ...
 
-    stub.__signature__ = inspect.signature(kernel.func)  # type: ignore[attr-defined]
-    stub.__annotations__, stub.__qualname__ = kernel.func.__annotations__, name
+    arguments = [f"argument_{k}" for k in range(argument_count)]
+    stub.__annotations__, stub.__qualname__ = dict.fromkeys(arguments, Any), name
+    stub.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
+        [inspect.Parameter(each, 1, annotation=Any) for each in arguments]
+    )
     return _native(stub, name, parameters)
 
 

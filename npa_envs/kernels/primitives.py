@@ -83,14 +83,14 @@ def scalar_of(value_type: Any) -> Any:
 
 @cached_under_lock()
 def make_read_at(value_type: type, alignment: int) -> Any:
-    """Return a Warp function that reads a vector from index `place` of an array of scalars.
+    """Return a Warp function that reads a vector from an index of an array of scalars.
 
     Its address must be a multiple of `alignment` bytes, 4, 8 or 16: the width of a load.
     """
     scalar = scalar_of(value_type)
 
     @native.func_native(value_type, alignment)
-    def read_at(values: wp.array[scalar], place: int) -> value_type: ...
+    def read_at(values: wp.array[scalar], index: int) -> value_type: ...
 
     return read_at
 
@@ -106,13 +106,13 @@ def make_read_channels(value_type: Any) -> Any:
         states: wp.array[scalar], state_dim: int, aligned: int, particle: int, first: int
     ):
         result = value_type()
-        place = particle * state_dim + first
+        index = particle * state_dim + first
         if aligned == 0:
             for k in range(wp.static(count)):
                 if first + k < state_dim:
-                    result[k] = states[place + k]
+                    result[k] = states[index + k]
         elif first < state_dim:
-            result = read_at(states, place)
+            result = read_at(states, index)
         return result
 
     return read_channels
@@ -120,14 +120,14 @@ def make_read_channels(value_type: Any) -> Any:
 
 @cached_under_lock()
 def make_write_at(value_type: type) -> Any:
-    """Return a Warp function that writes a vector to index `place` of an array of scalars.
+    """Return a Warp function that writes a vector to an index of an array of scalars.
 
     Address and size of the vector must be multiples of 16 bytes.
     """
     scalar = scalar_of(value_type)
 
     @native.func_native()
-    def write_at(values: wp.array[scalar], place: int, value: value_type): ...
+    def write_at(values: wp.array[scalar], index: int, value: value_type): ...
 
     return write_at
 
@@ -166,7 +166,7 @@ def make_lane_collect(value_type: Any, lanes: int) -> Any:
 def make_kept(scalar: type) -> Any:
     """Return a Warp function that returns its argument, of type `scalar`, kept in a register.
 
-    CUDA's compiler would otherwise convert an integer to float again in every turn of a loop.
+    CUDA's compiler would otherwise convert an integer to float again in every pass of a loop.
     """
 
     @native.func_native()

@@ -430,7 +430,7 @@ def build_neighbours(
         plan,
         ordered,
         batch_listing(plan.request),
-        state_place=ordered.source if in_place else None,
+        state_index=ordered.source if in_place else None,
         with_particles=False,
     )
     destination = ordered.source

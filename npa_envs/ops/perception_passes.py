@@ -38,7 +38,7 @@ class NeighbourLists(NamedTuple):
     """Number of neighbours of each row's particle, int32, [K]."""
     records: Tensor
     """Sorted positions with volumes, and in 2D indices of states, shape [B N, 4]."""
-    by_place: bool = False
+    per_particle: bool = False
     """Whether there is a list for each sorted particle, not for each row."""
 
 
@@ -84,12 +84,12 @@ def compute_densities(
     ordered: SortedWorlds,
     listing: Listing | None = None,
     *,
-    state_place: Tensor | None = None,
+    state_index: Tensor | None = None,
     with_particles: bool = True,
 ) -> Densities:
     """Compute densities, and neighbour lists or the rows' density gradients for perception.
 
-    Neighbours are listed where `plan.lists_neighbours`, by default as in rollouts. `state_place`
+    Neighbours are listed where `plan.lists_neighbours`, by default as in rollouts. `state_index`
     has the index of each sorted particle's state, by default in order. `with_particles`: also
     return `particles`, which the adjoint reads.
     """
@@ -105,7 +105,7 @@ def compute_densities(
         ordered.starts,
         ordered.cell,
         positions,
-        state_place,
+        state_index,
         ordered.source,
         ordered.row_of,
         particles,
@@ -184,7 +184,7 @@ def perception_launch(
     """
     some = row_count is not None
     row_count = plan.row_capacity if row_count is None else row_count
-    row_place = ordered.row_place[first_row:] if plan.masked or some else None
+    row_index = ordered.row_index[first_row:] if plan.masked or some else None
     terms = plan.physics.terms
     numbers = (
         plan.state_dim,
@@ -208,7 +208,7 @@ def perception_launch(
             lists.listing.capacity,
             row_kernel_sum is not None,
             lists.listing.teams,
-            lists.by_place,
+            lists.per_particle,
             lists.listing.tiled,
         )
         source = ordered.states if states is None else states
@@ -227,7 +227,7 @@ def perception_launch(
             lists.records,
             source,
             None if states is None else ordered.source,
-            row_place,
+            row_index,
             destination,
             lists.steps,
             lists.lengths,
@@ -250,7 +250,7 @@ def perception_launch(
         densities.particles,
         ordered.states,
         ordered.states.view(plan.total, -1),
-        row_place,
+        row_index,
         destination,
         densities.density_gradient,
         out,

@@ -190,7 +190,7 @@ def static_worlds(
     lists = None
     if plan.lists_neighbours:
         steps, lengths, records = worlds.lists
-        lists = NeighbourLists(plan.listing, steps, lengths, records, by_place=True)
+        lists = NeighbourLists(plan.listing, steps, lengths, records, per_particle=True)
     # States in groups of channels.
     padding = 0, plan.group_count * plan.width - plan.state_dim
     ordered = SortedWorlds(
@@ -199,7 +199,7 @@ def static_worlds(
         cell=worlds.cell,
         row_of=rows.row_of,
         row_source=rows.row_source,
-        row_place=rows.row_source,
+        row_index=rows.row_source,
         positions=x.view(plan.total, plan.space_dim),
         row_positions=rows.row_positions,
         states=aligned(torch.nn.functional.pad(s, padding)).view(-1, plan.width),

@@ -40,7 +40,7 @@ VARIANTS: dict[str, Callable[[], Any]] = {
     "density in tiles": lambda: tiled_density(True, 256, True),
     "perceive": lambda: perception(3, 16, True, "smooth", False, True, 128, True, 2),
     "perceive tiles": lambda: perception(
-        2, 16, True, "threshold", True, False, 256, False, 2, by_place=True, tiled=True
+        2, 16, True, "threshold", True, False, 256, False, 2, per_particle=True, tiled=True
     ),
     "adjoint": lambda: listed_adjoint(3, 16, True, True, True).gather_state_cotangents,
     "adjoint 2D": lambda: listed_adjoint(2, 16, True, False, False).unscale_cotangents,

@@ -3,8 +3,8 @@
 namespace npa {
 
 // Particles of a tile, the lanes that share one, and cells on each side in which neighbours lie.
-constexpr int TILE = 8, TILE_LANES = 4, TILE_REACH = 2;
-constexpr int TILE_LINES = 2 * TILE_REACH + 1;
+constexpr int TILE = 8, TILE_LANES = 4, CELLS_PER_EPS = 2;
+constexpr int TILE_LINES = 2 * CELLS_PER_EPS + 1;
 // A bit for each candidate that a lane tests, and the bits of a word.
 constexpr int TILE_TESTS = 32;
 // Tests in a row without a check of how many are left.
@@ -65,15 +65,15 @@ __device__ inline TileRun run_around(
 {
     const int lane = threadIdx.x & 31;
     const int nx = domain.cell_shape[0], ny = domain.cell_shape[1];
-    const int width = right - left + 2 * TILE_REACH + 1;
-    const int first = left - TILE_REACH < 0 ? left - TILE_REACH + nx : left - TILE_REACH;
+    const int width = right - left + 2 * CELLS_PER_EPS + 1;
+    const int first = left - CELLS_PER_EPS < 0 ? left - CELLS_PER_EPS + nx : left - CELLS_PER_EPS;
     const bool wraps = first + width > nx;
     TileRun run;
     run.copiers = wraps ? 3 : 6;
     const int number = wraps ? lane / 3 : lane / 6;
     run.copier = lane - number * run.copiers;
     const bool second = wraps && number & 1;
-    const int unwrapped = line - TILE_REACH + (wraps ? number / 2 : number);
+    const int unwrapped = line - CELLS_PER_EPS + (wraps ? number / 2 : number);
     const int y = unwrapped < 0 ? unwrapped + ny : unwrapped >= ny ? unwrapped - ny : unwrapped;
     run.begin = run.count = 0;
     if (number < (wraps ? 2 * TILE_LINES : TILE_LINES)) {

@@ -79,7 +79,7 @@ class PerceptionVariant(NamedTuple):
     teams: int
     """Teams of `CUDA_LANES` lanes that share a particle, so that few particles fill the GPU: each
     runs through its own part of the list, for all channels."""
-    by_place: bool = False
+    per_particle: bool = False
     """Whether there is a list for each sorted particle, not for each row."""
     tiled: bool = False
     """Whether lists have the layout of `tiled_density`."""
@@ -103,7 +103,7 @@ class PerceptionVariant(NamedTuple):
         """Return the Warp module of the variant."""
         topic = "listed_" + perception_topic(self.state_gradient, self.moment_inverse)
         topic += "_in_box" * self.periodic + "_grouped" * self.grouped + f"_{self.capacity}"
-        topic += "_for_adjoint" * self.for_adjoint + "_by_place" * self.by_place
+        topic += "_for_adjoint" * self.for_adjoint + "_by_place" * self.per_particle
         topic += "_tiled" * self.tiled
         return kernel_module(topic, self.space_dim, wp.float32, self.width, self.lanes)
 
@@ -214,7 +214,7 @@ def weighing_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> Si
     @wp.func
     def weigh(
         domain: Domain,
-        state_place: wp.array[wp.int32],
+        state_index: wp.array[wp.int32],
         slot: wp.uint32,
         entry: int,
         j: int,
@@ -230,8 +230,8 @@ def weighing_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> Si
         number = j
         if wp.static(flat):
             number = as_number(record[3])
-        elif state_place.shape[0] > 0:
-            number = load_integer(state_place, j)
+        elif state_index.shape[0] > 0:
+            number = load_integer(state_index, j)
         neighbour = vector()
         for d in range(wp.static(space_dim)):
             neighbour[d] = record[d]
@@ -259,7 +259,7 @@ def weighing_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> Si
     def weigh_found(
         domain: Domain,
         records: wp.array[RECORD],
-        state_place: wp.array[wp.int32],
+        state_index: wp.array[wp.int32],
         lane: int,
         slot: wp.uint32,
         begin: int,
@@ -283,7 +283,7 @@ def weighing_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> Si
                 entry = first + a * wp.static(lanes)
                 sums = weigh(
                     domain,
-                    state_place,
+                    state_index,
                     slot,
                     entry,
                     places[a],
@@ -300,7 +300,7 @@ def weighing_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> Si
         domain: Domain,
         records: wp.array[RECORD],
         lists: wp.array3d[wp.int16],
-        state_place: wp.array[wp.int32],
+        state_index: wp.array[wp.int32],
         lane: int,
         slot: wp.uint32,
         row: int,
@@ -327,7 +327,7 @@ def weighing_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> Si
             for a in range(wp.static(PAIR)):
                 sums = weigh(
                     domain,
-                    state_place,
+                    state_index,
                     slot,
                     first + a - begin,
                     places[a],
@@ -397,11 +397,11 @@ def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
     space_dim, width, lanes, teams = variant.space_dim, variant.width, variant.lanes, variant.teams
     state_gradient, moment_correction = variant.state_gradient, variant.moment_inverse is not None
     periodic, grouped, capacity = variant.periodic, variant.grouped, variant.capacity
-    for_adjoint, by_place = variant.for_adjoint, variant.by_place
+    for_adjoint, per_particle = variant.for_adjoint, variant.per_particle
     lane_width, team = variant.lane_width, CUDA_LANES
     types = domain_types(space_dim, scalar)
     vector, Domain = types.vector, types.Domain
-    cell_place, segment_count = types.cell_place, types.segment_count
+    cell_at, segment_count = types.cell_at, types.segment_count
     segment_cells, periodic_image = types.segment_cells, types.periodic_image
     vector_f64 = wp.types.vector(space_dim, wp.float64)
     square = wp.types.matrix((space_dim, space_dim), scalar)
@@ -465,8 +465,8 @@ def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
         sorted_positions: wp.array[vector],
         records: wp.array[RECORD],
         states: wp.array[lane_channels],
-        state_place: wp.array[wp.int32],
-        row_place: wp.array[wp.int32],
+        state_index: wp.array[wp.int32],
+        row_index: wp.array[wp.int32],
         row_destination: wp.array[wp.int32],
         lists: wp.array3d[wp.int16],
         list_lengths: wp.array[wp.int32],
@@ -477,7 +477,7 @@ def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
         """Write the perception vector of each row, as `perception_kernels` does.
 
         Threads are numbered by lanes, teams, groups and rows, in complete warps, some beyond the
-        last row. `state_place` has the index of each sorted particle's state, by default (empty)
+        last row. `state_index` has the index of each sorted particle's state, by default (empty)
         the same index; in 2D it is in `records`. Row k is written to row `row_destination[k]`, by
         default to row k. Entries are clipped to plus and minus `limit` unless it is 0.
         """
@@ -505,14 +505,14 @@ def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
         # Rows beyond the last one read the first particle, with no neighbours.
         safe_row = wp.where(present, row, wp.int32(0))
         k = safe_row
-        if row_place.shape[0] > 0:
-            k = wp.where(present, load_integer(row_place, safe_row), wp.int32(0))
+        if row_index.shape[0] > 0:
+            k = wp.where(present, load_integer(row_index, safe_row), wp.int32(0))
         destination = wp.where(row < row_capacity, row, wp.int32(-1))
         if row_destination.shape[0] > 0:
             destination = wp.where(present, load_integer(row_destination, safe_row), destination)
         own_place = k
-        if state_place.shape[0] > 0:
-            own_place = load_integer(state_place, k)
+        if state_index.shape[0] > 0:
+            own_place = load_integer(state_index, k)
         parts = part_address(states, part)
         own = part_of_state(parts, part_count, own_place)
         position = load_vector(sorted_positions, k)
@@ -522,7 +522,7 @@ def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
             centre.precise[d] = wp.float64(position[d])
         centre.inverse_eps = wp.float64(domain.inverse_eps)
         list_number = safe_row
-        if wp.static(by_place):
+        if wp.static(per_particle):
             list_number = k
         length = wp.where(present, load_integer(list_lengths, list_number), wp.int32(0))
         searching = length > wp.static(capacity)
@@ -534,7 +534,7 @@ def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
                 domain,
                 records,
                 lists,
-                state_place,
+                state_index,
                 lane,
                 slot,
                 list_number,
@@ -556,7 +556,7 @@ def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
             index = load_integer(sorted_cell, k)
             local = wp.int32(wp.uint32(index) % wp.uint32(domain.cell_count))
             base = index - local
-            cell = cell_place(domain, local)
+            cell = cell_at(domain, local)
             segments = wp.where(searching, segment_count(domain, cell), wp.int32(0))
         # Each lane looks up one run of cells; all lanes then go through the runs in order.
         run_count = largest_in_warp(segments)
@@ -601,7 +601,7 @@ def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
                 crowded = any_in_warp(count > wp.static(SLOT_ENTRIES - ahead * lanes))
                 filling = working and not crowded
             sums = weigh_found(
-                domain, records, state_place, lane, slot, begin, count, k, centre, sums
+                domain, records, state_index, lane, slot, begin, count, k, centre, sums
             )
             blur, gradient = add_states(parts, part_count, first, slot, count, own, blur, gradient)
             begin = count & wp.static(lanes - 1)

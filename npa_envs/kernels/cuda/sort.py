@@ -83,14 +83,14 @@ def block_functions(capacity: int) -> SimpleNamespace:
         """Return the range of provisional positions whose particles may belong to a slice."""
 
     @native.func_native(*sizes)
-    def ranked_at(address: wp.uint64, place: int, unordered: int) -> wp.vec3i:
+    def ranked_at(address: wp.uint64, provisional: int, unordered: int) -> wp.vec3i:
         """Return sorted index, cell and row (-1: none) of the particle at a provisional position.
 
         In the cell `unordered` (-1: none) provisional positions are final.
         """
 
     @native.func_native(*sizes)
-    def member_at(address: wp.uint64, place: int) -> int:
+    def member_at(address: wp.uint64, provisional: int) -> int:
         """Return the index of the particle at a provisional position."""
 
     functions = [block_memory, clear_counts, arrive, add_up_counts]
@@ -103,23 +103,17 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
     """Return the kernel that sorts worlds of float32 and of up to `capacity` particles."""
     scalar = wp.float32
     block = BLOCKS[capacity]
-    turns = capacity // block
-    types = domain_types(space_dim, scalar)
-    vector, Domain = types.vector, types.Domain
-    cell_of, cell_index = types.cell_of, types.cell_index
+    rounds = capacity // block
+    space = domain_types(space_dim, scalar)
+    vector, Domain = space.vector, space.Domain
     channels = wp.types.vector(THREAD_CHANNELS, scalar)
-    positions_ahead = wp.types.matrix((turns, space_dim), scalar)
-    flags_ahead = wp.types.vector(turns, wp.int32)
+    positions_ahead = wp.types.matrix((rounds, space_dim), scalar)
+    flags_ahead = wp.types.vector(rounds, wp.int32)
     load_vector = make_wide_load(vector)
     read_channels = make_read_channels(channels)
     store_vector = make_wide_store(vector)
     store_channels = make_wide_store(channels)
     sorting = block_functions(capacity)
-    block_memory, clear_counts = sorting.block_memory, sorting.clear_counts
-    arrive, add_up_counts = sorting.arrive, sorting.add_up_counts
-    start_of, place_arrived = sorting.start_of, sorting.place_arrived
-    span_of_slice, ranked_at = sorting.span_of_slice, sorting.ranked_at
-    member_at = sorting.member_at
 
     @wp.kernel(
         enable_backward=False,
@@ -145,7 +139,7 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
         sorted_cell: wp.array[wp.int32],
         row_of: wp.array[wp.int32],
         row_source: wp.array[wp.int32],
-        row_place: wp.array[wp.int32],
+        row_index: wp.array[wp.int32],
         sorted_positions: wp.array[vector],
         row_positions: wp.array[vector],
         sorted_states: wp.array[channels],
@@ -163,76 +157,76 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
         masked = mask.shape[0] > 0
         ahead = positions_ahead()
         acting = flags_ahead()
-        for turn in range(wp.static(turns)):
-            i = wp.min(lane + turn * wp.static(block), particle_count - 1)
+        for r in range(wp.static(rounds)):
+            i = wp.min(lane + r * wp.static(block), particle_count - 1)
             position = load_vector(positions, first_particle + i)
             for d in range(wp.static(space_dim)):
-                ahead[turn, d] = position[d]
-            acting[turn] = wp.int32(1)
+                ahead[r, d] = position[d]
+            acting[r] = wp.int32(1)
             if masked:
-                acting[turn] = wp.int32(mask[first_particle + i])
+                acting[r] = wp.int32(mask[first_particle + i])
         earlier = wp.int32(0)
         if masked:
             earlier = count_active(mask, first_particle)
         elif lane == 0:
             earlier = first_particle
-        memory = block_memory()
-        clear_counts(memory, domain.cell_count, earlier)
-        for turn in range(wp.static(turns)):
-            i = lane + turn * wp.static(block)
+        memory = sorting.block_memory()
+        sorting.clear_counts(memory, domain.cell_count, earlier)
+        for r in range(wp.static(rounds)):
+            i = lane + r * wp.static(block)
             if i < particle_count:
                 position = vector()
                 for d in range(wp.static(space_dim)):
-                    position[d] = ahead[turn, d]
-                cell = cell_index(domain, cell_of(domain, position))
-                arrive(memory, i, cell, acting[turn] != 0)
-        add_up_counts(memory, domain.cell_count)
+                    position[d] = ahead[r, d]
+                cell = space.cell_index(domain, space.cell_of(domain, position))
+                sorting.arrive(memory, i, cell, acting[r] != 0)
+        sorting.add_up_counts(memory, domain.cell_count)
 
         slice_cells = (domain.cell_count + slice_count - 1) / slice_count
         from_cell = slice_number * slice_cells
         to_cell = wp.min(from_cell + slice_cells, domain.cell_count)
         for cell in range(from_cell + lane, to_cell, wp.static(block)):
-            start = start_of(memory, cell)
+            start = sorting.start_of(memory, cell)
             store_integer(starts, first_cell + cell, first_particle + start[0])
             if masked:
                 store_integer(starts, active_offset + first_cell + cell, row_base + start[1])
         is_last_world = first_particle + particle_count == positions.shape[0]
         if lane == 0 and slice_number == 0 and is_last_world:
-            end_of_all = start_of(memory, domain.cell_count)
+            end_of_all = sorting.start_of(memory, domain.cell_count)
             starts[starts.shape[0] - 1] = row_base + end_of_all[1]
         for i in range(lane, particle_count, wp.static(block)):
-            place_arrived(memory, i)
+            sorting.place_arrived(memory, i)
         sync_block()
 
-        slice_places = (particle_count + slice_count - 1) / slice_count
-        begin = slice_number * slice_places
-        end = wp.min(begin + slice_places, particle_count)
+        slice_size = (particle_count + slice_count - 1) / slice_count
+        begin = slice_number * slice_size
+        end = wp.min(begin + slice_size, particle_count)
         if begin < end:
-            span = span_of_slice(memory, begin, end)
+            span = sorting.span_of_slice(memory, begin, end)
             for chunk in range(span[0] * parts + lane, span[1] * parts, wp.static(block)):
                 k = chunk / parts
                 part = chunk - k * parts
-                i = first_particle + member_at(memory, k)
+                i = first_particle + sorting.member_at(memory, k)
                 position = load_vector(positions, i)
                 state = channels()
                 if sorted_states.shape[0] > 0:
                     first = part * wp.static(THREAD_CHANNELS)
                     state = read_channels(states, state_dim, aligned, i, first)
-                ranked = ranked_at(memory, k, wp.int32(-1))
+                ranked = sorting.ranked_at(memory, k, wp.int32(-1))
                 inside = ranked[0] >= begin and ranked[0] < end
-                place = first_particle + ranked[0]
+                target = first_particle + ranked[0]
                 if inside and sorted_states.shape[0] > 0:
-                    store_channels(sorted_states, place * parts + part, state)
+                    store_channels(sorted_states, target * parts + part, state)
                 if inside and part == 0:
-                    store_integer(source, place, i)
-                    store_integer(sorted_cell, place, first_cell + ranked[1])
-                    store_vector(sorted_positions, place, position)
+                    store_integer(source, target, i)
+                    store_integer(sorted_cell, target, first_cell + ranked[1])
+                    store_vector(sorted_positions, target, position)
                     if row_of.shape[0] > 0:
                         row = wp.where(ranked[2] < row_capacity, ranked[2], wp.int32(-1))
                         store_integer(row_of, i, row)
                         if row >= 0:
                             store_integer(row_source, row, i)
-                            store_integer(row_place, row, place)
+                            store_integer(row_index, row, target)
                             store_vector(row_positions, row, position)
 
     return sort_worlds
@@ -267,7 +261,7 @@ def order_particles(space_dim: int, width: int) -> wp.Kernel:
         sorted_cell: wp.array[wp.int32],
         row_of: wp.array[wp.int32],
         row_source: wp.array[wp.int32],
-        row_place: wp.array[wp.int32],
+        row_index: wp.array[wp.int32],
         sorted_positions: wp.array[vector],
         row_positions: wp.array[vector],
         sorted_states: wp.array[channels],
@@ -293,11 +287,11 @@ def order_particles(space_dim: int, width: int) -> wp.Kernel:
             if entry < own[0]:
                 rank += 1
                 active_rank += entry & 1
-        place = begin + rank
+        target = begin + rank
         if k < total:
-            store_integer(source, place, i)
-            store_integer(sorted_cell, place, c)
-            store_vector(sorted_positions, place, position)
+            store_integer(source, target, i)
+            store_integer(sorted_cell, target, c)
+            store_vector(sorted_positions, target, position)
             if row_of.shape[0] > 0:
                 row = first_row + active_rank
                 if own[0] & 1 == 0 or row >= row_capacity:
@@ -305,7 +299,7 @@ def order_particles(space_dim: int, width: int) -> wp.Kernel:
                 store_integer(row_of, i, row)
                 if row >= 0:
                     store_integer(row_source, row, i)
-                    store_integer(row_place, row, place)
+                    store_integer(row_index, row, target)
                     store_vector(row_positions, row, position)
 
         # A warp moves the states of its particles together, adjacent threads adjacent channels. All
@@ -313,23 +307,23 @@ def order_particles(space_dim: int, width: int) -> wp.Kernel:
         if sorted_states.shape[0] > 0:
             lane = k % wp.static(WARP)
             parts = group_count * wp.static(CUDA_LANES)
-            for first_turn in range(0, parts, wp.static(CUDA_LANES)):
+            for first_round in range(0, parts, wp.static(CUDA_LANES)):
                 held = held_type()
-                for turn in range(wp.static(CUDA_LANES)):
-                    chunk = lane + (first_turn + turn) * wp.static(WARP)
+                for r in range(wp.static(CUDA_LANES)):
+                    chunk = lane + (first_round + r) * wp.static(WARP)
                     owner = chunk / parts
                     first = (chunk - owner * parts) * wp.static(thread_width)
                     state = read_channels(states, state_dim, aligned, of_warp(i, owner), first)
                     for n in range(wp.static(thread_width)):
-                        held[turn, n] = state[n]
-                for turn in range(wp.static(CUDA_LANES)):
-                    chunk = lane + (first_turn + turn) * wp.static(WARP)
+                        held[r, n] = state[n]
+                for r in range(wp.static(CUDA_LANES)):
+                    chunk = lane + (first_round + r) * wp.static(WARP)
                     owner = chunk / parts
                     part = chunk - owner * parts
-                    to = of_warp(place, owner) * parts + part
+                    to = of_warp(target, owner) * parts + part
                     state = channels()
                     for n in range(wp.static(thread_width)):
-                        state[n] = held[turn, n]
+                        state[n] = held[r, n]
                     if k - lane + owner < total:
                         store_channels(sorted_states, to, state)
 

@@ -26,18 +26,11 @@ def sort_small_splats(capacity: int) -> wp.Kernel:
     """Return the kernel that sorts splats of float32, of worlds of up to `capacity` particles."""
     scalar = wp.float32
     block = BLOCKS[capacity]
-    types, functions = splat_types(scalar), splat_functions(scalar)
+    types, splat = splat_types(scalar), splat_functions(scalar)
     View, vector, footprint_type = types.View, types.vector, types.footprint
-    pixel_place, patch_centre = functions.pixel_place, functions.patch_centre
-    cell_of_centre, footprint_of = functions.cell_of_centre, functions.footprint_of
     load_vector = make_wide_load(vector)
     store_footprint = make_wide_store(footprint_type)
     sorting = block_functions(capacity)
-    block_memory, clear_counts = sorting.block_memory, sorting.clear_counts
-    arrive, add_up_counts = sorting.arrive, sorting.add_up_counts
-    start_of, place_arrived = sorting.start_of, sorting.place_arrived
-    span_of_slice, ranked_at = sorting.span_of_slice, sorting.ranked_at
-    member_at = sorting.member_at
 
     @native.func_native(capacity, CHUNK)
     def mean_of_world(positions: wp.array[vector], first: int, count: int) -> vector:
@@ -70,41 +63,44 @@ def sort_small_splats(capacity: int) -> wp.Kernel:
         mean = vector()
         if goal.shape[0] > 0:
             mean = mean_of_world(positions, first_particle, particle_count)
-        memory = block_memory()
-        clear_counts(memory, view.cell_count, wp.int32(0))
+        memory = sorting.block_memory()
+        sorting.clear_counts(memory, view.cell_count, wp.int32(0))
         for i in range(lane, particle_count, wp.static(block)):
             position = load_vector(positions, first_particle + i)
-            place = pixel_place(view, position, mean, goal)
-            arrive(memory, i, cell_of_centre(view, patch_centre(place)), False)
-        add_up_counts(memory, view.cell_count)
+            position = splat.pixel_position(view, position, mean, goal)
+            cell = splat.cell_of_centre(view, splat.patch_centre(position))
+            sorting.arrive(memory, i, cell, False)
+        sorting.add_up_counts(memory, view.cell_count)
         first_cell = world * view.cell_count
         stride = slice_count * wp.static(block)
         for cell in range(slice_number * wp.static(block) + lane, view.cell_count, stride):
-            store_integer(starts, first_cell + cell, first_particle + start_of(memory, cell)[0])
+            start = first_particle + sorting.start_of(memory, cell)[0]
+            store_integer(starts, first_cell + cell, start)
         if lane == 0 and first_particle + particle_count == positions.shape[0]:
             starts[starts.shape[0] - 1] = positions.shape[0]
         for i in range(lane, particle_count, wp.static(block)):
-            place_arrived(memory, i)
+            sorting.place_arrived(memory, i)
         sync_block()
 
-        slice_places = (particle_count + slice_count - 1) / slice_count
-        begin = slice_number * slice_places
+        slice_size = (particle_count + slice_count - 1) / slice_count
+        begin = slice_number * slice_size
         # Invisible splats, which may be many, can have any order. As it differs among the blocks of
         # a world, the last block writes all of them.
-        hidden = start_of(memory, view.cell_count - 1)[0]
-        end = wp.min(begin + slice_places, hidden)
+        hidden = sorting.start_of(memory, view.cell_count - 1)[0]
+        end = wp.min(begin + slice_size, hidden)
         if slice_number == slice_count - 1:
             begin = wp.min(begin, hidden)
             end = particle_count
         if begin < end:
-            span = span_of_slice(memory, begin, end)
+            span = sorting.span_of_slice(memory, begin, end)
             for k in range(span[0] + lane, span[1], wp.static(block)):
-                target = ranked_at(memory, k, view.cell_count - 1)[0]
+                target = sorting.ranked_at(memory, k, view.cell_count - 1)[0]
                 if target >= begin and target < end:
-                    i = first_particle + member_at(memory, k)
-                    place = pixel_place(view, load_vector(positions, i), mean, goal)
+                    i = first_particle + sorting.member_at(memory, k)
+                    position = splat.pixel_position(view, load_vector(positions, i), mean, goal)
                     target += first_particle
-                    store_footprint(footprints, target, footprint_of(view, place, i, states, shift))
+                    footprint = splat.footprint_of(view, position, i, states, shift)
+                    store_footprint(footprints, target, footprint)
                     store_integer(source, target, i)
 
     return sort_splats

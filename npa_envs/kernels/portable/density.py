@@ -19,14 +19,10 @@ from npa_envs.thread_lock import cached_under_lock
 @cached_under_lock()
 def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespace:
     """Return the kernels of one variant: one thread a particle."""
-    types = domain_types(space_dim, scalar)
-    vector, particle, Domain = types.vector, types.particle, types.Domain
-    cell_of, segment_count = types.cell_of, types.segment_count
-    segment_cells = types.segment_cells
-    minimum_image, position_of = types.minimum_image, types.position_of
+    space = domain_types(space_dim, scalar)
+    vector, particle, Domain = space.vector, space.particle, space.Domain
     vector_f64 = wp.types.vector(space_dim, wp.float64)
     search = make_search(space_dim, scalar, particle, on_cpu)
-    run_count, run, filter_near = search.run_count, search.run, search.filter_near
     module = kernel_module("density" if on_cpu else "unfiltered_density", space_dim, scalar)
 
     @wp.func
@@ -74,19 +70,19 @@ def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespa
         if density_gradient != 0:
             row = row_of[source[k]]
         base = (k / particle_count) * domain.cell_count
-        cell = cell_of(domain, position)
+        cell = space.cell_of(domain, position)
         density = scalar(0.0)
         earlier = scalar(0.0)
         counted = wp.int32(0)
         gradient = vector_f64()
-        for segment in range(segment_count(domain, cell)):
-            first, last = segment_cells(domain, cell, segment)
+        for segment in range(space.segment_count(domain, cell)):
+            first, last = space.segment_cells(domain, cell, segment)
             end = starts[base + last]
             for block in range(starts[base + first], end, wp.static(TERMS_PER_SUM)):
                 stop = wp.min(block + wp.static(TERMS_PER_SUM), end)
                 for j in range(block, stop):
                     neighbour = sorted_positions[j]
-                    offset = minimum_image(domain, neighbour - position)
+                    offset = space.minimum_image(domain, neighbour - position)
                     squared = wp.dot(offset, offset)
                     is_near = squared < domain.squared_eps and j != k
                     weight = smoothing(squared, domain.inverse_squared_eps, domain.smoothing_norm)
@@ -125,21 +121,23 @@ def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespa
         Unless `neighbours` is empty, also write them, after those of the particle before.
         """
         k = range_start + wp.tid()
-        position = position_of(particles[k])
+        position = space.position_of(particles[k])
         base = (k / particle_count) * domain.cell_count
-        cell = cell_of(domain, position)
+        cell = space.cell_of(domain, position)
         begin = wp.int32(0)
         if k > 0 and neighbours.shape[0] > 0:
             begin = ends[k - 1]
-        place = begin
-        for r in range(run_count(domain, cell)):
-            first, end = run(domain, starts, neighbours, base, cell, k, r)
+        next_entry = begin
+        for r in range(search.run_count(domain, cell)):
+            first, end = search.run(domain, starts, neighbours, base, cell, k, r)
             for candidate in range(first, end, wp.static(search.stride)):
-                near, count = filter_near(domain, particles, neighbours, position, candidate, end)
+                near, count = search.filter_near(
+                    domain, particles, neighbours, position, candidate, end
+                )
                 if neighbours.shape[0] > 0:
                     for n in range(count):
-                        neighbours[place + n] = near[n]
-                place += count
-        counts[k] = place - begin
+                        neighbours[next_entry + n] = near[n]
+                next_entry += count
+        counts[k] = next_entry - begin
 
     return named(compute_density, list_neighbours)

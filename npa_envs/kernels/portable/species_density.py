@@ -18,11 +18,8 @@ from npa_envs.thread_lock import cached_under_lock
 @cached_under_lock()
 def species_kernel(space_dim: int, scalar: type, species_count: int) -> wp.Kernel:
     """Return the kernel of one variant."""
-    types = domain_types(space_dim, scalar)
-    vector, Domain = types.vector, types.Domain
-    cell_of, segment_count = types.cell_of, types.segment_count
-    segment_cells = types.segment_cells
-    minimum_image = types.minimum_image
+    space = domain_types(space_dim, scalar)
+    vector, Domain = space.vector, space.Domain
     vector_f64 = wp.types.vector(space_dim, wp.float64)
     densities_type = wp.types.vector(species_count, wp.float64)
     gradients_type = wp.types.matrix((species_count, space_dim), wp.float64)
@@ -50,14 +47,14 @@ def species_kernel(space_dim: int, scalar: type, species_count: int) -> wp.Kerne
         k += range_start
         position = sorted_positions[k]
         base = (k / particle_count) * domain.cell_count
-        cell = cell_of(domain, position)
+        cell = space.cell_of(domain, position)
         densities = densities_type()
         gradients = gradients_type()
-        for segment in range(segment_count(domain, cell)):
-            first, last = segment_cells(domain, cell, segment)
+        for segment in range(space.segment_count(domain, cell)):
+            first, last = space.segment_cells(domain, cell, segment)
             for j in range(starts[base + first], starts[base + last]):
                 neighbour = sorted_positions[j]
-                offset = minimum_image(domain, neighbour - position)
+                offset = space.minimum_image(domain, neighbour - position)
                 squared = wp.dot(offset, offset)
                 if squared < domain.squared_eps and j != k:
                     own = sorted_species[j]

@@ -38,8 +38,7 @@ TEAM = 32
 @cached_under_lock()
 def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
     """Return the kernels of one variant."""
-    types = domain_types(space_dim, scalar)
-    vector = types.vector
+    vector = domain_types(space_dim, scalar).vector
     vector_f64 = wp.types.vector(space_dim, wp.float64)
     channels = wp.types.vector(THREAD_CHANNELS, scalar)
     load_scalar = make_wide_load(scalar)

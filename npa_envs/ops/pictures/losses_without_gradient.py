@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.kernels.pictures.errors import BLOCK_TILES, TURN_TILES, gather_errors, sum_errors
+from npa_envs.kernels.pictures.errors import BLOCK_TILES, ROUND_TILES, gather_errors, sum_errors
 from npa_envs.kernels.pictures.splat import CHANNELS, make_view
 from npa_envs.kernels.primitives import CUDA_BLOCK
 from npa_envs.ops.backend import multiprocessor_count
@@ -46,7 +46,7 @@ def _picture_losses(
         partial_sums = x.new_empty(world_count, tile_total, 2, dtype=torch.float64)
         # Fewer tiles for a block if many would leave multiprocessors idle.
         tile_count, fewest = BLOCK_TILES, BLOCKS_OF_PROCESSOR * multiprocessor_count(device)
-        while tile_count > TURN_TILES and world_count * tile_total < fewest * tile_count:
+        while tile_count > ROUND_TILES and world_count * tile_total < fewest * tile_count:
             tile_count //= 2
         threads = world_count * -(-tile_total // tile_count) * CUDA_BLOCK
         pixels = aligned(target).view(-1, CHANNELS)
