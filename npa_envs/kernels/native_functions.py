@@ -6,6 +6,7 @@ shared by a few threads, and no tensor cores.
 """
 
 import inspect
+import re
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -36,10 +37,19 @@ CUDA_ONLY = (
 @cached_under_lock()
 def build_options() -> wp.ModuleBuildOptions:
     """Return the options that put the C++ text into a module, and into its hash."""
-    folder = Path(__file__).parent
-    for_cpu = "".join((folder / name).read_text(encoding="utf-8") for name in BOTH_DEVICES)
-    for_cuda = for_cpu + "".join((folder / name).read_text(encoding="utf-8") for name in CUDA_ONLY)
+    for_cpu = "".join(map(_text_of, BOTH_DEVICES))
+    for_cuda = for_cpu + "".join(map(_text_of, CUDA_ONLY))
     return wp.ModuleBuildOptions(extra_cpu_preamble=for_cpu, extra_cuda_preamble=for_cuda)
+
+
+def _text_of(file: str) -> str:
+    return (Path(__file__).parent / file).read_text(encoding="utf-8")
+
+
+def constants(file: str, *names: str) -> list[int]:
+    """Return integer constants that a C++ file defines as `name = value`."""
+    text = _text_of(file)
+    return [int(re.findall(rf"\b{name} = (\d+)", text)[0]) for name in names]
 
 
 def module(name: str) -> wp.Module:

@@ -242,12 +242,12 @@ template <unsigned LANES = 32> __device__ inline int sum_up_to(int value)
 
 __device__ inline int thread_of(int ends, int number)
 {
-    unsigned found = 0;
+    unsigned thread = 0;
     #pragma unroll
     for (unsigned step = 16; step > 0; step >>= 1) {
-        if (__shfl_sync(~0u, ends, found + step - 1) <= number) found += step;
+        if (__shfl_sync(~0u, ends, thread + step - 1) <= number) thread += step;
     }
-    return found;
+    return thread;
 }
 
 __device__ inline int as_number(float word) { return __float_as_int(word); }

@@ -63,17 +63,8 @@ load_integer = make_wide_load(wp.int32)
 load_scalar = make_wide_load(wp.float32)
 
 
-@cached_under_lock()
-def make_wide_store(value_type: type) -> Any:
-    """Return a Warp function that writes an entry of a flat array, on CUDA in few, wide stores.
-
-    The array and the index are as those of `make_wide_load`.
-    """
-
-    @native.func_native()
-    def wide_store(entries: wp.array[value_type], index: int, value: value_type): ...
-
-    return wide_store
+wide_store = native.generic("wide_store", 3)
+"""Writes to `entries` at `index` a `value`, in few, wide stores; as for `make_wide_load`."""
 
 
 def scalar_of(value_type: Any) -> Any:
@@ -118,18 +109,8 @@ def make_read_channels(value_type: Any) -> Any:
     return read_channels
 
 
-@cached_under_lock()
-def make_write_at(value_type: type) -> Any:
-    """Return a Warp function that writes a vector to an index of an array of scalars.
-
-    Address and size of the vector must be multiples of 16 bytes.
-    """
-    scalar = scalar_of(value_type)
-
-    @native.func_native()
-    def write_at(values: wp.array[scalar], index: int, value: value_type): ...
-
-    return write_at
+write_at = native.generic("write_at", 3)
+"""Writes to an array of scalars, from `index` on, a vector `value`, at multiples of 16 bytes."""
 
 
 @cached_under_lock()

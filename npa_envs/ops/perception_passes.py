@@ -1,4 +1,7 @@
-"""The passes over sorted worlds: arguments and launches of density, perception and adjoint."""
+"""The passes over sorted worlds: arguments and launches of density, perception and adjoint.
+
+Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
+"""
 
 from __future__ import annotations
 
@@ -9,8 +12,8 @@ from torch import Tensor
 
 from npa_envs.errors import NPAError
 from npa_envs.kernels.cuda.adjoint import THREAD_CHANNELS, listed_adjoint
-from npa_envs.kernels.cuda.adjoint import TILE as ADJOINT_TILE
-from npa_envs.kernels.cuda.density import LIST_BLOCK, TILE, listed_density, tiled_density
+from npa_envs.kernels.cuda.adjoint import TILE_PARTICLES as ADJOINT_PARTICLES
+from npa_envs.kernels.cuda.density import LIST_BLOCK, TILE_PARTICLES, listed_density, tiled_density
 from npa_envs.kernels.cuda.perceive import PerceptionVariant, listed_perception
 from npa_envs.kernels.portable.adjoint import adjoint_kernels
 from npa_envs.kernels.portable.density import density_kernels
@@ -116,7 +119,7 @@ def compute_densities(
     if listing.tiled:
         launch(
             tiled_density(plan.periodic, listing.capacity, plan.masked),
-            plan.world_count * -(-plan.particle_count // TILE) * WARP,
+            plan.world_count * -(-plan.particle_count // TILE_PARTICLES) * WARP,
             positions.device,
             plan.domain,
             plan.particle_count,
@@ -421,7 +424,7 @@ def _gather_by_tiles(plan: KernelPlan, saved: SavedPerception, bar: Tensor) -> T
         cotangents,
     )
     states_bar = bar.new_empty(plan.total, plan.state_dim)
-    tile_count = -(-plan.particle_count // ADJOINT_TILE)
+    tile_count = -(-plan.particle_count // ADJOINT_PARTICLES)
     launch(
         kernels.gather_state_cotangents,
         plan.world_count * tile_count * plan.group_count * WARP,

@@ -22,7 +22,7 @@ from npa_envs.ops.backend import (
     multiprocessor_count,
     rollout_listing,
 )
-from npa_envs.ops.launch import channel_width, is_aligned, is_recorded, launch, scalar_type
+from npa_envs.ops.launch import SCALARS, channel_width, is_aligned, is_recorded, launch
 from npa_envs.ops.physics_constants import Physics
 
 MAX_INDEX = 2**31 - 1
@@ -160,7 +160,7 @@ def plan_kernels(
     """
     # As integers: symbolic sizes of torch.compile become constants, and other sizes recompile.
     world_count, particle_count, space_dim = (int(size) for size in shape)
-    scalar = scalar_type(like.dtype)
+    scalar = SCALARS[like.dtype]
     eps, sides = physics.eps, physics.box
     # In 3D smaller cells give many short runs of candidates, which threads share badly.
     cells_per_eps = 1 if space_dim == 3 and like.device.type == "cuda" else 2

@@ -17,8 +17,12 @@ from npa_envs.kernels.cuda.network import (
     weight_gradient_kernels,
 )
 from npa_envs.kernels.cuda.perceive import PerceptionVariant, listed_perception
-from npa_envs.kernels.cuda.sort import BLOCKS, order_particles, sort_small_worlds
-from npa_envs.kernels.cuda.splat_sort import sort_small_splats
+from npa_envs.kernels.cuda.sort import (
+    BLOCKS,
+    order_particles,
+    sort_small_splats,
+    sort_small_worlds,
+)
 from npa_envs.kernels.pictures.blending import block_kernels
 from npa_envs.kernels.pictures.errors import gather_errors
 from npa_envs.kernels.portable.rewards_and_ends import update_episodes

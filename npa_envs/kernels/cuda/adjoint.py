@@ -4,6 +4,8 @@ The same sums as the portable `gather_state_cotangents`, in another order of wor
 eight consecutive particles of the sorted order: it lists the rows within eps of their bounding box,
 and multiplies the rows' cotangents by the weights of all eight on tensor cores. So a row's
 cotangents are read once for eight particles.
+
+Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
 """
 
 from types import SimpleNamespace
@@ -25,16 +27,16 @@ from npa_envs.kernels.primitives import (
     load_integer,
     load_scalar,
     make_wide_load,
-    make_wide_store,
     of_warp,
     scalar_of_warp,
     sum_up_to,
     thread_of,
     vote_of_warp,
+    wide_store,
 )
 from npa_envs.thread_lock import cached_under_lock
 
-TILE = 8
+TILE_PARTICLES = 8
 """Particles that a warp serves together, and rows of one matrix product."""
 
 LIST_ENTRIES = 96
@@ -56,7 +58,6 @@ MAX_LENGTH = 3.4028234663852886e38
 """The largest float32, a bound on any coordinate [length units]."""
 
 load_channels = make_wide_load(CHANNELS)
-store_channels = make_wide_store(CHANNELS)
 
 
 @cached_under_lock()
@@ -113,12 +114,12 @@ def append_entry(address: wp.uint32, count: int, accepted: bool, entry: ENTRY) -
 
 @native.func_native()
 def pad_list(address: wp.uint32, count: int, entry: ENTRY) -> int:
-    """Pad a list with an entry up to a multiple of `TILE`; return its new length."""
+    """Pad a list with an entry up to a multiple of `TILE_PARTICLES`; return its new length."""
 
 
 @native.func_native()
 def keep_unsummed(address: wp.uint32, summed_count: int, count: int):
-    """Move a list's entries from `summed_count` to `count`, fewer than `TILE`, to its beginning."""
+    """Move the last, fewer than `TILE_PARTICLES`, of a list's `count` entries to its beginning."""
 
 
 @native.func_native()
@@ -193,11 +194,11 @@ def listed_adjoint(
         index = entry * wp.static(weight_count * parts) + part % wp.static(parts)
         if row == row_capacity and part < wp.static(parts):
             for n in range(wp.static(weight_count)):
-                store_channels(cotangents, index + n * wp.static(parts), CHANNELS())
+                wide_store(cotangents, index + n * wp.static(parts), CHANNELS())
         if row < wp.min(load_integer(starts, starts.shape[0] - 1) - row_base, row_capacity):
             column = state_dim + channel
             blur = read_channels(perception_bar, row, column, 2 * state_dim)
-            store_channels(cotangents, index, blur_scale * blur)
+            wide_store(cotangents, index, blur_scale * blur)
             if wp.static(state_gradient):
                 column = 2 * state_dim + channel * wp.static(space_dim)
                 end = (2 + wp.static(space_dim)) * state_dim
@@ -214,7 +215,7 @@ def listed_adjoint(
                     for d in range(wp.static(space_dim)):
                         pulled[d, c] = pull[d]
                 for d in range(wp.static(space_dim)):
-                    store_channels(cotangents, index + (d + 1) * wp.static(parts), pulled[d])
+                    wide_store(cotangents, index + (d + 1) * wp.static(parts), pulled[d])
 
     @wp.func
     def line_of(domain: Domain, cell: cell_vector):
@@ -362,8 +363,8 @@ def listed_adjoint(
             g = tile % group_count
             tile = tile / group_count
         world = wp.int32(wp.uint32(tile) / wp.uint32(tile_count))
-        first = world * particle_count + (tile - world * tile_count) * wp.static(TILE)
-        end = wp.min(first + wp.static(TILE), (world + 1) * particle_count)
+        first = world * particle_count + (tile - world * tile_count) * wp.static(TILE_PARTICLES)
+        end = wp.min(first + wp.static(TILE_PARTICLES), (world + 1) * particle_count)
         base = active_offset + world * domain.cell_count
         # A thread computes weights for one particle, and at the end writes channels of another.
         k = first + (lane >> 2)
@@ -424,7 +425,7 @@ def listed_adjoint(
                     searching = candidate - lane < candidates
                     finished = not searching and first_run + wp.static(WARP) >= run_count
                     if finished or count > wp.static(LIST_ENTRIES - WARP):
-                        summed_count = count & ~wp.int32(wp.static(TILE - 1))
+                        summed_count = count & ~wp.int32(wp.static(TILE_PARTICLES - 1))
                         if finished:
                             # The entry after the last row is zero.
                             nothing = entry_of(origin, row_capacity * group_count)

@@ -27,8 +27,8 @@ from npa_envs.kernels.primitives import (
     load_integer,
     make_lane_sum,
     make_wide_load,
-    make_wide_store,
     thread_number,
+    wide_store,
 )
 from npa_envs.thread_lock import cached_under_lock
 
@@ -53,20 +53,14 @@ SHARE_OF_LIST = 2
 LIST_END = wp.types.vector(2, wp.uint32)
 """Address of a list's next entry, and the distance [bytes] from it to the one after."""
 
-TILE = 8
-"""Particles of a tile."""
-
-TILE_LANES = WARP // TILE
-"""Lanes of a warp that share a particle."""
-
-MIN_SIDE = 7
-"""Cells along each side of the smallest periodic box: in smaller ones the images of a particle that
-are nearest to its tile's particles may differ."""
+TILE_PARTICLES, TILE_LANES, MIN_SIDE = native.constants(
+    "cuda/density.cuh", "TILE_PARTICLES", "TILE_LANES", "MIN_SIDE"
+)
+"""Particles of a tile, lanes of a warp that share one, and cells along each side of the smallest
+periodic box that is divided into tiles."""
 
 TILE_REGISTERS = 64
 """Registers per thread, so that a multiprocessor runs 32 warps."""
-
-store_record = make_wide_store(RECORD)
 
 
 @cached_under_lock()
@@ -249,7 +243,7 @@ def listed_density(
                 if state_index.shape[0] > 0:
                     number = load_integer(state_index, k)
                 record[3] = as_word(number)
-            store_record(records, k, record)
+            wide_store(records, k, record)
 
     return compute_density
 
@@ -276,7 +270,7 @@ def tiled_density(periodic: bool, capacity: int, masked: bool) -> wp.Kernel:
     vector, particle, Domain = space.vector, space.particle, space.Domain
     load_vector = make_wide_load(vector)
 
-    @native.func_native(capacity, periodic, TILE, MIN_SIDE)
+    @native.func_native(capacity, periodic)
     def density_of_tile(
         domain: Domain,
         starts: wp.array[wp.int32],
@@ -319,10 +313,10 @@ def tiled_density(periodic: bool, capacity: int, masked: bool) -> wp.Kernel:
         thread = thread_number()
         tile = thread >> wp.static(WARP.bit_length() - 1)
         lane = thread & wp.static(WARP - 1)
-        tiles = (particle_count + wp.static(TILE - 1)) / wp.static(TILE)
+        tiles = (particle_count + wp.static(TILE_PARTICLES - 1)) / wp.static(TILE_PARTICLES)
         world = wp.int32(wp.uint32(tile) / wp.uint32(tiles))
         # Each world begins with a new tile, so its sums are the same in every batch.
-        first = world * particle_count + (tile - world * tiles) * wp.static(TILE)
+        first = world * particle_count + (tile - world * tiles) * wp.static(TILE_PARTICLES)
         k = first + lane / wp.static(TILE_LANES)
         inside = k < (world + 1) * particle_count
         k = wp.where(inside, k, first)
@@ -353,6 +347,6 @@ def tiled_density(periodic: bool, capacity: int, masked: bool) -> wp.Kernel:
             if state_index.shape[0] > 0:
                 number = load_integer(state_index, k)
             record = RECORD(position[0], position[1], volume, as_word(number))
-            store_record(records, k, record)
+            wide_store(records, k, record)
 
     return compute_density

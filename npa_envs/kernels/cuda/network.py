@@ -2,6 +2,8 @@
 
 Each factor of a product is split into two numbers of 16 bits; `network.cuh` has the layout in a
 warp. float16 has a small range, so rows are first scaled by powers of two, which is exact.
+
+Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
 """
 
 from types import SimpleNamespace

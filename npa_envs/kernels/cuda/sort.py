@@ -1,4 +1,4 @@
-"""Cell lists of small worlds on CUDA: a block sorts a world in shared memory.
+"""Cell lists of small worlds on CUDA, also of splats: a block sorts a world in shared memory.
 
 The same order as in the portable kernels, in one launch instead of six: particles are counted by
 cell, the counts are added up, particles get provisional positions in order of arrival, and ranks
@@ -12,6 +12,8 @@ import warp as wp
 
 from npa_envs.kernels import native_functions as native
 from npa_envs.kernels.domain import domain_types, kernel_module
+from npa_envs.kernels.pictures.splat import splat_functions, splat_types
+from npa_envs.kernels.portable.world_mean import CHUNK
 from npa_envs.kernels.primitives import (
     CUDA_LANES,
     WARP,
@@ -20,10 +22,10 @@ from npa_envs.kernels.primitives import (
     load_integer,
     make_read_channels,
     make_wide_load,
-    make_wide_store,
     of_warp,
     sync_block,
     thread_of_block,
+    wide_store,
 )
 from npa_envs.thread_lock import cached_under_lock
 
@@ -40,8 +42,6 @@ MAX_GRID = 4096
 
 THREAD_CHANNELS = 4
 """Adjacent channels that a thread moves."""
-
-store_integer = make_wide_store(wp.int32)
 
 
 @native.func_native()
@@ -111,8 +111,6 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
     flags_ahead = wp.types.vector(rounds, wp.int32)
     load_vector = make_wide_load(vector)
     read_channels = make_read_channels(channels)
-    store_vector = make_wide_store(vector)
-    store_channels = make_wide_store(channels)
     sorting = block_functions(capacity)
 
     @wp.kernel(
@@ -187,9 +185,9 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
         to_cell = wp.min(from_cell + slice_cells, domain.cell_count)
         for cell in range(from_cell + lane, to_cell, wp.static(block)):
             start = sorting.start_of(memory, cell)
-            store_integer(starts, first_cell + cell, first_particle + start[0])
+            wide_store(starts, first_cell + cell, first_particle + start[0])
             if masked:
-                store_integer(starts, active_offset + first_cell + cell, row_base + start[1])
+                wide_store(starts, active_offset + first_cell + cell, row_base + start[1])
         is_last_world = first_particle + particle_count == positions.shape[0]
         if lane == 0 and slice_number == 0 and is_last_world:
             end_of_all = sorting.start_of(memory, domain.cell_count)
@@ -216,20 +214,108 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
                 inside = ranked[0] >= begin and ranked[0] < end
                 target = first_particle + ranked[0]
                 if inside and sorted_states.shape[0] > 0:
-                    store_channels(sorted_states, target * parts + part, state)
+                    wide_store(sorted_states, target * parts + part, state)
                 if inside and part == 0:
-                    store_integer(source, target, i)
-                    store_integer(sorted_cell, target, first_cell + ranked[1])
-                    store_vector(sorted_positions, target, position)
+                    wide_store(source, target, i)
+                    wide_store(sorted_cell, target, first_cell + ranked[1])
+                    wide_store(sorted_positions, target, position)
                     if row_of.shape[0] > 0:
                         row = wp.where(ranked[2] < row_capacity, ranked[2], wp.int32(-1))
-                        store_integer(row_of, i, row)
+                        wide_store(row_of, i, row)
                         if row >= 0:
-                            store_integer(row_source, row, i)
-                            store_integer(row_index, row, target)
-                            store_vector(row_positions, row, position)
+                            wide_store(row_source, row, i)
+                            wide_store(row_index, row, target)
+                            wide_store(row_positions, row, position)
 
     return sort_worlds
+
+
+@cached_under_lock()
+def sort_small_splats(capacity: int) -> wp.Kernel:
+    """Return the kernel that sorts splats of float32, of worlds of up to `capacity` particles.
+
+    The same footprints in the same order as in `pictures/splat.py`. The block also computes its
+    world's mean.
+    """
+    scalar = wp.float32
+    block = BLOCKS[capacity]
+    types, splat = splat_types(scalar), splat_functions(scalar)
+    View, vector, footprint_type = types.View, types.vector, types.footprint
+    load_vector = make_wide_load(vector)
+    sorting = block_functions(capacity)
+
+    @native.func_native(capacity, CHUNK)
+    def mean_of_world(positions: wp.array[vector], first: int, count: int) -> vector:
+        """Return the mean of a world's positions; the whole block calls it."""
+
+    @wp.kernel(
+        enable_backward=False,
+        launch_bounds=(block, RESIDENT_THREADS // block),
+        module=native.module(f"npa_envs.kernels.small_splats_{capacity}"),
+    )
+    def sort_splats(
+        view: View,
+        slice_count: int,
+        particle_count: int,
+        positions: wp.array[vector],
+        states: wp.array2d[scalar],
+        shift: scalar,
+        goal: wp.array[vector],
+        # outputs
+        starts: wp.array[wp.int32],
+        footprints: wp.array[footprint_type],
+        source: wp.array[wp.int32],
+    ):
+        """Sort every world's splats by cell, then index; write one slice of them."""
+        await_earlier()
+        world = block_number() / slice_count
+        slice_number = block_number() - world * slice_count
+        lane = thread_of_block()
+        first_particle = world * particle_count
+        mean = vector()
+        if goal.shape[0] > 0:
+            mean = mean_of_world(positions, first_particle, particle_count)
+        memory = sorting.block_memory()
+        sorting.clear_counts(memory, view.cell_count, wp.int32(0))
+        for i in range(lane, particle_count, wp.static(block)):
+            position = load_vector(positions, first_particle + i)
+            position = splat.pixel_position(view, position, mean, goal)
+            cell = splat.cell_of_centre(view, splat.patch_centre(position))
+            sorting.arrive(memory, i, cell, False)
+        sorting.add_up_counts(memory, view.cell_count)
+        first_cell = world * view.cell_count
+        stride = slice_count * wp.static(block)
+        for cell in range(slice_number * wp.static(block) + lane, view.cell_count, stride):
+            start = first_particle + sorting.start_of(memory, cell)[0]
+            wide_store(starts, first_cell + cell, start)
+        if lane == 0 and first_particle + particle_count == positions.shape[0]:
+            starts[starts.shape[0] - 1] = positions.shape[0]
+        for i in range(lane, particle_count, wp.static(block)):
+            sorting.place_arrived(memory, i)
+        sync_block()
+
+        slice_size = (particle_count + slice_count - 1) / slice_count
+        begin = slice_number * slice_size
+        # Invisible splats, which may be many, can have any order. As it differs among the blocks of
+        # a world, the last block writes all of them.
+        hidden = sorting.start_of(memory, view.cell_count - 1)[0]
+        end = wp.min(begin + slice_size, hidden)
+        if slice_number == slice_count - 1:
+            begin = wp.min(begin, hidden)
+            end = particle_count
+        if begin < end:
+            span = sorting.span_of_slice(memory, begin, end)
+            for k in range(span[0] + lane, span[1], wp.static(block)):
+                target = sorting.ranked_at(memory, k, view.cell_count - 1)[0]
+                if target >= begin and target < end:
+                    i = first_particle + sorting.member_at(memory, k)
+                    position = splat.pixel_position(view, load_vector(positions, i), mean, goal)
+                    target += first_particle
+                    footprint = splat.footprint_of(view, position, i, states, shift)
+                    wide_store(footprints, target, footprint)
+                    wide_store(source, target, i)
+
+    return sort_splats
 
 
 @cached_under_lock()
@@ -241,8 +327,6 @@ def order_particles(space_dim: int, width: int) -> wp.Kernel:
     channels = wp.types.vector(thread_width, scalar)
     held_type = wp.types.matrix((CUDA_LANES, thread_width), scalar)
     read_channels = make_read_channels(channels)
-    store_vector = make_wide_store(vector)
-    store_channels = make_wide_store(channels)
 
     @wp.kernel(enable_backward=False, module=kernel_module("order", space_dim, scalar, width))
     def order_particles(
@@ -274,33 +358,33 @@ def order_particles(space_dim: int, width: int) -> wp.Kernel:
         await_earlier()
         k = wp.tid()
         total = arrived.shape[0]
-        own = load_pair(arrived, wp.min(k, total - 1))
-        i = own[0] / 2
-        c = own[1]
+        entry = load_pair(arrived, wp.min(k, total - 1))
+        i = entry[0] / 2
+        c = entry[1]
         begin = load_integer(starts, c)
         first_row = load_integer(starts, active_offset + c) - row_base
         position = positions[i]
         rank = wp.int32(0)
         active_rank = wp.int32(0)
-        for other in range(begin, load_integer(starts, c + 1)):
-            entry = load_pair(arrived, other)[0]
-            if entry < own[0]:
+        for j in range(begin, load_integer(starts, c + 1)):
+            other = load_pair(arrived, j)[0]
+            if other < entry[0]:
                 rank += 1
-                active_rank += entry & 1
+                active_rank += other & 1
         target = begin + rank
         if k < total:
-            store_integer(source, target, i)
-            store_integer(sorted_cell, target, c)
-            store_vector(sorted_positions, target, position)
+            wide_store(source, target, i)
+            wide_store(sorted_cell, target, c)
+            wide_store(sorted_positions, target, position)
             if row_of.shape[0] > 0:
                 row = first_row + active_rank
-                if own[0] & 1 == 0 or row >= row_capacity:
+                if entry[0] & 1 == 0 or row >= row_capacity:
                     row = wp.int32(-1)
-                store_integer(row_of, i, row)
+                wide_store(row_of, i, row)
                 if row >= 0:
-                    store_integer(row_source, row, i)
-                    store_integer(row_index, row, target)
-                    store_vector(row_positions, row, position)
+                    wide_store(row_source, row, i)
+                    wide_store(row_index, row, target)
+                    wide_store(row_positions, row, position)
 
         # A warp moves the states of its particles together, adjacent threads adjacent channels. All
         # loads come before the first store.
@@ -325,6 +409,6 @@ def order_particles(space_dim: int, width: int) -> wp.Kernel:
                     for n in range(wp.static(thread_width)):
                         state[n] = held[r, n]
                     if k - lane + owner < total:
-                        store_channels(sorted_states, to, state)
+                        wide_store(sorted_states, to, state)
 
     return order_particles

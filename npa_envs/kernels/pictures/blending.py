@@ -13,6 +13,8 @@ On CUDA a block serves a tile and a thread a pixel; sums over pixels use shuffle
 shared memory among warps. On a CPU a thread serves a tile, one Gaussian after the other, each only
 at the pixels that it covers. Either way every pair of a tile and a Gaussian has its own slot for
 the cotangents from that tile (its pull): no sum depends on the order of threads.
+
+Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
 """
 
 from types import SimpleNamespace
@@ -27,7 +29,7 @@ from npa_envs.kernels.pictures.gaussians import (
     CHANNELS,
     MIN_ALPHA,
     PULLS,
-    TILE,
+    TILE_SIDE,
     gaussian_types,
     make_covered,
 )
@@ -47,7 +49,7 @@ MAX_ALPHA = 0.99
 MIN_PASSING = 1e-4
 """Transmittance below which farther Gaussians are ignored."""
 
-TILE_PIXELS = TILE * TILE
+TILE_PIXELS = TILE_SIDE * TILE_SIDE
 """Pixels of a tile, and threads of its block."""
 
 PATCH_WIDTH, PATCH_HEIGHT = 8, 4
@@ -148,15 +150,15 @@ def tile_kernels(scalar: type) -> SimpleNamespace:
     def shared_pixels(frame: Frame, tile: int, footprint: footprint_type):
         """Return first, and last + 1, column and row of a tile's pixels that a footprint covers."""
         tile_in_picture = tile % frame.tile_count
-        row = tile_in_picture / frame.tile_columns * wp.static(TILE)
-        column = tile_in_picture % frame.tile_columns * wp.static(TILE)
+        row = tile_in_picture / frame.tile_columns * wp.static(TILE_SIDE)
+        column = tile_in_picture % frame.tile_columns * wp.static(TILE_SIDE)
         left, right = covered(footprint[0], footprint[10], frame.width)
         top, bottom = covered(footprint[1], footprint[11], frame.height)
         return wp.vec4i(
             wp.max(left, column),
             wp.max(top, row),
-            wp.min(right, column + wp.static(TILE)),
-            wp.min(bottom, row + wp.static(TILE)),
+            wp.min(right, column + wp.static(TILE_SIDE)),
+            wp.min(bottom, row + wp.static(TILE_SIDE)),
         )
 
     @in_ranges(TILES)
@@ -268,11 +270,11 @@ def block_kernels(scalar: type) -> SimpleNamespace:
         """Return column and row of a thread's pixel; a warp has a patch of its tile."""
         patch = k / wp.static(WARP)
         lane = k % wp.static(WARP)
-        across = wp.static(TILE // PATCH_WIDTH)
+        across = wp.static(TILE_SIDE // PATCH_WIDTH)
         tile_in_picture = tile % frame.tile_count
-        column = tile_in_picture % frame.tile_columns * wp.static(TILE)
+        column = tile_in_picture % frame.tile_columns * wp.static(TILE_SIDE)
         column += patch % across * wp.static(PATCH_WIDTH) + lane % wp.static(PATCH_WIDTH)
-        row = tile_in_picture / frame.tile_columns * wp.static(TILE)
+        row = tile_in_picture / frame.tile_columns * wp.static(TILE_SIDE)
         row += patch / across * wp.static(PATCH_HEIGHT) + lane / wp.static(PATCH_WIDTH)
         return column, row
 

@@ -8,6 +8,8 @@ Zwicker et al. 2002, "EWA Splatting". A Gaussian of mean p and covariance P = (R
 equation 6) lies at c = W p + t in a camera's frame and at (fx x/z + cx, fy y/z + cy) on its
 picture. There its covariance is Q⁻¹ = J W P Wᵀ Jᵀ + dilation (Kerbl, equation 5), where J is the
 projection's derivative at c, the local affine approximation (Zwicker).
+
+Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
 """
 
 from types import SimpleNamespace
@@ -18,10 +20,10 @@ import warp as wp
 from npa_envs.kernels import native_functions as native
 from npa_envs.kernels.domain import scalar_name
 from npa_envs.kernels.native_functions import PAIRS, in_ranges, named
-from npa_envs.kernels.primitives import make_wide_load, make_wide_store
+from npa_envs.kernels.primitives import make_wide_load, wide_store
 from npa_envs.thread_lock import cached_under_lock
 
-TILE = 16
+TILE_SIDE = 16
 """Pixels along each side of a tile."""
 
 CHANNELS = 4
@@ -87,8 +89,8 @@ def make_frame(
     frame = gaussian_types(scalar).Frame()
     frame.particle_count, frame.view_count, frame.channels = shape
     frame.width, frame.height = sizes
-    frame.tile_columns = -(-frame.width // TILE)
-    frame.tile_count = frame.tile_columns * -(-frame.height // TILE)
+    frame.tile_columns = -(-frame.width // TILE_SIDE)
+    frame.tile_count = frame.tile_columns * -(-frame.height // TILE_SIDE)
     frame.near = near
     frame.dilation = dilation
     return frame
@@ -119,7 +121,6 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
     covered = make_covered(scalar)
     module = native.module(f"npa_envs.kernels.gaussians_{scalar_name(scalar)}")
     load_footprint = make_wide_load(footprint_type)
-    store_footprint = make_wide_store(footprint_type)
     load_pulls = make_wide_load(pulls_type)
 
     @wp.func
@@ -266,7 +267,7 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
         top, bottom = covered(footprint[1], footprint[11], frame.height)
         result = wp.vec4i()
         if left < right and top < bottom:
-            size = wp.static(TILE)
+            size = wp.static(TILE_SIDE)
             result = wp.vec4i(
                 left / size, top / size, (right - 1) / size + 1, (bottom - 1) / size + 1
             )
@@ -342,7 +343,7 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
                 count = (tiles[2] - tiles[0]) * (tiles[3] - tiles[1])
                 if count > 0:
                     depth = position[2]
-        store_footprint(footprints, entry, footprint)
+        wide_store(footprints, entry, footprint)
         depths[entry] = depth
         counts[entry] = count
 

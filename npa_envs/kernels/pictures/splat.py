@@ -7,8 +7,10 @@ the picture. They are products of a row's weight and a column's.
 On CUDA n threads gather a tile of pixels: each sums every n-th particle around the tile, and gets a
 row of the sums. Particles are sorted by cells, the tiles that contain their patch's centre, with an
 origin r pixels before the picture: the particles that cover tiles along a row of cells are then one
-contiguous run. Small worlds are sorted by `kernels/cuda/splat_sort.py`. On a CPU a thread draws a
+contiguous run. Small worlds are sorted by `kernels/cuda/sort.py`. On a CPU a thread draws a
 world, particle by particle. Either way the order of a pixel's sum depends only on its own world.
+
+Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
 """
 
 import math
@@ -28,7 +30,7 @@ from npa_envs.kernels.primitives import (
     make_lane_collect,
     make_lane_sum,
     make_wide_load,
-    make_wide_store,
+    wide_store,
 )
 from npa_envs.thread_lock import cached_under_lock
 
@@ -305,9 +307,7 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
     lane_pixels = TILE_WIDTH * TILE_HEIGHT // lanes
     module = native.module(f"npa_envs.kernels.splat_{scalar_name(scalar)}_l{lanes}")
     load_footprint = make_wide_load(footprint_type)
-    store_footprint = make_wide_store(footprint_type)
     load_colour = make_wide_load(colour_type)
-    store_colour = make_wide_store(colour_type)
     lane_sum = make_lane_sum(pulls_type, lanes)
     splat = splat_functions(scalar)
     gather_tile = gather_functions(scalar, lanes).gather_tile
@@ -388,7 +388,7 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
             for other in range(begin, starts[c + 1]):
                 if arrived[other] < i:
                     target += 1
-        store_footprint(footprints, target, footprint)
+        wide_store(footprints, target, footprint)
         source[target] = i
 
     @wp.func
@@ -432,7 +432,7 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
                 pixel = pixel_of(view, row, column, lane * wp.static(lane_pixels) + k)
                 if pixel >= 0:
                     value = colour_type(values[0, k], values[1, k], values[2, k], values[3, k])
-                    store_colour(picture, begin + pixel, value)
+                    wide_store(picture, begin + pixel, value)
 
     @in_ranges(WORLDS)
     @wp.kernel(enable_backward=False, module=module)

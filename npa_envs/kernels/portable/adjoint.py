@@ -1,9 +1,10 @@
 """Hand-written adjoints of the perception pass, gathered: no float atomics, a fixed order of sums.
 
 Notation: centre i perceives neighbour j at r = x_j - x_i, with smoothing W_ij, spiky gradient
-K_ij = f r and volume v_j = 1 / ρ_j. A bar marks a cotangent: b̄_i of centre i's smoothed state,
-Ḡ_i of its state gradient before the correction, q̄_i of its density gradient, z̄_i of its own state
-in the perception vector. The moment correction is a stopped gradient, so it has no adjoint.
+K_ij = f r and volume v_j = 1 / ρ_j. x̄ (`x_bar`) = dL/dx, the gradient of the loss L: b̄_i by centre
+i's smoothed state, Ḡ_i by its state gradient before the correction, q̄_i by its density gradient,
+z̄_i by its own state in the perception vector. The moment correction is a stopped gradient, so it
+has no adjoint.
 
 State:     s̄_k = z̄_k + v_k Σ_i (W_ik b̄_i + Ḡ_i K_ik) - Ḡ_k Σ_j v_j K_kj
 Density:   ρ̄_k = -v_k² v̄_k,  v̄_k = Σ_i (W_ik s_k · b̄_i + (s_k - s_i) · Ḡ_i K_ik)

@@ -1,6 +1,8 @@
 """Vectors of equivariant rules: mixed vectors, rotation-invariant products, steering.
 
 `npa_envs/ops/equivariance.py` has the formulas. A thread computes a few numbers of a row.
+
+Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
 """
 
 from types import SimpleNamespace

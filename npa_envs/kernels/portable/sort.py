@@ -17,11 +17,9 @@ from npa_envs.kernels.primitives import (
     await_earlier,
     load_integer,
     make_read_channels,
-    make_wide_store,
+    wide_store,
 )
 from npa_envs.thread_lock import cached_under_lock
-
-store_pair = make_wide_store(wp.vec2i)
 
 
 @cached_under_lock()
@@ -75,7 +73,7 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
             entry += 1
         c = load_integer(cell, i)
         target = load_integer(starts, c) + load_integer(arrival, i)
-        store_pair(arrived, target, wp.vec2i(entry, c))
+        wide_store(arrived, target, wp.vec2i(entry, c))
 
     @in_ranges(PARTICLES)
     @wp.kernel(enable_backward=False, module=module)
@@ -107,21 +105,21 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
         """
         await_earlier()
         k = range_start + wp.tid()
-        own = arrived[k]
-        i = own[0] / 2
-        c = own[1]
+        entry = arrived[k]
+        i = entry[0] / 2
+        c = entry[1]
         target = starts[c]
         row = starts[active_offset + c] - row_base
-        for other in range(starts[c], starts[c + 1]):
-            entry = arrived[other][0]
-            if entry < own[0]:
+        for j in range(starts[c], starts[c + 1]):
+            other = arrived[j][0]
+            if other < entry[0]:
                 target += 1
-                row += entry & 1
+                row += other & 1
         source[target] = i
         sorted_cell[target] = c
         sorted_positions[target] = positions[i]
         if row_of.shape[0] > 0:
-            if own[0] & 1 == 0 or row >= row_capacity:
+            if entry[0] & 1 == 0 or row >= row_capacity:
                 row = wp.int32(-1)
             row_of[i] = row
             if row >= 0:
