@@ -14,7 +14,7 @@ from torch import Tensor
 
 from npa_envs.kernels.domain import domain_types, make_domain, scalar_name
 from npa_envs.kernels.mathematics import MOMENT_THRESHOLD, smoothing, spiky_factor
-from npa_envs.ops.launch import launch, scalar_type, warp_device
+from npa_envs.ops.launch import SCALARS, launch, warp_device
 
 GRID_CELLS = 128
 """Buckets of the hash grid along each axis; the third has one in 2D."""
@@ -33,7 +33,7 @@ def grid_fields(x: Tensor, s: Tensor, eps: float) -> GridFields:
     """Return the fields of worlds x [B, N, D], s [B, N, C] in open space; not differentiable."""
     world_count, particle_count, space_dim = x.shape
     total, state_dim = world_count * particle_count, s.shape[2]
-    scalar = scalar_type(x.dtype)
+    scalar = SCALARS[x.dtype]
     kernels = grid_kernels(space_dim, scalar, state_dim)
     domain = make_domain(space_dim, scalar, eps, None, particle_count)
     points = x.new_zeros(total, 3)
@@ -63,7 +63,7 @@ def _grid(device: torch.device, scalar: Any, depth: int) -> Any:
 
 def _built_grid(points: Tensor, world: Tensor, eps: float, space_dim: int) -> Any:
     """Return a hash grid of the points, one group for each world, built on torch's stream."""
-    scalar = scalar_type(points.dtype)
+    scalar = SCALARS[points.dtype]
     grid = _grid(points.device, scalar, GRID_CELLS if space_dim == 3 else 1)
     stream: contextlib.AbstractContextManager[Any] = contextlib.nullcontext()
     if points.is_cuda:

@@ -119,7 +119,7 @@ class BatchedWorlds(RewardedWorlds):
 
     def _start_and_sort(self, worlds: Tensor) -> NeighbourState:
         start = self.start(worlds)
-        return build_neighbours(start.x, start.s, self.physics, places=worlds)
+        return build_neighbours(start.x, start.s, self.physics, world_indices=worlds)
 
     def restart(self, worlds: NDArray[np.int64], observation: Tensor) -> None:
         """Start the next episodes of some worlds, [M], and write their rows of the observation."""

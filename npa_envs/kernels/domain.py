@@ -25,7 +25,7 @@ SLACK = 1.0 + 1e-5
 """Factor on eps² within which candidates are taken, against rounding errors of their distances."""
 
 CELL_SLACK = 1.0 + 2.0**-20
-"""Factor by which cells are larger than eps / reach, so that rounding cannot lose a neighbour."""
+"""Factor by which cells are larger than eps / n, so that rounding cannot lose a neighbour."""
 
 FAR = 2.0**62
 """Largest distance of a cell from the origin; positions beyond it are in the outermost cell."""
@@ -73,7 +73,7 @@ def domain_types(space_dim: int, scalar: type) -> SimpleNamespace:
         cell_scale: double_vector
         cell_shape: cell_vector
         cell_count: int
-        cell_reach: int
+        cells_per_eps: int
 
     @wp.func
     def cell_of(domain: Domain, position: vector):
@@ -81,15 +81,15 @@ def domain_types(space_dim: int, scalar: type) -> SimpleNamespace:
         cell = cell_vector()
         for d in range(wp.static(space_dim)):
             count = domain.cell_shape[d]
-            place = wp.float64(position[d]) * domain.cell_scale[d]
+            scaled = wp.float64(position[d]) * domain.cell_scale[d]
             # Comparisons are false for NaN, whose index must also be inside the grid.
             if domain.periodic != 0:
-                place = wp.floor((place - wp.floor(place)) * wp.float64(count))
-                if place < wp.float64(count):
-                    cell[d] = wp.int32(place)
-            elif wp.abs(place) < wp.float64(wp.static(FAR)):
+                scaled = wp.floor((scaled - wp.floor(scaled)) * wp.float64(count))
+                if scaled < wp.float64(count):
+                    cell[d] = wp.int32(scaled)
+            elif wp.abs(scaled) < wp.float64(wp.static(FAR)):
                 # The count is a power of two, and float64 divides slowly.
-                cell[d] = wp.int32(wp.int64(wp.floor(place)) & wp.int64(count - 1))
+                cell[d] = wp.int32(wp.int64(wp.floor(scaled)) & wp.int64(count - 1))
         return cell
 
     @wp.func
@@ -101,7 +101,7 @@ def domain_types(space_dim: int, scalar: type) -> SimpleNamespace:
         return index
 
     @wp.func
-    def cell_place(domain: Domain, index: int):
+    def cell_at(domain: Domain, index: int):
         """Return the cell at an index in row-major order within its world."""
         cell = cell_vector()
         rest = index
@@ -113,9 +113,9 @@ def domain_types(space_dim: int, scalar: type) -> SimpleNamespace:
         return cell
 
     @wp.func
-    def row_width(domain: Domain, d: int):
+    def cells_around(domain: Domain, d: int):
         """Return the number of cells with neighbours of a cell, along one direction."""
-        return wp.min(wp.int32(2) * domain.cell_reach + 1, domain.cell_shape[d])
+        return wp.min(wp.int32(2) * domain.cells_per_eps + 1, domain.cell_shape[d])
 
     @wp.func
     def wrapped(coordinate: int, count: int):
@@ -129,41 +129,41 @@ def domain_types(space_dim: int, scalar: type) -> SimpleNamespace:
 
     @wp.func
     def segment_count(domain: Domain, cell: cell_vector):
-        """Return the number of contiguous runs of cells around a cell: one for each row of cells,
-        two where rows wrap around."""
-        rows = wp.int32(1)
+        """Return the number of contiguous runs of cells around a cell: one for each line of cells,
+        two where lines wrap around."""
+        lines = wp.int32(1)
         for d in range(1, wp.static(space_dim)):
-            rows *= row_width(domain, d)
-        first = wrapped(cell[0] - domain.cell_reach, domain.cell_shape[0])
-        if first + row_width(domain, 0) > domain.cell_shape[0]:
-            rows *= 2
-        return rows
+            lines *= cells_around(domain, d)
+        first = wrapped(cell[0] - domain.cells_per_eps, domain.cell_shape[0])
+        if first + cells_around(domain, 0) > domain.cell_shape[0]:
+            lines *= 2
+        return lines
 
     @wp.func
     def segment_cells(domain: Domain, cell: cell_vector, segment: int):
         """Return the first cell and one past the last cell of a run, in row-major order."""
-        width = row_width(domain, 0)
+        width = cells_around(domain, 0)
         nx = domain.cell_shape[0]
-        first = wrapped(cell[0] - domain.cell_reach, nx)
-        row = segment
+        first = wrapped(cell[0] - domain.cells_per_eps, nx)
+        line = segment
         begin = first
         end = first + width
         if end > nx:
-            row = segment / 2
+            line = segment / 2
             if segment % 2 == 0:
                 end = nx
             else:
                 begin = 0
                 end = first + width - nx
-        y_row = row
+        y_line = line
         base = wp.int32(0)
         if wp.static(space_dim == 3):
             last = wp.static(space_dim - 1)
-            y_width = row_width(domain, 1)
-            y_row = row % y_width
-            z = wrapped(cell[last] - domain.cell_reach + row / y_width, domain.cell_shape[last])
+            y_width = cells_around(domain, 1)
+            y_line = line % y_width
+            z = wrapped(cell[last] - domain.cells_per_eps + line / y_width, domain.cell_shape[last])
             base = z * domain.cell_shape[1] * nx
-        base += wrapped(cell[1] - domain.cell_reach + y_row, domain.cell_shape[1]) * nx
+        base += wrapped(cell[1] - domain.cells_per_eps + y_line, domain.cell_shape[1]) * nx
         return base + begin, base + end
 
     @wp.func
@@ -189,27 +189,31 @@ def domain_types(space_dim: int, scalar: type) -> SimpleNamespace:
             result[d] = entry[d]
         return result
 
-    functions = [cell_of, cell_index, cell_place, row_width, wrapped, segment_count]
+    functions = [cell_of, cell_index, cell_at, cells_around, wrapped, segment_count]
     functions += [segment_cells, minimum_image, periodic_image, position_of]
     return native.named(*functions, vector=vector, particle=particle, Domain=Domain)
 
 
 @functools.lru_cache(maxsize=256)
 def cell_grid(
-    space_dim: int, particle_count: int, eps: float, box: tuple[float, ...] | None, cell_reach: int
+    space_dim: int,
+    particle_count: int,
+    eps: float,
+    box: tuple[float, ...] | None,
+    cells_per_eps: int,
 ) -> tuple[int, ...]:
     """Return the number of cells along each dimension.
 
     Open space gets about one cell for each particle (a power of two along each dimension: the grid
-    wraps around). A periodic box is divided into cells no smaller than eps / reach, and into at
-    most four times as many as open space has.
+    wraps around). A periodic box is divided into cells no smaller than eps / cells_per_eps, into
+    at most four times as many as open space has.
     """
     open_side = 8
     while open_side**space_dim < particle_count:
         open_side *= 2
     if box is None:
         return (open_side,) * space_dim
-    size = eps / cell_reach * CELL_SLACK
+    size = eps / cells_per_eps * CELL_SLACK
     shape = [max(int(side / size), 1) for side in box]
     while math.prod(shape) > 4 * open_side**space_dim:
         longest = shape.index(max(shape))
@@ -224,9 +228,9 @@ def make_domain(
     eps: float,
     box: tuple[float, ...] | None,
     particle_count: int,
-    cell_reach: int = 2,
+    cells_per_eps: int = 2,
 ) -> Any:
-    """Return the `Domain` of worlds of N particles, with cells of size eps / cell_reach."""
+    """Return the `Domain` of worlds of N particles, with cells of size eps / cells_per_eps."""
     types = domain_types(space_dim, scalar)
     domain = types.Domain()
     domain.inverse_eps = 1.0 / eps
@@ -235,14 +239,14 @@ def make_domain(
     smoothing_norm, spiky_norm = (4.0, 30.0) if space_dim == 2 else (315.0 / 64.0, 45.0)
     domain.smoothing_norm = smoothing_norm / (math.pi * eps**space_dim)
     domain.spiky_norm = spiky_norm / (math.pi * eps ** (space_dim + 1))
-    shape = cell_grid(space_dim, particle_count, eps, box, cell_reach)
+    shape = cell_grid(space_dim, particle_count, eps, box, cells_per_eps)
     domain.periodic = 0 if box is None else 1
     domain.box = types.vector(*(box or (1.0,) * space_dim))
     domain.inverse_box = types.vector(*(1.0 / side for side in (box or (1.0,) * space_dim)))
-    scale = 1.0 / (eps / cell_reach * CELL_SLACK)
+    scale = 1.0 / (eps / cells_per_eps * CELL_SLACK)
     scales = (scale,) * space_dim if box is None else tuple(1.0 / side for side in box)
     domain.cell_scale = wp.types.vector(space_dim, wp.float64)(*scales)
     domain.cell_shape = wp.types.vector(space_dim, wp.int32)(*shape)
     domain.cell_count = math.prod(shape)
-    domain.cell_reach = cell_reach
+    domain.cells_per_eps = cells_per_eps
     return domain

@@ -6,6 +6,7 @@ shared by a few threads, and no tensor cores.
 """
 
 import inspect
+import re
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -36,10 +37,19 @@ CUDA_ONLY = (
 @cached_under_lock()
 def build_options() -> wp.ModuleBuildOptions:
     """Return the options that put the C++ text into a module, and into its hash."""
-    folder = Path(__file__).parent
-    for_cpu = "".join((folder / name).read_text(encoding="utf-8") for name in BOTH_DEVICES)
-    for_cuda = for_cpu + "".join((folder / name).read_text(encoding="utf-8") for name in CUDA_ONLY)
+    for_cpu = "".join(map(_text_of, BOTH_DEVICES))
+    for_cuda = for_cpu + "".join(map(_text_of, CUDA_ONLY))
     return wp.ModuleBuildOptions(extra_cpu_preamble=for_cpu, extra_cuda_preamble=for_cuda)
+
+
+def _text_of(file: str) -> str:
+    return (Path(__file__).parent / file).read_text(encoding="utf-8")
+
+
+def constants(file: str, *names: str) -> list[int]:
+    """Return integer constants that a C++ file defines as `name = value`."""
+    text = _text_of(file)
+    return [int(re.findall(rf"\b{name} = (\d+)", text)[0]) for name in names]
 
 
 def module(name: str) -> wp.Module:
@@ -59,13 +69,16 @@ def func_native(*parameters: Any) -> Callable[[Any], Any]:
     return lambda stub: _native(stub, stub.__name__, parameters)
 
 
-def call_of(kernel: wp.Kernel, name: str, *parameters: Any) -> Any:
-    """Return a Warp function of the C++ function `npa::name`, with the arguments of a kernel."""
+def generic(name: str, argument_count: int, *parameters: Any) -> Any:
+    """Return a Warp function of the C++ function `npa::name`, with arguments of any types."""
 
     def stub(): ...
 
-    stub.__signature__ = inspect.signature(kernel.func)  # type: ignore[attr-defined]
-    stub.__annotations__, stub.__qualname__ = kernel.func.__annotations__, name
+    arguments = [f"argument_{k}" for k in range(argument_count)]
+    stub.__annotations__, stub.__qualname__ = dict.fromkeys(arguments, Any), name
+    stub.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
+        [inspect.Parameter(each, 1, annotation=Any) for each in arguments]
+    )
     return _native(stub, name, parameters)
 
 

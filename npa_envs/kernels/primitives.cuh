@@ -13,7 +13,7 @@ CUDA_CALLABLE inline void await_earlier()
 #endif
 }
 
-// Allow the blocks of the next kernel, if it is launched early, to start beside those of this one.
+// Allow the blocks of the next kernel, if it is launched early, to start before those of this one have ended.
 CUDA_CALLABLE inline void allow_next_launch()
 {
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900
@@ -32,9 +32,9 @@ template <unsigned BYTES> struct alignas(BYTES) Chunk {
 };
 
 template <unsigned BYTES, typename Value>
-CUDA_CALLABLE inline void load_chunks(Value& value, const void* place)
+CUDA_CALLABLE inline void load_chunks(Value& value, const void* address)
 {
-    const Chunk<BYTES>* from = reinterpret_cast<const Chunk<BYTES>*>(place);
+    const Chunk<BYTES>* from = reinterpret_cast<const Chunk<BYTES>*>(address);
     unsigned* to = reinterpret_cast<unsigned*>(&value);
     #pragma unroll
     for (unsigned i = 0; i < sizeof(value) / BYTES; ++i) {
@@ -45,9 +45,9 @@ CUDA_CALLABLE inline void load_chunks(Value& value, const void* place)
 }
 
 template <unsigned BYTES, typename Value>
-CUDA_CALLABLE inline void store_chunks(void* place, const Value& value)
+CUDA_CALLABLE inline void store_chunks(void* address, const Value& value)
 {
-    Chunk<BYTES>* to = reinterpret_cast<Chunk<BYTES>*>(place);
+    Chunk<BYTES>* to = reinterpret_cast<Chunk<BYTES>*>(address);
     const unsigned* from = reinterpret_cast<const unsigned*>(&value);
     #pragma unroll
     for (unsigned i = 0; i < sizeof(value) / BYTES; ++i) {
@@ -81,24 +81,24 @@ CUDA_CALLABLE inline void wide_store(const wp::array_t<Value>& entries, int inde
 }
 
 template <typename Value, unsigned BYTES, typename Part>
-CUDA_CALLABLE inline Value read_at(const wp::array_t<Part>& values, int place)
+CUDA_CALLABLE inline Value read_at(const wp::array_t<Part>& values, int index)
 {
     Value result;
 #if defined(__CUDA_ARCH__)
-    load_chunks<BYTES>(result, values.data + place);
+    load_chunks<BYTES>(result, values.data + index);
 #else
-    for (unsigned k = 0; k < sizeof(Value) / sizeof(Part); ++k) result[k] = values.data[place + k];
+    for (unsigned k = 0; k < sizeof(Value) / sizeof(Part); ++k) result[k] = values.data[index + k];
 #endif
     return result;
 }
 
 template <typename Value, typename Part>
-CUDA_CALLABLE inline void write_at(const wp::array_t<Part>& values, int place, Value value)
+CUDA_CALLABLE inline void write_at(const wp::array_t<Part>& values, int index, Value value)
 {
 #if defined(__CUDA_ARCH__)
-    store_chunks<16>(values.data + place, value);
+    store_chunks<16>(values.data + index, value);
 #else
-    for (unsigned k = 0; k < sizeof(Value) / sizeof(Part); ++k) values.data[place + k] = value[k];
+    for (unsigned k = 0; k < sizeof(Value) / sizeof(Part); ++k) values.data[index + k] = value[k];
 #endif
 }
 
@@ -152,7 +152,7 @@ CUDA_CALLABLE inline Share lane_collect(Value value)
     return result;
 }
 
-// A number kept in a register: the compiler would compute it again in every turn of a loop.
+// A number kept in a register: the compiler would compute it again in every pass of a loop.
 CUDA_CALLABLE inline float kept(float value)
 {
 #if defined(__CUDA_ARCH__)
@@ -242,12 +242,12 @@ template <unsigned LANES = 32> __device__ inline int sum_up_to(int value)
 
 __device__ inline int thread_of(int ends, int number)
 {
-    unsigned found = 0;
+    unsigned thread = 0;
     #pragma unroll
     for (unsigned step = 16; step > 0; step >>= 1) {
-        if (__shfl_sync(~0u, ends, found + step - 1) <= number) found += step;
+        if (__shfl_sync(~0u, ends, thread + step - 1) <= number) thread += step;
     }
-    return found;
+    return thread;
 }
 
 __device__ inline int as_number(float word) { return __float_as_int(word); }

@@ -63,17 +63,8 @@ load_integer = make_wide_load(wp.int32)
 load_scalar = make_wide_load(wp.float32)
 
 
-@cached_under_lock()
-def make_wide_store(value_type: type) -> Any:
-    """Return a Warp function that writes an entry of a flat array, on CUDA in few, wide stores.
-
-    The array and the index are as those of `make_wide_load`.
-    """
-
-    @native.func_native()
-    def wide_store(entries: wp.array[value_type], index: int, value: value_type): ...
-
-    return wide_store
+wide_store = native.generic("wide_store", 3)
+"""Writes to `entries` at `index` a `value`, in few, wide stores; as for `make_wide_load`."""
 
 
 def scalar_of(value_type: Any) -> Any:
@@ -83,14 +74,14 @@ def scalar_of(value_type: Any) -> Any:
 
 @cached_under_lock()
 def make_read_at(value_type: type, alignment: int) -> Any:
-    """Return a Warp function that reads a vector from index `place` of an array of scalars.
+    """Return a Warp function that reads a vector from an index of an array of scalars.
 
     Its address must be a multiple of `alignment` bytes, 4, 8 or 16: the width of a load.
     """
     scalar = scalar_of(value_type)
 
     @native.func_native(value_type, alignment)
-    def read_at(values: wp.array[scalar], place: int) -> value_type: ...
+    def read_at(values: wp.array[scalar], index: int) -> value_type: ...
 
     return read_at
 
@@ -106,30 +97,20 @@ def make_read_channels(value_type: Any) -> Any:
         states: wp.array[scalar], state_dim: int, aligned: int, particle: int, first: int
     ):
         result = value_type()
-        place = particle * state_dim + first
+        index = particle * state_dim + first
         if aligned == 0:
             for k in range(wp.static(count)):
                 if first + k < state_dim:
-                    result[k] = states[place + k]
+                    result[k] = states[index + k]
         elif first < state_dim:
-            result = read_at(states, place)
+            result = read_at(states, index)
         return result
 
     return read_channels
 
 
-@cached_under_lock()
-def make_write_at(value_type: type) -> Any:
-    """Return a Warp function that writes a vector to index `place` of an array of scalars.
-
-    Address and size of the vector must be multiples of 16 bytes.
-    """
-    scalar = scalar_of(value_type)
-
-    @native.func_native()
-    def write_at(values: wp.array[scalar], place: int, value: value_type): ...
-
-    return write_at
+write_at = native.generic("write_at", 3)
+"""Writes to an array of scalars, from `index` on, a vector `value`, at multiples of 16 bytes."""
 
 
 @cached_under_lock()
@@ -166,7 +147,7 @@ def make_lane_collect(value_type: Any, lanes: int) -> Any:
 def make_kept(scalar: type) -> Any:
     """Return a Warp function that returns its argument, of type `scalar`, kept in a register.
 
-    CUDA's compiler would otherwise convert an integer to float again in every turn of a loop.
+    CUDA's compiler would otherwise convert an integer to float again in every pass of a loop.
     """
 
     @native.func_native()

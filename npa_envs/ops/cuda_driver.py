@@ -91,8 +91,8 @@ def _follows_kernel(stream: int) -> bool:
     status, identifier, graph = ctypes.c_int(), ctypes.c_uint64(), ctypes.c_void_p()
     nodes, edges = ctypes.POINTER(ctypes.c_void_p)(), ctypes.c_void_p()
     count = ctypes.c_size_t()
-    places = (status, identifier, graph, nodes, edges, count)
-    if driver.cuStreamGetCaptureInfo_v3(ctypes.c_void_p(stream), *map(ctypes.byref, places)):
+    results = (status, identifier, graph, nodes, edges, count)
+    if driver.cuStreamGetCaptureInfo_v3(ctypes.c_void_p(stream), *map(ctypes.byref, results)):
         return False
     if count.value != 1:
         return False
@@ -121,7 +121,7 @@ class DriverLaunch:
         self._config = _Config(
             1, 1, 1, self._block, 1, 1, shared_bytes, None, ctypes.pointer(early), 0
         )
-        self._place = ctypes.byref(self._config)
+        self._config_address = ctypes.byref(self._config)
 
     def run(self, thread_count: int, stream: int) -> bool:
         """Launch on the current stream; return False where Warp has to launch instead."""
@@ -134,4 +134,4 @@ class DriverLaunch:
         config.stream = stream
         early = self._waits and torch.cuda.is_current_stream_capturing() and _follows_kernel(stream)
         config.attribute_count = int(early)
-        return not self._launch(self._place, self._function, self._addresses, None)
+        return not self._launch(self._config_address, self._function, self._addresses, None)

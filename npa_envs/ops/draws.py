@@ -7,7 +7,7 @@ from torch import Tensor
 
 from npa_envs.kernels.portable.draws import draw_kernel
 from npa_envs.ops.custom_op import custom_op
-from npa_envs.ops.launch import launch, scalar_type
+from npa_envs.ops.launch import SCALARS, launch
 
 WORD_COUNT = 2**32
 """Number of values of one 32-bit output of the generator."""
@@ -32,7 +32,7 @@ def draw(
     values = keys.new_empty(keys.shape[0], count, dtype=dtype)
     if values.numel() == 0:
         return values
-    kernel, per_thread = draw_kernel(distribution, scalar_type(dtype))
+    kernel, per_thread = draw_kernel(distribution, SCALARS[dtype])
     size = values.shape[0], -(-count // per_thread)
     launch(kernel, size, keys.device, bound, number, keys, episodes, steps, values)
     return values

@@ -4,6 +4,8 @@ v are a particle's perceived gradients, u = mixing^T v linear combinations of th
 the world rotates all of them and leaves u_a · u_b unchanged, in 2D also u_a × u_b, whose sign
 changes in a mirror. Each formula exists twice: in plain torch, for any tensors (`invariants`,
 `steered`), and as kernels with hand-written adjoints, for rollouts (`read_rows`, `steer_rows`).
+
+Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
 """
 
 from __future__ import annotations
@@ -28,7 +30,7 @@ from npa_envs.kernels.portable.equivariance import equivariance_kernels
 from npa_envs.kernels.primitives import WARP
 from npa_envs.ops.backend import KernelRequest, choose, multiprocessor_count
 from npa_envs.ops.custom_op import custom_op, once_differentiable
-from npa_envs.ops.launch import launch, scalar_type
+from npa_envs.ops.launch import SCALARS, launch
 
 MIXED_VECTORS = 8
 """Default number of mixed vectors of an equivariant rule."""
@@ -114,7 +116,7 @@ def _turned(vectors: Tensor) -> Tensor:
 
 
 def _kernels(like: Tensor, space_dim: int) -> Any:
-    return equivariance_kernels(space_dim, scalar_type(like.dtype))
+    return equivariance_kernels(space_dim, SCALARS[like.dtype])
 
 
 def _is_for_warps(like: Tensor, form: VectorForm) -> bool:

@@ -1,4 +1,7 @@
-"""The rule's network: fused operators on CUDA's tensor cores, their adjoint, and its weights."""
+"""The rule's network: fused operators on CUDA's tensor cores, their adjoint, and its weights.
+
+Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
+"""
 
 from __future__ import annotations
 

@@ -2,6 +2,8 @@
 
 Each is a custom torch operator, which torch.compile does not trace. The autograd functions save
 only tensors that the adjoint of the case reads.
+
+Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
 """
 
 from __future__ import annotations
@@ -395,7 +397,7 @@ class NeighbourState:
         """Return clipped perception of every particle, in the caller's order, shape [B, N, P].
 
         Later calls read the current values of the same tensors and cost less CPU time. For worlds
-        with `places` in a larger batch, `out` must be given, of that batch's shape.
+        with `world_indices` in a larger batch, `out` must be given, of that batch's shape.
         """
         if out is None:
             out = self._like.new_empty(self._shape)
@@ -404,19 +406,19 @@ class NeighbourState:
         if self._tape is None:
             self._tape, self._form = Tape(), form
             self._tape.add(*self._launch_of(rows))
-            self._places = self._tape.argument_slots(rows)
+            self._slots = self._tape.argument_slots(rows)
         assert form == self._form, "only the address may change"
-        self._tape.move(self._places, rows)
+        self._tape.move(self._slots, rows)
         self._tape.replay()
         return out
 
 
 def build_neighbours(
-    x: Tensor, s: Tensor, physics: Physics, places: Tensor | None = None
+    x: Tensor, s: Tensor, physics: Physics, world_indices: Tensor | None = None
 ) -> NeighbourState:
     """Sort checked worlds into cells and compute densities; valid until x or s change.
 
-    `places` are the worlds' indices in a larger batch, to which their perception is written, int64,
+    `world_indices` are indices in a larger batch, to which perception is written, int64,
     shape [B]; default: the worlds are the whole batch.
     """
     x, s = x.contiguous(), s.contiguous()
@@ -430,12 +432,14 @@ def build_neighbours(
         plan,
         ordered,
         batch_listing(plan.request),
-        state_place=ordered.source if in_place else None,
+        state_index=ordered.source if in_place else None,
         with_particles=False,
     )
     destination = ordered.source
-    if places is not None:
-        shift = (places - torch.arange(len(places), device=x.device)) * plan.particle_count
+    if world_indices is not None:
+        shift = (
+            world_indices - torch.arange(len(world_indices), device=x.device)
+        ) * plan.particle_count
         destination = (destination.view(plan.world_count, -1) + shift.int()[:, None]).view(-1)
 
     def launch_of(rows: Tensor) -> tuple[Any, ...]:

@@ -1,4 +1,7 @@
-"""The passes over sorted worlds: arguments and launches of density, perception and adjoint."""
+"""The passes over sorted worlds: arguments and launches of density, perception and adjoint.
+
+Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
+"""
 
 from __future__ import annotations
 
@@ -9,8 +12,8 @@ from torch import Tensor
 
 from npa_envs.errors import NPAError
 from npa_envs.kernels.cuda.adjoint import THREAD_CHANNELS, listed_adjoint
-from npa_envs.kernels.cuda.adjoint import TILE as ADJOINT_TILE
-from npa_envs.kernels.cuda.density import LIST_BLOCK, TILE, listed_density, tiled_density
+from npa_envs.kernels.cuda.adjoint import TILE_PARTICLES as ADJOINT_PARTICLES
+from npa_envs.kernels.cuda.density import LIST_BLOCK, TILE_PARTICLES, listed_density, tiled_density
 from npa_envs.kernels.cuda.perceive import PerceptionVariant, listed_perception
 from npa_envs.kernels.portable.adjoint import adjoint_kernels
 from npa_envs.kernels.portable.density import density_kernels
@@ -38,7 +41,7 @@ class NeighbourLists(NamedTuple):
     """Number of neighbours of each row's particle, int32, [K]."""
     records: Tensor
     """Sorted positions with volumes, and in 2D indices of states, shape [B N, 4]."""
-    by_place: bool = False
+    per_particle: bool = False
     """Whether there is a list for each sorted particle, not for each row."""
 
 
@@ -84,12 +87,12 @@ def compute_densities(
     ordered: SortedWorlds,
     listing: Listing | None = None,
     *,
-    state_place: Tensor | None = None,
+    state_index: Tensor | None = None,
     with_particles: bool = True,
 ) -> Densities:
     """Compute densities, and neighbour lists or the rows' density gradients for perception.
 
-    Neighbours are listed where `plan.lists_neighbours`, by default as in rollouts. `state_place`
+    Neighbours are listed where `plan.lists_neighbours`, by default as in rollouts. `state_index`
     has the index of each sorted particle's state, by default in order. `with_particles`: also
     return `particles`, which the adjoint reads.
     """
@@ -105,7 +108,7 @@ def compute_densities(
         ordered.starts,
         ordered.cell,
         positions,
-        state_place,
+        state_index,
         ordered.source,
         ordered.row_of,
         particles,
@@ -116,7 +119,7 @@ def compute_densities(
     if listing.tiled:
         launch(
             tiled_density(plan.periodic, listing.capacity, plan.masked),
-            plan.world_count * -(-plan.particle_count // TILE) * WARP,
+            plan.world_count * -(-plan.particle_count // TILE_PARTICLES) * WARP,
             positions.device,
             plan.domain,
             plan.particle_count,
@@ -184,7 +187,7 @@ def perception_launch(
     """
     some = row_count is not None
     row_count = plan.row_capacity if row_count is None else row_count
-    row_place = ordered.row_place[first_row:] if plan.masked or some else None
+    row_index = ordered.row_index[first_row:] if plan.masked or some else None
     terms = plan.physics.terms
     numbers = (
         plan.state_dim,
@@ -208,7 +211,7 @@ def perception_launch(
             lists.listing.capacity,
             row_kernel_sum is not None,
             lists.listing.teams,
-            lists.by_place,
+            lists.per_particle,
             lists.listing.tiled,
         )
         source = ordered.states if states is None else states
@@ -227,7 +230,7 @@ def perception_launch(
             lists.records,
             source,
             None if states is None else ordered.source,
-            row_place,
+            row_index,
             destination,
             lists.steps,
             lists.lengths,
@@ -250,7 +253,7 @@ def perception_launch(
         densities.particles,
         ordered.states,
         ordered.states.view(plan.total, -1),
-        row_place,
+        row_index,
         destination,
         densities.density_gradient,
         out,
@@ -421,7 +424,7 @@ def _gather_by_tiles(plan: KernelPlan, saved: SavedPerception, bar: Tensor) -> T
         cotangents,
     )
     states_bar = bar.new_empty(plan.total, plan.state_dim)
-    tile_count = -(-plan.particle_count // ADJOINT_TILE)
+    tile_count = -(-plan.particle_count // ADJOINT_PARTICLES)
     launch(
         kernels.gather_state_cotangents,
         plan.world_count * tile_count * plan.group_count * WARP,

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Callable
 from types import NoneType
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, ParamSpec, get_args
 
 import torch
 
@@ -107,7 +108,7 @@ class Physics(NamedTuple):
     @classmethod
     def of(cls, numbers: list[float]) -> Physics:
         """Return what `numbers` packed: everything but limits and the sizes of tensors."""
-        count = len(SCALARS)
+        count = len(NUMBER_FIELDS)
         state_gradient, inverse, density_gradient, moving, reflecting, *packed = numbers[count:]
         sides = tuple(packed) or None
         return cls(
@@ -118,7 +119,7 @@ class Physics(NamedTuple):
             terms=Terms(bool(state_gradient), INVERSES[int(inverse)], bool(density_gradient)),
             moving=bool(moving),
             limits=NO_LIMITS,
-            **dict(zip(SCALARS, numbers[:count], strict=True)),
+            **dict(zip(NUMBER_FIELDS, numbers[:count], strict=True)),
         )
 
     def numbers(self) -> list[float]:
@@ -126,7 +127,7 @@ class Physics(NamedTuple):
         state_gradient, inverse, density_gradient = self.terms
         reflecting = self.walls is not None
         flags = state_gradient, INVERSES.index(inverse), density_gradient, self.moving, reflecting
-        scalars = [getattr(self, name) for name in SCALARS]
+        scalars = [getattr(self, name) for name in NUMBER_FIELDS]
         sides = self.box or self.walls or ()
         return [constant(number) for number in (*scalars, *map(float, flags), *sides)]
 
@@ -142,7 +143,7 @@ class Physics(NamedTuple):
         return Physics(*[_constants(value) for value in self])
 
 
-SCALARS = ("eps", "eps0", "max_displacement", "update_prob", "dt", "position_noise")
+NUMBER_FIELDS = ("eps", "eps0", "max_displacement", "update_prob", "dt", "position_noise")
 """Fields of `Physics` that are one number."""
 
 
@@ -153,10 +154,28 @@ def _constants(value: Any) -> Any:
     return constant(value) if type(value) is float else value
 
 
-IMMUTABLE = frozenset((float, int, bool, str, NoneType))
-"""Types of values that can be keys of a cache."""
+IMMUTABLE = frozenset((float, int, bool, str, NoneType, torch.dtype, Terms))
+"""Types of arguments that can be keys of a cache."""
+
+Arguments = ParamSpec("Arguments")
 
 
+def _cached(make: Callable[Arguments, Physics]) -> Callable[Arguments, Physics]:
+    """Return a function that remembers results of immutable arguments, except for compilers."""
+    remembered = functools.lru_cache(maxsize=256, typed=True)(make)
+
+    @functools.wraps(make)
+    def cached(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Physics:
+        if not torch.compiler.is_compiling() and IMMUTABLE.issuperset(
+            map(type, (*args, *kwargs.values()))
+        ):
+            return remembered(*args, **kwargs)
+        return make(*args, **kwargs)
+
+    return cached
+
+
+@_cached
 def physics(
     space_dim: int,
     state_dim: int,
@@ -177,27 +196,6 @@ def physics(
 
     `eps0` is already checked, default: `eps`. The largest displacement is α ε.
     """
-    values: Any = (boundary, eps, eps0, box, alpha, update_prob, dt, position_noise)
-    # Only immutable values can be keys of the cache.
-    known = not torch.compiler.is_compiling() and IMMUTABLE.issuperset(map(type, values))
-    return (_known if known else _checked)(space_dim, state_dim, dtype, terms, moving, *values)
-
-
-def _checked(
-    space_dim: int,
-    state_dim: int,
-    dtype: torch.dtype,
-    terms: Terms,
-    moving: bool,
-    boundary: Boundary,
-    eps: Any,
-    eps0: float | None,
-    box: Box,
-    alpha: float,
-    update_prob: Any,
-    dt: Any,
-    position_noise: Any,
-) -> Physics:
     if boundary not in get_args(Boundary):
         raise NPAError(
             f"boundary must be 'open', 'periodic' or 'reflecting', got {shown(boundary)}"
@@ -234,6 +232,3 @@ def _checked(
         position_noise=position_noise,
         limits=NO_LIMITS,
     )
-
-
-_known = functools.lru_cache(maxsize=256, typed=True)(_checked)

@@ -22,7 +22,7 @@ from npa_envs.ops.backend import (
     multiprocessor_count,
     rollout_listing,
 )
-from npa_envs.ops.launch import channel_width, is_aligned, is_recorded, launch, scalar_type
+from npa_envs.ops.launch import SCALARS, channel_width, is_aligned, is_recorded, launch
 from npa_envs.ops.physics_constants import Physics
 
 MAX_INDEX = 2**31 - 1
@@ -136,7 +136,7 @@ class SortedWorlds(NamedTuple):
     """Row of each particle, -1 for inactive ones, int32, shape [B N]."""
     row_source: Tensor
     """Caller's index of each row, int32, shape [K]; undefined beyond the last active row."""
-    row_place: Tensor
+    row_index: Tensor
     """Sorted index of each row, int32, shape [K]; undefined beyond the last active row."""
     positions: Tensor
     """Sorted positions [length units], shape [B N, D]."""
@@ -160,18 +160,18 @@ def plan_kernels(
     """
     # As integers: symbolic sizes of torch.compile become constants, and other sizes recompile.
     world_count, particle_count, space_dim = (int(size) for size in shape)
-    scalar = scalar_type(like.dtype)
+    scalar = SCALARS[like.dtype]
     eps, sides = physics.eps, physics.box
     # In 3D smaller cells give many short runs of candidates, which threads share badly.
-    cell_reach = 1 if space_dim == 3 and like.device.type == "cuda" else 2
-    domain = make_domain(space_dim, scalar, eps, sides, particle_count, cell_reach)
+    cells_per_eps = 1 if space_dim == 3 and like.device.type == "cuda" else 2
+    domain = make_domain(space_dim, scalar, eps, sides, particle_count, cells_per_eps)
     request = KernelRequest(
         like.device,
         like.dtype,
         particle_count,
         int(domain.cell_count),
         space_dim,
-        smallest_side=min(cell_grid(space_dim, particle_count, eps, sides, cell_reach)),
+        smallest_side=min(cell_grid(space_dim, particle_count, eps, sides, cells_per_eps)),
     )
     plan = KernelPlan(
         scalar=scalar,
@@ -282,7 +282,7 @@ def _empty_worlds(
         cell=cell,
         row_of=source.new_empty(total if with_rows else 0),
         row_source=row_source,
-        row_place=torch.empty_like(row_source),
+        row_index=torch.empty_like(row_source),
         positions=x.new_empty(total, plan.space_dim),
         row_positions=x.new_empty(row_capacity, plan.space_dim),
         states=x.new_empty(total * plan.group_count if with_states else 0, plan.width),

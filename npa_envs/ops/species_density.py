@@ -18,9 +18,9 @@ from npa_envs.checks import (
     entries,
 )
 from npa_envs.errors import NPAError, shown
-from npa_envs.kernels.portable.species_density import species_kernel
+from npa_envs.kernels.portable.density import species_kernel
 from npa_envs.ops.custom_op import check_derivatives, custom_op
-from npa_envs.ops.launch import launch, scalar_type
+from npa_envs.ops.launch import SCALARS, launch
 from npa_envs.ops.perceive import perceive
 from npa_envs.ops.physics_constants import Physics, physics
 from npa_envs.ops.sort import plan_kernels, sort_worlds
@@ -69,15 +69,15 @@ def _gather_species(
     world_count, particle_count, space_dim = map(int, x.shape)
     plan = plan_kernels(x, x.shape, 1, world_count * particle_count, False, physics)
     ordered = sort_worlds(plan, x, None, None, with_rows=False)
-    place = ordered.source % particle_count
-    sorted_species = torch.zeros_like(place)
+    index_in_world = ordered.source % particle_count
+    sorted_species = torch.zeros_like(index_in_world)
     # Python numbers instead of a tensor: a CUDA graph must not copy from the host.
     for end in itertools.accumulate(counts[:-1]):
-        sorted_species += place >= end
+        sorted_species += index_in_world >= end
     density = x.new_empty(plan.total, len(counts))
     gradient = x.new_empty(plan.total, len(counts), space_dim)
     launch(
-        species_kernel(space_dim, scalar_type(x.dtype), len(counts)),
+        species_kernel(space_dim, SCALARS[x.dtype], len(counts)),
         plan.total,
         x.device,
         plan.domain,

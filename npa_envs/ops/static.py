@@ -14,7 +14,7 @@ from torch import Tensor
 from npa_envs.kernels.portable.density import density_kernels
 from npa_envs.kernels.portable.sort import give_rows
 from npa_envs.ops.custom_op import custom_op
-from npa_envs.ops.launch import aligned, is_traced, launch, scalar_type
+from npa_envs.ops.launch import SCALARS, aligned, is_traced, launch
 from npa_envs.ops.perception_passes import (
     Densities,
     ListedNeighbours,
@@ -33,7 +33,7 @@ class StaticWorlds(NamedTuple):
 
     source: Tensor
     """Caller's index of each sorted particle, int32, shape [B N]."""
-    place: Tensor
+    sorted_index: Tensor
     """Sorted index of each particle in the caller's order, int32, shape [B N]."""
     all_indices: Tensor
     """0, 1, ... B N - 1, int32: all sorted indices."""
@@ -79,7 +79,7 @@ def _prepare_static(x: Tensor, state_dim: int, physics: Physics) -> list[Tensor]
         lists = _list_neighbours(plan, ordered.starts, densities.particles)
     return StaticWorlds(
         source=ordered.source,
-        place=ordered.row_of,
+        sorted_index=ordered.row_of,
         all_indices=torch.arange(total, dtype=torch.int32, device=x.device),
         starts=ordered.starts,
         # Outputs of an operator must not share memory.
@@ -141,7 +141,7 @@ def _static_rows(
         x.new_empty(step_count, row_capacity, space_dim),
     )
     launch(
-        give_rows(space_dim, scalar_type(x.dtype)),
+        give_rows(space_dim, SCALARS[x.dtype]),
         (step_count, max(total, rows[2].shape[1])),
         x.device,
         total,
@@ -190,7 +190,7 @@ def static_worlds(
     lists = None
     if plan.lists_neighbours:
         steps, lengths, records = worlds.lists
-        lists = NeighbourLists(plan.listing, steps, lengths, records, by_place=True)
+        lists = NeighbourLists(plan.listing, steps, lengths, records, per_particle=True)
     # States in groups of channels.
     padding = 0, plan.group_count * plan.width - plan.state_dim
     ordered = SortedWorlds(
@@ -199,7 +199,7 @@ def static_worlds(
         cell=worlds.cell,
         row_of=rows.row_of,
         row_source=rows.row_source,
-        row_place=rows.row_source,
+        row_index=rows.row_source,
         positions=x.view(plan.total, plan.space_dim),
         row_positions=rows.row_positions,
         states=aligned(torch.nn.functional.pad(s, padding)).view(-1, plan.width),

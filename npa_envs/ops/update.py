@@ -1,4 +1,7 @@
-"""Updates of particles: by a rule's outputs, as a torch operator, and by actions, in place."""
+"""Updates of particles: by a rule's outputs, as a torch operator, and by actions, in place.
+
+Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
+"""
 
 from __future__ import annotations
 
@@ -10,10 +13,10 @@ from torch import Tensor
 from npa_envs.checks import check_world
 from npa_envs.errors import NPAError
 from npa_envs.kernels.portable.update import (
+    MOVED_TOGETHER,
     OPEN,
     PERIODIC,
     REFLECTING,
-    TEAM,
     THREAD_CHANNELS,
     UPDATE_ALIGNMENT,
     VALUES_PER_THREAD,
@@ -21,7 +24,7 @@ from npa_envs.kernels.portable.update import (
     update_kernels,
 )
 from npa_envs.ops.custom_op import check_derivatives, custom_op, once_differentiable
-from npa_envs.ops.launch import Tape, is_aligned, launch, scalar_type
+from npa_envs.ops.launch import SCALARS, Tape, is_aligned, launch
 from npa_envs.ops.perceive import Rows
 from npa_envs.ops.physics_constants import Physics
 from npa_envs.ops.sort import MAX_INDEX
@@ -52,7 +55,7 @@ def _update_particles(
     space_dim, state_dim = int(x.shape[2]), s.shape[2]
     boundary, sides = _boundary(physics, space_dim)
     total = x.shape[0] * x.shape[1]
-    kernels = update_kernels(space_dim, scalar_type(x.dtype))
+    kernels = update_kernels(space_dim, SCALARS[x.dtype])
     if update.numel() >= MAX_INDEX:
         raise NPAError(
             f"updates must stay below {MAX_INDEX} numbers in one batch, got "
@@ -67,7 +70,7 @@ def _update_particles(
     aligned = aligned and is_aligned(update, alignment)
     launch(
         kernels.apply_update,
-        -(-total // TEAM) * TEAM * (1 + _threads_for(state_dim)),
+        -(-total // MOVED_TOGETHER) * MOVED_TOGETHER * (1 + _threads_for(state_dim)),
         x.device,
         physics.max_displacement * physics.dt,
         physics.dt,
@@ -99,7 +102,7 @@ def _update_particles_backward(
     physics: Physics,
 ) -> Tensor:
     space_dim, state_dim = int(new_x_bar.shape[2]), new_s_bar.shape[2]
-    kernels = update_kernels(space_dim, scalar_type(update.dtype))
+    kernels = update_kernels(space_dim, SCALARS[update.dtype])
     update_bar = torch.empty_like(update, memory_format=torch.contiguous_format)
     launch(
         kernels.pull_back_update,
@@ -137,15 +140,15 @@ class _UpdateParticles(torch.autograd.Function):
         physics: Physics,
     ) -> tuple[Tensor, Tensor, Tensor]:
         ctx.options = rows.row_base, physics
-        places = () if physics.walls is None else (x, rows.row_of)
-        ctx.save_for_backward(update, rows.row_source, rows.starts, *places)
+        before = () if physics.walls is None else (x, rows.row_of)
+        ctx.save_for_backward(update, rows.row_source, rows.starts, *before)
         return _update_particles(update, x, s, path_length, rows.row_of, physics, True)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *bars: Tensor) -> tuple[Tensor | None, ...]:
-        update, row_source, starts, *places = ctx.saved_tensors
-        bars = _before_reflection(ctx.options[1], update, *places, *bars) if places else bars
+        update, row_source, starts, *before = ctx.saved_tensors
+        bars = _before_reflection(ctx.options[1], update, *before, *bars) if before else bars
         arguments: list[Any] = [update, *bars, row_source, starts, *ctx.options]
         update_bar = _update_particles_backward(*arguments)
         return (update_bar, *bars, None, None)
@@ -262,7 +265,7 @@ class ActedWorlds(NamedTuple):
         aligned = aligned and state_dim % THREAD_CHANNELS == 0
         aligned = aligned and (space_dim % 2 == 0 or not physics.moving)
         return (
-            update_kernels(space_dim, scalar_type(x.dtype)).apply_actions,
+            update_kernels(space_dim, SCALARS[x.dtype]).apply_actions,
             world_count * particle_count * _threads_for(state_dim),
             x.device,
             particle_count,
@@ -327,7 +330,7 @@ class PreparedActions:
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out the tape, which cannot be pickled."""
-        return self.__dict__ | {"_tape": None, "_places": None}
+        return self.__dict__ | {"_tape": None, "_action_slots": None}
 
     def __call__(self, action: Tensor) -> None:
         """Apply actions, shape [B, N, A], of any dtype, on any device."""
@@ -361,9 +364,9 @@ class PreparedActions:
             self._tape = Tape()
             x, s = self._worlds[:2]
             threads = -(-action.numel() // VALUES_PER_THREAD)
-            check = find_not_finite(scalar_type(x.dtype))
+            check = find_not_finite(SCALARS[x.dtype])
             self._tape.add(check, threads, x.device, threads, action, self._worlds.enabled)
             self._tape.add(*self._worlds.launch_of(action, self._physics, is_aligned(s)))
-            self._places = self._tape.argument_slots(action)
-        self._tape.move(self._places, action)
+            self._action_slots = self._tape.argument_slots(action)
+        self._tape.move(self._action_slots, action)
         self._tape.replay()

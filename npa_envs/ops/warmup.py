@@ -19,8 +19,7 @@ from npa_envs.ops.perceive import build_neighbours, perceive, perceive_rows
 from npa_envs.ops.physics_constants import Limits, Physics
 from npa_envs.ops.pictures.cameras import orbit
 from npa_envs.ops.pictures.gaussians import render_gaussians
-from npa_envs.ops.pictures.losses_without_gradient import picture_losses
-from npa_envs.ops.pictures.splat import splat
+from npa_envs.ops.pictures.splat import picture_losses, splat
 from npa_envs.ops.pictures.triangles import nearest_triangles
 from npa_envs.ops.rewards_and_ends import EpisodeRules, EpisodeUpdate
 from npa_envs.ops.static import prepare_static, static_rows
@@ -54,7 +53,7 @@ def warmup(
     streams = keys, counts, counts, 0
     draw(*streams, "bernoulli", 1, torch.uint8, 1)
     draw(*streams, "integers", 1, torch.int64, 2)
-    _warm_judgement(counts)
+    _warm_rewards(counts)
     for dtype in dtypes:
         draw(*streams, "uniform", 1, dtype, 0)
         draw(*streams, "normal", 1, dtype, 0)
@@ -93,9 +92,9 @@ def _chosen(name: str, value: Any, known: tuple[Any, ...]) -> list[Any]:
     return chosen
 
 
-def _warm_judgement(elapsed: torch.Tensor) -> None:
+def _warm_rewards(elapsed: torch.Tensor) -> None:
     number, flag = elapsed.float(), elapsed.byte()
-    judge = EpisodeUpdate(
+    update_episodes = EpisodeUpdate(
         EpisodeRules(None, None, "terminate"),
         enabled=flag,
         diverged=flag,
@@ -106,7 +105,7 @@ def _warm_judgement(elapsed: torch.Tensor) -> None:
         flags=flag.new_zeros(4, 1, dtype=torch.bool),
         endings=flag.new_zeros(2),
     )
-    judge(number[None])
+    update_episodes(number[None])
 
 
 def _warm_steps(x: torch.Tensor, s: torch.Tensor, physics: Physics) -> None:
@@ -165,8 +164,10 @@ def _warm_views(x: torch.Tensor) -> None:
     """Draw worlds, and meshes as targets, by cameras."""
     cameras = orbit(1, width=16, height=16)
     scales, colours = x.new_ones(x.shape), x.new_zeros(*x.shape[:2], 4, 3)
-    turns = x.new_ones(*x.shape[:2], 4)
-    pictures = render_gaussians(x, scales, turns, x.new_ones(x.shape[:2]), colours, cameras.to(x))
+    quaternions = x.new_ones(*x.shape[:2], 4)
+    pictures = render_gaussians(
+        x, scales, quaternions, x.new_ones(x.shape[:2]), colours, cameras.to(x)
+    )
     _pull_back(pictures.image)
     corners = torch.zeros(1, 3, dtype=torch.float64, device="cpu")
     nearest_triangles(

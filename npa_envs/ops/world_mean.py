@@ -1,4 +1,7 @@
-"""Mean over each world as a torch operator: the same in every batch, bit for bit."""
+"""Mean over each world as a torch operator: the same in every batch, bit for bit.
+
+Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
+"""
 
 from __future__ import annotations
 
@@ -11,14 +14,14 @@ from npa_envs.checks import check_floating
 from npa_envs.errors import NPAError
 from npa_envs.kernels.portable.world_mean import CHUNK, MEAN_LANES, mean_kernels
 from npa_envs.ops.custom_op import check_derivatives, custom_op
-from npa_envs.ops.launch import launch, scalar_type
+from npa_envs.ops.launch import SCALARS, launch
 
 
 def average_sums(partial_sums: Tensor, value_count: int, like: Tensor) -> Tensor:
     """Return means [B, K] from partial sums [B, L, K]; the order of summation depends only on L."""
     world_count, _, width = partial_sums.shape
     lanes = _lanes(like.device)
-    kernels = mean_kernels(scalar_type(like.dtype), lanes)
+    kernels = mean_kernels(SCALARS[like.dtype], lanes)
     means = like.new_empty(world_count, width)
     launch(
         kernels.average_sums,
@@ -39,7 +42,7 @@ def _lanes(device: torch.device) -> int:
 def _world_mean(values: Tensor) -> Tensor:
     world_count, value_count, width = values.shape
     lanes = _lanes(values.device)
-    kernels = mean_kernels(scalar_type(values.dtype), lanes)
+    kernels = mean_kernels(SCALARS[values.dtype], lanes)
     chunk_count = -(-value_count // CHUNK)
     partial_sums = values.new_empty(world_count, chunk_count, width, dtype=torch.float64)
     launch(

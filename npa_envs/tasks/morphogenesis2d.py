@@ -20,7 +20,7 @@ from npa_envs.checks import (
 )
 from npa_envs.errors import NPAError
 from npa_envs.ops import splat, world_mean
-from npa_envs.ops.pictures.losses_without_gradient import picture_losses
+from npa_envs.ops.pictures.splat import picture_losses
 from npa_envs.rule.picture_codes import carrying
 from npa_envs.rule.rule import COLOUR_OFFSET, LIFE, NPARule
 from npa_envs.tasks.base import GrowthConfig, GrowthTask

@@ -237,7 +237,7 @@ class StaticStep(RuleStep):
 
     def leave(self, particles: Particles) -> Particles:
         """Return the worlds in the caller's order."""
-        return particles.gather(self.sorted.place)
+        return particles.gather(self.sorted.sorted_index)
 
 
 class DivisionStep(RuleStep):

@@ -17,8 +17,12 @@ from npa_envs.kernels.cuda.network import (
     weight_gradient_kernels,
 )
 from npa_envs.kernels.cuda.perceive import PerceptionVariant, listed_perception
-from npa_envs.kernels.cuda.sort import BLOCKS, order_particles, sort_small_worlds
-from npa_envs.kernels.cuda.splat_sort import sort_small_splats
+from npa_envs.kernels.cuda.sort import (
+    BLOCKS,
+    order_particles,
+    sort_small_splats,
+    sort_small_worlds,
+)
 from npa_envs.kernels.pictures.blending import block_kernels
 from npa_envs.kernels.pictures.errors import gather_errors
 from npa_envs.kernels.portable.rewards_and_ends import update_episodes
@@ -40,7 +44,7 @@ VARIANTS: dict[str, Callable[[], Any]] = {
     "density in tiles": lambda: tiled_density(True, 256, True),
     "perceive": lambda: perception(3, 16, True, "smooth", False, True, 128, True, 2),
     "perceive tiles": lambda: perception(
-        2, 16, True, "threshold", True, False, 256, False, 2, by_place=True, tiled=True
+        2, 16, True, "threshold", True, False, 256, False, 2, per_particle=True, tiled=True
     ),
     "adjoint": lambda: listed_adjoint(3, 16, True, True, True).gather_state_cotangents,
     "adjoint 2D": lambda: listed_adjoint(2, 16, True, False, False).unscale_cotangents,

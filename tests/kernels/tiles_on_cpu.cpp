@@ -81,7 +81,7 @@ int check(int count, int worlds, float half_x, float half_y, float spread, Bad k
                 const int own = first + threadIdx.x / 4;
                 const bool inside = own < (world + 1) * count;
                 const int k = inside ? own : first;
-                const float sum = npa::density_of_tile<CAPACITY, PERIODIC, 8, 7>(domain,
+                const float sum = npa::density_of_tile<CAPACITY, PERIODIC>(domain,
                     {starts.data()}, {cell.data()}, {vectors}, world * cells, first, k, inside,
                     inside ? rows[k] : -1, {steps}, {lengths.data()});
                 if (inside && threadIdx.x % 4 == 0) sums[k] = sum;

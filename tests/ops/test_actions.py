@@ -1,4 +1,4 @@
-"""Applying actions: the formula, a rule as a policy, masks, noise, boxes, limits, errors."""
+"""Applying actions: the formula, masks, noise, boxes, limits, errors."""
 
 import math
 
@@ -8,12 +8,11 @@ from worlds import assert_same, random_mask
 
 from npa_envs.errors import NPAError
 from npa_envs.ops import apply_actions
-from npa_envs.ops.perceive import Rows
 from npa_envs.ops.physics_constants import Limits, Physics
-from npa_envs.ops.update import ActedWorlds, PreparedActions, update_particles
+from npa_envs.ops.update import ActedWorlds, PreparedActions
 
 B, N, C = 3, 77, 5
-REACH, DT, STATE_SCALE = 0.07, 0.8, 0.6
+MAX_STEP, DT, STATE_SCALE = 0.07, 0.8, 0.6
 ERRORS = {torch.float32: 1e-6, torch.float64: 3e-15}
 """Bound of differences from the formula, for values of size 3 (worst seen 2.2e-7 and 2.2e-16)."""
 
@@ -32,7 +31,7 @@ def physics_of(
     x, *, moving=True, box=None, state_scale=STATE_SCALE, position_limit=50.0, state_limit=20.0
 ):
     limits = Limits(state_scale, position=position_limit, state=state_limit)
-    form = {"box": box, "moving": moving, "max_displacement": REACH, "dt": DT}
+    form = {"box": box, "moving": moving, "max_displacement": MAX_STEP, "dt": DT}
     return Physics(x.shape[2], C, 1.0, 1.0, **form, limits=limits)
 
 
@@ -53,7 +52,7 @@ def formula(action, x, s, mask=None, noise=None, moving=True, box=None):
     x = x.double()
     if moving:
         direction, action = action[..., : x.shape[2]], action[..., x.shape[2] :]
-        x = x + REACH * DT * direction / direction.norm(dim=-1, keepdim=True).clamp_min(1.0)
+        x = x + MAX_STEP * DT * direction / direction.norm(dim=-1, keepdim=True).clamp_min(1.0)
     if box is not None:
         sides = torch.tensor(box, dtype=x.dtype, device=x.device)
         x = x - sides * torch.floor(x / sides + 0.5)
@@ -88,7 +87,7 @@ def test_particles_follow_the_formula(masked, noisy, moving, world, dtype):
         assert torch.equal(moved[0], resting)
     elif not noisy:
         step = (moved[0] - x).norm(dim=-1)
-        assert float(step.max()) == pytest.approx(REACH * DT, rel=1e-5)
+        assert float(step.max()) == pytest.approx(MAX_STEP * DT, rel=1e-5)
 
 
 def test_positions_are_wrapped_into_the_box(world, dtype, device):
@@ -101,26 +100,6 @@ def test_positions_are_wrapped_into_the_box(world, dtype, device):
     assert float((turn - turn.round()).abs().max()) <= 4.0 * ERRORS[dtype]
     assert float(turn.round().abs().max()) >= 1.0
     assert_near(moved[1:], formula(action, x, s)[1:], dtype)
-
-
-@pytest.mark.parametrize("box", [None, 1.2], ids=["open", "periodic"])
-def test_a_rule_is_a_policy(world, dtype, device, box):
-    action, x, s = world
-    space_dim = x.shape[2]
-    box = None if box is None else (box,) * space_dim
-    mask = random_mask(x)
-    # Every particle has its own row; those outside the mask have none.
-    own = torch.arange(B * N, dtype=torch.int32, device=device)
-    rows = Rows(torch.where(mask.view(-1) == 1, own, -1), own, own, 0)
-    update = action.reshape(B * N, -1)
-    physics = Physics(space_dim, C, 1.0, 1.0, box, max_displacement=REACH, dt=DT)
-    expected = update_particles(update, x, s, x.new_zeros(B, N), rows, physics)
-    delta, change = action[..., :space_dim], action[..., space_dim:]
-    scale = float(change.abs().max())
-    policy = torch.cat((delta / (1.0 + delta.norm(dim=-1, keepdim=True)), change / scale), dim=-1)
-    moved, changed, _ = applied(policy, x, s, mask=mask, state_scale=scale, box=box)
-    torch.testing.assert_close(moved, expected[0], rtol=0.0, atol=ERRORS[dtype])
-    torch.testing.assert_close(changed, expected[1], rtol=0.0, atol=2.0 * ERRORS[dtype])
 
 
 def test_values_beyond_their_limits_are_held_and_mark_their_world_alone(world, device):

@@ -18,7 +18,7 @@ B, PARTS = 64, 3
 
 
 def worlds(device):
-    """Worlds of all kinds: diverged, successful, late, with losses that are not finite."""
+    """Worlds of many kinds: diverged, successful, late, with losses that are not finite."""
     generator = torch.Generator().manual_seed(0)
 
     def draw(*shape):
@@ -42,22 +42,22 @@ def worlds(device):
 
 def expected(rules, arguments):
     """Numbers, flags and endings after a step."""
-    parts, fled = arguments["parts"], arguments["diverged"].bool()
-    lost = fled & (rules.on_divergence != "ignore")
-    ended = fled & (rules.on_divergence == "terminate")
+    parts, diverged = arguments["parts"], arguments["diverged"].bool()
+    penalised = diverged & (rules.on_divergence != "ignore")
+    ended = diverged & (rules.on_divergence == "terminate")
     loss = parts[0] + parts[1] + parts[2]
-    loss = torch.where(lost, torch.maximum(loss, arguments["first_loss"]), loss)
+    loss = torch.where(penalised, torch.maximum(loss, arguments["first_loss"]), loss)
     step = arguments["elapsed"] + 1
-    success = (loss <= arguments["success_loss"]) & ~lost
-    late = step >= rules.last_step if rules.last_step else torch.zeros_like(fled)
+    success = (loss <= arguments["success_loss"]) & ~penalised
+    late = step >= rules.last_step if rules.last_step else torch.zeros_like(diverged)
     improvement = arguments["numbers"][1] - loss
     reward = improvement
     if rules.rewarded_step is not None:
         reward = torch.where(success | ended | (step == rules.rewarded_step), -loss, 0.0)
     fallen = arguments["numbers"][2 : 2 + PARTS] - parts
-    flags = torch.stack((success | ended, late, success, fled))
-    unfit = ~improvement.isfinite() | (arguments["broken"].bool() & ~lost)
-    bits = SUCCESS * success.int() + DIVERGED * fled.int() + TIME_LIMIT * late.int()
+    flags = torch.stack((success | ended, late, success, diverged))
+    unfit = ~improvement.isfinite() | (arguments["broken"].bool() & ~penalised)
+    bits = SUCCESS * success.int() + DIVERGED * diverged.int() + TIME_LIMIT * late.int()
     return torch.cat((reward[None], loss[None], parts, fallen)), flags, bits + NOT_FINITE * unfit
 
 
@@ -72,17 +72,17 @@ def expected(rules, arguments):
         )
     ],
 )
-def test_worlds_are_judged_as_torch_would(rules, happened, device):
+def test_rewards_and_endings_equal_those_by_torch(rules, happened, device):
     arguments = worlds(device)
     before = {name: value.clone() for name, value in arguments.items()}
     endings = torch.zeros(B + 1, dtype=torch.uint8, device=device)
-    judge = EpisodeUpdate(
+    update = EpisodeUpdate(
         rules,
         enabled=torch.full((1,), happened, dtype=torch.uint8, device=device),
         endings=endings,
         **{name: arguments[name] for name in arguments.keys() - {"parts", "broken"}},
     )
-    judge(arguments["parts"], arguments["broken"])
+    update(arguments["parts"], arguments["broken"])
     if happened:
         numbers, flags, bits = expected(rules, before)
         assert torch.equal(arguments["elapsed"], before["elapsed"] + 1)

@@ -170,17 +170,6 @@ def single(mean, *, scale=(0.1, 0.1, 0.1), opacity=0.5, colour=(1.0, 0.5, 0.25),
     ]
 
 
-def test_a_gaussian_has_its_opacity_colour_and_place(device):
-    """At depth 2 and focal length 50, 0.3 to the right are 7.5 pixels; y points down."""
-    gaussians = single((0.3, -0.1, 2.0), device=device)
-    image, alpha, _ = render_gaussians(*gaussians, frontal(40, 32, device=device))
-    row, column = divmod(int(alpha[0, 0].argmax()), 40)
-    assert (row, column) == (13, 27)
-    middle = image[0, 0, 13, 27].cpu()
-    expected = torch.tensor([0.5, 0.25, 0.125], dtype=torch.float64)
-    torch.testing.assert_close(middle, expected, rtol=1e-9, atol=0.0)
-
-
 def test_a_footprint_has_the_covariance_of_projected_samples(device):
     """Against perspective itself, which the affine approximation follows near the mean."""
     generator = torch.Generator().manual_seed(3)
@@ -323,27 +312,6 @@ def test_without_room_the_farthest_are_missing(device):
     assert float(depths[drawn].max()) < float(depths[~drawn & (opacities > 0.1)].min())
     nearest = [t.detach()[:1, drawn] for t in gaussians]
     assert torch.equal(render_gaussians(*nearest, cameras).image[0], pictures.image[0])
-
-
-def test_a_gaussian_with_one_pair_too_many_is_missing(device):
-    """The nearer one covers a tile, the farther one two: room for two pairs, or for four."""
-    near = single((-0.15, 0.0, 1.0), scale=(0.005,) * 3, device=device)
-    far = single((0.0, 0.0, 2.0), scale=(0.01,) * 3, device=device)
-    both = [torch.cat(pair, dim=1) for pair in zip(far, near, strict=True)]
-    camera = frontal(32, 16, device=device)
-    full = render_gaussians(*both, camera, pairs_per_particle=2)
-    assert not bool(full.overflow.any())
-    pictures = render_gaussians(*both, camera, pairs_per_particle=1)
-    assert bool(pictures.overflow.all())
-    assert torch.equal(pictures.image, render_gaussians(*near, camera).image)
-    assert float(full.alpha[..., 15:17].min(-1).values.max()) > 0.1
-
-
-def test_a_gaussian_is_seen_from_the_near_plane_on(device):
-    for depth, seen in ((0.999, False), (1.001, True)):
-        camera = dataclasses.replace(frontal(20, 20, device=device), near=1.0)
-        alpha = render_gaussians(*single((0.0, 0.0, depth), device=device), camera).alpha
-        assert bool(alpha.max() > 0.4) == seen
 
 
 @pytest.mark.parametrize("pairs", [None, 12])

@@ -19,7 +19,7 @@ from npa_envs.ops import (
     world_mean,
 )
 from npa_envs.ops.physics_constants import Limits, Physics
-from npa_envs.ops.pictures.losses_without_gradient import picture_losses
+from npa_envs.ops.pictures.splat import picture_losses
 
 SIZE = {"width": 40, "height": 30}
 EYES = torch.eye(4)[None].repeat(2, 1, 1)

@@ -5,7 +5,6 @@ import torch
 from worlds import (
     assert_same,
     cotangents,
-    degenerate_world,
     random_mask,
     random_world,
     relative_error,
@@ -123,11 +122,6 @@ def test_rows_of_placed_particles_are_right(name, masked, device):
 def test_rows_of_other_widths_and_fewer_groups_are_right(options, space_dim, device):
     x, s = random_world(2, 50, space_dim, 16, dtype=torch.float32, device=device)
     assert_equals_float64(x, s, eps=0.3, **options)
-
-
-def test_rows_of_degenerate_worlds_are_right(space_dim, device):
-    x, s = degenerate_world(space_dim, 16, dtype=torch.float32, device=device)
-    assert_equals_float64(x, s, eps=0.15)
 
 
 def test_without_active_particles_the_state_gradient_is_zero(device):

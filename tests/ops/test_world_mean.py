@@ -38,13 +38,3 @@ def test_gradients_are_right_to_the_second_order(device):
     values = numbers(2, 5, 3, dtype=torch.float64, device=device).requires_grad_()
     assert torch.autograd.gradcheck(world_mean, values)
     assert torch.autograd.gradgradcheck(lambda v: world_mean(v) ** 2, values)
-
-
-def test_means_of_a_batch_are_right_after_a_single_world_of_any_stride(device):
-    """A first dimension of 1 says nothing of where the next world would be."""
-    values = torch.rand(2, 37, 3, generator=torch.Generator().manual_seed(0)).to(device)
-    single = values[0].as_strided((1, 37, 3), (7, 3, 1))
-    assert single.is_contiguous()
-    first, both = world_mean(single), world_mean(values)
-    assert torch.equal(first, both[:1])
-    assert torch.equal(both[1:], world_mean(values[1:].clone()))

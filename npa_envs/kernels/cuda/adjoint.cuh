@@ -43,11 +43,13 @@ __device__ inline int pad_list(unsigned address, int count, RowEntry entry)
     return (count + 7) & ~7;
 }
 
-__device__ inline void carry_rest(unsigned address, int summed, int count)
+__device__ inline void keep_unsummed(unsigned address, int summed_count, int count)
 {
     __syncwarp();
     const unsigned lane = threadIdx.x & 31u;
-    if ((int)lane < count - summed) listed_row(address, lane) = listed_row(address, summed + lane);
+    if ((int)lane < count - summed_count) {
+        listed_row(address, lane) = listed_row(address, summed_count + lane);
+    }
     __syncwarp();
 }
 
@@ -66,7 +68,7 @@ __device__ inline void split_number(float number, unsigned& part, unsigned& rest
     rest = __float_as_uint(number - __uint_as_float(part & 0xffffe000u));
 }
 
-template <int DIMS, int WIDTH, int KINDS, bool PERIODIC>
+template <int DIMS, int WIDTH, int WEIGHTS, bool PERIODIC>
 __device__ inline FourChannels sum_listed(
     unsigned address, int count, wp::vec_t<DIMS, float> position, float inverse_eps,
     float inverse_squared_eps, wp::vec_t<DIMS, float> box, wp::vec_t<DIMS, float> inverse_box,
@@ -79,18 +81,18 @@ __device__ inline FourChannels sum_listed(
     const float* columns = channels.data + (channel < WIDTH ? channel : 0u);
     FourChannels total = value;
     for (unsigned begin = 0; begin < count; begin += 8) {
-        unsigned weights[KINDS][2], weight_rests[KINDS][2];
-        unsigned values[KINDS][4], value_rests[KINDS][4];
+        unsigned weights[WEIGHTS][2], weight_rests[WEIGHTS][2];
+        unsigned values[WEIGHTS][4], value_rests[WEIGHTS][4];
         #pragma unroll
         for (unsigned half = 0; half < 2; ++half) {
             const float4 row = listed_row(address, begin + first_row + 4 * half);
-            const float* from = columns + (size_t)__float_as_uint(row.w) * (KINDS * WIDTH);
+            const float* from = columns + (size_t)__float_as_uint(row.w) * (WEIGHTS * WIDTH);
             #pragma unroll
-            for (unsigned kind = 0; kind < KINDS; ++kind) {
-                float2 pair = *reinterpret_cast<const float2*>(from + WIDTH * kind);
+            for (unsigned w = 0; w < WEIGHTS; ++w) {
+                float2 pair = *reinterpret_cast<const float2*>(from + WIDTH * w);
                 if (channel >= WIDTH) pair = make_float2(0.0f, 0.0f);
-                split_number(pair.x, values[kind][2 * half], value_rests[kind][2 * half]);
-                split_number(pair.y, values[kind][2 * half + 1], value_rests[kind][2 * half + 1]);
+                split_number(pair.x, values[w][2 * half], value_rests[w][2 * half]);
+                split_number(pair.y, values[w][2 * half + 1], value_rests[w][2 * half + 1]);
             }
             const float other[3] = {row.x, row.y, row.z};
             float offset[DIMS];
@@ -103,10 +105,10 @@ __device__ inline FourChannels sum_listed(
             }
             const float weight = smoothing(squared, inverse_squared_eps);
             split_number(weight, weights[0][half], weight_rests[0][half]);
-            if constexpr (KINDS > 1) {
+            if constexpr (WEIGHTS > 1) {
                 const float factor = spiky_factor(squared, inverse_eps);
                 #pragma unroll
-                for (unsigned d = 0; d < KINDS - 1; ++d) {
+                for (unsigned d = 0; d < WEIGHTS - 1; ++d) {
                     const float component = factor * offset[d];
                     split_number(component, weights[1 + d][half], weight_rests[1 + d][half]);
                 }
@@ -115,10 +117,10 @@ __device__ inline FourChannels sum_listed(
         // Three short chains instead of a long one, because tensor cores round towards zero.
         float sums[3][4] = {};
         #pragma unroll
-        for (unsigned kind = 0; kind < KINDS; ++kind) {
-            multiply_tiles(sums[0], values[kind], weight_rests[kind]);
-            multiply_tiles(sums[1], value_rests[kind], weights[kind]);
-            multiply_tiles(sums[2], values[kind], weights[kind]);
+        for (unsigned w = 0; w < WEIGHTS; ++w) {
+            multiply_tiles(sums[0], values[w], weight_rests[w]);
+            multiply_tiles(sums[1], value_rests[w], weights[w]);
+            multiply_tiles(sums[2], values[w], weights[w]);
         }
         #pragma unroll
         for (unsigned i = 0; i < 4; ++i) total[i] += sums[2][i] + (sums[0][i] + sums[1][i]);
@@ -150,7 +152,7 @@ __device__ inline float smallest_in_tile(float value)
 }
 
 // Unlike in `wide_load`, a row may begin at any address, and end within a group of columns.
-__device__ inline float* column_place(const wp::array_t<float>& values, int row, int column)
+__device__ inline float* column_address(const wp::array_t<float>& values, int row, int column)
 {
     return values.data + (size_t)(unsigned)row * (unsigned)values.shape[1] + column;
 }
@@ -160,7 +162,7 @@ __device__ inline wp::vec_t<COUNT, float> read_columns(
     const wp::array_t<float>& values, int row, int column, int end)
 {
     wp::vec_t<COUNT, float> result;
-    const float* from = column_place(values, row, column);
+    const float* from = column_address(values, row, column);
     if (column + COUNT <= end && ((size_t)from & 15u) == 0) {
         #pragma unroll
         for (int i = 0; i < COUNT / 4; ++i) {
@@ -180,7 +182,7 @@ __device__ inline wp::vec_t<COUNT, float> read_columns(
 __device__ inline void write_columns(
     const wp::array_t<float>& values, int row, int column, FourChannels entry)
 {
-    float* to = column_place(values, row, column);
+    float* to = column_address(values, row, column);
     if (column + 4 <= values.shape[1] && ((size_t)to & 15u) == 0) {
         *reinterpret_cast<float4*>(to) = four(entry);
     } else {
@@ -193,7 +195,7 @@ __device__ inline void write_columns(
 
 __device__ inline void prefetch_columns(const wp::array_t<float>& values, int row, int column)
 {
-    asm volatile("prefetch.global.L2 [%0];" : : "l"(column_place(values, row, column)));
+    asm volatile("prefetch.global.L2 [%0];" : : "l"(column_address(values, row, column)));
 }
 
 }  // namespace npa

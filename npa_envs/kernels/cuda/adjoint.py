@@ -4,6 +4,8 @@ The same sums as the portable `gather_state_cotangents`, in another order of wor
 eight consecutive particles of the sorted order: it lists the rows within eps of their bounding box,
 and multiplies the rows' cotangents by the weights of all eight on tensor cores. So a row's
 cotangents are read once for eight particles.
+
+Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
 """
 
 from types import SimpleNamespace
@@ -25,16 +27,16 @@ from npa_envs.kernels.primitives import (
     load_integer,
     load_scalar,
     make_wide_load,
-    make_wide_store,
     of_warp,
     scalar_of_warp,
     sum_up_to,
     thread_of,
     vote_of_warp,
+    wide_store,
 )
 from npa_envs.thread_lock import cached_under_lock
 
-TILE = 8
+TILE_PARTICLES = 8
 """Particles that a warp serves together, and rows of one matrix product."""
 
 LIST_ENTRIES = 96
@@ -56,18 +58,17 @@ MAX_LENGTH = 3.4028234663852886e38
 """The largest float32, a bound on any coordinate [length units]."""
 
 load_channels = make_wide_load(CHANNELS)
-store_channels = make_wide_store(CHANNELS)
 
 
 @cached_under_lock()
-def make_sum_listed(space_dim: int, width: int, kinds: int, periodic: bool) -> wp.Function:
+def make_sum_listed(space_dim: int, width: int, weight_count: int, periodic: bool) -> wp.Function:
     """Return a Warp function: a warp's particles sum `width` weighted channels of listed rows.
 
-    `kinds`: weights of a pair: 1 (smoothing kernel), or 1 + D (also the spiky gradient kernel).
+    A pair has 1 weight (smoothing kernel), or 1 + D (also the spiky gradient kernel).
     """
     vector = wp.types.vector(space_dim, wp.float32)
 
-    @native.func_native(space_dim, width, kinds, periodic)
+    @native.func_native(space_dim, width, weight_count, periodic)
     def sum_listed(
         address: wp.uint32,
         count: int,
@@ -113,12 +114,12 @@ def append_entry(address: wp.uint32, count: int, accepted: bool, entry: ENTRY) -
 
 @native.func_native()
 def pad_list(address: wp.uint32, count: int, entry: ENTRY) -> int:
-    """Pad a list with an entry up to a multiple of `TILE`; return its new length."""
+    """Pad a list with an entry up to a multiple of `TILE_PARTICLES`; return its new length."""
 
 
 @native.func_native()
-def carry_rest(address: wp.uint32, summed: int, count: int):
-    """Copy entries `summed` to `count` - 1 of a list, fewer than `TILE`, to its beginning."""
+def keep_unsummed(address: wp.uint32, summed_count: int, count: int):
+    """Move the last, fewer than `TILE_PARTICLES`, of a list's `count` entries to its beginning."""
 
 
 @native.func_native()
@@ -150,19 +151,17 @@ def listed_adjoint(
     gradient. An entry of zeros follows that of the last row.
     """
     scalar = wp.float32
-    types = domain_types(space_dim, scalar)
-    vector, Domain = types.vector, types.Domain
-    cell_of, periodic_image = types.cell_of, types.periodic_image
-    row_width, wrapped = types.row_width, types.wrapped
+    space = domain_types(space_dim, scalar)
+    vector, Domain = space.vector, space.Domain
     cell_vector = wp.types.vector(space_dim, wp.int32)
     thread_gradient = wp.types.matrix((space_dim, THREAD_CHANNELS), scalar)
-    kinds = 1 + space_dim if state_gradient else 1
+    weight_count = 1 + space_dim if state_gradient else 1
     topic = "listed_adjoint" if state_gradient else "listed_smoothing_adjoint"
     topic += "_in_box" * periodic + "_grouped" * grouped
     module = kernel_module(topic, space_dim, scalar, width)
     load_vector = make_wide_load(vector)
     parts = width // THREAD_CHANNELS
-    sum_listed = make_sum_listed(space_dim, width, kinds, periodic)
+    sum_listed = make_sum_listed(space_dim, width, weight_count, periodic)
     log_scale_pull = make_log_scale_pull(vector)
     read_gradients = make_read_columns(THREAD_CHANNELS * space_dim)
 
@@ -192,14 +191,14 @@ def listed_adjoint(
         part = thread - row * row_parts
         channel = part * wp.static(THREAD_CHANNELS)
         entry = row * group_count + part / wp.static(parts)
-        place = entry * wp.static(kinds * parts) + part % wp.static(parts)
+        index = entry * wp.static(weight_count * parts) + part % wp.static(parts)
         if row == row_capacity and part < wp.static(parts):
-            for kind in range(wp.static(kinds)):
-                store_channels(cotangents, place + kind * wp.static(parts), CHANNELS())
+            for n in range(wp.static(weight_count)):
+                wide_store(cotangents, index + n * wp.static(parts), CHANNELS())
         if row < wp.min(load_integer(starts, starts.shape[0] - 1) - row_base, row_capacity):
             column = state_dim + channel
             blur = read_channels(perception_bar, row, column, 2 * state_dim)
-            store_channels(cotangents, place, blur_scale * blur)
+            wide_store(cotangents, index, blur_scale * blur)
             if wp.static(state_gradient):
                 column = 2 * state_dim + channel * wp.static(space_dim)
                 end = (2 + wp.static(space_dim)) * state_dim
@@ -216,7 +215,7 @@ def listed_adjoint(
                     for d in range(wp.static(space_dim)):
                         pulled[d, c] = pull[d]
                 for d in range(wp.static(space_dim)):
-                    store_channels(cotangents, place + (d + 1) * wp.static(parts), pulled[d])
+                    wide_store(cotangents, index + (d + 1) * wp.static(parts), pulled[d])
 
     @wp.func
     def line_of(domain: Domain, cell: cell_vector):
@@ -236,9 +235,9 @@ def listed_adjoint(
         nx = domain.cell_shape[0]
         first = begin
         last = end
-        nearby = run
+        number = run
         if end > nx:
-            nearby = run >> 1
+            number = run >> 1
             first = wp.where((run & 1) == 0, begin, 0)
             last = wp.where((run & 1) == 0, nx, end - nx)
         base = wp.int32(0)
@@ -246,28 +245,30 @@ def listed_adjoint(
         if wp.static(space_dim == 3):
             z = wp.int32(wp.uint32(line) / wp.uint32(domain.cell_shape[1]))
             y = line - z * domain.cell_shape[1]
-            lines = row_width(domain, 1)
-            across = wp.int32(wp.uint32(nearby) / wp.uint32(lines))
-            nearby -= across * lines
-            z = wrapped(z - domain.cell_reach + across, domain.cell_shape[wp.static(space_dim - 1)])
+            lines = space.cells_around(domain, 1)
+            across = wp.int32(wp.uint32(number) / wp.uint32(lines))
+            number -= across * lines
+            z = space.wrapped(
+                z - domain.cells_per_eps + across, domain.cell_shape[wp.static(space_dim - 1)]
+            )
             base = z * domain.cell_shape[1]
-        base = (base + wrapped(y - domain.cell_reach + nearby, domain.cell_shape[1])) * nx
+        base = (base + space.wrapped(y - domain.cells_per_eps + number, domain.cell_shape[1])) * nx
         return base + first, base + last
 
     @wp.func
     def columns_around(domain: Domain, first: int, last: int):
         """Return the range of columns with neighbours of particles in a range, not wrapped."""
         nx = domain.cell_shape[0]
-        width = wp.min(last - first + 2 * domain.cell_reach + 1, nx)
-        begin = wp.where(width < nx, wrapped(first - domain.cell_reach, nx), 0)
+        width = wp.min(last - first + 2 * domain.cells_per_eps + 1, nx)
+        begin = wp.where(width < nx, space.wrapped(first - domain.cells_per_eps, nx), 0)
         return begin, begin + width
 
     @wp.func
     def count_runs(domain: Domain, to_column: int):
         """Return the number of runs of cells around particles on a line, up to a column."""
-        runs = row_width(domain, 1)
+        runs = space.cells_around(domain, 1)
         if wp.static(space_dim == 3):
-            runs *= row_width(domain, wp.static(space_dim - 1))
+            runs *= space.cells_around(domain, wp.static(space_dim - 1))
         return wp.where(to_column > domain.cell_shape[0], 2 * runs, runs)
 
     @wp.func
@@ -275,7 +276,7 @@ def listed_adjoint(
         """Return centre, relative to an origin, and half sides of served particles' bounds."""
         relative = position - origin
         if wp.static(periodic):
-            relative = periodic_image(domain, relative)
+            relative = space.periodic_image(domain, relative)
         middle = vector()
         half = vector()
         for d in range(wp.static(space_dim)):
@@ -290,7 +291,7 @@ def listed_adjoint(
         """Return whether a point, relative to a box's centre, is within eps of the box."""
         nearest = offset
         if wp.static(periodic):
-            nearest = periodic_image(domain, nearest)
+            nearest = space.periodic_image(domain, nearest)
         squared = scalar(0.0)
         for d in range(wp.static(space_dim)):
             beyond = wp.max(wp.abs(nearest[d]) - half[d], scalar(0.0))
@@ -362,8 +363,8 @@ def listed_adjoint(
             g = tile % group_count
             tile = tile / group_count
         world = wp.int32(wp.uint32(tile) / wp.uint32(tile_count))
-        first = world * particle_count + (tile - world * tile_count) * wp.static(TILE)
-        end = wp.min(first + wp.static(TILE), (world + 1) * particle_count)
+        first = world * particle_count + (tile - world * tile_count) * wp.static(TILE_PARTICLES)
+        end = wp.min(first + wp.static(TILE_PARTICLES), (world + 1) * particle_count)
         base = active_offset + world * domain.cell_count
         # A thread computes weights for one particle, and at the end writes channels of another.
         k = first + (lane >> 2)
@@ -375,7 +376,7 @@ def listed_adjoint(
         own_row = load_integer(row_of, i)
         if own_row >= 0 and channel < state_dim:
             prefetch_columns(perception_bar, own_row, channel)
-        cell = cell_of(domain, position)
+        cell = space.cell_of(domain, position)
         line = line_of(domain, cell)
         address = row_list_address()
         total = CHANNELS()
@@ -398,7 +399,7 @@ def listed_adjoint(
             votes = vote_of_warp(served) >> wp.uint32(8 * (lane & 3))
             count = wp.int32(0)
             block = wp.int32(0)
-            found = CHANNELS()
+            block_sums = CHANNELS()
             for first_run in range(0, run_count, wp.static(WARP)):
                 run = first_run + lane
                 run_begin = wp.int32(0)
@@ -424,44 +425,44 @@ def listed_adjoint(
                     searching = candidate - lane < candidates
                     finished = not searching and first_run + wp.static(WARP) >= run_count
                     if finished or count > wp.static(LIST_ENTRIES - WARP):
-                        summed = count & ~wp.int32(wp.static(TILE - 1))
+                        summed_count = count & ~wp.int32(wp.static(TILE_PARTICLES - 1))
                         if finished:
                             # The entry after the last row is zero.
                             nothing = entry_of(origin, row_capacity * group_count)
-                            summed = pad_list(address, count, nothing)
-                        found = sum_listed(
+                            summed_count = pad_list(address, count, nothing)
+                        block_sums = sum_listed(
                             address,
-                            summed,
+                            summed_count,
                             position,
                             domain.inverse_eps,
                             domain.inverse_squared_eps,
                             domain.box,
                             domain.inverse_box,
                             flat_cotangents,
-                            found,
+                            block_sums,
                         )
-                        carry_rest(address, summed, count)
-                        count = wp.max(count - summed, 0)
-                        block += summed
+                        keep_unsummed(address, summed_count, count)
+                        count = wp.max(count - summed_count, 0)
+                        block += summed_count
                         if finished or block >= wp.static(TERMS_PER_SUM):
                             for n in range(2):
                                 if (votes & wp.uint32(1 << (4 * n))) != wp.uint32(0):
-                                    total[n] += found[n]
-                                    total[n + 2] += found[n + 2]
-                            found = CHANNELS()
+                                    total[n] += block_sums[n]
+                                    total[n + 2] += block_sums[n + 2]
+                            block_sums = CHANNELS()
                             block = wp.int32(0)
         total = regroup_tile(total)
         if written < end and part < wp.static(parts) and channel < state_dim:
-            volume_place = written * wp.static(space_dim + 1) + wp.static(space_dim)
-            bar = (norm * load_scalar(particles, volume_place)) * total
+            volume_index = written * wp.static(space_dim + 1) + wp.static(space_dim)
+            bar = (norm * load_scalar(particles, volume_index)) * total
             if own_row >= 0:
                 bar += read_channels(perception_bar, own_row, channel, state_dim)
                 if wp.static(state_gradient):
-                    place = (own_row * group_count + g) * wp.static(kinds * parts) + part
+                    index = (own_row * group_count + g) * wp.static(weight_count * parts) + part
                     kernel_sum = load_vector(row_kernel_sum, own_row)
                     for d in range(wp.static(space_dim)):
                         bar -= kernel_sum[d] * load_channels(
-                            cotangents, place + (d + 1) * wp.static(parts)
+                            cotangents, index + (d + 1) * wp.static(parts)
                         )
             write_columns(states_bar, i, channel, bar)
 

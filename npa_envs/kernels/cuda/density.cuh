@@ -3,8 +3,8 @@
 namespace npa {
 
 // Particles of a tile, the lanes that share one, and cells on each side in which neighbours lie.
-constexpr int TILE = 8, TILE_LANES = 4, TILE_REACH = 2;
-constexpr int TILE_LINES = 2 * TILE_REACH + 1;
+constexpr int TILE_PARTICLES = 8, TILE_LANES = 4, CELLS_PER_EPS = 2;
+constexpr int TILE_LINES = 2 * CELLS_PER_EPS + 1;
 // A bit for each candidate that a lane tests, and the bits of a word.
 constexpr int TILE_TESTS = 32;
 // Tests in a row without a check of how many are left.
@@ -12,8 +12,9 @@ constexpr int TILE_UNROLLED = 4;
 // Largest distance in cells of particles that are served together: those further on come later, so
 // that few distant particles do not share all candidates between them.
 constexpr int TILE_SPAN = 12;
-// Cells along each side of the smallest periodic box whose density is computed in tiles.
-constexpr int MIN_TILED_BOX = 7;
+// Cells along each side of the smallest periodic box whose density is computed in tiles: in smaller
+// ones the images of a particle that are nearest to its tile's particles may differ.
+constexpr int MIN_SIDE = 7;
 
 // Infinity, as padding: every particle's position is finite.
 __device__ inline float nowhere() { return __uint_as_float(0x7f800000u); }
@@ -26,7 +27,7 @@ template <int CAPACITY> struct TileMemory {
     // Differences of their sorted indices from that of the tile's first particle.
     short steps[WINDOW];
     // The additional 16 bytes spread the lists over the banks of shared memory.
-    alignas(16) short lists[TILE][CAPACITY + 8];
+    alignas(16) short lists[TILE_PARTICLES][CAPACITY + 8];
 };
 
 // Copy 8 bytes from global to shared memory, asynchronously.
@@ -65,15 +66,15 @@ __device__ inline TileRun run_around(
 {
     const int lane = threadIdx.x & 31;
     const int nx = domain.cell_shape[0], ny = domain.cell_shape[1];
-    const int width = right - left + 2 * TILE_REACH + 1;
-    const int first = left - TILE_REACH < 0 ? left - TILE_REACH + nx : left - TILE_REACH;
+    const int width = right - left + 2 * CELLS_PER_EPS + 1;
+    const int first = left - CELLS_PER_EPS < 0 ? left - CELLS_PER_EPS + nx : left - CELLS_PER_EPS;
     const bool wraps = first + width > nx;
     TileRun run;
     run.copiers = wraps ? 3 : 6;
     const int number = wraps ? lane / 3 : lane / 6;
     run.copier = lane - number * run.copiers;
     const bool second = wraps && number & 1;
-    const int unwrapped = line - TILE_REACH + (wraps ? number / 2 : number);
+    const int unwrapped = line - CELLS_PER_EPS + (wraps ? number / 2 : number);
     const int y = unwrapped < 0 ? unwrapped + ny : unwrapped >= ny ? unwrapped - ny : unwrapped;
     run.begin = run.count = 0;
     if (number < (wraps ? 2 * TILE_LINES : TILE_LINES)) {
@@ -162,13 +163,12 @@ __device__ inline int append_near(
 // Sum of the smoothing kernel over all neighbours of particle k, without its norm. All lanes of the
 // tile call it together. It also writes the list of the particle's row (-1: none). `first` is the
 // tile's first particle, `base` the first cell of their world.
-template <int CAPACITY, bool PERIODIC, int SIZE, int MIN_SIDE, typename Domain>
+template <int CAPACITY, bool PERIODIC, typename Domain>
 __device__ inline float density_of_tile(
     const Domain& domain, const wp::array_t<int>& starts, const wp::array_t<int>& sorted_cell,
     const wp::array_t<wp::vec_t<2, float>>& sorted_positions, int base, int first, int k,
     bool inside, int row, const wp::array_t<wp::int16>& lists, const wp::array_t<int>& list_lengths)
 {
-    static_assert(SIZE == TILE && MIN_SIDE == MIN_TILED_BOX, "as in density.py");
     __shared__ TileMemory<CAPACITY> memory;
     const int lane = threadIdx.x & 31, part = lane & (TILE_LANES - 1);
     const float2* positions = reinterpret_cast<const float2*>(sorted_positions.data);
@@ -176,9 +176,9 @@ __device__ inline float density_of_tile(
     const int cell = sorted_cell.data[k] - base;
     const int nx = domain.cell_shape[0], ny = domain.cell_shape[1];
     const int y = (unsigned)cell / (unsigned)nx, x = cell - y * nx;
-    // One image of each candidate serves all particles of a turn: they and their neighbours are less
-    // than half a periodic box away from the first one's cell.
-    const int span = min(PERIODIC ? (nx - MIN_TILED_BOX) / 2 : nx - TILE_LINES, TILE_SPAN);
+    // Particles that are served together share one image of each candidate: they and their neighbours
+    // are less than half a periodic box away from the first one's cell.
+    const int span = min(PERIODIC ? (nx - MIN_SIDE) / 2 : nx - TILE_LINES, TILE_SPAN);
     short* list = memory.lists[lane / TILE_LANES];
     float total = 0.0f;
     int length = 0;

@@ -27,8 +27,8 @@ from npa_envs.kernels.primitives import (
     load_integer,
     make_lane_sum,
     make_wide_load,
-    make_wide_store,
     thread_number,
+    wide_store,
 )
 from npa_envs.thread_lock import cached_under_lock
 
@@ -53,20 +53,14 @@ SHARE_OF_LIST = 2
 LIST_END = wp.types.vector(2, wp.uint32)
 """Address of a list's next entry, and the distance [bytes] from it to the one after."""
 
-TILE = 8
-"""Particles of a tile."""
-
-TILE_LANES = WARP // TILE
-"""Lanes of a warp that share a particle."""
-
-MIN_SIDE = 7
-"""Cells along each side of the smallest periodic box: in smaller ones the images of a particle that
-are nearest to its tile's particles may differ."""
+TILE_PARTICLES, TILE_LANES, MIN_SIDE = native.constants(
+    "cuda/density.cuh", "TILE_PARTICLES", "TILE_LANES", "MIN_SIDE"
+)
+"""Particles of a tile, lanes of a warp that share one, and cells along each side of the smallest
+periodic box that is divided into tiles."""
 
 TILE_REGISTERS = 64
 """Registers per thread, so that a multiprocessor runs 32 warps."""
-
-store_record = make_wide_store(RECORD)
 
 
 @cached_under_lock()
@@ -79,11 +73,8 @@ def listed_density(
     """
     scalar = wp.float32
     flat = space_dim == 2
-    types = domain_types(space_dim, scalar)
-    vector, particle, Domain = types.vector, types.particle, types.Domain
-    cell_place, segment_count = types.cell_place, types.segment_count
-    segment_cells = types.segment_cells
-    periodic_image = types.periodic_image
+    space = domain_types(space_dim, scalar)
+    vector, particle, Domain = space.vector, space.particle, space.Domain
     load_vector = make_wide_load(vector)
     add_scalar = make_lane_sum(scalar, lanes)
     many = AHEAD if lanes == 1 else SHARED_AHEAD
@@ -112,7 +103,7 @@ def listed_density(
         """Return 1 - r^2 / eps^2 of a candidate, 0 beyond eps."""
         nearest = offset
         if wp.static(periodic):
-            nearest = periodic_image(domain, nearest)
+            nearest = space.periodic_image(domain, nearest)
         squared = wp.dot(nearest, nearest)
         return falloff_within(squared, domain.inverse_squared_eps)
 
@@ -145,7 +136,7 @@ def listed_density(
         starts: wp.array[wp.int32],
         sorted_cell: wp.array[wp.int32],
         sorted_positions: wp.array[vector],
-        state_place: wp.array[wp.int32],
+        state_index: wp.array[wp.int32],
         source: wp.array[wp.int32],
         row_of: wp.array[wp.int32],
         # outputs
@@ -169,7 +160,7 @@ def listed_density(
         index = load_integer(sorted_cell, k)
         local = wp.int32(wp.uint32(index) % wp.uint32(domain.cell_count))
         base = index - local
-        cell = cell_place(domain, local)
+        cell = space.cell_at(domain, local)
         row = k
         if wp.static(masked):
             row = load_integer(row_of, load_integer(source, k))
@@ -180,16 +171,16 @@ def listed_density(
         far = wp.bool(False)
         earlier = scalar(0.0)
         total = scalar(0.0)
-        segments = segment_count(domain, cell)
+        segments = space.segment_count(domain, cell)
         within_cell = vector()
         if wp.static(flat and not periodic):
             for d in range(wp.static(space_dim)):
                 scaled = wp.float64(position[d]) * domain.cell_scale[d]
                 within_cell[d] = scalar(scaled - wp.floor(scaled))
         for segment in range(segments):
-            first, last = segment_cells(domain, cell, segment)
+            first, last = space.segment_cells(domain, cell, segment)
             # Five lines of five cells each, without wrapping around the grid.
-            if wp.static(flat and not periodic) and segments == 5 and domain.cell_reach == 2:
+            if wp.static(flat and not periodic) and segments == 5 and domain.cells_per_eps == 2:
                 before, behind = cells_beyond(within_cell, segment)
                 first += before
                 last -= behind
@@ -223,8 +214,8 @@ def listed_density(
             if j < end:
                 ahead = positions_ahead()
                 for a in range(wp.static(many - 1)):
-                    place = wp.min(j + a * wp.static(lanes), end - 1)
-                    ahead[a] = load_vector(sorted_positions, place)
+                    candidate = wp.min(j + a * wp.static(lanes), end - 1)
+                    ahead[a] = load_vector(sorted_positions, candidate)
                 for a in range(wp.static(many - 1)):
                     candidate = j + a * wp.static(lanes)
                     falloff = falloff_at(domain, ahead[a] - position)
@@ -249,10 +240,10 @@ def listed_density(
                 record[d] = entry[d]
             if wp.static(flat):
                 number = k
-                if state_place.shape[0] > 0:
-                    number = load_integer(state_place, k)
+                if state_index.shape[0] > 0:
+                    number = load_integer(state_index, k)
                 record[3] = as_word(number)
-            store_record(records, k, record)
+            wide_store(records, k, record)
 
     return compute_density
 
@@ -275,11 +266,11 @@ def step_of(steps: int, entry: int) -> int:
 @cached_under_lock()
 def tiled_density(periodic: bool, capacity: int, masked: bool) -> wp.Kernel:
     """Return the density kernel of one variant, in which a block is a warp that serves a tile."""
-    types = domain_types(2, wp.float32)
-    vector, particle, Domain = types.vector, types.particle, types.Domain
+    space = domain_types(2, wp.float32)
+    vector, particle, Domain = space.vector, space.particle, space.Domain
     load_vector = make_wide_load(vector)
 
-    @native.func_native(capacity, periodic, TILE, MIN_SIDE)
+    @native.func_native(capacity, periodic)
     def density_of_tile(
         domain: Domain,
         starts: wp.array[wp.int32],
@@ -308,7 +299,7 @@ def tiled_density(periodic: bool, capacity: int, masked: bool) -> wp.Kernel:
         starts: wp.array[wp.int32],
         sorted_cell: wp.array[wp.int32],
         sorted_positions: wp.array[vector],
-        state_place: wp.array[wp.int32],
+        state_index: wp.array[wp.int32],
         source: wp.array[wp.int32],
         row_of: wp.array[wp.int32],
         # outputs
@@ -322,10 +313,10 @@ def tiled_density(periodic: bool, capacity: int, masked: bool) -> wp.Kernel:
         thread = thread_number()
         tile = thread >> wp.static(WARP.bit_length() - 1)
         lane = thread & wp.static(WARP - 1)
-        tiles = (particle_count + wp.static(TILE - 1)) / wp.static(TILE)
+        tiles = (particle_count + wp.static(TILE_PARTICLES - 1)) / wp.static(TILE_PARTICLES)
         world = wp.int32(wp.uint32(tile) / wp.uint32(tiles))
         # Each world begins with a new tile, so its sums are the same in every batch.
-        first = world * particle_count + (tile - world * tiles) * wp.static(TILE)
+        first = world * particle_count + (tile - world * tiles) * wp.static(TILE_PARTICLES)
         k = first + lane / wp.static(TILE_LANES)
         inside = k < (world + 1) * particle_count
         k = wp.where(inside, k, first)
@@ -353,9 +344,9 @@ def tiled_density(periodic: bool, capacity: int, masked: bool) -> wp.Kernel:
             if particles.shape[0] > 0:
                 particles[k] = particle(position[0], position[1], volume)
             number = k
-            if state_place.shape[0] > 0:
-                number = load_integer(state_place, k)
+            if state_index.shape[0] > 0:
+                number = load_integer(state_index, k)
             record = RECORD(position[0], position[1], volume, as_word(number))
-            store_record(records, k, record)
+            wide_store(records, k, record)
 
     return compute_density

@@ -1,4 +1,5 @@
 // Vectors of equivariant rules: a warp has a few rows. npa_envs/ops/equivariance.py has the formulas.
+// Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
 
 namespace npa {
 

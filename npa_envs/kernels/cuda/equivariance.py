@@ -3,6 +3,8 @@
 The formulas are those of `npa_envs/ops/equivariance.py`. Compared with
 `kernels/portable/equivariance.py` there are fewer passes over rows, and one of them also computes
 the gradient of the mixing weights.
+
+Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
 """
 
 from types import SimpleNamespace
@@ -26,33 +28,38 @@ SHARED_BYTES = 48 * 1024
 """Shared memory of a block that the driver grants by default [bytes]."""
 
 
-def rows_of_warp(mixed: int) -> int:
+def rows_of_warp(mixed_count: int) -> int:
     """Return the rows of a warp: a thread for each of their mixed vectors, at most four rows."""
-    return min(max(WARP // mixed, 1), 4)
+    return min(max(WARP // mixed_count, 1), 4)
 
 
-def fits_block(space_dim: int, scalars: int, perceived: int, mixed: int, chiral: bool) -> bool:
+def fits_block(
+    space_dim: int, scalars: int, perceived: int, mixed_count: int, chiral: bool
+) -> bool:
     """Return whether rows with these vectors fit into a block's shared memory."""
-    weights = perceived * mixed
-    products = mixed * (mixed + 1) // 2 + chiral * (mixed * (mixed - 1) // 2)
-    row = scalars + products + (perceived + 2 * mixed) * space_dim
-    floats = weights + PULL_WARPS * (weights + rows_of_warp(mixed) * row)
-    return weights <= MAX_MIXING and mixed < 256 and 4 * floats <= SHARED_BYTES
+    weights = perceived * mixed_count
+    products = mixed_count * (mixed_count + 1) // 2 + chiral * (
+        mixed_count * (mixed_count - 1) // 2
+    )
+    row = scalars + products + (perceived + 2 * mixed_count) * space_dim
+    floats = weights + PULL_WARPS * (weights + rows_of_warp(mixed_count) * row)
+    return weights <= MAX_MIXING and mixed_count < 256 and 4 * floats <= SHARED_BYTES
 
 
 @cached_under_lock()
 def row_kernels(
-    space_dim: int, scalars: int, perceived: int, mixed: int, chiral: bool
+    space_dim: int, scalars: int, perceived: int, mixed_count: int, chiral: bool
 ) -> SimpleNamespace:
     """Return the kernels that map rows to inputs, and cotangents back, for one form.
 
     Rows are [scalars | perceived vectors | 1 | 0], inputs [scalars | products | 1 | 0]; mixed
-    vectors [K, mixed, D] and mixing weights [perceived, mixed] are flat.
+    vectors [K, mixed_count, D] and mixing weights [perceived, mixed_count] are flat.
     """
-    form = space_dim, scalars, perceived, mixed, chiral
+    form = space_dim, scalars, perceived, mixed_count, chiral
     module = native.module(f"npa_envs.kernels.vector_rows_{'_'.join(str(int(k)) for k in form)}")
-
-    warp_rows = rows_of_warp(mixed)
+    warp_rows = rows_of_warp(mixed_count)
+    read_vectors = native.generic("read_vectors", 4, *form, READ_WARPS, warp_rows)
+    pull_back_vectors = native.generic("pull_back_vectors", 7, *form, PULL_WARPS, warp_rows)
 
     @wp.kernel(enable_backward=False, module=module)
     def read_rows(
@@ -81,16 +88,13 @@ def row_kernels(
         await_earlier()
         pull_back_vectors(rows, mixing, mixed, mixed_bar, inputs_bar, rows_bar, partial_sums)
 
-    read_vectors = native.call_of(read_rows, "read_vectors", *form, READ_WARPS, warp_rows)
-    pull_back_vectors = native.call_of(
-        pull_back_rows, "pull_back_vectors", *form, PULL_WARPS, warp_rows
-    )
     return SimpleNamespace(read_rows=read_rows, pull_back_rows=pull_back_rows)
 
 
 @cached_under_lock()
 def mixing_sum() -> wp.Kernel:
     """Return the kernel that adds up the blocks' gradients of the mixing weights."""
+    add_partial_sums = native.generic("add_partial_sums", 2, MIXING_SUM_WARPS)
 
     @wp.kernel(
         enable_backward=False,
@@ -106,18 +110,19 @@ def mixing_sum() -> wp.Kernel:
         await_earlier()
         add_partial_sums(partial_sums, total)
 
-    add_partial_sums = native.call_of(add_blocks, "add_partial_sums", MIXING_SUM_WARPS)
     return add_blocks
 
 
 @cached_under_lock()
-def steering_kernels(space_dim: int, mixed: int, chiral: bool) -> SimpleNamespace:
+def steering_kernels(space_dim: int, mixed_count: int, chiral: bool) -> SimpleNamespace:
     """Return the kernels that map outputs to updates, and back; a warp has `STEERED_ROWS` rows.
 
     Outputs are [gates | state changes | 0], updates [displacement | state changes | 0].
     """
-    form = space_dim, mixed, chiral
+    form = space_dim, mixed_count, chiral
     module = native.module(f"npa_envs.kernels.steering_{'_'.join(str(int(k)) for k in form)}")
+    steer_by_gates = native.generic("steer_by_gates", 4, *form, STEER_WARPS, STEERED_ROWS)
+    pull_back_gates = native.generic("pull_back_gates", 6, *form, STEER_WARPS, STEERED_ROWS)
 
     @wp.kernel(enable_backward=False, module=module)
     def steer(
@@ -145,7 +150,4 @@ def steering_kernels(space_dim: int, mixed: int, chiral: bool) -> SimpleNamespac
         await_earlier()
         pull_back_gates(output, mixed, signs, update_bar, output_bar, mixed_bar)
 
-    sizes = *form, STEER_WARPS, STEERED_ROWS
-    steer_by_gates = native.call_of(steer, "steer_by_gates", *sizes)
-    pull_back_gates = native.call_of(pull_back_steering, "pull_back_gates", *sizes)
     return SimpleNamespace(steer=steer, pull_back_steering=pull_back_steering)

@@ -7,6 +7,7 @@
 // A group of units or of rows is a fragment of PTX's `mma.m16n8k16`: lane 4 g + t of a warp holds
 // row g (and g + 8) and columns 2 t, 2 t + 1 (and 8 further). Two results side by side are laid out
 // like the left operand of a next product, so hidden units stay in registers between two products.
+// Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
 
 namespace npa {
 

@@ -2,6 +2,8 @@
 
 Each factor of a product is split into two numbers of 16 bits; `network.cuh` has the layout in a
 warp. float16 has a small range, so rows are first scaled by powers of two, which is exact.
+
+Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
 """
 
 from types import SimpleNamespace
@@ -55,6 +57,8 @@ def two_layer_kernel(steps: int, tiles: int, mode: str) -> wp.Kernel:
     name = f"npa_envs.kernels.network_{mode}_{steps}_{tiles}"
     registers = WIDE_REGISTERS if max(16 * steps, 8 * tiles) in WIDE else LAYER_REGISTERS
 
+    two_layers = native.generic("two_layers", 7, steps, tiles, mode.upper(), ROW_TARGET)
+
     @wp.kernel(enable_backward=False, module=native.module(name), cuda_max_registers=registers)
     def network_layers(
         unit_count: int,
@@ -70,9 +74,6 @@ def two_layer_kernel(steps: int, tiles: int, mode: str) -> wp.Kernel:
         await_earlier()
         two_layers(unit_count, rows, hidden_weights, output_weights, output_unscale, signs, output)
 
-    two_layers = native.call_of(
-        network_layers, "two_layers", steps, tiles, mode.upper(), ROW_TARGET
-    )
     return network_layers
 
 
@@ -89,6 +90,9 @@ def weight_gradient_kernels(
     """
     variant = f"{steps}_{tiles}_{out_tiles}_{warps}_{unit_blocks}_{words}"
     module = native.module(f"npa_envs.kernels.network_gradients_{variant}")
+    sizes = steps, tiles, out_tiles, warps, unit_blocks, words, ROW_TILE
+    weight_sums = native.generic("weight_sums", 8, *sizes)
+    add_partial_sums = native.generic("add_partial_sums", 2, SUM_WARPS)
 
     @wp.kernel(enable_backward=False, module=module, cuda_max_registers=GRADIENT_REGISTERS)
     def sum_weight_gradients(
@@ -127,9 +131,6 @@ def weight_gradient_kernels(
         allow_next_launch()
         add_partial_sums(partial_sums, total)
 
-    sizes = steps, tiles, out_tiles, warps, unit_blocks, words, ROW_TILE
-    weight_sums = native.call_of(sum_weight_gradients, "weight_sums", *sizes)
-    add_partial_sums = native.call_of(add_parts, "add_partial_sums", SUM_WARPS)
     return SimpleNamespace(sum_weight_gradients=sum_weight_gradients, add_parts=add_parts)
 
 
@@ -211,8 +212,8 @@ def arrangement_kernels() -> SimpleNamespace:
         """Write [H, width] as left operands of tensor cores; threads (H / 16, width / 16, 32)."""
         await_earlier()
         group, step, lane = wp.tid()
-        place = (group * ((weights.shape[1] + 15) / 16) + step) * 2 * wp.static(WARP)
-        first = (place + lane) * 8
+        fragment = (group * ((weights.shape[1] + 15) / 16) + step) * 2 * wp.static(WARP)
+        first = (fragment + lane) * 8
         for i in range(8):
             unit = 16 * group + lane / 4 + i / 2 % 2 * 8
             column = 16 * step + lane % 4 * 2 + i % 2 + i / 4 * 8

@@ -1,6 +1,6 @@
 // Slots: the parts of a block's shared memory, one for each particle's lanes.
 //
-// A slot contains a short list of neighbours: first their indices as they are found, then each with
+// A slot contains a short list of neighbours: first only their indices, then each with
 // its weights; at the end, the resulting row of perception, to be written. Votes are of complete
 // warps, so all threads of a warp must take the same branches: votes among the lanes of a particle
 // would make the particles of a warp run one after the other.

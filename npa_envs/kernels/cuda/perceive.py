@@ -1,11 +1,20 @@
 """Perception on CUDA in float32, from the neighbour lists of the density pass.
 
-The same sums as the portable kernel, in another order of work. First each lane of a particle
-computes the weights of other neighbours, and stores them in a slot, the particle's part of shared
-memory. Then all lanes run through the slot together, each for a few channels. So weights are
-computed once, only for neighbours, and a neighbour's state is read once, by adjacent lanes. Rows
-are also written through shared memory, in full transactions. Neighbours of a list beyond the
-capacity are searched for again.
+The same sums as the portable kernel, in another order of work. Threads that share a particle are
+its lanes: one team of `CUDA_LANES`, or several. Their part of shared memory is the particle's slot.
+With neighbours n0, n1, ..., two teams and 16 channels:
+
+    team  lane   1. writes weights of      2. adds states of   channels
+     0     0      n0  n1  n16 n17           n0 n2 n4 ...        0 to 3
+     0     1      n2  n3  n18 n19           n0 n2 n4 ...        4 to 7
+     ...
+     1     7      n14 n15 n30 n31           n1 n3 n5 ...        12 to 15
+
+    slot   | weight, weighted kernel and index of n0 | of n1 | ... | of n31 |
+
+So weights are computed once, only for neighbours, and a neighbour's state is read once, by adjacent
+lanes. Finished rows are also written through the slot, in full transactions. Particles with more
+neighbours than a list has room for search for all of them again.
 """
 
 import math
@@ -60,6 +69,9 @@ CANDIDATES = 16
 
 load_record = make_wide_load(RECORD)
 
+stage = native.generic("stage", 3)
+"""Writes to a `slot`, at an offset of 32-bit words, a `value`."""
+
 
 class PerceptionVariant(NamedTuple):
     """Switches of the perception kernel; each combination is a kernel of its own."""
@@ -79,7 +91,7 @@ class PerceptionVariant(NamedTuple):
     teams: int
     """Teams of `CUDA_LANES` lanes that share a particle, so that few particles fill the GPU: each
     runs through its own part of the list, for all channels."""
-    by_place: bool = False
+    per_particle: bool = False
     """Whether there is a list for each sorted particle, not for each row."""
     tiled: bool = False
     """Whether lists have the layout of `tiled_density`."""
@@ -103,7 +115,7 @@ class PerceptionVariant(NamedTuple):
         """Return the Warp module of the variant."""
         topic = "listed_" + perception_topic(self.state_gradient, self.moment_inverse)
         topic += "_in_box" * self.periodic + "_grouped" * self.grouped + f"_{self.capacity}"
-        topic += "_for_adjoint" * self.for_adjoint + "_by_place" * self.by_place
+        topic += "_for_adjoint" * self.for_adjoint + "_by_place" * self.per_particle
         topic += "_tiled" * self.tiled
         return kernel_module(topic, self.space_dim, wp.float32, self.width, self.lanes)
 
@@ -138,15 +150,8 @@ def slot_functions(variant: PerceptionVariant, lane_channels: type) -> SimpleNam
     @native.func_native(space_dim, SLOT_ENTRIES)
     def entry_at(slot: wp.uint32, entry: int) -> entry_type: ...
 
-    @native.func_native(space_dim, width, lanes, row_words, slot_bytes, variant.grouped)
-    def write_rows(
-        slot: wp.uint32,
-        destination: int,
-        group: int,
-        state_dim: int,
-        limit: float,
-        rows: wp.array2d[wp.float32],
-    ): ...
+    sizes = space_dim, width, lanes, row_words, slot_bytes, variant.grouped
+    write_rows = native.generic("write_rows", 6, *sizes)
 
     @wp.func
     def padded(count: int):
@@ -154,9 +159,8 @@ def slot_functions(variant: PerceptionVariant, lane_channels: type) -> SimpleNam
         return (count + wp.static(lanes - 1)) & ~wp.int32(wp.static(lanes - 1))
 
     numbers = append_number, number_at, padded
-    return native.named(
-        slot_address, part_address, part_of_state, *numbers, put_entry, entry_at, write_rows
-    )
+    functions = slot_address, part_address, part_of_state, *numbers, put_entry, entry_at
+    return native.named(*functions, write_rows=write_rows)
 
 
 def weighing_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> SimpleNamespace:
@@ -171,18 +175,20 @@ def weighing_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> Si
     moment_correction = variant.moment_inverse is not None
     flat = space_dim == 2
     steps_at = make_steps_at(variant.capacity, variant.tiled)
-    types = domain_types(space_dim, scalar)
-    vector, Domain, periodic_image = types.vector, types.Domain, types.periodic_image
+    space = domain_types(space_dim, scalar)
+    vector, Domain = space.vector, space.Domain
     vector_f64 = wp.types.vector(space_dim, wp.float64)
     square = wp.types.matrix((space_dim, space_dim), scalar)
-    places_of_pair = wp.types.vector(PAIR, wp.int32)
+    indices_of_pair = wp.types.vector(PAIR, wp.int32)
     records_of_pair = wp.types.matrix((PAIR, 4), scalar)
-    padded, number_at, put_entry = slots.padded, slots.number_at, slots.put_entry
 
     @wp.struct
     class Centre:
-        """A row's particle, in the types that its pairs need: converted once, not for each pair."""
+        """A row's particle, by the thread of a lane; numbers in the types that its pairs need."""
 
+        k: int
+        lane: int
+        slot: wp.uint32
         position: vector
         precise: vector_f64
         inverse_eps: wp.float64
@@ -194,6 +200,19 @@ def weighing_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> Si
         kernel: vector
         moment: square
         density_gradient: vector_f64
+
+    @wp.func
+    def centre_at(domain: Domain, k: int, lane: int, slot: wp.uint32, position: vector):
+        """Return the centre of sorted particle k."""
+        centre = Centre()
+        centre.k = k
+        centre.lane = lane
+        centre.slot = slot
+        centre.position = position
+        for d in range(wp.static(space_dim)):
+            centre.precise[d] = wp.float64(position[d])
+        centre.inverse_eps = wp.float64(domain.inverse_eps)
+        return centre
 
     @wp.func
     def spiky_f64(domain: Domain, centre: Centre, neighbour: vector, squared: scalar):
@@ -214,8 +233,7 @@ def weighing_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> Si
     @wp.func
     def weigh(
         domain: Domain,
-        state_place: wp.array[wp.int32],
-        slot: wp.uint32,
+        state_index: wp.array[wp.int32],
         entry: int,
         j: int,
         centre: Centre,
@@ -230,15 +248,15 @@ def weighing_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> Si
         number = j
         if wp.static(flat):
             number = as_number(record[3])
-        elif state_place.shape[0] > 0:
-            number = load_integer(state_place, j)
+        elif state_index.shape[0] > 0:
+            number = load_integer(state_index, j)
         neighbour = vector()
         for d in range(wp.static(space_dim)):
             neighbour[d] = record[d]
         volume = wp.where(counts, record[wp.static(space_dim)], scalar(0.0))
         offset = neighbour - centre.position
         if wp.static(periodic):
-            offset = periodic_image(domain, offset)
+            offset = space.periodic_image(domain, offset)
         squared = wp.dot(offset, offset)
         weight = smoothing(squared, domain.inverse_squared_eps, volume * domain.smoothing_norm)
         factor, r = spiky_f64(domain, centre, neighbour, squared)
@@ -252,45 +270,35 @@ def weighing_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> Si
                 for row in range(wp.static(space_dim)):
                     for column in range(row, wp.static(space_dim)):
                         sums.moment[row, column] += offset[row] * weighted[column]
-        put_entry(slot, entry, weight, weighted, number)
+        slots.put_entry(centre.slot, entry, weight, weighted, number)
         return sums
 
     @wp.func
-    def weigh_found(
+    def weigh_searched(
         domain: Domain,
         records: wp.array[RECORD],
-        state_place: wp.array[wp.int32],
-        lane: int,
-        slot: wp.uint32,
+        state_index: wp.array[wp.int32],
         begin: int,
         count: int,
-        k: int,
         centre: Centre,
         sums: Sums,
     ):
         """Call `weigh` for neighbours whose indices are in the slot, from `begin` to `count`."""
         sync_warp()
-        for first in range(lane, padded(count), wp.static(PAIR * lanes)):
-            places = places_of_pair()
-            found = records_of_pair()
+        for first in range(centre.lane, slots.padded(count), wp.static(PAIR * lanes)):
+            indices = indices_of_pair()
+            loaded = records_of_pair()
             for a in range(wp.static(PAIR)):
                 entry = first + a * wp.static(lanes)
                 listed = entry >= begin and entry < count
-                places[a] = wp.where(listed, number_at(slot, entry), k)
+                indices[a] = wp.where(listed, slots.number_at(centre.slot, entry), centre.k)
             for a in range(wp.static(PAIR)):
-                found[a] = load_record(records, places[a])
+                loaded[a] = load_record(records, indices[a])
             for a in range(wp.static(PAIR)):
                 entry = first + a * wp.static(lanes)
+                counts = entry >= begin and entry < count
                 sums = weigh(
-                    domain,
-                    state_place,
-                    slot,
-                    entry,
-                    places[a],
-                    centre,
-                    found[a],
-                    entry >= begin and entry < count,
-                    sums,
+                    domain, state_index, entry, indices[a], centre, loaded[a], counts, sums
                 )
         sync_warp()
         return sums
@@ -300,13 +308,10 @@ def weighing_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> Si
         domain: Domain,
         records: wp.array[RECORD],
         lists: wp.array3d[wp.int16],
-        state_place: wp.array[wp.int32],
-        lane: int,
-        slot: wp.uint32,
+        state_index: wp.array[wp.int32],
         row: int,
         begin: int,
         length: int,
-        k: int,
         centre: Centre,
         steps: int,
         sums: Sums,
@@ -315,33 +320,25 @@ def weighing_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> Si
 
         The steps of a lane's next pair are loaded before the current ones are used.
         """
-        end = begin + padded(wp.clamp(length - begin, 0, wp.static(SLOT_ENTRIES)))
-        for first in range(begin + wp.static(PAIR) * lane, end, wp.static(PAIR * lanes)):
-            places = places_of_pair()
-            found = records_of_pair()
+        end = begin + slots.padded(wp.clamp(length - begin, 0, wp.static(SLOT_ENTRIES)))
+        for first in range(begin + wp.static(PAIR) * centre.lane, end, wp.static(PAIR * lanes)):
+            indices = indices_of_pair()
+            loaded = records_of_pair()
             for a in range(wp.static(PAIR)):
-                places[a] = k + wp.where(first + a < length, step_of(steps, a), wp.int32(0))
+                indices[a] = centre.k + wp.where(first + a < length, step_of(steps, a), wp.int32(0))
             for a in range(wp.static(PAIR)):
-                found[a] = load_record(records, places[a])
+                loaded[a] = load_record(records, indices[a])
             steps = steps_at(lists, row, (first >> 1) + wp.static(lanes))
             for a in range(wp.static(PAIR)):
+                entry = first + a - begin
+                counts = first + a < length
                 sums = weigh(
-                    domain,
-                    state_place,
-                    slot,
-                    first + a - begin,
-                    places[a],
-                    centre,
-                    found[a],
-                    first + a < length,
-                    sums,
+                    domain, state_index, entry, indices[a], centre, loaded[a], counts, sums
                 )
         sync_warp()
         return steps, sums
 
-    return SimpleNamespace(
-        Centre=Centre, Sums=Sums, weigh_found=weigh_found, weigh_listed=weigh_listed
-    )
+    return native.named(centre_at, weigh_searched, weigh_listed, Sums=Sums)
 
 
 def make_add_states(
@@ -353,7 +350,6 @@ def make_add_states(
     state_gradient = variant.state_gradient
     entries_together = wp.types.matrix((TOGETHER, space_dim + 2), scalar)
     states_together = wp.types.matrix((TOGETHER, lane_width), scalar)
-    padded, entry_at, part_of_state = slots.padded, slots.entry_at, slots.part_of_state
 
     @wp.func
     def add_states(
@@ -362,25 +358,25 @@ def make_add_states(
         first: int,
         slot: wp.uint32,
         count: int,
-        own: lane_channels,
+        own_state: lane_channels,
         blur: lane_channels,
         gradient: lane_gradient,
     ):
         """Add weighted states of this team's neighbours, from `first` on, to the long sums."""
-        for entry in range(first, padded(count), wp.static(teams * TOGETHER)):
+        for entry in range(first, slots.padded(count), wp.static(teams * TOGETHER)):
             packed = entries_together()
-            found = states_together()
+            loaded = states_together()
             for a in range(wp.static(TOGETHER)):
-                weighed = entry_at(slot, entry + a * wp.static(teams))
+                weights = slots.entry_at(slot, entry + a * wp.static(teams))
                 for n in range(wp.static(space_dim + 2)):
-                    packed[a, n] = weighed[n]
+                    packed[a, n] = weights[n]
             for a in range(wp.static(TOGETHER)):
                 number = as_number(packed[a, wp.static(space_dim + 1)])
-                found[a] = part_of_state(states, part_count, number)
+                loaded[a] = slots.part_of_state(states, part_count, number)
             for a in range(wp.static(TOGETHER)):
-                blur += packed[a, 0] * found[a]
+                blur += packed[a, 0] * loaded[a]
                 if wp.static(state_gradient):
-                    difference = found[a] - own
+                    difference = loaded[a] - own_state
                     for d in range(wp.static(space_dim)):
                         for c in range(wp.static(lane_width)):
                             gradient[d, c] += packed[a, d + 1] * difference[c]
@@ -390,45 +386,70 @@ def make_add_states(
     return add_states
 
 
-@cached_under_lock()
-def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
-    """Return the perception kernel of a variant."""
-    scalar = wp.float32
-    space_dim, width, lanes, teams = variant.space_dim, variant.width, variant.lanes, variant.teams
-    state_gradient, moment_correction = variant.state_gradient, variant.moment_inverse is not None
-    periodic, grouped, capacity = variant.periodic, variant.grouped, variant.capacity
-    for_adjoint, by_place = variant.for_adjoint, variant.by_place
-    lane_width, team = variant.lane_width, CUDA_LANES
-    types = domain_types(space_dim, scalar)
-    vector, Domain = types.vector, types.Domain
-    cell_place, segment_count = types.cell_place, types.segment_count
-    segment_cells, periodic_image = types.segment_cells, types.periodic_image
-    vector_f64 = wp.types.vector(space_dim, wp.float64)
-    square = wp.types.matrix((space_dim, space_dim), scalar)
-    lane_channels = wp.types.vector(lane_width, scalar)
-    lane_gradient = wp.types.matrix((space_dim, lane_width), scalar)
-    lane_rows = wp.types.vector(lane_width * space_dim, scalar)
+def search_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> SimpleNamespace:
+    """Return the functions that search cells for the neighbours of particles without a list."""
+    space_dim, lanes = variant.space_dim, variant.lanes
+    space = domain_types(space_dim, wp.float32)
+    vector, Domain = space.vector, space.Domain
+    load_vector = make_wide_load(vector)
     cell_vector = wp.types.vector(space_dim, wp.int32)
     ahead = max(CANDIDATES // lanes, 1)
-    candidates_ahead = wp.types.matrix((ahead, space_dim), scalar)
-    registers = CUDA_REGISTERS[space_dim] if teams == 1 else TEAM_REGISTERS
-    load_vector = make_wide_load(vector)
-    add_vector = make_lane_sum(vector, lanes, whole_warps=True)
-    add_square = make_lane_sum(square, lanes, whole_warps=True)
-    add_f64 = make_lane_sum(vector_f64, lanes, whole_warps=True)
-    add_channels = make_lane_sum(lane_channels, lanes, whole_warps=True, stride=team)
-    add_gradient = make_lane_sum(lane_gradient, lanes, whole_warps=True, stride=team)
-    steps_at = make_steps_at(capacity, variant.tiled)
-    corrected = make_corrected(space_dim, scalar, lane_width, variant.moment_inverse)
-    stage_channels, stage_rows = make_stage(lane_channels), make_stage(lane_rows)
-    slots = slot_functions(variant, lane_channels)
-    slot_address, append_number = slots.slot_address, slots.append_number
-    part_address, part_of_state = slots.part_address, slots.part_of_state
-    write_rows = slots.write_rows
-    weighing = weighing_functions(variant, slots)
-    Centre, Sums = weighing.Centre, weighing.Sums
-    weigh_found, weigh_listed = weighing.weigh_found, weighing.weigh_listed
-    add_states = make_add_states(variant, slots, lane_channels, lane_gradient)
+    candidates_ahead = wp.types.matrix((ahead, space_dim), wp.float32)
+
+    @wp.func
+    def look_up_run(
+        domain: Domain,
+        starts: wp.array[wp.int32],
+        world_cell: int,
+        cell: cell_vector,
+        runs: int,
+        run: int,
+    ):
+        """Return first and last + 1 particle of a run of cells; none beyond the last run."""
+        first_cell, last_cell = space.segment_cells(
+            domain, cell, wp.min(run, wp.max(runs - 1, wp.int32(0)))
+        )
+        begin = load_integer(starts, world_cell + first_cell)
+        end = load_integer(starts, world_cell + last_cell)
+        return begin, wp.where(run < runs, end, wp.int32(0))
+
+    @wp.func
+    def append_near(
+        domain: Domain,
+        sorted_positions: wp.array[vector],
+        slot: wp.uint32,
+        position: vector,
+        first: int,
+        end: int,
+        count: int,
+    ):
+        """Append this lane's candidates within eps to a slot; return its number of entries."""
+        loaded = candidates_ahead()
+        total = wp.int32(count)
+        for a in range(wp.static(ahead)):
+            candidate = first + a * wp.static(lanes)
+            index = wp.where(candidate < end, candidate, wp.int32(0))
+            loaded[a] = load_vector(sorted_positions, index)
+        for a in range(wp.static(ahead)):
+            candidate = first + a * wp.static(lanes)
+            offset = loaded[a] - position
+            if wp.static(variant.periodic):
+                offset = space.periodic_image(domain, offset)
+            near = wp.dot(offset, offset) < domain.squared_eps
+            total = slots.append_number(slot, total, candidate < end and near, candidate)
+        return total
+
+    return native.named(look_up_run, append_near, ahead=ahead)
+
+
+def row_functions(variant: PerceptionVariant) -> SimpleNamespace:
+    """Return the functions that scale sums and write them as rows."""
+    scalar = wp.float32
+    space_dim, width, lane_width = variant.space_dim, variant.width, variant.lane_width
+    lane_channels = wp.types.vector(lane_width, scalar)
+    vector = wp.types.vector(space_dim, scalar)
+    lane_gradient = wp.types.matrix((space_dim, lane_width), scalar)
+    lane_rows = wp.types.vector(lane_width * space_dim, scalar)
 
     @wp.func
     def scale_huge(gradient_scale: scalar, gradient: lane_gradient, scaled: lane_rows):
@@ -443,6 +464,85 @@ def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
                 for d in range(wp.static(space_dim)):
                     result[c * wp.static(space_dim) + d] = along[d]
         return result
+
+    @wp.func
+    def scaled_gradient(gradient_scale: scalar, gradient: lane_gradient):
+        """Return a lane's scaled state gradients, channel by channel."""
+        scaled = lane_rows()
+        largest_square = scalar(0.0)
+        for c in range(wp.static(lane_width)):
+            along = vector()
+            for d in range(wp.static(space_dim)):
+                along[d] = gradient_scale * gradient[d, c]
+            squared = wp.dot(along, along)
+            largest_square = wp.max(largest_square, squared)
+            along *= log_scale_of_square(squared)
+            for d in range(wp.static(space_dim)):
+                scaled[c * wp.static(space_dim) + d] = along[d]
+        if wp.isinf(largest_square):
+            scaled = scale_huge(gradient_scale, gradient, scaled)
+        return scaled
+
+    @wp.func
+    def scaled_vector(v: vector):
+        """Return L(v)."""
+        result = v
+        squared = wp.dot(v, v)
+        if wp.isinf(squared):
+            result = log_scaled_huge(v)
+        else:
+            result *= log_scale_of_square(squared)
+        return result
+
+    @wp.func
+    def stage_sums(
+        slot: wp.uint32,
+        lane: int,
+        own_state: lane_channels,
+        blur: lane_channels,
+        gradient_scale: scalar,
+        gradient: lane_gradient,
+    ):
+        """Write a lane's columns of the row to the slot."""
+        first_channel = (lane & wp.static(CUDA_LANES - 1)) * wp.static(lane_width)
+        stage(slot, first_channel, own_state)
+        stage(slot, wp.static(width) + first_channel, blur)
+        if wp.static(variant.state_gradient):
+            scaled = scaled_gradient(gradient_scale, gradient)
+            stage(slot, wp.static(2 * width) + first_channel * wp.static(space_dim), scaled)
+
+    return native.named(scaled_vector, stage_sums)
+
+
+@cached_under_lock()
+def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
+    """Return the perception kernel of a variant."""
+    scalar = wp.float32
+    space_dim, lanes, teams = variant.space_dim, variant.lanes, variant.teams
+    state_gradient, moment_correction = variant.state_gradient, variant.moment_inverse is not None
+    grouped, capacity = variant.grouped, variant.capacity
+    for_adjoint, per_particle = variant.for_adjoint, variant.per_particle
+    lane_width, team = variant.lane_width, CUDA_LANES
+    space = domain_types(space_dim, scalar)
+    vector, Domain = space.vector, space.Domain
+    vector_f64 = wp.types.vector(space_dim, wp.float64)
+    square = wp.types.matrix((space_dim, space_dim), scalar)
+    lane_channels = wp.types.vector(lane_width, scalar)
+    lane_gradient = wp.types.matrix((space_dim, lane_width), scalar)
+    registers = CUDA_REGISTERS[space_dim] if teams == 1 else TEAM_REGISTERS
+    load_vector = make_wide_load(vector)
+    add_vector = make_lane_sum(vector, lanes, whole_warps=True)
+    add_square = make_lane_sum(square, lanes, whole_warps=True)
+    add_f64 = make_lane_sum(vector_f64, lanes, whole_warps=True)
+    add_channels = make_lane_sum(lane_channels, lanes, whole_warps=True, stride=team)
+    add_gradient = make_lane_sum(lane_gradient, lanes, whole_warps=True, stride=team)
+    steps_at = make_steps_at(capacity, variant.tiled)
+    corrected = make_corrected(space_dim, scalar, lane_width, variant.moment_inverse)
+    slots = slot_functions(variant, lane_channels)
+    weighing = weighing_functions(variant, slots)
+    cell_vector = wp.types.vector(space_dim, wp.int32)
+    search, rows = search_functions(variant, slots), row_functions(variant)
+    add_states = make_add_states(variant, slots, lane_channels, lane_gradient)
 
     @wp.kernel(
         enable_backward=False,
@@ -465,8 +565,8 @@ def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
         sorted_positions: wp.array[vector],
         records: wp.array[RECORD],
         states: wp.array[lane_channels],
-        state_place: wp.array[wp.int32],
-        row_place: wp.array[wp.int32],
+        state_index: wp.array[wp.int32],
+        row_index: wp.array[wp.int32],
         row_destination: wp.array[wp.int32],
         lists: wp.array3d[wp.int16],
         list_lengths: wp.array[wp.int32],
@@ -477,7 +577,7 @@ def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
         """Write the perception vector of each row, as `perception_kernels` does.
 
         Threads are numbered by lanes, teams, groups and rows, in complete warps, some beyond the
-        last row. `state_place` has the index of each sorted particle's state, by default (empty)
+        last row. `state_index` has the index of each sorted particle's state, by default (empty)
         the same index; in 2D it is in `records`. Row k is written to row `row_destination[k]`, by
         default to row k. Entries are clipped to plus and minus `limit` unless it is 0.
         """
@@ -489,7 +589,7 @@ def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
         if wp.static(grouped):
             g = row % group_count
             row = row / group_count
-        slot = slot_address()
+        slot = slots.slot_address()
         # This lane's channels, and the first of its team's neighbours.
         part = lane & wp.static(team - 1)
         first = lane >> wp.static(team.bit_length() - 1)
@@ -501,28 +601,24 @@ def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
         present = row < wp.min(row_count, row_capacity)
         blur = lane_channels()
         gradient = lane_gradient()
-        sums = Sums()
+        sums = weighing.Sums()
         # Rows beyond the last one read the first particle, with no neighbours.
         safe_row = wp.where(present, row, wp.int32(0))
         k = safe_row
-        if row_place.shape[0] > 0:
-            k = wp.where(present, load_integer(row_place, safe_row), wp.int32(0))
+        if row_index.shape[0] > 0:
+            k = wp.where(present, load_integer(row_index, safe_row), wp.int32(0))
         destination = wp.where(row < row_capacity, row, wp.int32(-1))
         if row_destination.shape[0] > 0:
             destination = wp.where(present, load_integer(row_destination, safe_row), destination)
-        own_place = k
-        if state_place.shape[0] > 0:
-            own_place = load_integer(state_place, k)
-        parts = part_address(states, part)
-        own = part_of_state(parts, part_count, own_place)
+        own_index = k
+        if state_index.shape[0] > 0:
+            own_index = load_integer(state_index, k)
+        parts = slots.part_address(states, part)
+        own_state = slots.part_of_state(parts, part_count, own_index)
         position = load_vector(sorted_positions, k)
-        centre = Centre()
-        centre.position = position
-        for d in range(wp.static(space_dim)):
-            centre.precise[d] = wp.float64(position[d])
-        centre.inverse_eps = wp.float64(domain.inverse_eps)
+        centre = weighing.centre_at(domain, k, lane, slot, position)
         list_number = safe_row
-        if wp.static(by_place):
+        if wp.static(per_particle):
             list_number = k
         length = wp.where(present, load_integer(list_lengths, list_number), wp.int32(0))
         searching = length > wp.static(capacity)
@@ -530,80 +626,66 @@ def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
         longest = largest_in_warp(length)
         steps = steps_at(lists, list_number, lane)
         for first_entry in range(0, longest, wp.static(SLOT_ENTRIES)):
-            steps, sums = weigh_listed(
+            steps, sums = weighing.weigh_listed(
                 domain,
                 records,
                 lists,
-                state_place,
-                lane,
-                slot,
+                state_index,
                 list_number,
                 first_entry,
                 length,
-                k,
                 centre,
                 steps,
                 sums,
             )
             fetched = wp.clamp(length - first_entry, 0, wp.static(SLOT_ENTRIES))
             blur, gradient = add_states(
-                parts, part_count, first, slot, fetched, own, blur, gradient
+                parts, part_count, first, slot, fetched, own_state, blur, gradient
             )
-        base = wp.int32(0)
+        world_cell = wp.int32(0)
         cell = cell_vector()
-        segments = wp.int32(0)
+        particle_runs = wp.int32(0)
         if any_in_warp(searching):
             index = load_integer(sorted_cell, k)
             local = wp.int32(wp.uint32(index) % wp.uint32(domain.cell_count))
-            base = index - local
-            cell = cell_place(domain, local)
-            segments = wp.where(searching, segment_count(domain, cell), wp.int32(0))
+            world_cell = index - local
+            cell = space.cell_at(domain, local)
+            particle_runs = wp.where(searching, space.segment_count(domain, cell), wp.int32(0))
         # Each lane looks up one run of cells; all lanes then go through the runs in order.
-        run_count = largest_in_warp(segments)
-        run = wp.int32(0)
-        run_begin = wp.int32(0)
-        run_end = wp.int32(0)
-        j = lane
+        warp_runs = largest_in_warp(particle_runs)
+        next_run = wp.int32(0)
+        lane_begin = wp.int32(0)
+        lane_end = wp.int32(0)
+        candidate = lane
         end = wp.int32(0)
         # The next round leaves as many entries free as this one has beyond a multiple of the lanes:
         # a neighbour's lane then depends only on its index, not on the rest of the warp.
         begin = wp.int32(0)
-        working = run_count > 0
-        while working:
+        unfinished = warp_runs > 0
+        while unfinished:
             count = wp.int32(begin)
             filling = wp.bool(True)
             while filling:
-                while run < run_count and not any_in_warp(j - lane < end):
-                    if run % wp.static(lanes) == 0:
-                        mine = wp.min(run + lane, wp.max(segments - 1, wp.int32(0)))
-                        first_cell, last_cell = segment_cells(domain, cell, mine)
-                        run_begin = load_integer(starts, base + first_cell)
-                        run_end = load_integer(starts, base + last_cell)
-                        run_end = wp.where(run + lane < segments, run_end, wp.int32(0))
-                    turn = run % wp.static(lanes)
-                    j = of_lane(run_begin, turn, wp.uint32(lanes)) + lane
-                    end = of_lane(run_end, turn, wp.uint32(lanes))
-                    run += 1
-                seen = candidates_ahead()
-                for a in range(wp.static(ahead)):
-                    candidate = j + a * wp.static(lanes)
-                    place = wp.where(candidate < end, candidate, wp.int32(0))
-                    seen[a] = load_vector(sorted_positions, place)
-                for a in range(wp.static(ahead)):
-                    candidate = j + a * wp.static(lanes)
-                    offset = seen[a] - position
-                    if wp.static(periodic):
-                        offset = periodic_image(domain, offset)
-                    near = wp.dot(offset, offset) < domain.squared_eps
-                    count = append_number(slot, count, candidate < end and near, candidate)
-                j += wp.static(ahead * lanes)
-                working = run < run_count or any_in_warp(j - lane < end)
-                crowded = any_in_warp(count > wp.static(SLOT_ENTRIES - ahead * lanes))
-                filling = working and not crowded
-            sums = weigh_found(
-                domain, records, state_place, lane, slot, begin, count, k, centre, sums
+                while next_run < warp_runs and not any_in_warp(candidate - lane < end):
+                    if next_run % wp.static(lanes) == 0:
+                        lane_begin, lane_end = search.look_up_run(
+                            domain, starts, world_cell, cell, particle_runs, next_run + lane
+                        )
+                    source_lane = next_run % wp.static(lanes)
+                    candidate = of_lane(lane_begin, source_lane, wp.uint32(lanes)) + lane
+                    end = of_lane(lane_end, source_lane, wp.uint32(lanes))
+                    next_run += 1
+                count = search.append_near(
+                    domain, sorted_positions, slot, position, candidate, end, count
+                )
+                candidate += wp.static(search.ahead * lanes)
+                unfinished = next_run < warp_runs or any_in_warp(candidate - lane < end)
+                crowded = any_in_warp(count > wp.static(SLOT_ENTRIES - search.ahead * lanes))
+                filling = unfinished and not crowded
+            sums = weighing.weigh_searched(domain, records, state_index, begin, count, centre, sums)
+            blur, gradient = add_states(
+                parts, part_count, first, slot, count, own_state, blur, gradient
             )
-            blur, gradient = add_states(parts, part_count, first, slot, count, own, blur, gradient)
             begin = count & wp.static(lanes - 1)
         gradient_f64 = wp.float64(domain.spiky_norm) * add_f64(sums.density_gradient)
         if wp.static(teams > 1):
@@ -615,26 +697,10 @@ def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
                 for c in range(r):
                     moment[r, c] = moment[c, r]
             gradient = corrected(gradient, moment)
-        mine = (lane & wp.static(team - 1)) * wp.static(lane_width)
-        stage_channels(slot, mine, wp.where(present, own, lane_channels()))
-        stage_channels(slot, wp.static(width) + mine, blur)
-        if wp.static(state_gradient):
-            scaled = lane_rows()
-            largest_square = scalar(0.0)
-            for c in range(wp.static(lane_width)):
-                along = vector()
-                for d in range(wp.static(space_dim)):
-                    along[d] = gradient_scale * gradient[d, c]
-                squared = wp.dot(along, along)
-                largest_square = wp.max(largest_square, squared)
-                along *= log_scale_of_square(squared)
-                for d in range(wp.static(space_dim)):
-                    scaled[c * wp.static(space_dim) + d] = along[d]
-            if wp.isinf(largest_square):
-                scaled = scale_huge(gradient_scale, gradient, scaled)
-            stage_rows(slot, wp.static(2 * width) + mine * wp.static(space_dim), scaled)
+        staged_state = wp.where(present, own_state, lane_channels())
+        rows.stage_sums(slot, lane, staged_state, blur, gradient_scale, gradient)
         bound = wp.where(limit > scalar(0.0), limit, scalar(wp.static(math.nan)))
-        write_rows(slot, destination, g, state_dim, bound, perception)
+        slots.write_rows(slot, destination, g, state_dim, bound, perception)
         if wp.static(for_adjoint):
             kernel_sum = add_vector(sums.kernel)
             if destination >= 0 and lane == 0 and g == 0:
@@ -646,11 +712,7 @@ def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
             along = vector()
             for d in range(wp.static(space_dim)):
                 along[d] = scalar(gradient_f64[d]) * density_scale
-            squared = wp.dot(along, along)
-            if wp.isinf(squared):
-                along = log_scaled_huge(along)
-            else:
-                along *= log_scale_of_square(squared)
+            along = rows.scaled_vector(along)
             if destination >= 0 and lane == 0 and g == 0:
                 for d in range(wp.static(space_dim)):
                     perception[destination, column + d] = within(along[d], bound)
@@ -662,13 +724,3 @@ def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
                 )
 
     return perceive
-
-
-@cached_under_lock()
-def make_stage(value_type: type) -> wp.Function:
-    """Return a Warp function that writes a value to a slot, at an offset of 32-bit words."""
-
-    @native.func_native()
-    def stage(slot: wp.uint32, word: int, value: value_type): ...
-
-    return stage

@@ -1,4 +1,4 @@
-"""Cell lists of small worlds on CUDA: a block sorts a world in shared memory.
+"""Cell lists of small worlds on CUDA, also of splats: a block sorts a world in shared memory.
 
 The same order as in the portable kernels, in one launch instead of six: particles are counted by
 cell, the counts are added up, particles get provisional positions in order of arrival, and ranks
@@ -12,6 +12,8 @@ import warp as wp
 
 from npa_envs.kernels import native_functions as native
 from npa_envs.kernels.domain import domain_types, kernel_module
+from npa_envs.kernels.pictures.splat import splat_functions, splat_types
+from npa_envs.kernels.portable.world_mean import CHUNK
 from npa_envs.kernels.primitives import (
     CUDA_LANES,
     WARP,
@@ -20,10 +22,10 @@ from npa_envs.kernels.primitives import (
     load_integer,
     make_read_channels,
     make_wide_load,
-    make_wide_store,
     of_warp,
     sync_block,
     thread_of_block,
+    wide_store,
 )
 from npa_envs.thread_lock import cached_under_lock
 
@@ -40,8 +42,6 @@ MAX_GRID = 4096
 
 THREAD_CHANNELS = 4
 """Adjacent channels that a thread moves."""
-
-store_integer = make_wide_store(wp.int32)
 
 
 @native.func_native()
@@ -83,14 +83,14 @@ def block_functions(capacity: int) -> SimpleNamespace:
         """Return the range of provisional positions whose particles may belong to a slice."""
 
     @native.func_native(*sizes)
-    def ranked_at(address: wp.uint64, place: int, unordered: int) -> wp.vec3i:
+    def ranked_at(address: wp.uint64, provisional: int, unordered: int) -> wp.vec3i:
         """Return sorted index, cell and row (-1: none) of the particle at a provisional position.
 
         In the cell `unordered` (-1: none) provisional positions are final.
         """
 
     @native.func_native(*sizes)
-    def member_at(address: wp.uint64, place: int) -> int:
+    def member_at(address: wp.uint64, provisional: int) -> int:
         """Return the index of the particle at a provisional position."""
 
     functions = [block_memory, clear_counts, arrive, add_up_counts]
@@ -103,23 +103,15 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
     """Return the kernel that sorts worlds of float32 and of up to `capacity` particles."""
     scalar = wp.float32
     block = BLOCKS[capacity]
-    turns = capacity // block
-    types = domain_types(space_dim, scalar)
-    vector, Domain = types.vector, types.Domain
-    cell_of, cell_index = types.cell_of, types.cell_index
+    rounds = capacity // block
+    space = domain_types(space_dim, scalar)
+    vector, Domain = space.vector, space.Domain
     channels = wp.types.vector(THREAD_CHANNELS, scalar)
-    positions_ahead = wp.types.matrix((turns, space_dim), scalar)
-    flags_ahead = wp.types.vector(turns, wp.int32)
+    positions_ahead = wp.types.matrix((rounds, space_dim), scalar)
+    flags_ahead = wp.types.vector(rounds, wp.int32)
     load_vector = make_wide_load(vector)
     read_channels = make_read_channels(channels)
-    store_vector = make_wide_store(vector)
-    store_channels = make_wide_store(channels)
     sorting = block_functions(capacity)
-    block_memory, clear_counts = sorting.block_memory, sorting.clear_counts
-    arrive, add_up_counts = sorting.arrive, sorting.add_up_counts
-    start_of, place_arrived = sorting.start_of, sorting.place_arrived
-    span_of_slice, ranked_at = sorting.span_of_slice, sorting.ranked_at
-    member_at = sorting.member_at
 
     @wp.kernel(
         enable_backward=False,
@@ -145,7 +137,7 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
         sorted_cell: wp.array[wp.int32],
         row_of: wp.array[wp.int32],
         row_source: wp.array[wp.int32],
-        row_place: wp.array[wp.int32],
+        row_index: wp.array[wp.int32],
         sorted_positions: wp.array[vector],
         row_positions: wp.array[vector],
         sorted_states: wp.array[channels],
@@ -163,79 +155,167 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
         masked = mask.shape[0] > 0
         ahead = positions_ahead()
         acting = flags_ahead()
-        for turn in range(wp.static(turns)):
-            i = wp.min(lane + turn * wp.static(block), particle_count - 1)
+        for r in range(wp.static(rounds)):
+            i = wp.min(lane + r * wp.static(block), particle_count - 1)
             position = load_vector(positions, first_particle + i)
             for d in range(wp.static(space_dim)):
-                ahead[turn, d] = position[d]
-            acting[turn] = wp.int32(1)
+                ahead[r, d] = position[d]
+            acting[r] = wp.int32(1)
             if masked:
-                acting[turn] = wp.int32(mask[first_particle + i])
+                acting[r] = wp.int32(mask[first_particle + i])
         earlier = wp.int32(0)
         if masked:
             earlier = count_active(mask, first_particle)
         elif lane == 0:
             earlier = first_particle
-        memory = block_memory()
-        clear_counts(memory, domain.cell_count, earlier)
-        for turn in range(wp.static(turns)):
-            i = lane + turn * wp.static(block)
+        memory = sorting.block_memory()
+        sorting.clear_counts(memory, domain.cell_count, earlier)
+        for r in range(wp.static(rounds)):
+            i = lane + r * wp.static(block)
             if i < particle_count:
                 position = vector()
                 for d in range(wp.static(space_dim)):
-                    position[d] = ahead[turn, d]
-                cell = cell_index(domain, cell_of(domain, position))
-                arrive(memory, i, cell, acting[turn] != 0)
-        add_up_counts(memory, domain.cell_count)
+                    position[d] = ahead[r, d]
+                cell = space.cell_index(domain, space.cell_of(domain, position))
+                sorting.arrive(memory, i, cell, acting[r] != 0)
+        sorting.add_up_counts(memory, domain.cell_count)
 
         slice_cells = (domain.cell_count + slice_count - 1) / slice_count
         from_cell = slice_number * slice_cells
         to_cell = wp.min(from_cell + slice_cells, domain.cell_count)
         for cell in range(from_cell + lane, to_cell, wp.static(block)):
-            start = start_of(memory, cell)
-            store_integer(starts, first_cell + cell, first_particle + start[0])
+            start = sorting.start_of(memory, cell)
+            wide_store(starts, first_cell + cell, first_particle + start[0])
             if masked:
-                store_integer(starts, active_offset + first_cell + cell, row_base + start[1])
+                wide_store(starts, active_offset + first_cell + cell, row_base + start[1])
         is_last_world = first_particle + particle_count == positions.shape[0]
         if lane == 0 and slice_number == 0 and is_last_world:
-            end_of_all = start_of(memory, domain.cell_count)
+            end_of_all = sorting.start_of(memory, domain.cell_count)
             starts[starts.shape[0] - 1] = row_base + end_of_all[1]
         for i in range(lane, particle_count, wp.static(block)):
-            place_arrived(memory, i)
+            sorting.place_arrived(memory, i)
         sync_block()
 
-        slice_places = (particle_count + slice_count - 1) / slice_count
-        begin = slice_number * slice_places
-        end = wp.min(begin + slice_places, particle_count)
+        slice_size = (particle_count + slice_count - 1) / slice_count
+        begin = slice_number * slice_size
+        end = wp.min(begin + slice_size, particle_count)
         if begin < end:
-            span = span_of_slice(memory, begin, end)
+            span = sorting.span_of_slice(memory, begin, end)
             for chunk in range(span[0] * parts + lane, span[1] * parts, wp.static(block)):
                 k = chunk / parts
                 part = chunk - k * parts
-                i = first_particle + member_at(memory, k)
+                i = first_particle + sorting.member_at(memory, k)
                 position = load_vector(positions, i)
                 state = channels()
                 if sorted_states.shape[0] > 0:
                     first = part * wp.static(THREAD_CHANNELS)
                     state = read_channels(states, state_dim, aligned, i, first)
-                ranked = ranked_at(memory, k, wp.int32(-1))
+                ranked = sorting.ranked_at(memory, k, wp.int32(-1))
                 inside = ranked[0] >= begin and ranked[0] < end
-                place = first_particle + ranked[0]
+                target = first_particle + ranked[0]
                 if inside and sorted_states.shape[0] > 0:
-                    store_channels(sorted_states, place * parts + part, state)
+                    wide_store(sorted_states, target * parts + part, state)
                 if inside and part == 0:
-                    store_integer(source, place, i)
-                    store_integer(sorted_cell, place, first_cell + ranked[1])
-                    store_vector(sorted_positions, place, position)
+                    wide_store(source, target, i)
+                    wide_store(sorted_cell, target, first_cell + ranked[1])
+                    wide_store(sorted_positions, target, position)
                     if row_of.shape[0] > 0:
                         row = wp.where(ranked[2] < row_capacity, ranked[2], wp.int32(-1))
-                        store_integer(row_of, i, row)
+                        wide_store(row_of, i, row)
                         if row >= 0:
-                            store_integer(row_source, row, i)
-                            store_integer(row_place, row, place)
-                            store_vector(row_positions, row, position)
+                            wide_store(row_source, row, i)
+                            wide_store(row_index, row, target)
+                            wide_store(row_positions, row, position)
 
     return sort_worlds
+
+
+@cached_under_lock()
+def sort_small_splats(capacity: int) -> wp.Kernel:
+    """Return the kernel that sorts splats of float32, of worlds of up to `capacity` particles.
+
+    The same footprints in the same order as in `pictures/splat.py`. The block also computes its
+    world's mean.
+    """
+    scalar = wp.float32
+    block = BLOCKS[capacity]
+    types, splat = splat_types(scalar), splat_functions(scalar)
+    View, vector, footprint_type = types.View, types.vector, types.footprint
+    load_vector = make_wide_load(vector)
+    sorting = block_functions(capacity)
+
+    @native.func_native(capacity, CHUNK)
+    def mean_of_world(positions: wp.array[vector], first: int, count: int) -> vector:
+        """Return the mean of a world's positions; the whole block calls it."""
+
+    @wp.kernel(
+        enable_backward=False,
+        launch_bounds=(block, RESIDENT_THREADS // block),
+        module=native.module(f"npa_envs.kernels.small_splats_{capacity}"),
+    )
+    def sort_splats(
+        view: View,
+        slice_count: int,
+        particle_count: int,
+        positions: wp.array[vector],
+        states: wp.array2d[scalar],
+        shift: scalar,
+        goal: wp.array[vector],
+        # outputs
+        starts: wp.array[wp.int32],
+        footprints: wp.array[footprint_type],
+        source: wp.array[wp.int32],
+    ):
+        """Sort every world's splats by cell, then index; write one slice of them."""
+        await_earlier()
+        world = block_number() / slice_count
+        slice_number = block_number() - world * slice_count
+        lane = thread_of_block()
+        first_particle = world * particle_count
+        mean = vector()
+        if goal.shape[0] > 0:
+            mean = mean_of_world(positions, first_particle, particle_count)
+        memory = sorting.block_memory()
+        sorting.clear_counts(memory, view.cell_count, wp.int32(0))
+        for i in range(lane, particle_count, wp.static(block)):
+            position = load_vector(positions, first_particle + i)
+            position = splat.pixel_position(view, position, mean, goal)
+            cell = splat.cell_of_centre(view, splat.patch_centre(position))
+            sorting.arrive(memory, i, cell, False)
+        sorting.add_up_counts(memory, view.cell_count)
+        first_cell = world * view.cell_count
+        stride = slice_count * wp.static(block)
+        for cell in range(slice_number * wp.static(block) + lane, view.cell_count, stride):
+            start = first_particle + sorting.start_of(memory, cell)[0]
+            wide_store(starts, first_cell + cell, start)
+        if lane == 0 and first_particle + particle_count == positions.shape[0]:
+            starts[starts.shape[0] - 1] = positions.shape[0]
+        for i in range(lane, particle_count, wp.static(block)):
+            sorting.place_arrived(memory, i)
+        sync_block()
+
+        slice_size = (particle_count + slice_count - 1) / slice_count
+        begin = slice_number * slice_size
+        # Invisible splats, which may be many, can have any order. As it differs among the blocks of
+        # a world, the last block writes all of them.
+        hidden = sorting.start_of(memory, view.cell_count - 1)[0]
+        end = wp.min(begin + slice_size, hidden)
+        if slice_number == slice_count - 1:
+            begin = wp.min(begin, hidden)
+            end = particle_count
+        if begin < end:
+            span = sorting.span_of_slice(memory, begin, end)
+            for k in range(span[0] + lane, span[1], wp.static(block)):
+                target = sorting.ranked_at(memory, k, view.cell_count - 1)[0]
+                if target >= begin and target < end:
+                    i = first_particle + sorting.member_at(memory, k)
+                    position = splat.pixel_position(view, load_vector(positions, i), mean, goal)
+                    target += first_particle
+                    footprint = splat.footprint_of(view, position, i, states, shift)
+                    wide_store(footprints, target, footprint)
+                    wide_store(source, target, i)
+
+    return sort_splats
 
 
 @cached_under_lock()
@@ -247,8 +327,6 @@ def order_particles(space_dim: int, width: int) -> wp.Kernel:
     channels = wp.types.vector(thread_width, scalar)
     held_type = wp.types.matrix((CUDA_LANES, thread_width), scalar)
     read_channels = make_read_channels(channels)
-    store_vector = make_wide_store(vector)
-    store_channels = make_wide_store(channels)
 
     @wp.kernel(enable_backward=False, module=kernel_module("order", space_dim, scalar, width))
     def order_particles(
@@ -267,7 +345,7 @@ def order_particles(space_dim: int, width: int) -> wp.Kernel:
         sorted_cell: wp.array[wp.int32],
         row_of: wp.array[wp.int32],
         row_source: wp.array[wp.int32],
-        row_place: wp.array[wp.int32],
+        row_index: wp.array[wp.int32],
         sorted_positions: wp.array[vector],
         row_positions: wp.array[vector],
         sorted_states: wp.array[channels],
@@ -280,57 +358,57 @@ def order_particles(space_dim: int, width: int) -> wp.Kernel:
         await_earlier()
         k = wp.tid()
         total = arrived.shape[0]
-        own = load_pair(arrived, wp.min(k, total - 1))
-        i = own[0] / 2
-        c = own[1]
+        entry = load_pair(arrived, wp.min(k, total - 1))
+        i = entry[0] / 2
+        c = entry[1]
         begin = load_integer(starts, c)
         first_row = load_integer(starts, active_offset + c) - row_base
         position = positions[i]
         rank = wp.int32(0)
         active_rank = wp.int32(0)
-        for other in range(begin, load_integer(starts, c + 1)):
-            entry = load_pair(arrived, other)[0]
-            if entry < own[0]:
+        for j in range(begin, load_integer(starts, c + 1)):
+            other = load_pair(arrived, j)[0]
+            if other < entry[0]:
                 rank += 1
-                active_rank += entry & 1
-        place = begin + rank
+                active_rank += other & 1
+        target = begin + rank
         if k < total:
-            store_integer(source, place, i)
-            store_integer(sorted_cell, place, c)
-            store_vector(sorted_positions, place, position)
+            wide_store(source, target, i)
+            wide_store(sorted_cell, target, c)
+            wide_store(sorted_positions, target, position)
             if row_of.shape[0] > 0:
                 row = first_row + active_rank
-                if own[0] & 1 == 0 or row >= row_capacity:
+                if entry[0] & 1 == 0 or row >= row_capacity:
                     row = wp.int32(-1)
-                store_integer(row_of, i, row)
+                wide_store(row_of, i, row)
                 if row >= 0:
-                    store_integer(row_source, row, i)
-                    store_integer(row_place, row, place)
-                    store_vector(row_positions, row, position)
+                    wide_store(row_source, row, i)
+                    wide_store(row_index, row, target)
+                    wide_store(row_positions, row, position)
 
         # A warp moves the states of its particles together, adjacent threads adjacent channels. All
         # loads come before the first store.
         if sorted_states.shape[0] > 0:
             lane = k % wp.static(WARP)
             parts = group_count * wp.static(CUDA_LANES)
-            for first_turn in range(0, parts, wp.static(CUDA_LANES)):
+            for first_round in range(0, parts, wp.static(CUDA_LANES)):
                 held = held_type()
-                for turn in range(wp.static(CUDA_LANES)):
-                    chunk = lane + (first_turn + turn) * wp.static(WARP)
+                for r in range(wp.static(CUDA_LANES)):
+                    chunk = lane + (first_round + r) * wp.static(WARP)
                     owner = chunk / parts
                     first = (chunk - owner * parts) * wp.static(thread_width)
                     state = read_channels(states, state_dim, aligned, of_warp(i, owner), first)
                     for n in range(wp.static(thread_width)):
-                        held[turn, n] = state[n]
-                for turn in range(wp.static(CUDA_LANES)):
-                    chunk = lane + (first_turn + turn) * wp.static(WARP)
+                        held[r, n] = state[n]
+                for r in range(wp.static(CUDA_LANES)):
+                    chunk = lane + (first_round + r) * wp.static(WARP)
                     owner = chunk / parts
                     part = chunk - owner * parts
-                    to = of_warp(place, owner) * parts + part
+                    to = of_warp(target, owner) * parts + part
                     state = channels()
                     for n in range(wp.static(thread_width)):
-                        state[n] = held[turn, n]
+                        state[n] = held[r, n]
                     if k - lane + owner < total:
-                        store_channels(sorted_states, to, state)
+                        wide_store(sorted_states, to, state)
 
     return order_particles

@@ -13,6 +13,8 @@ On CUDA a block serves a tile and a thread a pixel; sums over pixels use shuffle
 shared memory among warps. On a CPU a thread serves a tile, one Gaussian after the other, each only
 at the pixels that it covers. Either way every pair of a tile and a Gaussian has its own slot for
 the cotangents from that tile (its pull): no sum depends on the order of threads.
+
+Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
 """
 
 from types import SimpleNamespace
@@ -27,7 +29,7 @@ from npa_envs.kernels.pictures.gaussians import (
     CHANNELS,
     MIN_ALPHA,
     PULLS,
-    TILE,
+    TILE_SIDE,
     gaussian_types,
     make_covered,
 )
@@ -47,7 +49,7 @@ MAX_ALPHA = 0.99
 MIN_PASSING = 1e-4
 """Transmittance below which farther Gaussians are ignored."""
 
-TILE_PIXELS = TILE * TILE
+TILE_PIXELS = TILE_SIDE * TILE_SIDE
 """Pixels of a tile, and threads of its block."""
 
 PATCH_WIDTH, PATCH_HEIGHT = 8, 4
@@ -140,26 +142,23 @@ def tile_kernels(scalar: type) -> SimpleNamespace:
     """Return the kernels of one scalar type in which a thread serves a tile; for the CPU."""
     types = gaussian_types(scalar)
     Frame, footprint_type, pulls_type = types.Frame, types.footprint, types.pulls
-    functions = blending_functions(scalar)
-    strength_at, pull = functions.strength, functions.pull
-    channels_at, pixel_of = functions.channels_at, functions.pixel_of
-    middle_of = functions.middle_of
+    blending = blending_functions(scalar)
     covered = make_covered(scalar)
     module = native.module(f"npa_envs.kernels.blending_tiles_{scalar_name(scalar)}")
 
     @wp.func
     def shared_pixels(frame: Frame, tile: int, footprint: footprint_type):
         """Return first, and last + 1, column and row of a tile's pixels that a footprint covers."""
-        place = tile % frame.tile_count
-        row = place / frame.tile_columns * wp.static(TILE)
-        column = place % frame.tile_columns * wp.static(TILE)
+        tile_in_picture = tile % frame.tile_count
+        row = tile_in_picture / frame.tile_columns * wp.static(TILE_SIDE)
+        column = tile_in_picture % frame.tile_columns * wp.static(TILE_SIDE)
         left, right = covered(footprint[0], footprint[10], frame.width)
         top, bottom = covered(footprint[1], footprint[11], frame.height)
         return wp.vec4i(
             wp.max(left, column),
             wp.max(top, row),
-            wp.min(right, column + wp.static(TILE)),
-            wp.min(bottom, row + wp.static(TILE)),
+            wp.min(right, column + wp.static(TILE_SIDE)),
+            wp.min(bottom, row + wp.static(TILE_SIDE)),
         )
 
     @in_ranges(TILES)
@@ -186,10 +185,12 @@ def tile_kernels(scalar: type) -> SimpleNamespace:
             footprint = footprints[owners[j]]
             pixels = shared_pixels(frame, tile, footprint)
             for row in range(pixels[1], pixels[3]):
-                y = middle_of(row) - footprint[1]
+                y = blending.middle_of(row) - footprint[1]
                 for column in range(pixels[0], pixels[2]):
-                    strength = strength_at(footprint, middle_of(column) - footprint[0], y)
-                    pixel = pixel_of(frame, image, row, column)
+                    strength = blending.strength(
+                        footprint, blending.middle_of(column) - footprint[0], y
+                    )
+                    pixel = blending.pixel_of(frame, image, row, column)
                     if strength >= scalar(MIN_ALPHA) and j < stops[pixel]:
                         before = passing[pixel]
                         alpha = wp.min(strength, scalar(MAX_ALPHA))
@@ -209,7 +210,7 @@ def tile_kernels(scalar: type) -> SimpleNamespace:
         frame: Frame,
         starts: wp.array[wp.int32],
         owners: wp.array[wp.int32],
-        places: wp.array[wp.int64],
+        pair_slots: wp.array[wp.int64],
         footprints: wp.array[footprint_type],
         stops: wp.array[wp.int32],
         picture_bar: wp.array2d[scalar],
@@ -230,20 +231,20 @@ def tile_kernels(scalar: type) -> SimpleNamespace:
             pixels = shared_pixels(frame, tile, footprint)
             total = pulls_type()
             for row in range(pixels[1], pixels[3]):
-                y = middle_of(row) - footprint[1]
+                y = blending.middle_of(row) - footprint[1]
                 for column in range(pixels[0], pixels[2]):
-                    x = middle_of(column) - footprint[0]
-                    strength = strength_at(footprint, x, y)
-                    pixel = pixel_of(frame, image, row, column)
+                    x = blending.middle_of(column) - footprint[0]
+                    strength = blending.strength(footprint, x, y)
+                    pixel = blending.pixel_of(frame, image, row, column)
                     if strength >= scalar(MIN_ALPHA) and j < stops[pixel]:
-                        bar = channels_at(picture_bar, pixel)
-                        added, before, rest = pull(
+                        bar = blending.channels_at(picture_bar, pixel)
+                        added, before, rest = blending.pull(
                             footprint, x, y, strength, bar, through[pixel], behind[pixel]
                         )
                         total += added
                         through[pixel] = before
                         behind[pixel] = rest
-            pulls[wp.int32(places[j])] = total
+            pulls[wp.int32(pair_slots[j])] = total
 
     return SimpleNamespace(draw_tiles=draw_tiles, pull_back_tiles=pull_back_tiles)
 
@@ -253,10 +254,7 @@ def block_kernels(scalar: type) -> SimpleNamespace:
     """Return the kernels of one scalar type in which a block serves a tile; for CUDA."""
     types = gaussian_types(scalar)
     Frame, quad, footprint_type, pulls_type = types.Frame, types.quad, types.footprint, types.pulls
-    functions = blending_functions(scalar)
-    strength_at, colours_of, pull = functions.strength, functions.colours_of, functions.pull
-    channels_at, pixel_of = functions.channels_at, functions.pixel_of
-    middle_of = functions.middle_of
+    blending = blending_functions(scalar)
     name = scalar_name(scalar)
     drawing = native.module(f"npa_envs.kernels.blending_blocks_{name}")
     pulling = native.module(f"npa_envs.kernels.blending_blocks_adjoint_{name}")
@@ -272,11 +270,11 @@ def block_kernels(scalar: type) -> SimpleNamespace:
         """Return column and row of a thread's pixel; a warp has a patch of its tile."""
         patch = k / wp.static(WARP)
         lane = k % wp.static(WARP)
-        across = wp.static(TILE // PATCH_WIDTH)
-        place = tile % frame.tile_count
-        column = place % frame.tile_columns * wp.static(TILE)
+        across = wp.static(TILE_SIDE // PATCH_WIDTH)
+        tile_in_picture = tile % frame.tile_count
+        column = tile_in_picture % frame.tile_columns * wp.static(TILE_SIDE)
         column += patch % across * wp.static(PATCH_WIDTH) + lane % wp.static(PATCH_WIDTH)
-        row = place / frame.tile_columns * wp.static(TILE)
+        row = tile_in_picture / frame.tile_columns * wp.static(TILE_SIDE)
         row += patch / across * wp.static(PATCH_HEIGHT) + lane / wp.static(PATCH_WIDTH)
         return column, row
 
@@ -295,10 +293,10 @@ def block_kernels(scalar: type) -> SimpleNamespace:
         t = wp.tid()
         tile = t / wp.static(TILE_PIXELS)
         column, row = own_pixel(frame, tile, t % wp.static(TILE_PIXELS))
-        pixel = pixel_of(frame, tile / frame.tile_count, row, column)
+        pixel = blending.pixel_of(frame, tile / frame.tile_count, row, column)
         if pixel >= 0:
-            left = middle_of(column)
-            top = middle_of(row)
+            left = blending.middle_of(column)
+            top = blending.middle_of(row)
             total = quad()
             through = scalar(1.0)
             j = starts[tile]
@@ -306,14 +304,14 @@ def block_kernels(scalar: type) -> SimpleNamespace:
             stop = end
             while j < stop:
                 footprint = load_footprint(footprints, load_integer(owners, j))
-                strength = strength_at(footprint, left - footprint[0], top - footprint[1])
+                strength = blending.strength(footprint, left - footprint[0], top - footprint[1])
                 if strength >= scalar(MIN_ALPHA):
                     alpha = wp.min(strength, scalar(MAX_ALPHA))
                     after = through * (scalar(1.0) - alpha)
                     if after < scalar(MIN_PASSING):
                         stop = j
                     else:
-                        total += alpha * through * colours_of(footprint)
+                        total += alpha * through * blending.colours_of(footprint)
                         through = after
                 j += 1
             for c in range(wp.static(CHANNELS)):
@@ -327,7 +325,7 @@ def block_kernels(scalar: type) -> SimpleNamespace:
         frame: Frame,
         starts: wp.array[wp.int32],
         owners: wp.array[wp.int32],
-        places: wp.array[wp.int64],
+        pair_slots: wp.array[wp.int64],
         footprints: wp.array[footprint_type],
         stops: wp.array[wp.int32],
         picture_bar: wp.array2d[scalar],
@@ -344,9 +342,9 @@ def block_kernels(scalar: type) -> SimpleNamespace:
         tile = t / wp.static(TILE_PIXELS)
         k = t % wp.static(TILE_PIXELS)
         column, row = own_pixel(frame, tile, k)
-        pixel = pixel_of(frame, tile / frame.tile_count, row, column)
-        left = middle_of(column)
-        top = middle_of(row)
+        pixel = blending.pixel_of(frame, tile / frame.tile_count, row, column)
+        left = blending.middle_of(column)
+        top = blending.middle_of(row)
         begin = starts[tile]
         end = starts[tile + 1]
         stop = wp.int32(0)
@@ -355,7 +353,7 @@ def block_kernels(scalar: type) -> SimpleNamespace:
         behind = scalar(0.0)
         if pixel >= 0:
             stop = stops[pixel]
-            bar = channels_at(picture_bar, pixel)
+            bar = blending.channels_at(picture_bar, pixel)
             through = passing[pixel]
             behind = through * passing_bar[pixel]
         while end > begin:
@@ -367,11 +365,11 @@ def block_kernels(scalar: type) -> SimpleNamespace:
                     footprint = load_footprint(footprints, load_integer(owners, j))
                     x = left - footprint[0]
                     y = top - footprint[1]
-                    strength = strength_at(footprint, x, y)
+                    strength = blending.strength(footprint, x, y)
                     is_drawn = j < stop and strength >= scalar(MIN_ALPHA)
                     if any_in_warp(is_drawn):
                         if is_drawn:
-                            total, through, behind = pull(
+                            total, through, behind = blending.pull(
                                 footprint, x, y, strength, bar, through, behind
                             )
                         total = add_warp(total)
@@ -380,7 +378,7 @@ def block_kernels(scalar: type) -> SimpleNamespace:
             for entry in range(k, count * wp.static(PULLS), wp.static(TILE_PIXELS)):
                 i = entry / wp.static(PULLS)
                 part = entry - i * wp.static(PULLS)
-                slot = wp.int32(places[end - 1 - i])
+                slot = wp.int32(pair_slots[end - 1 - i])
                 pulls[slot * wp.static(PULLS) + part] = keep(False, i, part, pulls_type())
             sync_block()
             end -= count

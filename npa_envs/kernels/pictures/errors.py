@@ -39,8 +39,8 @@ BLOCK_WARPS = CUDA_BLOCK // WARP
 WARP_TILES = WARP // TILE_LANES
 """Tiles that a warp serves together."""
 
-TURN_TILES = WARP_TILES * BLOCK_WARPS
-"""Tiles that a block serves in a turn; it has one turn or several."""
+ROUND_TILES = WARP_TILES * BLOCK_WARPS
+"""Tiles that a block serves at a time."""
 
 
 @cached_under_lock()
@@ -70,7 +70,6 @@ def gather_errors(scalar: type) -> wp.Kernel:
     View, colour_type, footprint_type = types.View, types.colour, types.footprint
     row_type = wp.types.matrix((CHANNELS, TILE_WIDTH), scalar)
     gathering = gather_functions(scalar, TILE_LANES)
-    candidate_count, gather_tile = gathering.candidate_count, gathering.gather_tile
     pixel_errors = make_pixel_errors(scalar)
     load_colour = make_wide_load(colour_type)
     lane_sum = make_lane_sum(wp.vec2d, TILE_LANES)
@@ -109,23 +108,25 @@ def gather_errors(scalar: type) -> wp.Kernel:
         candidates = wp.int32(-1)
         if own < tiles and thread_of_block() < tile_count:
             row = own / view.tile_columns
-            candidates = candidate_count(view, world, row, own - row * view.tile_columns, starts)
+            candidates = gathering.candidate_count(
+                view, world, row, own - row * view.tile_columns, starts
+            )
         rank_tiles(tile_count, candidates)
         lane = thread_of_block() % wp.static(TILE_LANES)
         warp = thread_of_block() / wp.static(WARP)
-        place = thread_of_block() % wp.static(WARP) / wp.static(TILE_LANES)
-        for turn in range(tile_count / wp.static(TURN_TILES)):
+        tile_of_warp = thread_of_block() % wp.static(WARP) / wp.static(TILE_LANES)
+        for r in range(tile_count / wp.static(ROUND_TILES)):
             # In alternating directions, so that all warps do equal work.
-            batch = turn * wp.static(BLOCK_WARPS) + warp
-            if turn % 2 == 1:
+            batch = r * wp.static(BLOCK_WARPS) + warp
+            if r % 2 == 1:
                 batch += wp.static(BLOCK_WARPS - 1) - 2 * warp
-            ranked = ranked_tile(batch * wp.static(WARP_TILES) + place)
+            ranked = ranked_tile(batch * wp.static(WARP_TILES) + tile_of_warp)
             tile = first + ranked[0] * stride
             row = wp.int32(wp.uint32(tile) / wp.uint32(view.tile_columns))
             column = tile - row * view.tile_columns
             values = row_type()
             if ranked[1] > 0:
-                values = gather_tile(view, world, row, column, lane, starts, footprints)
+                values = gathering.gather_tile(view, world, row, column, lane, starts, footprints)
             # A lane has a row of the tile.
             row = row * wp.static(TILE_HEIGHT) + lane
             column *= wp.static(TILE_WIDTH)

@@ -8,6 +8,8 @@ Zwicker et al. 2002, "EWA Splatting". A Gaussian of mean p and covariance P = (R
 equation 6) lies at c = W p + t in a camera's frame and at (fx x/z + cx, fy y/z + cy) on its
 picture. There its covariance is Q⁻¹ = J W P Wᵀ Jᵀ + dilation (Kerbl, equation 5), where J is the
 projection's derivative at c, the local affine approximation (Zwicker).
+
+Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
 """
 
 from types import SimpleNamespace
@@ -18,17 +20,17 @@ import warp as wp
 from npa_envs.kernels import native_functions as native
 from npa_envs.kernels.domain import scalar_name
 from npa_envs.kernels.native_functions import PAIRS, in_ranges, named
-from npa_envs.kernels.primitives import make_wide_load, make_wide_store
+from npa_envs.kernels.primitives import make_wide_load, wide_store
 from npa_envs.thread_lock import cached_under_lock
 
-TILE = 16
+TILE_SIDE = 16
 """Pixels along each side of a tile."""
 
 CHANNELS = 4
 """Colour channels of a footprint; pictures may have fewer."""
 
 FOOTPRINT = 12
-"""Entries of a footprint: mean (2), conic Q (3: xx, xy, yy), opacity, colours (4), reach (2)."""
+"""Entries of a footprint: mean (2), conic Q (3: xx, xy, yy), opacity, colours (4), extent (2)."""
 
 PULLS = 10
 """Entries of a pull, the cotangents of a Gaussian from a tile: with weights α ᾱ and offsets d of
@@ -41,7 +43,7 @@ CLAMP_MARGIN = 0.3
 """J is computed at a point at most this fraction of half the picture outside of it, as in Kerbl's
 implementation: far outside, the affine approximation gives Gaussians that fill the picture."""
 
-REACH_SLACK = 1e-3
+EXTENT_SLACK = 1e-3
 """Added to the exponent at which a Gaussian ends, so that rounding cannot lose a pixel."""
 
 HARMONIC_0, HARMONIC_1 = 0.28209479177387814, 0.4886025119029199
@@ -87,8 +89,8 @@ def make_frame(
     frame = gaussian_types(scalar).Frame()
     frame.particle_count, frame.view_count, frame.channels = shape
     frame.width, frame.height = sizes
-    frame.tile_columns = -(-frame.width // TILE)
-    frame.tile_count = frame.tile_columns * -(-frame.height // TILE)
+    frame.tile_columns = -(-frame.width // TILE_SIDE)
+    frame.tile_count = frame.tile_columns * -(-frame.height // TILE_SIDE)
     frame.near = near
     frame.dilation = dilation
     return frame
@@ -99,11 +101,11 @@ def make_covered(scalar: type) -> wp.Function:
     """Return a Warp function for the pixels along one direction that a footprint covers."""
 
     @wp.func
-    def covered(middle: scalar, reach: scalar, size: int):
-        """Return first and last + 1 pixel along one direction whose centre is within reach."""
+    def covered(middle: scalar, extent: scalar, size: int):
+        """Return first and last + 1 pixel along one direction whose centre is within `extent`."""
         end = scalar(size)
-        first = wp.ceil(wp.clamp(middle - reach - scalar(0.5), scalar(0.0), end))
-        last = wp.floor(wp.clamp(middle + reach + scalar(0.5), scalar(0.0), end))
+        first = wp.ceil(wp.clamp(middle - extent - scalar(0.5), scalar(0.0), end))
+        last = wp.floor(wp.clamp(middle + extent + scalar(0.5), scalar(0.0), end))
         return wp.int32(first), wp.int32(last)
 
     return covered
@@ -119,7 +121,6 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
     covered = make_covered(scalar)
     module = native.module(f"npa_envs.kernels.gaussians_{scalar_name(scalar)}")
     load_footprint = make_wide_load(footprint_type)
-    store_footprint = make_wide_store(footprint_type)
     load_pulls = make_wide_load(pulls_type)
 
     @wp.func
@@ -197,18 +198,18 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
         return wp.clamp(ratio, (-middle - margin) / focal, (size - middle + margin) / focal)
 
     @wp.func
-    def limited_ratios(frame: Frame, camera: quad, place: triple):
+    def limited_ratios(frame: Frame, camera: quad, position: triple):
         return pair(
-            limited(place[0] / place[2], camera[0], camera[2], scalar(frame.width)),
-            limited(place[1] / place[2], camera[1], camera[3], scalar(frame.height)),
+            limited(position[0] / position[2], camera[0], camera[2], scalar(frame.width)),
+            limited(position[1] / position[2], camera[1], camera[3], scalar(frame.height)),
         )
 
     @wp.func
-    def jacobian_of(frame: Frame, camera: quad, place: triple):
+    def jacobian_of(frame: Frame, camera: quad, position: triple):
         """Return J, the derivative of picture coordinates by those in the camera's frame."""
-        ratios = limited_ratios(frame, camera, place)
-        x = camera[0] / place[2]
-        y = camera[1] / place[2]
+        ratios = limited_ratios(frame, camera, position)
+        x = camera[0] / position[2]
+        y = camera[1] / position[2]
         return flat(x, scalar(0.0), -x * ratios[0], scalar(0.0), y, -y * ratios[1])
 
     @wp.func
@@ -252,9 +253,9 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
                     result[c] = colours[i, c]
         else:
             basis = harmonic_basis(wp.normalize(outlook(motion, mean)))
-            seen = basis * harmonics_at(colours, i)
+            colour = basis * harmonics_at(colours, i)
             for c in range(3):
-                value = seen[c] + scalar(0.5)
+                value = colour[c] + scalar(0.5)
                 # Not wp.max, which would turn NaN into a colour.
                 result[c] = wp.where(value < scalar(0.0), scalar(0.0), value)
         return result
@@ -266,7 +267,7 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
         top, bottom = covered(footprint[1], footprint[11], frame.height)
         result = wp.vec4i()
         if left < right and top < bottom:
-            size = wp.static(TILE)
+            size = wp.static(TILE_SIDE)
             result = wp.vec4i(
                 left / size, top / size, (right - 1) / size + 1, (bottom - 1) / size + 1
             )
@@ -303,14 +304,14 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
         mean = means[i]
         opacity = opacities[i]
         rotation = rotation_part(motion)
-        place = rotation * mean + shift_part(motion)
+        position = rotation * mean + shift_part(motion)
         depth = scalar(wp.inf)
         count = wp.int32(0)
         footprint = footprint_type()
-        if place[2] >= frame.near and opacity >= scalar(MIN_ALPHA):
+        if position[2] >= frame.near and opacity >= scalar(MIN_ALPHA):
             unit, _inverse = unit_quaternion(quaternions[i])
             spread = scaled_columns(rotation * rotation_of(unit), scales[i])
-            root = jacobian_of(frame, camera, place) * spread
+            root = jacobian_of(frame, camera, position) * spread
             x = root[0]
             y = root[1]
             squared_x = wp.dot(x, x)
@@ -322,9 +323,9 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
             inverse = scalar(1.0) / determinant
             squared_x += frame.dilation
             squared_y += frame.dilation
-            reach = scalar(2.0) * (wp.log(scalar(255.0) * opacity) + scalar(REACH_SLACK))
-            footprint[0] = camera[0] * place[0] / place[2] + camera[2]
-            footprint[1] = camera[1] * place[1] / place[2] + camera[3]
+            extent = scalar(2.0) * (wp.log(scalar(255.0) * opacity) + scalar(EXTENT_SLACK))
+            footprint[0] = camera[0] * position[0] / position[2] + camera[2]
+            footprint[1] = camera[1] * position[1] / position[2] + camera[3]
             footprint[2] = squared_y * inverse
             footprint[3] = -wp.dot(x, y) * inverse
             footprint[4] = squared_x * inverse
@@ -332,8 +333,8 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
             colour = colours_of(colours, i, motion, mean)
             for c in range(wp.static(CHANNELS)):
                 footprint[6 + c] = colour[c]
-            footprint[10] = wp.sqrt(reach * squared_x)
-            footprint[11] = wp.sqrt(reach * squared_y)
+            footprint[10] = wp.sqrt(extent * squared_x)
+            footprint[11] = wp.sqrt(extent * squared_y)
             total = scalar(0.0)
             for k in range(wp.static(FOOTPRINT)):
                 total += footprint[k]
@@ -341,8 +342,8 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
                 tiles = covered_tiles(frame, footprint)
                 count = (tiles[2] - tiles[0]) * (tiles[3] - tiles[1])
                 if count > 0:
-                    depth = place[2]
-        store_footprint(footprints, entry, footprint)
+                    depth = position[2]
+        wide_store(footprints, entry, footprint)
         depths[entry] = depth
         counts[entry] = count
 
@@ -376,12 +377,12 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
         if begin < end and end <= wp.int64(room):
             slot = image * room + wp.int32(begin)
             covers = covered_tiles(frame, load_footprint(footprints, entry))
-            place = slot
+            next_slot = slot
             for row in range(covers[1], covers[3]):
                 for column in range(covers[0], covers[2]):
-                    tiles[place] = image * frame.tile_count + row * frame.tile_columns + column
-                    owners[place] = entry
-                    place += 1
+                    tiles[next_slot] = image * frame.tile_count + row * frame.tile_columns + column
+                    owners[next_slot] = entry
+                    next_slot += 1
         slots[entry] = slot
 
     @in_ranges(PAIRS)
@@ -412,7 +413,7 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
         mean = means[i]
         scale = scales[i]
         unit, inverse = unit_quaternion(quaternions[i])
-        turned = rotation_of(unit)
+        own_rotation = rotation_of(unit)
         mean_bar = triple()
         scale_bar = triple()
         rotation_bar = cube()
@@ -433,51 +434,51 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
                 motion = motions[image % motions.shape[0]]
                 camera = intrinsics[image % intrinsics.shape[0]]
                 rotation = rotation_part(motion)
-                place = rotation * mean + shift_part(motion)
+                position = rotation * mean + shift_part(motion)
                 conic = square(footprint[2], footprint[3], footprint[3], footprint[4])
                 centre_bar = conic * pair(pull[1], pull[2])
                 opacity_bar += pull[0] / footprint[5]
 
                 # Of Q = (A Aᵀ + dilation)⁻¹ with A = J W R S.
                 moments = square(pull[3], pull[4], pull[4], pull[5])
-                jacobian = jacobian_of(frame, camera, place)
-                towards = rotation * turned
-                spread = scaled_columns(towards, scale)
+                jacobian = jacobian_of(frame, camera, position)
+                axes = rotation * own_rotation
+                spread = scaled_columns(axes, scale)
                 root_bar = conic * moments * conic * (jacobian * spread)
                 jacobian_bar = root_bar * wp.transpose(spread)
                 spread_bar = wp.transpose(jacobian) * root_bar
                 for d in range(3):
                     for row in range(3):
-                        scale_bar[d] += spread_bar[row, d] * towards[row, d]
+                        scale_bar[d] += spread_bar[row, d] * axes[row, d]
                 rotation_bar += wp.transpose(rotation) * scaled_columns(spread_bar, scale)
 
-                ratios = limited_ratios(frame, camera, place)
-                place_bar = triple()
+                ratios = limited_ratios(frame, camera, position)
+                position_bar = triple()
                 for d in range(2):
-                    focal = camera[d] / place[2]
-                    ratio = place[d] / place[2]
-                    place_bar[d] = focal * centre_bar[d]
-                    place_bar[2] -= focal * centre_bar[d] * ratio
-                    place_bar[2] -= focal / place[2] * jacobian_bar[d, d]
-                    place_bar[2] += focal / place[2] * ratios[d] * jacobian_bar[d, 2]
+                    focal = camera[d] / position[2]
+                    ratio = position[d] / position[2]
+                    position_bar[d] = focal * centre_bar[d]
+                    position_bar[2] -= focal * centre_bar[d] * ratio
+                    position_bar[2] -= focal / position[2] * jacobian_bar[d, d]
+                    position_bar[2] += focal / position[2] * ratios[d] * jacobian_bar[d, 2]
                     if ratios[d] == ratio:
-                        ratio_bar = -focal / place[2] * jacobian_bar[d, 2]
-                        place_bar[d] += ratio_bar
-                        place_bar[2] -= ratio_bar * ratio
-                mean_bar += wp.transpose(rotation) * place_bar
+                        ratio_bar = -focal / position[2] * jacobian_bar[d, 2]
+                        position_bar[d] += ratio_bar
+                        position_bar[2] -= ratio_bar * ratio
+                mean_bar += wp.transpose(rotation) * position_bar
 
                 if colours.shape[1] <= wp.static(CHANNELS):
                     for c in range(wp.static(CHANNELS)):
                         colour_bar[c] += pull[6 + c]
                 else:
-                    seen_bar = triple()
+                    seen_colour_bar = triple()
                     for c in range(3):
                         if footprint[6 + c] > scalar(0.0):
-                            seen_bar[c] = pull[6 + c]
+                            seen_colour_bar[c] = pull[6 + c]
                     way = outlook(motion, mean)
                     direction = wp.normalize(way)
-                    harmonics_bar += wp.outer(harmonic_basis(direction), seen_bar)
-                    basis_bar = harmonics_at(colours, i) * seen_bar
+                    harmonics_bar += wp.outer(harmonic_basis(direction), seen_colour_bar)
+                    basis_bar = harmonics_at(colours, i) * seen_colour_bar
                     factor = scalar(HARMONIC_1) / wp.length(way)
                     way_bar = factor * triple(-basis_bar[3], -basis_bar[1], basis_bar[2])
                     mean_bar += way_bar - wp.dot(way_bar, direction) * direction

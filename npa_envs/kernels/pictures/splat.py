@@ -7,8 +7,10 @@ the picture. They are products of a row's weight and a column's.
 On CUDA n threads gather a tile of pixels: each sums every n-th particle around the tile, and gets a
 row of the sums. Particles are sorted by cells, the tiles that contain their patch's centre, with an
 origin r pixels before the picture: the particles that cover tiles along a row of cells are then one
-contiguous run. Small worlds are sorted by `kernels/cuda/splat_sort.py`. On a CPU a thread draws a
+contiguous run. Small worlds are sorted by `kernels/cuda/sort.py`. On a CPU a thread draws a
 world, particle by particle. Either way the order of a pixel's sum depends only on its own world.
+
+Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
 """
 
 import math
@@ -28,7 +30,7 @@ from npa_envs.kernels.primitives import (
     make_lane_collect,
     make_lane_sum,
     make_wide_load,
-    make_wide_store,
+    wide_store,
 )
 from npa_envs.thread_lock import cached_under_lock
 
@@ -145,7 +147,7 @@ def splat_functions(scalar: type) -> SimpleNamespace:
         return fast_exp2(offset * (slope - falloff * offset))
 
     @wp.func
-    def pixel_place(view: View, position: vector, mean: vector, goal: wp.array[vector]):
+    def pixel_position(view: View, position: vector, mean: vector, goal: wp.array[vector]):
         """Return a particle's position in pixels; if there is a goal, its world's mean is there."""
         moved = position
         if goal.shape[0] > 0:
@@ -156,8 +158,8 @@ def splat_functions(scalar: type) -> SimpleNamespace:
         )
 
     @wp.func
-    def patch_centre(place: vector):
-        return vector(wp.floor(place[0] + scalar(0.5)), wp.floor(place[1] + scalar(0.5)))
+    def patch_centre(position: vector):
+        return vector(wp.floor(position[0] + scalar(0.5)), wp.floor(position[1] + scalar(0.5)))
 
     @wp.func
     def visible(view: View, centre: vector):
@@ -177,10 +179,12 @@ def splat_functions(scalar: type) -> SimpleNamespace:
         return cell
 
     @wp.func
-    def footprint_of(view: View, place: vector, i: int, states: wp.array2d[scalar], shift: scalar):
+    def footprint_of(
+        view: View, position: vector, i: int, states: wp.array2d[scalar], shift: scalar
+    ):
         """Return a particle's footprint, with its last three states plus a shift as colours."""
-        centre = patch_centre(place)
-        near = centre - place
+        centre = patch_centre(position)
+        near = centre - position
         slope = scalar(-2.0) * view.falloff * near
         sums = vector()
         for o in range(-view.radius, view.radius + 1):
@@ -200,7 +204,7 @@ def splat_functions(scalar: type) -> SimpleNamespace:
     def footprint_colours(footprint: footprint_type):
         return colour_type(footprint[4], footprint[5], footprint[6], footprint[7])
 
-    functions = [patch_weight, pixel_place, patch_centre]
+    functions = [patch_weight, pixel_position, patch_centre]
     functions += [visible, cell_of_centre, footprint_of, footprint_colours]
     return named(*functions)
 
@@ -209,10 +213,9 @@ def splat_functions(scalar: type) -> SimpleNamespace:
 def gather_functions(scalar: type, lanes: int) -> SimpleNamespace:
     """Return functions that sum a tile's particles; `lanes`: 1, or a thread per pixel row."""
     assert lanes in (1, TILE_HEIGHT)
-    types, functions = splat_types(scalar), splat_functions(scalar)
+    types, splat = splat_types(scalar), splat_functions(scalar)
     View, footprint_type, tile_type = types.View, types.footprint, types.tile
     columns_type, rows_type, weights_type = types.columns, types.rows, types.weights
-    patch_weight, footprint_colours = functions.patch_weight, functions.footprint_colours
     runs_type = wp.types.vector(RUNS, wp.int32)
     load_footprint = make_wide_load(footprint_type)
     kept = make_kept(scalar)
@@ -248,7 +251,7 @@ def gather_functions(scalar: type, lanes: int) -> SimpleNamespace:
         down = rows_type()
         for r in range(wp.static(TILE_HEIGHT)):
             down[r] = kept(scalar(tile_row * wp.static(TILE_HEIGHT) + (r ^ lane)))
-        reach = scalar(view.radius) + scalar(0.5)
+        patch_half = scalar(view.radius) + scalar(0.5)
         totals = tile_type()
         base = world * view.cell_count + tile_row * view.cell_columns + tile_column
         for first_row in range(0, view.cells_down, wp.static(RUNS)):
@@ -276,19 +279,19 @@ def gather_functions(scalar: type, lanes: int) -> SimpleNamespace:
                 columns = columns_type()
                 for c in range(wp.static(TILE_WIDTH)):
                     offset = across[c] - footprint[2]
-                    weight = patch_weight(view.falloff, slope_x, offset)
-                    columns[c] = wp.where(wp.abs(offset) < reach, weight, scalar(0.0))
+                    weight = splat.patch_weight(view.falloff, slope_x, offset)
+                    columns[c] = wp.where(wp.abs(offset) < patch_half, weight, scalar(0.0))
                 rows = rows_type()
                 for r in range(wp.static(TILE_HEIGHT)):
                     offset = down[r] - footprint[3]
-                    weight = patch_weight(view.falloff, slope_y, offset)
-                    rows[r] = wp.where(wp.abs(offset) < reach, weight, scalar(0.0))
+                    weight = splat.patch_weight(view.falloff, slope_y, offset)
+                    rows[r] = wp.where(wp.abs(offset) < patch_half, weight, scalar(0.0))
                 weights = weights_type()
                 for k in range(wp.static(TILE_WIDTH * TILE_HEIGHT)):
                     weights[k] = (
                         rows[k / wp.static(TILE_WIDTH)] * columns[k % wp.static(TILE_WIDTH)]
                     )
-                totals += wp.outer(footprint_colours(footprint), weights)
+                totals += wp.outer(splat.footprint_colours(footprint), weights)
         return collect(totals)
 
     return SimpleNamespace(candidate_count=candidate_count, gather_tile=gather_tile)
@@ -304,25 +307,19 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
     lane_pixels = TILE_WIDTH * TILE_HEIGHT // lanes
     module = native.module(f"npa_envs.kernels.splat_{scalar_name(scalar)}_l{lanes}")
     load_footprint = make_wide_load(footprint_type)
-    store_footprint = make_wide_store(footprint_type)
     load_colour = make_wide_load(colour_type)
-    store_colour = make_wide_store(colour_type)
     lane_sum = make_lane_sum(pulls_type, lanes)
-    functions = splat_functions(scalar)
-    patch_weight, footprint_colours = functions.patch_weight, functions.footprint_colours
-    patch_centre, visible = functions.patch_centre, functions.visible
-    cell_of_centre, footprint_of = functions.cell_of_centre, functions.footprint_of
-    pixel_place = functions.pixel_place
+    splat = splat_functions(scalar)
     gather_tile = gather_functions(scalar, lanes).gather_tile
 
     @wp.func
-    def place_in_world(
+    def position_in_world(
         view: View, position: vector, means: wp.array[vector], goal: wp.array[vector], world: int
     ):
         mean = vector()
         if goal.shape[0] > 0:
             mean = means[world]
-        return pixel_place(view, position, mean, goal)
+        return splat.pixel_position(view, position, mean, goal)
 
     @wp.kernel(enable_backward=False, module=module)
     def count_splats(
@@ -341,8 +338,8 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         await_earlier()
         i = wp.tid()
         world = i / particle_count
-        place = place_in_world(view, positions[i], means, goal, world)
-        index = world * view.cell_count + cell_of_centre(view, patch_centre(place))
+        position = position_in_world(view, positions[i], means, goal, world)
+        index = world * view.cell_count + splat.cell_of_centre(view, splat.patch_centre(position))
         cell[i] = index
         arrival[i] = wp.atomic_add(counts, index + 1, 1)
 
@@ -381,8 +378,8 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         i = arrived[k]
         c = cell[i]
         world = i / particle_count
-        place = place_in_world(view, positions[i], means, goal, world)
-        footprint = footprint_of(view, place, i, states, shift)
+        position = position_in_world(view, positions[i], means, goal, world)
+        footprint = splat.footprint_of(view, position, i, states, shift)
         begin = starts[c]
         target = k
         # Invisible particles, which may be many, can have any order.
@@ -391,7 +388,7 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
             for other in range(begin, starts[c + 1]):
                 if arrived[other] < i:
                     target += 1
-        store_footprint(footprints, target, footprint)
+        wide_store(footprints, target, footprint)
         source[target] = i
 
     @wp.func
@@ -435,7 +432,7 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
                 pixel = pixel_of(view, row, column, lane * wp.static(lane_pixels) + k)
                 if pixel >= 0:
                     value = colour_type(values[0, k], values[1, k], values[2, k], values[3, k])
-                    store_colour(picture, begin + pixel, value)
+                    wide_store(picture, begin + pixel, value)
 
     @in_ranges(WORLDS)
     @wp.kernel(enable_backward=False, module=module)
@@ -458,11 +455,11 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         """Draw a world, particle after particle; for devices with few threads."""
         world = range_start + wp.tid()
         for i in range(world * particle_count, (world + 1) * particle_count):
-            place = place_in_world(view, positions[i], means, goal, world)
-            footprint = footprint_of(view, place, i, states, shift)
+            position = position_in_world(view, positions[i], means, goal, world)
+            footprint = splat.footprint_of(view, position, i, states, shift)
             footprints[i] = footprint
             source[i] = i
-            if visible(view, patch_centre(place)):
+            if splat.visible(view, splat.patch_centre(position)):
                 column = wp.int32(footprint[2])
                 row = wp.int32(footprint[3])
                 left = wp.max(column - view.radius, 0)
@@ -470,12 +467,12 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
                 slope_x = scalar(-2.0) * view.falloff * footprint[0]
                 slope_y = scalar(-2.0) * view.falloff * footprint[1]
                 for q in range(left, right):
-                    weight = patch_weight(view.falloff, slope_x, scalar(q - column))
+                    weight = splat.patch_weight(view.falloff, slope_x, scalar(q - column))
                     scratch[world, q - left] = weight
-                colours = footprint_colours(footprint)
+                colours = splat.footprint_colours(footprint)
                 low = wp.max(row - view.radius, 0)
                 for p in range(low, wp.min(row + view.radius, view.resolution - 1) + 1):
-                    along = patch_weight(view.falloff, slope_y, scalar(p - row)) * colours
+                    along = splat.patch_weight(view.falloff, slope_y, scalar(p - row)) * colours
                     for q in range(left, right):
                         drawn = picture[world, p, q]
                         picture[world, p, q] = drawn + scratch[world, q - left] * along
@@ -498,11 +495,11 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         k += range_start
         world = k / particle_count
         footprint = load_footprint(footprints, k)
-        colours = footprint_colours(footprint)
+        colours = splat.footprint_colours(footprint)
         centre = vector(footprint[2], footprint[3])
         near = vector(footprint[0], footprint[1])
         slope = scalar(-2.0) * view.falloff * near
-        is_drawn = visible(view, centre)
+        is_drawn = splat.visible(view, centre)
         pulls = pulls_type()
         if is_drawn:
             column = wp.int32(centre[0])
@@ -518,11 +515,11 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
                 pull = scalar(0.0)
                 for q in range(left, right):
                     away_x = near[0] + scalar(q - column)
-                    weight = patch_weight(view.falloff, slope[0], scalar(q - column))
+                    weight = splat.patch_weight(view.falloff, slope[0], scalar(q - column))
                     bar = weight * load_colour(picture_bar, begin + q)
                     along += bar
                     pull += wp.dot(bar, colours) * away_x
-                weight = patch_weight(view.falloff, slope[1], scalar(p - row))
+                weight = splat.patch_weight(view.falloff, slope[1], scalar(p - row))
                 for c in range(wp.static(CHANNELS)):
                     pulls[c] += weight * along[c]
                 pulls[4] += weight * pull
@@ -537,7 +534,7 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
                 moments = vector()
                 for o in range(-view.radius, view.radius + 1):
                     for d in range(2):
-                        weight = patch_weight(view.falloff, slope[d], scalar(o))
+                        weight = splat.patch_weight(view.falloff, slope[d], scalar(o))
                         sums[d] += weight
                         moments[d] += weight * (near[d] + scalar(o))
                 for c in range(wp.static(CHANNELS)):

@@ -22,7 +22,7 @@ def draw_triangles(
     range_start: int,
     width: int,
     height: int,
-    place: wp.array2d[wp.vec2d],
+    positions: wp.array2d[wp.vec2d],
     nearness: wp.array2d[wp.float64],
     colours: wp.array[wp.vec3d],
     faces: wp.array[wp.vec3i],
@@ -38,9 +38,9 @@ def draw_triangles(
         if visible[camera, face] == wp.uint8(0):
             continue
         corners = faces[face]
-        a = place[camera, corners[0]]
-        b = place[camera, corners[1]]
-        c = place[camera, corners[2]]
+        a = positions[camera, corners[0]]
+        b = positions[camera, corners[1]]
+        c = positions[camera, corners[2]]
         area = twice_area(a, b, c)
         if area == zero:
             continue

@@ -1,9 +1,10 @@
 """Hand-written adjoints of the perception pass, gathered: no float atomics, a fixed order of sums.
 
 Notation: centre i perceives neighbour j at r = x_j - x_i, with smoothing W_ij, spiky gradient
-K_ij = f r and volume v_j = 1 / ρ_j. A bar marks a cotangent: b̄_i of centre i's smoothed state,
-Ḡ_i of its state gradient before the correction, q̄_i of its density gradient, z̄_i of its own state
-in the perception vector. The moment correction is a stopped gradient, so it has no adjoint.
+K_ij = f r and volume v_j = 1 / ρ_j. x̄ (`x_bar`) = dL/dx, the gradient of the loss L: b̄_i by centre
+i's smoothed state, Ḡ_i by its state gradient before the correction, q̄_i by its density gradient,
+z̄_i by its own state in the perception vector. The moment correction is a stopped gradient, so it
+has no adjoint.
 
 State:     s̄_k = z̄_k + v_k Σ_i (W_ik b̄_i + Ḡ_i K_ik) - Ḡ_k Σ_j v_j K_kj
 Density:   ρ̄_k = -v_k² v̄_k,  v̄_k = Σ_i (W_ik s_k · b̄_i + (s_k - s_i) · Ḡ_i K_ik)
@@ -41,20 +42,15 @@ def adjoint_kernels(
     listed: bool = False,
 ) -> SimpleNamespace:
     """Return the kernels of one variant; arguments as for `perception_kernels`."""
-    types = domain_types(space_dim, scalar)
-    vector, particle, Domain = types.vector, types.particle, types.Domain
-    cell_of, segment_count = types.cell_of, types.segment_count
-    segment_cells = types.segment_cells
-    minimum_image, position_of = types.minimum_image, types.position_of
+    space = domain_types(space_dim, scalar)
+    vector, particle, Domain = space.vector, space.particle, space.Domain
     group = wp.types.vector(width, scalar)
     group_gradient = wp.types.matrix((space_dim, width), scalar)
     topic = "adjoint" if state_gradient else "smoothing_adjoint"
-    topic = "listed_by_place_" * listed + "unfiltered_" * (not on_cpu) + topic
+    topic = "listed_per_particle_" * listed + "unfiltered_" * (not on_cpu) + topic
     module = kernel_module(topic, space_dim, scalar, width)
     cell_vector = wp.types.vector(space_dim, wp.int32)
     search = make_search(space_dim, scalar, vector, on_cpu, listed)
-    run_count, run = search.run_count, search.run
-    filter_near = search.filter_near
     indices = wp.types.vector(search.stride, wp.int32)
     add_scaled = make_add_scaled(group)
     load_group = make_wide_load(group)
@@ -128,7 +124,7 @@ def adjoint_kernels(
         row_capacity: int,
     ):
         """Return first and last + 1 row of a run around particle k, or entry of its list."""
-        begin, end = run(domain, starts, ends, base, cell, k, r)
+        begin, end = search.run(domain, starts, ends, base, cell, k, r)
         if wp.static(not listed):
             begin -= row_base
             end = wp.min(end - row_base, row_capacity)
@@ -153,7 +149,9 @@ def adjoint_kernels(
                 near[count] = row
                 count += wp.where(row >= 0, 1, 0)
         else:
-            near, count = filter_near(domain, row_positions, neighbours, position, first, end)
+            near, count = search.filter_near(
+                domain, row_positions, neighbours, position, first, end
+            )
         return near, count
 
     @in_ranges(PAIRS)
@@ -189,11 +187,11 @@ def adjoint_kernels(
         k, g = wp.tid()
         k += range_start
         entry = particles[k]
-        position = position_of(entry)
+        position = space.position_of(entry)
         total = group()
         base = active_offset + (k / particle_count) * domain.cell_count
-        cell = cell_of(domain, position)
-        for r in range(run_count(domain, cell)):
+        cell = space.cell_of(domain, position)
+        for r in range(search.run_count(domain, cell)):
             begin, end = run_of_rows(domain, starts, ends, base, cell, k, r, row_base, row_capacity)
             for first in range(begin, end, wp.static(search.stride)):
                 near, count = filter_rows(
@@ -201,7 +199,7 @@ def adjoint_kernels(
                 )
                 for n in range(count):
                     row = near[n]
-                    offset = minimum_image(domain, position - row_positions[row])
+                    offset = space.minimum_image(domain, position - row_positions[row])
                     squared = wp.dot(offset, offset)
                     weight = smoothing(squared, domain.inverse_squared_eps, domain.smoothing_norm)
                     blur = load_group(blur_bar, row * group_count + g)
@@ -249,15 +247,15 @@ def adjoint_kernels(
         """Write the cotangent of every particle's density, through its volume."""
         k = range_start + wp.tid()
         entry = particles[k]
-        position = position_of(entry)
+        position = space.position_of(entry)
         volume = entry[wp.static(space_dim)]
         volume_bar = scalar(0.0)
         base = (k / particle_count) * domain.cell_count
-        cell = cell_of(domain, position)
-        for segment in range(segment_count(domain, cell)):
-            first, last = segment_cells(domain, cell, segment)
+        cell = space.cell_of(domain, position)
+        for segment in range(space.segment_count(domain, cell)):
+            first, last = space.segment_cells(domain, cell, segment)
             for j in range(starts[base + first], starts[base + last]):
-                offset = minimum_image(domain, position - position_of(particles[j]))
+                offset = space.minimum_image(domain, position - space.position_of(particles[j]))
                 squared = wp.dot(offset, offset)
                 row = row_of[source[j]]
                 if squared < domain.squared_eps and row >= 0:
@@ -315,17 +313,17 @@ def adjoint_kernels(
         """Write the cotangent of every position: as a neighbour of others, and as a centre."""
         k = range_start + wp.tid()
         entry = particles[k]
-        position = position_of(entry)
+        position = space.position_of(entry)
         volume = entry[wp.static(space_dim)]
         own_row = row_of[source[k]]
         pull = vector()
         base = (k / particle_count) * domain.cell_count
-        cell = cell_of(domain, position)
-        for segment in range(segment_count(domain, cell)):
-            first, last = segment_cells(domain, cell, segment)
+        cell = space.cell_of(domain, position)
+        for segment in range(space.segment_count(domain, cell)):
+            first, last = space.segment_cells(domain, cell, segment)
             for j in range(starts[base + first], starts[base + last]):
                 other = particles[j]
-                offset = minimum_image(domain, position - position_of(other))
+                offset = space.minimum_image(domain, position - space.position_of(other))
                 squared = wp.dot(offset, offset)
                 if squared < domain.squared_eps and j != k:
                     other_volume = other[wp.static(space_dim)]

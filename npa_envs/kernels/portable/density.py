@@ -1,4 +1,4 @@
-"""Density, volumes, density gradients and neighbour lists of sorted particles.
+"""Density, volumes, density gradients and neighbour lists of sorted particles; fields of species.
 
 Sums run over sorted particles, one contiguous run of cells after the other.
 
@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from npa_envs.kernels.domain import TERMS_PER_SUM, domain_types, kernel_module
-from npa_envs.kernels.mathematics import smoothing, spiky_factor_f64
+from npa_envs.kernels.mathematics import log_scaled, smoothing, spiky_factor, spiky_factor_f64
 from npa_envs.kernels.native_functions import PAIRS, in_ranges, named
 from npa_envs.kernels.portable.search import make_search
 from npa_envs.thread_lock import cached_under_lock
@@ -19,14 +19,10 @@ from npa_envs.thread_lock import cached_under_lock
 @cached_under_lock()
 def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespace:
     """Return the kernels of one variant: one thread a particle."""
-    types = domain_types(space_dim, scalar)
-    vector, particle, Domain = types.vector, types.particle, types.Domain
-    cell_of, segment_count = types.cell_of, types.segment_count
-    segment_cells = types.segment_cells
-    minimum_image, position_of = types.minimum_image, types.position_of
+    space = domain_types(space_dim, scalar)
+    vector, particle, Domain = space.vector, space.particle, space.Domain
     vector_f64 = wp.types.vector(space_dim, wp.float64)
     search = make_search(space_dim, scalar, particle, on_cpu)
-    run_count, run, filter_near = search.run_count, search.run, search.filter_near
     module = kernel_module("density" if on_cpu else "unfiltered_density", space_dim, scalar)
 
     @wp.func
@@ -74,19 +70,19 @@ def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespa
         if density_gradient != 0:
             row = row_of[source[k]]
         base = (k / particle_count) * domain.cell_count
-        cell = cell_of(domain, position)
+        cell = space.cell_of(domain, position)
         density = scalar(0.0)
         earlier = scalar(0.0)
         counted = wp.int32(0)
         gradient = vector_f64()
-        for segment in range(segment_count(domain, cell)):
-            first, last = segment_cells(domain, cell, segment)
+        for segment in range(space.segment_count(domain, cell)):
+            first, last = space.segment_cells(domain, cell, segment)
             end = starts[base + last]
             for block in range(starts[base + first], end, wp.static(TERMS_PER_SUM)):
                 stop = wp.min(block + wp.static(TERMS_PER_SUM), end)
                 for j in range(block, stop):
                     neighbour = sorted_positions[j]
-                    offset = minimum_image(domain, neighbour - position)
+                    offset = space.minimum_image(domain, neighbour - position)
                     squared = wp.dot(offset, offset)
                     is_near = squared < domain.squared_eps and j != k
                     weight = smoothing(squared, domain.inverse_squared_eps, domain.smoothing_norm)
@@ -125,21 +121,101 @@ def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespa
         Unless `neighbours` is empty, also write them, after those of the particle before.
         """
         k = range_start + wp.tid()
-        position = position_of(particles[k])
+        position = space.position_of(particles[k])
         base = (k / particle_count) * domain.cell_count
-        cell = cell_of(domain, position)
+        cell = space.cell_of(domain, position)
         begin = wp.int32(0)
         if k > 0 and neighbours.shape[0] > 0:
             begin = ends[k - 1]
-        place = begin
-        for r in range(run_count(domain, cell)):
-            first, end = run(domain, starts, neighbours, base, cell, k, r)
+        next_entry = begin
+        for r in range(search.run_count(domain, cell)):
+            first, end = search.run(domain, starts, neighbours, base, cell, k, r)
             for candidate in range(first, end, wp.static(search.stride)):
-                near, count = filter_near(domain, particles, neighbours, position, candidate, end)
+                near, count = search.filter_near(
+                    domain, particles, neighbours, position, candidate, end
+                )
                 if neighbours.shape[0] > 0:
                     for n in range(count):
-                        neighbours[place + n] = near[n]
-                place += count
-        counts[k] = place - begin
+                        neighbours[next_entry + n] = near[n]
+                next_entry += count
+        counts[k] = next_entry - begin
 
     return named(compute_density, list_neighbours)
+
+
+@cached_under_lock()
+def species_kernel(space_dim: int, scalar: type, species_count: int) -> wp.Kernel:
+    """Return the kernel of each species' density and density gradient at every particle.
+
+    A thread runs through a particle's neighbourhood once, for all species. Sums are in float64:
+    gradients cancel almost fully where particles are dense.
+    """
+    space = domain_types(space_dim, scalar)
+    vector, Domain = space.vector, space.Domain
+    vector_f64 = wp.types.vector(space_dim, wp.float64)
+    densities_type = wp.types.vector(species_count, wp.float64)
+    gradients_type = wp.types.matrix((species_count, space_dim), wp.float64)
+    module = kernel_module(f"species_{species_count}", space_dim, scalar)
+
+    @in_ranges(PAIRS)
+    @wp.kernel(enable_backward=False, module=module)
+    def gather_species(
+        range_start: int,
+        domain: Domain,
+        particle_count: int,
+        density_scale: wp.float64,
+        gradient_scale: wp.float64,
+        logarithmic: int,
+        starts: wp.array[wp.int32],
+        source: wp.array[wp.int32],
+        sorted_species: wp.array[wp.int32],
+        sorted_positions: wp.array[vector],
+        # outputs
+        density: wp.array2d[scalar],
+        gradient: wp.array3d[scalar],
+    ):
+        """Write each particle's scaled densities and density gradients, in the caller's order."""
+        k = wp.tid()
+        k += range_start
+        position = sorted_positions[k]
+        base = (k / particle_count) * domain.cell_count
+        cell = space.cell_of(domain, position)
+        densities = densities_type()
+        gradients = gradients_type()
+        for segment in range(space.segment_count(domain, cell)):
+            first, last = space.segment_cells(domain, cell, segment)
+            for j in range(starts[base + first], starts[base + last]):
+                neighbour = sorted_positions[j]
+                offset = space.minimum_image(domain, neighbour - position)
+                squared = wp.dot(offset, offset)
+                if squared < domain.squared_eps and j != k:
+                    species = sorted_species[j]
+                    weight = smoothing(squared, domain.inverse_squared_eps, domain.smoothing_norm)
+                    densities[species] += wp.float64(weight)
+                    away = vector_f64()
+                    for d in range(wp.static(space_dim)):
+                        away[d] = wp.float64(neighbour[d]) - wp.float64(position[d])
+                        if domain.periodic != 0:
+                            images = wp.round((neighbour[d] - position[d]) * domain.inverse_box[d])
+                            away[d] -= wp.float64(images) * wp.float64(domain.box[d])
+                    factor = spiky_factor(
+                        wp.length(away),
+                        wp.float64(domain.inverse_eps),
+                        wp.float64(domain.spiky_norm),
+                    )
+                    for d in range(wp.static(space_dim)):
+                        gradients[species, d] += factor * away[d]
+        # A particle always counts itself.
+        densities[sorted_species[k]] += wp.float64(domain.smoothing_norm)
+        i = source[k]
+        for q in range(wp.static(species_count)):
+            density[i, q] = scalar(density_scale * densities[q])
+            sum = vector_f64()
+            for d in range(wp.static(space_dim)):
+                sum[d] = gradient_scale * gradients[q, d]
+            if logarithmic != 0:
+                sum = log_scaled(sum)
+            for d in range(wp.static(space_dim)):
+                gradient[i, q, d] = scalar(sum[d])
+
+    return gather_species

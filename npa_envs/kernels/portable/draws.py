@@ -108,15 +108,15 @@ def draw_kernel(distribution: str, value_type: type) -> tuple[wp.Kernel, int]:
         for pair in range(wp.static(count // 2)):
             # The logarithm's argument lies in (0, 1], so the radius is finite.
             amount = wp.float64(0.0)
-            turn = wp.float64(0.0)
+            fraction = wp.float64(0.0)
             if wp.static(from_one_word):
                 amount = (wp.float64(w[2 * pair]) + wp.float64(1.0)) * ULP_32
-                turn = wp.float64(w[2 * pair + 1]) * ULP_32
+                fraction = wp.float64(w[2 * pair + 1]) * ULP_32
             else:
                 amount = fraction_53(w[0], w[1]) + ULP_53
-                turn = fraction_53(w[2], w[3])
+                fraction = fraction_53(w[2], w[3])
             radius = wp.sqrt(wp.float64(-2.0) * wp.log(amount))
-            angle = TWO_PI * turn
+            angle = TWO_PI * fraction
             result[2 * pair] = value_type(radius * wp.cos(angle))
             result[2 * pair + 1] = value_type(radius * wp.sin(angle))
         return result

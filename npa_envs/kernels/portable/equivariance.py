@@ -1,6 +1,8 @@
 """Vectors of equivariant rules: mixed vectors, rotation-invariant products, steering.
 
 `npa_envs/ops/equivariance.py` has the formulas. A thread computes a few numbers of a row.
+
+Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
 """
 
 from types import SimpleNamespace
@@ -31,7 +33,7 @@ def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         return result
 
     @wp.func
-    def place_of(a: int, b: int, first: int, count: int):
+    def pair_index(a: int, b: int, first: int, count: int):
         """Return the index of the pair (a, b), b >= a + first, among pairs of `count` vectors."""
         return a * (count - first) - a * (a - 1) / 2 + b - a - first
 
@@ -82,9 +84,9 @@ def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         end = scalars + count * (count + 1) / 2
         for a in range(b + 1):
             other = mixed[row, a]
-            inputs[row, scalars + place_of(a, b, 0, count)] = wp.dot(other, u)
+            inputs[row, scalars + pair_index(a, b, 0, count)] = wp.dot(other, u)
             if chiral != 0 and a < b:
-                inputs[row, end + place_of(a, b, 1, count)] = wp.dot(turned(other), u)
+                inputs[row, end + pair_index(a, b, 1, count)] = wp.dot(turned(other), u)
         if chiral != 0:
             end += count * (count - 1) / 2
         if b == 0:
@@ -113,12 +115,12 @@ def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         total = mixed_bar[row, a]
         for b in range(count):
             other = mixed[row, b]
-            bar = inputs_bar[row, scalars + place_of(wp.min(a, b), wp.max(a, b), 0, count)]
+            bar = inputs_bar[row, scalars + pair_index(wp.min(a, b), wp.max(a, b), 0, count)]
             if a == b:
                 bar += bar
             total += bar * other
             if chiral != 0 and a != b:
-                cross = crosses + place_of(wp.min(a, b), wp.max(a, b), 1, count)
+                cross = crosses + pair_index(wp.min(a, b), wp.max(a, b), 1, count)
                 bar = inputs_bar[row, cross]
                 if a < b:
                     bar = -bar
@@ -228,9 +230,9 @@ def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
                     total -= other * signs[count + column] * turned(pull)
                 mixed_bar[row, column] = total
         else:
-            place = column - gate_count + wp.static(space_dim)
-            if place < update_bar.shape[1]:
-                value = update_bar[row, place]
+            update_column = column - gate_count + wp.static(space_dim)
+            if update_column < update_bar.shape[1]:
+                value = update_bar[row, update_column]
         output_bar[row, column] = value
 
     return named(

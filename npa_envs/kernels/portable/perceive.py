@@ -43,18 +43,16 @@ def perception_kernels(
     the sums that only these need.
     """
     moment_correction = moment_inverse is not None
-    types = domain_types(space_dim, scalar)
-    vector, particle, Domain = types.vector, types.particle, types.Domain
-    cell_of, minimum_image, position_of = types.cell_of, types.minimum_image, types.position_of
+    space = domain_types(space_dim, scalar)
+    vector, particle, Domain = space.vector, space.particle, space.Domain
     vector_f64 = wp.types.vector(space_dim, wp.float64)
     group = wp.types.vector(width, scalar)
     group_gradient = wp.types.matrix((space_dim, width), scalar)
     square = wp.types.matrix((space_dim, space_dim), scalar)
-    topic = "listed_by_place_" * listed + "unfiltered_" * (not on_cpu)
+    topic = "listed_per_particle_" * listed + "unfiltered_" * (not on_cpu)
     topic += perception_topic(state_gradient, moment_inverse)
     module = kernel_module(topic, space_dim, scalar, width)
     search = make_search(space_dim, scalar, particle, on_cpu, listed)
-    run_count, run, filter_near = search.run_count, search.run, search.filter_near
     add_scaled = make_add_scaled(group)
     load_group = make_wide_load(group)
     corrected = make_corrected(space_dim, scalar, width, moment_inverse)
@@ -73,22 +71,24 @@ def perception_kernels(
         group_count: int,
     ):
         """Return the smoothed state, the state gradient, the sum of v K and the moment matrix."""
-        position = position_of(particles[k])
+        position = space.position_of(particles[k])
         own = load_group(states, k * group_count + g)
         blur = group()
         gradient = group_gradient()
         kernel_sum = vector()
         moment = square()
         base = (k / particle_count) * domain.cell_count
-        cell = cell_of(domain, position)
-        for r in range(run_count(domain, cell)):
-            begin, end = run(domain, starts, ends, base, cell, k, r)
+        cell = space.cell_of(domain, position)
+        for r in range(search.run_count(domain, cell)):
+            begin, end = search.run(domain, starts, ends, base, cell, k, r)
             for first in range(begin, end, wp.static(search.stride)):
-                near, count = filter_near(domain, particles, neighbours, position, first, end)
+                near, count = search.filter_near(
+                    domain, particles, neighbours, position, first, end
+                )
                 for n in range(count):
                     j = near[n]
                     entry = particles[j]
-                    offset = minimum_image(domain, position_of(entry) - position)
+                    offset = space.minimum_image(domain, space.position_of(entry) - position)
                     squared = wp.dot(offset, offset)
                     volume = entry[wp.static(space_dim)]
                     state = load_group(states, j * group_count + g)
@@ -132,7 +132,7 @@ def perception_kernels(
         particles: wp.array[particle],
         states: wp.array[group],
         flat_states: wp.array2d[scalar],
-        row_place: wp.array[wp.int32],
+        row_index: wp.array[wp.int32],
         row_destination: wp.array[wp.int32],
         density_gradients: wp.array[vector_f64],
         # outputs
@@ -152,8 +152,8 @@ def perception_kernels(
                 perception[row, column] = scalar(0.0)
             return
         k = row
-        if row_place.shape[0] > 0:
-            k = row_place[row]
+        if row_index.shape[0] > 0:
+            k = row_index[row]
         to = row
         if row_destination.shape[0] > 0:
             to = row_destination[row]
@@ -172,9 +172,9 @@ def perception_kernels(
                     for d in range(wp.static(space_dim)):
                         along[d] = gradient_scale * gradient[d, c]
                     along = log_scaled(along)
-                    place = 2 * state_dim + channel * wp.static(space_dim)
+                    first_column = 2 * state_dim + channel * wp.static(space_dim)
                     for d in range(wp.static(space_dim)):
-                        perception[to, place + d] = clipped(along[d], limit)
+                        perception[to, first_column + d] = clipped(along[d], limit)
         if g == 0:
             if row_kernel_sum.shape[0] > 0:
                 row_kernel_sum[row] = kernel_sum

@@ -27,7 +27,7 @@ def update_episodes(
     first_loss: wp.array[wp.float32],
     success_loss: wp.array[wp.float32],
     broken: wp.array[wp.uint8],
-    # changed in place
+    # changed in index
     elapsed: wp.array[wp.int32],
     numbers: wp.array[wp.float32],
     flags: wp.array[wp.uint8],
@@ -78,10 +78,10 @@ def update_episodes(
     numbers[world] = reward
     numbers[count + world] = loss
     for k in range(part_count):
-        place = (2 + k) * count + world
+        index = (2 + k) * count + world
         part = parts[k * count + world]
-        numbers[place + part_count * count] = numbers[place] - part
-        numbers[place] = part
+        numbers[index + part_count * count] = numbers[index] - part
+        numbers[index] = part
     flags[world] = wp.uint8(ended)
     flags[count + world] = wp.uint8(truncated)
     flags[2 * count + world] = wp.uint8(success)

@@ -32,9 +32,8 @@ def make_search(
 
     `listed`: `neighbours` holds the neighbours of each particle, up to its `ends`.
     """
-    types = domain_types(space_dim, scalar)
-    vector, Domain, minimum_image = types.vector, types.Domain, types.minimum_image
-    segment_count, segment_cells = types.segment_count, types.segment_cells
+    space = domain_types(space_dim, scalar)
+    vector, Domain = space.vector, space.Domain
     cell_vector = wp.types.vector(space_dim, wp.int32)
     stride = FILTER_BLOCK if on_cpu else 1
     indices = wp.types.vector(stride, wp.int32)
@@ -44,7 +43,7 @@ def make_search(
         """Return the number of runs of candidates around a cell."""
         count = wp.int32(1)
         if wp.static(not listed):
-            count = segment_count(domain, cell)
+            count = space.segment_count(domain, cell)
         return count
 
     @wp.func
@@ -66,7 +65,7 @@ def make_search(
                 begin = ends[k - 1]
             end = ends[k]
         else:
-            first, last = segment_cells(domain, cell, r)
+            first, last = space.segment_cells(domain, cell, r)
             begin = starts[base + first]
             end = starts[base + last]
         return begin, end
@@ -77,7 +76,7 @@ def make_search(
         entry = entries[j]
         for d in range(wp.static(space_dim)):
             offset[d] = entry[d] - position[d]
-        offset = minimum_image(domain, offset)
+        offset = space.minimum_image(domain, offset)
         return wp.where(wp.dot(offset, offset) < domain.squared_eps, 1, 0)
 
     @wp.func

@@ -17,19 +17,16 @@ from npa_envs.kernels.primitives import (
     await_earlier,
     load_integer,
     make_read_channels,
-    make_wide_store,
+    wide_store,
 )
 from npa_envs.thread_lock import cached_under_lock
-
-store_pair = make_wide_store(wp.vec2i)
 
 
 @cached_under_lock()
 def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
     """Return the kernels of one variant."""
-    types = domain_types(space_dim, scalar)
-    vector, Domain = types.vector, types.Domain
-    cell_of, cell_index = types.cell_of, types.cell_index
+    space = domain_types(space_dim, scalar)
+    vector, Domain = space.vector, space.Domain
     group = wp.types.vector(width, scalar)
     read_channels = make_read_channels(group)
     module = kernel_module("sort", space_dim, scalar, width)
@@ -50,7 +47,7 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
         await_earlier()
         i = wp.tid()
         index = (i / particle_count) * domain.cell_count
-        index += cell_index(domain, cell_of(domain, positions[i]))
+        index += space.cell_index(domain, space.cell_of(domain, positions[i]))
         cell[i] = index
         arrival[i] = wp.atomic_add(counts, index + 1, 1)
         if mask.shape[0] > 0 and mask[i] != wp.uint8(0):
@@ -75,8 +72,8 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
         if mask.shape[0] == 0 or mask[i] != wp.uint8(0):
             entry += 1
         c = load_integer(cell, i)
-        place = load_integer(starts, c) + load_integer(arrival, i)
-        store_pair(arrived, place, wp.vec2i(entry, c))
+        target = load_integer(starts, c) + load_integer(arrival, i)
+        wide_store(arrived, target, wp.vec2i(entry, c))
 
     @in_ranges(PARTICLES)
     @wp.kernel(enable_backward=False, module=module)
@@ -97,7 +94,7 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
         sorted_cell: wp.array[wp.int32],
         row_of: wp.array[wp.int32],
         row_source: wp.array[wp.int32],
-        row_place: wp.array[wp.int32],
+        row_index: wp.array[wp.int32],
         sorted_positions: wp.array[vector],
         row_positions: wp.array[vector],
         sorted_states: wp.array[group],
@@ -108,31 +105,31 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
         """
         await_earlier()
         k = range_start + wp.tid()
-        own = arrived[k]
-        i = own[0] / 2
-        c = own[1]
-        place = starts[c]
+        entry = arrived[k]
+        i = entry[0] / 2
+        c = entry[1]
+        target = starts[c]
         row = starts[active_offset + c] - row_base
-        for other in range(starts[c], starts[c + 1]):
-            entry = arrived[other][0]
-            if entry < own[0]:
-                place += 1
-                row += entry & 1
-        source[place] = i
-        sorted_cell[place] = c
-        sorted_positions[place] = positions[i]
+        for j in range(starts[c], starts[c + 1]):
+            other = arrived[j][0]
+            if other < entry[0]:
+                target += 1
+                row += other & 1
+        source[target] = i
+        sorted_cell[target] = c
+        sorted_positions[target] = positions[i]
         if row_of.shape[0] > 0:
-            if own[0] & 1 == 0 or row >= row_capacity:
+            if entry[0] & 1 == 0 or row >= row_capacity:
                 row = wp.int32(-1)
             row_of[i] = row
             if row >= 0:
                 row_source[row] = i
-                row_place[row] = place
+                row_index[row] = target
                 row_positions[row] = positions[i]
         if sorted_states.shape[0] > 0:
             for g in range(group_count):
                 state = read_channels(states, state_dim, aligned, i, g * wp.static(width))
-                sorted_states[place * group_count + g] = state
+                sorted_states[target * group_count + g] = state
 
     @in_ranges(WORLDS)
     @wp.kernel(enable_backward=False, module=module)
@@ -156,7 +153,7 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
         sorted_cell: wp.array[wp.int32],
         row_of: wp.array[wp.int32],
         row_source: wp.array[wp.int32],
-        row_place: wp.array[wp.int32],
+        row_index: wp.array[wp.int32],
         sorted_positions: wp.array[vector],
         row_positions: wp.array[vector],
         sorted_states: wp.array[group],
@@ -180,33 +177,33 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
             if masked:
                 starts[active_offset + c] = 0
         for i in range(first, end):
-            c = first_cell + cell_index(domain, cell_of(domain, positions[i]))
+            c = first_cell + space.cell_index(domain, space.cell_of(domain, positions[i]))
             cell[i] = c
             starts[c] = starts[c] + 1
             if masked:
                 starts[active_offset + c] = starts[active_offset + c] + wp.int32(mask[i])
-        place = first
+        target = first
         row = first_row
         for c in range(first_cell, end_cell):
             count = starts[c]
-            starts[c] = place
-            place += count
+            starts[c] = target
+            target += count
             if masked:
                 count = starts[active_offset + c]
                 starts[active_offset + c] = row
                 row += count
         if end == positions.shape[0]:
-            starts[starts.shape[0] - 1] = wp.where(masked, row, place)
+            starts[starts.shape[0] - 1] = wp.where(masked, row, target)
 
         # Each start is increased with every particle placed, up to the next cell's start.
         for i in range(first, end):
             c = cell[i]
-            place = starts[c]
-            starts[c] = place + 1
-            source[place] = i
-            sorted_cell[place] = c
-            sorted_positions[place] = positions[i]
-            row = place
+            target = starts[c]
+            starts[c] = target + 1
+            source[target] = i
+            sorted_cell[target] = c
+            sorted_positions[target] = positions[i]
+            row = target
             if masked:
                 row = starts[active_offset + c] - row_base
                 active = wp.int32(mask[i])
@@ -216,12 +213,12 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
                 row_of[i] = wp.where(row < row_capacity, row, wp.int32(-1))
                 if row < row_capacity:
                     row_source[row] = i
-                    row_place[row] = place
+                    row_index[row] = target
                     row_positions[row] = positions[i]
             if sorted_states.shape[0] > 0:
                 for g in range(group_count):
                     state = read_channels(states, state_dim, aligned, i, g * wp.static(width))
-                    sorted_states[place * group_count + g] = state
+                    sorted_states[target * group_count + g] = state
         for back in range(end_cell - first_cell - 1):
             c = end_cell - 1 - back
             starts[c] = starts[c - 1]

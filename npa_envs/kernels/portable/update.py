@@ -3,6 +3,8 @@
 A displacement is alpha eps delta / (1 + |delta|): it never exceeds alpha eps. Actions are fractions
 of alpha eps.
 Source: arXiv 2601.16096, section 3.
+
+Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
 """
 
 from types import SimpleNamespace
@@ -18,7 +20,7 @@ from npa_envs.kernels.primitives import (
     load_integer,
     make_read_at,
     make_wide_load,
-    make_write_at,
+    write_at,
 )
 from npa_envs.thread_lock import cached_under_lock
 
@@ -31,22 +33,20 @@ UPDATE_ALIGNMENT = {2: 8, 3: 4}
 OPEN, PERIODIC, REFLECTING = range(3)
 """Kinds of boundaries, as kernels read them."""
 
-TEAM = 32
-"""Particles that one warp moves; further warps change their states."""
+MOVED_TOGETHER = 32
+"""Particles whose positions a warp updates; the warps after it update their states."""
 
 
 @cached_under_lock()
 def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
     """Return the kernels of one variant."""
-    types = domain_types(space_dim, scalar)
-    vector = types.vector
+    vector = domain_types(space_dim, scalar).vector
     vector_f64 = wp.types.vector(space_dim, wp.float64)
     channels = wp.types.vector(THREAD_CHANNELS, scalar)
     load_scalar = make_wide_load(scalar)
     read_states = make_read_at(channels, 16)
     read_actions = make_read_at(channels, 8)
     read_change = make_read_at(channels, UPDATE_ALIGNMENT[space_dim])
-    write_channels = make_write_at(channels)
     module = kernel_module("update", space_dim, scalar)
 
     @wp.func
@@ -77,17 +77,38 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
     def clipped(value: scalar, limit: scalar):
         """Return a value clipped to its limit, 0 for NaN, and whether it was changed."""
         result = value
-        moved = wp.int32(0)
+        changed = wp.int32(0)
         if wp.isnan(value):
             result = scalar(0.0)
-            moved = wp.int32(1)
+            changed = wp.int32(1)
         elif value > limit:
             result = limit
-            moved = wp.int32(1)
+            changed = wp.int32(1)
         elif value < -limit:
             result = -limit
-            moved = wp.int32(1)
-        return result, moved
+            changed = wp.int32(1)
+        return result, changed
+
+    @wp.func
+    def acted_state(state: scalar, action: scalar, largest_change: wp.float64):
+        """Return a state after an action, which is clipped to [-1, 1]."""
+        # Comparisons keep NaN; a clamp would not.
+        part = action
+        if part > scalar(1.0):
+            part = scalar(1.0)
+        if part < scalar(-1.0):
+            part = scalar(-1.0)
+        return scalar(wp.float64(state) + largest_change * wp.float64(part))
+
+    @wp.func
+    def acted_position(position: vector, action: vector_f64, largest_step: wp.float64):
+        """Return a position after an action, which is scaled down to a length of at most 1."""
+        length = wp.length(action)
+        step = largest_step
+        # Written in this way, one NaN coordinate makes all of them NaN.
+        if not (length <= wp.float64(1.0)):
+            step = largest_step / length
+        return displaced(position, step, action)
 
     @in_ranges(ELEMENTS)
     @wp.kernel(enable_backward=False, module=module)
@@ -113,17 +134,19 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
     ):
         """Move and change the particles that have a row; copy the others."""
         await_earlier()
-        # The first threads of a team move one particle each, the others change some channels each.
+        # Of the threads of a group of particles, the first move one particle each, and the others
+        # change some channels each.
         chunks = (state_dim + wp.static(THREAD_CHANNELS - 1)) / wp.static(THREAD_CHANNELS)
         t = range_start + wp.tid()
-        team = t / (wp.static(TEAM) * (1 + chunks))
-        place = t - team * (wp.static(TEAM) * (1 + chunks))
-        i = team * wp.static(TEAM) + place
+        group = t / (wp.static(MOVED_TOGETHER) * (1 + chunks))
+        thread = t - group * (wp.static(MOVED_TOGETHER) * (1 + chunks))
+        i = group * wp.static(MOVED_TOGETHER) + thread
         first = wp.int32(-1)
-        if place >= wp.static(TEAM):
-            member = (place - wp.static(TEAM)) / chunks
-            i = team * wp.static(TEAM) + member
-            first = (place - wp.static(TEAM) - member * chunks) * wp.static(THREAD_CHANNELS)
+        if thread >= wp.static(MOVED_TOGETHER):
+            channel_thread = thread - wp.static(MOVED_TOGETHER)
+            member = channel_thread / chunks
+            i = group * wp.static(MOVED_TOGETHER) + member
+            first = (channel_thread - member * chunks) * wp.static(THREAD_CHANNELS)
         if i >= positions.shape[0]:
             return
         row = load_integer(row_of, i)
@@ -153,7 +176,7 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
                     change = read_change(update, change_begin)
                     for k in range(wp.static(THREAD_CHANNELS)):
                         state[k] += dt * change[k]
-                write_channels(new_states, states_begin, state)
+                write_at(new_states, states_begin, state)
             else:
                 for k in range(wp.min(wp.static(THREAD_CHANNELS), state_dim - first)):
                     value = states[states_begin + k]
@@ -199,8 +222,8 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
             for k in range(wp.static(THREAD_CHANNELS)):
                 # Updates may have padding columns.
                 c = first + k - offset
-                place = i * state_dim + wp.clamp(c, 0, state_dim - 1)
-                state_bar = load_scalar(new_states_bar, place)
+                index = i * state_dim + wp.clamp(c, 0, state_dim - 1)
+                state_bar = load_scalar(new_states_bar, index)
                 if c >= 0 and c < state_dim:
                     bar[k] = dt * state_bar
             if first < offset:
@@ -216,7 +239,7 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
                 for d in range(wp.static(space_dim)):
                     bar[d] = largest_step * (shrink * pull[d] + radial * delta[d])
         if aligned != 0:
-            write_channels(update_bar, row_begin + first, bar)
+            write_at(update_bar, row_begin + first, bar)
         else:
             for k in range(wp.static(THREAD_CHANNELS)):
                 if first + k < update_width:
@@ -300,13 +323,7 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
             for k in range(wp.static(THREAD_CHANNELS)):
                 state = before[k]
                 if acting != wp.uint8(0):
-                    # Comparisons keep NaN; a clamp would not.
-                    part = change[k]
-                    if part > scalar(1.0):
-                        part = scalar(1.0)
-                    if part < scalar(-1.0):
-                        part = scalar(-1.0)
-                    state = scalar(wp.float64(state) + largest_change * wp.float64(part))
+                    state = acted_state(state, change[k], largest_change)
                 state, state_clipped = clipped(state, state_limit)
                 after[k] = state
                 if first + k * stride < state_dim:
@@ -314,7 +331,7 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
             clipped_count += changed
             if acting != wp.uint8(0) or changed != 0:
                 if aligned != 0:
-                    write_channels(states, states_begin + first, after)
+                    write_at(states, states_begin + first, after)
                 else:
                     for k in range(wp.static(THREAD_CHANNELS)):
                         c = first + k * stride
@@ -324,12 +341,7 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
                 if noise.shape[0] > 0:
                     position += push
                 if moving != 0 and acting != wp.uint8(0):
-                    length = wp.length(direction)
-                    step = largest_step
-                    # Written in this way, one NaN coordinate makes all of them NaN.
-                    if not (length <= wp.float64(1.0)):
-                        step = largest_step / length
-                    position = displaced(position, step, direction)
+                    position = acted_position(position, direction, largest_step)
                 position = bounded(position, boundary, box)
                 for d in range(wp.static(space_dim)):
                     coordinate, coordinate_clipped = clipped(position[d], position_limit)
@@ -365,19 +377,19 @@ def find_not_finite(scalar: type) -> wp.Kernel:
         """Write 0 if any of the values, aligned to 16 bytes in memory, is infinite or NaN."""
         await_earlier()
         t = wp.tid()
-        found = wp.int32(0)
+        wild = wp.int32(0)
         for k in range(wp.static(VALUES_PER_THREAD // QUAD)):
             first = (t + k * thread_count) * wp.static(QUAD)
             if first <= values.shape[0] - wp.static(QUAD):
                 together = read_quad(values, first)
                 for c in range(wp.static(QUAD)):
                     if not wp.isfinite(together[c]):
-                        found = wp.int32(1)
+                        wild = wp.int32(1)
             else:
                 for i in range(first, values.shape[0]):
                     if not wp.isfinite(values[i]):
-                        found = wp.int32(1)
-        if found != 0:
+                        wild = wp.int32(1)
+        if wild != 0:
             finite[0] = wp.uint8(0)
 
     return find

@@ -145,7 +145,7 @@ def _reasons(
         f"One step of {workload.world_count} x {workload.particle_count} particles in "
         f"{workload.space_dim}D, C {workload.state_dim}, {number} on {x.device}, "
         f"{'open space' if box is None else 'a periodic box'}, gradients: {gradients}",
-        f"  cells       {plan.domain.cell_count} a world, eps / {plan.domain.cell_reach} wide: "
+        f"  cells       {plan.domain.cell_count} a world, eps / {plan.domain.cells_per_eps} wide: "
         "a neighbourhood is a few ranges of sorted particles",
         f"  channels    {plan.group_count} group(s) of {plan.width}, "
         f"{workload.state_dim} used: a kernel is compiled for a group's width",

@@ -1,4 +1,7 @@
-"""Pictures of 3D Gaussians as a differentiable torch operator."""
+"""Pictures of 3D Gaussians as a differentiable torch operator.
+
+Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +22,7 @@ from npa_envs.kernels.pictures.gaussians import (
     make_frame,
 )
 from npa_envs.ops.custom_op import check_derivatives, custom_op, once_differentiable
-from npa_envs.ops.launch import is_traced, launch, scalar_type
+from npa_envs.ops.launch import SCALARS, is_traced, launch
 from npa_envs.ops.pictures.cameras import Cameras
 from npa_envs.ops.sort import MAX_INDEX
 
@@ -124,7 +127,7 @@ class Pairs(NamedTuple):
     """First pair of each tile of each picture, and the end, int32."""
     owners: Tensor
     """Index of picture and Gaussian of each pair, among all B V N, int32, shape [slots]."""
-    places: Tensor
+    pair_slots: Tensor
     """Slot of each pair, int64, shape [slots]."""
 
 
@@ -156,19 +159,19 @@ def sort_pairs(
     owners = torch.zeros_like(tiles)
     slots = torch.empty_like(counts)
     arguments = (footprints, order.view(-1), ends.view(-1), room, tiles, owners, slots.view(-1))
-    kernels = gaussian_kernels(scalar_type(depths.dtype))
+    kernels = gaussian_kernels(SCALARS[depths.dtype])
     launch(kernels.list_pairs, counts.numel(), device, frame, *arguments)
-    tiles, places = torch.sort(tiles, stable=True)
+    tiles, pair_slots = torch.sort(tiles, stable=True)
     starts = torch.searchsorted(
         tiles, torch.arange(tile_end + 1, dtype=torch.int32, device=device), out_int32=True
     )
-    return Pairs(ends[:, -1] > room, slots.view(-1), starts, owners[places], places)
+    return Pairs(ends[:, -1] > room, slots.view(-1), starts, owners[pair_slots], pair_slots)
 
 
 def blend(frame: Any, footprints: Tensor, pairs: Pairs, images: int) -> tuple[Tensor, ...]:
     """Return colours [B V H W, K], final transmittance and each pixel's end of pairs, [B V H W]."""
     device, pixels = footprints.device, images * frame.width * frame.height
-    scalar = scalar_type(footprints.dtype)
+    scalar = SCALARS[footprints.dtype]
     listed = (pairs.starts, pairs.owners, footprints)
     if device.type == "cuda":
         picture = footprints.new_empty(pixels, frame.channels)
@@ -222,7 +225,7 @@ class GaussianScene(NamedTuple):
         # As integers: symbolic sizes of torch.compile become constants, and others recompile.
         sizes = self.means.shape[1], self.motions.shape[-3], self.colours.shape[-1]
         shape = int(sizes[0]), int(sizes[1]), int(sizes[2])
-        return make_frame(scalar_type(self.means.dtype), shape, (width, height), near, dilation)
+        return make_frame(SCALARS[self.means.dtype], shape, (width, height), near, dilation)
 
     def flat(self) -> list[Tensor]:
         """Return the tensors for kernels, with worlds and views flattened to one dimension."""
@@ -242,7 +245,7 @@ def _gaussians(
     dilation: float,
     pairs_per_particle: int,
 ) -> list[Tensor]:
-    """Return pictures, whether pairs found no room, and the tensors of the adjoint."""
+    """Return pictures, whether pairs overflowed, and the tensors of the adjoint."""
     scene = GaussianScene(*tensors)
     means, frame = scene.means, scene.frame(int(width), int(height), near, dilation)
     worlds, views = means.shape[0], frame.view_count
@@ -252,7 +255,7 @@ def _gaussians(
     counts = torch.empty(images, particles, dtype=torch.int32, device=means.device)
     flat = scene.flat()
     projected = (footprints, depths.view(-1), counts.view(-1))
-    kernels = gaussian_kernels(scalar_type(means.dtype))
+    kernels = gaussian_kernels(SCALARS[means.dtype])
     arguments = (*flat[:3], opacities.view(-1), *flat[3:], *projected)
     launch(kernels.project_gaussians, images * particles, means.device, frame, *arguments)
     pairs = sort_pairs(frame, footprints, depths, counts, pairs_per_particle)
@@ -274,15 +277,15 @@ def _gaussians_backward(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Return the cotangents of means, scales, quaternions, opacities and colours."""
     scene = GaussianScene(*saved[:6])
-    passing, stops, footprints, counts, slots, starts, owners, places = saved[6:]
-    device, scalar = footprints.device, scalar_type(footprints.dtype)
+    passing, stops, footprints, counts, slots, starts, owners, pair_slots = saved[6:]
+    device, scalar = footprints.device, SCALARS[footprints.dtype]
     frame = scene.frame(int(passing.shape[3]), int(passing.shape[2]), near, dilation)
     picture_bar = picture_bar.contiguous().view(-1, frame.channels)
     passing, passing_bar = passing.view(-1), passing_bar.contiguous().view(-1)
     # Cotangents from tiles, a row for each slot; unused slots are undefined.
     pulls = footprints.new_empty(owners.shape[0], PULLS)
     tiles = starts.shape[0] - 1
-    listed = (starts, owners, places, footprints, stops, picture_bar)
+    listed = (starts, owners, pair_slots, footprints, stops, picture_bar)
     if device.type == "cuda":
         kernel = block_kernels(scalar).pull_back_blocks
         pulled = (*listed, passing, passing_bar, pulls.view(-1))
@@ -342,11 +345,11 @@ def render_gaussians(
     dilation: float = DILATION,
     pairs_per_particle: int | None = None,
 ) -> GaussianPictures:
-    """Draw 3D worlds: each particle is a Gaussian, seen by cameras; differentiable.
+    """Draw 3D worlds by cameras, with a Gaussian for each particle; differentiable.
 
     This is 3D Gaussian splatting (Kerbl et al. 2023) with EWA's local affine projection (Zwicker et
-    al. 2002): docs/mathematics.md has the formulas. There are no gradients for the cameras, the
-    order of Gaussians, or their ends, at an alpha of 1/255.
+    al. 2002): docs/mathematics.md has the formulas. Cameras have no gradients. The order by depth
+    and the smallest alpha, 1/255, below which a Gaussian is cut off, have no derivatives either.
 
     Gaussians nearer than `cameras.near`, or with a number that is not finite, are not drawn.
     Results are the same bit for bit in every run, and in every batch.
@@ -355,8 +358,8 @@ def render_gaussians(
         means: Particle positions [length units], shape [B, N, 3].
         scales: Standard deviations along the Gaussians' own axes [length units], not negative,
             shape [B, N, 3].
-        quaternions: Rotations of these axes (w, x, y, z), of any length: they are normalised here;
-            a zero stands for no rotation. Shape [B, N, 4].
+        quaternions: Rotations of these axes (w, x, y, z), of any length: they are normalised; a
+            zero stands for no rotation. Shape [B, N, 4].
         opacities: Alpha at each Gaussian's centre, in [0, 1], shape [B, N].
         colours: Dimensionless; K = 1 to 4 channels, shape [B, N, K], or coefficients of real
             spherical harmonics up to degree 1 for red, green and blue, shape [B, N, 4, 3], whose
@@ -370,7 +373,7 @@ def render_gaussians(
             wait for the device, and as many as needed on the CPU. A pair takes about 60 bytes.
 
     Returns:
-        Image, alpha, and for each picture whether its pairs found no room.
+        Image, alpha, and for each picture whether it had too few pairs.
 
     Raises:
         NPAError: A shape, dtype or device does not fit, or a number is out of its range; signs of

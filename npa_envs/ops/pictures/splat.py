@@ -1,4 +1,7 @@
-"""Pictures of 2D worlds as a differentiable torch operator."""
+"""Pictures of 2D worlds as a differentiable torch operator, and their losses in fused kernels.
+
+Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
+"""
 
 from __future__ import annotations
 
@@ -17,8 +20,8 @@ from npa_envs.checks import (
     checked_side,
 )
 from npa_envs.errors import NPAError, shown
-from npa_envs.kernels.cuda.sort import BLOCKS
-from npa_envs.kernels.cuda.splat_sort import sort_small_splats
+from npa_envs.kernels.cuda.sort import BLOCKS, sort_small_splats
+from npa_envs.kernels.pictures.errors import BLOCK_TILES, ROUND_TILES, gather_errors, sum_errors
 from npa_envs.kernels.pictures.splat import (
     CHANNELS,
     FOOTPRINT,
@@ -30,11 +33,12 @@ from npa_envs.kernels.pictures.splat import (
     make_view,
     splat_kernels,
 )
-from npa_envs.ops.backend import KernelRequest
+from npa_envs.kernels.primitives import CUDA_BLOCK
+from npa_envs.ops.backend import KernelRequest, multiprocessor_count
 from npa_envs.ops.custom_op import check_derivatives, custom_op, once_differentiable
-from npa_envs.ops.launch import aligned, launch, scalar_type
+from npa_envs.ops.launch import SCALARS, aligned, launch
 from npa_envs.ops.sort import MAX_INDEX, block_capacity, slice_count
-from npa_envs.ops.world_mean import world_mean
+from npa_envs.ops.world_mean import average_sums, world_mean
 
 MAX_SPOT = 1e6
 """Largest standard deviation of a Gaussian [pixels], and of its inverse."""
@@ -61,13 +65,13 @@ class Splats(NamedTuple):
         """Arguments of kernels: particles of a world, positions, states, shift."""
         return self.x.shape[1], self.x.view(-1, 2), self.states.view(self.total, -1), self.shift
 
-    def aim(self) -> Tensor | None:
+    def goal_argument(self) -> Tensor | None:
         """Argument of kernels: the goal, or None where worlds are not moved."""
         return None if self.goal is None else self.goal.view(1, 2)
 
-    def places(self) -> tuple[Tensor | None, Tensor | None]:
+    def means_and_goal(self) -> tuple[Tensor | None, Tensor | None]:
         """Arguments of kernels for moving worlds: means and goal."""
-        return None if self.goal is None else world_mean(self.x), self.aim()
+        return None if self.goal is None else world_mean(self.x), self.goal_argument()
 
 
 def splat_lanes(device: torch.device) -> int:
@@ -77,7 +81,7 @@ def splat_lanes(device: torch.device) -> int:
 
 def device_kernels(like: Tensor) -> Any:
     """Return the kernels for a tensor's dtype and device."""
-    return splat_kernels(scalar_type(like.dtype), splat_lanes(like.device))
+    return splat_kernels(SCALARS[like.dtype], splat_lanes(like.device))
 
 
 def gather_threads(world_count: int, resolution: int, device: torch.device) -> int:
@@ -115,22 +119,22 @@ def sort_splats(splats: Splats, view: Any) -> tuple[Tensor, Tensor, Tensor]:
             view,
             slices,
             *splats.contents(),
-            splats.aim(),
+            splats.goal_argument(),
             starts,
             footprints,
             source,
             block_dim=block,
         )
         return starts, footprints, source
-    kernels, contents, places = device_kernels(x), splats.contents(), splats.places()
+    kernels, contents, moves = device_kernels(x), splats.contents(), splats.means_and_goal()
     cell, arrival, arrived = torch.empty(3, total, dtype=torch.int32, device=x.device).unbind()
     counts = torch.zeros(cell_total + 1, dtype=torch.int32, device=x.device)
     counted = (cell, arrival, counts)
-    launch(kernels.count_splats, total, x.device, view, *contents[:2], *places, *counted)
+    launch(kernels.count_splats, total, x.device, view, *contents[:2], *moves, *counted)
     starts = torch.cumsum(counts, 0, dtype=torch.int32)
     launch(kernels.place_splats, total, x.device, cell, arrival, starts, arrived)
     sorted_splats = (cell, arrived, starts, footprints, source)
-    launch(kernels.order_splats, total, x.device, view, *contents, *places, *sorted_splats)
+    launch(kernels.order_splats, total, x.device, view, *contents, *moves, *sorted_splats)
     return starts, footprints, source
 
 
@@ -141,7 +145,7 @@ def scatter_splats(splats: Splats, view: Any) -> tuple[Tensor, Tensor, Tensor]:
     footprints = x.new_empty(total, FOOTPRINT)
     source = torch.empty(total, dtype=torch.int32, device=x.device)
     scratch = x.new_empty(x.shape[0], min(2 * view.radius + 1, view.resolution))
-    drawn = (*splats.contents(), *splats.places(), scratch, picture, footprints, source)
+    drawn = (*splats.contents(), *splats.means_and_goal(), scratch, picture, footprints, source)
     launch(device_kernels(x).scatter_splats, x.shape[0], x.device, view, *drawn)
     return picture, footprints, source
 
@@ -170,7 +174,7 @@ def _splat(
     low: float,
     high: float,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    view = make_view(scalar_type(x.dtype), int(resolution), pixel_size, sigma, low, high)
+    view = make_view(SCALARS[x.dtype], int(resolution), pixel_size, sigma, low, high)
     return _draw(Splats(x, colour), view)
 
 
@@ -192,7 +196,7 @@ def _splat_backward(
         device_kernels(footprints).pull_back_splats,
         (total, splat_lanes(footprints.device)),
         footprints.device,
-        make_view(scalar_type(footprints.dtype), int(resolution), pixel_size, sigma, low, high),
+        make_view(SCALARS[footprints.dtype], int(resolution), pixel_size, sigma, low, high),
         total // world_count,
         footprints,
         source,
@@ -289,16 +293,16 @@ def checked_window(
     if not (begin < end and math.isfinite(end - begin)):
         raise NPAError(f"the window must have lo < hi, got lo={begin:g} and hi={end:g}")
     pixels = side * pixel / (end - begin)
-    for what, size in (("a pixel of the target", pixels), ("sigma", spread * pixels)):
+    for name, size in (("a pixel of the target", pixels), ("sigma", spread * pixels)):
         if not 1.0 / MAX_SPOT <= size <= MAX_SPOT:
             raise NPAError(
-                f"{what} must have a size in [{1.0 / MAX_SPOT:g}, {MAX_SPOT:g}] pixels of "
+                f"{name} must have a size in [{1.0 / MAX_SPOT:g}, {MAX_SPOT:g}] pixels of "
                 f"the picture, got {size:g}: choose pixel_size, sigma and the window alike"
             )
     if not abs(begin) <= MAX_SPOT * side * (end - begin):
         raise NPAError(
-            f"the window must not be tiny beside its distance from the origin, got lo={begin:g} "
-            f"and hi={end:g}: move the particles to the origin"
+            f"the window must not be tiny compared to its distance from the origin, got "
+            f"lo={begin:g} and hi={end:g}: move the particles to the origin"
         )
     return side, pixel, spread, begin, end
 
@@ -357,8 +361,87 @@ def _sum_periods(canvas: Tensor, dim: int, margin: int, period: int) -> Tensor:
     folded = canvas.new_zeros(shape)
     begin = 0
     while begin < length:
-        place = (begin - margin) % period
-        count = min(period - place, length - begin)
-        folded.narrow(dim, place, count).add_(canvas.narrow(dim, begin, count))
+        pixel = (begin - margin) % period
+        count = min(period - pixel, length - begin)
+        folded.narrow(dim, pixel, count).add_(canvas.narrow(dim, begin, count))
         begin += count
     return folded
+
+
+# Losses against a target, without gradient: on CUDA no picture is written.
+
+BLOCKS_OF_PROCESSOR = 4
+"""Blocks per multiprocessor that gather errors in parallel."""
+
+
+@custom_op("npa::picture_losses")
+def _picture_losses(
+    x: Tensor,
+    states: Tensor,
+    goal: Tensor,
+    target: Tensor,
+    shift: float,
+    pixel_size: float,
+    sigma: float,
+    low: float,
+    high: float,
+) -> Tensor:
+    world_count, device, scalar = x.shape[0], x.device, SCALARS[x.dtype]
+    view = make_view(scalar, int(target.shape[0]), pixel_size, sigma, low, high)
+    splats = Splats(x, states, shift, goal)
+    if device.type == "cuda":
+        starts, footprints, _ = sort_splats(splats, view)
+        tile_total = view.tile_columns * view.tile_rows
+        partial_sums = x.new_empty(world_count, tile_total, 2, dtype=torch.float64)
+        # Fewer tiles for a block if many would leave multiprocessors idle.
+        tile_count, fewest = BLOCK_TILES, BLOCKS_OF_PROCESSOR * multiprocessor_count(device)
+        while tile_count > ROUND_TILES and world_count * tile_total < fewest * tile_count:
+            tile_count //= 2
+        threads = world_count * -(-tile_total // tile_count) * CUDA_BLOCK
+        pixels = aligned(target).view(-1, CHANNELS)
+        gathered = (tile_count, starts, footprints, pixels, partial_sums)
+        launch(gather_errors(scalar), threads, device, view, *gathered)
+    else:
+        picture, *_ = scatter_splats(splats, view)
+        rows = (world_count, view.resolution)
+        partial_sums = x.new_empty(*rows, 2, dtype=torch.float64)
+        launch(sum_errors(scalar), rows, device, picture, target.contiguous(), partial_sums)
+    return average_sums(partial_sums, view.resolution**2, x)
+
+
+def picture_losses(
+    x: Tensor,
+    states: Tensor,
+    target: Tensor,
+    *,
+    goal: Tensor,
+    shift: float,
+    pixel_size: float,
+    sigma: float = 1.0,
+    lo: float = -1.0,
+    hi: float = 1.0,
+) -> tuple[Tensor, Tensor]:
+    """Compare worlds with a target picture; without gradient.
+
+    Each world's mean position is moved to `goal` and drawn as by `splat`; colours are the last
+    three states plus `shift`. With d the difference from the target and e = |d| + d^2, a pixel's
+    density error is that of the densities, its colour error is the mean of e over the colours times
+    exp(-(density error)). The target has shape [R, R, 4], the goal [2].
+
+    Returns:
+        Means over the pixels of the density error and of the colour error, shape [B] each, bit for
+        bit the same in every batch.
+    """
+    check_particles(x, states, None)
+    resolution = target.shape[0] if target.ndim else 0
+    if tuple(target.shape) != (resolution, resolution, CHANNELS) or tuple(goal.shape) != (2,):
+        raise NPAError(
+            f"target and goal must have shapes [R, R, {CHANNELS}] and [2], "
+            f"got {tuple(target.shape)} and {tuple(goal.shape)}"
+        )
+    window = checked_window(resolution, pixel_size, sigma, lo, hi)
+    x, states, target, goal = (t.detach() for t in (x, states, target.to(x), goal.to(x)))
+    losses = _picture_losses(
+        x.contiguous(), states.contiguous(), goal.contiguous(), target, shift, *window[1:]
+    )
+    return losses[:, 0], losses[:, 1]

@@ -10,7 +10,7 @@ from npa_envs.ops.launch import launch
 
 
 def nearest_triangles(
-    place: Tensor,
+    positions: Tensor,
     nearness: Tensor,
     colours: Tensor,
     faces: Tensor,
@@ -24,22 +24,22 @@ def nearest_triangles(
     Everything is on the CPU, in float64. A triangle covers a pixel if it covers the centre.
 
     Args:
-        place: Coordinates of K corners in the pictures of V cameras [pixels], shape [V, K, 2].
+        positions: Coordinates of K corners in the pictures of V cameras [pixels], shape [V, K, 2].
         nearness: 1 / depth of the corners [1 / length units], shape [V, K].
         colours: Colours of the corners, shape [K, 3].
         faces: Corners of each triangle, from 0 to K − 1, shape [F, 3].
         visible: Whether a triangle is visible to a camera, shape [V, F].
     """
-    count = len(place)
-    nearest = place.new_zeros(count, height * width)
-    picture = place.new_zeros(count, height * width, 4)
+    count = len(positions)
+    nearest = positions.new_zeros(count, height * width)
+    picture = positions.new_zeros(count, height * width, 4)
     launch(
         draw_triangles,
         count,
         torch.device("cpu"),
         width,
         height,
-        place.contiguous(),
+        positions.contiguous(),
         nearness.contiguous(),
         colours.contiguous(),
         faces.int().contiguous(),
