@@ -8,12 +8,14 @@ import math
 import operator
 import sys
 from collections.abc import Callable, Sequence
-from typing import Any, Literal, TypeGuard, get_args
+from typing import Any, Literal, TypeGuard, TypeVar
 
 import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError, shown, suggest
+
+Choice = TypeVar("Choice")
 
 DTYPES = (torch.float32, torch.float64)
 
@@ -170,16 +172,13 @@ def checked_flag(name: str, value: Any) -> bool:
     raise NPAError(f"{name} must be True or False, got {shown(value)}")
 
 
-def checked_moment_inverse(value: Any) -> MomentInverse:
-    """Return the option `moment_inverse`, checked."""
-    for word in get_args(MomentInverse):
-        if isinstance(value, str) and value == word:
-            inverse: MomentInverse = word
-            return inverse
-    raise NPAError(
-        f"moment_inverse must be 'threshold' or 'smooth', got {shown(value)}: 'threshold' is the "
-        "paper's"
-    )
+def checked_choice(name: str, value: Any, choices: Sequence[Choice]) -> Choice:
+    """Return an option, one of at least two words or flags."""
+    for choice in choices:
+        if isinstance(value, type(choice)) and value == choice:
+            return choice
+    *others, last = map(repr, choices)
+    raise NPAError(f"{name} must be {', '.join(others)} or {last}, got {shown(value)}")
 
 
 def checked_number(name: str, value: Any) -> float:

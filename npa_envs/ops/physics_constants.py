@@ -13,6 +13,7 @@ from npa_envs.checks import (
     Box,
     check_scale,
     checked_box,
+    checked_choice,
     checked_eps,
     checked_number,
     checked_positive,
@@ -65,7 +66,7 @@ NO_LIMITS = Limits()
 
 
 class Physics(NamedTuple):
-    """The constants of worlds; `physics` makes and checks them."""
+    """The constants of worlds; `make_physics` makes and checks them."""
 
     space_dim: int
     """Space dimension D."""
@@ -157,7 +158,7 @@ IMMUTABLE = frozenset((float, int, bool, str, NoneType))
 """Types of values that can be keys of a cache."""
 
 
-def physics(
+def make_physics(
     space_dim: int,
     state_dim: int,
     dtype: torch.dtype,
@@ -165,7 +166,7 @@ def physics(
     eps: float | None,
     eps0: float | None = None,
     box: Box = None,
-    boundary: Boundary = "periodic",
+    boundary: Boundary | None = None,
     terms: Terms = ALL_TERMS,
     moving: bool = True,
     alpha: float = 0.0,
@@ -175,7 +176,8 @@ def physics(
 ) -> Physics:
     """Check the constants of worlds, and return them.
 
-    `eps0` is already checked, default: `eps`. The largest displacement is α ε.
+    `eps0` is already checked, default: `eps`. `boundary` None is "periodic" if there is a box, else
+    "open". The largest displacement is α ε.
     """
     values: Any = (boundary, eps, eps0, box, alpha, update_prob, dt, position_noise)
     # Only immutable values can be keys of the cache.
@@ -189,7 +191,7 @@ def _checked(
     dtype: torch.dtype,
     terms: Terms,
     moving: bool,
-    boundary: Boundary,
+    boundary: Boundary | None,
     eps: Any,
     eps0: float | None,
     box: Box,
@@ -198,14 +200,15 @@ def _checked(
     dt: Any,
     position_noise: Any,
 ) -> Physics:
-    if boundary not in get_args(Boundary):
-        raise NPAError(
-            f"boundary must be 'open', 'periodic' or 'reflecting', got {shown(boundary)}"
-        )
+    if boundary is None:
+        boundary = "open" if box is None else "periodic"
+    checked_choice("boundary", boundary, get_args(Boundary))
     if boundary == "open" and box is not None:
         raise NPAError(f"box must be None where boundary is 'open', got {shown(box)}: leave it out")
-    if boundary == "reflecting" and box is None:
-        raise NPAError("box must be given where boundary is 'reflecting', got None: give its sides")
+    if boundary != "open" and box is None:
+        raise NPAError(
+            f"box must be given where boundary is {boundary!r}, got None: give its sides"
+        )
     unchecked: Any = eps0 if eps is None else eps
     radius = checked_eps("eps", unchecked, space_dim, dtype)
     radius0 = radius if eps0 is None else constant(eps0)

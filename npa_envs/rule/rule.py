@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Sequence
-from typing import Any, get_type_hints
+from typing import Any, get_args, get_type_hints
 
 import torch
 from torch import Tensor, nn
@@ -14,8 +14,8 @@ from torch.nn.modules.module import _has_any_global_hook
 from npa_envs.checks import (
     MomentInverse,
     check_positive,
+    checked_choice,
     checked_flag,
-    checked_moment_inverse,
     checked_number,
     checked_positive,
     constant,
@@ -156,7 +156,9 @@ class NPARule(nn.Module):
         self.alpha = checked_positive("alpha", alpha)
         self.static = checked_flag("static", static)
         self.moment_correction = checked_flag("moment_correction", moment_correction)
-        self.moment_inverse = checked_moment_inverse(moment_inverse)
+        self.moment_inverse = checked_choice(
+            "moment_inverse", moment_inverse, get_args(MomentInverse)
+        )
         self.state_gradient = checked_flag("state_gradient", state_gradient)
         self.density_gradient = checked_flag("density_gradient", density_gradient)
         self.equivariant = checked_flag("equivariant", equivariant)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor
 
-from npa_envs.checks import check_world, checked_number
-from npa_envs.errors import DivergedError, NPAError, shown
+from npa_envs.checks import check_world, checked_choice, checked_number
+from npa_envs.errors import DivergedError, NPAError
 from npa_envs.world.particles import Particles
 
 OnDivergence = Literal["ignore", "raise"]
@@ -158,9 +158,7 @@ class DivergenceWatch:
 
 def make_watch(on_divergence: str, worlds: Particles) -> DivergenceWatch | None:
     """Return the watch of a rollout, None with `on_divergence="ignore"`."""
-    if on_divergence not in ("ignore", "raise"):
-        raise NPAError(f"on_divergence must be 'ignore' or 'raise', got {shown(on_divergence)}")
-    if on_divergence == "ignore":
+    if checked_choice("on_divergence", on_divergence, get_args(OnDivergence)) == "ignore":
         return None
     if worlds.x.is_cuda and torch.cuda.is_current_stream_capturing():
         raise NPAError(

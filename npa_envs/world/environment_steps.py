@@ -1,7 +1,7 @@
-"""Worlds that environments act on: perception and actions.
+"""All that environments import of the engine: actions, perception, constants, ends of episodes.
 
-The dynamics of `npa_envs.rollout`, with an action in the place of a rule's bounded output. Nothing
-waits for the device.
+A step is that of `npa_envs.rollout`, with an action in the place of a rule's bounded output.
+Nothing waits for the device.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from collections.abc import Callable, Mapping, Sequence
 import torch
 from torch import Tensor
 
-from npa_envs.checks import MomentInverse
 from npa_envs.ops.perceive import NeighbourState, build_neighbours
 from npa_envs.ops.physics_constants import Boundary, Limits, Physics, Terms
 from npa_envs.ops.rewards_and_ends import (
@@ -38,7 +37,6 @@ __all__ = [
     "EpisodeRules",
     "EpisodeUpdate",
     "Limits",
-    "MomentInverse",
     "NeighbourState",
     "Physics",
     "Terms",

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Literal, TypedDict, Unpack, overload
+from typing import Literal, TypedDict, Unpack, get_args, overload
 
 from torch import Tensor
 
-from npa_envs.checks import Box, check_world, checked_count, checked_flag
+from npa_envs.checks import Box, check_world, checked_choice, checked_count, checked_flag
 from npa_envs.errors import NPAError, shown
 from npa_envs.ops.custom_op import check_derivatives
-from npa_envs.ops.physics_constants import Boundary, Physics, Terms, physics
+from npa_envs.ops.physics_constants import Boundary, Physics, Terms, make_physics
 from npa_envs.rule.rule import NPARule, check_rule
 from npa_envs.world.divergence import OnDivergence, make_watch
-from npa_envs.world.execute import STORED_INTERVAL, Memory, RolloutSpec, execute, resting
-from npa_envs.world.graphed_rollouts import CudaGraph, check_cuda_graph
+from npa_envs.world.execute import Memory, RolloutSpec, execute, resting
+from npa_envs.world.graphed_rollouts import CUDA_GRAPH_CHOICES, CudaGraph
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness, check_generator
 
@@ -25,7 +25,7 @@ class RolloutOptions(TypedDict, total=False):
 
     eps: float | None
     box: Box
-    boundary: Boundary
+    boundary: Boundary | None
     dt: float
     position_noise: float
     detach_positions: bool
@@ -36,19 +36,13 @@ class RolloutOptions(TypedDict, total=False):
     cuda_graph: CudaGraph
 
 
-def check_memory(memory: Memory) -> None:
-    """Check the name of a memory mode."""
-    if not isinstance(memory, str) or memory not in STORED_INTERVAL:
-        raise NPAError(f"memory must be 'store', 'recompute' or 'minimal', got {shown(memory)}")
-
-
 def checked_physics(
     rule: NPARule,
     worlds: Particles,
     *,
     eps: float | None,
     box: Box,
-    boundary: Boundary,
+    boundary: Boundary | None,
     update_prob: float = 1.0,
     dt: float,
     position_noise: float = 0.0,
@@ -68,7 +62,7 @@ def checked_physics(
             f"the rule must share dtype and device with x, got {weight.dtype} on {weight.device} "
             f"and {x.dtype} on {x.device}: move it with rule.to(x)"
         )
-    return physics(
+    return make_physics(
         rule.space_dim,
         rule.state_dim,
         x.dtype,
@@ -97,7 +91,7 @@ def _check_one_species(rule: NPARule) -> None:
         )
 
 
-def result(
+def returned_fields(
     after: Particles, return_path_length: bool
 ) -> tuple[Tensor, Tensor] | tuple[Tensor, Tensor, Tensor]:
     """Return worlds as public functions do: x, s and, if asked, path lengths."""
@@ -127,7 +121,7 @@ def step(
     *,
     eps: float | None = None,
     box: Box = None,
-    boundary: Boundary = "periodic",
+    boundary: Boundary | None = None,
     update_prob: float = 0.5,
     dt: float = 1.0,
     position_noise: float = 0.0,
@@ -166,7 +160,7 @@ def at_rest(
     *,
     eps: float | None = None,
     box: Box = None,
-    boundary: Boundary = "periodic",
+    boundary: Boundary | None = None,
     dt: float = 1.0,
 ) -> Tensor:
     """Return which worlds are not changed by any further step.
@@ -237,7 +231,7 @@ def rollout(
     *,
     eps: float | None = None,
     box: Box = None,
-    boundary: Boundary = "periodic",
+    boundary: Boundary | None = None,
     update_prob: float = 0.5,
     dt: float = 1.0,
     position_noise: float = 0.0,
@@ -271,7 +265,8 @@ def rollout(
         box: Sides of a box centred on the origin [length units], or None for open space.
         boundary: "periodic": particles perceive nearest images, and positions are wrapped.
             "reflecting": particles perceive as in open space, and positions beyond a wall of the
-            box are mirrored at it, repeatedly if needed. "open": there is no box.
+            box are mirrored at it, repeatedly if needed. "open": there is no box. Default:
+            "periodic" with a box, "open" without one.
         update_prob: Probability p of each particle's update in a step, in (0, 1].
         dt: Time step, dimensionless.
         position_noise: Standard deviation of the noise added to every position in each step
@@ -308,8 +303,8 @@ def rollout(
     """
     steps = checked_count("steps", steps)
     interval = checked_keep_every(keep_every, steps)
-    check_memory(memory)
-    check_cuda_graph(cuda_graph)
+    checked_choice("memory", memory, get_args(Memory))
+    checked_choice("cuda_graph", cuda_graph, CUDA_GRAPH_CHOICES)
     check_rule(rule)
     _check_one_species(rule)
     worlds = Particles(x, s)
@@ -339,4 +334,4 @@ def rollout(
         watch=make_watch(on_divergence, worlds),
         may_rest=not return_path_length,
     )
-    return result(after, return_path_length)
+    return returned_fields(after, return_path_length)

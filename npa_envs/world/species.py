@@ -4,32 +4,37 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, Literal, Unpack, overload
+from typing import Any, Literal, Unpack, get_args, overload
 
 from torch import Tensor
 
-from npa_envs.checks import Box, check_world, checked_count, checked_flag, checked_number, entries
+from npa_envs.checks import (
+    Box,
+    check_world,
+    checked_choice,
+    checked_count,
+    checked_flag,
+    checked_number,
+    entries,
+)
 from npa_envs.errors import NPAError, shown
 from npa_envs.ops.physics_constants import Boundary
 from npa_envs.ops.species_density import checked_counts
 from npa_envs.rule.rule import NPARule
 from npa_envs.world.divergence import OnDivergence, make_watch
 from npa_envs.world.execute import Memory, RolloutSpec, execute
-from npa_envs.world.graphed_rollouts import CudaGraph, check_cuda_graph
+from npa_envs.world.graphed_rollouts import CUDA_GRAPH_CHOICES, CudaGraph
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness, check_generator
 from npa_envs.world.rollout import (
     RolloutOptions,
-    check_memory,
     checked_keep_every,
     checked_physics,
-    result,
+    returned_fields,
 )
 from npa_envs.world.steps import SpeciesSpec
 
 SpeciesPerception = Literal["shared", "per_species"]
-
-MODES: tuple[SpeciesPerception, ...] = ("shared", "per_species")
 """Whether rules perceive each species' density and density gradient, or only those of all."""
 
 AGREEMENTS = (
@@ -87,7 +92,7 @@ def rollout_species(
     eps: float | None = None,
     update_prob: float | Sequence[float] = 0.5,
     box: Box = None,
-    boundary: Boundary = "periodic",
+    boundary: Boundary | None = None,
     dt: float = 1.0,
     position_noise: float = 0.0,
     generator: Randomness | None = None,
@@ -145,11 +150,11 @@ def rollout_species(
     _check_agreement(species_rules, len(sizes), perception)
     probabilities = _checked_probabilities(update_prob, len(sizes))
     divisors = _checked_divisors(density_counts, sizes)
-    check_memory(memory)
+    checked_choice("memory", memory, get_args(Memory))
     # With one species this is `rollout`.
     alone = perception == "shared" and divisors == (float(x.shape[1]),)
     interval = checked_keep_every(keep_every, steps)
-    check_cuda_graph(cuda_graph)
+    checked_choice("cuda_graph", cuda_graph, CUDA_GRAPH_CHOICES)
     worlds = Particles(x, s)
     constants = [
         checked_physics(
@@ -191,7 +196,7 @@ def rollout_species(
         watch=make_watch(on_divergence, worlds),
         may_rest=False,
     )
-    return result(after, return_path_length)
+    return returned_fields(after, return_path_length)
 
 
 def _checked_rules(rules: Any) -> list[NPARule]:
@@ -212,8 +217,7 @@ def _checked_rules(rules: Any) -> list[NPARule]:
 
 def _check_agreement(rules: list[NPARule], species_count: int, perception: str) -> None:
     """Check that rules fit each other, the number of species and the mode of perception."""
-    if not isinstance(perception, str) or perception not in MODES:
-        raise NPAError(f"perception must be 'shared' or 'per_species', got {shown(perception)}")
+    checked_choice("perception", perception, get_args(SpeciesPerception))
     if len(rules) != species_count:
         raise NPAError(
             f"rules and counts must be one for each species, got {len(rules)} rules and "
