@@ -45,7 +45,7 @@ class Rollout(Protocol):
 
     def __call__(
         self, rule: NPARule, x: Tensor, s: Tensor, steps: int, /, **options: Unpack[TrainingOptions]
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    ) -> tuple[Tensor, ...]:
         """Return positions, states and path lengths after `steps` steps."""
 
 

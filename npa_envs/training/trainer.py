@@ -502,7 +502,7 @@ class _JointTrainer(Trainer):
 
         def rollout(
             rule: NPARule, x: Tensor, s: Tensor, steps: int, /, **options: Unpack[TrainingOptions]
-        ) -> tuple[Tensor, Tensor, Tensor]:
+        ) -> tuple[Tensor, ...]:
             each = list(cast(JointRules, rule))
             return rollout_species(
                 each, x, s, steps, counts=counts, density_counts=counts, **options

@@ -143,7 +143,7 @@ class RolloutSpec(NamedTuple):
                 else:
                     particles = step.advance(particles, draws)
                 if watch is not None:
-                    watch.look(step.leave(particles.map(Tensor.detach)))
+                    watch.check(step.leave(particles.map(Tensor.detach)))
                 if keep_every is not None and (number + 1) % keep_every == 0:
                     trajectory.append(step.leave(particles))
             if recomputed is not None:

@@ -79,7 +79,8 @@ class Particles(NamedTuple):
             [None] * len(counts) if value is None else torch.split(value, [*counts], dim=1)
             for value in self.per_particle()
         ]
-        return [Particles(*species, goal=self.goal) for species in zip(*fields, strict=True)]
+        species = (Particles(*each) for each in zip(*fields, strict=True))
+        return [worlds._replace(goal=self.goal) for worlds in species]
 
     def copy_(self, other: Particles) -> None:
         """Overwrite these worlds with others, in one kernel."""

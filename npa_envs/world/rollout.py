@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Literal, TypedDict, Unpack, get_args, overload
+from typing import get_args
 
 from torch import Tensor
 
 from npa_envs.checks import Box, check_world, checked_choice, checked_count, checked_flag
 from npa_envs.errors import NPAError, shown
 from npa_envs.ops.custom_op import check_derivatives
-from npa_envs.ops.physics_constants import Boundary, Physics, Terms, make_physics
+from npa_envs.ops.physics_constants import Boundary, Physics, make_physics
 from npa_envs.rule.rule import NPARule, check_rule
 from npa_envs.world.divergence import OnDivergence, make_watch
 from npa_envs.world.execute import Memory, RolloutSpec, execute, resting
@@ -18,22 +18,6 @@ from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness, check_generator
 
 __all__ = ["Memory", "at_rest", "rollout", "step"]
-
-
-class RolloutOptions(TypedDict, total=False):
-    """Keywords shared by `rollout` and `rollout_species`; `rollout` documents them."""
-
-    eps: float | None
-    box: Box
-    boundary: Boundary | None
-    dt: float
-    position_noise: float
-    detach_positions: bool
-    memory: Memory
-    generator: Randomness | None
-    on_divergence: OnDivergence
-    keep_every: int | None
-    cuda_graph: CudaGraph
 
 
 def checked_physics(
@@ -70,11 +54,7 @@ def checked_physics(
         eps0=rule.eps0,
         box=box,
         boundary=boundary,
-        terms=Terms(
-            rule.state_gradient,
-            rule.moment_inverse if rule.moment_correction else None,
-            rule.density_gradient,
-        ),
+        terms=rule.terms,
         moving=not rule.static,
         alpha=rule.alpha,
         update_prob=update_prob,
@@ -91,9 +71,7 @@ def _check_one_species(rule: NPARule) -> None:
         )
 
 
-def returned_fields(
-    after: Particles, return_path_length: bool
-) -> tuple[Tensor, Tensor] | tuple[Tensor, Tensor, Tensor]:
+def returned_fields(after: Particles, return_path_length: bool) -> tuple[Tensor, ...]:
     """Return worlds as public functions do: x, s and, if asked, path lengths."""
     if not return_path_length:
         return after.x, after.s
@@ -135,7 +113,7 @@ def step(
     Returns:
         Positions [length units], shape [B, N, D], and states, dimensionless, shape [B, N, C].
     """
-    return rollout(
+    x, s = rollout(
         rule,
         x,
         s,
@@ -151,6 +129,7 @@ def step(
         on_divergence=on_divergence,
         cuda_graph=cuda_graph,
     )
+    return x, s
 
 
 def at_rest(
@@ -197,32 +176,6 @@ def at_rest(
     return resting((rule,), worlds, constants, "auto")
 
 
-@overload
-def rollout(
-    rule: NPARule,
-    x: Tensor,
-    s: Tensor,
-    steps: int,
-    *,
-    update_prob: float = ...,
-    return_path_length: Literal[False] = ...,
-    **options: Unpack[RolloutOptions],
-) -> tuple[Tensor, Tensor]: ...
-
-
-@overload
-def rollout(
-    rule: NPARule,
-    x: Tensor,
-    s: Tensor,
-    steps: int,
-    *,
-    update_prob: float = ...,
-    return_path_length: Literal[True],
-    **options: Unpack[RolloutOptions],
-) -> tuple[Tensor, Tensor, Tensor]: ...
-
-
 def rollout(
     rule: NPARule,
     x: Tensor,
@@ -242,7 +195,7 @@ def rollout(
     keep_every: int | None = None,
     cuda_graph: CudaGraph = "auto",
     return_path_length: bool = False,
-) -> tuple[Tensor, Tensor] | tuple[Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, ...]:
     """Run a rule for a number of steps; differentiable, and particle i stays particle i.
 
     Each step draws m ~ Bernoulli(update_prob) for every particle, perceives the particles with

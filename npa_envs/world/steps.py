@@ -418,7 +418,7 @@ class SpeciesStep(Step):
         own = fields[:, species.particles].flatten(0, 1).index_select(0, particle)
         if ratio != 1.0:
             density, gradients = own.tensor_split([len(self.species)], dim=1)
-            gradients = _recounted(gradients.unflatten(1, (-1, space_dim)), ratio).flatten(1)
+            gradients = _recounted(gradients.view(len(own), -1, space_dim), ratio).flatten(1)
             own = torch.cat((ratio * density, gradients), dim=1)
         return torch.cat((z, own), dim=1)
 

@@ -357,10 +357,8 @@ def roll_one_species(
 ) -> tuple[Tensor, Tensor]:
     """Run `rollout_species` with all particles as one species."""
     count = [x.shape[1]]
-    worlds: tuple[Tensor, Tensor] = rollout_species(
-        [rule], x, s, steps, counts=count, density_counts=count, **options
-    )
-    return worlds
+    x, s = rollout_species([rule], x, s, steps, counts=count, density_counts=count, **options)
+    return x, s
 
 
 # The suites
