@@ -281,16 +281,14 @@ def checked_box(
         sides = tuple(checked_number("a side of box", side) for side in several)
     if len(sides) != space_dim:
         raise NPAError(f"box must have {space_dim} sides, got {len(sides)}: {shown(sides)}")
-    if eps is None and not all(math.isfinite(side) and side > 0.0 for side in sides):
-        raise NPAError(f"box sides must be finite and positive, got {shown(sides)}")
-    # With a tolerance: a box of exactly 2 eps passes however both were rounded.
-    if eps is not None and not all(
-        math.isfinite(side) and side >= 2.0 * eps * (1.0 - 1e-10) for side in sides
-    ):
-        raise NPAError(
-            f"box sides must be finite and at least 2 eps = {2.0 * eps:g}, got {shown(sides)}: "
-            f"enlarge the box or perceive at a smaller eps"
-        )
+    rule, hint, least = "positive", "", math.ulp(0.0)
+    if eps is not None:
+        rule = f"at least 2 eps = {2.0 * eps:g}"
+        hint = ": enlarge the box or perceive at a smaller eps"
+        # With a tolerance: a box of exactly 2 eps passes however both were rounded.
+        least = 2.0 * eps * (1.0 - 1e-10)
+    if not all(math.isfinite(side) and side >= least for side in sides):
+        raise NPAError(f"box sides must be finite and {rule}, got {shown(sides)}{hint}")
     largest = 1e-6 * torch.finfo(dtype).max
     if max(sides) > largest:
         raise NPAError(
