@@ -58,6 +58,7 @@ STEP_PARTS = frozenset(
         "_folded",
         "_folded_invariants",
         "_update_by_invariants",
+        "_with_code_zeros",
         "division_probabilities",
         "folded",
         "forward",
@@ -313,21 +314,21 @@ class NPARule(nn.Module):
         if self.equivariant:
             return self._update_by_invariants(perception)
         output: Tensor = self.output(torch.relu(self.hidden(perception)))
-        update = without_small(output, self.dead_zone)
-        if self.code_dim == 0:
-            return update
-        moves, states = update.tensor_split([self.update_dim - self.state_dim], dim=-1)
-        no_change = moves.new_zeros(*moves.shape[:-1], self.code_dim)
-        return torch.cat((moves, no_change, states), dim=-1)
+        return self._with_code_zeros(without_small(output, self.dead_zone), dim=-1)
 
     @property
     def update_weight(self) -> Tensor:
         """W2, with rows of zeros for the code; shape [A, H]."""
-        weight = self.output.weight
+        return self._with_code_zeros(self.output.weight, dim=0)
+
+    def _with_code_zeros(self, outputs: Tensor, *, dim: int) -> Tensor:
+        """Insert zeros for the code, which no update changes, between δ and Δs in a dimension."""
         if self.code_dim == 0:
-            return weight
-        moves, states = weight.tensor_split([self.update_dim - self.state_dim])
-        return torch.cat((moves, weight.new_zeros(self.code_dim, self.hidden_dim), states))
+            return outputs
+        moves, states = outputs.tensor_split([self.update_dim - self.state_dim], dim=dim)
+        shape = list(states.shape)
+        shape[dim] = self.code_dim
+        return torch.cat((moves, states.new_zeros(shape), states), dim=dim)
 
     def _update_by_invariants(self, perception: Tensor) -> Tensor:
         """Map perception vectors to raw updates by rotation-invariant inputs."""
