@@ -11,70 +11,56 @@ from npa_envs._module_search import extend_path as _extend_path
 from npa_envs.registration import register_environments as _register_environments
 
 if TYPE_CHECKING:
-    from npa_envs.errors import DivergedError, MissingDependencyError, NPAError
-    from npa_envs.ops import (
-        PerceptionFields,
-        SpeciesFields,
-        perceive,
-        perceive_species,
-        perception_fields,
-        species_fields,
-        world_mean,
-    )
-    from npa_envs.rule.files import load_rule, save_rule, shipped_rules
-    from npa_envs.rule.rule import NPARule
-    from npa_envs.world.divergence import describe_divergence, divergence
-    from npa_envs.world.randomness import WorldRandom
-    from npa_envs.world.rollout import at_rest, rollout, step
-    from npa_envs.world.species import rollout_species
+    from npa_envs.errors import DivergedError as DivergedError
+    from npa_envs.errors import MissingDependencyError as MissingDependencyError
+    from npa_envs.errors import NPAError as NPAError
+    from npa_envs.ops import PerceptionFields as PerceptionFields
+    from npa_envs.ops import SpeciesFields as SpeciesFields
+    from npa_envs.ops import perceive as perceive
+    from npa_envs.ops import perceive_species as perceive_species
+    from npa_envs.ops import perception_fields as perception_fields
+    from npa_envs.ops import species_fields as species_fields
+    from npa_envs.ops import world_mean as world_mean
+    from npa_envs.rule.files import load_rule as load_rule
+    from npa_envs.rule.files import save_rule as save_rule
+    from npa_envs.rule.files import shipped_rules as shipped_rules
+    from npa_envs.rule.rule import NPARule as NPARule
+    from npa_envs.world.divergence import describe_divergence as describe_divergence
+    from npa_envs.world.divergence import divergence as divergence
+    from npa_envs.world.randomness import WorldRandom as WorldRandom
+    from npa_envs.world.rollout import at_rest as at_rest
+    from npa_envs.world.rollout import rollout as rollout
+    from npa_envs.world.rollout import step as step
+    from npa_envs.world.species import rollout_species as rollout_species
 
 _extend_path(__path__, __file__)
 _register_environments()
 
 __version__ = "0.1.0"
 
-__all__ = [
-    "DivergedError",
-    "MissingDependencyError",
-    "NPAError",
-    "NPARule",
-    "PerceptionFields",
-    "SpeciesFields",
-    "WorldRandom",
-    "at_rest",
-    "describe_divergence",
-    "divergence",
-    "load_rule",
-    "perceive",
-    "perceive_species",
-    "perception_fields",
-    "rollout",
-    "rollout_species",
-    "save_rule",
-    "shipped_rules",
-    "species_fields",
-    "step",
-    "world_mean",
-]
-
-_MODULES = {
-    "errors": {"DivergedError", "MissingDependencyError", "NPAError"},
-    "rule.files": {"load_rule", "save_rule", "shipped_rules"},
-    "rule.rule": {"NPARule"},
-    "world.divergence": {"describe_divergence", "divergence"},
-    "world.randomness": {"WorldRandom"},
-    "world.rollout": {"at_rest", "rollout", "step"},
-    "world.species": {"rollout_species"},
+_PUBLIC_NAMES = {
+    "errors": "DivergedError MissingDependencyError NPAError",
+    "ops": "PerceptionFields SpeciesFields perceive perceive_species perception_fields "
+    "species_fields world_mean",
+    "rule.files": "load_rule save_rule shipped_rules",
+    "rule.rule": "NPARule",
+    "world.divergence": "describe_divergence divergence",
+    "world.randomness": "WorldRandom",
+    "world.rollout": "at_rest rollout step",
+    "world.species": "rollout_species",
 }
-"""Modules of the public names; all others are in `npa_envs.ops`."""
+"""The public names of each module."""
+
+_MODULES = {name: module for module, names in _PUBLIC_NAMES.items() for name in names.split()}
+
+__all__ = sorted(_MODULES)
 
 
 def __getattr__(name: str) -> Any:
-    if name not in __all__:
+    if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    module = next((path for path, names in _MODULES.items() if name in names), "ops")
     # Kept, so that only the first use searches.
-    value = globals()[name] = getattr(_import_module(f"npa_envs.{module}"), name)
+    value = globals()[name] = getattr(_import_module(f"npa_envs.{_MODULES[name]}"), name)
     return value
 
 

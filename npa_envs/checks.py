@@ -8,12 +8,14 @@ import math
 import operator
 import sys
 from collections.abc import Callable, Sequence
-from typing import Any, Literal, TypeGuard, get_args
+from typing import Any, Literal, TypeGuard, TypeVar
 
 import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError, shown, suggest
+
+Choice = TypeVar("Choice")
 
 DTYPES = (torch.float32, torch.float64)
 
@@ -170,16 +172,13 @@ def checked_flag(name: str, value: Any) -> bool:
     raise NPAError(f"{name} must be True or False, got {shown(value)}")
 
 
-def checked_moment_inverse(value: Any) -> MomentInverse:
-    """Return the option `moment_inverse`, checked."""
-    for word in get_args(MomentInverse):
-        if isinstance(value, str) and value == word:
-            inverse: MomentInverse = word
-            return inverse
-    raise NPAError(
-        f"moment_inverse must be 'threshold' or 'smooth', got {shown(value)}: 'threshold' is the "
-        "paper's"
-    )
+def checked_choice(name: str, value: Any, choices: Sequence[Choice]) -> Choice:
+    """Return an option, one of at least two words or flags."""
+    for choice in choices:
+        if isinstance(value, type(choice)) and value == choice:
+            return choice
+    *others, last = map(repr, choices)
+    raise NPAError(f"{name} must be {', '.join(others)} or {last}, got {shown(value)}")
 
 
 def checked_number(name: str, value: Any) -> float:
@@ -282,16 +281,14 @@ def checked_box(
         sides = tuple(checked_number("a side of box", side) for side in several)
     if len(sides) != space_dim:
         raise NPAError(f"box must have {space_dim} sides, got {len(sides)}: {shown(sides)}")
-    if eps is None and not all(math.isfinite(side) and side > 0.0 for side in sides):
-        raise NPAError(f"box sides must be finite and positive, got {shown(sides)}")
-    # With a tolerance: a box of exactly 2 eps passes however both were rounded.
-    if eps is not None and not all(
-        math.isfinite(side) and side >= 2.0 * eps * (1.0 - 1e-10) for side in sides
-    ):
-        raise NPAError(
-            f"box sides must be finite and at least 2 eps = {2.0 * eps:g}, got {shown(sides)}: "
-            f"enlarge the box or perceive at a smaller eps"
-        )
+    rule, hint, least = "positive", "", math.ulp(0.0)
+    if eps is not None:
+        rule = f"at least 2 eps = {2.0 * eps:g}"
+        hint = ": enlarge the box or perceive at a smaller eps"
+        # With a tolerance: a box of exactly 2 eps passes however both were rounded.
+        least = 2.0 * eps * (1.0 - 1e-10)
+    if not all(math.isfinite(side) and side >= least for side in sides):
+        raise NPAError(f"box sides must be finite and {rule}, got {shown(sides)}{hint}")
     largest = 1e-6 * torch.finfo(dtype).max
     if max(sides) > largest:
         raise NPAError(

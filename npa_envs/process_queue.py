@@ -39,8 +39,8 @@ class Slots:
     """CPU threads of each process."""
 
     @property
-    def ahead(self) -> bool:
-        """Whether the next process starts early, during a run: not on CPUs, which it would slow."""
+    def starts_early(self) -> bool:
+        """Whether the next process starts during a run: not on CPUs, which it would slow."""
         return not any(name.startswith("cpu") for name in self.devices)
 
 
@@ -48,12 +48,12 @@ class Child(ABC):
     """A child process, which gets its device when its turn comes."""
 
     @abstractmethod
-    def go(self, device: str) -> None:
-        """Start its work on a device."""
+    def begin_work(self, device: str) -> None:
+        """Begin its work on a device."""
 
     @property
     @abstractmethod
-    def over(self) -> bool:
+    def has_ended(self) -> bool:
         """Whether the process has ended, successfully or not."""
 
     def stop(self, *, at_once: bool) -> None:  # noqa: B027 - not all have something to save
@@ -72,66 +72,67 @@ def run_children(
     finished: Callable[[SomeChild], None],
     slots: Slots,
     *,
-    ahead: bool,
+    starts_early: bool,
     max_seconds: float = math.inf,
 ) -> None:
     """Run child processes until none is left; an interruption ends all of them.
 
     All are asked to end before the first is waited for; a second signal ends them at once. `start`
-    gets the children that are not over, and returns the next one, or None if none is left or can
-    begin yet. With `ahead`, up to `slots.jobs` more children start early and wait for their turn.
+    gets the children that have not ended, and returns the next one, or None if none is left or can
+    begin yet. With `starts_early`, up to `slots.jobs` more children start and wait for their turn.
     """
-    ready, running = deque[SomeChild](), dict[int, SomeChild]()
-    until = time.monotonic() + max_seconds
+    waiting, running = deque[SomeChild](), dict[int, SomeChild]()
+    deadline = time.monotonic() + max_seconds
 
     def next_child() -> SomeChild | None:
-        late = time.monotonic() >= until
-        return None if late else start([*ready, *running.values()])
+        late = time.monotonic() >= deadline
+        return None if late else start([*waiting, *running.values()])
 
     with _Interruption() as interruption:
         try:
             while True:
                 interruption.check()
-                while ready and time.monotonic() >= until:
-                    _end([ready.pop()])
-                for number in range(slots.jobs):
-                    one = None
-                    if number not in running:
-                        one = ready.popleft() if ready else next_child()
-                    if one is not None:
-                        running[number] = one
-                        one.go(slots.devices[number % len(slots.devices)])
+                while waiting and time.monotonic() >= deadline:
+                    _end([waiting.pop()])
+                for slot in range(slots.jobs):
+                    child = None
+                    if slot not in running:
+                        child = waiting.popleft() if waiting else next_child()
+                    if child is not None:
+                        running[slot] = child
+                        child.begin_work(slots.devices[slot % len(slots.devices)])
                         interruption.check()
                 if not running:
                     return
-                while ahead and len(ready) < slots.jobs and (one := next_child()) is not None:
-                    ready.append(one)
+                while starts_early and len(waiting) < slots.jobs and (child := next_child()):
+                    waiting.append(child)
                     interruption.check()
-                for number, one in list(running.items()):
-                    if one.over:
+                for slot, child in list(running.items()):
+                    if child.has_ended:
                         # The signal may have ended it too: then it is not finished.
                         interruption.check()
-                        del running[number]
-                        finished(one)
+                        del running[slot]
+                        finished(child)
                 time.sleep(POLL_SECONDS if running else 0.0)
         finally:
             interruption.came = True  # The next signal raises at once.
-            _end([*running.values(), *ready])
+            _end([*running.values(), *waiting])
 
 
 def _end(children: Sequence[Child]) -> None:
     """End children: all are asked first, so that they save their work at the same time."""
     try:
-        for one in children:
-            one.stop(at_once=False)
-        for one in children:
-            one.end()
+        _stop(children, at_once=False)
     except BaseException:
-        for one in children:
-            one.stop(at_once=True)
-        for one in children:
-            one.end()
+        _stop(children, at_once=True)
         raise
+
+
+def _stop(children: Sequence[Child], *, at_once: bool) -> None:
+    for child in children:
+        child.stop(at_once=at_once)
+    for child in children:
+        child.end()
 
 
 class _Interruption:

@@ -7,12 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any
 
 import gymnasium
-
-MODULES = {"PointClassification": "point_classification"}
-"""Modules whose names are not those of their classes in lower case."""
 
 
 class Registration:
@@ -28,7 +25,8 @@ class Registration:
     def __init__(self, name: str, max_episode_steps: int, size: str = "", **keywords: Any) -> None:
         self.id = f"npa/{name}{size}-v0"
         self.name = name
-        self.module = f"npa_envs.envs.{MODULES.get(name, name.lower())}"
+        module = "point_classification" if name == "PointClassification" else name.lower()
+        self.module = f"npa_envs.envs.{module}"
         self.entry_point = f"{self.module}:{name}Env"
         self.vector_entry_point = f"{self.module}:{name}VectorEnv"
         self.max_episode_steps = max_episode_steps
@@ -100,25 +98,6 @@ ALL = (*ENVIRONMENTS, *GARDENS, *CODED, *SMALL, *SIZES)
 """All entries that are registered with Gymnasium."""
 
 
-class SpeciesRegistration(NamedTuple):
-    """A variant of a task of several species, for PettingZoo and for batches."""
-
-    id: str
-    """Id for `pettingzoo.make` and `npa_envs.envs.multispecies_v0.batched`."""
-
-    task: str
-    """A name from `npa_envs.envs.multi.TASKS`."""
-
-    keywords: Mapping[str, Any]
-    """Fields of the task's configuration."""
-
-    @property
-    def max_episode_steps(self) -> int:
-        """Steps after which an episode is truncated."""
-        steps: int = self.keywords["max_cycles"]
-        return steps
-
-
 SPECIES = {
     "npa/Mixing-v0": "mixing",
     "npa/Segregation-v0": "segregation",
@@ -137,25 +116,36 @@ _SMALL_PICTURES: Mapping[str, Any] = {
 _LARGE_SPECIES: Mapping[str, Any] = {"particle_count": 4096, "max_cycles": 256}
 
 
-def _sized(name: str, size: str, **keywords: Any) -> SpeciesRegistration:
-    task = SPECIES[f"npa/{name}-v0"]
-    return SpeciesRegistration(f"npa/{name}{size}-v0", task, MappingProxyType(keywords))
+class SpeciesRegistration:
+    """A variant of a task of several species, for PettingZoo and for batches.
+
+    Args:
+        name: Name of the task in its ids.
+        size: End of the id's name.
+        keywords: Fields of the task's configuration.
+    """
+
+    def __init__(self, name: str, size: str, **keywords: Any) -> None:
+        self.id = f"npa/{name}{size}-v0"
+        self.task = SPECIES[f"npa/{name}-v0"]
+        self.max_episode_steps: int = keywords["max_cycles"]
+        self.keywords = MappingProxyType(keywords)
 
 
 SPECIES_SIZES = (
-    _sized("Mixing", "Small", **_SMALL_SPECIES),
-    _sized("Segregation", "Small", **_SMALL_SPECIES),
-    _sized("CoMorphogenesis", "Small", **_SMALL_PICTURES, targets=("heart", "ring")),
-    _sized("Symbiosis", "Small", **_SMALL_PICTURES, target="flower"),
-    _sized(
+    SpeciesRegistration("Mixing", "Small", **_SMALL_SPECIES),
+    SpeciesRegistration("Segregation", "Small", **_SMALL_SPECIES),
+    SpeciesRegistration("CoMorphogenesis", "Small", **_SMALL_PICTURES, targets=("heart", "ring")),
+    SpeciesRegistration("Symbiosis", "Small", **_SMALL_PICTURES, target="flower"),
+    SpeciesRegistration(
         "Invasion", "Small", particle_counts=(64, 32), **_STATES, eps=0.2, **_PERCEIVED,
         colour_weight=20.0, seed_radius=0.4, target="ring", opponent="random",
     ),
-    _sized("Mixing", "Large", **_LARGE_SPECIES),
-    _sized("Segregation", "Large", **_LARGE_SPECIES),
-    _sized("CoMorphogenesis", "Large", **_LARGE_SPECIES, resolution=128),
-    _sized("Symbiosis", "Large", **_LARGE_SPECIES, resolution=128),
-    _sized(
+    SpeciesRegistration("Mixing", "Large", **_LARGE_SPECIES),
+    SpeciesRegistration("Segregation", "Large", **_LARGE_SPECIES),
+    SpeciesRegistration("CoMorphogenesis", "Large", **_LARGE_SPECIES, resolution=128),
+    SpeciesRegistration("Symbiosis", "Large", **_LARGE_SPECIES, resolution=128),
+    SpeciesRegistration(
         "Invasion", "Large", particle_counts=(3072, 1024), max_cycles=256, resolution=128,
         opponent="random",
     ),

@@ -258,11 +258,11 @@ class _Process(Child):
     begin: float = 0.0
 
     @property
-    def over(self) -> bool:
+    def has_ended(self) -> bool:
         """Whether the run has ended."""
         return (self.folder / RECORD).exists() or self.process.poll() is not None
 
-    def go(self, device: str) -> None:
+    def begin_work(self, device: str) -> None:
         """Start the run on a device."""
         self.begin = time.perf_counter()
         _send(self.process, device)
@@ -362,7 +362,7 @@ def run_jobs(
             start,
             finished,
             slots,
-            ahead=slots.ahead and not all(lasts(plan, job) for job in jobs),
+            starts_early=slots.starts_early and not all(lasts(plan, job) for job in jobs),
             max_seconds=max_seconds,
         )
     finally:

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.checks import (
+    MomentInverse,
     check_field,
     check_flag,
     check_fraction,
@@ -22,7 +23,7 @@ from npa_envs.checks import (
 from npa_envs.devices import check_device
 from npa_envs.errors import NPAError, UnknownKeywordError, shown, suggest
 from npa_envs.render import STYLES
-from npa_envs.world.environment_steps import Boundary, Limits, MomentInverse, Physics, Terms
+from npa_envs.world.environment_steps import Boundary, Limits, Physics, Terms
 
 Reward = Literal["dense", "sparse", "particle", "marginal"]
 Output = Literal["numpy", "torch"]

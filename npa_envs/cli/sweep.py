@@ -73,7 +73,7 @@ class SweepRun(Child):
     process: subprocess.Popen[bytes] | None = None
     start_time: float = 0.0
 
-    def go(self, device: str) -> None:
+    def begin_work(self, device: str) -> None:
         """Start it on a device."""
         self.start_time = time.perf_counter()
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -91,7 +91,7 @@ class SweepRun(Child):
             )
 
     @property
-    def over(self) -> bool:
+    def has_ended(self) -> bool:
         """Whether the process has ended."""
         return self.process is not None and self.process.poll() is not None
 
@@ -151,7 +151,7 @@ def main(arguments: Sequence[str]) -> int:
                 lambda _: waiting.pop(0) if waiting else None,
                 finished,
                 slots,
-                ahead=False,
+                starts_early=False,
                 max_seconds=options.max_seconds,
             )
         except KeyboardInterrupt:

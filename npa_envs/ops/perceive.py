@@ -9,7 +9,7 @@ Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 import torch
 from torch import Tensor
@@ -19,9 +19,9 @@ from npa_envs.checks import (
     MomentInverse,
     check_finite_positions,
     check_world,
+    checked_choice,
     checked_eps,
     checked_flag,
-    checked_moment_inverse,
 )
 from npa_envs.ops.backend import batch_listing
 from npa_envs.ops.custom_op import check_derivatives, custom_op, once_differentiable
@@ -34,7 +34,7 @@ from npa_envs.ops.perception_passes import (
     perception_launch,
     portable_kernels,
 )
-from npa_envs.ops.physics_constants import Physics, Terms, physics
+from npa_envs.ops.physics_constants import Physics, Terms, make_physics
 from npa_envs.ops.sort import plan_kernels, sort_worlds
 from npa_envs.ops.static import StaticRows, StaticWorlds, all_rows, static_worlds
 
@@ -103,13 +103,15 @@ def perceive(
     space_dim, state_dim = x.shape[2], s.shape[2]
     if eps0 is not None:
         eps0 = checked_eps("eps0", eps0, space_dim, x.dtype)
-    inverse = checked_moment_inverse(moment_inverse)
+    inverse = checked_choice("moment_inverse", moment_inverse, get_args(MomentInverse))
     terms = Terms(
         checked_flag("state_gradient", state_gradient),
         inverse if checked_flag("moment_correction", moment_correction) else None,
         checked_flag("density_gradient", density_gradient),
     )
-    constants = physics(space_dim, state_dim, x.dtype, eps=eps, eps0=eps0, box=box, terms=terms)
+    constants = make_physics(
+        space_dim, state_dim, x.dtype, eps=eps, eps0=eps0, box=box, terms=terms
+    )
     check_finite_positions(x)
     perception, rows = perceive_rows(
         x.detach() if checked_flag("detach_positions", detach_positions) else x,
@@ -143,12 +145,13 @@ def perception_fields(
     Raises:
         NPAError: As `perceive`.
     """
-    terms = Terms(moment_inverse=checked_moment_inverse(moment_inverse))
+    inverse = checked_choice("moment_inverse", moment_inverse, get_args(MomentInverse))
+    terms = Terms(moment_inverse=inverse)
     check_world(x, s)
     check_derivatives(x=x, s=s)
     world_count, particle_count, space_dim = x.shape
     state_dim = s.shape[2]
-    constants = physics(space_dim, state_dim, x.dtype, eps=eps, box=box, terms=terms)
+    constants = make_physics(space_dim, state_dim, x.dtype, eps=eps, box=box, terms=terms)
     check_finite_positions(x)
     x, s = x.contiguous(), s.contiguous()
     plan = plan_kernels(x, x.shape, state_dim, world_count * particle_count, False, constants)

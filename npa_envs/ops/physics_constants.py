@@ -14,6 +14,7 @@ from npa_envs.checks import (
     Box,
     check_scale,
     checked_box,
+    checked_choice,
     checked_eps,
     checked_number,
     checked_positive,
@@ -66,7 +67,7 @@ NO_LIMITS = Limits()
 
 
 class Physics(NamedTuple):
-    """The constants of worlds; `physics` makes and checks them."""
+    """The constants of worlds; `make_physics` makes and checks them."""
 
     space_dim: int
     """Space dimension D."""
@@ -176,7 +177,7 @@ def _cached(make: Callable[Arguments, Physics]) -> Callable[Arguments, Physics]:
 
 
 @_cached
-def physics(
+def make_physics(
     space_dim: int,
     state_dim: int,
     dtype: torch.dtype,
@@ -184,7 +185,7 @@ def physics(
     eps: float | None,
     eps0: float | None = None,
     box: Box = None,
-    boundary: Boundary = "periodic",
+    boundary: Boundary | None = None,
     terms: Terms = ALL_TERMS,
     moving: bool = True,
     alpha: float = 0.0,
@@ -194,16 +195,18 @@ def physics(
 ) -> Physics:
     """Check the constants of worlds, and return them.
 
-    `eps0` is already checked, default: `eps`. The largest displacement is α ε.
+    `eps0` is already checked, default: `eps`. `boundary` None is "periodic" if there is a box, else
+    "open". The largest displacement is α ε.
     """
-    if boundary not in get_args(Boundary):
-        raise NPAError(
-            f"boundary must be 'open', 'periodic' or 'reflecting', got {shown(boundary)}"
-        )
+    if boundary is None:
+        boundary = "open" if box is None else "periodic"
+    checked_choice("boundary", boundary, get_args(Boundary))
     if boundary == "open" and box is not None:
         raise NPAError(f"box must be None where boundary is 'open', got {shown(box)}: leave it out")
-    if boundary == "reflecting" and box is None:
-        raise NPAError("box must be given where boundary is 'reflecting', got None: give its sides")
+    if boundary != "open" and box is None:
+        raise NPAError(
+            f"box must be given where boundary is {boundary!r}, got None: give its sides"
+        )
     unchecked: Any = eps0 if eps is None else eps
     radius = checked_eps("eps", unchecked, space_dim, dtype)
     radius0 = radius if eps0 is None else constant(eps0)

@@ -22,7 +22,7 @@ from npa_envs.kernels.portable.density import species_kernel
 from npa_envs.ops.custom_op import check_derivatives, custom_op
 from npa_envs.ops.launch import SCALARS, launch
 from npa_envs.ops.perceive import perceive
-from npa_envs.ops.physics_constants import Physics, physics
+from npa_envs.ops.physics_constants import Physics, make_physics
 from npa_envs.ops.sort import plan_kernels, sort_worlds
 
 MAX_SPECIES = 64
@@ -128,7 +128,7 @@ def species_fields(
     check_world(x, x)
     check_derivatives(x=x)
     checked = checked_counts(counts, x.shape[1])
-    constants = physics(x.shape[2], 1, x.dtype, eps=eps, box=box)
+    constants = make_physics(x.shape[2], 1, x.dtype, eps=eps, box=box)
     check_finite_positions(x)
     return SpeciesFields(*_gather_species(x.detach().contiguous(), list(checked), constants, False))
 
@@ -168,7 +168,7 @@ def perceive_species(
     checked = checked_counts(counts, x.shape[1])
     if eps0 is not None:
         eps0 = checked_eps("eps0", eps0, x.shape[2], x.dtype)
-    constants = physics(x.shape[2], s.shape[2], x.dtype, eps=eps, eps0=eps0, box=box)
+    constants = make_physics(x.shape[2], s.shape[2], x.dtype, eps=eps, eps0=eps0, box=box)
     shared = perceive(x, s, constants.eps, constants.eps0, constants.box, detach_positions)
     appended = perceive_by_species(x, checked, constants)
     return torch.cat((shared, appended), dim=-1)

@@ -107,9 +107,9 @@ def check_weights(weights: Mapping[str, Tensor]) -> None:
 def read_state_dict(data: bytes) -> RuleParts:
     """Read the authors' state dict; shapes determine D and C."""
     state = _unpickle(data)
-    known, kind, more = _WEIGHT_NAMES, "", f" and, with a read-out, {sorted(_DECODER_NAMES)}"
+    known, rule_type, more = _WEIGHT_NAMES, "", f" and, with a read-out, {sorted(_DECODER_NAMES)}"
     if state.keys() & _EQUIVARIANT_NAMES:
-        known, kind, more = _EQUIVARIANT_NAMES, " of an equivariant rule", ""
+        known, rule_type, more = _EQUIVARIANT_NAMES, " of an equivariant rule", ""
     decoder = _DECODER_NAMES & known.keys()
     required = {*known, "eps0", "alpha"} - decoder
     missing = required - state.keys()
@@ -117,7 +117,7 @@ def read_state_dict(data: bytes) -> RuleParts:
     unknown = state.keys() - required - decoder - _IGNORED
     if missing or unknown:
         raise NPAError(
-            f"the state dict{kind} must hold {sorted(required)}{more}; missing: "
+            f"the state dict{rule_type} must hold {sorted(required)}{more}; missing: "
             f"{sorted(missing)}, unknown: {shown(sorted(map(str, unknown)))}"
         )
     weights = {known[name]: _matrix(name, state[name]) for name in known if name in state}
@@ -135,16 +135,16 @@ def read_state_dict(data: bytes) -> RuleParts:
 
 
 def _parts(
-    weights: dict[str, Tensor], numbers: Mapping[Any, Any], **hyper_parameters: Any
+    weights: dict[str, Tensor], scalars: Mapping[Any, Any], **hyper_parameters: Any
 ) -> RuleParts:
-    """Return a rule's parts with the hyper-parameters that all formats have; `numbers`: radii."""
-    common = {name: _scalar(name, numbers.get(name)) for name in ("eps0", "alpha")}
+    """Return a rule's parts, with the hyper-parameters that all formats have: `scalars`."""
+    common = {name: _scalar(name, scalars.get(name)) for name in ("eps0", "alpha")}
     sizes = {"space_dim": _DEMO_SPACE_DIM, "hidden_dim": len(weights["hidden.weight"])}
     return RuleParts(sizes | common | hyper_parameters, weights)
 
 
-def _equivariant_parts(tensors: Mapping[str, Tensor], numbers: Mapping[Any, Any]) -> RuleParts:
-    """Return a 2D equivariant rule's parts, from tensors and numbers named as in `models.json`."""
+def _equivariant_parts(tensors: Mapping[str, Tensor], scalars: Mapping[Any, Any]) -> RuleParts:
+    """Return a 2D equivariant rule's parts, from tensors and scalars named as in `models.json`."""
     mixing, first, second = (tensors[name] for name in ("W_hidden", "w1.weight", "w2.weight"))
     state_dim, mixed = mixing.shape[0] - 1, mixing.shape[1]
     hidden_dim = first.shape[0]
@@ -172,7 +172,7 @@ def _equivariant_parts(tensors: Mapping[str, Tensor], numbers: Mapping[Any, Any]
         "mixing": mixing.contiguous(),
         "steering": tensors["W_out"][:, 0].contiguous(),
     }
-    return _parts(weights, numbers, state_dim=state_dim, equivariant=True, mixed_vectors=mixed)
+    return _parts(weights, scalars, state_dim=state_dim, equivariant=True, mixed_vectors=mixed)
 
 
 def read_demo_json(data: bytes, name: str | None) -> RuleParts:
@@ -276,12 +276,12 @@ def save_demo_json(
 def _demo_entry(name: str, rule: NPARule, particle_count: int) -> dict[str, Any]:
     check_rule(rule)
     defaults = inspect.signature(NPARule).parameters
-    for field, made in rule.hyper_parameters().items():
-        wanted = defaults[field].default
-        if field not in _DEMO_FREE and made != wanted:
+    for field, value in rule.hyper_parameters().items():
+        default = defaults[field].default
+        if field not in _DEMO_FREE and value != default:
             raise NPAError(
-                f"the authors' demo runs rules with {field}={wanted!r} only, {shown(name)} has "
-                f"{made!r}: save it with npa_envs.save_rule"
+                f"the authors' demo runs rules with {field}={default!r} only, {shown(name)} has "
+                f"{value!r}: save it with npa_envs.save_rule"
             )
     if not rule.is_plain():
         raise NPAError(
@@ -362,20 +362,20 @@ def _infer_dimensions(
     perception_dim: int, update_dim: int, channels: int | None
 ) -> tuple[int, int, bool]:
     """Return (D, C, static) such that P = C(2+D)+D and A = C+D, or C if static."""
-    found = []
+    fitting = []
     for space_dim in (2, 3):
         state_dim, rest = divmod(perception_dim - space_dim, 2 + space_dim)
         if rest or state_dim < 1 or channels not in (None, state_dim):
             continue
         if update_dim in (state_dim, state_dim + space_dim):
-            found.append((space_dim, state_dim, update_dim == state_dim))
-    if len(found) != 1:
+            fitting.append((space_dim, state_dim, update_dim == state_dim))
+    if len(fitting) != 1:
         raise NPAError(
             "model.0.weight [H, C(2+D)+D] and model.2.weight [C+D or C, H] must fit one space "
             f"dimension D of 2 or 3, got {perception_dim} inputs and {update_dim} outputs, which "
-            f"fit {len(found)}"
+            f"fit {len(fitting)}"
         )
-    return found[0]
+    return fitting[0]
 
 
 def _scalar(name: str, value: Any) -> float:

@@ -41,7 +41,7 @@ FORMAT_NAME = "npa-envs rule"
 FORMAT_VERSION = "1"
 
 _PLAIN: dict[Any, type] = {Literal: str, Sequence: tuple}
-_FIELDS = {name: _PLAIN.get(get_origin(kind), kind) for name, kind in HYPER_PARAMETERS.items()}
+_FIELDS = {name: _PLAIN.get(get_origin(cls), cls) for name, cls in HYPER_PARAMETERS.items()}
 _RESERVED = {"format", "version", "checksum", *_FIELDS}
 _SUFFIXES = (".safetensors", ".pth", ".pt", ".json")
 _MAX_FILE = 64 * 2**20
@@ -102,8 +102,8 @@ def load_rule(source: str | Path, *, device: str | torch.device = "cpu") -> NPAR
         content, ours = b"", path.suffix == ".safetensors"
         if ours:
             header, weights = _read_ours(path, with_weights=True)
-            given = {name: _parse(header, name, kind) for name, kind in _FIELDS.items()}
-            parts = RuleParts(given, weights)
+            fields = {name: _parse(header, name, cls) for name, cls in _FIELDS.items()}
+            parts = RuleParts(fields, weights)
         else:
             content = read_bytes(path, limit=_MAX_FILE)
             is_demo = path.suffix == ".json"
@@ -191,9 +191,9 @@ def _is_as_made(rule: NPARule) -> bool:
     same_shapes = _shapes(rule.state_dict()) == _shapes(loaded.state_dict())
     if type(rule).forward is not NPARule.forward or is_altered(rule) or not same_shapes:
         return False
-    own = dict(rule.named_modules())
-    for name, part in loaded.named_modules():
-        if name and (type(own.get(name)) is not type(part) or is_altered(own[name])):
+    modules = dict(rule.named_modules())
+    for name, module in loaded.named_modules():
+        if name and (type(modules.get(name)) is not type(module) or is_altered(modules[name])):
             return False
     return True
 
@@ -219,10 +219,10 @@ def rule_metadata(path: str | Path) -> dict[str, str]:
 
 def rule_digest(rule: NPARule) -> str:
     """Return the first 16 hexadecimal digits of the SHA-256 of a rule's weights."""
-    found = hashlib.sha256()
+    digest = hashlib.sha256()
     for weight in rule.state_dict().values():
-        found.update(weight.cpu().numpy().tobytes())
-    return found.hexdigest()[:16]
+        digest.update(weight.cpu().numpy().tobytes())
+    return digest.hexdigest()[:16]
 
 
 def rule_file(source: str | Path) -> Path:
@@ -248,9 +248,9 @@ def _locate(source: str | Path) -> tuple[Path, str | None]:
         if rule.is_file():
             return rule, None
         others = sorted(Path(text).glob("rule-*.safetensors"))
-        cure = f"one of its rules, such as {str(others[0])!r}" if others else "another one"
+        hint = f"one of its rules, such as {str(others[0])!r}" if others else "another one"
         raise NPAError(
-            f"a folder must hold the {rule.name} of a run, {text!r} does not: name {cure}"
+            f"a folder must hold the {rule.name} of a run, {text!r} does not: name {hint}"
         )
     base, mark, name = text.rpartition("#")
     path, inner = (Path(base), name) if mark and base.endswith(".json") else (Path(text), None)
@@ -293,26 +293,26 @@ def _checksum(header: Mapping[str, str], weights: Mapping[str, Tensor]) -> str:
     """Return the SHA-256 of the metadata, without the checksum, and of all weights."""
     content: list[Any] = sorted(item for item in header.items() if item[0] != "checksum")
     content += [(name, str(w.dtype), *w.shape) for name, w in sorted(weights.items())]
-    found = hashlib.sha256(json.dumps(content).encode())
+    digest = hashlib.sha256(json.dumps(content).encode())
     for _, tensor in sorted(weights.items()):
-        found.update(tensor.numpy().tobytes())
-    return found.hexdigest()
+        digest.update(tensor.numpy().tobytes())
+    return digest.hexdigest()
 
 
-def _parse(header: Mapping[str, str], name: str, kind: type) -> Any:
+def _parse(header: Mapping[str, str], name: str, cls: type) -> Any:
     if name not in header:
         raise NPAError(f"the metadata lacks {name!r}: save the rule again with npa_envs.save_rule")
     try:
         value = parse_json(header[name])
-        if kind is float and type(value) is int:
+        if cls is float and type(value) is int:
             value = float(value)
-        if kind is tuple and type(value) is list:
+        if cls is tuple and type(value) is list:
             value = tuple(value)
     except (NPAError, OverflowError):
         value = None
-    if type(value) is not kind:
+    if type(value) is not cls:
         raise NPAError(
-            f"the metadata's {name!r} must be a JSON {kind.__name__}, got {shown(header[name])}"
+            f"the metadata's {name!r} must be a JSON {cls.__name__}, got {shown(header[name])}"
         )
     return value
 

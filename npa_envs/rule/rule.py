@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Sequence
-from typing import Any, get_type_hints
+from typing import Any, get_args, get_type_hints
 
 import torch
 from torch import Tensor, nn
@@ -14,8 +13,8 @@ from torch.nn.modules.module import _has_any_global_hook
 from npa_envs.checks import (
     MomentInverse,
     check_positive,
+    checked_choice,
     checked_flag,
-    checked_moment_inverse,
     checked_number,
     checked_positive,
     constant,
@@ -23,6 +22,7 @@ from npa_envs.checks import (
 )
 from npa_envs.errors import NPAError, shown
 from npa_envs.ops.equivariance import MIXED_VECTORS, VectorForm, invariants, signed_gates, steered
+from npa_envs.ops.physics_constants import Terms
 from npa_envs.rule.folded_network import (
     FOLD,
     FoldedInvariants,
@@ -58,6 +58,7 @@ STEP_PARTS = frozenset(
         "_folded",
         "_folded_invariants",
         "_update_by_invariants",
+        "_with_code_zeros",
         "division_probabilities",
         "folded",
         "forward",
@@ -154,46 +155,53 @@ class NPARule(nn.Module):
         self._check_sizes()
         self.eps0 = checked_positive("eps0", eps0, " [length units]")
         self.alpha = checked_positive("alpha", alpha)
+        self.moment_inverse = checked_choice(
+            "moment_inverse", moment_inverse, get_args(MomentInverse)
+        )
+        self.dead_zone = checked_number("dead_zone", dead_zone)
+        self.code_names = checked_names(code_names)
         self.static = checked_flag("static", static)
         self.moment_correction = checked_flag("moment_correction", moment_correction)
-        self.moment_inverse = checked_moment_inverse(moment_inverse)
         self.state_gradient = checked_flag("state_gradient", state_gradient)
         self.density_gradient = checked_flag("density_gradient", density_gradient)
         self.equivariant = checked_flag("equivariant", equivariant)
         self.chiral = checked_flag("chiral", chiral)
-        self.divides = checked_flag("divides", divides)
-        self.dead_zone = checked_number("dead_zone", dead_zone)
-        self.code_names = checked_names(code_names)
         self.encoder = checked_flag("encoder", encoder)
-        self._check_parts()
+        self.divides = checked_flag("divides", divides)
+        self._check_combinations()
 
         self.hidden = nn.Linear(self.input_dim, hidden_dim)
         self.output = nn.Linear(hidden_dim, self.output_dim, bias=False)
-        self.readout = (
-            nn.Sequential(
-                nn.Linear(state_dim, readout_hidden_dim),
-                nn.ReLU(),
-                nn.Linear(readout_hidden_dim, readout_dim),
-            )
-            if readout_dim
-            else None
-        )
+        self.readout = self._make_readout() if readout_dim else None
         for module in self.modules():
             if isinstance(module, nn.Linear):
                 nn.init.xavier_uniform_(module.weight, gain=INIT_GAIN)
         if self.divides:
-            self.fate = nn.Linear(state_dim, 2)
-            with torch.no_grad():
-                self.fate.weight.zero_()
-                self.fate.bias.copy_(torch.tensor(FIRST_FATES))
+            self._add_fate()
         if self.equivariant:
-            vectors = self.vector_form
-            mixing = torch.empty(vectors.perceived, vectors.mixed)
-            self.mixing = nn.Parameter(nn.init.xavier_uniform_(mixing))
-            steering = torch.empty(1, 0 if self.static else vectors.gate_count)
-            self.steering = nn.Parameter(nn.init.xavier_uniform_(steering)[0])
+            self._add_vector_weights()
         self.codes = Codes(code_names, code_dim, encoder=encoder) if code_dim else None
         """The known codes, or None without `code_dim`."""
+
+    def _make_readout(self) -> nn.Sequential:
+        return nn.Sequential(
+            nn.Linear(self.state_dim, self.readout_hidden_dim),
+            nn.ReLU(),
+            nn.Linear(self.readout_hidden_dim, self.readout_dim),
+        )
+
+    def _add_fate(self) -> None:
+        self.fate = nn.Linear(self.state_dim, 2)
+        with torch.no_grad():
+            self.fate.weight.zero_()
+            self.fate.bias.copy_(torch.tensor(FIRST_FATES))
+
+    def _add_vector_weights(self) -> None:
+        vectors = self.vector_form
+        mixing = torch.empty(vectors.perceived, vectors.mixed)
+        self.mixing = nn.Parameter(nn.init.xavier_uniform_(mixing))
+        steering = torch.empty(1, 0 if self.static else vectors.gate_count)
+        self.steering = nn.Parameter(nn.init.xavier_uniform_(steering)[0])
 
     def _check_sizes(self) -> None:
         if not is_whole(self.space_dim) or self.space_dim not in (2, 3):
@@ -207,7 +215,7 @@ class NPARule(nn.Module):
                 f"{self.readout_hidden_dim} with readout_dim={self.readout_dim}"
             )
 
-    def _check_parts(self) -> None:
+    def _check_combinations(self) -> None:
         """Check requirements of the dead zone, equivariance, codes and division."""
         zone, species_count, code_dim = self.dead_zone, self.species_count, self.code_dim
         name_count, encoder = len(self.code_names), self.encoder
@@ -253,6 +261,12 @@ class NPARule(nn.Module):
             )
 
     @property
+    def terms(self) -> Terms:
+        """Which groups of entries the shared part of the perception vector has."""
+        inverse = self.moment_inverse if self.moment_correction else None
+        return Terms(self.state_gradient, inverse, self.density_gradient)
+
+    @property
     def vector_form(self) -> VectorForm:
         """How an equivariant rule reads the perception vector."""
         vectors = self.state_dim * self.state_gradient + self.density_gradient
@@ -275,8 +289,7 @@ class NPARule(nn.Module):
     @property
     def perception_dim(self) -> int:
         """Length P of the perception vector: C(2+D)+D, and 1+D for each distinguished species."""
-        gradients = self.state_dim * self.space_dim * self.state_gradient
-        shared = 2 * self.state_dim + gradients + self.space_dim * self.density_gradient
+        shared = self.terms.perception_dim(self.space_dim, self.state_dim)
         return shared + self.species_count * (1 + self.space_dim)
 
     @property
@@ -301,21 +314,21 @@ class NPARule(nn.Module):
         if self.equivariant:
             return self._update_by_invariants(perception)
         output: Tensor = self.output(torch.relu(self.hidden(perception)))
-        update = without_small(output, self.dead_zone)
-        if self.code_dim == 0:
-            return update
-        moves, states = update.tensor_split([self.update_dim - self.state_dim], dim=-1)
-        kept = moves.new_zeros(*moves.shape[:-1], self.code_dim)
-        return torch.cat((moves, kept, states), dim=-1)
+        return self._with_code_zeros(without_small(output, self.dead_zone), dim=-1)
 
     @property
     def update_weight(self) -> Tensor:
         """W2, with rows of zeros for the code; shape [A, H]."""
-        weight = self.output.weight
+        return self._with_code_zeros(self.output.weight, dim=0)
+
+    def _with_code_zeros(self, outputs: Tensor, *, dim: int) -> Tensor:
+        """Insert zeros for the code, which no update changes, between δ and Δs in a dimension."""
         if self.code_dim == 0:
-            return weight
-        moves, states = weight.tensor_split([self.update_dim - self.state_dim])
-        return torch.cat((moves, weight.new_zeros(self.code_dim, self.hidden_dim), states))
+            return outputs
+        moves, states = outputs.tensor_split([self.update_dim - self.state_dim], dim=dim)
+        shape = list(states.shape)
+        shape[dim] = self.code_dim
+        return torch.cat((moves, states.new_zeros(shape), states), dim=dim)
 
     def _update_by_invariants(self, perception: Tensor) -> Tensor:
         """Map perception vectors to raw updates by rotation-invariant inputs."""
@@ -335,7 +348,7 @@ class NPARule(nn.Module):
         """Return whether the rule's network is that of `NPARule`: it is plain, or equivariant."""
         names = ("hidden", "output", "fate") if self.divides else ("hidden", "output")
         # `_modules` is faster than attributes of modules.
-        layers = [own for own in map(self._modules.get, names) if type(own) is nn.Linear]
+        layers = [layer for layer in map(self._modules.get, names) if type(layer) is nn.Linear]
         if len(layers) < len(names):
             return False
         hidden, output = layers[:2]
@@ -473,18 +486,6 @@ class NPARule(nn.Module):
         caption = f"<caption>a rule of {self.space_dim}D worlds</caption>"
         return f"<table>{caption}{''.join(shown_rows)}</table>"
 
-    def __getattr__(self, name: str) -> Any:
-        try:
-            return super().__getattr__(name)
-        except AttributeError as error:
-            if name.startswith("_"):
-                # Libraries probe for private names, which must be fast.
-                raise
-            # A hint as in Python's own errors, which torch's modules replace.
-            nearest = difflib.get_close_matches(name, [n for n in dir(self) if n[0] != "_"], n=1)
-            hint = f": did you mean {nearest[0]!r}?" if nearest else ""
-            raise AttributeError(f"{error}{hint}", name=name, obj=self) from None
-
     def hyper_parameters(self) -> dict[str, Any]:
         """Return the arguments of `NPARule` for a rule of the same shape."""
         return {name: getattr(self, name) for name in HYPER_PARAMETERS}
@@ -494,9 +495,9 @@ HYPER_PARAMETERS = {k: v for k, v in get_type_hints(NPARule.__init__).items() if
 """Arguments of `NPARule`: name -> type."""
 
 
-def _overrides_no_part(kind: type[NPARule]) -> bool:
+def _overrides_no_part(cls: type[NPARule]) -> bool:
     """Return whether a subclass overrides none of `STEP_PARTS`."""
-    return all(getattr(kind, name) is getattr(NPARule, name) for name in STEP_PARTS)
+    return all(getattr(cls, name) is getattr(NPARule, name) for name in STEP_PARTS)
 
 
 def is_altered(module: nn.Module) -> bool:
@@ -516,14 +517,14 @@ def with_codes(rule: NPARule, untrained: NPARule) -> NPARule:
     shapes do not fit, `rule` is returned.
     """
     count, space_dim, code_dim = untrained.state_dim, untrained.space_dim, untrained.code_dim
-    own = torch.ones(untrained.perception_dim, dtype=torch.bool)
-    own[:code_dim] = False
-    own[count : count + code_dim] = False
+    shared = torch.ones(untrained.perception_dim, dtype=torch.bool)
+    shared[:code_dim] = False
+    shared[count : count + code_dim] = False
     if untrained.state_gradient:
-        own[2 * count : 2 * count + code_dim * space_dim] = False
+        shared[2 * count : 2 * count + code_dim * space_dim] = False
     rows = rule.hidden_dim
     fits = (
-        int(own.sum()) == rule.perception_dim
+        int(shared.sum()) == rule.perception_dim
         and rows <= untrained.hidden_dim
         and rule.output_dim == untrained.output_dim
         and rule.readout is None
@@ -531,7 +532,7 @@ def with_codes(rule: NPARule, untrained: NPARule) -> NPARule:
     )
     if not fits:
         return rule
-    untrained.hidden.weight[:rows, own] = rule.hidden.weight.to(untrained.hidden.weight)
+    untrained.hidden.weight[:rows, shared] = rule.hidden.weight.to(untrained.hidden.weight)
     untrained.hidden.bias[:rows] = rule.hidden.bias.to(untrained.hidden.bias)
     untrained.output.weight[:, :rows] = rule.output.weight.to(untrained.output.weight)
     return untrained

@@ -16,7 +16,7 @@ import math
 import torch
 from torch import Tensor
 
-from npa_envs.checks import check_world, checked_number, entries
+from npa_envs.checks import check_alike, check_world, checked_number, entries
 from npa_envs.errors import NPAError, shown
 
 Sides = tuple[float, ...] | None
@@ -27,6 +27,7 @@ def offsets_from(x: Tensor, centre: Tensor, box: Sides = None) -> Tensor:
 
     Arguments and errors are those of `push`.
     """
+    check_world(x, x)
     _check_vector("centre", centre, x)
     if box is not None and len(entries(box) or ()) != x.shape[2]:
         raise NPAError(f"box must have {x.shape[2]} sides, got {shown(box)}: give one for each")
@@ -267,10 +268,6 @@ def _per_world(name: str, value: float | Tensor, x: Tensor, *, highest: float = 
 
 def _check_vector(name: str, vector: Tensor, like: Tensor, letter: str = "D") -> None:
     """Check that a tensor has a vector for each world, like positions (D) or states (C)."""
-    if like.ndim != 3:
-        raise NPAError(
-            f"x must have shape [B, N, D], got {tuple(like.shape)}: add a world, x[None]"
-        )
     shape = (like.shape[0], like.shape[2])
     if not isinstance(vector, Tensor) or vector.shape != shape:
         got = tuple(vector.shape) if isinstance(vector, Tensor) else shown(vector)
@@ -278,9 +275,4 @@ def _check_vector(name: str, vector: Tensor, like: Tensor, letter: str = "D") ->
             f"{name} must have shape [B, {letter}] = {shape}, got {got}: give one vector for each "
             f"world, for example torch.zeros{shape}"
         )
-    if vector.device != like.device or vector.dtype != like.dtype:
-        like_name = "x" if letter == "D" else "s"
-        raise NPAError(
-            f"{name} must be {like.dtype} on {like.device} like {like_name}, got {vector.dtype} "
-            f"on {vector.device}: convert it with {name}.to({like_name})"
-        )
+    check_alike(name, vector, "x" if letter == "D" else "s", like)

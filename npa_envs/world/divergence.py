@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor
 
-from npa_envs.checks import check_world, checked_number
-from npa_envs.errors import DivergedError, NPAError, shown
+from npa_envs.checks import check_world, checked_choice, checked_number
+from npa_envs.errors import DivergedError, NPAError
 from npa_envs.world.particles import Particles
 
 OnDivergence = Literal["ignore", "raise"]
@@ -110,46 +110,42 @@ class DivergenceWatch:
     """
 
     def __init__(self, worlds: Particles) -> None:
-        x, s, *_ = worlds
-        world_count, _, self._space_dim = x.shape
-        self._looks = 0
-        self._everyone = torch.arange(world_count, device=x.device)
-        self._first = torch.full_like(self._everyone, -1)
-        self._particle = torch.zeros_like(self._everyone)
-        self._values = x.new_zeros(world_count, self._space_dim + s.shape[2])
-        self.look(worlds)
+        world_count, _, self._space_dim = worlds.x.shape
+        self._checks = 0
+        self._first_check = torch.full((world_count,), -1, device=worlds.x.device)
+        """The first check that found a value, by world; -1: none did."""
+        self._values = torch.zeros_like(torch.cat((worlds.x, worlds.s), dim=2))
+        """Positions and states at that check."""
+        self.check(worlds)
 
     @torch.no_grad()
-    def look(self, worlds: Particles) -> None:
+    def check(self, worlds: Particles) -> None:
         """Check the worlds after a step."""
-        values = torch.cat((worlds.x.detach(), worlds.s.detach()), dim=2)
-        bad = ~values.isfinite().all(dim=2)
-        particle = bad.byte().argmax(dim=1)
-        rose = bad[self._everyone, particle] & (self._first < 0)
-        self._first.masked_fill_(rose, self._looks)
-        self._particle = torch.where(rose, particle, self._particle)
-        self._values = torch.where(rose[:, None], values[self._everyone, particle], self._values)
-        self._looks += 1
+        values = torch.cat((worlds.x, worlds.s), dim=2)
+        is_first = ~values.isfinite().all(dim=(1, 2)) & (self._first_check < 0)
+        self._first_check.masked_fill_(is_first, self._checks)
+        self._values = torch.where(is_first[:, None, None], values, self._values)
+        self._checks += 1
 
     def raise_diverged(self) -> None:
         """Raise an error that says when and where worlds diverged, if any; waits for the device."""
-        first = self._first.tolist()
-        worlds = sorted((step, world) for world, step in enumerate(first) if step >= 0)
+        first_checks = self._first_check.tolist()
+        worlds = sorted((step, world) for world, step in enumerate(first_checks) if step >= 0)
         if not worlds:
             return
         lines = []
         for step, world in worlds[:MAX_REPORT]:
             values = self._values[world].cpu()
-            entry = int((~values.isfinite()).nonzero()[0])
+            particle, entry = (~values.isfinite()).nonzero()[0].tolist()
             when = f"in step {step}" if step > 0 else "before the first step"
             lines.append(
-                f"world {world}: {term_name(entry, self._space_dim)} of particle "
-                f"{int(self._particle[world])} was {values[entry].item():g} {when}"
+                f"world {world}: {term_name(entry, self._space_dim)} of particle {particle} was "
+                f"{values[particle, entry].item():g} {when}"
             )
         if len(worlds) > MAX_REPORT:
             lines.append(f"and {len(worlds) - MAX_REPORT} more worlds")
         raise DivergedError(
-            f"worlds must stay finite, but {len(worlds)} of {len(first)} did not, "
+            f"worlds must stay finite, but {len(worlds)} of {len(first_checks)} did not, "
             f"{'; '.join(lines)}: "
             "take smaller steps (dt) or states, or find such worlds with npa_envs.divergence and "
             "replace them (on_divergence='ignore')"
@@ -158,9 +154,7 @@ class DivergenceWatch:
 
 def make_watch(on_divergence: str, worlds: Particles) -> DivergenceWatch | None:
     """Return the watch of a rollout, None with `on_divergence="ignore"`."""
-    if on_divergence not in ("ignore", "raise"):
-        raise NPAError(f"on_divergence must be 'ignore' or 'raise', got {shown(on_divergence)}")
-    if on_divergence == "ignore":
+    if checked_choice("on_divergence", on_divergence, get_args(OnDivergence)) == "ignore":
         return None
     if worlds.x.is_cuda and torch.cuda.is_current_stream_capturing():
         raise NPAError(

@@ -1,7 +1,7 @@
-"""Worlds that environments act on: perception and actions.
+"""All that environments import of the engine: actions, perception, constants, ends of episodes.
 
-The dynamics of `npa_envs.rollout`, with an action in the place of a rule's bounded output. Nothing
-waits for the device.
+A step is that of `npa_envs.rollout`, with an action in the place of a rule's bounded output.
+Nothing waits for the device.
 """
 
 from __future__ import annotations
@@ -11,42 +11,23 @@ from collections.abc import Callable, Mapping, Sequence
 import torch
 from torch import Tensor
 
-from npa_envs.checks import MomentInverse
-from npa_envs.ops.perceive import NeighbourState, build_neighbours
-from npa_envs.ops.physics_constants import Boundary, Limits, Physics, Terms
-from npa_envs.ops.rewards_and_ends import (
-    DIVERGED,
-    NOT_FINITE,
-    SUCCESS,
-    TIME_LIMIT,
-    EpisodeRules,
-    EpisodeUpdate,
-)
+from npa_envs.ops.perceive import NeighbourState as NeighbourState
+from npa_envs.ops.perceive import build_neighbours as build_neighbours
+from npa_envs.ops.physics_constants import Boundary as Boundary
+from npa_envs.ops.physics_constants import Limits as Limits
+from npa_envs.ops.physics_constants import Physics as Physics
+from npa_envs.ops.physics_constants import Terms as Terms
+from npa_envs.ops.rewards_and_ends import DIVERGED as DIVERGED
+from npa_envs.ops.rewards_and_ends import NOT_FINITE as NOT_FINITE
+from npa_envs.ops.rewards_and_ends import SUCCESS as SUCCESS
+from npa_envs.ops.rewards_and_ends import TIME_LIMIT as TIME_LIMIT
+from npa_envs.ops.rewards_and_ends import EpisodeRules as EpisodeRules
+from npa_envs.ops.rewards_and_ends import EpisodeUpdate as EpisodeUpdate
 from npa_envs.ops.species_density import perceive_by_species
 from npa_envs.ops.update import ActedWorlds, PreparedActions, wrapped
 from npa_envs.ops.world_mean import world_mean
 from npa_envs.world.randomness import WorldRandom
 from npa_envs.world.steps import draw_step
-
-__all__ = [
-    "DIVERGED",
-    "NOT_FINITE",
-    "SUCCESS",
-    "TIME_LIMIT",
-    "Actions",
-    "Boundary",
-    "EpisodeRules",
-    "EpisodeUpdate",
-    "Limits",
-    "MomentInverse",
-    "NeighbourState",
-    "Physics",
-    "Terms",
-    "build_neighbours",
-    "marginal_gains",
-    "perceive_each_species",
-    "with_mean_reward",
-]
 
 
 def perceive_each_species(x: Tensor, counts: Sequence[int], physics: Physics) -> Tensor:

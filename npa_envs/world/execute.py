@@ -74,7 +74,7 @@ class RolloutSpec(NamedTuple):
     """Interval in steps at which worlds are returned; None: only the last worlds."""
     species: tuple[SpeciesSpec, ...] = ()
     """The species, if several rules share a world."""
-    by_species: bool = False
+    per_species: bool = False
     """Whether rules perceive each species' density and density gradient."""
 
     def make_step(self, rules: Sequence[NPARule], particles: Particles) -> Step:
@@ -85,7 +85,7 @@ class RolloutSpec(NamedTuple):
                 self.species,
                 self.physics.constants(),
                 particles.x,
-                by_species=self.by_species,
+                per_species=self.per_species,
                 detach_positions=self.detach_positions,
             )
         (rule,) = rules
@@ -143,7 +143,7 @@ class RolloutSpec(NamedTuple):
                 else:
                     particles = step.advance(particles, draws)
                 if watch is not None:
-                    watch.look(step.leave(particles.map(Tensor.detach)))
+                    watch.check(step.leave(particles.map(Tensor.detach)))
                 if keep_every is not None and (number + 1) % keep_every == 0:
                     trajectory.append(step.leave(particles))
             if recomputed is not None:

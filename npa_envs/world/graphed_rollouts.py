@@ -1,13 +1,13 @@
 """Recorded rollouts: on CUDA, repeated calls are replayed as CUDA graphs instead of launched.
 
 A rollout launches some ten short kernels a step, and the launches take many times longer than the
-kernels. The third call of a kind (same shapes, options and form of the rule) is recorded: its
-forward pass, and with gradients its backward pass, as two CUDA graphs on fixed tensors. Each call
-copies worlds and weights into these, replays, and returns copies of the results. So a recording
-serves any rule of that form, and later calls do not overwrite results.
+kernels. Calls with the same shapes, options and form of the rule are of one kind. The third call of
+a kind is recorded: its forward pass, and with gradients its backward pass, as two CUDA graphs on
+fixed tensors. Each call copies worlds and weights into these, replays, and returns copies of the
+results. So a recording serves any rule of that form, and later calls do not overwrite results.
 
 Tensors for the backward pass stay in the recording's memory. Until that pass has run, the recording
-is leased, and another rollout of the kind gets another recording.
+is in use, and another rollout of the kind gets another recording.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.checks import FiniteCheck, check_finite_positions
-from npa_envs.errors import NPAError, shown
+from npa_envs.errors import NPAError
 from npa_envs.ops.custom_op import once_differentiable
 from npa_envs.rule.rule import HYPER_PARAMETERS, NPARule
 from npa_envs.world.cuda_graph import (
@@ -55,10 +55,12 @@ if TYPE_CHECKING:
 CudaGraph = bool | Literal["auto"]
 """Which rollouts are recorded on CUDA: those of plain rules ("auto"), all or none."""
 
+CUDA_GRAPH_CHOICES: tuple[CudaGraph, ...] = ("auto", True, False)
+
 LAUNCHED_FIRST = 2
 """Calls of a kind that are launched before the next one is recorded."""
 
-MEMORY_SHARE = 0.5
+MEMORY_FRACTION = 0.5
 """Largest fraction of a device's memory for recordings; the least recently used are deleted."""
 
 BLOCK_STEPS = 64
@@ -79,7 +81,111 @@ WARM_UP_STEPS = 4
 logger = logging.getLogger(__name__)
 
 
-# Recording: a rollout is captured as CUDA graphs, on copies of worlds and weights.
+# A call: it is launched, recorded or replayed.
+def run_recorded(
+    spec: RolloutSpec,
+    rules: Sequence[NPARule],
+    particles: Particles,
+    generator: Randomness | None,
+    *,
+    cuda_graph: CudaGraph,
+) -> Particles | None:
+    """Run a checked rollout by replaying a recording; None if it has to be launched.
+
+    Raises:
+        NPAError: A position is not finite.
+    """
+    x = particles.x
+    # In this order: a compiler cannot trace queries of streams.
+    if cuda_graph is False or not x.is_cuda or torch.compiler.is_compiling() or spec.steps == 0:
+        return None
+    if not can_capture() or torch.cuda.is_current_stream_capturing():
+        return None
+    explicit = cuda_graph is True
+    plain = [rule.has_network() for rule in rules]
+    if not all(plain) and (not explicit or torch.is_autocast_enabled(x.device.type)):
+        return None
+    forms, rule_weights = zip(*map(_form, rules, plain), strict=True)
+    weights = list(itertools.chain.from_iterable(rule_weights))
+    grad_flags = _grad_flags(particles, weights)
+    per_world_streams = isinstance(generator, WorldRandom)
+    # Torch's older getter raises an error if the precision was set in the new way.
+    precision = torch.backends.cuda.matmul.fp32_precision
+    shape = (x.shape, particles.s.shape[2], x.dtype, x.device)
+    key = spec._replace(steps=0), forms, shape, grad_flags, per_world_streams, precision
+    with _lock:
+        kind = _kinds.count(key, MAX_KINDS)
+    if kind.refused or kind.calls <= (1 if explicit else LAUNCHED_FIRST):
+        return None
+    if grad_flags and (spec.steps > MAX_STEPS or _saves_tensors_elsewhere()):
+        return None
+    blocks = _blocks(spec, with_gradients=bool(grad_flags))
+    call = _Call(spec, rules, particles, weights, grad_flags, generator, explicit, blocks)
+    use = _take_recording(kind, call)
+    if use is None:
+        return None
+    if not all(plain) and not use.recording.compared.issuperset(call.blocks):
+        return _run_and_compare(call, kind, use)
+    return use.recording.replay(call, use)
+
+
+def _grad_flags(particles: Particles, weights: list[Tensor]) -> tuple[bool, ...]:
+    """Return which worlds and weights require a gradient; () if none does or can."""
+    if not torch.is_grad_enabled():
+        return ()
+    world_flags = [tensor.requires_grad for tensor in particles.tensors()]
+    weight_flags = [tensor.requires_grad for tensor in weights]
+    # Paths, which begin at 0, need no gradient.
+    return (*world_flags, False, *weight_flags) if any(world_flags + weight_flags) else ()
+
+
+def _saves_tensors_elsewhere() -> bool:
+    """Return whether the caller has hooks for saved tensors, as checkpoints do."""
+    hooks = getattr(torch._C._autograd, "_top_saved_tensors_default_hooks", None)
+    return hooks is not None and hooks(True) is not None
+
+
+def _blocks(spec: RolloutSpec, *, with_gradients: bool) -> list[int]:
+    """Return the steps of each graph to replay: without gradients a long rollout has several."""
+    if with_gradients:
+        return [spec.steps]
+    interval = spec.keep_every or 1
+    block = max(BLOCK_STEPS // interval, 1) * interval
+    remainder = spec.steps % block
+    return [block] * (spec.steps // block) + [remainder] * (remainder > 0)
+
+
+def _run_and_compare(call: _Call, kind: CallKind, use: _RecordingUse) -> Particles:
+    """Launch a rollout and compare it with its replay, which custom Python code may break.
+
+    If results differ, calls of this kind are launched from then on.
+    """
+    particles, weights, generator = call.particles, call.weights, call.generator
+    device = particles.x.device
+    check_finite_positions(particles.x)
+    with torch.no_grad():
+        copies = [weight.clone() for weight in weights]
+    source: Randomness
+    if isinstance(generator, WorldRandom):
+        source = generator.take(slice(None))
+    else:
+        # If other threads draw from a shared one in the meantime, results differ.
+        shared = torch_generator(generator, device)
+        source = torch.Generator(device).manual_seed(shared.initial_seed())
+        source.set_offset(shared.get_offset())
+    worlds = particles.map(lambda value: value.view_as(value)).begun()
+    launched = call.spec.run(call.rules, worlds, generator)
+    with torch.no_grad():
+        replayed = use.recording.replay(call._replace(weights=copies, generator=source), use)
+        pairs = zip((*launched.tensors(), *weights), (*replayed.tensors(), *copies), strict=True)
+        same = all(bool(((a == b) | (a.isnan() & b.isnan())).all()) for a, b in pairs)
+    if same:
+        use.recording.compared.update(call.blocks)
+    else:
+        _refuse(kind, "a replay gives other numbers than forward, run by Python", logging.WARNING)
+    return launched
+
+
 rule_form: Callable[[NPARule], Hashable] = operator.attrgetter(
     *HYPER_PARAMETERS.keys() - {"readout_dim", "readout_hidden_dim", "code_names", "encoder"}
 )
@@ -90,14 +196,14 @@ def _form(rule: NPARule, plain: bool) -> tuple[Hashable, list[Tensor]]:
     """Return a rule's settings that a recording depends on, and its weights."""
     if plain:
         weights = rule.network_weights()
-        return (rule_form(rule), *map(_memory_form, weights)), weights
+        return (rule_form(rule), *map(_tensor_form, weights)), weights
     device = rule.hidden.weight.device
     settings = tuple(rule_settings(rule, device).items())
     deterministic = torch.are_deterministic_algorithms_enabled()
     return (weakref.ref(rule), settings, deterministic), rule_tensors(rule, device)
 
 
-def _memory_form(tensor: Tensor) -> Hashable:
+def _tensor_form(tensor: Tensor) -> Hashable:
     return tensor.shape, tensor.dtype, tensor.device
 
 
@@ -110,7 +216,7 @@ def _clone(rule: NPARule, like: Tensor) -> NPARule:
     with torch.device("meta"):
         clone = NPARule(**form)
     clone = clone.to(like.dtype).to_empty(device=like.device)
-    forms = [list(map(_memory_form, each.network_weights())) for each in (rule, clone)]
+    forms = [list(map(_tensor_form, each.network_weights())) for each in (rule, clone)]
     if forms[0] != forms[1]:
         raise NPAError(
             f"a rule's weights must have the shapes of its sizes, {forms[1]}, got {forms[0]}: make "
@@ -127,15 +233,147 @@ class _Call(NamedTuple):
     particles: Particles
     weights: list[Tensor]
     """Tensors of all rules."""
-    wanted: tuple[bool, ...]
+    grad_flags: tuple[bool, ...]
     """Which worlds and weights require a gradient; (): none does, or gradients are disabled."""
     generator: Randomness | None
     explicit: bool
     """Whether the caller asked for a recording by `cuda_graph=True`."""
     blocks: list[int]
-    """Steps of each graph to replay: without gradients a long rollout replays several."""
+    """Steps of each graph to replay, one after the other."""
 
 
+# Kinds of calls: which recording serves a call, and which are deleted to make room.
+class CallKind:
+    """Calls of one kind: their number, and their recordings or taped steps."""
+
+    def __init__(self) -> None:
+        self.calls = 0
+        self.free: collections.deque[Any] = collections.deque()
+        """Recordings, or taped steps, that are not in use."""
+        self.recordings: list[_Recording] = []
+        self.failures = 0
+        """Number of failed recordings."""
+        self.refused = False
+        """Whether calls of this kind cannot be recorded."""
+
+
+class CallKinds(collections.OrderedDict[Hashable, CallKind]):
+    """How often each kind of call was seen, and its recordings; the least recently used first."""
+
+    def count(self, key: Hashable, most: int) -> CallKind:
+        """Count a call and return its kind; beyond `most` kinds delete the least recently used."""
+        kind = self.get(key)
+        if kind is None:
+            kind = self[key] = CallKind()
+            if len(self) > most:
+                self.forget(next(iter(self)))
+        else:
+            self.move_to_end(key)
+        kind.calls += 1
+        return kind
+
+    def forget(self, key: Hashable) -> None:
+        """Delete a kind; recordings in use live until their backward pass has run."""
+        for recording in self.pop(key).recordings:
+            if recording.stream is not None:
+                recording.stream.synchronize()
+
+
+class _RecordingUse:
+    """One use of a recording, which ends with this object; autograd keeps it until a backward pass.
+
+    The recording is then free for other calls.
+    """
+
+    def __init__(self, recording: _Recording, kind: CallKind) -> None:
+        self.recording = recording
+        self._kind = kind
+        self.broken = False
+        """Whether the recording must not be used again."""
+
+    def __del__(self) -> None:
+        if not (self.broken or self._kind.refused):
+            # Appending to a deque needs no lock: any thread may drop the last reference.
+            self._kind.free.append(self.recording)
+
+
+_kinds = CallKinds()
+
+_lock = recording_lock
+"""Lock of `_kinds`: that of captures, as with two locks two threads could wait for each other."""
+
+
+def recorded_memory(device: torch.device) -> int:
+    """Return the bytes of a device's memory that recorded rollouts use."""
+    with _lock:
+        recordings = [recording for kind in _kinds.values() for recording in kind.recordings]
+        return sum(recording.bytes for recording in recordings if recording.device == device)
+
+
+def release_recordings() -> None:
+    """Delete all recorded rollouts and free their memory; later calls are recorded again."""
+    with _lock:
+        for key in list(_kinds):
+            _kinds.forget(key)
+    torch.cuda.empty_cache()
+
+
+def _take_recording(kind: CallKind, call: _Call) -> _RecordingUse | None:
+    """Return the use of a free or new recording with graphs for a call; None if impossible."""
+    with _lock:
+        use = None
+        with contextlib.suppress(IndexError):
+            # The one used last: it more likely has these numbers of steps.
+            use = _RecordingUse(kind.free.pop(), kind)
+        try:
+            if use is None:
+                with plain_tensors():
+                    recording = _Recording(call)
+                kind.recordings.append(recording)
+                use = _RecordingUse(recording, kind)
+            recording = use.recording
+            for steps in set(call.blocks) - recording.graphs.keys():
+                if not _make_room(recording.device):
+                    logger.debug("a rollout is launched: recordings use all memory that they may")
+                    return None
+                # Later calls may be in other modes.
+                with plain_tensors(), torch.autocast("cuda", enabled=False):
+                    recording.record(steps, call)
+        except Exception as error:
+            kind.failures += 1
+            if use is not None and may_be_disturbed(kind.failures):
+                use.broken = True
+                kind.recordings.remove(use.recording)
+                return None
+            drew = "CUDA generator" in str(error)
+            reason = "forward draws from torch's own generator, as dropout does" if drew else error
+            # If the rollout cannot be launched either, that raises the right error.
+            _refuse(kind, reason, logging.WARNING if call.explicit else logging.DEBUG)
+            return None
+        return use
+
+
+def _make_room(device: torch.device) -> bool:
+    """Delete other kinds, the least recently used first, until a device has room for a graph."""
+    limit = MEMORY_FRACTION * torch.cuda.get_device_properties(device).total_memory
+    for key in list(_kinds)[:-1]:
+        if recorded_memory(device) < limit:
+            break
+        if any(other.device == device for other in _kinds[key].recordings):
+            _kinds.forget(key)
+    return recorded_memory(device) < limit
+
+
+def _refuse(kind: CallKind, reason: object, level: int) -> None:
+    """Launch all calls of a kind from now on."""
+    logger.log(level, "rollouts of this kind are launched, not recorded: %s", reason)
+    with _lock:
+        kind.refused = True
+        kind.recordings.clear()
+        kind.free.clear()
+
+
+# Recordings: a rollout is captured as CUDA graphs, on copies of worlds and weights, and replayed.
 class _Graphs(NamedTuple):
     forward: GraphSequence
     worlds: list[Tensor]
@@ -171,10 +409,10 @@ class _Recording:
             lambda value: torch.empty(value.shape, dtype=value.dtype, device=value.device)
         )
         self._inputs = [*self._worlds.tensors(), *weights]
-        self._wanted = call.wanted or (False,) * len(self._inputs)
-        self.differentiable = any(self._wanted)
+        self._grad_flags = call.grad_flags or (False,) * len(self._inputs)
+        self.differentiable = any(self._grad_flags)
         """Whether backward passes are recorded."""
-        for tensor, flag in zip(self._inputs, self._wanted, strict=True):
+        for tensor, flag in zip(self._inputs, self._grad_flags, strict=True):
             # Buffers of rules may be integers.
             if tensor.requires_grad != flag:
                 tensor.requires_grad_(flag)
@@ -189,11 +427,13 @@ class _Recording:
         """Graphs by number of steps, the least recently used first."""
         self.compared: set[int] = set()
         """Numbers of steps whose replay was found equal to a launched rollout."""
-        self._draws_a_step = 0
+        self._draws_per_step = 0
         """Increase of a generator's offset in one step."""
         self._pool = torch.cuda.graph_pool_handle()
         self.stream: torch.cuda.Stream | None = None
+        """Stream of the last use."""
         self.token = torch.empty(0, device=self.device)
+        """What autograd saves in the place of tensors for the backward pass."""
 
     def _inputs_of(self, call: _Call) -> list[Tensor]:
         """Return all inputs of a rollout, in the order of the fixed tensors."""
@@ -202,30 +442,11 @@ class _Recording:
     def record(self, steps: int, call: _Call) -> None:
         """Record rollouts of a number of steps, after a warm-up with the inputs of a call."""
         if not self.graphs:
-            first = self._spec._replace(steps=min(steps, WARM_UP_STEPS), keep_every=None)
-            with torch.no_grad():
-                torch._foreach_copy_(self._inputs, self._inputs_of(call))
-            # Free the allocator's cache of earlier, launched calls.
-            torch.cuda.synchronize(self.device)
-            torch.cuda.empty_cache()
-            self._generator.set_offset(0)
-            shared = torch_generator(None, self.device)
-            offset = shared.get_offset()
-
-            def warm_up() -> None:
-                after = self._run(first, []).tensors()
-                if self.differentiable:
-                    self._pull_back(after, [torch.zeros_like(value) for value in after])
-
-            prepare_capture(warm_up, self.device)
-            self._draws_a_step = self._generator.get_offset() // first.steps
-            if self._custom_rules:
-                # Draws of their networks in the warm-up do not count.
-                shared.set_offset(offset)
+            self._warm_up(min(steps, WARM_UP_STEPS), call)
         elif len(self.graphs) >= MAX_GRAPHS:
             self.compared.discard(self.graphs.popitem(last=False)[0])
         spec = self._spec._replace(steps=steps)
-        before = torch.cuda.memory_reserved(self.device)
+        bytes_before = torch.cuda.memory_reserved(self.device)
         results: list[Tensor] = []
         saved: list[Tensor] = []
         gradients: list[Tensor] = []
@@ -238,7 +459,7 @@ class _Recording:
             gradients[:] = self._pull_back(results, self._cotangents_of(steps))
 
         draws = None if self._streams is not None else self._generator
-        begin, versions = self._settings(), self._versions()
+        settings, versions = self._settings(), self._versions()
         forward_graph = capture(forward, self.device, pool=self._pool, generator=draws, alone=True)
         # Not every operator that writes to a buffer changes its version.
         buffers = {
@@ -257,8 +478,42 @@ class _Recording:
         if self.differentiable:
             self._cotangents_of(steps)
             backward_graph = capture(backward, self.device, pool=self._pool, alone=True)
-        now = self._settings()
-        changed = {key[1] for key in begin.keys() | now.keys() if begin.get(key) != now.get(key)}
+        self._check_unchanged(settings, versions)
+        self.graphs[steps] = _Graphs(
+            forward_graph, _views(results), backward_graph, _views(gradients), written
+        )
+        self.bytes += max(torch.cuda.memory_reserved(self.device) - bytes_before, 0)
+
+    def _warm_up(self, steps: int, call: _Call) -> None:
+        """Launch a rollout with the inputs of a call, and count the numbers that it draws."""
+        spec = self._spec._replace(steps=steps, keep_every=None)
+        with torch.no_grad():
+            torch._foreach_copy_(self._inputs, self._inputs_of(call))
+        # Free the allocator's cache of earlier, launched calls.
+        torch.cuda.synchronize(self.device)
+        torch.cuda.empty_cache()
+        self._generator.set_offset(0)
+        shared = torch_generator(None, self.device)
+        offset = shared.get_offset()
+
+        def launch() -> None:
+            after = self._run(spec, []).tensors()
+            if self.differentiable:
+                self._pull_back(after, [torch.zeros_like(value) for value in after])
+
+        prepare_capture(launch, self.device)
+        self._draws_per_step = self._generator.get_offset() // steps
+        if self._custom_rules:
+            # Draws of their networks in the warm-up do not count.
+            shared.set_offset(offset)
+
+    def _check_unchanged(
+        self, settings: dict[tuple[int, str], Hashable], versions: list[int]
+    ) -> None:
+        """Check that a capture has changed no settings, and its backward pass no inputs."""
+        after = self._settings()
+        keys = settings.keys() | after.keys()
+        changed = {key[1] for key in keys if settings.get(key) != after.get(key)}
         if changed:
             raise NPAError(
                 "forward must not change a rule's attributes, but for the numbers of its tensors, "
@@ -266,10 +521,6 @@ class _Recording:
             )
         if versions != self._versions():
             raise NPAError("a rule's tensors must not change in its backward pass, but one does")
-        self.graphs[steps] = _Graphs(
-            forward_graph, _views(results), backward_graph, _views(gradients), written
-        )
-        self.bytes += max(torch.cuda.memory_reserved(self.device) - before, 0)
 
     def _settings(self) -> dict[tuple[int, str], Hashable]:
         """Return all settings of rules with custom networks that must not change."""
@@ -308,52 +559,41 @@ class _Recording:
         with torch.set_grad_enabled(self.differentiable), hooks:
             return spec.run(self._rules, self._worlds, generator)
 
-    def _pull_back(self, results: Sequence[Tensor], bars: list[Tensor]) -> list[Tensor]:
+    def _pull_back(self, results: Sequence[Tensor], cotangents: list[Tensor]) -> list[Tensor]:
         """Launch the backward pass, and return the gradients of inputs that require one."""
-        pairs = [
-            (result, bar) for result, bar in zip(results, bars, strict=True) if result.requires_grad
-        ]
-        sources = [tensor for tensor, flag in zip(self._inputs, self._wanted, strict=False) if flag]
+        pairs = [pair for pair in zip(results, cotangents, strict=True) if pair[0].requires_grad]
         # Retained, because a replay may run twice: otherwise memory that the pass reads, such as
         # weights laid out for recomputed steps, would be reused within it.
         gradients = torch.autograd.grad(
             [result for result, _ in pairs],
-            sources,
-            [bar for _, bar in pairs],
+            list(itertools.compress(self._inputs, self._grad_flags)),
+            [cotangent for _, cotangent in pairs],
             retain_graph=True,
             allow_unused=True,
             materialize_grads=True,
         )
         return [gradient.contiguous() for gradient in gradients]
 
-    def replay(self, call: _Call, lease: _Lease) -> Particles:
+    def replay(self, call: _Call, use: _RecordingUse) -> Particles:
         """Replay a rollout's graphs in order; copy buffers that they change back to the rule."""
-        generator, interval = call.generator, call.spec.keep_every
+        generator = call.generator
         inputs = self._inputs_of(call)
         self.ready.record(current_stream(self.device))
         results: list[Particles] = []
         for steps in call.blocks:
             if self.differentiable:
-                # The lease takes the place of saved tensors. It ends when autograd drops these:
+                # The use takes the place of saved tensors. It ends when autograd drops these:
                 # after a backward pass, unless the graph is retained, or with the last result.
                 hooks = torch.autograd.graph.saved_tensors_hooks(
-                    lambda _: lease, lambda saved: saved.recording.token
+                    lambda _: use, lambda saved: saved.recording.token
                 )
                 with hooks:
-                    after = Particles(*_Replayed.apply(self, steps, generator, *inputs))  # type: ignore[no-untyped-call]
+                    worlds = Particles(*_Replayed.apply(self, steps, generator, *inputs))  # type: ignore[no-untyped-call]
             else:
-                after = Particles(*self.forward(steps, inputs, generator))
+                worlds = Particles(*self.forward(steps, inputs, generator))
             if not results:
                 # Only now, when the device has work: this check takes much CPU time.
-                try:
-                    FiniteCheck(call.particles.x, self.ready).wait()
-                except NPAError:
-                    if self._streams is None:
-                        # The caller's generator returns to its state before the rollout.
-                        count = steps * self._draws_a_step
-                        source = torch_generator(generator, self.device)
-                        give_back_draws(source, self._generator.get_offset() - count, count)
-                    raise
+                self._check_positions(call.particles.x, generator, steps)
             if self._streams is not None:
                 assert isinstance(generator, WorldRandom)
                 generator.sync_with(self._streams, steps)
@@ -363,12 +603,24 @@ class _Recording:
                     torch._foreach_copy_(
                         [inputs[k] for k in written], [self._inputs[k] for k in written]
                     )
-            results.append(after)
-            last = after if interval is None else after.map(lambda value: value[-1])
-            inputs = [*last.tensors(), *call.weights]
-        if len(results) == 1:
-            return results[0]
-        return last if interval is None else combined(torch.cat, results)
+            results.append(worlds)
+            if call.spec.keep_every is not None:
+                worlds = worlds.map(lambda value: value[-1])
+            inputs = [*worlds.tensors(), *call.weights]
+        if call.spec.keep_every is None or len(results) == 1:
+            return results[-1]
+        return combined(torch.cat, results)
+
+    def _check_positions(self, x: Tensor, generator: Randomness | None, steps: int) -> None:
+        """Check that positions are finite; otherwise the generator returns to its former state."""
+        try:
+            FiniteCheck(x, self.ready).wait()
+        except NPAError:
+            if self._streams is None:
+                count = steps * self._draws_per_step
+                source = torch_generator(generator, self.device)
+                give_back_draws(source, self._generator.get_offset() - count, count)
+            raise
 
     def forward(
         self, steps: int, tensors: Sequence[Tensor], generator: Randomness | None
@@ -384,19 +636,20 @@ class _Recording:
             return _copies(graphs.worlds)
 
     def backward(
-        self, steps: int, cotangents: Sequence[Tensor | None], wanted: Sequence[bool]
+        self, steps: int, cotangents: Sequence[Tensor | None], grad_flags: Sequence[bool]
     ) -> list[Tensor | None]:
         """Replay the backward pass of the last rollout, and return copies of the gradients."""
         with torch.cuda.device(self.device):
             self._wait_for_last_use()
-            for buffer, bar in zip(self._cotangents_of(steps), cotangents, strict=True):
-                buffer.zero_() if bar is None else buffer.copy_(bar)
+            for buffer, cotangent in zip(self._cotangents_of(steps), cotangents, strict=True):
+                buffer.zero_() if cotangent is None else buffer.copy_(cotangent)
             graphs = self.graphs[steps]
             assert graphs.backward is not None, "it was recorded for gradients"
             graphs.backward.replay()
             recorded = iter(_copies(graphs.gradients))
-            gradients = [next(recorded) if flag else None for flag in self._wanted]
-            return [value if flag else None for value, flag in zip(gradients, wanted, strict=True)]
+            gradients = [next(recorded) if flag else None for flag in self._grad_flags]
+            pairs = zip(gradients, grad_flags, strict=True)
+            return [gradient if flag else None for gradient, flag in pairs]
 
     def _load_draws(self, generator: Randomness | None, steps: int) -> None:
         if self._streams is not None:
@@ -405,8 +658,7 @@ class _Recording:
         else:
             source = torch_generator(generator, self.device)
             self._generator.manual_seed(source.initial_seed())
-            begin = reserve_draws(source, steps * self._draws_a_step)
-            self._generator.set_offset(begin)
+            self._generator.set_offset(reserve_draws(source, steps * self._draws_per_step))
 
     def _wait_for_last_use(self) -> None:
         """Make the current stream wait for the stream of the last use."""
@@ -438,229 +690,6 @@ def _copies(tensors: list[Tensor]) -> list[Tensor]:
     copies = [torch.empty_like(tensor) for tensor in tensors]
     torch._foreach_copy_(copies, tensors)
     return copies
-
-
-# Leases and memory: which recording serves a call, and which are deleted to make room.
-class CallKind:
-    """Calls of one kind: their number, and their recordings or taped steps."""
-
-    def __init__(self) -> None:
-        self.calls = 0
-        self.free: collections.deque[Any] = collections.deque()
-        """Recordings, or taped steps, that are not in use."""
-        self.recordings: list[_Recording] = []
-        self.failures = 0
-        """Number of failed recordings."""
-        self.refused = False
-        """Whether calls of this kind cannot be recorded."""
-
-
-class CallKinds(collections.OrderedDict[Hashable, CallKind]):
-    """How often each kind of call was seen, and its recordings; the least recently used first."""
-
-    def count(self, key: Hashable, most: int) -> CallKind:
-        """Count a call and return its kind; beyond `most` kinds delete the least recently used."""
-        kind = self.get(key)
-        if kind is None:
-            kind = self[key] = CallKind()
-            if len(self) > most:
-                self.forget(next(iter(self)))
-        else:
-            self.move_to_end(key)
-        kind.calls += 1
-        return kind
-
-    def forget(self, key: Hashable) -> None:
-        """Delete a kind; recordings in use live until their backward pass has run."""
-        for recording in self.pop(key).recordings:
-            if recording.stream is not None:
-                recording.stream.synchronize()
-
-
-class _Lease:
-    """One use of a recording, which its deletion ends; autograd keeps it until a backward pass."""
-
-    def __init__(self, recording: _Recording, kind: CallKind) -> None:
-        self.recording = recording
-        self._kind = kind
-        self.broken = False
-        """Whether the recording must not be used again."""
-
-    def __del__(self) -> None:
-        if not (self.broken or self._kind.refused):
-            # Appending to a deque needs no lock: any thread may drop the last reference.
-            self._kind.free.append(self.recording)
-
-
-_kinds = CallKinds()
-
-
-_lock = recording_lock
-"""Lock of `_kinds`: that of captures, as with two locks two threads could wait for each other."""
-
-
-def recorded_memory(device: torch.device) -> int:
-    """Return the bytes of a device's memory that recorded rollouts use."""
-    with _lock:
-        recordings = [recording for kind in _kinds.values() for recording in kind.recordings]
-        return sum(recording.bytes for recording in recordings if recording.device == device)
-
-
-def release_recordings() -> None:
-    """Delete all recorded rollouts and free their memory; later calls are recorded again."""
-    with _lock:
-        for key in list(_kinds):
-            _kinds.forget(key)
-    torch.cuda.empty_cache()
-
-
-def _lease(kind: CallKind, call: _Call) -> _Lease | None:
-    """Return a free or new recording with graphs for a call; None if impossible."""
-    with _lock:
-        lease = None
-        with contextlib.suppress(IndexError):
-            # The one used last: it more likely has these numbers of steps.
-            lease = _Lease(kind.free.pop(), kind)
-        try:
-            if lease is None:
-                with plain_tensors():
-                    recording = _Recording(call)
-                kind.recordings.append(recording)
-                lease = _Lease(recording, kind)
-            recording = lease.recording
-            device = recording.device
-            for steps in set(call.blocks) - recording.graphs.keys():
-                limit = MEMORY_SHARE * torch.cuda.get_device_properties(device).total_memory
-                # Make room by deleting other kinds, the least recently used first.
-                for key in list(_kinds)[:-1]:
-                    if recorded_memory(device) < limit:
-                        break
-                    if any(other.device == device for other in _kinds[key].recordings):
-                        _kinds.forget(key)
-                if recorded_memory(device) >= limit:
-                    logger.debug("a rollout is launched: recordings use all memory that they may")
-                    return None
-                # Later calls may be in other modes.
-                with plain_tensors(), torch.autocast("cuda", enabled=False):
-                    recording.record(steps, call)
-        except Exception as error:
-            kind.failures += 1
-            if lease is not None and may_be_disturbed(kind.failures):
-                lease.broken = True
-                kind.recordings.remove(lease.recording)
-                return None
-            drew = "CUDA generator" in str(error)
-            reason = "forward draws from torch's own generator, as dropout does" if drew else error
-            # If the rollout cannot be launched either, that raises the right error.
-            _refuse(kind, reason, logging.WARNING if call.explicit else logging.DEBUG)
-            return None
-        return lease
-
-
-def _refuse(kind: CallKind, reason: object, level: int) -> None:
-    """Launch all calls of a kind from now on."""
-    logger.log(level, "rollouts of this kind are launched, not recorded: %s", reason)
-    with _lock:
-        kind.refused = True
-        kind.recordings.clear()
-        kind.free.clear()
-
-
-# Replay: a call looks for a recording of its kind, and replays it.
-def check_cuda_graph(cuda_graph: CudaGraph) -> None:
-    """Check the keyword `cuda_graph`."""
-    if not isinstance(cuda_graph, bool | str) or cuda_graph not in (True, False, "auto"):
-        raise NPAError(f"cuda_graph must be 'auto', True or False, got {shown(cuda_graph)}")
-
-
-def run_recorded(
-    spec: RolloutSpec,
-    rules: Sequence[NPARule],
-    particles: Particles,
-    generator: Randomness | None,
-    *,
-    cuda_graph: CudaGraph,
-) -> Particles | None:
-    """Run a checked rollout by replaying a recording; None if it has to be launched.
-
-    Raises:
-        NPAError: A position is not finite.
-    """
-    x = particles.x
-    # In this order: a compiler cannot trace queries of streams.
-    if cuda_graph is False or not x.is_cuda or torch.compiler.is_compiling() or spec.steps == 0:
-        return None
-    if not can_capture() or torch.cuda.is_current_stream_capturing():
-        return None
-    explicit = cuda_graph is True
-    plain = [rule.has_network() for rule in rules]
-    if not all(plain) and (not explicit or torch.is_autocast_enabled(x.device.type)):
-        return None
-    forms, rule_weights = zip(*map(_form, rules, plain), strict=True)
-    weights = list(itertools.chain.from_iterable(rule_weights))
-    wanted: tuple[bool, ...] = ()
-    if torch.is_grad_enabled():
-        flags = [[tensor.requires_grad for tensor in of] for of in (particles.tensors(), weights)]
-        # Paths, which begin at 0, need no gradient.
-        wanted = (*flags[0], False, *flags[1]) if any(map(any, flags)) else ()
-    by_world = isinstance(generator, WorldRandom)
-    # Torch's older getter raises an error if the precision was set in the new way.
-    precision = torch.backends.cuda.matmul.fp32_precision
-    shape = (x.shape, particles.s.shape[2], x.dtype, x.device)
-    key = spec._replace(steps=0), forms, shape, wanted, by_world, precision
-    with _lock:
-        kind = _kinds.count(key, MAX_KINDS)
-    if kind.refused or kind.calls <= (1 if explicit else LAUNCHED_FIRST):
-        return None
-    # The caller may have hooks for saved tensors, as checkpoints do.
-    hooks = getattr(torch._C._autograd, "_top_saved_tensors_default_hooks", None)
-    hooked = hooks is not None and hooks(True) is not None
-    if wanted and (hooked or spec.steps > MAX_STEPS):
-        return None
-    interval = spec.keep_every or 1
-    block = spec.steps if wanted else max(BLOCK_STEPS // interval, 1) * interval
-    rest = spec.steps % block
-    blocks = [block] * (spec.steps // block) + [rest] * (rest > 0)
-    call = _Call(spec, rules, particles, weights, wanted, generator, explicit, blocks)
-    lease = _lease(kind, call)
-    if lease is None:
-        return None
-    if not all(plain) and not lease.recording.compared.issuperset(call.blocks):
-        return _run_and_compare(call, kind, lease)
-    return lease.recording.replay(call, lease)
-
-
-def _run_and_compare(call: _Call, kind: CallKind, lease: _Lease) -> Particles:
-    """Launch a rollout and compare it with its replay, which custom Python code may break.
-
-    If results differ, calls of this kind are launched from then on.
-    """
-    particles, weights, generator = call.particles, call.weights, call.generator
-    device = particles.x.device
-    check_finite_positions(particles.x)
-    with torch.no_grad():
-        copies = [weight.clone() for weight in weights]
-    source: Randomness
-    if isinstance(generator, WorldRandom):
-        source = generator.take(slice(None))
-    else:
-        # If other threads draw from a shared one in the meantime, results differ.
-        shared = torch_generator(generator, device)
-        source = torch.Generator(device).manual_seed(shared.initial_seed())
-        source.set_offset(shared.get_offset())
-    worlds = particles.map(lambda value: value.view_as(value)).begun()
-    launched = call.spec.run(call.rules, worlds, generator)
-    with torch.no_grad():
-        again = call._replace(weights=copies, generator=source)
-        replayed = lease.recording.replay(again, lease)
-        pairs = zip((*launched.tensors(), *weights), (*replayed.tensors(), *copies), strict=True)
-        same = all(bool(((a == b) | (a.isnan() & b.isnan())).all()) for a, b in pairs)
-    if same:
-        lease.recording.compared.update(call.blocks)
-    else:
-        reason = "a replay gives other numbers than forward, run by Python"
-        _refuse(kind, reason, logging.WARNING)
-    return launched
 
 
 class _Replayed(torch.autograd.Function):

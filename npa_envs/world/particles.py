@@ -49,8 +49,8 @@ class Particles(NamedTuple):
 
     def put_(self, worlds: Tensor, other: Particles) -> None:
         """Write other worlds to these indices."""
-        for own, new in zip(self.tensors(), other.tensors(), strict=True):
-            own.index_copy_(0, worlds, new)
+        for field, new in zip(self.tensors(), other.tensors(), strict=True):
+            field.index_copy_(0, worlds, new)
 
     def where(self, worlds: Tensor, other: Particles) -> Particles:
         """Return these worlds where `worlds`, bool, shape [B], is True, and `other` elsewhere."""
@@ -75,8 +75,12 @@ class Particles(NamedTuple):
 
     def split(self, counts: Sequence[int]) -> list[Particles]:
         """Return the particles of each species, which lie one species after the other."""
-        species = (torch.split(value, [*counts], dim=1) for value in self.tensors())
-        return [Particles(*fields) for fields in zip(*species, strict=True)]
+        fields = [
+            [None] * len(counts) if value is None else torch.split(value, [*counts], dim=1)
+            for value in self.per_particle()
+        ]
+        species = (Particles(*each) for each in zip(*fields, strict=True))
+        return [worlds._replace(goal=self.goal) for worlds in species]
 
     def copy_(self, other: Particles) -> None:
         """Overwrite these worlds with others, in one kernel."""

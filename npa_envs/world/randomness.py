@@ -19,6 +19,7 @@ from npa_envs.ops.draws import WORD_COUNT, draw
 from npa_envs.ops.sort import MAX_INDEX
 
 
+@enum.unique
 class StreamId(enum.IntEnum):
     """Purposes of the package's separate random streams, as for `WorldRandom.substream`.
 

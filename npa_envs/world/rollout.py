@@ -2,44 +2,22 @@
 
 from __future__ import annotations
 
-from typing import Literal, TypedDict, Unpack, overload
+from typing import get_args
 
 from torch import Tensor
 
-from npa_envs.checks import Box, check_world, checked_count, checked_flag
+from npa_envs.checks import Box, check_world, checked_choice, checked_count, checked_flag
 from npa_envs.errors import NPAError, shown
 from npa_envs.ops.custom_op import check_derivatives
-from npa_envs.ops.physics_constants import Boundary, Physics, Terms, physics
+from npa_envs.ops.physics_constants import Boundary, Physics, make_physics
 from npa_envs.rule.rule import NPARule, check_rule
 from npa_envs.world.divergence import OnDivergence, make_watch
-from npa_envs.world.execute import STORED_INTERVAL, Memory, RolloutSpec, execute, resting
-from npa_envs.world.graphed_rollouts import CudaGraph, check_cuda_graph
+from npa_envs.world.execute import Memory, RolloutSpec, execute, resting
+from npa_envs.world.graphed_rollouts import CUDA_GRAPH_CHOICES, CudaGraph
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness, check_generator
 
 __all__ = ["Memory", "at_rest", "rollout", "step"]
-
-
-class RolloutOptions(TypedDict, total=False):
-    """Keywords shared by `rollout` and `rollout_species`; `rollout` documents them."""
-
-    eps: float | None
-    box: Box
-    boundary: Boundary
-    dt: float
-    position_noise: float
-    detach_positions: bool
-    memory: Memory
-    generator: Randomness | None
-    on_divergence: OnDivergence
-    keep_every: int | None
-    cuda_graph: CudaGraph
-
-
-def check_memory(memory: Memory) -> None:
-    """Check the name of a memory mode."""
-    if not isinstance(memory, str) or memory not in STORED_INTERVAL:
-        raise NPAError(f"memory must be 'store', 'recompute' or 'minimal', got {shown(memory)}")
 
 
 def checked_physics(
@@ -48,7 +26,7 @@ def checked_physics(
     *,
     eps: float | None,
     box: Box,
-    boundary: Boundary,
+    boundary: Boundary | None,
     update_prob: float = 1.0,
     dt: float,
     position_noise: float = 0.0,
@@ -68,7 +46,7 @@ def checked_physics(
             f"the rule must share dtype and device with x, got {weight.dtype} on {weight.device} "
             f"and {x.dtype} on {x.device}: move it with rule.to(x)"
         )
-    return physics(
+    return make_physics(
         rule.space_dim,
         rule.state_dim,
         x.dtype,
@@ -76,11 +54,7 @@ def checked_physics(
         eps0=rule.eps0,
         box=box,
         boundary=boundary,
-        terms=Terms(
-            rule.state_gradient,
-            rule.moment_inverse if rule.moment_correction else None,
-            rule.density_gradient,
-        ),
+        terms=rule.terms,
         moving=not rule.static,
         alpha=rule.alpha,
         update_prob=update_prob,
@@ -97,9 +71,7 @@ def _check_one_species(rule: NPARule) -> None:
         )
 
 
-def result(
-    after: Particles, return_path_length: bool
-) -> tuple[Tensor, Tensor] | tuple[Tensor, Tensor, Tensor]:
+def returned_fields(after: Particles, return_path_length: bool) -> tuple[Tensor, ...]:
     """Return worlds as public functions do: x, s and, if asked, path lengths."""
     if not return_path_length:
         return after.x, after.s
@@ -127,7 +99,7 @@ def step(
     *,
     eps: float | None = None,
     box: Box = None,
-    boundary: Boundary = "periodic",
+    boundary: Boundary | None = None,
     update_prob: float = 0.5,
     dt: float = 1.0,
     position_noise: float = 0.0,
@@ -141,7 +113,7 @@ def step(
     Returns:
         Positions [length units], shape [B, N, D], and states, dimensionless, shape [B, N, C].
     """
-    return rollout(
+    x, s = rollout(
         rule,
         x,
         s,
@@ -157,6 +129,7 @@ def step(
         on_divergence=on_divergence,
         cuda_graph=cuda_graph,
     )
+    return x, s
 
 
 def at_rest(
@@ -166,7 +139,7 @@ def at_rest(
     *,
     eps: float | None = None,
     box: Box = None,
-    boundary: Boundary = "periodic",
+    boundary: Boundary | None = None,
     dt: float = 1.0,
 ) -> Tensor:
     """Return which worlds are not changed by any further step.
@@ -203,32 +176,6 @@ def at_rest(
     return resting((rule,), worlds, constants, "auto")
 
 
-@overload
-def rollout(
-    rule: NPARule,
-    x: Tensor,
-    s: Tensor,
-    steps: int,
-    *,
-    update_prob: float = ...,
-    return_path_length: Literal[False] = ...,
-    **options: Unpack[RolloutOptions],
-) -> tuple[Tensor, Tensor]: ...
-
-
-@overload
-def rollout(
-    rule: NPARule,
-    x: Tensor,
-    s: Tensor,
-    steps: int,
-    *,
-    update_prob: float = ...,
-    return_path_length: Literal[True],
-    **options: Unpack[RolloutOptions],
-) -> tuple[Tensor, Tensor, Tensor]: ...
-
-
 def rollout(
     rule: NPARule,
     x: Tensor,
@@ -237,7 +184,7 @@ def rollout(
     *,
     eps: float | None = None,
     box: Box = None,
-    boundary: Boundary = "periodic",
+    boundary: Boundary | None = None,
     update_prob: float = 0.5,
     dt: float = 1.0,
     position_noise: float = 0.0,
@@ -248,7 +195,7 @@ def rollout(
     keep_every: int | None = None,
     cuda_graph: CudaGraph = "auto",
     return_path_length: bool = False,
-) -> tuple[Tensor, Tensor] | tuple[Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, ...]:
     """Run a rule for a number of steps; differentiable, and particle i stays particle i.
 
     Each step draws m ~ Bernoulli(update_prob) for every particle, perceives the particles with
@@ -271,7 +218,8 @@ def rollout(
         box: Sides of a box centred on the origin [length units], or None for open space.
         boundary: "periodic": particles perceive nearest images, and positions are wrapped.
             "reflecting": particles perceive as in open space, and positions beyond a wall of the
-            box are mirrored at it, repeatedly if needed. "open": there is no box.
+            box are mirrored at it, repeatedly if needed. "open": there is no box. Default:
+            "periodic" with a box, "open" without one.
         update_prob: Probability p of each particle's update in a step, in (0, 1].
         dt: Time step, dimensionless.
         position_noise: Standard deviation of the noise added to every position in each step
@@ -308,8 +256,8 @@ def rollout(
     """
     steps = checked_count("steps", steps)
     interval = checked_keep_every(keep_every, steps)
-    check_memory(memory)
-    check_cuda_graph(cuda_graph)
+    checked_choice("memory", memory, get_args(Memory))
+    checked_choice("cuda_graph", cuda_graph, CUDA_GRAPH_CHOICES)
     check_rule(rule)
     _check_one_species(rule)
     worlds = Particles(x, s)
@@ -339,4 +287,4 @@ def rollout(
         watch=make_watch(on_divergence, worlds),
         may_rest=not return_path_length,
     )
-    return result(after, return_path_length)
+    return returned_fields(after, return_path_length)

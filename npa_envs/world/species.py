@@ -2,34 +2,37 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from typing import Any, Literal, Unpack, overload
+from typing import Any, Literal, get_args
 
 from torch import Tensor
 
-from npa_envs.checks import Box, check_world, checked_count, checked_flag, checked_number, entries
+from npa_envs.checks import (
+    Box,
+    check_world,
+    checked_choice,
+    checked_count,
+    checked_flag,
+    checked_positive,
+    entries,
+)
 from npa_envs.errors import NPAError, shown
 from npa_envs.ops.physics_constants import Boundary
 from npa_envs.ops.species_density import checked_counts
 from npa_envs.rule.rule import NPARule
 from npa_envs.world.divergence import OnDivergence, make_watch
 from npa_envs.world.execute import Memory, RolloutSpec, execute
-from npa_envs.world.graphed_rollouts import CudaGraph, check_cuda_graph
+from npa_envs.world.graphed_rollouts import CUDA_GRAPH_CHOICES, CudaGraph
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness, check_generator
 from npa_envs.world.rollout import (
-    RolloutOptions,
-    check_memory,
     checked_keep_every,
     checked_physics,
-    result,
+    returned_fields,
 )
 from npa_envs.world.steps import SpeciesSpec
 
 SpeciesPerception = Literal["shared", "per_species"]
-
-MODES: tuple[SpeciesPerception, ...] = ("shared", "per_species")
 """Whether rules perceive each species' density and density gradient, or only those of all."""
 
 AGREEMENTS = (
@@ -45,38 +48,6 @@ AGREEMENTS = (
 """Attributes in which rules must agree to share a perception pass."""
 
 
-@overload
-def rollout_species(
-    rules: Sequence[NPARule],
-    x: Tensor,
-    s: Tensor,
-    steps: int,
-    *,
-    counts: Sequence[int],
-    update_prob: float | Sequence[float] = ...,
-    perception: SpeciesPerception = ...,
-    density_counts: Sequence[float] | None = ...,
-    return_path_length: Literal[False] = ...,
-    **options: Unpack[RolloutOptions],
-) -> tuple[Tensor, Tensor]: ...
-
-
-@overload
-def rollout_species(
-    rules: Sequence[NPARule],
-    x: Tensor,
-    s: Tensor,
-    steps: int,
-    *,
-    counts: Sequence[int],
-    update_prob: float | Sequence[float] = ...,
-    perception: SpeciesPerception = ...,
-    density_counts: Sequence[float] | None = ...,
-    return_path_length: Literal[True],
-    **options: Unpack[RolloutOptions],
-) -> tuple[Tensor, Tensor, Tensor]: ...
-
-
 def rollout_species(
     rules: Sequence[NPARule],
     x: Tensor,
@@ -87,19 +58,19 @@ def rollout_species(
     eps: float | None = None,
     update_prob: float | Sequence[float] = 0.5,
     box: Box = None,
-    boundary: Boundary = "periodic",
+    boundary: Boundary | None = None,
     dt: float = 1.0,
     position_noise: float = 0.0,
     generator: Randomness | None = None,
     detach_positions: bool = True,
     perception: SpeciesPerception = "shared",
-    density_counts: Sequence[float] | None = None,
+    density_counts: float | Sequence[float] | None = None,
     memory: Memory = "store",
     on_divergence: OnDivergence = "ignore",
     keep_every: int | None = None,
     cuda_graph: CudaGraph = "auto",
     return_path_length: bool = False,
-) -> tuple[Tensor, Tensor] | tuple[Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, ...]:
     """Run several rules in one world; differentiable, and particle i stays particle i.
 
     Each step is that of `rollout`: one perception pass for the particles of all species, then each
@@ -128,8 +99,8 @@ def rollout_species(
         perception: "shared", or "per_species" for rules made with `species_count`: they also
             perceive the density and the density gradient of each species, as `perceive_species`
             gives them.
-        density_counts: Number that each species divides densities and their gradients by, positive;
-            default: N, the particles of the world, for all.
+        density_counts: Number that each species divides densities and their gradients by, positive,
+            for all species or one for each; default: N, the particles of the world, for all.
 
     Returns:
         As `rollout`.
@@ -143,13 +114,16 @@ def rollout_species(
     check_world(x, s)
     sizes = checked_counts(counts, x.shape[1])
     _check_agreement(species_rules, len(sizes), perception)
-    probabilities = _checked_probabilities(update_prob, len(sizes))
-    divisors = _checked_divisors(density_counts, sizes)
-    check_memory(memory)
+    probabilities = _for_each_species("update_prob", update_prob, len(sizes))
+    divisors = _for_each_species(
+        "density_counts", x.shape[1] if density_counts is None else density_counts, len(sizes)
+    )
+    divisors = [checked_positive("an entry of density_counts", count) for count in divisors]
+    checked_choice("memory", memory, get_args(Memory))
     # With one species this is `rollout`.
-    alone = perception == "shared" and divisors == (float(x.shape[1]),)
+    alone = perception == "shared" and divisors == [x.shape[1]]
     interval = checked_keep_every(keep_every, steps)
-    check_cuda_graph(cuda_graph)
+    checked_choice("cuda_graph", cuda_graph, CUDA_GRAPH_CHOICES)
     worlds = Particles(x, s)
     constants = [
         checked_physics(
@@ -191,29 +165,23 @@ def rollout_species(
         watch=make_watch(on_divergence, worlds),
         may_rest=False,
     )
-    return result(after, return_path_length)
+    return returned_fields(after, return_path_length)
 
 
 def _checked_rules(rules: Any) -> list[NPARule]:
     checked = None if isinstance(rules, NPARule) else entries(rules)
-    if checked is None:
+    if checked is None or not all(isinstance(rule, NPARule) for rule in checked):
+        types = [type(entry).__name__ for entry in ([rules] if checked is None else checked)]
         raise NPAError(
-            f"rules must have one rule for each species, got {type(rules).__name__}: "
-            f"give (rule,) for one species"
+            f"rules must have one NPARule for each species, got {', '.join(types)}: give (rule,) "
+            "for one species, and load rules with npa_envs.load_rule"
         )
-    for number, rule in enumerate(checked):
-        if not isinstance(rule, NPARule):
-            raise NPAError(
-                f"rules must be NPARule each, got {type(rule).__name__} as rule {number}: "
-                f"load it with npa_envs.load_rule"
-            )
     return checked
 
 
 def _check_agreement(rules: list[NPARule], species_count: int, perception: str) -> None:
     """Check that rules fit each other, the number of species and the mode of perception."""
-    if not isinstance(perception, str) or perception not in MODES:
-        raise NPAError(f"perception must be 'shared' or 'per_species', got {shown(perception)}")
+    checked_choice("perception", perception, get_args(SpeciesPerception))
     if len(rules) != species_count:
         raise NPAError(
             f"rules and counts must be one for each species, got {len(rules)} rules and "
@@ -240,30 +208,14 @@ def _check_agreement(rules: list[NPARule], species_count: int, perception: str) 
             )
 
 
-def _checked_probabilities(update_prob: Any, species_count: int) -> list[Any]:
-    """Return one probability for each species; values are checked with the rules."""
-    probabilities = entries(update_prob)
-    if probabilities is None:
-        return [update_prob] * species_count
-    if len(probabilities) != species_count:
+def _for_each_species(name: str, numbers: Any, species_count: int) -> list[Any]:
+    """Return one number for each species, whose values are not checked."""
+    each = entries(numbers)
+    if each is None:
+        return [numbers] * species_count
+    if len(each) != species_count:
         raise NPAError(
-            f"update_prob must be one number, or one for each of {species_count} species, "
-            f"got {len(probabilities)}"
+            f"{name} must be one number, or one for each of {species_count} species, "
+            f"got {len(each)}"
         )
-    return probabilities
-
-
-def _checked_divisors(density_counts: Any, counts: tuple[int, ...]) -> tuple[float, ...]:
-    """Return the number by which each species divides densities."""
-    if density_counts is None:
-        return (float(sum(counts)),) * len(counts)
-    divisors = entries(density_counts)
-    if divisors is None:
-        divisors = [density_counts]
-    checked = tuple(checked_number("an entry of density_counts", number) for number in divisors)
-    if len(checked) != len(counts) or not all(0.0 < number < math.inf for number in checked):
-        raise NPAError(
-            f"density_counts must have one positive number for each of {len(counts)} species, "
-            f"got {shown(density_counts)}: for example density_counts={counts}"
-        )
-    return checked
+    return each

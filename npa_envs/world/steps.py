@@ -297,12 +297,9 @@ class Species(NamedTuple):
     rule: NPARule
     network: Network | None
     """The rule's weights in the form that kernels run; None: the rule runs as its module."""
-    first: int
-    """Index of its first particle in a world."""
-    end: int
-    """One past its last particle."""
-    update_prob: float
-    """Probability of each of its particles' updates."""
+    particles: slice
+    """Its particles in a world."""
+    spec: SpeciesSpec
     displacement_fraction: float
     """Its largest displacement as a fraction of the largest of all species."""
     count_ratio: float
@@ -310,13 +307,13 @@ class Species(NamedTuple):
 
     def capacity(self, world_count: int) -> int:
         """Return the number of rows for its active particles in B worlds."""
-        return row_capacity(world_count * (self.end - self.first), self.update_prob)
+        return row_capacity(world_count * self.spec.size, self.spec.update_prob)
 
 
 class SpeciesStep(Step):
     """The step of several rules in one world: a common perception pass, then rule by rule.
 
-    `by_species`: rules perceive each species' density and density gradient.
+    `per_species`: rules perceive each species' density and density gradient.
     """
 
     def __init__(
@@ -326,27 +323,29 @@ class SpeciesStep(Step):
         physics: Physics,
         x: Tensor,
         *,
-        by_species: bool,
+        per_species: bool,
         detach_positions: bool,
     ) -> None:
         self.physics = physics
-        self.by_species = by_species
+        self.per_species = per_species
         self.detach_positions = detach_positions
         self.species: list[Species] = []
         longest = max(rule.alpha for rule in rules)
         first = 0
         for rule, spec in zip(rules, specs, strict=True):
-            end, prob = first + spec.size, constant(spec.update_prob)
-            ratio = x.shape[1] / spec.density_count
-            fraction = rule.alpha / longest
-            self.species.append(Species(rule, rule.network(), first, end, prob, fraction, ratio))
-            first = end
+            # Not by `_replace`: torch.compile cannot trace it.
+            spec = SpeciesSpec(spec.size, constant(spec.update_prob), spec.density_count)
+            particles = slice(first, first + spec.size)
+            fraction, ratio = rule.alpha / longest, x.shape[1] / spec.density_count
+            self.species.append(Species(rule, rule.network(), particles, spec, fraction, ratio))
+            first = particles.stop
         self.update_fraction: Tensor | None = None
         """Fraction of its drawn updates that each particle keeps, shape [N]; None: all of them."""
-        if min(own.update_prob for own in self.species) < physics.update_prob:
+        specs = [species.spec for species in self.species]
+        if min(spec.update_prob for spec in specs) < physics.update_prob:
             fractions = [
-                torch.full((spec.size,), own.update_prob / physics.update_prob, device=x.device)
-                for spec, own in zip(specs, self.species, strict=True)
+                torch.full((spec.size,), spec.update_prob / physics.update_prob, device=x.device)
+                for spec in specs
             ]
             self.update_fraction = torch.cat(fractions)
 
@@ -363,48 +362,34 @@ class SpeciesStep(Step):
     def advance(self, particles: Particles, draws: Draws) -> Particles:
         """Return the worlds after one step with these draws."""
         x, s, *_ = particles
-        mask = draws.mask
-        species, physics = self.species, self.physics
-        shared_width = shared_dim = physics.perception_dim
-        if not self.by_species:
+        mask, physics = draws.mask, self.physics
+        row_width = physics.perception_dim
+        if not self.per_species:
             # Rows of a rule's kernels: the perception vector, a one, then zeros.
-            shared_width = max(
-                own.network.row_width if own.network else shared_dim for own in species
-            )
+            networks = [species.network for species in self.species]
+            row_width = max(network.row_width if network else row_width for network in networks)
         total = row_count(mask, x, physics.update_prob)
         if mask is not None and mask.is_cuda:
             every = x.shape[0] * x.shape[1]
-            total = min(every, sum(own.capacity(x.shape[0]) for own in species))
+            total = min(every, sum(species.capacity(x.shape[0]) for species in self.species))
         perception, active = perceive_rows(
             x.detach() if self.detach_positions else x,
             s,
             physics,
             mask=mask,
             row_capacity=total,
-            row_width=shared_width,
+            row_width=row_width,
         )
-        appended = None
-        if self.by_species:
-            counts = tuple(own.end - own.first for own in species)
-            appended = perceive_by_species(x, counts, physics)
+        fields = None
+        if self.per_species:
+            fields = perceive_by_species(x, tuple(own.spec.size for own in self.species), physics)
         row_total = len(perception)
         outputs, rows = [], []
-        for own in species:
-            row, particle = _rows_of_species(active.row_of.view(x.shape[:2]), own, row_total, mask)
+        for species in self.species:
+            row_of = active.row_of.view(x.shape[:2])
+            row, particle = _rows_of_species(row_of, species, row_total, mask)
             z = perception.index_select(0, row.clamp(max=row_total - 1))
-            if own.count_ratio != 1.0 and physics.terms.density_gradient:
-                begin, end = shared_dim - physics.space_dim, shared_dim
-                gradient = _recounted(z[:, begin:end], own.count_ratio)
-                z = torch.cat((z[:, :begin], gradient, z[:, end:]), dim=1)
-            if appended is not None:
-                extra = appended[:, own.first : own.end].flatten(0, 1).index_select(0, particle)
-                if own.count_ratio != 1.0:
-                    density, gradient = extra[:, : len(species)], extra[:, len(species) :]
-                    gradient = gradient.view(len(extra), len(species), -1)
-                    gradient = _recounted(gradient, own.count_ratio).flatten(1)
-                    extra = torch.cat((own.count_ratio * density, gradient), dim=1)
-                z = torch.cat((z, extra), dim=1)
-            outputs.append(_update_of(own, z))
+            outputs.append(_update_of(species, self._perceived(species, z, fields, particle)))
             rows.append(row)
         width = min(output.shape[1] for output in outputs)
         update = perception.new_zeros(row_total + 1, width).index_copy(
@@ -412,22 +397,47 @@ class SpeciesStep(Step):
         )
         return _updated(particles, update[:row_total], active, draws, physics)
 
+    def _perceived(
+        self, species: Species, z: Tensor, fields: Tensor | None, particle: Tensor
+    ) -> Tensor:
+        """Return rows of perception with a species' divisor of densities and, if any, `fields`.
+
+        Args:
+            z: Rows of perception, [R, P] or wider, with densities divided by N.
+            fields: Each species' density and density gradient at all particles, or None.
+            particle: Indices of the rows' particles among those of the species, [R].
+        """
+        ratio, space_dim = species.count_ratio, self.physics.space_dim
+        if ratio != 1.0 and self.physics.terms.density_gradient:
+            end = self.physics.perception_dim
+            begin = end - space_dim
+            gradient = _recounted(z[:, begin:end], ratio)
+            z = torch.cat((z[:, :begin], gradient, z[:, end:]), dim=1)
+        if fields is None:
+            return z
+        own = fields[:, species.particles].flatten(0, 1).index_select(0, particle)
+        if ratio != 1.0:
+            density, gradients = own.tensor_split([len(self.species)], dim=1)
+            gradients = _recounted(gradients.view(len(own), -1, space_dim), ratio).flatten(1)
+            own = torch.cat((ratio * density, gradients), dim=1)
+        return torch.cat((z, own), dim=1)
+
 
 def _rows_of_species(
-    row_of: Tensor, own: Species, row_count: int, mask: Tensor | None
+    row_of: Tensor, species: Species, row_count: int, mask: Tensor | None
 ) -> tuple[Tensor, Tensor]:
     """Return the rows of a species' active particles, and the indices of these particles.
 
     Both are int64, shape [R]. On CUDA R does not depend on the draw, so that nothing waits for the
     device; unused entries have the row `row_count`.
     """
-    row = row_of[:, own.first : own.end].reshape(-1).long()
+    row = row_of[:, species.particles].reshape(-1).long()
     everyone = torch.arange(len(row), device=row.device)
     if mask is None:
         return row, everyone
     active = row >= 0
     if row.is_cuda:
-        capacity = own.capacity(row_of.shape[0])
+        capacity = species.capacity(row_of.shape[0])
         rank = active.cumsum(0) - 1
         rank = torch.where(active & (rank < capacity), rank, capacity)
         particle = everyone.new_zeros(capacity + 1).scatter(0, rank, everyone)[:capacity]
@@ -442,24 +452,24 @@ def _rows_of_species(
 def _recounted(scaled: Tensor, ratio: float) -> Tensor:
     """Return L(ratio v) from L(v), of vectors in the last dimension; differentiable."""
     length = torch.linalg.vector_norm(scaled, dim=-1, keepdim=True)
-    somewhere = length > 0.0
-    divisor = torch.where(somewhere, length, 1.0)
+    nonzero = length > 0.0
+    divisor = torch.where(nonzero, length, 1.0)
     factor = torch.log1p(ratio * torch.expm1(divisor)) / divisor
-    return scaled * torch.where(somewhere, factor, ratio)
+    return scaled * torch.where(nonzero, factor, ratio)
 
 
-def _update_of(own: Species, z: Tensor) -> Tensor:
+def _update_of(species: Species, z: Tensor) -> Tensor:
     """Return a species' raw updates, [R, A] or wider, for its rows of perception."""
-    rule = own.rule
-    if own.network is None:
+    rule = species.rule
+    if species.network is None:
         update: Tensor = rule(z[:, : rule.perception_dim])
     else:
-        if z.shape[1] < own.network.row_width:
+        if z.shape[1] < species.network.row_width:
             one = z.new_ones(len(z), 1)
-            rest = z.new_zeros(len(z), own.network.row_width - rule.perception_dim - 1)
+            rest = z.new_zeros(len(z), species.network.row_width - rule.perception_dim - 1)
             z = torch.cat((z[:, : rule.perception_dim], one, rest), dim=1)
-        update = own.network(z)
-    fraction = own.displacement_fraction
+        update = species.network(z)
+    fraction = species.displacement_fraction
     if rule.static or fraction == 1.0:
         return update
     # The displacement r q δ / (1 + |δ|), a fraction q of the common largest one r, is that of

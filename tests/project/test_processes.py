@@ -21,11 +21,11 @@ class Noted(Child):
         self.notes.append(f"{what} {self.name}")
         self.at.get(what, lambda: None)()
 
-    def go(self, device):
+    def begin_work(self, device):
         self.note("go")
 
     @property
-    def over(self):
+    def has_ended(self):
         self.note("over")
         return True
 
@@ -49,13 +49,13 @@ def nothing(number, frame):
     """Do nothing."""
 
 
-def run(*children, jobs=2, ahead=False):
+def run(*children, jobs=2, starts_early=False):
     waiting, finished = list(children), []
     run_children(
         lambda _: waiting.pop(0) if waiting else None,
         lambda one: finished.append(one.name),
         Slots(("cpu",), jobs),
-        ahead=ahead,
+        starts_early=starts_early,
     )
     return finished
 
@@ -76,7 +76,7 @@ def break_down():
         # All are asked to end before one is waited for; what ended with the signal is no result.
         (
             lambda send: {name: {"over": send} for name in "abcd"},
-            {"ahead": True},
+            {"starts_early": True},
             "go a, go b, over a, stop a, stop b, stop c, stop d, end a, end b, end c, end d",
         ),
         # A second signal ends all at once.

@@ -66,16 +66,3 @@ def test_divergence_is_looked_for_with_the_rule_as_it_was(tmp_path):
     snapshot["parameters"] = good * torch.nan
     assert diverged_worlds(ReadOutTask(), rule, snapshot) == [0, 1, 2]
     assert rule.readout[0].weight.isfinite().all()
-
-
-def test_a_name_that_a_rule_lacks_is_answered_with_the_nearest(monkeypatch):
-    rule = NPARule()
-    with pytest.raises(AttributeError, match="no attribute 'color': did you mean 'colour'"):
-        _ = rule.color
-    assert not hasattr(rule, "color")
-    assert isinstance(copy.deepcopy(rule), NPARule)
-    # What libraries ask for searches for no name.
-    monkeypatch.setattr("difflib.get_close_matches", None)
-    with pytest.raises(AttributeError, match=r"no attribute '_color'$"):
-        _ = rule._color
-    assert not hasattr(rule, "_orig_mod")

@@ -155,8 +155,11 @@ PUSH = AT | {"move": points(X)}
         (lambda: push(X, **PUSH | {"radius": -1.0}), "radius must be finite .* at least 0, got -1"),
         (lambda: push(X, **PUSH, strength=1.5), r"strength must be in \[0, 1\], got 1\.5"),
         (lambda: push(X, **PUSH | {"move": points(X)[:, :1]}), r"move must have shape \[B, D\]"),
-        (lambda: push(X, **PUSH | {"centre": AT["centre"].float()}), "centre must be .* like x"),
-        (lambda: inject(X, S, **AT, state=S[:, 0].float()), "state must be .*64 .* like s"),
+        (
+            lambda: push(X, **PUSH | {"centre": AT["centre"].float()}),
+            "centre and x must share",
+        ),
+        (lambda: inject(X, S, **AT, state=S[:, 0].float()), "state and s must share .*32 .*64"),
         (lambda: inject(X, S, **AT, state=S[:, 0, :2]), r"state must have .* \[B, C\] = \(2, 3\)"),
         (lambda: removed(X, S, gone=None), "gone must be a bool tensor of shape .* got None"),
         (lambda: removed(X, S, gone=ONE.float()), r"gone must be a bool .*\[B, N\] = \[2, 12\]"),

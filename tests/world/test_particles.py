@@ -38,3 +38,12 @@ def test_gathered_particles_keep_the_goals_of_their_worlds():
     result = two.gather(order)
     assert_same(result.s, two.s.view(6, 1)[order].view(2, 3, 1))
     assert result.goal is two.goal
+
+
+@pytest.mark.parametrize("path_length", [None, torch.ones(2, 3)])
+def test_species_keep_the_goals_of_their_worlds(path_length):
+    two = worlds(2)._replace(path_length=path_length)
+    first, second = two.split([1, 2])
+    assert_same((first.x, second.s), (two.x[:, :1], two.s[:, 1:]))
+    assert first.goal is second.goal is two.goal
+    assert (second.path_length is None) == (path_length is None)

@@ -315,7 +315,7 @@ def test_inside_a_graph_of_the_caller():
 
 
 def test_memory_is_bounded(monkeypatch):
-    monkeypatch.setattr(graphed_rollouts, "MEMORY_SHARE", 1e-12)
+    monkeypatch.setattr(graphed_rollouts, "MEMORY_FRACTION", 1e-12)
     as_launched(make_rule(), 5)
 
 

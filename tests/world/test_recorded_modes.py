@@ -21,7 +21,6 @@ from test_recorded import (
 import npa_envs
 from npa_envs.ops import launch
 from npa_envs.world.cuda_graph import capture, plain_tensors
-from npa_envs.world.randomness import give_back_draws, reserve_draws
 
 pytestmark = [pytest.mark.gpu, pytest.mark.usefixtures("nothing_recorded")]
 
@@ -60,18 +59,6 @@ def test_threads_that_share_a_generator_draw_different_numbers():
     together(*[work] * 4)
     sums = {float(states.double().sum()) for states in result}
     assert len(sums) == len(result) == 80
-
-
-def test_draws_are_reserved_and_given_back():
-    generator = torch.Generator(DEVICE).manual_seed(0)
-    begin = reserve_draws(generator, 8)
-    assert (begin, generator.get_offset()) == (0, 8)
-    give_back_draws(generator, begin, 8)
-    assert generator.get_offset() == 0
-    reserve_draws(generator, 8)
-    reserve_draws(generator, 4)
-    give_back_draws(generator, 0, 8)
-    assert generator.get_offset() == 12
 
 
 def test_with_cuda_as_default_device():
@@ -120,12 +107,6 @@ def test_others_draw_while_something_is_recorded():
     assert torch.equal(drawn[1], drawn[3])
     assert torch.equal(drawn[2], drawn[4])
     assert numbers.tolist() == [1.0] * 10
-
-
-def test_what_draws_from_torchs_own_generator_is_not_recorded_alone():
-    with pytest.raises(RuntimeError, match="CUDA generator"):
-        capture(lambda: torch.randn(10, device=DEVICE), DEVICE, alone=True)
-    torch.randn(10, device=DEVICE)
 
 
 def test_launches_keep_none_of_their_tensors():

@@ -9,7 +9,7 @@ from test_recorded import as_launched as follows
 from torch import nn
 
 import npa_envs
-from npa_envs.world.network_fingerprint import rule_settings, rule_tensors
+from npa_envs.world.network_fingerprint import rule_settings
 
 pytestmark = pytest.mark.usefixtures("nothing_recorded")
 
@@ -104,15 +104,6 @@ def test_what_a_network_depends_on_is_seen(change):
     assert rule_settings(rule, CPU) == before
     CHANGES[change](rule)
     assert rule_settings(rule, CPU) != before
-
-
-def test_tensors_of_a_rule_are_its_parameters_buffers_and_attributes():
-    rule = Scaled(2, 8, 32, eps0=EPS)
-    rule.same = rule.factor
-    result = rule_tensors(rule, CPU)
-    wanted = [rule.hidden.weight, rule.hidden.bias, rule.output.weight, rule.shift, rule.factor]
-    assert {id(tensor) for tensor in result} == {id(tensor) for tensor in wanted}
-    assert len(result) == len(wanted)
 
 
 @pytest.mark.gpu

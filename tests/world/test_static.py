@@ -112,13 +112,6 @@ def test_positions_are_returned_as_a_copy_and_pass_their_gradient(device):
     assert torch.equal(gradient, weights)
 
 
-def test_noise_moves_particles_of_static_rules(device):
-    rule = static_rule(device, torch.float64)
-    x, s = random_world(1, 40, 2, 5, dtype=torch.float64, device=device)
-    after, _ = npa_envs.rollout(rule, x, s, STEPS, position_noise=0.01)
-    assert 0.0 < float((after - x).abs().max()) < 0.2
-
-
 def test_warmup_leaves_nothing_to_compile(device):
     warmup(device)
     rule = npa_envs.NPARule(static=True).to(device)

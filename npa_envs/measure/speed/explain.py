@@ -15,7 +15,7 @@ from npa_envs.measure.benchmark_records import aligned
 from npa_envs.measure.speed.timing import TimingSession, Workload, rollout_call
 from npa_envs.ops.backend import describe
 from npa_envs.ops.launch import noted_launches
-from npa_envs.ops.physics_constants import physics
+from npa_envs.ops.physics_constants import make_physics
 from npa_envs.ops.sort import plan_kernels
 from npa_envs.rule.rule import NPARule
 from npa_envs.world.rollout import step
@@ -119,7 +119,7 @@ def _reasons(
         workload.state_dim,
         row_capacity(total, prob) if masked else total,
         masked,
-        physics(workload.space_dim, workload.state_dim, x.dtype, eps=workload.eps, box=box),
+        make_physics(workload.space_dim, workload.state_dim, x.dtype, eps=workload.eps, box=box),
     )
     hidden, output = rule.folded()[:2]
     request = plan.request._replace(
