@@ -170,7 +170,7 @@ def _cached(make: Callable[Arguments, Physics]) -> Callable[Arguments, Physics]:
         if not torch.compiler.is_compiling() and IMMUTABLE.issuperset(
             map(type, (*args, *kwargs.values()))
         ):
-            return remembered(*args, **kwargs)
+            return remembered(*args, **kwargs)  # type: ignore[arg-type]
         return make(*args, **kwargs)
 
     return cached

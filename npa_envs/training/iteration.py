@@ -24,7 +24,7 @@ WARM_UP_STEPS = 2
 """Steps of the eager rollout that loads every kernel before the first capture."""
 
 
-Rollout = Callable[..., tuple[Tensor, Tensor, Tensor]]
+Rollout = Callable[..., tuple[Tensor, ...]]
 """Type of `npa_envs.rollout` in training: returns positions, states and path lengths."""
 
 

@@ -337,12 +337,9 @@ def _species_row(
 ) -> OneSpeciesRow:
     x, s = workload.worlds(session.device)
 
-    def roll_species(rule: NPARule, *arguments: Any, **options: Any) -> tuple[Tensor, Tensor]:
+    def roll_species(rule: NPARule, *arguments: Any, **options: Any) -> tuple[Tensor, ...]:
         count = [workload.particle_count]
-        worlds: tuple[Tensor, Tensor] = rollout_species(
-            [rule], *arguments, counts=count, density_counts=count, **options
-        )
-        return worlds
+        return rollout_species([rule], *arguments, counts=count, density_counts=count, **options)
 
     # Both draw the same masks.
     alone, species = (
