@@ -166,14 +166,14 @@ def run(folder: Path, device: str) -> None:
 
 
 def _learn(
-    request: RunRequest, folder: Path, device: str, on_entry: Callable[[CurvePoint], None]
+    request: RunRequest, folder: Path, device: str, on_point: Callable[[CurvePoint], None]
 ) -> Episodes:
     """Learn, write rules or policy and a picture, and return the held-out episodes."""
     job, facts = request.job, request.facts
     problem, amount = Problem(**facts["problem"]), facts["budget"]
     in_seconds = job.axis == "seconds"
     budget = Budget(seconds=amount) if in_seconds else Budget(particle_steps=int(amount))
-    options = dict(facts["options"], device=device, on_entry=on_entry)
+    options = dict(facts["options"], device=device, on_point=on_point)
     if request.teacher:
         options["teacher"] = request.teacher
     trained = train(facts["method"], problem, budget, job.seed, **options)

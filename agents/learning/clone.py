@@ -77,7 +77,7 @@ def train(progress: Progress, options: CloneOptions = DEFAULTS) -> RuleSet:
 
     def iteration() -> int:
         steps = options.updates * options.batch_worlds if collect is None else collect()
-        rate = annealed(options.learning_rate, options.last_rate, progress.share)
+        rate = annealed(options.learning_rate, options.last_rate, progress.spent_fraction)
         for group in optimiser.param_groups:
             group["lr"] = rate
         for _ in range(options.updates):

@@ -45,7 +45,7 @@ class GradientOptions:
     steps: tuple[int, int] | None = None
     """Range [lo, hi) of the steps of a rollout; None: whole episodes of up to 96 steps, and 32 to
     96 steps of longer ones."""
-    world_count: int = 8
+    num_envs: int = 8
     """Worlds in a batch."""
     pool_size: int | None = None
     """Worlds of a pool, from which rollouts continue; 0: all rollouts start new episodes. None: 64
@@ -88,15 +88,15 @@ def train(progress: Progress, options: GradientOptions = DEFAULTS) -> RuleSet:
     if steps is None:
         steps = (length, length + 1) if length <= LONGEST else (LONGEST // 3, LONGEST + 1)
     if pool_size is None:
-        pool_size = 0 if steps[0] >= length else max(POOL_SIZE, options.world_count)
+        pool_size = 0 if steps[0] >= length else max(POOL_SIZE, options.num_envs)
     config = BudgetTrainConfig(
         task=problem.config,
         progress=progress,
         # A single repeat without an end: the budget ends the run.
         iterations=sys.maxsize,
         repeats=1,
-        world_count=options.world_count,
-        pool_size=pool_size or options.world_count,
+        world_count=options.num_envs,
+        pool_size=pool_size or options.num_envs,
         steps=steps,
         learning_rate=options.learning_rate,
         last_rate=options.last_rate,
@@ -134,7 +134,7 @@ class BudgetTrainConfig(TrainConfig[Any]):
 
     def learning_rate_at(self, iteration: int, share: float = 0.0) -> float:
         """Return the current learning rate, half a cosine over the budget; ignores arguments."""
-        return annealed(self.learning_rate, self.last_rate, self.progress.share)
+        return annealed(self.learning_rate, self.last_rate, self.progress.spent_fraction)
 
 
 class EnvironmentTask(ParticleTask[Any]):

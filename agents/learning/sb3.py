@@ -22,8 +22,7 @@ from npa_envs.agents.learning.actor_critic import (
     Critic,
     CriticKind,
     GaussianRules,
-    Pace,
-    noise_left,
+    Schedule,
 )
 from npa_envs.agents.learning.baselines import check_no_start
 from npa_envs.agents.learning.problem import world_seeds
@@ -72,7 +71,7 @@ def train(progress: Progress, options: WorldOptions = DEFAULTS) -> RuleSet:
     the CPU.
     """
     problem, seed, device = progress.problem, progress.seed, progress.device
-    pace = options.pace(progress.initial)
+    schedule = options.schedule(progress.initial)
     world_steps = options.steps * problem.num_envs
     batch_size = -(-world_steps // options.minibatches)
     if batch_size < 2:
@@ -81,11 +80,11 @@ def train(progress: Progress, options: WorldOptions = DEFAULTS) -> RuleSet:
             f"got {options.minibatches}: give fewer, more steps, or more worlds"
         )
     env = WorldVecEnv(problem.make_envs(device=device))
-    callback = RoundCallback(progress, options, pace)
+    callback = RoundCallback(progress, options, schedule)
     model = PPO(
         WorldRulePolicy,
         env,
-        learning_rate=lambda _: pace.learning_rate * callback.budget_left,
+        learning_rate=lambda _: schedule.learning_rate * callback.remaining_budget,
         n_steps=options.steps,
         batch_size=batch_size,
         n_epochs=options.epochs,
@@ -94,10 +93,10 @@ def train(progress: Progress, options: WorldOptions = DEFAULTS) -> RuleSet:
         clip_range=options.clip,
         ent_coef=options.entropy_weight,
         max_grad_norm=options.max_gradient_norm,
-        target_kl=world_kl(pace.target_kl),
+        target_kl=world_kl(schedule.target_kl),
         policy_kwargs={
             "rules": progress.first_rules(zero_output=True),
-            "initial_std": pace.initial_std,
+            "initial_std": schedule.initial_std,
             "critic": options.critic,
         },
         seed=seed,
@@ -152,30 +151,29 @@ class ProgressCallback(BaseCallback):
 class RoundCallback(ProgressCallback):
     """As `ProgressCallback`, once a round; anneals the noise, and lets the critic begin alone."""
 
-    def __init__(self, progress: Progress, options: WorldOptions, pace: Pace) -> None:
+    def __init__(self, progress: Progress, options: WorldOptions, schedule: Schedule) -> None:
         super().__init__(progress)
-        self.options, self.pace = options, pace
+        self.options, self.schedule = options, schedule
         self.rounds = 0
-        self.budget_left = 1.0
-        """Fraction of the budget that was left at the start of the round."""
+        self.remaining_budget = 1.0
+        """Remaining fraction of the budget at the start of the round."""
 
     def _on_rollout_start(self) -> None:
         self.progress.look(self.learned)
-        self.budget_left = max(0.0, 1.0 - self.progress.share)
+        self.remaining_budget = max(0.0, 1.0 - self.progress.spent_fraction)
         policy: Any = self.model.policy
         actor: GaussianRules = policy.actor
-        actor.leave_noise(
-            noise_left(self.budget_left, self.pace.last_noise, self.options.noise_decay_share)
-        )
+        last_noise = self.schedule.last_noise
+        actor.set_noise(self.options.noise_factor(self.remaining_budget, last_noise))
         if self.rounds == 0:
             self._trained = [p for p in actor.parameters() if p.requires_grad]
         for parameter in self._trained:
-            parameter.requires_grad_(self.rounds >= self.pace.critic_rounds)
+            parameter.requires_grad_(self.rounds >= self.schedule.critic_rounds)
         self.rounds += 1
 
     def _on_step(self) -> bool:
         # A round that begins with no budget left ends at once.
-        return self.budget_left > 0.0
+        return self.remaining_budget > 0.0
 
     def _on_rollout_end(self) -> None:
         self.progress.advance(self.options.steps * self.world_steps)

@@ -41,7 +41,7 @@ class SHACOptions:
 
     steps: int = 16
     """Most steps of a window, h; windows of an episode have equal lengths."""
-    world_count: int = 8
+    num_envs: int = 8
     """Worlds B of all processes."""
     gamma: float = 0.97
     """Discount of a reward one step later (dimensionless)."""
@@ -67,7 +67,7 @@ class SHACOptions:
 
     def __post_init__(self) -> None:
         """Check every field; raises NPAError. `memory` is checked where rollouts begin."""
-        check_positive(self, int, "steps", "world_count", "critic_epochs", "minibatches")
+        check_positive(self, int, "steps", "num_envs", "critic_epochs", "minibatches")
         check_word(self, "critic", get_args(CriticKind))
         check_positive(self, float, "learning_rate")
         check_fraction(self, "gamma", "td_lambda", "last_rate", "target_rate")
@@ -86,8 +86,8 @@ def train(progress: Progress, options: SHACOptions = DEFAULTS) -> RuleSet:
     learner = SHACLearner(progress, options)
 
     def iteration() -> int:
-        learner.learn(annealed(options.learning_rate, options.last_rate, progress.share))
-        return options.world_count * learner.window * progress.problem.particle_count
+        learner.learn(annealed(options.learning_rate, options.last_rate, progress.spent_fraction))
+        return options.num_envs * learner.window * progress.problem.particle_count
 
     return progress.run(learner.rules, iteration, learner)
 
@@ -116,14 +116,14 @@ class SHACLearner:
     def __init__(self, progress: Progress, options: SHACOptions) -> None:
         problem, device, ranks = progress.problem, progress.device, progress.ranks
         self.options, self.device, self.ranks = options, device, ranks
-        ranks.check_even("world_count", options.world_count)
-        indices = ranks.indices(options.world_count)
+        ranks.check_even("num_envs", options.num_envs)
+        indices = ranks.indices(options.num_envs)
         self.rules = progress.first_rules(zero_output=True)
         count = -(-problem.episode_steps // options.steps)
         self.window = -(-problem.episode_steps // count)
         """Steps of a window, h."""
         self.task = EnvironmentTask(problem, device)
-        self.random = learner_random(progress, options.world_count, indices)
+        self.random = learner_random(progress, options.num_envs, indices)
         width = problem.physics.space_dim + problem.physics.state_dim + 1
         self.critic = seeded_critic(progress, width, options.critic)
         self.target = copy.deepcopy(self.critic).requires_grad_(False)
@@ -147,8 +147,8 @@ class SHACLearner:
         """Windows left of each world's episode: at first different ones, so that a batch has all
         parts of an episode."""
 
-    def resume(self, iteration: int, part: int) -> None:
-        """Resume after `iteration` windows, for the `part`-th time, in new worlds."""
+    def resume(self, iteration: int, resumption: int) -> None:
+        """Resume after `iteration` windows, for the `resumption`-th time, in new worlds."""
         self._begin()
 
     def learn(self, rate: float) -> None:
@@ -238,8 +238,8 @@ class SHACLearner:
                 critic.rescale(targets, self.ranks)
         for _ in range(options.critic_epochs):
             self._minibatches.shuffle()
-            for part in self._minibatches.parts[0]:
-                error = (values(self.critic, features[part]) - targets[part]) / self.critic.scale
+            for index in self._minibatches.indices[0]:
+                error = (values(self.critic, features[index]) - targets[index]) / self.critic.scale
                 find_gradients(self.optimisers["critic"], 0.5 * error.square().mean())
                 self.ranks.reduce(gradients_of(self.optimisers["critic"]))
                 self.optimisers["critic"].step()

@@ -113,7 +113,7 @@ def policy_of(options: RecordOptions, problem: Problem) -> Callable[[Any], Any]:
             _choice_seed(options) if options.policy == "scripted" else 0,
             device=options.device,
             evaluation_seeds=[2**31],  # Its episode only checks that the policy runs.
-            entries=1,
+            curve_points=1,
         ).policy
     source = options.policy
     if source.endswith(".zip") and problem.actor == "brushes":

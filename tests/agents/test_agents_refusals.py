@@ -176,7 +176,7 @@ REFUSED = {
         ({"particle_steps": -1}, "particle_steps must be"),
     ],
     entered: [
-        ({"entries": 0}, "entries"),
+        ({"curve_points": 0}, "curve_points"),
         ({"evaluation_seeds": []}, "seed"),
     ],
     trained: [

@@ -291,9 +291,9 @@ def test_a_run_that_clones_is_refused_where_its_teacher_will_never_be(tmp_path, 
     refused(r"clones the rules of 'gradient'.*add --methods gradient", ran, made, tmp_path)
     assert list(tmp_path.iterdir()) == []
     # What an earlier call has run serves as well, from the same settings.
-    taught = plan(methods=["gradient"], seeds=(0,), options={"gradient": {"world_count": 2}})
+    taught = plan(methods=["gradient"], seeds=(0,), options={"gradient": {"num_envs": 2}})
     ran(taught, tmp_path)
-    refused(r"of other settings: options was \{'world_count': 2\}, now", ran, made, tmp_path)
+    refused(r"of other settings: options was \{'num_envs': 2\}, now", ran, made, tmp_path)
     shutil.rmtree(tmp_path / taught.jobs()[0].folder)
     ran(plan(methods=["gradient"], seeds=(0,)), tmp_path)
     ran(made, tmp_path)

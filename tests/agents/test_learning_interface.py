@@ -209,13 +209,14 @@ def rules():
     return PROBLEM.new_rules(0)
 
 
-def progress_of(problem, entries, on_entry=lambda _: None, **budget):
-    options = {"evaluation_seeds": range(100, 103), "entries": entries, "on_entry": on_entry}
+def progress_of(problem, curve_points, on_point=lambda _: None, **budget):
+    options = {"evaluation_seeds": range(100, 103), "on_point": on_point}
+    options["curve_points"] = curve_points
     return Progress(problem, Budget(**budget), device="cpu", **options)
 
 
 @pytest.mark.parametrize(
-    ("budget", "entries", "pause", "iterations"),
+    ("budget", "curve_points", "pause", "iterations"),
     [
         # At the start, and at the first iteration after each fifth.
         ({"particle_steps": 10_000}, 5, 0.0, [0, 5, 9, 13, 17, 21]),
@@ -229,11 +230,11 @@ def progress_of(problem, entries, on_entry=lambda _: None, **budget):
     ],
 )
 def test_budgets_are_kept_up_to_one_iteration_and_evaluations_take_none_of_them(
-    rules, monkeypatch, budget, entries, pause, iterations
+    rules, monkeypatch, budget, curve_points, pause, iterations
 ):
     clock = Clock()
     monkeypatch.setattr("npa_envs.agents.learning.progress.time", clock)
-    progress = progress_of(PROBLEM, entries, lambda _: clock.sleep(1.0), **budget)
+    progress = progress_of(PROBLEM, curve_points, lambda _: clock.sleep(1.0), **budget)
 
     def iteration():
         clock.sleep(pause)
@@ -283,9 +284,9 @@ def test_learning_rates_fall_from_the_first_to_the_last():
 
 
 def test_options_are_named_with_their_defaults_and_lists_serve_as_ranges():
-    assert method_options("gradient")["world_count"] == 8
+    assert method_options("gradient")["num_envs"] == 8
     assert method_options("scripted").keys() == {"gains"}
     assert method_options("zero") == {}
-    log = train("gradient", heart(), Budget(particle_steps=1), 0, steps=[2, 3], entries=1).log
+    log = train("gradient", heart(), Budget(particle_steps=1), 0, steps=[2, 3], curve_points=1).log
     # Eight worlds of 48 particles, two steps.
     assert log[-1].particle_steps == 8 * 48 * 2

@@ -39,7 +39,7 @@ def run(problem, method="gradient", iterations=30, seed=0, worlds=4, **options):
     steps = iterations * worlds * problem.particle_count * problem.episode_steps
     budget = Budget(particle_steps=steps)
     seeds = range(500, 503)
-    return train(method, problem, budget, seed, evaluation_seeds=seeds, entries=1, **options)
+    return train(method, problem, budget, seed, evaluation_seeds=seeds, curve_points=1, **options)
 
 
 def damaged(**keywords):
@@ -115,7 +115,7 @@ def test_repeated_rollouts_stay_clamped_where_they_are_recorded(cuda_graph, devi
     assert all(torch.allclose(after, found[0], atol=1e-5) for after in found)
 
 
-GRADIENT = {"world_count": 4, "learning_rate": 1e-2}
+GRADIENT = {"num_envs": 4, "learning_rate": 1e-2}
 SHAC = {"method": "shac", "steps": 4, **GRADIENT}
 PIECES = {"steps": (3, 7), "pool_size": 8, "fresh_share": 0.5, **GRADIENT}
 EVOLUTION = {"method": "evolution", "iterations": 40, "worlds": 16, "population": 16}
@@ -145,8 +145,8 @@ def test_what_is_learned_leaves_a_share_of_the_loss_and_raises_the_return(case, 
 
 
 LEARNERS = {
-    "gradient": {"world_count": 4},
-    "shac": {"world_count": 4, "steps": 2, "critic_epochs": 1},
+    "gradient": {"num_envs": 4},
+    "shac": {"num_envs": 4, "steps": 2, "critic_epochs": 1},
     "ppo": {"steps": 4},
     "ppo_world": {"steps": 4, "minibatches": 4},
     "clone": {"collect_steps": 4},
@@ -305,7 +305,7 @@ def test_worlds_of_one_seed_follow_each_other_and_end_before_those_of_the_next()
 
 
 def actor_critic(problem, **options):
-    given = SHACOptions(**{"world_count": 3} | options)
+    given = SHACOptions(**{"num_envs": 3} | options)
     return SHACLearner(progress_of(problem, initial=wild_rules(problem)), given)
 
 

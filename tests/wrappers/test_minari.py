@@ -100,7 +100,9 @@ def test_rules_learn_from_a_dataset_without_a_world(monkeypatch):
     recorded(problem, teacher)
     options = {"dataset": "npa/test-v0", "batch_worlds": 4, "updates": 8}
     steps = 4 * 8 * problem.particle_count
-    trained = train("clone", problem, Budget(particle_steps=60 * steps), 0, entries=1, **options)
+    trained = train(
+        "clone", problem, Budget(particle_steps=60 * steps), 0, curve_points=1, **options
+    )
     seen, done = read_pairs("npa/test-v0")
     error = (trained.policy(seen) - done).square().mean() / done.var()
     assert error < 0.1
