@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import accumulate, pairwise
-from typing import Any, NamedTuple, TypeVar, overload
+from typing import Any, TypeVar, overload
 
 import numpy as np
 import torch
@@ -14,77 +14,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.checks import checked_count, checked_finite, checked_positive, number_tensor
+from npa_envs.envs.core.interface import Interface
 from npa_envs.errors import NPAError, shown
 from npa_envs.rule.rule import COLOUR_OFFSET, NPARule, check_rule
-from npa_envs.world.environment_steps import Physics
 from npa_envs.world.randomness import StreamId, WorldRandom
 
 Array = TypeVar("Array", NDArray[Any], Tensor)
-
-
-class Interface(NamedTuple):
-    """Meaning of the columns of an environment's observations and actions."""
-
-    space_dim: int
-    """Space dimension D."""
-    state_dim: int
-    """State channels C."""
-    moving: bool
-    """Whether actions begin with a displacement, as particles move."""
-    state_scale: float
-    """State step of an action of 1, dimensionless."""
-    species_count: int = 0
-    """Species whose densities and density gradients are at the end of a perception; 0: none."""
-    target_dim: int = 0
-    """Columns of the world's target at the end of an observation; policies ignore them."""
-
-    @classmethod
-    def of(cls, physics: Physics, species_count: int = 0, target_dim: int = 0) -> Interface:
-        """Return the columns of observations and actions for these physical constants."""
-        scale = physics.limits.state_scale
-        sizes = physics.space_dim, physics.state_dim, physics.moving
-        return cls(*sizes, scale, species_count, target_dim)
-
-    @property
-    def shared_dim(self) -> int:
-        """Columns of an observation before those of single species."""
-        return self.state_dim * (2 + self.space_dim) + self.space_dim
-
-    @property
-    def perception_dim(self) -> int:
-        """Length P of a perception vector."""
-        return self.shared_dim + self.species_count * (1 + self.space_dim)
-
-    @property
-    def action_dim(self) -> int:
-        """Length A of an action."""
-        return self.state_dim + (self.space_dim if self.moving else 0)
-
-    def states(self, observation: Tensor) -> Tensor:
-        """Return the particles' own states s, dimensionless, shape [..., C]."""
-        return observation[..., : self.state_dim]
-
-    def mean_states(self, observation: Tensor) -> Tensor:
-        """Return the mean states s̄ of their neighbourhoods, dimensionless, shape [..., C]."""
-        return observation[..., self.state_dim : 2 * self.state_dim]
-
-    def density_gradient(self, observation: Tensor) -> Tensor:
-        """Return c^{1+D} ∇ρ / N on a linear scale, shape [..., D]."""
-        scaled = observation[..., self.shared_dim - self.space_dim : self.shared_dim]
-        size = scaled.norm(dim=-1, keepdim=True)
-        return scaled * torch.where(size > 0.0, torch.expm1(size) / size, 1.0)
-
-    def action(self, displacement: Tensor, state_step: Tensor) -> Tensor:
-        """Return the action of a displacement and a state step, within the action space.
-
-        Displacements [..., D], fractions of α ε, are clipped to length 1 and left out if particles
-        do not move; state steps [..., C] are clipped to ± `state_scale`.
-        """
-        parts = [(state_step / self.state_scale).clamp(-1.0, 1.0)]
-        if self.moving:
-            size = displacement.norm(dim=-1, keepdim=True)
-            parts.insert(0, (displacement / size.clamp(min=1.0)).clamp(-1.0, 1.0))
-        return torch.cat(parts, dim=-1)
 
 
 def unwrapped(env: Any) -> Any:
@@ -115,11 +50,8 @@ def interface_of(env: Any) -> Interface:
         NPAError: `env` is not such an environment.
     """
     worlds = unwrapped(env).worlds
-    physics = worlds.physics
-    # Perception by species has columns that `physics` does not count.
-    appended = getattr(worlds, "perception_dim", physics.perception_dim) - physics.perception_dim
-    species = appended // (1 + physics.space_dim)
-    return Interface.of(physics, species, getattr(worlds, "target_dim", 0))
+    interface: Interface = worlds.task.config.interface(worlds.physics)
+    return interface
 
 
 def acting_interface(env: Any) -> Interface:

@@ -149,7 +149,7 @@ def train(
             raise NPAError(
                 f"{name.lower()} must be a {name}, got {shown(value)}: make it with {make}"
             )
-    if problem.actor == "codes" and method in GARDEN_METHODS | METHODS:
+    if problem.controlled == "codes" and method in GARDEN_METHODS | METHODS:
         raise NPAError(
             f"method {shown(method)} cannot learn codes, the actions of {problem.env_id}: "
             "give a function of your own, 'package.module:function', or take another library"
@@ -200,9 +200,9 @@ def train(
 
 def methods_for(problem: Problem) -> dict[str, str]:
     """Return the methods that can learn a problem, as `METHODS`; none for codes."""
-    if problem.actor == "codes":
+    if problem.controlled == "codes":
         return {}
-    return GARDEN_METHODS if problem.actor == "brushes" else METHODS
+    return GARDEN_METHODS if problem.controlled == "brushes" else METHODS
 
 
 def method_options(method: str) -> dict[str, Any]:

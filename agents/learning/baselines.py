@@ -52,7 +52,7 @@ def _evaluated(
     """Return the policy for particles, or the one for brushes, after its evaluation."""
     check_no_start(progress)
     made: Policy | Tending
-    if progress.problem.actor == "brushes":
+    if progress.problem.controlled == "brushes":
         made = Tending(lambda env: gardener(env, **options))
     else:
         made = policy(progress.problem.make_envs(1, device=progress.device), **options)
@@ -101,7 +101,7 @@ def train_scripted(progress: Progress, *, gains: Sequence[float] = GAINS) -> Pol
 def check_no_start(progress: Progress) -> None:
     """Check that the run has no `start`."""
     if progress.initial is not None:
-        if progress.problem.actor == "brushes":
+        if progress.problem.controlled == "brushes":
             raise NPAError("start must be None in a garden, where the world's rule is not learned")
         raise NPAError(
             "start must be None for a method that learns nothing: choose 'gradient', 'ppo', "

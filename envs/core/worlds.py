@@ -100,11 +100,6 @@ class BatchedWorlds(RewardedWorlds):
             self.episode_steps, self._evaluation = episode_steps, None
             self._make_graphs()
 
-    @property
-    def target_dim(self) -> int:
-        """Columns of the target after those of perception in an observation's row, T."""
-        return 0 if self._target is None else int(self._target.shape[1])
-
     @torch.no_grad()
     @makes_plain_tensors
     def start(self, worlds: Tensor, keys: Tensor | None = None) -> Start:

@@ -92,7 +92,7 @@ def problem_of(options: RecordOptions) -> Problem:
         episode_steps=registered(options.env).steps,
         num_envs=worlds,
     )
-    if problem.actor == "species":
+    if problem.controlled == "species":
         raise NPAError(
             f"env must be of one species, as Minari keeps one agent's episodes, got {options.env}"
         )
@@ -103,7 +103,7 @@ def policy_of(options: RecordOptions, problem: Problem) -> Callable[[Any], Any]:
     """Return the policy that the options name."""
     from npa_envs.agents.learning import Budget, RuleSet, train
 
-    known = (*UNTRAINED, "gradient") if problem.actor == "brushes" else UNTRAINED
+    known = (*UNTRAINED, "gradient") if problem.controlled == "brushes" else UNTRAINED
     if options.policy in known:
         # These learn nothing: `train` only chooses among them, by seeds that are not recorded.
         return train(
@@ -116,11 +116,11 @@ def policy_of(options: RecordOptions, problem: Problem) -> Callable[[Any], Any]:
             curve_points=1,
         ).policy
     source = options.policy
-    if source.endswith(".zip") and problem.actor == "brushes":
+    if source.endswith(".zip") and problem.controlled == "brushes":
         from npa_envs.agents.learning.sb3 import GardenPolicy
 
         return GardenPolicy.load(source)
-    if problem.actor == "brushes":
+    if problem.controlled == "brushes":
         raise NPAError(
             f"policy must be one of {known} or a file sac.zip or ppo.zip, got {source!r}"
         )

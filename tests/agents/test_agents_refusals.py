@@ -91,7 +91,7 @@ def benched(**changes):
 
 
 def start_of(problem):
-    return {"start": problem.new_rules(0)}
+    return {"start": RuleSet.new(problem, 0)}
 
 
 ALONE = problem(env_id=GARDEN, num_envs=1, keywords=QUICK)

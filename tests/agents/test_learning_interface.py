@@ -36,7 +36,7 @@ def test_every_environment_is_a_problem_with_rules_that_fit(name):
     assert (again, hash(again), again.counts) == (problem, hash(problem), problem.counts)
     assert problem != dataclasses.replace(problem, episode_steps=9)
     assert problem != dataclasses.replace(problem, keywords={"update_prob": 0.25})
-    rules = problem.new_rules(0)
+    rules = RuleSet.new(problem, 0)
     assert [rule.perception_dim for rule in rules] == [problem.interface.perception_dim] * len(
         problem.counts
     )
@@ -183,7 +183,7 @@ def test_a_species_that_left_its_world_is_the_reason_of_the_episode(deaths):
     envs = begun(problem.make_envs(2))
     action = torch.zeros(2, problem.particle_count, problem.interface.action_dim)
     # Its states grow in the first world alone.
-    action[0, problem.new_rules(0).spans[1], 2:] = 1.0
+    action[0, RuleSet.new(problem, 0).spans[1], 2:] = 1.0
     for step in range(problem.episode_steps):
         *_, infos = envs.step(action)
         assert ("final_info" in infos) == (step == problem.episode_steps - 1)
@@ -206,7 +206,7 @@ ITERATION = 480
 
 @pytest.fixture
 def rules():
-    return PROBLEM.new_rules(0)
+    return RuleSet.new(PROBLEM, 0)
 
 
 def progress_of(problem, curve_points, on_point=lambda _: None, **budget):

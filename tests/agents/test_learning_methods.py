@@ -156,7 +156,7 @@ LEARNERS = {
 
 def learner(method, problem):
     """Return the options of a method."""
-    return LEARNERS[method] | ({"teacher": problem.new_rules(7)} if method == "clone" else {})
+    return LEARNERS[method] | ({"teacher": RuleSet.new(problem, 7)} if method == "clone" else {})
 
 
 @pytest.fixture
@@ -234,7 +234,7 @@ def test_a_clone_does_what_its_teacher_does(problem, iterations, largest):
     assert unexplained(rules, observation, teacher.policy()(observation)) < largest
     taught, clone, untaught = (
         evaluate_policy(envs, one.policy(), range(900, 906)).mean_return
-        for one in (teacher, rules, problem.new_rules(0))
+        for one in (teacher, rules, RuleSet.new(problem, 0))
     )
     assert abs(clone - taught) < 0.1 * abs(untaught - taught)
 
@@ -373,7 +373,7 @@ PROBLEMS = {name: replace(problem, hidden_dim=12) for name, problem in SMALL.ite
 
 def candidates_of(problem: Problem, device: torch.device, count: int):
     """Rules, and the weights of some candidates that differ much, one a row."""
-    rules = problem.new_rules(0).to(device)
+    rules = RuleSet.new(problem, 0).to(device)
     weights, draws = RuleWeights(rules), np.random.default_rng(1)
     spread = draws.standard_normal((count, len(weights.vector()))) * weights.scales()
     candidates = weights.vector() + 0.5 * spread
@@ -382,7 +382,7 @@ def candidates_of(problem: Problem, device: torch.device, count: int):
 
 def policy_of(problem: Problem, weights: torch.Tensor):
     """The policy of a candidate."""
-    rules = problem.new_rules(5).to(weights.device)
+    rules = RuleSet.new(problem, 5).to(weights.device)
     RuleWeights(rules).put(weights.cpu().double().numpy())
     return rules.policy()
 
@@ -429,7 +429,7 @@ def test_the_fitness_of_a_population_is_that_of_one_candidate_after_the_other(pr
 
 
 def test_scales_are_those_that_layers_are_drawn_with():
-    (rule,) = PROBLEMS["growth"].new_rules(0)
+    (rule,) = RuleSet.new(PROBLEMS["growth"], 0)
     for layer in (rule.hidden, rule.output):
         torch.nn.init.xavier_normal_(layer.weight)
     drawn = RuleWeights([rule]).vector() / RuleWeights([rule]).scales()

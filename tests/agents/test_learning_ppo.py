@@ -125,7 +125,7 @@ def test_worlds_that_are_cut_off_are_worth_what_the_critic_says_of_their_last_ob
 
 
 def test_likelihoods_are_those_of_gaussians_and_a_world_s_is_their_mean():
-    actor = GaussianRules(MIXING.new_rules(0), 0.2)
+    actor = GaussianRules(RuleSet.new(MIXING, 0), 0.2)
     with torch.no_grad():
         actor.log_std.add_(0.3 * torch.randn(actor.log_std.shape))
     observation = torch.randn(5, 32, MIXING.interface.perception_dim)

@@ -11,7 +11,7 @@ from learning_problems import heart, progress_of, species
 from processes import on_ranks
 from refusals import refused
 
-from npa_envs.agents.learning import Budget, ppo, shac, train
+from npa_envs.agents.learning import Budget, RuleSet, ppo, shac, train
 from npa_envs.rule.files import load_rule
 from npa_envs.training.checkpoint import load_checkpoint, save_checkpoint
 
@@ -154,7 +154,7 @@ def test_a_run_that_is_asked_to_stop_can_be_resumed(tmp_path, monkeypatch):
             os.kill(os.getpid(), signal.SIGTERM)
 
     monkeypatch.setattr(ppo.PPOLearner, "improve", asked)
-    start = HEART.new_rules(3)
+    start = RuleSet.new(HEART, 3)
     # Seeds of evaluations are read once.
     seeds = iter([500, 501])
     assert run_in("ppo", tmp_path, 8, start=start, evaluation_seeds=seeds)[1] == [0, 3]
@@ -190,7 +190,7 @@ def finished(tmp_path):
     ("method", "options", "message"),
     [
         ("ppo", {}, "holds one: resume it"),
-        ("ppo", {"resume": True, "start": HEART.new_rules(3), **METHODS["ppo"]}, "in started"),
+        ("ppo", {"resume": True, "start": RuleSet.new(HEART, 3), **METHODS["ppo"]}, "in started"),
         ("shac", {"resume": True}, "differs in method, options"),
         ("evolution", {"resume": True}, "cannot be kept in a folder"),
     ],
