@@ -219,21 +219,21 @@ class ZeroPolicy(Policy):
         return observation.new_zeros(*observation.shape[:2], self.interface.action_dim)
 
 
-class PolicyDraws:
-    """Random numbers of a policy: world k has the stream of `seed + k`."""
+class PolicyRandom:
+    """Random streams of a policy: world k has the stream of `seed + k`."""
 
     def __init__(self, seed: Any) -> None:
         self._seed = checked_count("seed", seed)
-        self._random: WorldRandom | None = None
+        self._streams: WorldRandom | None = None
 
-    def next(self, world_count: int, device: torch.device) -> WorldRandom:
-        """Return the next step's random streams; a change of `world_count` restarts them."""
-        if self._random is None or self._random.world_count != world_count:
+    def next_step(self, world_count: int, device: torch.device) -> WorldRandom:
+        """Return the next step's streams; another `world_count` restarts them from the seed."""
+        if self._streams is None or self._streams.world_count != world_count:
             seeds = range(self._seed, self._seed + world_count)
             # A substream, as an environment with the same seed uses these streams itself.
-            self._random = WorldRandom(seeds, device=device).substream(StreamId.POLICY)
-        self._random.advance()
-        return self._random
+            self._streams = WorldRandom(seeds, device=device).substream(StreamId.POLICY)
+        self._streams.advance()
+        return self._streams
 
 
 class RandomPolicy(Policy):
@@ -251,12 +251,12 @@ class RandomPolicy(Policy):
 
     def __init__(self, env: Any, seed: int = 0) -> None:
         super().__init__(acting_interface(env))
-        self._draws = PolicyDraws(seed)
+        self._random = PolicyRandom(seed)
 
     def act(self, observation: Tensor) -> Tensor:
         """Return numbers from [-1, 1)."""
         world_count, particle_count, _ = observation.shape
-        random = self._draws.next(world_count, observation.device)
+        random = self._random.next_step(world_count, observation.device)
         return 2.0 * random.uniform(particle_count, self.interface.action_dim) - 1.0
 
 

@@ -163,8 +163,6 @@ class GaussianRules(nn.Module):
         self.log_std = nn.Parameter(start)
         """Logarithms of the standard deviations, a row for each species, shape [K, A]."""
         self.register_buffer("row_species", species_of(rules.counts), persistent=False)
-        # A tuple, so that modules are registered once.
-        self._each_rule = tuple(RuleSet([rule], [1], self.rules.interface) for rule in self.rules)
 
     def get_extra_state(self) -> float:
         """Return `noise_factor`, for `state_dict`."""
@@ -199,7 +197,7 @@ class GaussianRules(nn.Module):
 
     def row_log_prob(self, species: int, rows: Tensor, action: Tensor) -> Tensor:
         """Return log-probabilities [K] of actions [K, A] of one species that observes [K, P]."""
-        mean = self._each_rule[species].mean(rows[:, None])[:, 0]
+        mean = self.rules.mean_by_rule(list(self.rules)[species], rows)
         return gaussian_log_prob(mean, self.log_std[species], action)
 
     def entropy(self) -> Tensor:

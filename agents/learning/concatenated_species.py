@@ -86,10 +86,11 @@ class ConcatenatedSpeciesEnv(MultiSpeciesVectorEnv):
         if "final_obs" in first:
             last = {agent: infos[agent]["final_obs"] for agent in self.agents}
             ended = over.cpu().numpy()
-            final = {"loss": info["loss"], "reason": np.where(ended, self._reasons, None)}
-            self._reasons[ended] = None
+            reasons = self._reasons.copy()
+            reasons[~ended] = self._reasons[ended] = None
+            final = {"loss": info["loss"], "_loss": over, "reason": reasons}
             info |= {"final_obs": self._concatenated(last), "_final_obs": over}
-            info |= {"final_info": final | {"_loss": over}, "_final_info": over}
+            info |= {"final_info": final, "_final_info": over}
         observation, reward = self._concatenated(observations), rewards.mean(dim=1)
         return observation, reward, over & ~cut, over & cut, info
 

@@ -246,7 +246,7 @@ class EnvironmentTask(ParticleTask[Any]):
 
 
 class _ClampInward(torch.autograd.Function):
-    """The autograd function of `clamp_inward`."""
+    """Clamps values to ± a limit; beyond it gradients pass only if descent leads back inside."""
 
     @staticmethod
     def forward(ctx: Any, values: Tensor, limit: float) -> Tensor:
@@ -262,18 +262,6 @@ class _ClampInward(torch.autograd.Function):
         return bar.masked_fill((values.abs() > ctx.limit) & leads_out, 0.0), None
 
 
-def clamp_inward(values: Tensor, limit: float) -> Tensor:
-    """Clamp values to ± a limit; beyond it gradients pass only if descent leads back inside."""
-    clamped: Tensor = _ClampInward.apply(values, limit)  # type: ignore[no-untyped-call]
-    return clamped
-
-
-def with_clamped_states(update: Tensor, rule: ClampedRule) -> Tensor:
-    """Return updates [..., δ | Δs] with state steps clamped to the rule's limit."""
-    first = rule.update_dim - rule.state_dim
-    return torch.cat((update[..., :first], clamp_inward(update[..., first:], rule.limit)), dim=-1)
-
-
 class ClampedWeights(FoldedRule):
     """The `FoldedRule` of a `ClampedRule`: it clamps the state part of each update."""
 
@@ -281,7 +269,7 @@ class ClampedWeights(FoldedRule):
 
     def __call__(self, rows: Tensor) -> Tensor:
         """Map rows [z | 1 | 0] to updates [δ | clamped Δs | 0]."""
-        return with_clamped_states(super().__call__(rows), self.rule)
+        return self.rule.clamped(super().__call__(rows))
 
 
 class ClampedRule(NPARule):
@@ -298,7 +286,13 @@ class ClampedRule(NPARule):
 
     def forward(self, perception: Tensor) -> Tensor:
         """Map perception vectors [..., P] to updates with clamped state steps."""
-        return with_clamped_states(super().forward(perception), self)
+        return self.clamped(super().forward(perception))
+
+    def clamped(self, update: Tensor) -> Tensor:
+        """Return updates [..., δ | Δs] with clamped state steps."""
+        first = self.update_dim - self.state_dim
+        state_step = _ClampInward.apply(update[..., first:], self.limit)  # type: ignore[no-untyped-call]
+        return torch.cat((update[..., :first], state_step), dim=-1)
 
     def is_plain(self) -> bool:
         """Return whether the other rule is plain, so that `folded` may replace `forward`."""

@@ -166,7 +166,7 @@ class Candidates:
     def rule_of(self, solution: Numbers) -> NPARule:
         """Return the rule of a candidate's weights in units of `scales`, [W], on the CPU."""
         rule = self.world.make_rule()
-        RuleWeights([rule]).put(solution * self.scales)
+        RuleWeights([rule]).set_vector(solution * self.scales)
         return rule
 
     @torch.no_grad()

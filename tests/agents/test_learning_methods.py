@@ -21,11 +21,12 @@ from npa_envs.agents import (
 from npa_envs.agents.learning import EVALUATION_SEEDS, Budget, Problem, RuleSet, train
 from npa_envs.agents.learning.clone import Demonstrations, unexplained
 from npa_envs.agents.learning.evolution import RuleWeights, candidates_actions, costs, fitness
-from npa_envs.agents.learning.gradient import EnvironmentTask, clamp_inward
+from npa_envs.agents.learning.gradient import ClampedRule, EnvironmentTask
 from npa_envs.agents.learning.problem import FIRST_EVALUATION_SEED, world_seeds
 from npa_envs.agents.learning.shac import SHACLearner, SHACOptions, td_lambda_targets, values
 from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.envs.morphogenesis2d import PictureEnvTask
+from npa_envs.rule.rule import NPARule
 
 GROWTH = {"eps": 0.2, "eps0": 0.2, "colour_weight": 20.0, "resolution": 32, "state_scale": 0.1}
 
@@ -52,7 +53,8 @@ def damaged(**keywords):
 
 def test_clamped_numbers_are_clipped_and_let_gradients_lead_back():
     values = torch.tensor([-3.0, -3.0, 0.5, 3.0, 3.0], requires_grad=True)
-    clamped = clamp_inward(values, 1.0)
+    rule = ClampedRule(NPARule(2, 5, 4, static=True), 1.0)
+    clamped = rule.clamped(values)
     assert clamped.tolist() == [-1.0, -1.0, 0.5, 1.0, 1.0]
     clamped.backward(torch.tensor([2.0, -2.0, 2.0, 2.0, -2.0]))
     # A step against the gradient would lead the first and the last further out.
@@ -383,7 +385,7 @@ def candidates_of(problem: Problem, device: torch.device, count: int):
 def policy_of(problem: Problem, weights: torch.Tensor):
     """The policy of a candidate."""
     rules = RuleSet.new(problem, 5).to(weights.device)
-    RuleWeights(rules).put(weights.cpu().double().numpy())
+    RuleWeights(rules).set_vector(weights.cpu().double().numpy())
     return rules.policy()
 
 
