@@ -68,8 +68,8 @@ def evaluate_policy(env: Any, policy: Callable[[Any], Any], seeds: Iterable[int]
         NPAError: Seeds are missing or wrong, or the environment is not of this library.
     """
     # `_run` checks environments in other processes by their infos.
-    elsewhere = isinstance(getattr(env, "unwrapped", None), AsyncVectorEnv)
-    worlds = None if elsewhere else unwrapped(env).worlds
+    in_processes = isinstance(getattr(env, "unwrapped", None), AsyncVectorEnv)
+    worlds = None if in_processes else unwrapped(env).worlds
     if not (hasattr(env, "num_envs") or isinstance(env, gymnasium.Env)):
         raise NPAError(
             f"env must be a single or a vector environment, got {type(env).__name__}: for several "

@@ -28,7 +28,7 @@ from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness, WorldRandom
 from npa_envs.world.rollout import Memory
 
-LONGEST = 96
+MAX_STEPS = 96
 """Most steps of a rollout by default: longer episodes continue in a pool."""
 
 POOL_SIZE = 64
@@ -86,7 +86,7 @@ def train(progress: Progress, options: GradientOptions = DEFAULTS) -> RuleSet:
     task, rules = EnvironmentTask(problem, device), progress.first_rules()
     length, steps, pool_size = problem.episode_steps, options.steps, options.pool_size
     if steps is None:
-        steps = (length, length + 1) if length <= LONGEST else (LONGEST // 3, LONGEST + 1)
+        steps = (length, length + 1) if length <= MAX_STEPS else (MAX_STEPS // 3, MAX_STEPS + 1)
     if pool_size is None:
         pool_size = 0 if steps[0] >= length else max(POOL_SIZE, options.num_envs)
     config = BudgetTrainConfig(

@@ -170,9 +170,9 @@ class Progress:
         self._on_point, self._on_stop = on_point, on_stop
         self._envs: Any = None
         self._started = False
-        self._since: float | None = None
+        self._begin: float | None = None
         self._seconds = self._agreed_seconds = 0.0
-        self._previous: torch.cuda.Event | None = None
+        self._last_event: torch.cuda.Event | None = None
         self._resumptions = 0
         self._settings = dict(run or {})
         folder = None if out is None else RunFolder(out)
@@ -236,7 +236,7 @@ class Progress:
             self._run.go(step, begin=begin, over=lambda: self.over, end=end)
         return rules
 
-    def start(self, actor: RuleSet | Callable[[Any], Any]) -> None:
+    def start(self, policy: RuleSet | Callable[[Any], Any]) -> None:
         """Evaluate the rules or the policy before any learning, and start the clock.
 
         A resumed run has this evaluation already.
@@ -245,14 +245,14 @@ class Progress:
             raise NPAError("progress must start once, got a second start: make one for each run")
         self._started = True
         if not self.log:
-            self._evaluate(actor)
-        self._since = time.perf_counter()
+            self._evaluate(policy)
+        self._begin = time.perf_counter()
         self._agree_on_time()
 
     @property
     def seconds(self) -> float:
         """Learning time so far by this process's clock [s]."""
-        return self._seconds + (0.0 if self._since is None else time.perf_counter() - self._since)
+        return self._seconds + (0.0 if self._begin is None else time.perf_counter() - self._begin)
 
     @property
     def spent_fraction(self) -> float:
@@ -272,13 +272,13 @@ class Progress:
         if self.device.type == "cuda":
             event = torch.cuda.Event()  # type: ignore[no-untyped-call]
             event.record(torch.cuda.current_stream(self.device))
-            if self._previous is not None:
-                self._previous.synchronize()
-            self._previous = event
+            if self._last_event is not None:
+                self._last_event.synchronize()
+            self._last_event = event
         if self.budget.seconds is not None:
             self._agree_on_time()
 
-    def look(self, actor: RuleSet | Callable[[Any], Any], force: bool = False) -> bool:
+    def look(self, policy: RuleSet | Callable[[Any], Any], force: bool = False) -> bool:
         """Evaluate if the next point of the curve is due, or with `force`; return whether it did.
 
         Without particle-steps since the last evaluation there is none.
@@ -292,7 +292,7 @@ class Progress:
             return False
         with self._stopped_clock():
             self._points_due = int(self.spent_fraction * self._curve_points)
-            self._evaluate(actor)
+            self._evaluate(policy)
         return True
 
     @contextlib.contextmanager
@@ -300,9 +300,9 @@ class Progress:
         """Stop the clock while a block runs; all processes enter it."""
         self._synchronise()
         self._agree_on_time()
-        self._seconds, self._since = self._agreed_seconds, None
+        self._seconds, self._begin = self._agreed_seconds, None
         yield
-        self._since = time.perf_counter()
+        self._begin = time.perf_counter()
 
     def _agree_on_time(self) -> None:
         self._agreed_seconds = self.ranks.broadcast(self.seconds)
@@ -311,15 +311,14 @@ class Progress:
         if not self._started:
             raise NPAError(f"{caller} needs a start: call progress.start(rules) after the set-up")
 
-    def _evaluate(self, actor: RuleSet | Callable[[Any], Any]) -> None:
+    def _evaluate(self, policy: RuleSet | Callable[[Any], Any]) -> None:
         if self._envs is None:
             count = min(len(self._evaluation_seeds), self.problem.num_envs)
             self._envs = self.problem.make_envs(count, device=self.device)
-        policy = actor
-        if isinstance(actor, RuleSet):
-            policy = actor.policy()
-            check_finite(actor, self.particle_steps)
-            self.ranks.check_same(list(actor.parameters()))
+        if isinstance(policy, RuleSet):
+            check_finite(policy, self.particle_steps)
+            self.ranks.check_same(list(policy.parameters()))
+            policy = policy.policy()
         episodes = evaluate_policy(self._envs, policy, self._evaluation_seeds)
         point = CurvePoint(
             seconds=self._seconds,

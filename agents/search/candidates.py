@@ -195,13 +195,13 @@ class Candidates:
         )
         found: list[Found | None] = []
         for k in range(count):
-            own = Particles(later.x[:, k], later.s[:, k])
-            quality = (
-                float(quality_of(own)) if all(v.isfinite().all() for v in own.tensors()) else 0.0
-            )
+            snapshots = later.map(lambda values, k=k: values[:, k])
+            quality = float(quality_of(snapshots))
+            # It is 0 or NaN where worlds came to rest or diverged.
             if quality > 0.0:
-                crowding, mixing = self.crowding_and_mixing(own.map(lambda v: v.flatten(0, 1)))
-                found.append(Found(quality, (float(speeds[k]), crowding, mixing)))
+                worlds = snapshots.map(lambda values: values.flatten(0, 1))
+                measures = float(speeds[k]), *self.crowding_and_mixing(worlds)
+                found.append(Found(quality, measures))
             else:
                 found.append(None)
         return Trials(found, later.map(lambda values: values[-1]))

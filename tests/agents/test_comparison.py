@@ -266,9 +266,9 @@ def test_runs_follow_each_other_in_a_process_until_one_fails(tmp_path, child):
     assert not any(living(tmp_path))
     # Functions from outside, and what is measured by time, have processes of their own.
     job = made.jobs()[0]
-    assert one_run.lasts(made, job)
-    assert not one_run.lasts(plan(own={"one": "mine:train"}, budgets=steps), job)
-    assert not one_run.lasts(made, dataclasses.replace(job, axis="seconds"))
+    assert one_run.shares_process(made, job)
+    assert not one_run.shares_process(plan(own={"one": "mine:train"}, budgets=steps), job)
+    assert not one_run.shares_process(made, dataclasses.replace(job, axis="seconds"))
 
 
 @pytest.mark.parametrize("device", ["cpu", "cuda"])

@@ -19,7 +19,7 @@ from npa_envs.agents import (
     evaluate_policy,
 )
 from npa_envs.agents.learning import EVALUATION_SEEDS, Budget, Problem, RuleSet, train
-from npa_envs.agents.learning.clone import Demonstrations, unexplained
+from npa_envs.agents.learning.clone import Demonstrations, unexplained_variance
 from npa_envs.agents.learning.evolution import RuleWeights, candidates_actions, costs, fitness
 from npa_envs.agents.learning.gradient import ClampedRule, EnvironmentTask
 from npa_envs.agents.learning.problem import FIRST_EVALUATION_SEED, world_seeds
@@ -233,7 +233,7 @@ def test_a_clone_does_what_its_teacher_does(problem, iterations, largest):
     observation, _ = envs.reset(seed=900)
     for _ in range(4):
         observation, *_ = envs.step(teacher.policy()(observation))
-    assert unexplained(rules, observation, teacher.policy()(observation)) < largest
+    assert unexplained_variance(rules, observation, teacher.policy()(observation)) < largest
     taught, clone, untaught = (
         evaluate_policy(envs, one.policy(), range(900, 906)).mean_return
         for one in (teacher, rules, RuleSet.new(problem, 0))
