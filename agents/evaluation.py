@@ -150,7 +150,7 @@ def _run_single(
     start_loss, total, steps, over = info["loss"], 0.0, 0, False
     while not over:
         batch: Any = (
-            {name: part[None] for name, part in observation.items()}
+            {name: value[None] for name, value in observation.items()}
             if isinstance(observation, Mapping)
             else observation[None]
         )

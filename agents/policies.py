@@ -119,20 +119,20 @@ class Policy:
         if not observations:
             return {}
         rows = {agent: torch.as_tensor(values) for agent, values in observations.items()}
-        rows = {agent: part if part.ndim > 1 else part[None] for agent, part in rows.items()}
+        rows = {agent: row if row.ndim > 1 else row[None] for agent, row in rows.items()}
         spans = self._spans({agent: values.shape[-2] for agent, values in rows.items()})
         first = next(iter(rows.values()))
         count = max(span.stop for span in spans.values())
         joined = first.new_zeros(*first.shape[:-2], count, first.shape[-1])
         for agent, span in spans.items():
-            part = joined[..., span, :]
-            if rows[agent].shape != part.shape:
+            target = joined[..., span, :]
+            if rows[agent].shape != target.shape:
                 raise NPAError(
-                    f"observation[{agent!r}] must have shape {tuple(part.shape)}, got "
+                    f"observation[{agent!r}] must have shape {tuple(target.shape)}, got "
                     f"{tuple(rows[agent].shape)}: use the policy with the environment that it was "
                     "made for"
                 )
-            part.copy_(rows[agent])
+            target.copy_(rows[agent])
         actions = self._act_on(joined).to(joined.device)
         result: dict[str, Any] = {}
         for agent, observed in observations.items():
@@ -400,9 +400,9 @@ def check_rule_fits(rule: NPARule, wanted: Interface, config: Any) -> None:
     """Check that a rule can act in an environment with this interface and configuration."""
     _check_correction(rule)
     if rule.static == wanted.moving:
-        own, other = ("static", "moving") if rule.static else ("moving", "static")
+        motion, other = ("static", "moving") if rule.static else ("moving", "static")
         raise NPAError(
-            f"rule must be one of {other} particles like the environment's, got one of {own} "
+            f"rule must be one of {other} particles like the environment's, got one of {motion} "
             f"particles (static={rule.static}): choose another environment or another rule"
         )
     if rule.species_count != wanted.species_count:
@@ -419,10 +419,11 @@ def check_rule_fits(rule: NPARule, wanted: Interface, config: Any) -> None:
         "alpha": rule.alpha if rule.static else config.alpha,
     }
     for name, value in required.items():
-        own = getattr(rule, name)
-        if math.isclose(own, value, rel_tol=1e-6) if isinstance(own, float) else own == value:
+        actual = getattr(rule, name)
+        is_float = isinstance(actual, float)
+        if math.isclose(actual, value, rel_tol=1e-6) if is_float else actual == value:
             continue
-        wanted_text, text = (f"{n:g}" if isinstance(n, float) else repr(n) for n in (value, own))
+        wanted_text, text = (f"{n:g}" if is_float else repr(n) for n in (value, actual))
         hint = f"make the environment with {name}={text}"
         if name == "space_dim":
             hint = "choose another environment or another rule"

@@ -225,10 +225,10 @@ def _joined(suite: Suite, stored: Mapping[str, Any], row: dict[str, Any]) -> dic
     if not old:
         return row
     added = [dict(run) for run in row["runs"]]
-    for some, machine in ((old, stored["machine"]), (added, row["machine"])):
+    for runs, machine in ((old, stored["machine"]), (added, row["machine"])):
         # In a row of several machines each run names its machine already.
         if stored["machine"] != row["machine"] and ";" not in machine:
-            for run in some:
+            for run in runs:
                 run.setdefault("machine", machine)
     order, runs = list(suite.budgets), [*old, *added]
     runs.sort(key=lambda run: (run["seed"], order.index(run["id"]) if run["id"] in order else -1))
@@ -246,5 +246,5 @@ def _both(first: str | None, second: str | None) -> str | None:
     """Join two lists that are separated by semicolons, without duplicates."""
     if first == second:
         return first
-    parts = [part for text in (first, second) for part in str(text).split("; ")]
-    return "; ".join(dict.fromkeys(parts))
+    items = [item for text in (first, second) for item in str(text).split("; ")]
+    return "; ".join(dict.fromkeys(items))

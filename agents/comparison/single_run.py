@@ -378,25 +378,25 @@ def _start(
 ) -> RunProcess:
     """Return the process of a run, an idle or a new one, which waits for its device."""
     target = folder / request.job.folder
-    part = target.parent / f".{target.name}.{secrets.token_hex(4)}"
-    part.mkdir(parents=True)
-    write_record(part / REQUEST, asdict(request))
+    temporary = target.parent / f".{target.name}.{secrets.token_hex(4)}"
+    temporary.mkdir(parents=True)
+    write_record(temporary / REQUEST, asdict(request))
     if idle:
         # The process opens this file itself, unless it dies before.
-        (part / OUTPUT).touch()
+        (temporary / OUTPUT).touch()
         process = idle.pop()
-        _send(process, json.dumps(str(part)))
-        return RunProcess(request, part, process)
+        _send(process, json.dumps(str(temporary)))
+        return RunProcess(request, temporary, process)
     environment = os.environ | {"OMP_NUM_THREADS": str(threads)}
-    with (part / OUTPUT).open("wb") as output:
+    with (temporary / OUTPUT).open("wb") as output:
         process = subprocess.Popen(
-            [*PROGRAM, str(part)],
+            [*PROGRAM, str(temporary)],
             stdin=subprocess.PIPE,
             stdout=output,
             stderr=output,
             env=environment,
         )
-    return RunProcess(request, part, process)
+    return RunProcess(request, temporary, process)
 
 
 def _finish(one: RunProcess, folder: Path) -> RunRecord:

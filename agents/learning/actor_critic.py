@@ -43,7 +43,7 @@ CRITIC_RATE = 1e-3
 CRITIC_WIDTH = 64
 """Units in a hidden layer of the critic."""
 
-CriticKind = Literal["particle", "central"]
+CriticInput = Literal["particle", "central"]
 """Input of a value: a "particle" alone, or also the mean over its world ("central")."""
 
 
@@ -82,7 +82,7 @@ class CommonOptions:
     """Fraction of the budget, at its end, in which standard deviations fall by `last_noise`."""
     critic_rounds: int | None = None
     """Rounds at first in which only the critic learns. None: 0, or 4 with a `start`."""
-    critic: CriticKind = "particle"
+    critic: CriticInput = "particle"
     """Input of the critic: a particle's own perception, or also its whole world ("central")."""
 
     def __post_init__(self) -> None:
@@ -98,7 +98,7 @@ class CommonOptions:
             check_fraction(self, "last_noise")
         if self.critic_rounds is not None:
             check_positive(self, int, "critic_rounds", at_least=0)
-        check_word(self, "critic", get_args(CriticKind))
+        check_word(self, "critic", get_args(CriticInput))
 
     def schedule(self, start: RuleSet | None) -> Schedule:
         """Return the options that depend on `start`, with defaults in place of None."""
@@ -215,7 +215,7 @@ INPUT_LIMIT = 8.0
 class Critic(nn.Module):
     """Network of particles' values, whose inputs and outputs are scaled by running moments.
 
-    Its input is a particle's perception; of the kind "central" also the mean features of its world.
+    Its input is a particle's perception; a "central" one also has the mean features of its world.
     """
 
     mean: Tensor
@@ -225,13 +225,13 @@ class Critic(nn.Module):
     row_species: Tensor
 
     def __init__(
-        self, perception_dim: int, counts: Sequence[int], kind: CriticKind = "particle"
+        self, perception_dim: int, counts: Sequence[int], inputs: CriticInput = "particle"
     ) -> None:
         super().__init__()
         width = CRITIC_WIDTH
         self.features = nn.Linear(perception_dim, width)
         self.hidden = nn.Linear(width, width)
-        self.pooled = nn.Linear(width, width, bias=False) if kind == "central" else None
+        self.pooled = nn.Linear(width, width, bias=False) if inputs == "central" else None
         self.species = nn.Embedding(len(counts), width)
         self.value = nn.Linear(width, 1)
         nn.init.zeros_(self.species.weight)
@@ -281,11 +281,11 @@ class Critic(nn.Module):
         return (1.0 / self.updates[moment]).clamp(min=MIN_RATE)
 
 
-def seeded_critic(progress: Progress, input_dim: int, kind: CriticKind) -> Critic:
+def seeded_critic(progress: Progress, input_dim: int, inputs: CriticInput) -> Critic:
     """Return a new critic, on the device; torch's global random state does not change."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(progress.seed)
-        return Critic(input_dim, progress.problem.counts, kind).to(progress.device)
+        return Critic(input_dim, progress.problem.counts, inputs).to(progress.device)
 
 
 def learner_random(progress: Progress, total: int, indices: Tensor) -> Randomness:

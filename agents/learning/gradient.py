@@ -186,11 +186,11 @@ class EnvironmentTask(ParticleTask[Any]):
         return self if goal is None else self._with(inner=self.inner.toward(goal))
 
     def compare(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the loss, averaged over worlds and species, and its parts by name."""
-        parts = {name: part.mean() for name, part in self._losses(worlds).items()}
-        total = torch.stack(list(parts.values())).sum()
+        """Return the loss, averaged over worlds and species, and its terms by name."""
+        losses = {name: loss.mean() for name, loss in self._losses(worlds).items()}
+        total = torch.stack(list(losses.values())).sum()
         self._check_gradient(total, worlds)
-        return total, parts
+        return total, losses
 
     def penalties(self, *_: Any) -> dict[str, tuple[float, Tensor]]:
         """Return no terms: environments have none."""
@@ -198,8 +198,8 @@ class EnvironmentTask(ParticleTask[Any]):
 
     def world_losses(self, worlds: Particles) -> Tensor:
         """Return the loss of each world, averaged over its species, shape [B]."""
-        parts = self.toward(worlds.goal)._losses(worlds)
-        total = torch.stack(list(parts.values())).sum(dim=0)
+        losses = self.toward(worlds.goal)._losses(worlds)
+        total = torch.stack(list(losses.values())).sum(dim=0)
         total = total.flatten(1).mean(dim=1) if total.dim() > 1 else total
         self._check_gradient(total, worlds)
         return total

@@ -462,7 +462,7 @@ class RoundMemory:
     def round(self) -> Round:
         """The round, as views."""
         others = (self.actions, self.log_probs, self.advantages, self.targets, self.acted)
-        return Round(*(part.flatten(0, 1) for part in (self.observations[:-1], *others)))
+        return Round(*(values.flatten(0, 1) for values in (self.observations[:-1], *others)))
 
 
 def generalised_advantages(
@@ -506,7 +506,7 @@ def standardised(values: Tensor, weights: Tensor, ranks: Ranks = ALONE) -> Tenso
     """
     weights = weights if values.shape == weights.shape else weights.amax(-1, True)
     dims = (1, 2) if values.shape[1] * ranks.count > 1 else (0, 1, 2)
-    means, totals = (part.sum(dims, keepdim=True) for part in (values * weights, weights))
+    means, totals = (sums.sum(dims, keepdim=True) for sums in (values * weights, weights))
     ranks.reduce([means, totals])
     centred = weights * (values - means / totals.clamp(min=1e-8))
     square, total = centred.square().sum(), weights.sum()

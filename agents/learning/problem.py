@@ -312,7 +312,7 @@ def world_seeds(seed: int, count: int, resumption: int = 0) -> list[int]:
     check_run_seed(seed)
     if count > WORLDS_PER_SEED:
         raise NPAError(
-            f"worlds must be at most {WORLDS_PER_SEED}, got {count}: more would share their "
+            f"num_envs must be at most {WORLDS_PER_SEED}, got {count}: more would share their "
             "seeds with the next run"
         )
     first = seed * WORLDS_PER_SEED

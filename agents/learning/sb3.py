@@ -20,7 +20,7 @@ from torch import Tensor
 from npa_envs.agents.learning.actor_critic import (
     CommonOptions,
     Critic,
-    CriticKind,
+    CriticInput,
     GaussianRules,
     Schedule,
 )
@@ -193,7 +193,7 @@ class WorldRulePolicy(ActorCriticPolicy):
         *,
         rules: RuleSet,
         initial_std: float = 0.2,
-        critic: CriticKind = "particle",
+        critic: CriticInput = "particle",
         **keywords: Any,
     ) -> None:
         super().__init__(observation_space, action_space, lr_schedule, net_arch=[], **keywords)
@@ -372,7 +372,7 @@ class GardenPolicy:
             ) from error
 
 
-def _shapes(parts: Any) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of an observation or a space by the names of its parts, if it has some."""
-    named = parts if isinstance(parts, dict) else {"observation": parts}
-    return {name: tuple(part.shape) for name, part in named.items()}
+def _shapes(values: Any) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of an observation or a space, or of those in a dict, by name."""
+    named = values if isinstance(values, dict) else {"observation": values}
+    return {name: tuple(value.shape) for name, value in named.items()}

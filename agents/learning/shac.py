@@ -17,7 +17,7 @@ from torch import Tensor
 from npa_envs.agents.learning.actor_critic import (
     CRITIC_RATE,
     Critic,
-    CriticKind,
+    CriticInput,
     Minibatches,
     find_gradients,
     gradients_of,
@@ -57,7 +57,7 @@ class SHACOptions:
     """Passes of the critic over a window."""
     minibatches: int = 4
     """Minibatches of a pass, which is shuffled."""
-    critic: CriticKind = "central"
+    critic: CriticInput = "central"
     """Input of the critic: each particle, or also its whole world ("central"). A world's value is
     the mean over its particles."""
     target_rate: float = 0.2
@@ -68,7 +68,7 @@ class SHACOptions:
     def __post_init__(self) -> None:
         """Check every field; raises NPAError. `memory` is checked where rollouts begin."""
         check_positive(self, int, "steps", "num_envs", "critic_epochs", "minibatches")
-        check_word(self, "critic", get_args(CriticKind))
+        check_word(self, "critic", get_args(CriticInput))
         check_positive(self, float, "learning_rate")
         check_fraction(self, "gamma", "td_lambda", "last_rate", "target_rate")
         check_non_negative(self, "value_weight")
@@ -160,7 +160,7 @@ class SHACLearner:
         normalise_gradients(means)
         optimiser.param_groups[0]["lr"] = rate
         optimiser.step()
-        self.learn_values(StepWindow(*(part.detach() for part in window)))
+        self.learn_values(StepWindow(*(values.detach() for values in window)))
 
     def play(self) -> StepWindow:
         """Run the rules for a window, differentiably; restart worlds whose episode is over."""

@@ -173,10 +173,10 @@ class Candidates:
     def try_all(self, solutions: Numbers) -> Trials:
         """Run the worlds of candidates; their weights [K, W] are in units of `scales`."""
         weights = torch.as_tensor(solutions * self.scales, dtype=torch.float32).to(self.device)
-        together = len(weights) if self.device.type == "cpu" else 1
-        parts = [self._try(some) for some in torch.split(weights, together)]
-        found = [one for part in parts for one in part.found]
-        return Trials(found, combined(torch.cat, [part.worlds for part in parts]))
+        batch_size = len(weights) if self.device.type == "cpu" else 1
+        batches = [self._try(batch) for batch in torch.split(weights, batch_size)]
+        found = [result for batch in batches for result in batch.found]
+        return Trials(found, combined(torch.cat, [batch.worlds for batch in batches]))
 
     def _try(self, weights: Tensor) -> Trials:
         world, count = self.world, len(weights)
