@@ -39,7 +39,7 @@ class RecordOptions(common.RunOptions):
     """Episodes to record, each from a different seed."""
     first_seed: int = 0
     """The first one's seed; the others follow."""
-    worlds: int = 16
+    num_envs: int = 16
     """Worlds that run at the same time."""
     options: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE")] = ()
     """Keywords of the environment, values as JSON or plain text: target=heart."""
@@ -50,7 +50,7 @@ class RecordOptions(common.RunOptions):
 def main(arguments: Sequence[str]) -> int:
     """Record the episodes and write the dataset."""
     options = common.parse_options(RecordOptions, "record", arguments)
-    common.check_numbers(options, episodes=1, worlds=1)
+    common.check_numbers(options, episodes=1, num_envs=1)
     from npa_envs.agents.evaluation import policy_in
     from npa_envs.measure.benchmark_records import command_text
     from npa_envs.wrappers.minari import ROOT, record_episodes, spec_of, write_dataset
@@ -85,12 +85,11 @@ def problem_of(options: RecordOptions) -> Problem:
     """Return the environment with its keywords."""
     from npa_envs.agents.learning.problem import Problem, registered
 
-    worlds = min(options.worlds, options.episodes)
     problem = Problem(
         env_id=options.env,
         keywords=common.named_values("options", options.options),
         episode_steps=registered(options.env).steps,
-        num_envs=worlds,
+        num_envs=min(options.num_envs, options.episodes),
     )
     if problem.controlled == "species":
         raise NPAError(

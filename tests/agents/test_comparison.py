@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from clock import Clock
 from refusals import refused
 
 from npa_envs.agents import RandomPolicy, ZeroPolicy
@@ -343,18 +342,6 @@ def test_an_interrupted_comparison_ends_its_processes_and_goes_on_where_it_was(
     assert time.perf_counter() - begin < 300.0
     assert list(held_records(plan(), tmp_path)) == plan().jobs()[:1]
     assert not list(tmp_path.rglob(".seed*"))
-
-
-@pytest.mark.parametrize("device", ["cpu", "cuda"])
-def test_no_run_begins_once_the_time_is_over_and_who_waits_leaves_nothing(
-    tmp_path, monkeypatch, child, device
-):
-    monkeypatch.setattr("npa_envs.process_queue.time", Clock(tick=1e-3))
-    child("time.sleep(0.3)", before=WRITE_PID.format(tmp_path))
-    ended = ran(plan(), tmp_path, device, max_seconds=0.2)
-    assert [one.job for one in ended] == plan().jobs()[:1]
-    assert not list(tmp_path.rglob(".seed*"))
-    assert not any(living(tmp_path))
 
 
 @pytest.mark.parametrize("line", [b"", b"cpu\n"], ids=["that waits", "that learns"])

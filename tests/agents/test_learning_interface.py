@@ -11,7 +11,7 @@ from refusals import refused
 from small_envs import begun
 
 import npa_envs
-from npa_envs.agents import SpreadPolicy, evaluate_policy
+from npa_envs.agents import SpreadPolicy
 from npa_envs.agents.learning import (
     Budget,
     Problem,
@@ -243,17 +243,6 @@ def test_budgets_are_kept_up_to_one_iteration_and_evaluations_take_none_of_them(
     assert progress.run(rules, iteration) is rules
     spent = [(entry.seconds, entry.particle_steps) for entry in progress.log]
     assert spent == [(count * pause, count * ITERATION) for count in iterations]
-
-
-def test_entries_are_evaluations_from_the_seeds_given():
-    rules, progress = wild_rules(PROBLEM), progress_of(PROBLEM, 1, particle_steps=ITERATION)
-    progress.run(rules, lambda: ITERATION)
-    episodes = evaluate_policy(PROBLEM.make_envs(), rules.policy(), range(100, 103))
-    assert len(progress.log) == 2
-    for entry in progress.log:
-        assert entry.mean_return == episodes.mean_return
-        assert entry.standard_error == episodes.standard_error
-        assert entry.final_loss == pytest.approx(episodes.final_losses.mean())
 
 
 def test_what_is_out_of_turn_or_diverged_is_refused(rules):

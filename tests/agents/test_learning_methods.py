@@ -204,7 +204,10 @@ def test_a_run_begins_with_its_start_which_stays_as_it_is(method):
     trained = run(problem, method, iterations=1, start=start, **learner(method, problem))
     policy = RuleSet.of(problem, list(before)).policy()
     episodes = evaluate_policy(problem.make_envs(), policy, range(500, 503))
-    assert trained.log[0].mean_return == pytest.approx(episodes.mean_return, rel=1e-6)
+    for name in ("mean_return", "standard_error"):
+        found, wanted = (getattr(one, name) for one in (trained.log[0], episodes))
+        assert found == pytest.approx(wanted, rel=1e-6)
+    assert trained.log[0].final_loss == pytest.approx(episodes.final_losses.mean(), rel=1e-6)
     assert all(map(torch.equal, start.parameters(), before.parameters()))
     assert trained.rules.counts == (20, 15)
 

@@ -85,12 +85,6 @@ def test_every_form_learns_to_grow_and_colour_particles(form):
     assert last.mean_return > max(0.05, by_chance.mean_return + 5.0 * error, 5.0 * error)
 
 
-@EVERY_FORM
-def test_every_form_trains_a_rule_for_each_species(form):
-    for rule in run(form, MIXING, 2 * 16 * 4 * 32).rules:
-        assert 0.0 < rule.output.weight.abs().max() < math.inf
-
-
 def test_advantages_are_the_sums_of_the_definition_within_episodes():
     generator = torch.Generator().manual_seed(0)
     steps, worlds, gamma, gae_lambda = 12, 40, 0.9, 0.8

@@ -129,7 +129,7 @@ def recording(env, policy, dataset, words):
     ],
 )
 def test_the_command_records_any_policy(root, capsys, env, policy, names):
-    assert recording(env, policy, f"{policy}-v0", f"--episodes 3 --worlds 2 --root {root}") == 0
+    assert recording(env, policy, f"{policy}-v0", f"--episodes 3 --num-envs 2 --root {root}") == 0
     assert "3 episodes, mean return" in capsys.readouterr().out
     dataset = minari.load_dataset(f"npa/{policy}-v0")
     assert (dataset.total_episodes, dataset.total_steps) == (3, 96)
