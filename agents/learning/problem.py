@@ -125,20 +125,20 @@ class Problem:
         return self.task_type.actor
 
     @cached_property
-    def registered(self) -> Registered:
+    def registration(self) -> Registration:
         """What the id is registered with."""
-        return registered(self.env_id)
+        return registration_of(self.env_id)
 
     @property
     def task_type(self) -> type[EnvTask[Any]] | type[SpeciesTask]:
         """Class of the task."""
-        return self.registered.task_type
+        return self.registration.task_type
 
     @cached_property
     def config(self) -> EnvConfig | SpeciesConfig:
         """The environment's configuration, on the CPU."""
-        keywords = self.registered.keywords | dict(self.keywords)
-        if self.registered.species_task is not None:
+        keywords = self.registration.keywords | dict(self.keywords)
+        if self.registration.species_task is not None:
             keywords["max_cycles"] = self.episode_steps
         elif keywords.get("reward") == "sparse":
             keywords["episode_steps"] = self.episode_steps
@@ -210,14 +210,14 @@ class Problem:
         count = self.num_envs if num_envs is None else num_envs
         device = str(check_device(device))
         keywords = dict(self.keywords)
-        if self.registered.species_task is not None:
+        if self.registration.species_task is not None:
             return ConcatenatedSpeciesEnv(
-                self.registered.species_task,
+                self.registration.species_task,
                 world_count=count,
                 max_cycles=self.episode_steps,
                 device=device,
                 output="torch",
-                **self.registered.keywords | keywords,
+                **self.registration.keywords | keywords,
             )
         if row_rewards:
             if keywords.get("reward", "dense") != "dense":
@@ -239,7 +239,7 @@ class Problem:
             copy=copy,
             **keywords,
         ).unwrapped
-        assert isinstance(envs, NPAVectorEnv), "checked by `registered`"
+        assert isinstance(envs, NPAVectorEnv), "checked by `registration_of`"
         return envs
 
     def to_json(self) -> str:
@@ -262,7 +262,7 @@ class Problem:
             ) from error
 
 
-class Registered(NamedTuple):
+class Registration(NamedTuple):
     """What an id is registered with."""
 
     task_type: type[EnvTask[Any]] | type[SpeciesTask]
@@ -275,12 +275,12 @@ class Registered(NamedTuple):
     """Name of the task of several species; None: there is one species."""
 
 
-def registered(env_id: Any) -> Registered:
+def registration_of(env_id: Any) -> Registration:
     """Return what an id is registered with; raises NPAError without a batched environment."""
     if isinstance(env_id, str) and env_id in SPECIES:
         name, keywords = task_settings(env_id)
         steps = keywords.pop("max_cycles", DEFAULT_STEPS)
-        return Registered(species_task_type(name), keywords, steps, name)
+        return Registration(species_task_type(name), keywords, steps, name)
     spec = gymnasium.registry.get(env_id) if isinstance(env_id, str) else None
     entry: Any = None if spec is None else spec.vector_entry_point
     if isinstance(entry, str):
@@ -292,7 +292,7 @@ def registered(env_id: Any) -> Registered:
             f"{suggest(env_id, [*known, *SPECIES])}"
         )
     steps = DEFAULT_STEPS if spec.max_episode_steps is None else spec.max_episode_steps
-    return Registered(entry.task_type, dict(spec.kwargs), steps)
+    return Registration(entry.task_type, dict(spec.kwargs), steps)
 
 
 def check_run_seed(seed: Any) -> None:

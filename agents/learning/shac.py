@@ -142,7 +142,7 @@ class SHACLearner:
 
     def _begin(self) -> None:
         restart(self.random)
-        self.worlds = self._fresh(list(range(len(self._indices))))
+        self.worlds = self._new_worlds(list(range(len(self._indices))))
         self.windows_left = [1 + k % self.window_count for k in self._indices]
         """Windows left of each world's episode: at first different ones, so that a batch has all
         parts of an episode."""
@@ -199,14 +199,13 @@ class SHACLearner:
         """Start new episodes in worlds whose last window this was."""
         restart(self.random)
         self.windows_left = [left - 1 for left in self.windows_left]
-        over = [k for k, left in enumerate(self.windows_left) if left == 0]
-        if not over:
-            return
-        self.worlds.put_(torch.tensor(over, device=self.device), self._fresh(over))
+        over = [world for world, left in enumerate(self.windows_left) if left == 0]
+        if over:
+            self.worlds.put_(torch.tensor(over, device=self.device), self._new_worlds(over))
         for world in over:
             self.windows_left[world] = self.window_count
 
-    def _fresh(self, worlds: list[int]) -> Particles:
+    def _new_worlds(self, worlds: list[int]) -> Particles:
         random = self.random
         if isinstance(random, WorldRandom):
             random = random.take(torch.tensor(worlds, device=self.device))
@@ -217,7 +216,7 @@ class SHACLearner:
         gamma, steps = self.options.gamma, self.window
         discounts = gamma ** torch.arange(steps, device=self.device, dtype=torch.float32)
         returns = (discounts[:, None] * window.rewards).sum(dim=0)
-        value = values(self.target, window.features[-1])
+        value = world_values(self.target, window.features[-1])
         return (returns + self.options.value_weight * gamma**steps * value).mean()
 
     def learn_values(self, window: StepWindow) -> None:
@@ -227,7 +226,7 @@ class SHACLearner:
         with torch.no_grad():
             for critic in (self.critic, self.target):
                 critic.observe(features, self.ranks)
-            later = values(self.target, window.features[1:].flatten(0, 1))
+            later = world_values(self.target, window.features[1:].flatten(0, 1))
             targets = td_lambda_targets(
                 window.rewards,
                 later.view_as(window.rewards),
@@ -239,7 +238,8 @@ class SHACLearner:
         for _ in range(options.critic_epochs):
             self._minibatches.shuffle()
             for index in self._minibatches.indices[0]:
-                error = (values(self.critic, features[index]) - targets[index]) / self.critic.scale
+                values = world_values(self.critic, features[index])
+                error = (values - targets[index]) / self.critic.scale
                 find_gradients(self.optimisers["critic"], 0.5 * error.square().mean())
                 self.ranks.reduce(gradients_of(self.optimisers["critic"]))
                 self.optimisers["critic"].step()
@@ -249,7 +249,7 @@ class SHACLearner:
                 target.lerp_(parameter, options.target_rate)
 
 
-def values(critic: Critic, features: Tensor) -> Tensor:
+def world_values(critic: Critic, features: Tensor) -> Tensor:
     """Return the values of worlds with features [M, N, F], shape [M]."""
     each: Tensor = critic(features)
     return each.mean(dim=-1)

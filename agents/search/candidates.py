@@ -195,7 +195,7 @@ class Candidates:
         )
         found: list[Found | None] = []
         for k in range(count):
-            snapshots = later.map(lambda values, k=k: values[:, k])
+            snapshots = Particles(later.x[:, k], later.s[:, k])
             quality = float(quality_of(snapshots))
             # It is 0 or NaN where worlds came to rest or diverged.
             if quality > 0.0:

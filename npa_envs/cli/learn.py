@@ -142,12 +142,12 @@ def run(options: LearnOptions, ranks: Ranks) -> int:
 
 def problem_of(options: LearnOptions) -> Problem:
     """Return the environment to learn."""
-    from npa_envs.agents.learning.problem import Problem, registered
+    from npa_envs.agents.learning.problem import Problem, registration_of
 
     steps = options.episode_steps
     return Problem(
         env_id=options.env,
         keywords=common.named_values("keywords", options.keywords),
-        episode_steps=registered(options.env).steps if steps is None else steps,
+        episode_steps=registration_of(options.env).steps if steps is None else steps,
         num_envs=NUM_ENVS if options.num_envs is None else options.num_envs,
     )

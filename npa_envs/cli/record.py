@@ -83,12 +83,12 @@ def main(arguments: Sequence[str]) -> int:
 
 def problem_of(options: RecordOptions) -> Problem:
     """Return the environment with its keywords."""
-    from npa_envs.agents.learning.problem import Problem, registered
+    from npa_envs.agents.learning.problem import Problem, registration_of
 
     problem = Problem(
         env_id=options.env,
         keywords=common.named_values("options", options.options),
-        episode_steps=registered(options.env).steps,
+        episode_steps=registration_of(options.env).steps,
         num_envs=min(options.num_envs, options.episodes),
     )
     if problem.controlled == "species":

@@ -23,7 +23,7 @@ from npa_envs.agents.learning.clone import Demonstrations, unexplained_variance
 from npa_envs.agents.learning.evolution import RuleWeights, candidates_actions, costs, fitness
 from npa_envs.agents.learning.gradient import ClampedRule, EnvironmentTask
 from npa_envs.agents.learning.problem import FIRST_EVALUATION_SEED, world_seeds
-from npa_envs.agents.learning.shac import SHACLearner, SHACOptions, td_lambda_targets, values
+from npa_envs.agents.learning.shac import SHACLearner, SHACOptions, td_lambda_targets, world_values
 from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.envs.morphogenesis2d import PictureEnvTask
 from npa_envs.rule.rule import NPARule
@@ -359,7 +359,7 @@ def test_the_critic_learns_what_is_paid_and_its_copy_follows():
     seen = window.features[:-1].flatten(0, 1)
     paid = td_lambda_targets(window.rewards, torch.zeros(4, 3), gamma=0.9, td_lambda=0.95)
     with torch.no_grad():
-        learned, followed = values(made.critic, seen), values(made.target, seen)
+        learned, followed = world_values(made.critic, seen), world_values(made.target, seen)
     spread = (paid.flatten() - paid.mean()).square().mean()
     assert (learned - paid.flatten()).square().mean() < 0.5 * (spread + paid.mean().square())
     assert 0.0 < followed.abs().mean() < learned.abs().mean()

@@ -44,8 +44,8 @@ def learner_of(form):
         learner.critic.updates.zero_()
         learner.critic.observe(learner.memory.observations[-1], learner.ranks)
         return learner
-    fresh = learner._fresh
-    learner._fresh = lambda worlds: fresh(worlds).map(
+    new_worlds = learner._new_worlds
+    learner._new_worlds = lambda worlds: new_worlds(worlds).map(
         lambda part: part.double() if part.is_floating_point() else part
     )
     learner._begin()

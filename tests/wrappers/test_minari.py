@@ -10,7 +10,7 @@ from refusals import refused
 
 from npa_envs.agents import evaluate_policy
 from npa_envs.agents.learning import Budget, train
-from npa_envs.agents.learning.problem import registered, world_seeds
+from npa_envs.agents.learning.problem import registration_of, world_seeds
 from npa_envs.cli import main, record
 from npa_envs.cli.record import RecordOptions
 from npa_envs.errors import DivergedError, NPAError
@@ -160,7 +160,7 @@ def test_episodes_of_an_environment_of_ones_own_are_as_long_as_it_is_registered(
         kwargs=small.kwargs,
     )
     try:
-        assert registered("mine/Growth-v0").steps == 3
+        assert registration_of("mine/Growth-v0").steps == 3
         words = ["record", "mine/Growth-v0", "--policy", "zero", "--episodes", "2", "--no-progress"]
         assert main([*words, "--dataset", "npa/own-v0"]) == 0
         assert minari.load_dataset("npa/own-v0").total_steps == 6
