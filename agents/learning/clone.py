@@ -52,10 +52,7 @@ class CloneOptions:
         check_fraction(self, "last_rate")
 
 
-DEFAULTS = CloneOptions()
-
-
-def train(progress: Progress, options: CloneOptions = DEFAULTS) -> RuleSet:
+def train(progress: Progress, options: CloneOptions = CloneOptions()) -> RuleSet:
     """Learn a teacher's actions in worlds where the teacher acts, and where the student acts.
 
     The loss is the squared error of actions over the variance of the teacher's, column by column.

@@ -50,10 +50,7 @@ class EvolutionOptions:
         check_positive(self, float, "sigma")
 
 
-DEFAULTS = EvolutionOptions()
-
-
-def train(progress: Progress, options: EvolutionOptions = DEFAULTS) -> RuleSet:
+def train(progress: Progress, options: EvolutionOptions = EvolutionOptions()) -> RuleSet:
     """Evolve rules until the budget is spent, and return the mean of the last generation.
 
     Candidates are drawn on the CPU and evaluated on the device.

@@ -73,10 +73,7 @@ class GradientOptions:
             object.__setattr__(self, "steps", tuple(steps))
 
 
-DEFAULTS = GradientOptions()
-
-
-def train(progress: Progress, options: GradientOptions = DEFAULTS) -> RuleSet:
+def train(progress: Progress, options: GradientOptions = GradientOptions()) -> RuleSet:
     """Descend the loss at the end of rollouts, differentiated through all of their steps.
 
     Rollouts start new episodes, or continue earlier ones from a pool as in the paper (arXiv
@@ -188,9 +185,7 @@ class EnvironmentTask(ParticleTask[Any]):
     def compare(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the loss, averaged over worlds and species, and its terms by name."""
         losses = {name: loss.mean() for name, loss in self._losses(worlds).items()}
-        total = torch.stack(list(losses.values())).sum()
-        self._check_gradient(total, worlds)
-        return total, losses
+        return torch.stack(list(losses.values())).sum(), losses
 
     def penalties(self, *_: Any) -> dict[str, tuple[float, Tensor]]:
         """Return no terms: environments have none."""
@@ -200,9 +195,7 @@ class EnvironmentTask(ParticleTask[Any]):
         """Return the loss of each world, averaged over its species, shape [B]."""
         losses = self.toward(worlds.goal)._losses(worlds)
         total = torch.stack(list(losses.values())).sum(dim=0)
-        total = total.flatten(1).mean(dim=1) if total.dim() > 1 else total
-        self._check_gradient(total, worlds)
-        return total
+        return total.flatten(1).mean(dim=1) if total.dim() > 1 else total
 
     def rollout(self, rules: Any, x: Tensor, s: Tensor, steps: int, /, **options: Any) -> Any:
         """Run a `RuleSet` by the environment's physics; options are those of `npa_envs.rollout`."""
@@ -233,16 +226,14 @@ class EnvironmentTask(ParticleTask[Any]):
             losses = self.inner.losses(Population(x, s, self.problem.counts, self._species))
         else:
             losses = self.inner.losses(x, s)
-        return losses
-
-    def _check_gradient(self, total: Tensor, worlds: Particles) -> None:
-        needed = torch.is_grad_enabled() and (worlds.x.requires_grad or worlds.s.requires_grad)
-        if needed and not total.requires_grad:
+        needed = torch.is_grad_enabled() and (x.requires_grad or s.requires_grad)
+        if needed and not any(loss.requires_grad for loss in losses.values()):
             raise NPAError(
                 f"the losses of {type(self.inner).__name__} must be differentiable for "
                 "a method that follows gradients, but no gradient leads from them to positions or "
                 "states: compute them by torch's operations, or learn by 'ppo' or 'evolution'"
             )
+        return losses
 
 
 class _ClampInward(torch.autograd.Function):

@@ -94,10 +94,7 @@ class PPOOptions(CommonOptions):
         return 0.2 if self.ratio == "particle" else 0.02
 
 
-DEFAULTS = PPOOptions()
-
-
-def train(progress: Progress, options: PPOOptions = DEFAULTS) -> RuleSet:
+def train(progress: Progress, options: PPOOptions = PPOOptions()) -> RuleSet:
     """Return the rules that proximal policy optimisation finds within a budget."""
     problem, device, ranks = progress.problem, progress.device, progress.ranks
     count = ranks.broadcast(total_num_envs(problem, options, device, progress.budget, ranks))

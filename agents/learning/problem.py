@@ -53,17 +53,14 @@ RowRewards = Literal["particle", "marginal"]
 ROW_REWARDS = get_args(RowRewards)
 
 RESERVED_KEYWORDS = {
-    **dict.fromkeys(("num_envs", "world_count"), "set the field num_envs of Problem"),
+    "num_envs": "set the field num_envs of Problem",
     **dict.fromkeys(
         ("max_episode_steps", "max_cycles", "episode_steps"),
         "set the field episode_steps of Problem",
     ),
     "device": "it is given to train and make_envs",
     "output": "learners are given tensors",
-    "autoreset_mode": "learners' worlds restart in the step that ends their episodes",
     "observe_target": "rules read what particles perceive, and no target",
-    "task": "the id says it",
-    "perceive": "the id says it",
 }
 """Keywords of environments that problems do not take, and why."""
 
@@ -114,10 +111,6 @@ class Problem:
         object.__setattr__(self, "keywords", plain)
         # Raises on unknown ids and wrong keywords.
         _ = self.config
-
-    def __hash__(self) -> int:
-        """Return a number that is the same for equal problems."""
-        return hash(self.to_json())
 
     @property
     def controlled(self) -> Actor:

@@ -61,10 +61,7 @@ class WorldOptions(CommonOptions):
         check_positive(self, float, "clip")
 
 
-DEFAULTS = WorldOptions()
-
-
-def train(progress: Progress, options: WorldOptions = DEFAULTS) -> RuleSet:
+def train(progress: Progress, options: WorldOptions = WorldOptions()) -> RuleSet:
     """Return the rules that Stable-Baselines3's PPO finds within a budget.
 
     Stable-Baselines3 seeds the global random states of torch and NumPy. Observations are copied to
@@ -280,10 +277,7 @@ class GardenPPOOptions(GardenOptions):
     counts = ("steps", "batch_size")
 
 
-SAC_DEFAULTS, GARDEN_PPO_DEFAULTS = SACOptions(), GardenPPOOptions()
-
-
-def train_garden_sac(progress: Progress, options: SACOptions = SAC_DEFAULTS) -> GardenPolicy:
+def train_garden_sac(progress: Progress, options: SACOptions = SACOptions()) -> GardenPolicy:
     """Return the policy that SAC (Haarnoja et al., arXiv 1801.01290) finds within a budget."""
     # A gradient step for about eight steps of worlds.
     steps, starts = max(1, progress.problem.num_envs // 8), options.learning_starts
@@ -291,7 +285,7 @@ def train_garden_sac(progress: Progress, options: SACOptions = SAC_DEFAULTS) -> 
 
 
 def train_garden_ppo(
-    progress: Progress, options: GardenPPOOptions = GARDEN_PPO_DEFAULTS
+    progress: Progress, options: GardenPPOOptions = GardenPPOOptions()
 ) -> GardenPolicy:
     """Return the policy that PPO (Schulman et al., arXiv 1707.06347) finds within a budget."""
     size = options.batch_size

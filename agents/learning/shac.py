@@ -74,10 +74,7 @@ class SHACOptions:
         check_non_negative(self, "value_weight")
 
 
-DEFAULTS = SHACOptions()
-
-
-def train(progress: Progress, options: SHACOptions = DEFAULTS) -> RuleSet:
+def train(progress: Progress, options: SHACOptions = SHACOptions()) -> RuleSet:
     """Return the rules that a short-horizon actor-critic finds within a budget.
 
     Rewards are decreases of the environment's loss, as with `reward="dense"`. The critic values
