@@ -5,7 +5,6 @@ They are imported as `npa_envs.agents` and use the public API only.
 
 from npa_envs.agents.evaluation import Episodes, evaluate_policy
 from npa_envs.agents.policies import (
-    Interface,
     MendPolicy,
     PaintPolicy,
     Policy,
@@ -15,6 +14,7 @@ from npa_envs.agents.policies import (
     ZeroPolicy,
     interface_of,
 )
+from npa_envs.envs.core.interface import Interface
 
 __all__ = [
     "Episodes",

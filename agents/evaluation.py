@@ -68,8 +68,8 @@ def evaluate_policy(env: Any, policy: Callable[[Any], Any], seeds: Iterable[int]
         NPAError: Seeds are missing or wrong, or the environment is not of this library.
     """
     # `_run` checks environments in other processes by their infos.
-    elsewhere = isinstance(getattr(env, "unwrapped", None), AsyncVectorEnv)
-    worlds = None if elsewhere else unwrapped(env).worlds
+    in_processes = isinstance(getattr(env, "unwrapped", None), AsyncVectorEnv)
+    worlds = None if in_processes else unwrapped(env).worlds
     if not (hasattr(env, "num_envs") or isinstance(env, gymnasium.Env)):
         raise NPAError(
             f"env must be a single or a vector environment, got {type(env).__name__}: for several "
@@ -151,7 +151,7 @@ def _run_single(
     start_loss, total, steps, over = info["loss"], 0.0, 0, False
     while not over:
         batch: Any = (
-            {name: part[None] for name, part in observation.items()}
+            {name: value[None] for name, value in observation.items()}
             if isinstance(observation, Mapping)
             else observation[None]
         )

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from npa_envs.agents.policies import PolicyDraws, unwrapped
+from npa_envs.agents.policies import PolicyRandom, unwrapped
 from npa_envs.checks import checked_positive
 from npa_envs.envs.garden.base import GardenTask, TargetDeficit
 from npa_envs.envs.garden.brushes import BrushLayout, grid_places
@@ -69,11 +69,11 @@ class RandomGardener(BrushPolicy):
 
     def __init__(self, env: Any, seed: int = 0) -> None:
         super().__init__(env)
-        self._draws = PolicyDraws(seed)
+        self._random = PolicyRandom(seed)
 
     def act(self) -> Tensor:
         """Return numbers from [-1, 1)."""
-        random = self._draws.next(self.worlds.world_count, self.task.device)
+        random = self._random.next_step(self.worlds.world_count, self.task.device)
         return 2.0 * random.uniform(*self.shape) - 1.0
 
 
@@ -193,11 +193,11 @@ class GradientGardener(BrushPolicy):
         self._scripted = ScriptedShepherd(env) if shepherd else ScriptedGardener(env)
         self._horizon, self._iterations = horizon, iterations
         self._learning_rate = learning_rate
-        self._draws = PolicyDraws(seed)
+        self._random = PolicyRandom(seed)
 
     def act(self) -> Tensor:
         """Return the first step of the best plan."""
-        draws = self._draws.next(self.worlds.world_count, self.task.device)
+        random = self._random.next_step(self.worlds.world_count, self.task.device)
         first = self._scripted.act()
         plan = torch.stack([first] + [self.still()] * (self._horizon - 1))
         plan[1:, ..., self.columns.place] = first[..., self.columns.place]
@@ -206,7 +206,7 @@ class GradientGardener(BrushPolicy):
         best = plan.detach().clone()
         highest = torch.full_like(first[:, 0, 0], -torch.inf)
         for _ in range(self._iterations):
-            rewards = self.planned_rewards(plan, draws)
+            rewards = self.planned_rewards(plan, random)
             with torch.no_grad():
                 better = rewards > highest
                 highest = torch.where(better, rewards, highest)
@@ -218,11 +218,11 @@ class GradientGardener(BrushPolicy):
         return best[0].detach()
 
     @torch.enable_grad()
-    def planned_rewards(self, plan: Tensor, draws: WorldRandom) -> Tensor:
+    def planned_rewards(self, plan: Tensor, random: WorldRandom) -> Tensor:
         """Return the sum of each world's rewards in the steps of a plan, [T, B, K, W], [B]."""
         worlds, task = self.worlds, self.task
         particles = worlds.particles
-        random = draws.substream(StreamId.POLICY)
+        random = random.substream(StreamId.POLICY)
         total = torch.zeros(worlds.world_count, device=worlds.device)
         for action in plan:
             particles = task.brush_and_roll(particles, action, random)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import accumulate, pairwise
-from typing import Any, NamedTuple, TypeVar, overload
+from typing import Any, TypeVar, overload
 
 import numpy as np
 import torch
@@ -14,77 +14,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.checks import checked_count, checked_finite, checked_positive, number_tensor
+from npa_envs.envs.core.interface import Interface
 from npa_envs.errors import NPAError, shown
 from npa_envs.rule.rule import COLOUR_OFFSET, NPARule, check_rule
-from npa_envs.world.environment_steps import Physics
 from npa_envs.world.randomness import StreamId, WorldRandom
 
 Array = TypeVar("Array", NDArray[Any], Tensor)
-
-
-class Interface(NamedTuple):
-    """Meaning of the columns of an environment's observations and actions."""
-
-    space_dim: int
-    """Space dimension D."""
-    state_dim: int
-    """State channels C."""
-    moving: bool
-    """Whether actions begin with a displacement, as particles move."""
-    state_scale: float
-    """State step of an action of 1, dimensionless."""
-    species_count: int = 0
-    """Species whose densities and density gradients are at the end of a perception; 0: none."""
-    target_dim: int = 0
-    """Columns of the world's target at the end of an observation; policies ignore them."""
-
-    @classmethod
-    def of(cls, physics: Physics, species_count: int = 0, target_dim: int = 0) -> Interface:
-        """Return the columns of observations and actions for these physical constants."""
-        scale = physics.limits.state_scale
-        sizes = physics.space_dim, physics.state_dim, physics.moving
-        return cls(*sizes, scale, species_count, target_dim)
-
-    @property
-    def shared_dim(self) -> int:
-        """Columns of an observation before those of single species."""
-        return self.state_dim * (2 + self.space_dim) + self.space_dim
-
-    @property
-    def perception_dim(self) -> int:
-        """Length P of a perception vector."""
-        return self.shared_dim + self.species_count * (1 + self.space_dim)
-
-    @property
-    def action_dim(self) -> int:
-        """Length A of an action."""
-        return self.state_dim + (self.space_dim if self.moving else 0)
-
-    def states(self, observation: Tensor) -> Tensor:
-        """Return the particles' own states s, dimensionless, shape [..., C]."""
-        return observation[..., : self.state_dim]
-
-    def mean_states(self, observation: Tensor) -> Tensor:
-        """Return the mean states s̄ of their neighbourhoods, dimensionless, shape [..., C]."""
-        return observation[..., self.state_dim : 2 * self.state_dim]
-
-    def density_gradient(self, observation: Tensor) -> Tensor:
-        """Return c^{1+D} ∇ρ / N on a linear scale, shape [..., D]."""
-        scaled = observation[..., self.shared_dim - self.space_dim : self.shared_dim]
-        size = scaled.norm(dim=-1, keepdim=True)
-        return scaled * torch.where(size > 0.0, torch.expm1(size) / size, 1.0)
-
-    def action(self, displacement: Tensor, state_step: Tensor) -> Tensor:
-        """Return the action of a displacement and a state step, within the action space.
-
-        Displacements [..., D], fractions of α ε, are clipped to length 1 and left out if particles
-        do not move; state steps [..., C] are clipped to ± `state_scale`.
-        """
-        parts = [(state_step / self.state_scale).clamp(-1.0, 1.0)]
-        if self.moving:
-            size = displacement.norm(dim=-1, keepdim=True)
-            parts.insert(0, (displacement / size.clamp(min=1.0)).clamp(-1.0, 1.0))
-        return torch.cat(parts, dim=-1)
 
 
 def unwrapped(env: Any) -> Any:
@@ -115,11 +50,8 @@ def interface_of(env: Any) -> Interface:
         NPAError: `env` is not such an environment.
     """
     worlds = unwrapped(env).worlds
-    physics = worlds.physics
-    # Perception by species has columns that `physics` does not count.
-    appended = getattr(worlds, "perception_dim", physics.perception_dim) - physics.perception_dim
-    species = appended // (1 + physics.space_dim)
-    return Interface.of(physics, species, getattr(worlds, "target_dim", 0))
+    interface: Interface = worlds.task.config.interface(worlds.physics)
+    return interface
 
 
 def acting_interface(env: Any) -> Interface:
@@ -187,20 +119,20 @@ class Policy:
         if not observations:
             return {}
         rows = {agent: torch.as_tensor(values) for agent, values in observations.items()}
-        rows = {agent: part if part.ndim > 1 else part[None] for agent, part in rows.items()}
+        rows = {agent: row if row.ndim > 1 else row[None] for agent, row in rows.items()}
         spans = self._spans({agent: values.shape[-2] for agent, values in rows.items()})
         first = next(iter(rows.values()))
         count = max(span.stop for span in spans.values())
         joined = first.new_zeros(*first.shape[:-2], count, first.shape[-1])
         for agent, span in spans.items():
-            part = joined[..., span, :]
-            if rows[agent].shape != part.shape:
+            target = joined[..., span, :]
+            if rows[agent].shape != target.shape:
                 raise NPAError(
-                    f"observation[{agent!r}] must have shape {tuple(part.shape)}, got "
+                    f"observation[{agent!r}] must have shape {tuple(target.shape)}, got "
                     f"{tuple(rows[agent].shape)}: use the policy with the environment that it was "
                     "made for"
                 )
-            part.copy_(rows[agent])
+            target.copy_(rows[agent])
         actions = self._act_on(joined).to(joined.device)
         result: dict[str, Any] = {}
         for agent, observed in observations.items():
@@ -287,21 +219,21 @@ class ZeroPolicy(Policy):
         return observation.new_zeros(*observation.shape[:2], self.interface.action_dim)
 
 
-class PolicyDraws:
-    """Random numbers of a policy: world k has the stream of `seed + k`."""
+class PolicyRandom:
+    """Random streams of a policy: world k has the stream of `seed + k`."""
 
     def __init__(self, seed: Any) -> None:
         self._seed = checked_count("seed", seed)
-        self._random: WorldRandom | None = None
+        self._streams: WorldRandom | None = None
 
-    def next(self, world_count: int, device: torch.device) -> WorldRandom:
-        """Return the next step's random streams; a change of `world_count` restarts them."""
-        if self._random is None or self._random.world_count != world_count:
+    def next_step(self, world_count: int, device: torch.device) -> WorldRandom:
+        """Return the next step's streams; another `world_count` restarts them from the seed."""
+        if self._streams is None or self._streams.world_count != world_count:
             seeds = range(self._seed, self._seed + world_count)
             # A substream, as an environment with the same seed uses these streams itself.
-            self._random = WorldRandom(seeds, device=device).substream(StreamId.POLICY)
-        self._random.advance()
-        return self._random
+            self._streams = WorldRandom(seeds, device=device).substream(StreamId.POLICY)
+        self._streams.advance()
+        return self._streams
 
 
 class RandomPolicy(Policy):
@@ -319,12 +251,12 @@ class RandomPolicy(Policy):
 
     def __init__(self, env: Any, seed: int = 0) -> None:
         super().__init__(acting_interface(env))
-        self._draws = PolicyDraws(seed)
+        self._random = PolicyRandom(seed)
 
     def act(self, observation: Tensor) -> Tensor:
         """Return numbers from [-1, 1)."""
         world_count, particle_count, _ = observation.shape
-        random = self._draws.next(world_count, observation.device)
+        random = self._random.next_step(world_count, observation.device)
         return 2.0 * random.uniform(particle_count, self.interface.action_dim) - 1.0
 
 
@@ -468,9 +400,9 @@ def check_rule_fits(rule: NPARule, wanted: Interface, config: Any) -> None:
     """Check that a rule can act in an environment with this interface and configuration."""
     _check_correction(rule)
     if rule.static == wanted.moving:
-        own, other = ("static", "moving") if rule.static else ("moving", "static")
+        motion, other = ("static", "moving") if rule.static else ("moving", "static")
         raise NPAError(
-            f"rule must be one of {other} particles like the environment's, got one of {own} "
+            f"rule must be one of {other} particles like the environment's, got one of {motion} "
             f"particles (static={rule.static}): choose another environment or another rule"
         )
     if rule.species_count != wanted.species_count:
@@ -487,10 +419,11 @@ def check_rule_fits(rule: NPARule, wanted: Interface, config: Any) -> None:
         "alpha": rule.alpha if rule.static else config.alpha,
     }
     for name, value in required.items():
-        own = getattr(rule, name)
-        if math.isclose(own, value, rel_tol=1e-6) if isinstance(own, float) else own == value:
+        actual = getattr(rule, name)
+        is_float = isinstance(actual, float)
+        if math.isclose(actual, value, rel_tol=1e-6) if is_float else actual == value:
             continue
-        wanted_text, text = (f"{n:g}" if isinstance(n, float) else repr(n) for n in (value, own))
+        wanted_text, text = (f"{n:g}" if is_float else repr(n) for n in (value, actual))
         hint = f"make the environment with {name}={text}"
         if name == "space_dim":
             hint = "choose another environment or another rule"

@@ -16,7 +16,7 @@ from typing import Any
 from npa_envs.agents.comparison.plan import Axis, ComparisonPlan
 from npa_envs.agents.comparison.single_run import RunRecord
 from npa_envs.agents.learning import methods_for
-from npa_envs.agents.learning.problem import Problem, registered
+from npa_envs.agents.learning.problem import Problem, registration_of
 from npa_envs.atomic_files import read_json
 from npa_envs.errors import NPAError, shown
 from npa_envs.measure.benchmark_records import write_record
@@ -84,7 +84,7 @@ class Suite:
     def problem_of(self, task: str) -> Problem:
         """Return the problem of a task name: the registered environment in 16 or 64 worlds."""
         env_id = self.tasks[task]
-        steps, worlds = registered(env_id).steps, 64 if env_id in GARDEN_IDS else 16
+        steps, worlds = registration_of(env_id).steps, 64 if env_id in GARDEN_IDS else 16
         return Problem(env_id=env_id, episode_steps=steps, num_envs=worlds, hidden_dim=HIDDEN_DIM)
 
     def leaves_out(self, task: str, method: str) -> bool:
@@ -225,10 +225,10 @@ def _joined(suite: Suite, stored: Mapping[str, Any], row: dict[str, Any]) -> dic
     if not old:
         return row
     added = [dict(run) for run in row["runs"]]
-    for some, machine in ((old, stored["machine"]), (added, row["machine"])):
+    for runs, machine in ((old, stored["machine"]), (added, row["machine"])):
         # In a row of several machines each run names its machine already.
         if stored["machine"] != row["machine"] and ";" not in machine:
-            for run in some:
+            for run in runs:
                 run.setdefault("machine", machine)
     order, runs = list(suite.budgets), [*old, *added]
     runs.sort(key=lambda run: (run["seed"], order.index(run["id"]) if run["id"] in order else -1))
@@ -246,5 +246,5 @@ def _both(first: str | None, second: str | None) -> str | None:
     """Join two lists that are separated by semicolons, without duplicates."""
     if first == second:
         return first
-    parts = [part for text in (first, second) for part in str(text).split("; ")]
-    return "; ".join(dict.fromkeys(parts))
+    items = [item for text in (first, second) for item in str(text).split("; ")]
+    return "; ".join(dict.fromkeys(items))

@@ -174,19 +174,19 @@ def fraction(result: Estimate, nothing: Estimate, yardstick: Estimate) -> Estima
 
 def text(table: Sequence[ReportRow]) -> str:
     """Return a table in Markdown for each axis and task."""
-    parts = []
+    sections = []
     for axis in AXES:
         axis_rows = [row for row in table if row.axis == axis]
         if axis_rows:
-            parts.append(f"## {HEADINGS[axis]}")
+            sections.append(f"## {HEADINGS[axis]}")
         for task in dict.fromkeys(row.task for row in axis_rows):
-            some = [row for row in axis_rows if row.task == task]
-            parts.append(f"### {task}\n\n{_table(some)}")
-            methods = {row.method for row in some}
+            task_rows = [row for row in axis_rows if row.task == task]
+            sections.append(f"### {task}\n\n{_table(task_rows)}")
+            methods = {row.method for row in task_rows}
             missing = [f"`{name}`" for name in (NOTHING, YARDSTICK) if name not in methods]
             if missing:
-                parts.append(f"Fractions need runs of {' and '.join(missing)}.")
-    return "\n\n".join(parts) + "\n"
+                sections.append(f"Fractions need runs of {' and '.join(missing)}.")
+    return "\n\n".join(sections) + "\n"
 
 
 def _table(table: Sequence[ReportRow]) -> str:
@@ -287,8 +287,10 @@ def _picture(records: Sequence[RunRecord]) -> bytes:
     for axis, panels in zip(axes, grid, strict=True):
         for (label, across), panel in zip(ACROSS.items(), panels, strict=True):
             for number, (method, name) in enumerate(names.items()):
-                some = [r for r in records if (r.job.axis, r.job.method) == (axis, method)]
-                _draw(panel, curve(some, across), f"C{number}", name)
+                method_records = [
+                    r for r in records if (r.job.axis, r.job.method) == (axis, method)
+                ]
+                _draw(panel, curve(method_records, across), f"C{number}", name)
             panel.set(xlabel=label, ylabel="return of held-out episodes")
             panel.set_title(HEADINGS[axis], fontsize=9, loc="left")
             panel.grid(alpha=0.3)

@@ -166,14 +166,14 @@ def run(folder: Path, device: str) -> None:
 
 
 def _learn(
-    request: RunRequest, folder: Path, device: str, on_entry: Callable[[CurvePoint], None]
+    request: RunRequest, folder: Path, device: str, on_point: Callable[[CurvePoint], None]
 ) -> Episodes:
     """Learn, write rules or policy and a picture, and return the held-out episodes."""
     job, facts = request.job, request.facts
     problem, amount = Problem(**facts["problem"]), facts["budget"]
     in_seconds = job.axis == "seconds"
     budget = Budget(seconds=amount) if in_seconds else Budget(particle_steps=int(amount))
-    options = dict(facts["options"], device=device, on_entry=on_entry)
+    options = dict(facts["options"], device=device, on_point=on_point)
     if request.teacher:
         options["teacher"] = request.teacher
     trained = train(facts["method"], problem, budget, job.seed, **options)
@@ -251,7 +251,9 @@ LAST_OUTPUT = 2000
 
 
 @dataclass
-class _Process(Child):
+class RunProcess(Child):
+    """The process of a run, in the run's temporary folder."""
+
     request: RunRequest
     folder: Path
     process: subprocess.Popen[bytes]
@@ -282,15 +284,15 @@ def _send(process: subprocess.Popen[bytes], line: str) -> None:
         process.stdin.flush()
 
 
-def lasts(plan: ComparisonPlan, job: Job) -> bool:
+def shares_process(plan: ComparisonPlan, job: Job) -> bool:
     """Return whether a process may do other runs before and after this one.
 
     Runs with a time budget have separate processes, for equal conditions, and so do functions from
     outside this library, which may leave objects in memory.
     """
-    own = ":" in plan.own.get(job.method, job.method)
+    from_outside = ":" in plan.own.get(job.method, job.method)
     # Other systems cannot rename a folder in which a process has an open file.
-    return os.name == "posix" and job.axis == "particle-steps" and not own
+    return os.name == "posix" and job.axis == "particle-steps" and not from_outside
 
 
 def held_records(plan: ComparisonPlan, folder: Path) -> dict[Job, RunRecord]:
@@ -330,19 +332,20 @@ def run_jobs(
     waiting = list(jobs)
     idle: list[subprocess.Popen[bytes]] = []
 
-    def start(unfinished: Sequence[_Process]) -> _Process | None:
+    def start(unfinished: Sequence[RunProcess]) -> RunProcess | None:
         ahead = {*waiting, *(one.request.job for one in unfinished)}
         for job in waiting:
             teacher = plan.teacher(job)
             if teacher not in ahead:
                 waiting.remove(job)
-                taught = "" if teacher is None else str(folder / teacher.folder)
-                request = RunRequest(job, plan.facts(job), command, taught)
-                return _start(request, folder, slots.threads, idle if lasts(plan, job) else [])
+                rules = "" if teacher is None else str(folder / teacher.folder)
+                request = RunRequest(job, plan.facts(job), command, rules)
+                reusable = idle if shares_process(plan, job) else []
+                return _start(request, folder, slots.threads, reusable)
         return None
 
-    def finished(one: _Process) -> None:
-        again = lasts(plan, one.request.job)
+    def finished(one: RunProcess) -> None:
+        again = shares_process(plan, one.request.job)
         if not again:
             one.process.communicate()
         record = _finish(one, folder)
@@ -362,7 +365,7 @@ def run_jobs(
             start,
             finished,
             slots,
-            starts_early=slots.starts_early and not all(lasts(plan, job) for job in jobs),
+            starts_early=slots.starts_early and not all(shares_process(plan, job) for job in jobs),
             max_seconds=max_seconds,
         )
     finally:
@@ -372,31 +375,31 @@ def run_jobs(
 
 def _start(
     request: RunRequest, folder: Path, threads: int, idle: list[subprocess.Popen[bytes]]
-) -> _Process:
+) -> RunProcess:
     """Return the process of a run, an idle or a new one, which waits for its device."""
     target = folder / request.job.folder
-    part = target.parent / f".{target.name}.{secrets.token_hex(4)}"
-    part.mkdir(parents=True)
-    write_record(part / REQUEST, asdict(request))
+    temporary = target.parent / f".{target.name}.{secrets.token_hex(4)}"
+    temporary.mkdir(parents=True)
+    write_record(temporary / REQUEST, asdict(request))
     if idle:
         # The process opens this file itself, unless it dies before.
-        (part / OUTPUT).touch()
+        (temporary / OUTPUT).touch()
         process = idle.pop()
-        _send(process, json.dumps(str(part)))
-        return _Process(request, part, process)
+        _send(process, json.dumps(str(temporary)))
+        return RunProcess(request, temporary, process)
     environment = os.environ | {"OMP_NUM_THREADS": str(threads)}
-    with (part / OUTPUT).open("wb") as output:
+    with (temporary / OUTPUT).open("wb") as output:
         process = subprocess.Popen(
-            [*PROGRAM, str(part)],
+            [*PROGRAM, str(temporary)],
             stdin=subprocess.PIPE,
             stdout=output,
             stderr=output,
             env=environment,
         )
-    return _Process(request, part, process)
+    return RunProcess(request, temporary, process)
 
 
-def _finish(one: _Process, folder: Path) -> RunRecord:
+def _finish(one: RunProcess, folder: Path) -> RunRecord:
     """Move the results of an ended run into its folder, and return its record."""
     request = one.request
     record = RunRecord.read(one.folder, request.facts)

@@ -103,8 +103,8 @@ def train(
     device: str | torch.device = "cpu",
     start: RuleSet | None = None,
     evaluation_seeds: Iterable[int] = EVALUATION_SEEDS,
-    entries: int = 20,
-    on_entry: Callable[[CurvePoint], None] = lambda _: None,
+    curve_points: int = 20,
+    on_point: Callable[[CurvePoint], None] = lambda _: None,
     on_stop: Callable[[], None] = lambda: None,
     out: str | Path | None = None,
     resume: bool = False,
@@ -125,8 +125,8 @@ def train(
         device: Device of worlds, rules and evaluations.
         start: Rules to begin with, `RuleSet.of(problem, "heart")`; copied. None: new ones.
         evaluation_seeds: Seeds of the episodes that measure the learning curve.
-        entries: Points of the curve after the first, at equal parts of the budget.
-        on_entry: Called with each point as soon as it is known.
+        curve_points: Points of the curve after the first, at equal fractions of the budget.
+        on_point: Called with each point as soon as it is known.
         on_stop: Called when a signal stops a run with `out` before its budget is spent.
         out: Folder for checkpoint, rules and curve, by `KEPT_METHODS` only; SIGTERM and Ctrl-C then
             save before they stop the run. None: nothing is written.
@@ -149,7 +149,7 @@ def train(
             raise NPAError(
                 f"{name.lower()} must be a {name}, got {shown(value)}: make it with {make}"
             )
-    if problem.actor == "codes" and method in GARDEN_METHODS | METHODS:
+    if problem.controlled == "codes" and method in GARDEN_METHODS | METHODS:
         raise NPAError(
             f"method {shown(method)} cannot learn codes, the actions of {problem.env_id}: "
             "give a function of your own, 'package.module:function', or take another library"
@@ -178,8 +178,8 @@ def train(
         seed,
         device=device,
         evaluation_seeds=evaluation_seeds,
-        entries=entries,
-        on_entry=on_entry,
+        curve_points=curve_points,
+        on_point=on_point,
         initial=start,
         out=None if out is None else Path(out),
         run=None if out is None else json.loads(json.dumps(settings)),
@@ -200,9 +200,9 @@ def train(
 
 def methods_for(problem: Problem) -> dict[str, str]:
     """Return the methods that can learn a problem, as `METHODS`; none for codes."""
-    if problem.actor == "codes":
+    if problem.controlled == "codes":
         return {}
-    return GARDEN_METHODS if problem.actor == "brushes" else METHODS
+    return GARDEN_METHODS if problem.controlled == "brushes" else METHODS
 
 
 def method_options(method: str) -> dict[str, Any]:

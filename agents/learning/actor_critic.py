@@ -18,7 +18,7 @@ from npa_envs.training.process_group import ALONE, ProcessGroup, restart, world_
 from npa_envs.world.randomness import Randomness, WorldRandom, normal_draws
 
 
-class Pace(NamedTuple):
+class Schedule(NamedTuple):
     """Options of `CommonOptions` whose defaults depend on whether the run has a `start`."""
 
     learning_rate: float
@@ -28,9 +28,13 @@ class Pace(NamedTuple):
     target_kl: float
 
 
-FRESH = Pace(learning_rate=1e-3, initial_std=0.2, last_noise=0.25, critic_rounds=0, target_kl=0.2)
+NEW_RULES = Schedule(
+    learning_rate=1e-3, initial_std=0.2, last_noise=0.25, critic_rounds=0, target_kl=0.2
+)
 
-WARM = Pace(learning_rate=1e-4, initial_std=0.05, last_noise=1.0, critic_rounds=4, target_kl=0.05)
+START_RULES = Schedule(
+    learning_rate=1e-4, initial_std=0.05, last_noise=1.0, critic_rounds=4, target_kl=0.05
+)
 """With a `start`: much noise, large steps and an untrained critic would spoil those rules."""
 
 CRITIC_RATE = 1e-3
@@ -39,7 +43,7 @@ CRITIC_RATE = 1e-3
 CRITIC_WIDTH = 64
 """Units in a hidden layer of the critic."""
 
-CriticKind = Literal["particle", "central"]
+CriticInput = Literal["particle", "central"]
 """Input of a value: a "particle" alone, or also the mean over its world ("central")."""
 
 
@@ -78,7 +82,7 @@ class CommonOptions:
     """Fraction of the budget, at its end, in which standard deviations fall by `last_noise`."""
     critic_rounds: int | None = None
     """Rounds at first in which only the critic learns. None: 0, or 4 with a `start`."""
-    critic: CriticKind = "particle"
+    critic: CriticInput = "particle"
     """Input of the critic: a particle's own perception, or also its whole world ("central")."""
 
     def __post_init__(self) -> None:
@@ -94,22 +98,21 @@ class CommonOptions:
             check_fraction(self, "last_noise")
         if self.critic_rounds is not None:
             check_positive(self, int, "critic_rounds", at_least=0)
-        check_word(self, "critic", get_args(CriticKind))
+        check_word(self, "critic", get_args(CriticInput))
 
-    def pace(self, start: RuleSet | None) -> Pace:
-        """Return the options that depend on `start`, with `FRESH` or `WARM` in place of None."""
-        chosen = {name: getattr(self, name) for name in Pace._fields}
+    def schedule(self, start: RuleSet | None) -> Schedule:
+        """Return the options that depend on `start`, with defaults in place of None."""
+        chosen = {name: getattr(self, name) for name in Schedule._fields}
         chosen = {name: value for name, value in chosen.items() if value is not None}
-        return (FRESH if start is None else WARM)._replace(**chosen)
+        return (NEW_RULES if start is None else START_RULES)._replace(**chosen)
 
+    def noise_factor(self, remaining_budget: float, last_noise: float) -> float:
+        """Return the factor on the first noise: 1 until the last `noise_decay_share` of the budget.
 
-def noise_left(budget_left: float, last_noise: float, decay_share: float) -> float:
-    """Return the factor on the first noise: 1 until the last `decay_share` of the budget.
-
-    There it falls exponentially to `last_noise`, as rules learn with noise, but are evaluated
-    without.
-    """
-    return math.pow(last_noise, max(0.0, 1.0 - budget_left / decay_share))
+        There it falls exponentially to `last_noise`, as rules learn with noise, but are evaluated
+        without.
+        """
+        return math.pow(last_noise, max(0.0, 1.0 - remaining_budget / self.noise_decay_share))
 
 
 def find_gradients(optimiser: torch.optim.Optimizer, loss: Tensor) -> None:
@@ -155,31 +158,29 @@ class GaussianRules(nn.Module):
         self.rules = copy.deepcopy(rules)
         widths = [rule.update_dim for rule in self.rules]
         start = torch.full((len(widths), widths[0]), math.log(initial_std))
-        self.noise_left = 1.0
+        self.noise_factor = 1.0
         """Factor on the first standard deviations (dimensionless)."""
         self.log_std = nn.Parameter(start)
         """Logarithms of the standard deviations, a row for each species, shape [K, A]."""
         self.register_buffer("row_species", species_of(rules.counts), persistent=False)
-        # A tuple, so that modules are registered once.
-        self._each = tuple(RuleSet([rule], [1], self.rules.interface) for rule in self.rules)
 
     def get_extra_state(self) -> float:
-        """Return `noise_left`, for `state_dict`."""
-        return self.noise_left
+        """Return `noise_factor`, for `state_dict`."""
+        return self.noise_factor
 
     def set_extra_state(self, state: float) -> None:
-        """Set `noise_left`."""
-        self.noise_left = state
+        """Set `noise_factor`."""
+        self.noise_factor = state
 
     def row_log_std(self) -> Tensor:
         """Return the logarithms of the standard deviations of every particle, shape [N, A]."""
         return self.log_std[self.row_species]
 
     @torch.no_grad()
-    def leave_noise(self, noise_left: float) -> None:
+    def set_noise(self, factor: float) -> None:
         """Set the factor on the first standard deviations, which are also learned."""
-        self.log_std.add_(math.log(noise_left / self.noise_left))
-        self.noise_left = noise_left
+        self.log_std.add_(math.log(factor / self.noise_factor))
+        self.noise_factor = factor
 
     def sample(
         self, observation: Tensor, generator: Randomness | None = None
@@ -196,7 +197,7 @@ class GaussianRules(nn.Module):
 
     def row_log_prob(self, species: int, rows: Tensor, action: Tensor) -> Tensor:
         """Return log-probabilities [K] of actions [K, A] of one species that observes [K, P]."""
-        mean = self._each[species].mean(rows[:, None])[:, 0]
+        mean = self.rules.mean_by_rule(list(self.rules)[species], rows)
         return gaussian_log_prob(mean, self.log_std[species], action)
 
     def entropy(self) -> Tensor:
@@ -214,7 +215,7 @@ INPUT_LIMIT = 8.0
 class Critic(nn.Module):
     """Network of particles' values, whose inputs and outputs are scaled by running moments.
 
-    Its input is a particle's perception; of the kind "central" also the mean features of its world.
+    Its input is a particle's perception; a "central" one also has the mean features of its world.
     """
 
     mean: Tensor
@@ -224,13 +225,13 @@ class Critic(nn.Module):
     row_species: Tensor
 
     def __init__(
-        self, perception_dim: int, counts: Sequence[int], kind: CriticKind = "particle"
+        self, perception_dim: int, counts: Sequence[int], inputs: CriticInput = "particle"
     ) -> None:
         super().__init__()
         width = CRITIC_WIDTH
         self.features = nn.Linear(perception_dim, width)
-        self.own = nn.Linear(width, width)
-        self.pooled = nn.Linear(width, width, bias=False) if kind == "central" else None
+        self.hidden = nn.Linear(width, width)
+        self.pooled = nn.Linear(width, width, bias=False) if inputs == "central" else None
         self.species = nn.Embedding(len(counts), width)
         self.value = nn.Linear(width, 1)
         nn.init.zeros_(self.species.weight)
@@ -247,7 +248,7 @@ class Critic(nn.Module):
         spread = (self.square - self.mean.square()).clamp(min=1e-6).sqrt()
         inputs = ((observation - self.mean) / spread).clamp(-INPUT_LIMIT, INPUT_LIMIT)
         features = torch.tanh(self.features(inputs))
-        mixed = self.own(features) + self.species(self.row_species)
+        mixed = self.hidden(features) + self.species(self.row_species)
         if self.pooled is not None:
             mixed = mixed + self.pooled(features.mean(dim=-2, keepdim=True))
         values: Tensor = self.value(torch.tanh(mixed)).squeeze(-1)
@@ -280,11 +281,11 @@ class Critic(nn.Module):
         return (1.0 / self.updates[moment]).clamp(min=MIN_RATE)
 
 
-def seeded_critic(progress: Progress, input_dim: int, kind: CriticKind) -> Critic:
+def seeded_critic(progress: Progress, input_dim: int, inputs: CriticInput) -> Critic:
     """Return a new critic, on the device; torch's global random state does not change."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(progress.seed)
-        return Critic(input_dim, progress.problem.counts, kind).to(progress.device)
+        return Critic(input_dim, progress.problem.counts, inputs).to(progress.device)
 
 
 def learner_random(progress: Progress, total: int, indices: Tensor) -> Randomness:
@@ -297,45 +298,52 @@ def learner_random(progress: Progress, total: int, indices: Tensor) -> Randomnes
 class Minibatches:
     """Minibatches: the rows of a round, shuffled for each pass and split into `count` parts.
 
-    There are several groups of rows, which are shuffled separately: one with n in `rows` has n rows
-    a world and step, in the order [T, B, n]. Few rows make fewer parts. One process shuffles all
-    rows; of several each shuffles the rows of each world by the world's own stream, and a part has
-    equally many of each world, so that parts do not depend on the number of processes.
+    There are several groups of rows, which are shuffled separately: one with n in `group_sizes` has
+    n rows per world and step, in the order [T, B, n]. Few rows make fewer minibatches. One process
+    shuffles all rows; of several each shuffles the rows of each world by the world's own stream,
+    and a minibatch has equally many of each world, so that minibatches do not depend on the number
+    of processes.
     """
 
     def __init__(
-        self, steps: int, worlds: int, rows: Sequence[int], count: int, random: Randomness
+        self,
+        steps: int,
+        world_count: int,
+        group_sizes: Sequence[int],
+        count: int,
+        random: Randomness,
     ) -> None:
-        self._shape = steps, worlds
-        self._rows = rows
+        self._steps, self._world_count = steps, world_count
+        self._group_sizes = group_sizes
         self._random = random
-        shared = worlds if isinstance(random, WorldRandom) else 1
-        self.count = min(count, steps * worlds * min(rows) // shared)
-        """Parts of a pass."""
+        unit = world_count if isinstance(random, WorldRandom) else 1
+        self.count = min(count, steps * world_count * min(group_sizes) // unit)
+        """Minibatches of a pass."""
         # CUDA graphs read them in place.
         self._orders = [
-            torch.zeros(steps * worlds * n, dtype=torch.int64, device=random.device) for n in rows
+            torch.zeros(steps * world_count * n, dtype=torch.int64, device=random.device)
+            for n in group_sizes
         ]
-        self.parts: list[tuple[Tensor, ...]] = []
-        """Row numbers of each part, int64, by group: views that `shuffle` overwrites."""
+        self.indices: list[tuple[Tensor, ...]] = []
+        """Rows of each minibatch by group, int64: views that `shuffle` overwrites."""
         for order in self._orders:
             # Sizes as of `tensor_split`.
-            sizes = [shared * ((len(order) // shared + k) // self.count) for k in range(self.count)]
-            self.parts.append(torch.split(order, sizes[::-1]))
+            sizes = [unit * ((len(order) // unit + k) // self.count) for k in range(self.count)]
+            self.indices.append(torch.split(order, sizes[::-1]))
 
     def shuffle(self) -> None:
         """Draw the orders of the next pass."""
         restart(self._random)
-        for order, rows in zip(self._orders, self._rows, strict=True):
+        for order, group_size in zip(self._orders, self._group_sizes, strict=True):
             if isinstance(self._random, WorldRandom):
-                order.copy_(self._by_world(self._random, rows))
+                order.copy_(self._shuffled_by_world(self._random, group_size))
             else:
                 torch.randperm(len(order), generator=self._random, out=order)
 
-    def _by_world(self, random: WorldRandom, rows: int) -> Tensor:
-        """Return all rows of a group, part by part, shape [T B n]."""
-        steps, worlds = self._shape
-        order = random.uniform(steps * rows).argsort(dim=1, stable=True)
-        world = torch.arange(worlds, device=order.device)[:, None]
-        index = (order // rows * worlds + world) * rows + order % rows
-        return torch.cat([part.flatten() for part in index.tensor_split(self.count, dim=1)])
+    def _shuffled_by_world(self, random: WorldRandom, group_size: int) -> Tensor:
+        """Return all rows of a group, minibatch by minibatch, shape [T B n]."""
+        order = random.uniform(self._steps * group_size).argsort(dim=1, stable=True)
+        world = torch.arange(self._world_count, device=order.device)[:, None]
+        step, row = order // group_size, order % group_size
+        index = (step * self._world_count + world) * group_size + row
+        return torch.cat([split.flatten() for split in index.tensor_split(self.count, dim=1)])

@@ -38,26 +38,26 @@ GAINS = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, -0.01, -0.03, -0.1, -0.3)
 
 def train_random(progress: Progress) -> Policy | Tending:
     """Return the policy that acts at random; no particle-steps are used."""
-    return _evaluated(progress, RandomPolicy, RandomGardener, seed=progress.seed)
+    return _evaluate_once(progress, RandomPolicy, RandomGardener, seed=progress.seed)
 
 
 def train_zero(progress: Progress) -> Policy | Tending:
     """Return the policy that does nothing; no particle-steps are used."""
-    return _evaluated(progress, ZeroPolicy, StillGardener)
+    return _evaluate_once(progress, ZeroPolicy, StillGardener)
 
 
-def _evaluated(
+def _evaluate_once(
     progress: Progress, policy: Callable[..., Policy], gardener: Any, **options: int
 ) -> Policy | Tending:
     """Return the policy for particles, or the one for brushes, after its evaluation."""
     check_no_start(progress)
-    made: Policy | Tending
-    if progress.problem.actor == "brushes":
-        made = Tending(lambda env: gardener(env, **options))
+    result: Policy | Tending
+    if progress.problem.controlled == "brushes":
+        result = Tending(lambda env: gardener(env, **options))
     else:
-        made = policy(progress.problem.make_envs(1, device=progress.device), **options)
-    progress.start(made)
-    return made
+        result = policy(progress.problem.make_envs(1, device=progress.device), **options)
+    progress.start(result)
+    return result
 
 
 def train_scripted(progress: Progress, *, gains: Sequence[float] = GAINS) -> Policy:
@@ -85,10 +85,8 @@ def train_scripted(progress: Progress, *, gains: Sequence[float] = GAINS) -> Pol
         return episodes.mean_return
 
     highest = mean_return_of(best)
-    makers = [
-        make for make in SCRIPTED if make is not PaintPolicy or target_colour(envs) is not None
-    ]
-    for policy in (make(envs, gain=gain) for make in makers for gain in gains):
+    scripts = [cls for cls in SCRIPTED if cls is not PaintPolicy or target_colour(envs) is not None]
+    for policy in (cls(envs, gain=gain) for cls in scripts for gain in gains):
         if progress.over:
             break
         mean_return = mean_return_of(policy)
@@ -101,7 +99,7 @@ def train_scripted(progress: Progress, *, gains: Sequence[float] = GAINS) -> Pol
 def check_no_start(progress: Progress) -> None:
     """Check that the run has no `start`."""
     if progress.initial is not None:
-        if progress.problem.actor == "brushes":
+        if progress.problem.controlled == "brushes":
             raise NPAError("start must be None in a garden, where the world's rule is not learned")
         raise NPAError(
             "start must be None for a method that learns nothing: choose 'gradient', 'ppo', "
@@ -128,9 +126,9 @@ class Tending:
 def tend_scripted(progress: Progress) -> Policy | Tending:
     """Return the scripted gardener, or in `npa/Shepherd2D-v0` the scripted shepherd."""
     shepherd = issubclass(progress.problem.task_type, ShepherdTask)
-    return _evaluated(progress, ZeroPolicy, ScriptedShepherd if shepherd else ScriptedGardener)
+    return _evaluate_once(progress, ZeroPolicy, ScriptedShepherd if shepherd else ScriptedGardener)
 
 
 def tend_gradient(progress: Progress) -> Policy | Tending:
     """Return the gardener that plans by the gradient through the world's physics."""
-    return _evaluated(progress, ZeroPolicy, GradientGardener, seed=progress.seed)
+    return _evaluate_once(progress, ZeroPolicy, GradientGardener, seed=progress.seed)

@@ -11,8 +11,8 @@ from torch import Tensor
 from npa_envs.agents.learning.problem import world_seeds
 from npa_envs.agents.learning.progress import Progress, annealed
 from npa_envs.agents.learning.rule_set import RuleSet, Source
-from npa_envs.checks import check_fraction, check_positive, is_real
-from npa_envs.errors import NPAError, shown
+from npa_envs.checks import check_fraction, check_non_negative, check_positive
+from npa_envs.errors import NPAError
 
 STORED_STEPS = 64
 """Last steps of all worlds that are learned from, or `collect_steps` if that is more."""
@@ -46,19 +46,13 @@ class CloneOptions:
 
     def __post_init__(self) -> None:
         """Check every field but the teacher; raises NPAError."""
-        if not (is_real(self.student_share) and 0.0 <= self.student_share <= 1.0):
-            raise NPAError(
-                f"student_share must lie in [0, 1], got {shown(self.student_share)}: try 0.5"
-            )
+        check_non_negative(self, "student_share", at_most=1.0)
         check_positive(self, int, "collect_steps", "updates", "batch_worlds")
         check_positive(self, float, "learning_rate")
         check_fraction(self, "last_rate")
 
 
-DEFAULTS = CloneOptions()
-
-
-def train(progress: Progress, options: CloneOptions = DEFAULTS) -> RuleSet:
+def train(progress: Progress, options: CloneOptions = CloneOptions()) -> RuleSet:
     """Learn a teacher's actions in worlds where the teacher acts, and where the student acts.
 
     The loss is the squared error of actions over the variance of the teacher's, column by column.
@@ -71,17 +65,19 @@ def train(progress: Progress, options: CloneOptions = DEFAULTS) -> RuleSet:
         rules.parameters(), lr=options.learning_rate, fused=device.type == "cuda"
     )
     if options.dataset is None:
-        collect, pairs = _taught(progress, rules, options)
+        collect, demonstrations = _from_teacher(progress, rules, options)
     else:
-        collect, pairs = None, _recorded(progress, options)
+        collect, demonstrations = None, _from_dataset(progress, options)
 
     def iteration() -> int:
         steps = options.updates * options.batch_worlds if collect is None else collect()
-        rate = annealed(options.learning_rate, options.last_rate, progress.share)
+        rate = annealed(options.learning_rate, options.last_rate, progress.spent_fraction)
         for group in optimiser.param_groups:
             group["lr"] = rate
         for _ in range(options.updates):
-            loss = unexplained(rules, *pairs.draw(options.batch_worlds, generator))
+            loss = unexplained_variance(
+                rules, *demonstrations.draw(options.batch_worlds, generator)
+            )
             optimiser.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
             optimiser.step()
@@ -90,7 +86,7 @@ def train(progress: Progress, options: CloneOptions = DEFAULTS) -> RuleSet:
     return progress.run(rules, iteration)
 
 
-def _taught(
+def _from_teacher(
     progress: Progress, rules: RuleSet, options: CloneOptions
 ) -> tuple[Callable[[], int], Demonstrations]:
     """Return a function that collects demonstrations and returns the steps, and these."""
@@ -101,23 +97,24 @@ def _taught(
     student, envs = rules.policy(), problem.make_envs(device=device)
     observation, _ = envs.reset(seed=world_seeds(progress.seed, problem.num_envs))
     stored_steps = max(STORED_STEPS, options.collect_steps)
-    pairs = Demonstrations(stored_steps * problem.num_envs, observation, teacher(observation))
-    taught = problem.num_envs - round(options.student_share * problem.num_envs)
+    capacity = stored_steps * problem.num_envs
+    demonstrations = Demonstrations(capacity, observation, teacher(observation))
+    teacher_worlds = problem.num_envs - round(options.student_share * problem.num_envs)
 
     def collect() -> int:
         nonlocal observation
         for _ in range(options.collect_steps):
             action = teacher(observation)
-            pairs.add(observation, action)
-            if taught < problem.num_envs:
-                action[taught:] = student(observation[taught:])
+            demonstrations.add(observation, action)
+            if teacher_worlds < problem.num_envs:
+                action[teacher_worlds:] = student(observation[teacher_worlds:])
             observation, *_ = envs.step(action)
         return options.collect_steps * problem.num_envs
 
-    return collect, pairs
+    return collect, demonstrations
 
 
-def _recorded(progress: Progress, options: CloneOptions) -> Demonstrations:
+def _from_dataset(progress: Progress, options: CloneOptions) -> Demonstrations:
     """Return the demonstrations of a dataset, on a device."""
     from npa_envs.wrappers.minari import read_pairs
 
@@ -134,22 +131,22 @@ def _recorded(progress: Progress, options: CloneOptions) -> Demonstrations:
             "problem"
         )
     observations, actions = observations.to(progress.device), actions.to(progress.device)
-    pairs = Demonstrations(len(observations), observations, actions)
-    pairs.add(observations, actions)
-    return pairs
+    demonstrations = Demonstrations(len(observations), observations, actions)
+    demonstrations.add(observations, actions)
+    return demonstrations
 
 
-def unexplained(rules: RuleSet, observation: Tensor, action: Tensor) -> Tensor:
+def unexplained_variance(rules: RuleSet, observation: Tensor, action: Tensor) -> Tensor:
     """Return the squared error of rules over the variance of the actions: 1 - R², a scalar.
 
     Observations have shape [B, N, P], the teacher's actions [B, N, A].
     """
-    parts, errors = [], (rules.mean(observation) - action).square()
+    ratios, errors = [], (rules.mean(observation) - action).square()
     for span in rules.spans:
         error = errors[:, span]
         variance = action[:, span].flatten(0, 1).var(dim=0, correction=0)
-        parts.append((error.flatten(0, 1).mean(dim=0) / (variance + VARIANCE_FLOOR)).mean())
-    return torch.stack(parts).mean()
+        ratios.append((error.flatten(0, 1).mean(dim=0) / (variance + VARIANCE_FLOOR)).mean())
+    return torch.stack(ratios).mean()
 
 
 class Demonstrations:

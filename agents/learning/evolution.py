@@ -50,10 +50,7 @@ class EvolutionOptions:
         check_positive(self, float, "sigma")
 
 
-DEFAULTS = EvolutionOptions()
-
-
-def train(progress: Progress, options: EvolutionOptions = DEFAULTS) -> RuleSet:
+def train(progress: Progress, options: EvolutionOptions = EvolutionOptions()) -> RuleSet:
     """Evolve rules until the budget is spent, and return the mean of the last generation.
 
     Candidates are drawn on the CPU and evaluated on the device.
@@ -72,7 +69,7 @@ def train(progress: Progress, options: EvolutionOptions = DEFAULTS) -> RuleSet:
         weights = torch.as_tensor(np.stack(proposed), dtype=torch.float32).to(device)
         returns = fitness(envs, rules, weights, seeds, problem.episode_steps)
         strategy.tell(proposed, costs(returns.cpu().double().numpy()))
-        rule_weights.put(strategy.mean)
+        rule_weights.set_vector(strategy.mean)
         return world_count * problem.particle_count * problem.episode_steps
 
     return progress.run(rules, generation)
@@ -99,7 +96,7 @@ class RuleWeights:
         with torch.no_grad():
             return nn.utils.parameters_to_vector(self._parts).double().cpu().numpy()
 
-    def put(self, vector: NDArray[np.float64]) -> None:
+    def set_vector(self, vector: NDArray[np.float64]) -> None:
         """Set the weights of the rules in place from a vector, shape [W]."""
         first = self._parts[0]
         with torch.no_grad():
@@ -149,12 +146,13 @@ def candidates_actions(rules: RuleSet, weights: Tensor, observation: Tensor) -> 
     sizes = [sum(part.numel() for part in layers_of(rule)) for rule in rules]
     weights_of = dict(zip(rules, torch.split(weights, sizes, dim=1), strict=True))
 
-    def update(rule: NPARule, observation: Tensor) -> tuple[Tensor, Tensor]:
+    def action(rule: NPARule, observation: Tensor) -> Tensor:
         rows = perceived(rule, observation)
         rows = rows.view(len(weights), -1, rows.shape[1])
-        return bounded(rule, updates_of(rule, weights_of[rule], rows).flatten(0, 1))
+        update = updates_of(rule, weights_of[rule], rows).flatten(0, 1)
+        return rules.interface.action(*bounded(rule, update))
 
-    return rules.acted(observation, rules.interface.action, update)
+    return rules.actions(observation, action)
 
 
 def fitness(

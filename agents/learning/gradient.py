@@ -28,7 +28,7 @@ from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness, WorldRandom
 from npa_envs.world.rollout import Memory
 
-LONGEST = 96
+MAX_STEPS = 96
 """Most steps of a rollout by default: longer episodes continue in a pool."""
 
 POOL_SIZE = 64
@@ -45,7 +45,7 @@ class GradientOptions:
     steps: tuple[int, int] | None = None
     """Range [lo, hi) of the steps of a rollout; None: whole episodes of up to 96 steps, and 32 to
     96 steps of longer ones."""
-    world_count: int = 8
+    num_envs: int = 8
     """Worlds in a batch."""
     pool_size: int | None = None
     """Worlds of a pool, from which rollouts continue; 0: all rollouts start new episodes. None: 64
@@ -73,10 +73,7 @@ class GradientOptions:
             object.__setattr__(self, "steps", tuple(steps))
 
 
-DEFAULTS = GradientOptions()
-
-
-def train(progress: Progress, options: GradientOptions = DEFAULTS) -> RuleSet:
+def train(progress: Progress, options: GradientOptions = GradientOptions()) -> RuleSet:
     """Descend the loss at the end of rollouts, differentiated through all of their steps.
 
     Rollouts start new episodes, or continue earlier ones from a pool as in the paper (arXiv
@@ -86,17 +83,17 @@ def train(progress: Progress, options: GradientOptions = DEFAULTS) -> RuleSet:
     task, rules = EnvironmentTask(problem, device), progress.first_rules()
     length, steps, pool_size = problem.episode_steps, options.steps, options.pool_size
     if steps is None:
-        steps = (length, length + 1) if length <= LONGEST else (LONGEST // 3, LONGEST + 1)
+        steps = (length, length + 1) if length <= MAX_STEPS else (MAX_STEPS // 3, MAX_STEPS + 1)
     if pool_size is None:
-        pool_size = 0 if steps[0] >= length else max(POOL_SIZE, options.world_count)
+        pool_size = 0 if steps[0] >= length else max(POOL_SIZE, options.num_envs)
     config = BudgetTrainConfig(
         task=problem.config,
         progress=progress,
         # A single repeat without an end: the budget ends the run.
         iterations=sys.maxsize,
         repeats=1,
-        world_count=options.world_count,
-        pool_size=pool_size or options.world_count,
+        world_count=options.num_envs,
+        pool_size=pool_size or options.num_envs,
         steps=steps,
         learning_rate=options.learning_rate,
         last_rate=options.last_rate,
@@ -134,7 +131,7 @@ class BudgetTrainConfig(TrainConfig[Any]):
 
     def learning_rate_at(self, iteration: int, share: float = 0.0) -> float:
         """Return the current learning rate, half a cosine over the budget; ignores arguments."""
-        return annealed(self.learning_rate, self.last_rate, self.progress.share)
+        return annealed(self.learning_rate, self.last_rate, self.progress.spent_fraction)
 
 
 class EnvironmentTask(ParticleTask[Any]):
@@ -186,11 +183,9 @@ class EnvironmentTask(ParticleTask[Any]):
         return self if goal is None else self._with(inner=self.inner.toward(goal))
 
     def compare(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the loss, averaged over worlds and species, and its parts by name."""
-        parts = {name: part.mean() for name, part in self._losses(worlds).items()}
-        total = torch.stack(list(parts.values())).sum()
-        self._check_gradient(total, worlds)
-        return total, parts
+        """Return the loss, averaged over worlds and species, and its terms by name."""
+        losses = {name: loss.mean() for name, loss in self._losses(worlds).items()}
+        return torch.stack(list(losses.values())).sum(), losses
 
     def penalties(self, *_: Any) -> dict[str, tuple[float, Tensor]]:
         """Return no terms: environments have none."""
@@ -198,11 +193,9 @@ class EnvironmentTask(ParticleTask[Any]):
 
     def world_losses(self, worlds: Particles) -> Tensor:
         """Return the loss of each world, averaged over its species, shape [B]."""
-        parts = self.toward(worlds.goal)._losses(worlds)
-        total = torch.stack(list(parts.values())).sum(dim=0)
-        total = total.flatten(1).mean(dim=1) if total.dim() > 1 else total
-        self._check_gradient(total, worlds)
-        return total
+        losses = self.toward(worlds.goal)._losses(worlds)
+        total = torch.stack(list(losses.values())).sum(dim=0)
+        return total.flatten(1).mean(dim=1) if total.dim() > 1 else total
 
     def rollout(self, rules: Any, x: Tensor, s: Tensor, steps: int, /, **options: Any) -> Any:
         """Run a `RuleSet` by the environment's physics; options are those of `npa_envs.rollout`."""
@@ -233,20 +226,18 @@ class EnvironmentTask(ParticleTask[Any]):
             losses = self.inner.losses(Population(x, s, self.problem.counts, self._species))
         else:
             losses = self.inner.losses(x, s)
-        return losses
-
-    def _check_gradient(self, total: Tensor, worlds: Particles) -> None:
-        needed = torch.is_grad_enabled() and (worlds.x.requires_grad or worlds.s.requires_grad)
-        if needed and not total.requires_grad:
+        needed = torch.is_grad_enabled() and (x.requires_grad or s.requires_grad)
+        if needed and not any(loss.requires_grad for loss in losses.values()):
             raise NPAError(
                 f"the losses of {type(self.inner).__name__} must be differentiable for "
                 "a method that follows gradients, but no gradient leads from them to positions or "
                 "states: compute them by torch's operations, or learn by 'ppo' or 'evolution'"
             )
+        return losses
 
 
 class _ClampInward(torch.autograd.Function):
-    """The autograd function of `clamp_inward`."""
+    """Clamps values to ± a limit; beyond it gradients pass only if descent leads back inside."""
 
     @staticmethod
     def forward(ctx: Any, values: Tensor, limit: float) -> Tensor:
@@ -262,18 +253,6 @@ class _ClampInward(torch.autograd.Function):
         return bar.masked_fill((values.abs() > ctx.limit) & leads_out, 0.0), None
 
 
-def clamp_inward(values: Tensor, limit: float) -> Tensor:
-    """Clamp values to ± a limit; beyond it gradients pass only if descent leads back inside."""
-    clamped: Tensor = _ClampInward.apply(values, limit)  # type: ignore[no-untyped-call]
-    return clamped
-
-
-def with_clamped_states(update: Tensor, rule: ClampedRule) -> Tensor:
-    """Return updates [..., δ | Δs] with state steps clamped to the rule's limit."""
-    first = rule.update_dim - rule.state_dim
-    return torch.cat((update[..., :first], clamp_inward(update[..., first:], rule.limit)), dim=-1)
-
-
 class ClampedWeights(FoldedRule):
     """The `FoldedRule` of a `ClampedRule`: it clamps the state part of each update."""
 
@@ -281,7 +260,7 @@ class ClampedWeights(FoldedRule):
 
     def __call__(self, rows: Tensor) -> Tensor:
         """Map rows [z | 1 | 0] to updates [δ | clamped Δs | 0]."""
-        return with_clamped_states(super().__call__(rows), self.rule)
+        return self.rule.clamped(super().__call__(rows))
 
 
 class ClampedRule(NPARule):
@@ -298,7 +277,13 @@ class ClampedRule(NPARule):
 
     def forward(self, perception: Tensor) -> Tensor:
         """Map perception vectors [..., P] to updates with clamped state steps."""
-        return with_clamped_states(super().forward(perception), self)
+        return self.clamped(super().forward(perception))
+
+    def clamped(self, update: Tensor) -> Tensor:
+        """Return updates [..., δ | Δs] with clamped state steps."""
+        first = self.update_dim - self.state_dim
+        state_step = _ClampInward.apply(update[..., first:], self.limit)  # type: ignore[no-untyped-call]
+        return torch.cat((update[..., :first], state_step), dim=-1)
 
     def is_plain(self) -> bool:
         """Return whether the other rule is plain, so that `folded` may replace `forward`."""

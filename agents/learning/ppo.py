@@ -11,10 +11,11 @@ longer than running them.
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, Self
 
 import torch
 from torch import Tensor, nn
@@ -28,7 +29,6 @@ from npa_envs.agents.learning.actor_critic import (
     find_gradients,
     gradients_of,
     learner_random,
-    noise_left,
     seeded_critic,
 )
 from npa_envs.agents.learning.problem import ROW_REWARDS, WORLDS_PER_SEED, Problem, world_seeds
@@ -55,7 +55,7 @@ MEMORY_FRACTION = 0.25
 class PPOOptions(CommonOptions):
     """Options of `train`."""
 
-    worlds: int | None = None
+    num_envs: int | None = None
     """Worlds B of all processes; None: the problem's `num_envs`, or more on CUDA: 131 072 particles
     on each GPU, if they fit into memory and the particle-steps are enough for 128 rounds."""
     clip: float | None = None
@@ -76,8 +76,8 @@ class PPOOptions(CommonOptions):
         check_flag(self, "masked")
         if self.clip is not None:
             check_positive(self, float, "clip")
-        if self.worlds is not None:
-            check_positive(self, int, "worlds")
+        if self.num_envs is not None:
+            check_positive(self, int, "num_envs")
         check_word(self, "ratio", ("particle", "world"))
         check_word(self, "credit", ("world", *ROW_REWARDS))
         if self.ratio == "world" and self.credit != "world":
@@ -94,39 +94,36 @@ class PPOOptions(CommonOptions):
         return 0.2 if self.ratio == "particle" else 0.02
 
 
-DEFAULTS = PPOOptions()
-
-
-def train(progress: Progress, options: PPOOptions = DEFAULTS) -> RuleSet:
+def train(progress: Progress, options: PPOOptions = PPOOptions()) -> RuleSet:
     """Return the rules that proximal policy optimisation finds within a budget."""
     problem, device, ranks = progress.problem, progress.device, progress.ranks
-    count = ranks.broadcast(world_count(problem, options, device, progress.budget, ranks))
-    options = replace(options, worlds=count)
-    learner = PPOLearner(progress, options)
+    count = ranks.broadcast(total_num_envs(problem, options, device, progress.budget, ranks))
+    learner = PPOLearner(progress, replace(options, num_envs=count))
 
-    def round_of_ppo() -> int:
-        budget_left = 1.0 - progress.share
+    def iteration() -> int:
+        remaining_budget = 1.0 - progress.spent_fraction
         learner.play()
-        learner.improve(budget_left)
+        learner.improve(remaining_budget)
         return learner.round_size
 
-    return progress.run(learner.actor.rules, round_of_ppo, learner)
+    return progress.run(learner.actor.rules, iteration, learner)
 
 
 class PPOLearner:
     """Rules, critic and worlds, which alternately `play` a round and `improve` from it.
 
     With several processes (`ranks`) each has some of the worlds, which have random streams of their
-    own, and gradients, moments and weights are averaged. `_graphed_NAME` runs `_NAME`: on CUDA
-    as a CUDA graph, so that it reads and writes attributes and `memory` in place.
+    own, and gradients, moments and weights are averaged, between CUDA graphs.
     """
 
     def __init__(self, progress: Progress, options: PPOOptions) -> None:
         problem, device, ranks = progress.problem, progress.device, progress.ranks
-        self.options, self.pace, self.ranks = options, options.pace(progress.initial), ranks
-        total = problem.num_envs if options.worlds is None else options.worlds
-        ranks.check_even("worlds", total)
-        indices = ranks.indices(total)
+        self.options, self.schedule = options, options.schedule(progress.initial)
+        self.ranks, self._seed = ranks, progress.seed
+        self._total = problem.num_envs if options.num_envs is None else options.num_envs
+        ranks.check_even("num_envs", self._total)
+        indices = ranks.indices(self._total)
+        self._indices = indices.tolist()
         self.envs = problem.make_envs(
             len(indices),
             device=device,
@@ -134,68 +131,32 @@ class PPOLearner:
             tell_updated=options.masked,
             copy=False,
         )
-        self.random = learner_random(progress, total, indices)
+        self.random = learner_random(progress, self._total, indices)
         rules = progress.first_rules(zero_output=True)
-        self.actor = GaussianRules(rules, self.pace.initial_std).to(device)
+        self.actor = GaussianRules(rules, self.schedule.initial_std).to(device)
         self.critic = seeded_critic(progress, problem.interface.perception_dim, options.critic)
         self.modules = {"actor": self.actor, "critic": self.critic}
-        # CUDA graphs read the learning rate from a tensor.
-        self.optimisers = {
-            name: torch.optim.Adam(
-                net.parameters(),
-                lr=torch.zeros((), device=device),
-                eps=1e-5,
-                fused=True,
-                capturable=device.type == "cuda",
-            )
-            for name, net in self.modules.items()
-        }
-        self._seed, self._indices, self._total = progress.seed, indices.tolist(), total
-        observation = self._worlds_of_part(0)
-        self.memory = RoundMemory(
-            options.steps,
-            observation,
-            problem.interface.action_dim,
-            own_advantages=options.ratio == "particle",
-        )
-        self.critic.observe(observation, ranks)
+        self.optimisers = {name: _adam(net, device) for name, net in self.modules.items()}
         self.rounds = 0
-        self._observation = observation.clone()
-        self._action, self._log_prob = (
-            part[0].clone() for part in (self.memory.actions, self.memory.log_probs)
-        )
-        # `_within_kl` is 0 once the rules have moved farther than `target_kl` in a round.
-        self._within_kl, self._rules_rate, self._all_acted = torch.ones(3, device=device)
         # One group of rows for each species, or of worlds, for the rules; worlds for the critic.
-        rows = (1,) if options.ratio == "world" else problem.counts
+        groups = (1,) if options.ratio == "world" else problem.counts
         self._minibatches = Minibatches(
-            options.steps, len(indices), (*rows, 1), options.minibatches, self.random
+            options.steps, len(indices), (*groups, 1), options.minibatches, self.random
         )
-        count = self._minibatches.count
-        self._current_part = 0
-        self._weight_sums: Tensor = self._within_kl.new_zeros(count, 2)
-        self._kl_sums = self._within_kl.new_zeros(2)
-        # Means over processes are taken between graphs.
-        graphed = partial(GraphedCallable, device=device)
-        self._graphed_draw_actions = graphed(self._draw_actions, generator=registered(self.random))
-        self._graphed_find_values = graphed(self._find_values)
-        self._graphed_find_advantages = graphed(
-            self._find_advantages, recorded=not ranks.distributed
-        )
-        pool = torch.cuda.graph_pool_handle() if device.type == "cuda" else None
-        self._graphed_sum_weights = graphed(self._sum_weights, pool=pool)
-        self._graphed_find_gradients = [
-            graphed(self._find_gradients, pool=pool) for _ in range(count)
-        ]
-        self._graphed_step = graphed(self._step, pool=pool)
+        observation = self._reset_worlds(0)
+        self.critic.observe(observation, ranks)
+        self.memory = RoundMemory(options, observation, problem.interface.action_dim)
+        self.update = UpdateState.new(self._minibatches.count, device)
+        self._play_graphs = GraphedMethods(device)
+        self._update_graphs = GraphedMethods(device, share_memory=True)
 
-    def resume(self, iteration: int, part: int) -> None:
-        """Resume after `iteration` rounds, for the `part`-th time, in new worlds."""
+    def resume(self, iteration: int, resumption: int) -> None:
+        """Resume after `iteration` rounds, for the `resumption`-th time, in new worlds."""
         self.rounds = iteration
-        self.memory.observations[-1].copy_(self._worlds_of_part(part))
+        self.memory.observations[-1].copy_(self._reset_worlds(resumption))
 
-    def _worlds_of_part(self, part: int) -> Tensor:
-        seeds = world_seeds(self._seed, self._total, part)
+    def _reset_worlds(self, resumption: int) -> Tensor:
+        seeds = world_seeds(self._seed, self._total, resumption)
         observation: Tensor
         observation, _ = self.envs.reset(seed=[seeds[k] for k in self._indices])
         return observation
@@ -208,47 +169,47 @@ class PPOLearner:
     @torch.no_grad()
     def play(self) -> Round:
         """Act for T steps in all worlds, and compute advantages; the next round overwrites them."""
-        memory = self.memory
+        memory, options = self.memory, self.options
         memory.observations[0].copy_(memory.observations[-1])
         last_observations = {}
-        for step in range(self.options.steps):
-            self._observation.copy_(memory.observations[step])
-            self._graphed_draw_actions()
-            memory.actions[step].copy_(self._action)
-            memory.log_probs[step].copy_(self._log_prob)
-            observation, reward, terminated, truncated, infos = self.envs.step(self._action)
+        for step in range(options.steps):
+            memory.observation.copy_(memory.observations[step])
+            self._play_graphs.run(self._draw_actions, generator=registered(self.random))
+            memory.actions[step].copy_(memory.action)
+            memory.log_probs[step].copy_(memory.log_prob)
+            observation, reward, terminated, truncated, infos = self.envs.step(memory.action)
             memory.observations[step + 1].copy_(observation)
             if "final_obs" in infos:
                 last_observations[step] = infos["final_obs"]
-            shared = self.options.credit == "world"
+            shared = options.credit == "world"
             memory.rewards[step].copy_(reward[:, None] if shared else own_rewards(infos))
-            memory.acted[step].copy_(infos.get("acted", self._all_acted))
-            if self.options.masked and "updated" in infos:
-                # It describes the step before a restart.
-                memory.acted[step].mul_(infos["updated"])
+            # `updated` is of one species; it describes the step before a restart.
+            acted = infos.get("acted", infos.get("updated") if options.masked else None)
+            if acted is not None:
+                memory.acted[step].copy_(acted)
             # A species may end before its world does.
             ended = infos.get("particle_terminated", terminated[:, None])
             memory.terminated[step].copy_(terminated[:, None] | ended)
             memory.ended[step].copy_((terminated | truncated)[:, None] | ended)
-        self._graphed_find_values()
+        self._play_graphs.run(self._find_values)
         for step, observation in last_observations.items():
             memory.next_values[step].copy_(self.critic(observation))
-        self._graphed_find_advantages()
+        self._play_graphs.run(self._find_advantages, recorded=not self.ranks.together)
         return memory.round
 
     @torch.no_grad()
     def _draw_actions(self) -> None:
         restart(self.random)
-        action, log_prob = self.actor.sample(self._observation, self.random)
-        self._action.copy_(action)
-        self._log_prob.copy_(log_prob)
+        action, log_prob = self.actor.sample(self.memory.observation, self.random)
+        self.memory.action.copy_(action)
+        self.memory.log_prob.copy_(log_prob)
 
     @torch.no_grad()
     def _find_values(self) -> None:
-        """Compute the critic's values of all observations, part by part to save memory."""
+        """Compute the critic's values of all observations, in chunks to save memory."""
         memory, observations = self.memory, self.memory.observations.flatten(0, 1)
         size = -(-len(observations) // self.options.minibatches)
-        values = torch.cat([self.critic(part) for part in torch.split(observations, size)])
+        values = torch.cat([self.critic(chunk) for chunk in torch.split(observations, size)])
         memory.values.copy_(values.view_as(memory.values))
         memory.next_values.copy_(memory.values[1:])
 
@@ -269,76 +230,105 @@ class PPOLearner:
             advantages = over_particles(advantages, memory.acted)
         memory.advantages.copy_(standardised(advantages, memory.acted, self.ranks))
 
-    def improve(self, budget_left: float) -> None:
+    def improve(self, remaining_budget: float) -> None:
         """Train rules and critic on the last round.
 
-        Learning rates, and the noise of the next round, fall with the fraction of the budget that
-        is left.
+        Learning rates, and the noise of the next round, fall with the remaining fraction of the
+        budget.
         """
-        options = self.options
-        rules_learn = self.rounds >= self.pace.critic_rounds
+        schedule, update = self.schedule, self.update
+        rules_learn = self.rounds >= schedule.critic_rounds
         self.rounds += 1
         self.critic.observe(self.memory.observations[:-1], self.ranks)
         self.critic.rescale(self.memory.targets, self.ranks)
-        rate = self.optimisers["critic"].param_groups[0]["lr"]
-        rate.fill_(CRITIC_RATE * budget_left)
-        self._rules_rate.fill_(self.pace.learning_rate * budget_left)
-        self._within_kl.fill_(1.0)
-        for _ in range(options.epochs):
+        self.optimisers["critic"].param_groups[0]["lr"].fill_(CRITIC_RATE * remaining_budget)
+        update.rules_rate.fill_(schedule.learning_rate * remaining_budget)
+        update.within_kl.fill_(1.0)
+        for _ in range(self.options.epochs):
             self._minibatches.shuffle()
-            self._improve_once(rules_learn)
+            self._update_graphs.run(self._sum_weights)
+            self.ranks.reduce([update.weight_sums])
+            for minibatch in range(self._minibatches.count):
+                if rules_learn:
+                    self._train(minibatch)
+                else:
+                    self._train_critic(minibatch)
             # The only synchronisation with the device.
-            if not bool(self._within_kl):
+            if not bool(update.within_kl):
                 break
-        self.actor.leave_noise(
-            noise_left(budget_left, self.pace.last_noise, options.noise_decay_share)
-        )
+        self.actor.set_noise(self.options.noise_factor(remaining_budget, schedule.last_noise))
 
-    def _improve_once(self, rules_learn: bool) -> None:
-        """Train on one pass over a round, in the orders of `_minibatches`."""
-        self._graphed_sum_weights()
-        self.ranks.reduce([self._weight_sums])
-        critic = self.optimisers["critic"]
-        for part, find_gradients_of_part in enumerate(self._graphed_find_gradients):
-            self._current_part = part
-            if rules_learn:
-                find_gradients_of_part()
-                gradients = gradients_of(critic) + gradients_of(self.optimisers["actor"])
-                self.ranks.reduce([*gradients, self._kl_sums])
-                self._graphed_step()
-            else:
-                self._find_critic_gradients()
-                self.ranks.reduce(gradients_of(critic))
-                self._descend(critic)
+    def _train(self, minibatch: int) -> None:
+        """Take a step of rules and critic on a minibatch."""
+        self._update_graphs.run(self._find_gradients, minibatch)
+        gradients = [g for name in ("critic", "actor") for g in gradients_of(self.optimisers[name])]
+        self.ranks.reduce([*gradients, self.update.kl_sums])
+        self._update_graphs.run(self._descend_both)
+
+    def _train_critic(self, minibatch: int) -> None:
+        self._find_critic_gradients(minibatch)
+        self.ranks.reduce(gradients_of(self.optimisers["critic"]))
+        self._descend(self.optimisers["critic"])
 
     def _sum_weights(self) -> None:
         """Sum the weights of the critic's and of the rules' rows in each minibatch of a pass."""
         acted = [self.memory.round.acted]
-        for part in range(self._minibatches.count):
-            (worlds,) = self._critic_rows(part, acted)
-            rows = torch.cat([own for (own,) in self._rule_rows(part, acted)])
-            sums = worlds.sum(), self._gain_weights(rows).sum()
-            self._weight_sums[part].copy_(torch.stack(sums))
+        for minibatch in range(self._minibatches.count):
+            (worlds,) = self._critic_rows(minibatch, acted)
+            rows = torch.cat([group for (group,) in self._rule_rows(minibatch, acted)])
+            sums = worlds.sum(), self._ratio_weights(rows).sum()
+            self.update.weight_sums[minibatch].copy_(torch.stack(sums))
 
-    def _find_gradients(self) -> None:
-        self._find_critic_gradients()
-        rows = [Round(*own) for own in self._rule_rows(self._current_part, self.memory.round)]
-        find_gradients(self.optimisers["actor"], -self._gain(rows))
+    def _find_gradients(self, minibatch: int) -> None:
+        self._find_critic_gradients(minibatch)
+        objective, kl_sums = self._objective(minibatch)
+        find_gradients(self.optimisers["actor"], -objective)
+        self.update.kl_sums.copy_(kl_sums)
 
-    def _find_critic_gradients(self) -> None:
-        worlds = Round(*self._critic_rows(self._current_part, self.memory.round))
+    def _find_critic_gradients(self, minibatch: int) -> None:
+        worlds = Round(*self._critic_rows(minibatch, self.memory.round))
         error = (self.critic(worlds.observations) - worlds.targets) / self.critic.scale
         squares = (worlds.acted * error.square()).sum()
-        loss = 0.5 * squares / self._weight_sums[self._current_part, 0].clamp(min=1.0)
+        loss = 0.5 * squares / self.update.weight_sums[minibatch, 0].clamp(min=1.0)
         find_gradients(self.optimisers["critic"], loss)
 
-    def _step(self) -> None:
+    def _objective(self, minibatch: int) -> tuple[Tensor, Tensor]:
+        """Return PPO's clipped objective, and the sums of `UpdateState.kl_sums`."""
+        options, actor = self.options, self.actor
+        groups = [Round(*rows) for rows in self._rule_rows(minibatch, self.memory.round)]
+        if options.ratio == "world":
+            (worlds,) = groups
+            log_probs = [actor.log_prob(worlds.observations, worlds.actions)]
+        else:
+            log_probs = [
+                actor.row_log_prob(species, rows.observations, rows.actions)
+                for species, rows in enumerate(groups)
+            ]
+        log_ratio = torch.cat(
+            [new - rows.log_probs for new, rows in zip(log_probs, groups, strict=True)]
+        )
+        advantages, acted = (
+            torch.cat([getattr(rows, name) for rows in groups]) for name in ("advantages", "acted")
+        )
+        divergence = (acted * (torch.expm1(log_ratio) - log_ratio)).sum().detach()
+        kl_sums = torch.stack((divergence, acted.sum()))
+        if options.ratio == "world":
+            log_ratio = over_particles(log_ratio, acted)
+        weights, total = self._ratio_weights(acted), self.update.weight_sums[minibatch, 1]
+        clip = options.largest_change
+        objective = clipped_objective(log_ratio, advantages, weights, total, clip=clip)
+        if options.entropy_weight:
+            objective = objective + options.entropy_weight * actor.entropy()
+        return objective, kl_sums
+
+    def _descend_both(self) -> None:
         self._descend(self.optimisers["critic"])
         # Rules that moved too far get the learning rate 0, without a synchronisation.
-        moved, count = self._kl_sums
-        self._within_kl *= moved / count.clamp(min=1.0) <= self.pace.target_kl
+        divergence, count = self.update.kl_sums
+        self.update.within_kl.mul_(divergence / count.clamp(min=1.0) <= self.schedule.target_kl)
         optimiser = self.optimisers["actor"]
-        optimiser.param_groups[0]["lr"].copy_(self._within_kl * self._rules_rate)
+        rate = self.update.within_kl * self.update.rules_rate
+        optimiser.param_groups[0]["lr"].copy_(rate)
         self._descend(optimiser)
 
     def _descend(self, optimiser: torch.optim.Optimizer) -> None:
@@ -346,51 +336,75 @@ class PPOLearner:
         nn.utils.clip_grad_norm_(parameters, self.options.max_gradient_norm)
         optimiser.step()
 
-    def _critic_rows(self, part: int, values: Sequence[Tensor]) -> list[Tensor]:
-        """Return the critic's minibatch `part` of tensors [T B, N, ...]: worlds at some steps."""
-        order = self._minibatches.parts[-1][part]
-        return [value[order] for value in values]
+    def _critic_rows(self, minibatch: int, values: Sequence[Tensor]) -> list[Tensor]:
+        """Return the critic's minibatch of tensors [T B, N, ...]: worlds at some steps."""
+        index = self._minibatches.indices[-1][minibatch]
+        return [value[index] for value in values]
 
-    def _rule_rows(self, part: int, values: Sequence[Tensor]) -> list[list[Tensor]]:
+    def _rule_rows(self, minibatch: int, values: Sequence[Tensor]) -> list[list[Tensor]]:
         """Return the rules' rows of a minibatch: worlds, or particles of each species."""
-        orders = [parts[part] for parts in self._minibatches.parts[:-1]]
+        indices = [group[minibatch] for group in self._minibatches.indices[:-1]]
         if self.options.ratio == "world":
-            return [[value[order] for value in values] for order in orders]
-        rows, count = [], self.memory.acted.shape[2]
-        for span, order in zip(self.actor.rules.spans, orders, strict=True):
-            own = span.stop - span.start
-            whole = own == count
-            index = order if whole else order // own * count + span.start + order % own
+            return [[value[index] for value in values] for index in indices]
+        rows, total = [], self.memory.acted.shape[2]
+        for span, index in zip(self.actor.rules.spans, indices, strict=True):
+            count = span.stop - span.start
+            if count < total:
+                index = index // count * total + span.start + index % count
             rows.append([value.flatten(0, 1)[index] for value in values])
         return rows
 
-    def _gain_weights(self, acted: Tensor) -> Tensor:
+    def _ratio_weights(self, acted: Tensor) -> Tensor:
         return acted.amax(dim=1, keepdim=True) if self.options.ratio == "world" else acted
 
-    def _gain(self, part: list[Round]) -> Tensor:
-        """Return PPO's clipped objective; write sums of the KL estimate [nats] to `_kl_sums`."""
-        options, actor = self.options, self.actor
-        if options.ratio == "world":
-            (worlds,) = part
-            changes = [actor.log_prob(worlds.observations, worlds.actions) - worlds.log_probs]
-        else:
-            changes = [
-                actor.row_log_prob(species, rows.observations, rows.actions) - rows.log_probs
-                for species, rows in enumerate(part)
-            ]
-        log_ratio, advantages, acted = (
-            torch.cat(values)
-            for values in (changes, [p.advantages for p in part], [p.acted for p in part])
-        )
-        moved = (acted * (torch.expm1(log_ratio) - log_ratio)).sum().detach()
-        self._kl_sums.copy_(torch.stack((moved, acted.sum())))
-        if options.ratio == "world":
-            log_ratio = over_particles(log_ratio, acted)
-        weights, total = self._gain_weights(acted), self._weight_sums[self._current_part, 1]
-        gain = clipped_gain(log_ratio, advantages, weights, total, clip=options.largest_change)
-        if options.entropy_weight:
-            gain = gain + options.entropy_weight * actor.entropy()
-        return gain
+
+def _adam(net: nn.Module, device: torch.device) -> torch.optim.Optimizer:
+    # CUDA graphs read the learning rate from a tensor.
+    rate = torch.zeros((), device=device)
+    capturable = device.type == "cuda"
+    return torch.optim.Adam(net.parameters(), lr=rate, eps=1e-5, fused=True, capturable=capturable)
+
+
+class UpdateState(NamedTuple):
+    """Tensors on the device that the CUDA graphs of an update read and write in place."""
+
+    within_kl: Tensor
+    """1, or 0 once the rules have moved farther than `target_kl` in a round, shape []."""
+    rules_rate: Tensor
+    """Learning rate of the rules while `within_kl` is 1, shape []."""
+    kl_sums: Tensor
+    """Sums of a minibatch's KL estimates [nats] and of their weights, shape [2]."""
+    weight_sums: Tensor
+    """Sums of the weights of the critic's and of the rules' rows by minibatch, shape [M, 2]."""
+
+    @classmethod
+    def new(cls, minibatch_count: int, device: torch.device) -> Self:
+        """Return the state before the first update."""
+        shapes = ((), (), (2,), (minibatch_count, 2))
+        return cls(*(torch.zeros(shape, device=device) for shape in shapes))
+
+
+class GraphedMethods:
+    """Runs methods of an object by `GraphedCallable`, with one CUDA graph for each argument.
+
+    A method returns nothing, does not synchronise, and reads and writes the same tensors in each
+    call. With `share_memory` the graphs share a pool of memory.
+    """
+
+    def __init__(self, device: torch.device, *, share_memory: bool = False) -> None:
+        self._device = device
+        shared = share_memory and device.type == "cuda"
+        self._pool = torch.cuda.graph_pool_handle() if shared else None
+        self._graphs: dict[tuple[Any, ...], GraphedCallable] = {}
+
+    def run(self, method: Any, *arguments: int, **options: Any) -> None:
+        """Run a method with arguments; `options` are those of `GraphedCallable`."""
+        key = (method.__name__, *arguments)
+        if key not in self._graphs:
+            # A weak reference, as the object of the method has this one.
+            function = partial(method.__func__, weakref.proxy(method.__self__), *arguments)
+            self._graphs[key] = GraphedCallable(function, self._device, pool=self._pool, **options)
+        self._graphs[key]()
 
 
 class Round(NamedTuple):
@@ -413,38 +427,39 @@ class Round(NamedTuple):
 class RoundMemory:
     """Tensors of a round, which the next round overwrites, as CUDA graphs read them in place.
 
-    The default shape is [T, B, N]; for other fields see `Round`. There is an advantage for each
-    particle with `own_advantages`, else for each world.
+    The default shape is [T, B, N]; for other fields see `Round`.
     """
 
-    def __init__(
-        self, steps: int, observation: Tensor, action_dim: int, *, own_advantages: bool
-    ) -> None:
-        worlds, particles = observation.shape[:2]
+    def __init__(self, options: PPOOptions, observation: Tensor, action_dim: int) -> None:
+        steps, (worlds, particles) = options.steps, observation.shape[:2]
 
         def zeros(*shape: int, dtype: torch.dtype = observation.dtype) -> Tensor:
             return observation.new_zeros(*shape, dtype=dtype)
 
+        self.observation = observation.clone()
+        """Observations before the current step, shape [B, N, P]."""
+        self.action, self.log_prob = zeros(worlds, particles, action_dim), zeros(worlds, particles)
+        """Actions of the current step, [B, N, A], and their log-probabilities, [B, N]."""
         single = (steps, worlds, particles)
         self.observations = zeros(steps + 1, *observation.shape)
         """Observations before each step, and after the last one, shape [T + 1, B, N, P]."""
         self.observations[-1].copy_(observation)
         self.actions = zeros(*single, action_dim)
-        self.log_probs, self.acted, self.targets = (zeros(*single) for _ in range(3))
-        self.rewards = zeros(*single)
+        self.rewards, self.log_probs, self.targets = (zeros(*single) for _ in range(3))
+        self.acted = torch.ones_like(self.rewards)
         self.terminated, self.ended = (zeros(*single, dtype=torch.bool) for _ in range(2))
         """Whether a particle's episode terminated in a step; whether it terminated or truncated."""
         self.values = zeros(steps + 1, worlds, particles)
         """The critic's values of `observations`, shape [T + 1, B, N]."""
         self.next_values = zeros(*single)
         """The critic's values of the states after each step, before any restart."""
-        self.advantages = zeros(steps, worlds, particles if own_advantages else 1)
+        self.advantages = zeros(steps, worlds, 1 if options.ratio == "world" else particles)
 
     @property
     def round(self) -> Round:
         """The round, as views."""
         others = (self.actions, self.log_probs, self.advantages, self.targets, self.acted)
-        return Round(*(part.flatten(0, 1) for part in (self.observations[:-1], *others)))
+        return Round(*(values.flatten(0, 1) for values in (self.observations[:-1], *others)))
 
 
 def generalised_advantages(
@@ -488,7 +503,7 @@ def standardised(values: Tensor, weights: Tensor, ranks: ProcessGroup = ALONE) -
     """
     weights = weights if values.shape == weights.shape else weights.amax(-1, True)
     dims = (1, 2) if values.shape[1] * ranks.count > 1 else (0, 1, 2)
-    means, totals = (part.sum(dims, keepdim=True) for part in (values * weights, weights))
+    means, totals = (sums.sum(dims, keepdim=True) for sums in (values * weights, weights))
     ranks.reduce([means, totals])
     centred = weights * (values - means / totals.clamp(min=1e-8))
     square, total = centred.square().sum(), weights.sum()
@@ -496,7 +511,7 @@ def standardised(values: Tensor, weights: Tensor, ranks: ProcessGroup = ALONE) -
     return centred / (square / total.clamp(min=1e-8) + 1e-16).sqrt()
 
 
-def clipped_gain(
+def clipped_objective(
     log_ratio: Tensor, advantages: Tensor, weights: Tensor, total: Tensor, *, clip: float
 ) -> Tensor:
     """Return the weighted mean of min(r A, clip(r) A) for likelihood ratios r and advantages A.
@@ -507,20 +522,20 @@ def clipped_gain(
     """
     ratio = log_ratio.exp()
     clipped = ratio.clamp(1.0 - clip, 1.0 + clip)
-    gain = torch.minimum(ratio * advantages, clipped * advantages)
-    return (weights * gain).sum() / total.clamp(min=1.0)
+    gains = torch.minimum(ratio * advantages, clipped * advantages)
+    return (weights * gains).sum() / total.clamp(min=1.0)
 
 
-def world_count(
+def total_num_envs(
     problem: Problem,
     options: PPOOptions,
     device: torch.device,
     budget: Budget,
     ranks: ProcessGroup = ALONE,
 ) -> int:
-    """Return the worlds B of all processes, as `PPOOptions.worlds` defines them."""
-    if options.worlds is not None:
-        return options.worlds
+    """Return the worlds B of all processes, as `PPOOptions.num_envs` defines them."""
+    if options.num_envs is not None:
+        return options.num_envs
     if device.type != "cuda":
         return problem.num_envs
     counts = [MANY_PARTICLES // problem.particle_count, WORLDS_PER_SEED // ranks.count]

@@ -37,7 +37,7 @@ class Budget:
 
     seconds: float | None = None
     """Wall-clock time of learning [s]. Set-up and evaluations do not count, and may take longer:
-    there are at most `entries` + 2 evaluations, by default 22 of 16 episodes."""
+    there are at most `curve_points` + 2 evaluations, by default 22 of 16 episodes."""
     particle_steps: int | None = None
     """Steps times particles that took them, of environments and rollouts together."""
 
@@ -52,8 +52,8 @@ class Budget:
         if self.particle_steps is not None:
             check_positive(self, int, "particle_steps")
 
-    def share(self, seconds: float, particle_steps: int) -> float:
-        """Return the spent fraction of time [s] or particle-steps, whichever is larger; 1: all."""
+    def spent_fraction(self, seconds: float, particle_steps: int) -> float:
+        """Return the spent fraction of the time [s] or of the particle-steps, the larger one."""
         by_time = 0.0 if self.seconds is None else seconds / self.seconds
         by_steps = 0.0 if self.particle_steps is None else particle_steps / self.particle_steps
         return max(by_time, by_steps)
@@ -89,8 +89,8 @@ class Learner(Protocol):
     def optimisers(self) -> Mapping[str, torch.optim.Optimizer]:
         """Their optimisers, Adam or AdamW, by name."""
 
-    def resume(self, iteration: int, part: int) -> None:
-        """Resume after `iteration` iterations, for the `part`-th time, in new worlds."""
+    def resume(self, iteration: int, resumption: int) -> None:
+        """Resume after `iteration` iterations, for the `resumption`-th time, in new worlds."""
 
 
 class Progress:
@@ -110,7 +110,7 @@ class Progress:
     synchronise; `advance` keeps the CPU at most one iteration ahead of the device, so that the time
     measured is the device's.
 
-    With `out`, a checkpoint, the rules and the curve (`log.jsonl`) are written after each entry of
+    With `out`, a checkpoint, the rules and the curve (`log.jsonl`) are written after each point of
     the curve, and when SIGTERM or Ctrl-C stops the run. A resumed run continues from the weights,
     optimisers and counts of the checkpoint, on any number of processes, with new episodes.
 
@@ -123,7 +123,7 @@ class Progress:
         others: As of `npa_envs.agents.learning.train`.
 
     Raises:
-        NPAError: Seeds are missing or wrong, or the number of entries is not positive. Or as for
+        NPAError: Seeds are missing or wrong, or the number of points is not positive. Or as for
             `npa_envs.training.run_folder.Run`.
     """
 
@@ -135,8 +135,8 @@ class Progress:
         *,
         device: str | torch.device,
         evaluation_seeds: Iterable[int],
-        entries: int = 20,
-        on_entry: Callable[[CurvePoint], None] = lambda _: None,
+        curve_points: int = 20,
+        on_point: Callable[[CurvePoint], None] = lambda _: None,
         initial: RuleSet | None = None,
         out: Path | None = None,
         run: Mapping[str, Any] | None = None,
@@ -164,16 +164,16 @@ class Progress:
         self.ranks = ProcessGroup.current()
         """The processes that share the run."""
         self._evaluation_seeds = checked_seeds("evaluation_seeds", evaluation_seeds)
-        check_count("entries", entries, ": try 20")
-        self._entries = entries
-        self._entries_due = 0
-        self._on_entry, self._on_stop = on_entry, on_stop
+        check_count("curve_points", curve_points, ": try 20")
+        self._curve_points = curve_points
+        self._points_due = 0
+        self._on_point, self._on_stop = on_point, on_stop
         self._envs: Any = None
         self._started = False
-        self._since: float | None = None
+        self._begin: float | None = None
         self._seconds = self._agreed_seconds = 0.0
-        self._previous: torch.cuda.Event | None = None
-        self._part = 0
+        self._last_event: torch.cuda.Event | None = None
+        self._resumptions = 0
         self._settings = dict(run or {})
         folder = None if out is None else RunFolder(out)
         self._run = Run(
@@ -236,7 +236,7 @@ class Progress:
             self._run.repeat(step, begin=begin, over=lambda: self.over, end=end)
         return rules
 
-    def start(self, actor: RuleSet | Callable[[Any], Any]) -> None:
+    def start(self, policy: RuleSet | Callable[[Any], Any]) -> None:
         """Evaluate the rules or the policy before any learning, and start the clock.
 
         A resumed run has this evaluation already.
@@ -245,25 +245,25 @@ class Progress:
             raise NPAError("progress must start once, got a second start: make one for each run")
         self._started = True
         if not self.log:
-            self._evaluate(actor)
-        self._since = time.perf_counter()
+            self._evaluate(policy)
+        self._begin = time.perf_counter()
         self._agree_on_time()
 
     @property
     def seconds(self) -> float:
         """Learning time so far by this process's clock [s]."""
-        return self._seconds + (0.0 if self._since is None else time.perf_counter() - self._since)
+        return self._seconds + (0.0 if self._begin is None else time.perf_counter() - self._begin)
 
     @property
-    def share(self) -> float:
+    def spent_fraction(self) -> float:
         """Fraction of the budget that is spent; the last iteration may take it above 1."""
         seconds = self._agreed_seconds if self.ranks.distributed else self.seconds
-        return self.budget.share(seconds, self.particle_steps)
+        return self.budget.spent_fraction(seconds, self.particle_steps)
 
     @property
     def over(self) -> bool:
         """Whether the budget is spent."""
-        return self.share >= 1.0
+        return self.spent_fraction >= 1.0
 
     def advance(self, particle_steps: int) -> None:
         """Count the particle-steps that an iteration took."""
@@ -272,14 +272,14 @@ class Progress:
         if self.device.type == "cuda":
             event = torch.cuda.Event()  # type: ignore[no-untyped-call]
             event.record(torch.cuda.current_stream(self.device))
-            if self._previous is not None:
-                self._previous.synchronize()
-            self._previous = event
+            if self._last_event is not None:
+                self._last_event.synchronize()
+            self._last_event = event
         if self.budget.seconds is not None:
             self._agree_on_time()
 
-    def look(self, actor: RuleSet | Callable[[Any], Any], force: bool = False) -> bool:
-        """Evaluate if the next entry of the curve is due, or with `force`; return whether it did.
+    def look(self, policy: RuleSet | Callable[[Any], Any], force: bool = False) -> bool:
+        """Evaluate if the next point of the curve is due, or with `force`; return whether it did.
 
         Without particle-steps since the last evaluation there is none.
 
@@ -287,12 +287,12 @@ class Progress:
             DivergedError: A weight of the rules is not finite, or an action.
         """
         self._check_started("look")
-        due = self.share >= (self._entries_due + 1) / self._entries
+        due = self.spent_fraction >= (self._points_due + 1) / self._curve_points
         if self.particle_steps == self.log[-1].particle_steps or not (force or due):
             return False
         with self._stopped_clock():
-            self._entries_due = int(self.share * self._entries)
-            self._evaluate(actor)
+            self._points_due = int(self.spent_fraction * self._curve_points)
+            self._evaluate(policy)
         return True
 
     @contextlib.contextmanager
@@ -300,9 +300,9 @@ class Progress:
         """Stop the clock while a block runs; all processes enter it."""
         self._synchronise()
         self._agree_on_time()
-        self._seconds, self._since = self._agreed_seconds, None
+        self._seconds, self._begin = self._agreed_seconds, None
         yield
-        self._since = time.perf_counter()
+        self._begin = time.perf_counter()
 
     def _agree_on_time(self) -> None:
         self._agreed_seconds = self.ranks.broadcast(self.seconds)
@@ -311,17 +311,16 @@ class Progress:
         if not self._started:
             raise NPAError(f"{caller} needs a start: call progress.start(rules) after the set-up")
 
-    def _evaluate(self, actor: RuleSet | Callable[[Any], Any]) -> None:
+    def _evaluate(self, policy: RuleSet | Callable[[Any], Any]) -> None:
         if self._envs is None:
             count = min(len(self._evaluation_seeds), self.problem.num_envs)
             self._envs = self.problem.make_envs(count, device=self.device)
-        policy = actor
-        if isinstance(actor, RuleSet):
-            policy = actor.policy()
-            check_finite(actor, self.particle_steps)
-            self.ranks.check_same(list(actor.parameters()))
+        if isinstance(policy, RuleSet):
+            check_finite(policy, self.particle_steps)
+            self.ranks.check_same(list(policy.parameters()))
+            policy = policy.policy()
         episodes = evaluate_policy(self._envs, policy, self._evaluation_seeds)
-        entry = CurvePoint(
+        point = CurvePoint(
             seconds=self._seconds,
             particle_steps=self.particle_steps,
             mean_return=episodes.mean_return,
@@ -329,9 +328,9 @@ class Progress:
             final_loss=float(episodes.final_losses.mean()),
         )
         self._synchronise()
-        self.log.append(entry)
+        self.log.append(point)
         if self.ranks.first:
-            self._on_entry(entry)
+            self._on_point(point)
 
     def _synchronise(self) -> None:
         if self.device.type == "cuda":
@@ -349,9 +348,9 @@ class Progress:
             self.ranks.check_same([value for value in values if isinstance(value, Tensor)])
             if not self.ranks.first:
                 return
-            curve = [asdict(entry) for entry in self.log]
+            curve = [asdict(point) for point in self.log]
             state |= {"learner": self._settings, "curve": curve, "iteration": self._run.iteration}
-            state |= {"part": self._part, "seconds": self._agreed_seconds}
+            state |= {"resumptions": self._resumptions, "seconds": self._agreed_seconds}
             self._run.write_checkpoint(state | {"particle_steps": self.particle_steps})
             rules.save(folder.path)
             lines = [" ".join(json_text(line).split()) for line in curve]
@@ -370,7 +369,7 @@ class Progress:
     def _restore(self, learner: Learner, content: dict[str, Any]) -> None:
         assert self._run.folder is not None, "it contains the checkpoint"
         path, like = self._run.folder.checkpoint, learner_state(learner)
-        like |= {"iteration": 0, "part": 0, "particle_steps": 0, "seconds": 0.0}
+        like |= {"iteration": 0, "resumptions": 0, "particle_steps": 0, "seconds": 0.0}
         moments = content.get("optimisers")
         for name, optimiser in learner.optimisers.items():
             stored = moments.get(name) if isinstance(moments, dict) else None
@@ -387,8 +386,8 @@ class Progress:
             content["random"] = like["random"]
         check_content(content, like, path)
         try:
-            self.log = [CurvePoint(**entry) for entry in content.get("curve") or ()]
-            numbers = [value for entry in self.log for value in asdict(entry).values()]
+            self.log = [CurvePoint(**point) for point in content.get("curve") or ()]
+            numbers = [value for point in self.log for value in asdict(point).values()]
             for name, module in learner.modules.items():
                 module.load_state_dict(content["modules"][name])
             for name, optimiser in learner.optimisers.items():
@@ -401,12 +400,12 @@ class Progress:
             raise unusable_checkpoint(path, f"it cannot be used ({shown(error)})") from error
         # A single episode has an infinite standard error.
         if not self.log or not all(is_real(value) or value == math.inf for value in numbers):
-            raise unusable_checkpoint(path, "curve must hold the numbers of its entries")
-        self._run.iteration, self._part = content["iteration"], content["part"] + 1
+            raise unusable_checkpoint(path, "curve must hold the numbers of its points")
+        self._run.iteration, self._resumptions = content["iteration"], content["resumptions"] + 1
         self.particle_steps = content["particle_steps"]
         self._seconds = self._agreed_seconds = content["seconds"]
-        self._entries_due = int(self.share * self._entries)
-        learner.resume(self._run.iteration, self._part)
+        self._points_due = int(self.spent_fraction * self._curve_points)
+        learner.resume(self._run.iteration, self._resumptions)
 
 
 def annealed(rate: float, last_rate: float, fraction: float) -> float:

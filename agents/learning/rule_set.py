@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, cast
 import torch
 from torch import Tensor, nn
 
-from npa_envs.agents.policies import Interface, Policy, bounded_update, check_rule_fits, spans_of
+from npa_envs.agents.policies import Policy, bounded_update, check_rule_fits, spans_of
 from npa_envs.atomic_files import made_folder
 from npa_envs.checks import checked_count
+from npa_envs.envs.core.interface import Interface
 from npa_envs.errors import NPAError, shown
 from npa_envs.rule.files import load_rule, save_rule
 from npa_envs.rule.rule import NPARule
@@ -134,35 +135,29 @@ class RuleSet(nn.Module):
         """Return the rules one by one."""
         return iter(cast(list[NPARule], list(self.rules)))
 
-    def forward(self, observation: Tensor) -> Tensor:
-        """Return `mean` of the observation."""
-        return self.mean(observation)
-
     def mean(self, observation: Tensor) -> Tensor:
         """Return actions [B, N, A] for observations: a_x = δ / (1 + |δ|), a_s = Δs / state_scale.
 
         They are differentiable. Unlike those of `policy`, state steps are not clipped to the action
         space, so that gradients do not vanish.
         """
-        scale = self.interface.state_scale
-        return self.acted(observation, lambda delta, step: torch.cat((delta, step / scale), dim=-1))
+        return self.actions(observation, self.mean_by_rule)
 
-    def acted(
-        self,
-        observation: Tensor,
-        action: Callable[[Tensor, Tensor], Tensor],
-        update: Callable[[NPARule, Tensor], tuple[Tensor, Tensor]] = bounded_update,
+    def mean_by_rule(self, rule: NPARule, rows: Tensor) -> Tensor:
+        """Return `mean` for particles of one rule that observe [K, P], shape [K, A]."""
+        delta, state_step = bounded_update(rule, rows)
+        return torch.cat((delta, state_step / self.interface.state_scale), dim=-1)
+
+    def actions(
+        self, observation: Tensor, action_by_rule: Callable[[NPARule, Tensor], Tensor]
     ) -> Tensor:
-        """Return actions [B, N, A] that `action` makes of displacements and state steps.
-
-        update: Returns these for a rule and its observations [K, P].
-        """
-        parts = []
+        """Return actions [B, N, A]; `action_by_rule` maps a rule and rows [K, P] to [K, A]."""
+        actions = []
         for rule, span in zip(self, self.spans, strict=True):
             rows = observation[:, span]
-            actions = action(*update(rule, rows.flatten(0, 1)))
-            parts.append(actions.view(*rows.shape[:2], -1))
-        return parts[0] if len(parts) == 1 else torch.cat(parts, dim=1)
+            action = action_by_rule(rule, rows.flatten(0, 1))
+            actions.append(action.view(*rows.shape[:2], -1))
+        return actions[0] if len(actions) == 1 else torch.cat(actions, dim=1)
 
     def policy(self) -> RuleSetPolicy:
         """Return the rules as a policy; it shares their weights."""
@@ -178,18 +173,21 @@ class RuleSetPolicy(Policy):
 
     def act(self, observation: Tensor) -> Tensor:
         """Return the rules' bounded updates of all particles."""
-        return self.rules.acted(observation, self.interface.action).float()
+
+        def action(rule: NPARule, rows: Tensor) -> Tensor:
+            return self.interface.action(*bounded_update(rule, rows))
+
+        return self.rules.actions(observation, action).float()
 
     def _spans(self, counts: Mapping[str, int]) -> dict[str, slice]:
         # Agents that ended are missing: names identify the others.
-        spans = self.rules.spans
-        particles = [slice(k, k + 1) for k in range(spans[-1].stop)]
+        spans, count = self.rules.spans, self.rules.spans[-1].stop
         known = {f"species_{k}": span for k, span in enumerate(spans)}
-        known |= {f"particle_{k}": span for k, span in enumerate(particles)}
+        known |= {f"particle_{k}": slice(k, k + 1) for k in range(count)}
         for agent in counts:
             if agent not in known:
                 raise NPAError(
-                    f"observation must be of agents of {len(spans)} species and {len(particles)} "
+                    f"observation must be of agents of {len(spans)} species and {count} "
                     f"particles, got one of {agent!r}: use the policy with the environment that it "
                     "was made for"
                 )

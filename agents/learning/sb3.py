@@ -20,10 +20,9 @@ from torch import Tensor
 from npa_envs.agents.learning.actor_critic import (
     CommonOptions,
     Critic,
-    CriticKind,
+    CriticInput,
     GaussianRules,
-    Pace,
-    noise_left,
+    Schedule,
 )
 from npa_envs.agents.learning.baselines import check_no_start
 from npa_envs.agents.learning.problem import world_seeds
@@ -62,17 +61,14 @@ class WorldOptions(CommonOptions):
         check_positive(self, float, "clip")
 
 
-DEFAULTS = WorldOptions()
-
-
-def train(progress: Progress, options: WorldOptions = DEFAULTS) -> RuleSet:
+def train(progress: Progress, options: WorldOptions = WorldOptions()) -> RuleSet:
     """Return the rules that Stable-Baselines3's PPO finds within a budget.
 
     Stable-Baselines3 seeds the global random states of torch and NumPy. Observations are copied to
     the CPU.
     """
     problem, seed, device = progress.problem, progress.seed, progress.device
-    pace = options.pace(progress.initial)
+    schedule = options.schedule(progress.initial)
     world_steps = options.steps * problem.num_envs
     batch_size = -(-world_steps // options.minibatches)
     if batch_size < 2:
@@ -81,11 +77,11 @@ def train(progress: Progress, options: WorldOptions = DEFAULTS) -> RuleSet:
             f"got {options.minibatches}: give fewer, more steps, or more worlds"
         )
     env = WorldVecEnv(problem.make_envs(device=device))
-    callback = RoundCallback(progress, options, pace)
+    callback = RoundCallback(progress, options, schedule)
     model = PPO(
         WorldRulePolicy,
         env,
-        learning_rate=lambda _: pace.learning_rate * callback.budget_left,
+        learning_rate=lambda _: schedule.learning_rate * callback.remaining_budget,
         n_steps=options.steps,
         batch_size=batch_size,
         n_epochs=options.epochs,
@@ -94,10 +90,10 @@ def train(progress: Progress, options: WorldOptions = DEFAULTS) -> RuleSet:
         clip_range=options.clip,
         ent_coef=options.entropy_weight,
         max_grad_norm=options.max_gradient_norm,
-        target_kl=world_kl(pace.target_kl),
+        target_kl=world_kl(schedule.target_kl),
         policy_kwargs={
             "rules": progress.first_rules(zero_output=True),
-            "initial_std": pace.initial_std,
+            "initial_std": schedule.initial_std,
             "critic": options.critic,
         },
         seed=seed,
@@ -152,30 +148,29 @@ class ProgressCallback(BaseCallback):
 class RoundCallback(ProgressCallback):
     """As `ProgressCallback`, once a round; anneals the noise, and lets the critic begin alone."""
 
-    def __init__(self, progress: Progress, options: WorldOptions, pace: Pace) -> None:
+    def __init__(self, progress: Progress, options: WorldOptions, schedule: Schedule) -> None:
         super().__init__(progress)
-        self.options, self.pace = options, pace
+        self.options, self.schedule = options, schedule
         self.rounds = 0
-        self.budget_left = 1.0
-        """Fraction of the budget that was left at the start of the round."""
+        self.remaining_budget = 1.0
+        """Remaining fraction of the budget at the start of the round."""
 
     def _on_rollout_start(self) -> None:
         self.progress.look(self.learned)
-        self.budget_left = max(0.0, 1.0 - self.progress.share)
+        self.remaining_budget = max(0.0, 1.0 - self.progress.spent_fraction)
         policy: Any = self.model.policy
         actor: GaussianRules = policy.actor
-        actor.leave_noise(
-            noise_left(self.budget_left, self.pace.last_noise, self.options.noise_decay_share)
-        )
+        last_noise = self.schedule.last_noise
+        actor.set_noise(self.options.noise_factor(self.remaining_budget, last_noise))
         if self.rounds == 0:
             self._trained = [p for p in actor.parameters() if p.requires_grad]
         for parameter in self._trained:
-            parameter.requires_grad_(self.rounds >= self.pace.critic_rounds)
+            parameter.requires_grad_(self.rounds >= self.schedule.critic_rounds)
         self.rounds += 1
 
     def _on_step(self) -> bool:
         # A round that begins with no budget left ends at once.
-        return self.budget_left > 0.0
+        return self.remaining_budget > 0.0
 
     def _on_rollout_end(self) -> None:
         self.progress.advance(self.options.steps * self.world_steps)
@@ -195,7 +190,7 @@ class WorldRulePolicy(ActorCriticPolicy):
         *,
         rules: RuleSet,
         initial_std: float = 0.2,
-        critic: CriticKind = "particle",
+        critic: CriticInput = "particle",
         **keywords: Any,
     ) -> None:
         super().__init__(observation_space, action_space, lr_schedule, net_arch=[], **keywords)
@@ -282,10 +277,7 @@ class GardenPPOOptions(GardenOptions):
     counts = ("steps", "batch_size")
 
 
-SAC_DEFAULTS, GARDEN_PPO_DEFAULTS = SACOptions(), GardenPPOOptions()
-
-
-def train_garden_sac(progress: Progress, options: SACOptions = SAC_DEFAULTS) -> GardenPolicy:
+def train_garden_sac(progress: Progress, options: SACOptions = SACOptions()) -> GardenPolicy:
     """Return the policy that SAC (Haarnoja et al., arXiv 1801.01290) finds within a budget."""
     # A gradient step for about eight steps of worlds.
     steps, starts = max(1, progress.problem.num_envs // 8), options.learning_starts
@@ -293,7 +285,7 @@ def train_garden_sac(progress: Progress, options: SACOptions = SAC_DEFAULTS) -> 
 
 
 def train_garden_ppo(
-    progress: Progress, options: GardenPPOOptions = GARDEN_PPO_DEFAULTS
+    progress: Progress, options: GardenPPOOptions = GardenPPOOptions()
 ) -> GardenPolicy:
     """Return the policy that PPO (Schulman et al., arXiv 1707.06347) finds within a budget."""
     size = options.batch_size
@@ -374,7 +366,7 @@ class GardenPolicy:
             ) from error
 
 
-def _shapes(parts: Any) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of an observation or a space by the names of its parts, if it has some."""
-    named = parts if isinstance(parts, dict) else {"observation": parts}
-    return {name: tuple(part.shape) for name, part in named.items()}
+def _shapes(values: Any) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of an observation or a space, or of those in a dict, by name."""
+    named = values if isinstance(values, dict) else {"observation": values}
+    return {name: tuple(value.shape) for name, value in named.items()}

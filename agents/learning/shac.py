@@ -17,7 +17,7 @@ from torch import Tensor
 from npa_envs.agents.learning.actor_critic import (
     CRITIC_RATE,
     Critic,
-    CriticKind,
+    CriticInput,
     Minibatches,
     find_gradients,
     gradients_of,
@@ -41,7 +41,7 @@ class SHACOptions:
 
     steps: int = 16
     """Most steps of a window, h; windows of an episode have equal lengths."""
-    world_count: int = 8
+    num_envs: int = 8
     """Worlds B of all processes."""
     gamma: float = 0.97
     """Discount of a reward one step later (dimensionless)."""
@@ -57,7 +57,7 @@ class SHACOptions:
     """Passes of the critic over a window."""
     minibatches: int = 4
     """Minibatches of a pass, which is shuffled."""
-    critic: CriticKind = "central"
+    critic: CriticInput = "central"
     """Input of the critic: each particle, or also its whole world ("central"). A world's value is
     the mean over its particles."""
     target_rate: float = 0.2
@@ -67,17 +67,14 @@ class SHACOptions:
 
     def __post_init__(self) -> None:
         """Check every field; raises NPAError. `memory` is checked where rollouts begin."""
-        check_positive(self, int, "steps", "world_count", "critic_epochs", "minibatches")
-        check_word(self, "critic", get_args(CriticKind))
+        check_positive(self, int, "steps", "num_envs", "critic_epochs", "minibatches")
+        check_word(self, "critic", get_args(CriticInput))
         check_positive(self, float, "learning_rate")
         check_fraction(self, "gamma", "td_lambda", "last_rate", "target_rate")
         check_non_negative(self, "value_weight")
 
 
-DEFAULTS = SHACOptions()
-
-
-def train(progress: Progress, options: SHACOptions = DEFAULTS) -> RuleSet:
+def train(progress: Progress, options: SHACOptions = SHACOptions()) -> RuleSet:
     """Return the rules that a short-horizon actor-critic finds within a budget.
 
     Rewards are decreases of the environment's loss, as with `reward="dense"`. The critic values
@@ -86,8 +83,8 @@ def train(progress: Progress, options: SHACOptions = DEFAULTS) -> RuleSet:
     learner = SHACLearner(progress, options)
 
     def iteration() -> int:
-        learner.learn(annealed(options.learning_rate, options.last_rate, progress.share))
-        return options.world_count * learner.window * progress.problem.particle_count
+        learner.learn(annealed(options.learning_rate, options.last_rate, progress.spent_fraction))
+        return options.num_envs * learner.window * progress.problem.particle_count
 
     return progress.run(learner.rules, iteration, learner)
 
@@ -116,14 +113,14 @@ class SHACLearner:
     def __init__(self, progress: Progress, options: SHACOptions) -> None:
         problem, device, ranks = progress.problem, progress.device, progress.ranks
         self.options, self.device, self.ranks = options, device, ranks
-        ranks.check_even("world_count", options.world_count)
-        indices = ranks.indices(options.world_count)
+        ranks.check_even("num_envs", options.num_envs)
+        indices = ranks.indices(options.num_envs)
         self.rules = progress.first_rules(zero_output=True)
         count = -(-problem.episode_steps // options.steps)
         self.window = -(-problem.episode_steps // count)
         """Steps of a window, h."""
         self.task = EnvironmentTask(problem, device)
-        self.random = learner_random(progress, options.world_count, indices)
+        self.random = learner_random(progress, options.num_envs, indices)
         width = problem.physics.space_dim + problem.physics.state_dim + 1
         self.critic = seeded_critic(progress, width, options.critic)
         self.target = copy.deepcopy(self.critic).requires_grad_(False)
@@ -142,13 +139,13 @@ class SHACLearner:
 
     def _begin(self) -> None:
         restart(self.random)
-        self.worlds = self._fresh(list(range(len(self._indices))))
+        self.worlds = self._new_worlds(list(range(len(self._indices))))
         self.windows_left = [1 + k % self.window_count for k in self._indices]
         """Windows left of each world's episode: at first different ones, so that a batch has all
         parts of an episode."""
 
-    def resume(self, iteration: int, part: int) -> None:
-        """Resume after `iteration` windows, for the `part`-th time, in new worlds."""
+    def resume(self, iteration: int, resumption: int) -> None:
+        """Resume after `iteration` windows, for the `resumption`-th time, in new worlds."""
         self._begin()
 
     def learn(self, rate: float) -> None:
@@ -160,7 +157,7 @@ class SHACLearner:
         normalise_gradients(means)
         optimiser.param_groups[0]["lr"] = rate
         optimiser.step()
-        self.learn_values(StepWindow(*(part.detach() for part in window)))
+        self.learn_values(StepWindow(*(values.detach() for values in window)))
 
     def play(self) -> StepWindow:
         """Run the rules for a window, differentiably; restart worlds whose episode is over."""
@@ -199,14 +196,13 @@ class SHACLearner:
         """Start new episodes in worlds whose last window this was."""
         restart(self.random)
         self.windows_left = [left - 1 for left in self.windows_left]
-        over = [k for k, left in enumerate(self.windows_left) if left == 0]
-        if not over:
-            return
-        self.worlds.put_(torch.tensor(over, device=self.device), self._fresh(over))
+        over = [world for world, left in enumerate(self.windows_left) if left == 0]
+        if over:
+            self.worlds.put_(torch.tensor(over, device=self.device), self._new_worlds(over))
         for world in over:
             self.windows_left[world] = self.window_count
 
-    def _fresh(self, worlds: list[int]) -> Particles:
+    def _new_worlds(self, worlds: list[int]) -> Particles:
         random = self.random
         if isinstance(random, WorldRandom):
             random = random.take(torch.tensor(worlds, device=self.device))
@@ -217,7 +213,7 @@ class SHACLearner:
         gamma, steps = self.options.gamma, self.window
         discounts = gamma ** torch.arange(steps, device=self.device, dtype=torch.float32)
         returns = (discounts[:, None] * window.rewards).sum(dim=0)
-        value = values(self.target, window.features[-1])
+        value = world_values(self.target, window.features[-1])
         return (returns + self.options.value_weight * gamma**steps * value).mean()
 
     def learn_values(self, window: StepWindow) -> None:
@@ -227,7 +223,7 @@ class SHACLearner:
         with torch.no_grad():
             for critic in (self.critic, self.target):
                 critic.observe(features, self.ranks)
-            later = values(self.target, window.features[1:].flatten(0, 1))
+            later = world_values(self.target, window.features[1:].flatten(0, 1))
             targets = td_lambda_targets(
                 window.rewards,
                 later.view_as(window.rewards),
@@ -238,8 +234,9 @@ class SHACLearner:
                 critic.rescale(targets, self.ranks)
         for _ in range(options.critic_epochs):
             self._minibatches.shuffle()
-            for part in self._minibatches.parts[0]:
-                error = (values(self.critic, features[part]) - targets[part]) / self.critic.scale
+            for index in self._minibatches.indices[0]:
+                values = world_values(self.critic, features[index])
+                error = (values - targets[index]) / self.critic.scale
                 find_gradients(self.optimisers["critic"], 0.5 * error.square().mean())
                 self.ranks.reduce(gradients_of(self.optimisers["critic"]))
                 self.optimisers["critic"].step()
@@ -249,7 +246,7 @@ class SHACLearner:
                 target.lerp_(parameter, options.target_rate)
 
 
-def values(critic: Critic, features: Tensor) -> Tensor:
+def world_values(critic: Critic, features: Tensor) -> Tensor:
     """Return the values of worlds with features [M, N, F], shape [M]."""
     each: Tensor = critic(features)
     return each.mean(dim=-1)

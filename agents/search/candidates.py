@@ -166,17 +166,17 @@ class Candidates:
     def rule_of(self, solution: Numbers) -> NPARule:
         """Return the rule of a candidate's weights in units of `scales`, [W], on the CPU."""
         rule = self.world.make_rule()
-        RuleWeights([rule]).put(solution * self.scales)
+        RuleWeights([rule]).set_vector(solution * self.scales)
         return rule
 
     @torch.no_grad()
     def try_all(self, solutions: Numbers) -> Trials:
         """Run the worlds of candidates; their weights [K, W] are in units of `scales`."""
         weights = torch.as_tensor(solutions * self.scales, dtype=torch.float32).to(self.device)
-        together = len(weights) if self.device.type == "cpu" else 1
-        parts = [self._try(some) for some in torch.split(weights, together)]
-        found = [one for part in parts for one in part.found]
-        return Trials(found, combined(torch.cat, [part.worlds for part in parts]))
+        batch_size = len(weights) if self.device.type == "cpu" else 1
+        batches = [self._try(batch) for batch in torch.split(weights, batch_size)]
+        found = [result for batch in batches for result in batch.found]
+        return Trials(found, combined(torch.cat, [batch.worlds for batch in batches]))
 
     def _try(self, weights: Tensor) -> Trials:
         world, count = self.world, len(weights)
@@ -195,13 +195,13 @@ class Candidates:
         )
         found: list[Found | None] = []
         for k in range(count):
-            own = Particles(later.x[:, k], later.s[:, k])
-            quality = (
-                float(quality_of(own)) if all(v.isfinite().all() for v in own.tensors()) else 0.0
-            )
+            snapshots = Particles(later.x[:, k], later.s[:, k])
+            quality = float(quality_of(snapshots))
+            # It is 0 or NaN where worlds came to rest or diverged.
             if quality > 0.0:
-                crowding, mixing = self.crowding_and_mixing(own.map(lambda v: v.flatten(0, 1)))
-                found.append(Found(quality, (float(speeds[k]), crowding, mixing)))
+                worlds = snapshots.map(lambda values: values.flatten(0, 1))
+                measures = float(speeds[k]), *self.crowding_and_mixing(worlds)
+                found.append(Found(quality, measures))
             else:
                 found.append(None)
         return Trials(found, later.map(lambda values: values[-1]))

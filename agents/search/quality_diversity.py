@@ -27,7 +27,7 @@ RESULTS = "search.json"
 LIBRARIES = ("numpy", "ribs", "cma")
 """Libraries whose versions affect the proposed candidates."""
 
-SMALLEST, LARGEST = 0.05, 0.8
+MIN_STD, MAX_STD = 0.05, 0.8
 """Range of a random candidate's standard deviation of weights, in Xavier's."""
 
 MUTATION = 0.1
@@ -78,23 +78,24 @@ class RandomEmitter:
 
     def ask(self) -> Numbers:
         """Return candidates, shape [K, W]."""
-        return drawn(self._draws, self._batch_size, self.solution_dim)
+        return random_weights(self._draws, self._batch_size, self.solution_dim)
 
     def tell(self, *_: Any, **results: Any) -> None:
         """Ignore the results."""
 
 
-def drawn(draws: np.random.Generator, count: int, weight_count: int) -> Numbers:
-    """Return random candidates, shape [count, W], weights of sizes from `SMALLEST` to `LARGEST`."""
-    sizes = np.exp(draws.uniform(np.log(SMALLEST), np.log(LARGEST), (count, 1)))
-    return sizes * draws.standard_normal((count, weight_count))
+def random_weights(draws: np.random.Generator, count: int, weight_count: int) -> Numbers:
+    """Return random candidates, [count, W], of log-uniform deviations `MIN_STD` to `MAX_STD`."""
+    deviations = np.exp(draws.uniform(np.log(MIN_STD), np.log(MAX_STD), (count, 1)))
+    return deviations * draws.standard_normal((count, weight_count))
 
 
 def _map_elites(archive: Any, batch_size: int, seed: int) -> Any:
+    draws = np.random.default_rng(seed)
     return import_ribs().emitters.GaussianEmitter(
         archive,
         sigma=MUTATION,
-        initial_solutions=drawn(np.random.default_rng(seed), batch_size, archive.solution_dim),
+        initial_solutions=random_weights(draws, batch_size, archive.solution_dim),
         batch_size=batch_size,
         seed=seed,
     )

@@ -21,6 +21,7 @@ from npa_envs.checks import (
     is_real,
 )
 from npa_envs.devices import check_device
+from npa_envs.envs.core.interface import Interface
 from npa_envs.errors import NPAError, UnknownKeywordError, shown, suggest
 from npa_envs.render import STYLES
 from npa_envs.world.environment_steps import Boundary, Limits, Physics, Terms
@@ -188,6 +189,11 @@ class WorldConfig:
             ),
         )
 
+    def interface(self, physics: Physics) -> Interface:
+        """Return the meaning of the columns of observations and actions."""
+        limits = physics.limits
+        return Interface(physics.space_dim, self.state_dim, physics.moving, limits.state_scale)
+
     @property
     def torch_device(self) -> torch.device:
         """The device of the worlds."""
@@ -280,6 +286,10 @@ class EnvConfig(WorldConfig):
     def target_dim(self) -> int:
         """Columns of the target after those of perception in an observation's row, T."""
         return 0
+
+    def interface(self, physics: Physics) -> Interface:
+        """As `WorldConfig.interface`, with the columns of the target."""
+        return super().interface(physics)._replace(target_dim=self.target_dim)
 
     @property
     def per_particle_reward(self) -> bool:

@@ -16,11 +16,13 @@ from torch import Tensor
 
 from npa_envs.checks import check_field, check_non_negative, check_positive, is_whole
 from npa_envs.envs.core.config import WorldConfig, plain
+from npa_envs.envs.core.interface import Interface
 from npa_envs.envs.core.task import WorldTask
 from npa_envs.errors import NPAError
 from npa_envs.render import STYLES
 from npa_envs.rule.rule import COLOUR_OFFSET
 from npa_envs.tasks.seeds import uniform_ball
+from npa_envs.world.environment_steps import Physics
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import WorldRandom
 
@@ -101,6 +103,11 @@ class SpeciesConfig(WorldConfig):
                 f"seed_radius and seed_distance must keep all disks within {half:g}, got disks up "
                 f"to {self.seed_span:g}: worlds would begin out of bounds"
             )
+
+    def interface(self, physics: Physics) -> Interface:
+        """As `WorldConfig.interface`, with the columns of single species."""
+        count = self.species_count if self.perception == "per_species" else 0
+        return super().interface(physics)._replace(species_count=count)
 
     @property
     def counts(self) -> tuple[int, ...]:

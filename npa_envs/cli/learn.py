@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from npa_envs.training.process_group import ProcessGroup
 
 
-WORLDS = 16
+NUM_ENVS = 16
 """Default number of worlds, and the most for evaluations."""
 
 
@@ -44,9 +44,9 @@ class LearnOptions(common.SharedRunOptions, common.RunOptions):
     """Options of the method, values as JSON or plain text: steps=32 (docs/learning.md)."""
     episode_steps: int | None = None
     """Steps after which an episode is truncated; default: as registered, or 256."""
-    worlds: int | None = None
-    """Worlds of all processes together; default: 16, for shac 8. On CUDA ppo takes more if it
-    can."""
+    num_envs: int | None = None
+    """Worlds of all processes together; default: 16, for shac 8, for ppo on CUDA more if they
+    fit."""
     seed: int = 0
     """Seed of everything random, from 0 to 99."""
     particle_steps: float | None = None
@@ -55,7 +55,7 @@ class LearnOptions(common.SharedRunOptions, common.RunOptions):
     """Budget in seconds of learning, without start and evaluations."""
     episodes: int = 16
     """Episodes that evaluate each point of the curve."""
-    points: int = 20
+    curve_points: int = 20
     """Points of the curve after the first, and checkpoints."""
     out: Path = Path("runs/learn")
     """Folder for checkpoint, rules and curve."""
@@ -88,7 +88,7 @@ def main(arguments: Sequence[str]) -> int:
 def parse(arguments: Sequence[str]) -> LearnOptions:
     """Return the options of `npa-envs learn`."""
     options = common.parse_options(LearnOptions, "learn", arguments)
-    common.check_numbers(options, worlds=1, episodes=1, points=1)
+    common.check_numbers(options, num_envs=1, episodes=1, curve_points=1)
     return options
 
 
@@ -106,17 +106,17 @@ def run(options: LearnOptions, ranks: ProcessGroup) -> int:
     if steps is not None and not math.isfinite(steps):
         raise NPAError(f"particle_steps must be finite, got {steps}: try 1e8")
 
-    def show(entry: CurvePoint) -> None:
+    def show(point: CurvePoint) -> None:
         if options.progress:
             print(
-                f"{entry.seconds:8.1f} s  {entry.particle_steps:.3g} particle-steps  "
-                f"return {entry.mean_return:.4g}  final loss {entry.final_loss:.4g}",
+                f"{point.seconds:8.1f} s  {point.particle_steps:.3g} particle-steps  "
+                f"return {point.mean_return:.4g}  final loss {point.final_loss:.4g}",
                 flush=True,
             )
 
     kwargs = common.named_values("options", options.options)
-    if options.method == "shac" and options.worlds is not None:
-        kwargs.setdefault("world_count", options.worlds)
+    if options.num_envs is not None:
+        kwargs.setdefault("num_envs", options.num_envs)
     stopped: list[bool] = []
     budget = Budget(
         seconds=options.learning_seconds, particle_steps=None if steps is None else int(steps)
@@ -128,8 +128,8 @@ def run(options: LearnOptions, ranks: ProcessGroup) -> int:
         options.seed,
         device=options.device,
         evaluation_seeds=range(FIRST_EVALUATION_SEED, FIRST_EVALUATION_SEED + options.episodes),
-        entries=options.points,
-        on_entry=show,
+        curve_points=options.curve_points,
+        on_point=show,
         on_stop=lambda: stopped.append(True),
         out=options.out,
         resume=options.resume,
@@ -144,12 +144,12 @@ def run(options: LearnOptions, ranks: ProcessGroup) -> int:
 
 def problem_of(options: LearnOptions) -> Problem:
     """Return the environment to learn."""
-    from npa_envs.agents.learning.problem import Problem, registered
+    from npa_envs.agents.learning.problem import Problem, registration_of
 
     steps = options.episode_steps
     return Problem(
         env_id=options.env,
         keywords=common.named_values("keywords", options.keywords),
-        episode_steps=registered(options.env).steps if steps is None else steps,
-        num_envs=WORLDS if options.worlds is None else options.worlds,
+        episode_steps=registration_of(options.env).steps if steps is None else steps,
+        num_envs=NUM_ENVS if options.num_envs is None else options.num_envs,
     )

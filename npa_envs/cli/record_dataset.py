@@ -44,7 +44,7 @@ class RecordOptions(common.RunOptions):
     """Episodes to record, each from a different seed."""
     first_seed: int = 0
     """The first one's seed; the others follow."""
-    worlds: int = 16
+    num_envs: int = 16
     """Worlds that run at the same time."""
     keywords: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE")] = ()
     """Keywords of the environment, values as JSON or plain text: target=heart."""
@@ -55,7 +55,7 @@ class RecordOptions(common.RunOptions):
 def main(arguments: Sequence[str]) -> int:
     """Record the episodes and write the dataset."""
     options = common.parse_options(RecordOptions, "record-dataset", arguments)
-    common.check_numbers(options, episodes=1, worlds=1)
+    common.check_numbers(options, episodes=1, num_envs=1)
     from npa_envs.agents.evaluation import policy_in
     from npa_envs.measure.benchmark_records import command_text
     from npa_envs.wrappers.minari import ROOT, record_episodes, spec_of, write_dataset
@@ -88,16 +88,15 @@ def main(arguments: Sequence[str]) -> int:
 
 def problem_of(options: RecordOptions) -> Problem:
     """Return the environment with its keywords."""
-    from npa_envs.agents.learning.problem import Problem, registered
+    from npa_envs.agents.learning.problem import Problem, registration_of
 
-    worlds = min(options.worlds, options.episodes)
     problem = Problem(
         env_id=options.env,
         keywords=common.named_values("keywords", options.keywords),
-        episode_steps=registered(options.env).steps,
-        num_envs=worlds,
+        episode_steps=registration_of(options.env).steps,
+        num_envs=min(options.num_envs, options.episodes),
     )
-    if problem.actor == "species":
+    if problem.controlled == "species":
         raise NPAError(
             f"env must be of one species, as Minari keeps one agent's episodes, got {options.env}"
         )
@@ -109,7 +108,7 @@ def policy_of(options: RecordOptions, problem: Problem) -> Callable[[Any], Any]:
     from npa_envs.agents.learning import Budget, RuleSet, train
     from npa_envs.agents.learning.problem import WORLDS_PER_SEED
 
-    known = (*UNTRAINED, "gradient") if problem.actor == "brushes" else UNTRAINED
+    known = (*UNTRAINED, "gradient") if problem.controlled == "brushes" else UNTRAINED
     if options.policy in known:
         # These learn nothing: `train` plays each scripted policy once and returns the best.
         seed = 0
@@ -125,14 +124,14 @@ def policy_of(options: RecordOptions, problem: Problem) -> Callable[[Any], Any]:
             seed,
             device=options.device,
             evaluation_seeds=evaluation_seeds,
-            entries=1,
+            curve_points=1,
         ).policy
     source = options.policy
-    if source.endswith(".zip") and problem.actor == "brushes":
+    if source.endswith(".zip") and problem.controlled == "brushes":
         from npa_envs.agents.learning.sb3 import GardenPolicy
 
         return GardenPolicy.load(source)
-    if problem.actor == "brushes":
+    if problem.controlled == "brushes":
         raise NPAError(
             f"policy must be one of {known} or a file sac.zip or ppo.zip, got {source!r}"
         )

@@ -3,7 +3,7 @@
 import gymnasium
 import numpy as np
 import pytest
-from learning_problems import digits, heart, species
+from learning_problems import heart, species
 from refusals import refused
 
 import npa_envs
@@ -91,15 +91,13 @@ def benched(**changes):
 
 
 def start_of(problem):
-    return {"start": problem.new_rules(0)}
+    return {"start": RuleSet.new(problem, 0)}
 
 
 ALONE = problem(env_id=GARDEN, num_envs=1, keywords=QUICK)
 WIDE = {"state_dim": 16, "eps0": 0.1}
 APART = WIDE | {"perception": "per_species"}
 INVASION, DYING = species("npa/Invasion-v0", seed_distance=0.5), species(deaths=[[0, 2]])
-ADVANCES = "must be a whole number from 0 to 99, .* got"
-LISTED = "gains must be a list of finite numbers"
 WARM = ("ppo", "ppo_world", "evolution", "gradient")
 TIMED = {"learning_seconds": 1.0}
 
@@ -130,7 +128,6 @@ REFUSED = {
     evaluated: [
         ({"seeds": []}, "seeds must have at least one seed"),
         ({"seeds": 7}, r"one for each episode, got 7: give seeds=range\(8\)"),
-        ({"seeds": [1, 0.5]}, "a seed must be an integer of at least 0, got 0.5"),
         ({"seeds": [0, 1, -1]}, "a seed must be an integer of at least 0, got -1"),
         ({"make": multispecies_v0.parallel_env}, r"single or a vector .*make_envs"),
         ({"make": make, "max_episode_steps": -1}, "max_episode_steps=256"),
@@ -144,20 +141,16 @@ REFUSED = {
         ({"policy": gardening.ScriptedGardener, "tools": ("wipe",)}, "have brushes that push"),
         ({"policy": gardening.ScriptedShepherd}, "env must be npa/Shepherd2D-v0"),
         ({"policy": gardening.ScriptedGardener, "gain": 0.0}, "gain must be positive"),
-        ({"policy": gardening.ScriptedGardener, "share": -1.0}, "share must be positive"),
-        ({"policy": gardening.ScriptedGardener, "width": float("nan")}, "width must be positive"),
     ],
     problem: [
         ({"env_id": "npa/Mixng-v0"}, "did you mean 'npa/Mixing-v0'"),
         ({"env_id": "CartPole-v1"}, "env_id must be of an environment of many worlds"),
         ({"keywords": {"epsilon": 0.1}}, "unexpected keyword argument 'epsilon'"),
-        ({"keywords": {"eps": -0.1}}, "eps must be"),
         ({"keywords": {"device": "cuda"}}, "given to train and make_envs"),
         ({"keywords": {"max_cycles": 3}}, "field episode_steps"),
         ({"keywords": {"reward": "particle"}}, "row_rewards='particle'"),
         ({"keywords": {"box_size": {1, 2}}}, "JSON"),
         ({"keywords": [1]}, "keywords must map names"),
-        ({"episode_steps": 0}, "episode_steps"),
         ({"num_envs": 1.5}, "num_envs"),
         # Rules are not taught where rows show pictures.
         ({"env_id": PICTURES, "keywords": {"observe_target": True}}, "must not have 'observe_tar"),
@@ -166,8 +159,6 @@ REFUSED = {
     heart(reward="sparse").make_envs: [({"row_rewards": "particle"}, "row_rewards")],
     RuleSet.of: [
         ({"problem": heart(), "source": "heart"}, "state_dim"),
-        ({"problem": heart(state_dim=16), "source": "heart"}, "eps0"),
-        ({"problem": digits(state_dim=16), "source": "heart"}, "static"),
         ({"problem": species(**APART), "source": "heart"}, "rule must distinguish 2 species"),
         ({"problem": species(**WIDE), "source": ["heart"] * 3}, "one for each of 2 species"),
         ({"problem": heart(), "source": "hart"}, "unknown rule"),
@@ -175,22 +166,19 @@ REFUSED = {
     Budget: [
         ({}, "must say something"),
         ({"seconds": 0.0}, "seconds must be"),
-        ({"particle_steps": -1}, "particle_steps must be"),
     ],
     entered: [
-        ({"entries": 0}, "entries"),
+        ({"curve_points": 0}, "curve_points"),
         ({"evaluation_seeds": []}, "seed"),
     ],
     trained: [
         ({"method": "gradients"}, "did you mean 'gradient'"),
         ({"method": "gradient", "learning_rat": 1.0}, "did you mean 'learning_rate'"),
         ({"method": "zero", "device": "tpu"}, "device"),
-        ({"method": "zero", "seed": -1}, f"seed {ADVANCES} -1"),
-        ({"method": "zero", "seed": 100}, f"seed {ADVANCES} 100"),
+        ({"method": "zero", "seed": 100}, "must be a whole number from 0 to 99, .* got 100"),
         ({"method": "zero", "evaluation_seeds": 4}, "seeds must be one for each episode, got 4"),
         ({"method": "zero", **start_of(heart())}, "start must be None"),
-        ({"method": "scripted", "gains": 0.1}, f"{LISTED}, got 0.1"),
-        ({"method": "scripted", "gains": [0.1, "a"]}, LISTED),
+        ({"method": "scripted", "gains": [0.1, "a"]}, "gains must be a list of finite numbers"),
         ({"method": "gradient", "steps": 5}, "steps must be a range .* of two whole num.*, got 5"),
         ({"method": "gradient", "steps": [5, 2]}, "steps must be two whole numbers"),
         ({"method": "evolution", "population": 2}, "population must be a whole number of at lea"),

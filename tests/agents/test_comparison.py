@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from clock import Clock
 from refusals import refused
 
 from npa_envs.agents import RandomPolicy, ZeroPolicy
@@ -266,9 +265,9 @@ def test_runs_follow_each_other_in_a_process_until_one_fails(tmp_path, child):
     assert not any(living(tmp_path))
     # Functions from outside, and what is measured by time, have processes of their own.
     job = made.jobs()[0]
-    assert one_run.lasts(made, job)
-    assert not one_run.lasts(plan(own={"one": "mine:train"}, budgets=steps), job)
-    assert not one_run.lasts(made, dataclasses.replace(job, axis="seconds"))
+    assert one_run.shares_process(made, job)
+    assert not one_run.shares_process(plan(own={"one": "mine:train"}, budgets=steps), job)
+    assert not one_run.shares_process(made, dataclasses.replace(job, axis="seconds"))
 
 
 @pytest.mark.parametrize("device", ["cpu", "cuda"])
@@ -291,9 +290,9 @@ def test_a_run_that_clones_is_refused_where_its_teacher_will_never_be(tmp_path, 
     refused(r"clones the rules of 'gradient'.*add --methods gradient", ran, made, tmp_path)
     assert list(tmp_path.iterdir()) == []
     # What an earlier call has run serves as well, from the same settings.
-    taught = plan(methods=["gradient"], seeds=(0,), options={"gradient": {"world_count": 2}})
+    taught = plan(methods=["gradient"], seeds=(0,), options={"gradient": {"num_envs": 2}})
     ran(taught, tmp_path)
-    refused(r"of other settings: options was \{'world_count': 2\}, now", ran, made, tmp_path)
+    refused(r"of other settings: options was \{'num_envs': 2\}, now", ran, made, tmp_path)
     shutil.rmtree(tmp_path / taught.jobs()[0].folder)
     ran(plan(methods=["gradient"], seeds=(0,)), tmp_path)
     ran(made, tmp_path)
@@ -343,18 +342,6 @@ def test_an_interrupted_comparison_ends_its_processes_and_goes_on_where_it_was(
     assert time.perf_counter() - begin < 300.0
     assert list(held_records(plan(), tmp_path)) == plan().jobs()[:1]
     assert not list(tmp_path.rglob(".seed*"))
-
-
-@pytest.mark.parametrize("device", ["cpu", "cuda"])
-def test_no_run_begins_once_the_time_is_over_and_who_waits_leaves_nothing(
-    tmp_path, monkeypatch, child, device
-):
-    monkeypatch.setattr("npa_envs.process_queue.time", Clock(tick=1e-3))
-    child("time.sleep(0.3)", before=WRITE_PID.format(tmp_path))
-    ended = ran(plan(), tmp_path, device, max_seconds=0.2)
-    assert [one.job for one in ended] == plan().jobs()[:1]
-    assert not list(tmp_path.rglob(".seed*"))
-    assert not any(living(tmp_path))
 
 
 @pytest.mark.parametrize("line", [b"", b"cpu\n"], ids=["that waits", "that learns"])

@@ -19,13 +19,14 @@ from npa_envs.agents import (
     evaluate_policy,
 )
 from npa_envs.agents.learning import EVALUATION_SEEDS, Budget, Problem, RuleSet, train
-from npa_envs.agents.learning.clone import Demonstrations, unexplained
+from npa_envs.agents.learning.clone import Demonstrations, unexplained_variance
 from npa_envs.agents.learning.evolution import RuleWeights, candidates_actions, costs, fitness
-from npa_envs.agents.learning.gradient import EnvironmentTask, clamp_inward
+from npa_envs.agents.learning.gradient import ClampedRule, EnvironmentTask
 from npa_envs.agents.learning.problem import FIRST_EVALUATION_SEED, world_seeds
-from npa_envs.agents.learning.shac import SHACLearner, SHACOptions, td_lambda_targets, values
+from npa_envs.agents.learning.shac import SHACLearner, SHACOptions, td_lambda_targets, world_values
 from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.envs.morphogenesis2d import PictureEnvTask
+from npa_envs.rule.rule import NPARule
 
 GROWTH = {"eps": 0.2, "eps0": 0.2, "colour_weight": 20.0, "resolution": 32, "state_scale": 0.1}
 
@@ -39,7 +40,7 @@ def run(problem, method="gradient", iterations=30, seed=0, worlds=4, **options):
     steps = iterations * worlds * problem.particle_count * problem.episode_steps
     budget = Budget(particle_steps=steps)
     seeds = range(500, 503)
-    return train(method, problem, budget, seed, evaluation_seeds=seeds, entries=1, **options)
+    return train(method, problem, budget, seed, evaluation_seeds=seeds, curve_points=1, **options)
 
 
 def damaged(**keywords):
@@ -52,7 +53,8 @@ def damaged(**keywords):
 
 def test_clamped_numbers_are_clipped_and_let_gradients_lead_back():
     values = torch.tensor([-3.0, -3.0, 0.5, 3.0, 3.0], requires_grad=True)
-    clamped = clamp_inward(values, 1.0)
+    rule = ClampedRule(NPARule(2, 5, 4, static=True), 1.0)
+    clamped = rule.clamped(values)
     assert clamped.tolist() == [-1.0, -1.0, 0.5, 1.0, 1.0]
     clamped.backward(torch.tensor([2.0, -2.0, 2.0, 2.0, -2.0]))
     # A step against the gradient would lead the first and the last further out.
@@ -115,7 +117,7 @@ def test_repeated_rollouts_stay_clamped_where_they_are_recorded(cuda_graph, devi
     assert all(torch.allclose(after, found[0], atol=1e-5) for after in found)
 
 
-GRADIENT = {"world_count": 4, "learning_rate": 1e-2}
+GRADIENT = {"num_envs": 4, "learning_rate": 1e-2}
 SHAC = {"method": "shac", "steps": 4, **GRADIENT}
 PIECES = {"steps": (3, 7), "pool_size": 8, "fresh_share": 0.5, **GRADIENT}
 EVOLUTION = {"method": "evolution", "iterations": 40, "worlds": 16, "population": 16}
@@ -145,8 +147,8 @@ def test_what_is_learned_leaves_a_share_of_the_loss_and_raises_the_return(case, 
 
 
 LEARNERS = {
-    "gradient": {"world_count": 4},
-    "shac": {"world_count": 4, "steps": 2, "critic_epochs": 1},
+    "gradient": {"num_envs": 4},
+    "shac": {"num_envs": 4, "steps": 2, "critic_epochs": 1},
     "ppo": {"steps": 4},
     "ppo_world": {"steps": 4, "minibatches": 4},
     "clone": {"collect_steps": 4},
@@ -156,7 +158,7 @@ LEARNERS = {
 
 def learner(method, problem):
     """Return the options of a method."""
-    return LEARNERS[method] | ({"teacher": problem.new_rules(7)} if method == "clone" else {})
+    return LEARNERS[method] | ({"teacher": RuleSet.new(problem, 7)} if method == "clone" else {})
 
 
 @pytest.fixture
@@ -202,7 +204,10 @@ def test_a_run_begins_with_its_start_which_stays_as_it_is(method):
     trained = run(problem, method, iterations=1, start=start, **learner(method, problem))
     policy = RuleSet.of(problem, list(before)).policy()
     episodes = evaluate_policy(problem.make_envs(), policy, range(500, 503))
-    assert trained.log[0].mean_return == pytest.approx(episodes.mean_return, rel=1e-6)
+    for name in ("mean_return", "standard_error"):
+        found, wanted = (getattr(one, name) for one in (trained.log[0], episodes))
+        assert found == pytest.approx(wanted, rel=1e-6)
+    assert trained.log[0].final_loss == pytest.approx(episodes.final_losses.mean(), rel=1e-6)
     assert all(map(torch.equal, start.parameters(), before.parameters()))
     assert trained.rules.counts == (20, 15)
 
@@ -231,10 +236,10 @@ def test_a_clone_does_what_its_teacher_does(problem, iterations, largest):
     observation, _ = envs.reset(seed=900)
     for _ in range(4):
         observation, *_ = envs.step(teacher.policy()(observation))
-    assert unexplained(rules, observation, teacher.policy()(observation)) < largest
+    assert unexplained_variance(rules, observation, teacher.policy()(observation)) < largest
     taught, clone, untaught = (
         evaluate_policy(envs, one.policy(), range(900, 906)).mean_return
-        for one in (teacher, rules, problem.new_rules(0))
+        for one in (teacher, rules, RuleSet.new(problem, 0))
     )
     assert abs(clone - taught) < 0.1 * abs(untaught - taught)
 
@@ -305,7 +310,7 @@ def test_worlds_of_one_seed_follow_each_other_and_end_before_those_of_the_next()
 
 
 def actor_critic(problem, **options):
-    given = SHACOptions(**{"world_count": 3} | options)
+    given = SHACOptions(**{"num_envs": 3} | options)
     return SHACLearner(progress_of(problem, initial=wild_rules(problem)), given)
 
 
@@ -354,7 +359,7 @@ def test_the_critic_learns_what_is_paid_and_its_copy_follows():
     seen = window.features[:-1].flatten(0, 1)
     paid = td_lambda_targets(window.rewards, torch.zeros(4, 3), gamma=0.9, td_lambda=0.95)
     with torch.no_grad():
-        learned, followed = values(made.critic, seen), values(made.target, seen)
+        learned, followed = world_values(made.critic, seen), world_values(made.target, seen)
     spread = (paid.flatten() - paid.mean()).square().mean()
     assert (learned - paid.flatten()).square().mean() < 0.5 * (spread + paid.mean().square())
     assert 0.0 < followed.abs().mean() < learned.abs().mean()
@@ -373,7 +378,7 @@ PROBLEMS = {name: replace(problem, hidden_dim=12) for name, problem in SMALL.ite
 
 def candidates_of(problem: Problem, device: torch.device, count: int):
     """Rules, and the weights of some candidates that differ much, one a row."""
-    rules = problem.new_rules(0).to(device)
+    rules = RuleSet.new(problem, 0).to(device)
     weights, draws = RuleWeights(rules), np.random.default_rng(1)
     spread = draws.standard_normal((count, len(weights.vector()))) * weights.scales()
     candidates = weights.vector() + 0.5 * spread
@@ -382,8 +387,8 @@ def candidates_of(problem: Problem, device: torch.device, count: int):
 
 def policy_of(problem: Problem, weights: torch.Tensor):
     """The policy of a candidate."""
-    rules = problem.new_rules(5).to(weights.device)
-    RuleWeights(rules).put(weights.cpu().double().numpy())
+    rules = RuleSet.new(problem, 5).to(weights.device)
+    RuleWeights(rules).set_vector(weights.cpu().double().numpy())
     return rules.policy()
 
 
@@ -429,7 +434,7 @@ def test_the_fitness_of_a_population_is_that_of_one_candidate_after_the_other(pr
 
 
 def test_scales_are_those_that_layers_are_drawn_with():
-    (rule,) = PROBLEMS["growth"].new_rules(0)
+    (rule,) = RuleSet.new(PROBLEMS["growth"], 0)
     for layer in (rule.hidden, rule.output):
         torch.nn.init.xavier_normal_(layer.weight)
     drawn = RuleWeights([rule]).vector() / RuleWeights([rule]).scales()

@@ -11,7 +11,7 @@ from learning_problems import heart, progress_of, species
 from processes import on_ranks
 from refusals import refused
 
-from npa_envs.agents.learning import Budget, ppo, shac, train
+from npa_envs.agents.learning import Budget, RuleSet, ppo, shac, train
 from npa_envs.rule.files import load_rule
 from npa_envs.training.checkpoint import load_checkpoint, save_checkpoint
 
@@ -21,8 +21,8 @@ DYING = species(episode_steps=6, deaths=[[1, 3]])
 FORMS = {
     "PPO": (HEART, ppo, {"steps": 5, "masked": True, "minibatches": 2, "epochs": 2}),
     "PPO by worlds": (HEART, ppo, {"steps": 4, "ratio": "world", "critic": "central"}),
-    "PPO of species that die": (DYING, ppo, {"worlds": 4, "steps": 4, "epochs": 2}),
-    "SHAC": (HEART, shac, {"steps": 2, "world_count": 4}),
+    "PPO of species that die": (DYING, ppo, {"num_envs": 4, "steps": 4, "epochs": 2}),
+    "SHAC": (HEART, shac, {"steps": 2, "num_envs": 4}),
 }
 
 
@@ -36,16 +36,16 @@ def learner_of(form):
     for module in learner.modules.values():
         module.double()
     if method is ppo:
-        for holder in (learner.memory, learner):
-            for name, value in vars(holder).items():
-                if isinstance(value, torch.Tensor) and value.is_floating_point():
-                    setattr(holder, name, value.double())
+        for name, value in vars(learner.memory).items():
+            if value.is_floating_point():
+                setattr(learner.memory, name, value.double())
+        learner.update = type(learner.update)(*(value.double() for value in learner.update))
         # As at the beginning.
         learner.critic.updates.zero_()
         learner.critic.observe(learner.memory.observations[-1], learner.ranks)
         return learner
-    fresh = learner._fresh
-    learner._fresh = lambda worlds: fresh(worlds).map(
+    new_worlds = learner._new_worlds
+    learner._new_worlds = lambda worlds: new_worlds(worlds).map(
         lambda part: part.double() if part.is_floating_point() else part
     )
     learner._begin()
@@ -102,7 +102,7 @@ def test_two_processes_learn_what_one_does(form, tmp_path):
         assert means == pytest.approx(whole, rel=1e-9, abs=1e-11)
 
 
-METHODS = {"ppo": {"worlds": 4, "steps": 3}, "shac": {"world_count": 4, "steps": 2}}
+METHODS = {"ppo": {"num_envs": 4, "steps": 3}, "shac": {"num_envs": 4, "steps": 2}}
 ROUND = {"ppo": 3 * 4 * 48, "shac": 2 * 4 * 48}
 """Particle-steps of an iteration."""
 
@@ -110,7 +110,7 @@ ROUND = {"ppo": 3 * 4 * 48, "shac": 2 * 4 * 48}
 def run_in(method, out, rounds, **options):
     """Learn for some rounds; what is learned, and the particle-steps of the curve's entries."""
     budget, options = Budget(particle_steps=rounds * ROUND[method]), METHODS[method] | options
-    options = {"evaluation_seeds": range(500, 502), "entries": 2, "out": out} | options
+    options = {"evaluation_seeds": range(500, 502), "curve_points": 2, "out": out} | options
     trained = train(method, HEART, budget, 0, **options)
     weights = [weight.flatten().tolist() for weight in trained.rules.parameters()]
     return weights, [entry.particle_steps // ROUND[method] for entry in trained.log]
@@ -154,7 +154,7 @@ def test_a_run_that_is_asked_to_stop_can_be_resumed(tmp_path, monkeypatch):
             os.kill(os.getpid(), signal.SIGTERM)
 
     monkeypatch.setattr(ppo.PPOLearner, "improve", asked)
-    start = HEART.new_rules(3)
+    start = RuleSet.new(HEART, 3)
     # Seeds of evaluations are read once.
     seeds = iter([500, 501])
     assert run_in("ppo", tmp_path, 8, start=start, evaluation_seeds=seeds)[1] == [0, 3]
@@ -166,7 +166,7 @@ def test_a_run_that_is_asked_to_stop_can_be_resumed(tmp_path, monkeypatch):
 def test_a_shared_run_that_goes_on_by_seconds_evaluates_at_their_shares(tmp_path):
     def learn(seconds, **options):
         budget, options = Budget(seconds=seconds), METHODS["ppo"] | options
-        options |= {"evaluation_seeds": [500], "entries": 2, "out": tmp_path / "run"}
+        options |= {"evaluation_seeds": [500], "curve_points": 2, "out": tmp_path / "run"}
         return len(train("ppo", HEART, budget, 0, **options).log)
 
     def resumed():
@@ -190,7 +190,7 @@ def finished(tmp_path):
     ("method", "options", "message"),
     [
         ("ppo", {}, "holds one: resume it"),
-        ("ppo", {"resume": True, "start": HEART.new_rules(3), **METHODS["ppo"]}, "in started"),
+        ("ppo", {"resume": True, "start": RuleSet.new(HEART, 3), **METHODS["ppo"]}, "in started"),
         ("shac", {"resume": True}, "differs in method, options"),
         ("evolution", {"resume": True}, "cannot be kept in a folder"),
     ],
@@ -201,7 +201,7 @@ def test_a_folder_with_another_run_is_refused(method, options, message, finished
 
 def test_a_checkpoint_that_was_changed_is_refused(finished):
     content = load_checkpoint(finished / "checkpoint.pt")
-    spoilt = [{"curve": []}, {"iteration": -1}, {"part": "x"}, {"optimisers": {"actor": {}}}]
+    spoilt = [{"curve": []}, {"iteration": -1}, {"resumptions": "x"}, {"optimisers": {"actor": {}}}]
     name = next(iter(content["modules"]["actor"]))
     modules = content["modules"] | {"actor": content["modules"]["actor"] | {name: torch.ones(1)}}
     for change in (*spoilt, {"modules": modules}):
@@ -213,7 +213,11 @@ def test_a_checkpoint_that_was_changed_is_refused(finished):
     ("method", "options", "message"),
     [
         ("evolution", {}, "'evolution' cannot be shared by processes: take one of ppo, shac"),
-        ("ppo", {"worlds": 3}, "worlds must be a multiple of the number of processes, got 3 and 2"),
+        (
+            "ppo",
+            {"num_envs": 3},
+            "num_envs must be a multiple of the number of processes, got 3 and 2",
+        ),
     ],
 )
 def test_what_cannot_be_shared_is_refused(method, options, message, tmp_path):

@@ -83,7 +83,7 @@ def test_a_suite_is_every_method_on_all_that_it_can_learn_within_the_frozen_budg
         ran = {job.method for job in plan.jobs() if job.task == task}
         assert ran <= methods_for(problem).keys()
         assert {"zero", "gradient", "random", "ppo_world"} <= ran
-        assert ("sac" in ran) == (problem.actor == "brushes")
+        assert ("sac" in ran) == (problem.controlled == "brushes")
 
 
 def test_the_small_suite_is_all_small_worlds_that_rules_act_in():

@@ -17,7 +17,7 @@ from npa_envs.training.checkpoint import load_checkpoint
 from npa_envs.training.run_folder import Run
 
 WORDS = ["learn", "ppo", "npa/Morphogenesis2DSmall-v0", "--keywords", "target=ring"]
-WORDS += ["--worlds", "2", "--episode-steps", "4", "--episodes", "1", "--points", "2"]
+WORDS += ["--num-envs", "2", "--episode-steps", "4", "--episodes", "1", "--curve-points", "2"]
 WORDS += ["--options", "steps=4"]
 ROUND = 4 * 2 * 64
 
@@ -47,7 +47,7 @@ def test_a_run_begins_and_goes_on_with_the_same_words(tmp_path, capsys):
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs Linux's /proc")
 def test_a_killed_process_ends_a_run_and_a_signal_stops_it(tmp_path):
-    words = [*WORDS, "--particle-steps", "1e9", "--learning-seconds", "60", "--points", "60"]
+    words = [*WORDS, "--particle-steps", "1e9", "--learning-seconds", "60", "--curve-points", "60"]
     words += ["--out", str(tmp_path), "--processes", "2", "--resume", "auto"]
 
     def begun(count):
@@ -110,8 +110,8 @@ def test_episodes_are_as_long_as_registered(env, steps):
 
 def test_worlds_are_those_of_shac_when_given(tmp_path):
     words = ["learn", "shac", "npa/MixingSmall-v0", "--particle-steps", "1", "--episodes", "1"]
-    words += ["--points", "1", "--episode-steps", "2", "--no-progress", "--out"]
-    for name, worlds, count in (("three", ["--worlds", "3"], 3), ("default", [], 8)):
+    words += ["--curve-points", "1", "--episode-steps", "2", "--no-progress", "--out"]
+    for name, worlds, count in (("told", ["--num-envs", "3"], 3), ("default", [], 8)):
         assert main([*words, str(tmp_path / name), *worlds]) == 0
         assert points(tmp_path / name)[-1]["particle_steps"] == count * 2 * 64
 

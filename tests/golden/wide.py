@@ -227,7 +227,7 @@ def resumed():
 def of_learning(method, name, fields, **options):
     """A few updates of a learner: its curve and its rules."""
     problem = learning.Problem(env_id=name, keywords=fields, episode_steps=4, num_envs=2)
-    options |= {"evaluation_seeds": range(100, 102), "entries": 2}
+    options |= {"evaluation_seeds": range(100, 102), "curve_points": 2}
     done = learning.train(method, problem, learning.Budget(particle_steps=4096), 1, **options)
     curve = [{k: v for k, v in vars(e).items() if "second" not in k} for e in done.log]
     rules = None if done.rules is None else [rule.state_dict() for rule in done.rules.rules]

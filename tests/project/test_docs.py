@@ -435,7 +435,7 @@ def test_the_code_about_learning_runs(folder, monkeypatch, capsys):
     (folder / "mine.py").write_text(code_blocks("learning")[2], encoding="utf-8")
     monkeypatch.syspath_prepend(folder)
     budget = Budget(particle_steps=2000)
-    trained = train("mine:train", names["problem"], budget, 0, noise=0.2, entries=1)
+    trained = train("mine:train", names["problem"], budget, 0, noise=0.2, curve_points=1)
     assert [entry.particle_steps for entry in trained.log] == [0, 2000]
 
 

@@ -10,7 +10,7 @@ from refusals import refused
 
 from npa_envs.agents import evaluate_policy
 from npa_envs.agents.learning import Budget, train
-from npa_envs.agents.learning.problem import registered, world_seeds
+from npa_envs.agents.learning.problem import registration_of, world_seeds
 from npa_envs.cli import main
 from npa_envs.cli.record_dataset import RecordOptions, policy_of, problem_of
 from npa_envs.errors import DivergedError, NPAError
@@ -100,7 +100,9 @@ def test_rules_learn_from_a_dataset_without_a_world(monkeypatch):
     recorded(problem, teacher)
     options = {"dataset": "npa/test-v0", "batch_worlds": 4, "updates": 8}
     steps = 4 * 8 * problem.particle_count
-    trained = train("clone", problem, Budget(particle_steps=60 * steps), 0, entries=1, **options)
+    trained = train(
+        "clone", problem, Budget(particle_steps=60 * steps), 0, curve_points=1, **options
+    )
     seen, done = read_pairs("npa/test-v0")
     error = (trained.policy(seen) - done).square().mean() / done.var()
     assert error < 0.1
@@ -128,7 +130,7 @@ def recording(env, policy, dataset, words):
     ],
 )
 def test_the_command_records_any_policy(root, capsys, env, policy, names):
-    assert recording(env, policy, f"{policy}-v0", f"--episodes 3 --worlds 2 --root {root}") == 0
+    assert recording(env, policy, f"{policy}-v0", f"--episodes 3 --num-envs 2 --root {root}") == 0
     assert "3 episodes, mean return" in capsys.readouterr().out
     dataset = minari.load_dataset(f"npa/{policy}-v0")
     assert (dataset.total_episodes, dataset.total_steps) == (3, 96)
@@ -159,7 +161,7 @@ def test_episodes_of_an_environment_of_ones_own_are_as_long_as_it_is_registered(
         kwargs=small.kwargs,
     )
     try:
-        assert registered("mine/Growth-v0").steps == 3
+        assert registration_of("mine/Growth-v0").steps == 3
         words = [
             "record-dataset",
             "mine/Growth-v0",
