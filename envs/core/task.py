@@ -202,9 +202,7 @@ class EnvTask(WorldTask[Config]):
         Raises:
             NPAError: The losses have no gradient.
         """
-        box = self.config.periodic_box
-        sides = None if box is None else (box,) * self.space_dim
-        gains = marginal_gains(self.losses, before, after, sides)
+        gains = marginal_gains(self.losses, before, after, self.periodic_sides)
         if gains is None:
             raise NPAError(
                 f"the losses of {type(self).__name__} must be differentiable for "
@@ -212,6 +210,12 @@ class EnvTask(WorldTask[Config]):
                 "'particle' or 'dense', or give it a particle_gains method"
             )
         return gains
+
+    @property
+    def periodic_sides(self) -> tuple[float, ...] | None:
+        """Sides of the periodic box [length units]; None: open space, or walls."""
+        box = self.config.periodic_box
+        return None if box is None else (box,) * self.space_dim
 
     @property
     def start_is_short(self) -> bool:

@@ -125,7 +125,9 @@ def film_world(
             film.add(task, Particles(x, s), step)
         for damage in damages:
             if damage.step == step < last:
-                x, s = damage_worlds(x, s, kind=damage.kind, size=damage.size, generator=generator)
+                x, s = damage_worlds(
+                    x, s, kind=damage.kind, size=damage.size, box=task.box, generator=generator
+                )
                 s = task.coded(s)
                 film.add(task, Particles(x, s), step, damage.text)
         if stop():

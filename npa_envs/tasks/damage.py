@@ -23,7 +23,7 @@ from npa_envs.checks import (
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.ops import world_mean
 from npa_envs.tasks.seeds import drawn_indices, uniform_ball
-from npa_envs.world.brushes import clump, cut, wipe_state
+from npa_envs.world.brushes import Sides, clump, cut, wipe_state
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness, check_generator, normal_draws, uniform_draws
 
@@ -97,6 +97,7 @@ def damage_worlds(
     *,
     kind: str,
     size: float | None = None,
+    box: Sides = None,
     generator: Randomness | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Damage worlds at a random position, or cut them through the middle at a random angle.
@@ -106,6 +107,8 @@ def damage_worlds(
         s: Particle states (dimensionless), shape [B, N, C].
         kind: "wipe", "cut", "clump", or "noise" on every position.
         size: Radius, gap or standard deviation [length units]; None is the usual one.
+        box: Sides of the periodic box [length units], across whose edges damage continues; None:
+            open space. Positions may leave the box; the next step wraps them.
         generator: Source of the random position, on the device of `x`; None is torch's own.
 
     Returns:
@@ -124,11 +127,11 @@ def damage_worlds(
         return x + extent * normal_draws(generator, x.shape, x), s
     if kind == "cut":
         normal = normal_draws(generator, (len(x), x.shape[2]), x)
-        return cut(x, s, centre=world_mean(x), normal=normal, gap=extent)
+        return cut(x, s, centre=world_mean(x), normal=normal, gap=extent, box=box)
     centre = random_particle(x, generator)
     if kind == "clump":
-        return clump(x, s, centre=centre, radius=extent, factor=CLUMP_FACTOR)
-    return x, wipe_state(x, s, centre=centre, radius=extent)
+        return clump(x, s, centre=centre, radius=extent, factor=CLUMP_FACTOR, box=box)
+    return x, wipe_state(x, s, centre=centre, radius=extent, box=box)
 
 
 def random_particle(x: Tensor, generator: Randomness | None = None) -> Tensor:

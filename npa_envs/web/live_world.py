@@ -234,7 +234,8 @@ class LiveWorld(ABC):
 
     def _damage(self, name: str) -> None:
         particles = self._particles()
-        self._place(Particles(*damage_worlds(particles.x, particles.s, kind=name)))
+        x, s = damage_worlds(particles.x, particles.s, kind=name, box=self.box)
+        self._place(Particles(x, s))
 
     def _brush(self, touch: Touch) -> bool:
         """Apply a brush, and return whether `describe` has changed."""

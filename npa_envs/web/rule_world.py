@@ -312,7 +312,9 @@ class RuleWorld(LiveWorld):
     @torch.no_grad()
     def _damage(self, name: str) -> None:
         if self.x.shape[1]:
-            self.x, s = damage_worlds(self.x, self.s, kind=name, generator=self._generator)
+            self.x, s = damage_worlds(
+                self.x, self.s, kind=name, box=self.box, generator=self._generator
+            )
             self.s = self._all_coded(s)
 
     @torch.no_grad()

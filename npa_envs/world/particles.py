@@ -75,8 +75,11 @@ class Particles(NamedTuple):
 
     def split(self, counts: Sequence[int]) -> list[Particles]:
         """Return the particles of each species, which lie one species after the other."""
-        species = (torch.split(value, [*counts], dim=1) for value in self.tensors())
-        return [Particles(*fields) for fields in zip(*species, strict=True)]
+        fields = self._replace(goal=None).tensors()
+        species = (torch.split(value, [*counts], dim=1) for value in fields)
+        return [
+            Particles(*values)._replace(goal=self.goal) for values in zip(*species, strict=True)
+        ]
 
     def copy_(self, other: Particles) -> None:
         """Overwrite these worlds with others, in one kernel."""

@@ -2,17 +2,33 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
+import small_envs
 import torch
 
+from npa_envs import load_rule
 from npa_envs.errors import NPAError
+from npa_envs.render.world_film import film_world
 from npa_envs.tasks import damage
-from npa_envs.tasks.damage import FARTHEST, NEAREST, SHARE, PoolDamage, damage_pool
+from npa_envs.tasks.damage import (
+    FARTHEST,
+    NEAREST,
+    SHARE,
+    PoolDamage,
+    damage_pool,
+    damage_worlds,
+    parse_damage,
+)
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 from npa_envs.tasks.seeds import uniform_ball
+from npa_envs.training.task_of_rule import task_of_rule
+from npa_envs.web.rule_world import RuleWorld
 from npa_envs.world import brushes
+from npa_envs.world.brushes import nearest_image
 from npa_envs.world.particles import Particles
-from npa_envs.world.randomness import WorldRandom
+from npa_envs.world.randomness import WorldRandom, normal_draws
+from npa_envs.wrappers import DamageEvents
 
 B, N, C = 3, 257, 5
 
@@ -153,6 +169,82 @@ def test_each_world_suffers_what_it_would_suffer_alone(device):
         assert torch.equal(alone.s, together.s[k : k + 1])
     untouched = damage_pool(before, PoolDamage(), generator=torch.Generator())
     assert (untouched.x, untouched.s) == (before.x, before.s)
+
+
+@pytest.mark.parametrize("kind", ["wipe", "cut", "clump"])
+@pytest.mark.parametrize("space_dim", [2, 3])
+def test_damage_continues_across_the_edges_of_a_box(kind, space_dim):
+    box, size = (1.0, 1.4, 1.2)[:space_dim], 0.3
+    sides = torch.tensor(box, dtype=torch.float64)
+    x = sides * (torch.rand(8, 300, space_dim, generator=seeded(1), dtype=sides.dtype) - 0.5)
+    s = torch.ones(8, 300, 3, dtype=x.dtype)
+    normal = normal_draws(seeded(2), (8, space_dim), x) if kind == "cut" else None
+    centre = damage.random_particle(x, seeded(2)) if normal is None else x.mean(dim=1)
+    shifts = sides * torch.cartesian_prod(*[torch.tensor([-1.0, 0.0, 1.0])] * space_dim)
+    # The offset to the nearest of all images, [B, N, D].
+    images = (x - centre[:, None])[..., None, :] + shifts
+    nearest = images.norm(dim=-1).argmin(dim=-1)
+    offset = images.take_along_dim(nearest[..., None, None], dim=2)[:, :, 0]
+    inside = offset.norm(dim=-1, keepdim=True) <= size
+    moved, states = x, s
+    if normal is not None:
+        unit = torch.nn.functional.normalize(normal, dim=-1)[:, None]
+        height = (offset * unit).sum(-1, keepdim=True)
+        inside = height.abs() < size
+        moved = torch.where(inside, x + 0.5 * (size * height.sign() - height) * unit, x)
+    elif kind == "clump":
+        moved = torch.where(inside, x - 0.9 * offset, x)
+    else:
+        states = torch.where(inside, 0.0, s)
+    # Some particles are hit whose nearest image is not themselves.
+    assert (inside[..., 0] & (shifts[nearest] != 0.0).any(dim=-1)).sum() > 20
+    found_x, found_s = damage_worlds(x, s, kind=kind, size=size, box=box, generator=seeded(2))
+    torch.testing.assert_close(found_x, moved, rtol=0.0, atol=1e-12)
+    assert torch.equal(found_s, states)
+
+
+def wiped_in_the_viewer():
+    world = RuleWorld("dots", device=torch.device("cpu"), particle_count=300)
+    world.s.fill_(1.0)
+    world.x[:] = nearest_image(0.3 * torch.rand(1, 300, 2, generator=seeded(1)) + 0.85, (2.0, 2.0))
+    world.handle({"type": "damage", "name": "wipe"})
+    return world.x, world.s, 0.2
+
+
+def wiped_in_a_film():
+    rule = load_rule("dots")
+    task = task_of_rule("dots", rule, torch.device("cpu"), particle_count=300).task
+    x = task.seed(1, generator=seeded(1)).x
+    worlds, events = Particles(x, torch.ones(1, 300, rule.state_dim)), [parse_damage("0:wipe:0.6")]
+    options = {"generator": seeded(3), "stop": lambda: True}
+    worlds, _ = film_world(rule, task, worlds, 1, damages=events, **options)
+    return worlds.x, worlds.s, 0.6
+
+
+def wiped_by_a_wrapper():
+    env = DamageEvents(small_envs.make("npa/Texture-v0", update_prob=1.0), "1:wipe:0.6")
+    env.reset(seed=0)
+    env.step(np.ones(env.action_space.shape, np.float32))
+    return *(value[None] for value in env.unwrapped.particles()), 0.6
+
+
+def wiped_at_the_start():
+    fields = {"boundary": "periodic", "box_size": 1.7, "damage": "wipe", "damage_size": 0.7}
+    env = small_envs.begun(small_envs.make("npa/Regeneration2D-v0", **fields))
+    return *(value[None] for value in env.unwrapped.particles()), 0.7
+
+
+CALLERS = (wiped_in_the_viewer, wiped_in_a_film, wiped_by_a_wrapper, wiped_at_the_start)
+
+
+@pytest.mark.parametrize("wiped", CALLERS)
+def test_whoever_damages_a_periodic_world_wipes_a_whole_disk(wiped):
+    (x,), (s,), radius = wiped()
+    side = 1.7 if wiped is wiped_at_the_start else 2.0
+    away = x[:, None] - x
+    disks = [v.norm(dim=-1) <= radius for v in (away, nearest_image(away, (side, side)))]
+    is_disk = [bool((disk == (s == 0.0).all(dim=-1)).all(dim=-1).any()) for disk in disks]
+    assert is_disk == [False, True]
 
 
 TINY = {"state_dim": 6, "hidden_dim": 24, "eps": 0.3, "resolution": 24, "particle_count": 96}

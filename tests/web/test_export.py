@@ -212,6 +212,20 @@ def test_settings_reach_the_world_and_wrong_messages_are_told(run, settings):
         assert (damaged["s"] != whole["s"]) == (name == "wipe")
 
 
+def test_damage_of_a_page_continues_across_the_edges_of_a_box(run, settings):
+    texture = {"type": "set", "name": "rule", "value": "dots"}
+    wipe = [*[ADVANCE] * 20, PAUSE, {"type": "damage", "name": "wipe"}]
+    is_disk = []
+    for seed in range(8):
+        result = live(run, settings, texture, {"type": "reset", "seed": seed}, *wipe)
+        x, s = unpacked(result["x"], (200, 2)), unpacked(result["s"], (200, -1))
+        away = x[:, None] - x
+        disks = [v.norm(dim=-1) <= 0.2 for v in (away, nearest_image(away, (2.0, 2.0)))]
+        wiped = (s == 0.0).all(dim=-1)
+        is_disk.append(tuple(bool((disk == wiped).all(dim=-1).any()) for disk in disks))
+    assert set(is_disk) == {(False, True), (True, True)}
+
+
 @pytest.mark.parametrize(
     "show", ["colours", "density", "components", "species", "speed", "mask", "state 3"]
 )

@@ -268,18 +268,18 @@ export class LiveWorld {
 
   // Damage at a random place, or through the middle at a random angle.
   damage(name) {
-    const { dimension, random, constants } = this;
+    const { box, dimension, random, constants } = this;
     const { x, s, count } = this.world;
     const size = constants.DAMAGE_SIZES[name];
     if (size === undefined) throw Error(`no damage is called ${name}`);
     if (count === 0) return;
     const particle = random.below(count);
     const centre = x.slice(particle * dimension, (particle + 1) * dimension);
-    if (name === "wipe") wipeState(x, s, dimension, centre, size, null);
-    if (name === "clump") clump(x, dimension, centre, size, constants.CLUMP_FACTOR, null);
-    if (name === "cut") cut(x, dimension, meanOf(x, dimension), random.direction(dimension), size, null, null);
+    if (name === "wipe") wipeState(x, s, dimension, centre, size, box);
+    if (name === "clump") clump(x, dimension, centre, size, constants.CLUMP_FACTOR, box);
+    if (name === "cut") cut(x, dimension, meanOf(x, dimension), random.direction(dimension), size, null, box);
     if (name === "noise") random.normals(x.length, size).forEach((part, k) => (x[k] += part));
-    if (this.box !== null) wrap(x, count, this.box);
+    if (box !== null) wrap(x, count, box);
   }
 
   // Whether there is a new frame to show, and the page is ready for it.
