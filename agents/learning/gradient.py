@@ -181,9 +181,9 @@ class EnvironmentTask(ParticleTask[Any]):
         x, s, *rest = self.inner.start(WorldRandom.from_keys(keys))
         return Particles(x, s, goal=rest[1] if rest else None)
 
-    def toward(self, goal: Tensor | None) -> Self:
+    def with_goal(self, goal: Tensor | None) -> Self:
         """Return a copy of the task whose losses are for these goals, shape [B]."""
-        return self if goal is None else self._with(inner=self.inner.toward(goal))
+        return self if goal is None else self._with(inner=self.inner.with_goal(goal))
 
     def compare(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the loss, averaged over worlds and species, and its parts by name."""
@@ -198,7 +198,7 @@ class EnvironmentTask(ParticleTask[Any]):
 
     def world_losses(self, worlds: Particles) -> Tensor:
         """Return the loss of each world, averaged over its species, shape [B]."""
-        parts = self.toward(worlds.goal)._losses(worlds)
+        parts = self.with_goal(worlds.goal)._losses(worlds)
         total = torch.stack(list(parts.values())).sum(dim=0)
         total = total.flatten(1).mean(dim=1) if total.dim() > 1 else total
         self._check_gradient(total, worlds)

@@ -167,7 +167,7 @@ class EnvTask(WorldTask[Config]):
             )
         return Start(*result)
 
-    def toward(self, goal: Tensor) -> Self:
+    def with_goal(self, goal: Tensor) -> Self:
         """Return a task whose losses are for worlds of these goals; by default the task itself.
 
         Goals are int64, shape [B]; each call of `losses` reads their values.
@@ -319,10 +319,10 @@ class TargetEnvTask(EnvTask[Config]):
         x, s, *_ = self.task.seed(random.world_count, generator=random, device=self.device)
         return x, s
 
-    def toward(self, goal: Tensor) -> Self:
+    def with_goal(self, goal: Tensor) -> Self:
         """Return a task whose losses are for worlds of these goals."""
         goal_task = copy.copy(self)
-        goal_task.task = self.task.toward(goal)
+        goal_task.task = self.task.with_goal(goal)
         return goal_task
 
     def particle_losses(self, x: Tensor, s: Tensor) -> Tensor:

@@ -128,7 +128,7 @@ def film_world(
                 x, s = damage_worlds(
                     x, s, kind=damage.kind, size=damage.size, box=task.box, generator=generator
                 )
-                s = task.coded(s)
+                s = task.with_target_code(s)
                 film.add(task, Particles(x, s), step, damage.text)
         if stop():
             break

@@ -117,16 +117,16 @@ class CoMorphogenesis2D(ParticleTask[Any]):
         species = zip(self.tasks, worlds.split(self.config.counts), strict=True)
         return _together([task.damage(own, generator) for task, own in species])
 
-    def loss_of(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the sum of the species' training losses and its parts, named "k.part"."""
+    def loss(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the sum of the species' training losses and its terms, named "k.term"."""
         total = worlds.x.new_zeros(())
-        parts: dict[str, Tensor] = {}
+        terms: dict[str, Tensor] = {}
         for k, species in enumerate(worlds.split(self.config.counts)):
             # Positions relative to the seed: the loss bounds each species around its own.
-            loss, terms = self.tasks[k].loss_of(_shifted(species, -self.config.centres[k]))
+            loss, own = self.tasks[k].loss(_shifted(species, -self.config.centres[k]))
             total = total + loss
-            parts |= {f"{k}.{name}": term for name, term in terms.items()}
-        return total, parts
+            terms |= {f"{k}.{name}": term for name, term in own.items()}
+        return total, terms
 
     def picture(self, x: Tensor, s: Tensor) -> Tensor:
         """Return each world's picture with all species, shape [B, R, R, 4].

@@ -228,10 +228,11 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
             if config.seed_across > 0.0:
                 s[..., 1] = config.seed_across * across / config.seed_radius
         if self._code is not None:
-            s = self.coded(torch.cat((s.new_zeros(*s.shape[:2], len(self._code)), s), dim=-1))
+            blank = s.new_zeros(*s.shape[:2], len(self._code))
+            s = self.with_target_code(torch.cat((blank, s), dim=-1))
         return Particles(x, s)
 
-    def coded(self, s: Tensor) -> Tensor:
+    def with_target_code(self, s: Tensor) -> Tensor:
         """Return states with the task's code, or unchanged where it has none."""
         return s if self._code is None else carrying(s, self._code)
 

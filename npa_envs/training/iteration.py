@@ -77,7 +77,7 @@ class EagerIteration:
     ) -> None:
         self.start = worlds.map(torch.clone)
         self.end = self.start._replace(x=torch.empty_like(worlds.x), s=torch.empty_like(worlds.s))
-        task = task.toward(self.start.goal)
+        task = task.with_goal(self.start.goal)
         self.grown = torch.zeros_like(worlds.x[:, 0, 0], dtype=torch.bool)
         """Worlds to which the stillness loss applies, bool, shape [B]."""
         self._stillness_weight = config.stillness_weight
@@ -86,7 +86,7 @@ class EagerIteration:
         self._divides = bool(fate_parameters(rule))
         self._task = task
         with torch.no_grad():
-            total, parts = self._loss(self.start.begun())
+            total, parts = self._loss(self.start.with_zero_paths())
         self.term_names: tuple[str, ...] = ("loss", *parts)
         """Names of `terms`."""
         self.terms = total.new_zeros(len(self.term_names))
@@ -103,7 +103,7 @@ class EagerIteration:
     def run(self, steps: int) -> None:
         """Run the rollout, the loss and the backward pass."""
         # Gradients of codes flow through these states; `start` keeps their values.
-        first_states = self._task.coded(self.start.s)
+        first_states = self._task.with_target_code(self.start.s)
         if first_states is not self.start.s:
             self.start.s.copy_(first_states.detach())
         fields = self._rollout(
@@ -143,9 +143,9 @@ class EagerIteration:
 
     def _loss(self, end: Particles) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the task's loss plus the stillness loss of grown worlds, and named parts."""
-        x, s, path = end.per_particle()
-        total, parts = self._task.loss(x, s, path)
+        total, parts = self._task.loss(end)
         if self._stillness_weight > 0.0:
+            x, s, path = end.per_particle()
             change = s - self.start.s
             if self._divides:
                 # Births and deaths do not count.
@@ -359,8 +359,7 @@ def bad_worlds(task: Task, rule: NPARule, snapshot: dict[str, Any]) -> list[int]
         finite = all(bool(torch.isfinite(value).all()) for value in world.tensors())
         if finite:
             with torch.no_grad():
-                fields = world.begun().per_particle()
-                total, parts = task.toward(world.goal).loss(*fields)
+                total, parts = task.with_goal(world.goal).loss(world.with_zero_paths())
             finite = all(bool(torch.isfinite(v).all()) for v in (total, *parts.values()))
         if not finite:
             bad.append(index)

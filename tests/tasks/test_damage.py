@@ -285,9 +285,9 @@ def test_a_share_throws_particles_of_the_pool_out_and_a_weight_counts_their_path
     hurt_x, *_ = task.damage(Particles(x, s), generator)
     out = hurt_x.norm(dim=-1) > 1.0
     assert 0 < int(out.sum()) < 60
-    path = torch.ones(2, 96)
-    total, parts = task.loss(hurt_x, s, path)
-    plain, without = Morphogenesis2D(replace(SMALL, escape_weight=0.0)).loss(hurt_x, s, path)
+    hurt = Particles(hurt_x, s, torch.ones(2, 96))
+    total, parts = task.loss(hurt)
+    plain, without = Morphogenesis2D(replace(SMALL, escape_weight=0.0)).loss(hurt)
     assert float(parts["stray"]) == 1.0
     assert "stray" not in without
     assert float(total) == pytest.approx(float(plain) + 1.0)
@@ -297,8 +297,8 @@ def test_the_distance_of_the_centroid_from_where_worlds_begin_is_paid_for():
     task = Morphogenesis2D(replace(SMALL, drift_weight=2.0))
     x, s, *_ = task.seed(1, generator=seeded(0))
     moved = (x + torch.tensor([0.3, -0.4])).requires_grad_()
-    still = x.new_zeros(x.shape[:2])
-    near, there = task.loss(x - x.mean(1, keepdim=True), s, still), task.loss(moved, s, still)
+    still = Particles(x - x.mean(1, keepdim=True), s).with_zero_paths()
+    near, there = task.loss(still), task.loss(still._replace(x=moved))
     assert float(near[1]["drift"]) < 2e-6
     assert float(there[1]["drift"].detach()) == pytest.approx(0.5, abs=0.05)
     (pull,) = torch.autograd.grad(there[1]["drift"], moved)
@@ -306,4 +306,4 @@ def test_the_distance_of_the_centroid_from_where_worlds_begin_is_paid_for():
     torch.testing.assert_close(
         pull.sum(1), moved.mean(1) / moved.mean(1).norm(dim=-1), rtol=1e-5, atol=1e-6
     )
-    assert "drift" not in Morphogenesis2D(SMALL).loss(x, s, still)[1]
+    assert "drift" not in Morphogenesis2D(SMALL).loss(still)[1]

@@ -61,7 +61,7 @@ def test_each_world_is_compared_with_its_own_target(device):
     alone = [config_of(target=name, targets=()) for name in TARGETS]
     singles = [Morphogenesis2D(config, device=device) for config in alone]
     goal = torch.tensor([2, 0, 1], device=device)
-    aimed = task.toward(goal)
+    aimed = task.with_goal(goal)
     worlds = [singles[k].target for k in goal.tolist()]
     for number, target in enumerate(worlds):
         x = target.points[None].expand(3, -1, -1)
@@ -81,11 +81,11 @@ def test_gradients_of_the_loss_reach_the_worlds_codes_alone(device):
     task = task.for_rule(rule)
     x, s, _, goal = task.seed(2, generator=generator(1, device), device=device)
     goal.fill_(1)
-    aimed = task.toward(goal)
-    s = aimed.coded(s)
+    aimed = task.with_goal(goal)
+    s = aimed.with_target_code(s)
     assert torch.equal(s[..., :3], rule.codes.table[1].expand(2, 48, 3))
     x, s, path = npa_envs.rollout(rule, x, s, 3, eps=task.eps, return_path_length=True)
-    total, parts = aimed.loss(x, s, path)
+    total, parts = aimed.loss(Particles(x, s, path))
     (gradient,) = torch.autograd.grad(total, rule.codes.table)
     assert float(gradient[1].abs().min()) > 0.0
     assert float(gradient[[0, 2]].abs().max()) == 0.0
@@ -98,7 +98,7 @@ def test_switched_worlds_get_another_goal_and_its_code(device):
     x, s, _, goal = task.seed(16, generator=generator(1, device), device=device)
     _, hurt, _, switched = task.damage(Particles(x, s, goal=goal), generator(2, device))
     assert 0 < int((switched != goal).sum()) < 16
-    after = task.toward(switched).coded(hurt)
+    after = task.with_goal(switched).with_target_code(hurt)
     codes = after[..., :3].unique(dim=1)[:, 0]
     assert len(codes.unique(dim=0)) == 2
     steady = task_of(device, switch_share=0.0)

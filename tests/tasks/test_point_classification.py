@@ -82,10 +82,10 @@ def test_test_clouds_are_others_and_never_varied(folder):
 def test_loss_is_the_error_to_the_class_and_the_overflow(task, device):
     rule = task.make_rule(random()).to(device).double()
     goal = torch.tensor([2, 0], device=device)
-    aimed = task.for_rule(rule).toward(goal)
+    aimed = task.for_rule(rule).with_goal(goal)
     s = 2.0 * torch.randn(2, 24, 6, dtype=torch.float64, device=device)
     x = torch.rand(2, 24, 2, dtype=torch.float64, device=device)
-    total, parts = aimed.loss(x, s, x[..., 0])
+    total, parts = aimed.loss(Particles(x, s, x[..., 0]))
     wanted = torch.nn.functional.one_hot(goal, 3)[:, None]
     outputs = rule.readout(s)
     error = (outputs - wanted).square().mean()
@@ -99,14 +99,14 @@ def test_loss_is_the_error_to_the_class_and_the_overflow(task, device):
     torch.testing.assert_close(aimed.metric(x, s).mean(), error, rtol=1e-6, atol=0)
     # The goals are read when they are asked for.
     goal.copy_(torch.tensor([1, 1]))
-    assert aimed.loss(x, s, x[..., 0])[1]["error"] != error
+    assert aimed.loss(Particles(x, s, x[..., 0]))[1]["error"] != error
 
 
 def test_without_read_out_the_last_channels_are_the_classes(task, device):
     s = torch.zeros(1, 24, 6, device=device)
     s[..., 4] = 1.0
     goals = [torch.tensor([k], device=device) for k in range(3)]
-    errors = [task.toward(goal).metric(s, s).item() for goal in goals]
+    errors = [task.with_goal(goal).metric(s, s).item() for goal in goals]
     assert errors == pytest.approx([2 / 3, 0.0, 2 / 3])
     with pytest.raises(NPAError, match="goals must be given first"):
         task.metric(s, s)

@@ -138,9 +138,9 @@ def many(*targets, **fields):
         (lambda: load_pictures("digits", "half"), "split must be"),
         (lambda: many("heart", "hart"), "unknown|emoji"),
         (lambda: many(equivariant=True), "targets need a rule that knows directions"),
-        (lambda: many().toward(torch.tensor([-1, 0])), "goal .* below 2, got .-1, 0.: for"),
-        (lambda: many().toward(torch.tensor([2, 0])), "goal must .* below 2, got .2, 0.: for"),
-        (lambda: many().toward(torch.zeros(2)), r"an int64 tensor of shape .*float32 \(2,\)"),
+        (lambda: many().with_goal(torch.tensor([-1, 0])), "goal .* below 2, got .-1, 0.: for"),
+        (lambda: many().with_goal(torch.tensor([2, 0])), "goal must .* below 2, got .2, 0.: for"),
+        (lambda: many().with_goal(torch.zeros(2)), r"an int64 tensor of shape .*float32 \(2,\)"),
         (lambda: Texture(SMALL_TEXTURE, target=DOTS), "target must have 24 x 24 pixels"),
         (lambda: Morphogenesis3D(SMALL, target=VIEWS), "views must have 16 x 16 pixels"),
         (lambda: Morphogenesis3D(TINY), "at least 16 pixels for MS-SSIM"),
@@ -166,7 +166,7 @@ def test_damages_and_targets(call, message):
 def test_classes_that_do_not_exist(folder, goal, message):
     config = PointClassificationConfig(data=str(folder), class_count=3)
     with pytest.raises(NPAError, match=f"goal must .*{message}"):
-        PointClassification(config).toward(goal)
+        PointClassification(config).with_goal(goal)
     task = PointClassification(replace(config, class_count=2))
     with pytest.raises(NPAError, match="more than the highest class of the data, 2, got 2"):
         task.seed(1, generator=torch.Generator())

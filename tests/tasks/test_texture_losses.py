@@ -30,6 +30,7 @@ from npa_envs.tasks.losses.texture import (
 )
 from npa_envs.tasks.targets.textures import load_texture
 from npa_envs.tasks.texture import Texture, TextureConfig
+from npa_envs.world.particles import Particles
 
 JOINT = tuple(name for name, entry in TEXTURE_LOSSES.items() if entry.joint)
 SLICED = ("patch_swd", "filter_swd")
@@ -314,7 +315,7 @@ def test_grey_starts_and_empty_places_have_finite_slopes(name):
         x, s = seeded(task, 2)
         for positions in (x, torch.zeros_like(x)):
             leaves = positions.clone().requires_grad_(), s.clone().requires_grad_()
-            loss, _ = task.loss(*leaves, torch.zeros(x.shape[:2]))
+            loss, _ = task.loss(Particles(*leaves, torch.zeros(x.shape[:2])))
             slopes = torch.autograd.grad(loss, leaves)
             assert all(torch.isfinite(value).all() for value in (loss, *slopes))
             assert (float(slopes[1].abs().max()) > 0.0) == (not fields)
