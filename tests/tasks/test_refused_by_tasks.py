@@ -37,7 +37,7 @@ TINY = replace(SMALL, resolution=12, ssim_weight=0.2)
     [
         (TEXTURE, {"target": ""}, "target must be a built-in texture or a path"),
         (TEXTURE, {"loss": "swd"}, "loss must be a texture loss that exists"),
-        (TEXTURE, {"loss": "patch_ot+filter_op"}, "did you mean 'filter_ot'"),
+        (TEXTURE, {"loss": "patch_ot+joint_sdw"}, "did you mean 'joint_swd'"),
         (TEXTURE, {"loss": "patch_ot+patch_swd"}, "summed must be joint ones.*joint_swd"),
         (TEXTURE, {"loss": "patch_ot+"}, "must be a texture loss that exists"),
         (TEXTURE, {"loss": ["patch_ot"]}, r"loss that exists, got \['patch_ot'\]: known"),

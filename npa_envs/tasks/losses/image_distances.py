@@ -1,10 +1,8 @@
-"""Parts of losses that compare pictures: patches, features, optimal transport, MS-SSIM."""
+"""Distances between pictures: by patches at several sizes, by their transport, MS-SSIM."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -23,9 +21,6 @@ PLACES = 64
 
 ALIGNMENT = 64
 """Alignment of the matrices that are multiplied [bytes]."""
-
-TINY_SQUARE = 1e-12
-"""Added to the squared length of a feature vector before it is normalised."""
 
 
 @dataclass(frozen=True)
@@ -142,37 +137,6 @@ def quantiles(values: Tensor, count: int) -> Tensor:
     return ordered[:, low] * (1.0 - part) + ordered[:, (low + 1).clamp(max=total - 1)] * part
 
 
-def relaxed_transport(first: Tensor, second: Tensor) -> Tensor:
-    """Return the relaxed earth mover's distance of rows under the cosine distance, shape [B].
-
-    Every row moves to the nearest row of the other side. The larger of both directions' mean costs
-    is returned; each is a lower bound of the cost of transport.
-    """
-    costs = 1.0 - _directions(first) @ _directions(second).transpose(1, 2)
-    there, back = costs.amin(dim=2).mean(dim=1), costs.amin(dim=1).mean(dim=1)
-    return torch.maximum(there, back)
-
-
-def moment_distance(first: Tensor, second: Tensor) -> Tensor:
-    """Return the mean absolute differences of means and of covariances, added, shape [B]."""
-    (mean, covariance), (other_mean, other_covariance) = _moments(first), _moments(second)
-    difference = (mean - other_mean).abs().mean(dim=(1, 2))
-    return difference + (covariance - other_covariance).abs().mean(dim=(1, 2))
-
-
-def _directions(rows: Tensor) -> Tensor:
-    return rows * (rows.square().sum(dim=-1, keepdim=True) + TINY_SQUARE).rsqrt()
-
-
-def _moments(rows: Tensor) -> tuple[Tensor, Tensor]:
-    mean = rows.mean(dim=1, keepdim=True)
-    centred = rows - mean
-    return mean, centred.transpose(1, 2) @ centred / (rows.shape[1] - 1)
-
-
-# Losses that compare shapes, by patches matched with patches or features with features, of all
-# channels together.
-
 MATCHED_PATCH = 7
 """Side of a matched patch [pixels]; at the smallest of four sizes it spans 56 image pixels."""
 
@@ -236,76 +200,6 @@ def _matched(found: Tensor, expected: Tensor) -> Tensor:
     backward = ratio * (times * found.square() - 2.0 * found * sums)
     both = [world_mean(part.flatten(1)[..., None])[:, 0] for part in (forward, backward)]
     return torch.maximum(both[0], both[1] + rest)
-
-
-FILTER_SIZES = (3, 5, 7, 11, 15, 23, 37, 55)
-"""Sides of random filters for images of `REFERENCE` pixels [pixels]."""
-
-FILTERS = 32
-"""Random filters of each size."""
-
-REFERENCE = 128
-"""Side of the images that `FILTER_SIZES` refers to [pixels]."""
-
-
-class RandomFilters:
-    """Features of images: their channels and the rectified responses of random filters.
-
-    After Ustyuzhaninov, Brendel, Gatys and Bethge, arXiv 1606.00021.
-    """
-
-    def __init__(self, like: Tensor, options: LossOptions) -> None:
-        channels, side, _ = like.shape
-        generator = torch.Generator().manual_seed(options.seed)
-        banks = []
-        for size in FILTER_SIZES:
-            width = min(side, max(2, round(size * side / REFERENCE)))
-            drawn = torch.randn(FILTERS, channels, width, width, generator=generator)
-            drawn -= drawn.mean(dim=(2, 3), keepdim=True)
-            bank = torch.zeros(FILTERS, channels, side, side)
-            bank[..., :width, :width] = drawn / drawn.flatten(1).norm(dim=1)[:, None, None, None]
-            banks.append(bank)
-        self._largest = width
-        self.filter_waves = torch.fft.rfft2(torch.cat(banks).to(like)).conj()
-        """The filters' conjugate Fourier transforms."""
-
-    def __call__(self, images: Tensor, *, wrap: bool) -> list[Tensor]:
-        """Return the features at every second pixel or fewer, [B, M, F]; `wrap`: edges meet."""
-        waves = torch.fft.rfft2(images)
-        responses = torch.einsum("bkrc,fkrc->bfrc", waves, self.filter_waves.to(waves))
-        fields = torch.fft.irfft2(responses, s=images.shape[-2:]).relu()
-        inside = images.shape[-1] - (0 if wrap else self._largest - 1)
-        features = torch.cat((images, fields), dim=1)[..., :inside:2, :inside:2]
-        stride = -(-features.shape[-1] // MATCHED_PLACES)
-        return [features[..., ::stride, ::stride].flatten(2).transpose(1, 2)]
-
-
-class FeatureTransport(TextureDistance):
-    """Relaxed optimal transport of features and their moments, summed over layers.
-
-    For each layer it is the relaxed earth mover's distance under the cosine distance of features,
-    plus the mean absolute differences of their means and of their covariances (Kolkin, Salavon and
-    Shakhnarovich 2019).
-
-    Args:
-        features: Class of a network, which returns features of images, [B, M, F] for each layer.
-    """
-
-    def __init__(
-        self, features: Callable[[Tensor, LossOptions], Any], target: Tensor, options: LossOptions
-    ) -> None:
-        super().__init__(target)
-        self._features = features(target, options)
-        with torch.no_grad():
-            self._expected = self._features(target[None], wrap=options.tiles)
-
-    def compare(self, images: Tensor) -> Tensor:
-        """Return the distance of each of some checked images, [B]."""
-        total = images.new_zeros(len(images))
-        for found, target in zip(self._features(images, wrap=True), self._expected, strict=True):
-            expected = target.to(found)
-            total = total + relaxed_transport(found, expected) + moment_distance(found, expected)
-        return total
 
 
 # MS-SSIM: structural similarity at several sizes (Wang et al. 2003).
