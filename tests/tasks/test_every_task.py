@@ -47,6 +47,7 @@ def task_of(name, config, device="cpu"):
         *((name, {}) for name in NAMES),
         ("morphogenesis2d", {"equivariant": True, "seed_across": 0.2}),
         ("texture", {"loss": "patch_ot+joint_swd"}),
+        ("point_classification", {"rotation": 40.0, "stretch": 0.1, "jitter": 0.02}),
     ],
 )
 def test_a_world_is_seeded_and_measured_alone_as_in_a_batch(tiny, name, fields):

@@ -2,7 +2,6 @@
 
 import json
 
-import gymnasium
 import pytest
 import torch
 from training_runs import make_cycle
@@ -273,40 +272,3 @@ def test_the_paper_recipe_runs_on_files_of_mnists_format(folder, tmp_path):
     assert result.finished
     # Blank outputs would have 1/3.
     assert 0.05 < result.record["error"] < 0.6
-
-
-def classes(env):
-    """The class of each world: particles that almost say it have almost no loss."""
-    env = env.unwrapped
-    x, s = env.particles()
-    losses = []
-    for k in range(3):
-        said = torch.zeros_like(s)
-        said[..., 3 + k] = 0.9
-        env.place_particles(x, said)
-        *_, info = env.step(0.0 * env.action_space.sample())
-        losses.append(torch.as_tensor(info["loss"]))
-    least, *others = torch.stack(losses).sort(dim=0).values
-    assert least.max() < 0.01
-    assert min(other.min() for other in others) > 0.6
-    return torch.stack(losses).argmin(dim=0)
-
-
-def test_worlds_have_their_own_classes_and_keep_them(folder):
-    fields = {
-        "particle_count": 32,
-        "state_dim": 6,
-        "class_count": 3,
-        "data": str(folder),
-        "rule": "",
-    }
-    single = gymnasium.make("npa/PointClassification-v0", split="test", **fields)
-    many = {"num_envs": 5, "vectorization_mode": "vector_entry_point"}
-    batch = gymnasium.make_vec(single.spec.id, **many, **single.spec.kwargs)
-    single.reset(seed=3)
-    batch.reset(seed=3)
-    before = classes(batch)
-    assert len(set(before.tolist())) > 1
-    assert classes(single) == before[0]
-    batch.reset(options={"reset_mask": torch.tensor([True, False, False, True, False]).numpy()})
-    assert torch.equal(classes(batch)[[1, 2, 4]], before[[1, 2, 4]])
