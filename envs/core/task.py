@@ -327,7 +327,7 @@ class TargetEnvTask(EnvTask[Config]):
 
     def particle_losses(self, x: Tensor, s: Tensor) -> Tensor:
         """Return the training task's loss of each particle."""
-        losses: Tensor = self.task.particle_shares(x, s)
+        losses: Tensor = self.task.particle_contributions(x, s)
         return losses
 
 

@@ -412,7 +412,7 @@ def distances_moved(worlds: Particles) -> Tensor:
     return worlds.path_length
 
 
-def shares_of_loss(loss: Tensor, amounts: Tensor) -> Tensor:
+def contributions_to_loss(loss: Tensor, amounts: Tensor) -> Tensor:
     """Return each particle's contribution to its world's loss, times N; shape [B, N].
 
     It is the loss [B] plus N times the difference between the particle's amount and its world's
@@ -430,7 +430,7 @@ def untrained_rule(generator: torch.Generator, **hyper_parameters: Any) -> NPARu
         return NPARule(**hyper_parameters)
 
 
-def differing_fields(rule: NPARule, wanted: NPARule) -> list[str]:
+def differing_fields(rule: NPARule, task_rule: NPARule) -> list[str]:
     """Return the names of the hyper-parameters in which a rule differs from one of a task."""
-    own, expected = rule.hyper_parameters(), wanted.hyper_parameters()
-    return [name for name in expected if own[name] != expected[name]]
+    actual, expected = rule.hyper_parameters(), task_rule.hyper_parameters()
+    return [name for name in expected if actual[name] != expected[name]]

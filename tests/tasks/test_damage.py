@@ -12,9 +12,9 @@ from npa_envs.errors import NPAError
 from npa_envs.render.world_film import film_world
 from npa_envs.tasks import damage
 from npa_envs.tasks.damage import (
+    CHANCE,
     FARTHEST,
     NEAREST,
-    SHARE,
     PoolDamage,
     damage_pool,
     damage_worlds,
@@ -81,7 +81,7 @@ def test_a_ball_of_states_is_wiped_in_every_world(space_dim):
 @pytest.mark.parametrize(
     ("fields", "fraction"),
     [
-        *(({name: 0.5}, SHARE) for name in ("clump_radius", "cut_gap", "flake_radius")),
+        *(({name: 0.5}, CHANCE) for name in ("clump_radius", "cut_gap", "flake_radius")),
         ({"cut_gap": 0.5, "cut_share": 0.7}, 0.7),
     ],
 )

@@ -123,7 +123,7 @@ def slope_of(task, x, s, k):
 def test_shares_average_to_the_loss_and_show_what_a_particle_changes(tiny, name, fields):
     task = task_of(name, tiny(name, **fields))
     x, s = worlds_of(task, 2, torch.float64)
-    shares = task.particle_shares(x, s)
+    shares = task.particle_contributions(x, s)
     torch.testing.assert_close(shares.mean(1), task.metric(x, s), rtol=1e-9, atol=0.0)
     slopes = [slope_of(task, x[:1], s[:1], k) for k in (3, 40, 41)]
     for contribution, expected in zip(shares[0, [3, 41]], (slopes[0], slopes[2]), strict=True):

@@ -13,10 +13,10 @@ from npa_envs.ops import world_mean
 LEVELS = 4
 """Largest number of image sizes, each half of the one before."""
 
-SMALLEST = 12
+MIN_SIDE = 12
 """Least side of the smallest image size [pixels]."""
 
-PLACES = 64
+POSITIONS = 64
 """Largest number of positions along each side that are compared; larger images are subsampled."""
 
 ALIGNMENT = 64
@@ -44,9 +44,9 @@ class TextureDistance:
     """Whether `compare` returns the same for an image, bit for bit, in every batch."""
 
     def __init__(self, target: Tensor) -> None:
-        if target.shape[-1] < SMALLEST:
+        if target.shape[-1] < MIN_SIDE:
             raise NPAError(
-                f"resolution must be at least {SMALLEST} pixels, got {target.shape[-1]}: for "
+                f"resolution must be at least {MIN_SIDE} pixels, got {target.shape[-1]}: for "
                 "example 64"
             )
         self._shape = tuple(target.shape)
@@ -74,7 +74,7 @@ class TextureDistance:
 def level_count(resolution: int) -> int:
     """Return the number of image sizes to compare at a resolution."""
     count = 1
-    while count < LEVELS and resolution % 2 == 0 and resolution // 2 >= SMALLEST:
+    while count < LEVELS and resolution % 2 == 0 and resolution // 2 >= MIN_SIDE:
         resolution //= 2
         count += 1
     return count
@@ -93,7 +93,7 @@ def pyramid(images: Tensor, count: int) -> list[Tensor]:
 
 def stride_of(level: Tensor, thinned: bool) -> int:
     """Return the stride in pixels between compared positions; 1 unless `thinned`."""
-    return max(1, level.shape[-1] // PLACES) if thinned else 1
+    return max(1, level.shape[-1] // POSITIONS) if thinned else 1
 
 
 def patches(images: Tensor, size: int, *, stride: int, wrap: bool) -> Tensor:
@@ -140,10 +140,10 @@ def quantiles(values: Tensor, count: int) -> Tensor:
 MATCHED_PATCH = 7
 """Side of a matched patch [pixels]; at the smallest of four sizes it spans 56 image pixels."""
 
-MATCHED_PLACES = 32
+WORLD_POSITIONS = 32
 """Largest number of patches of a world along each side, for each size."""
 
-TARGET_PLACES = 64
+TARGET_POSITIONS = 64
 """Largest number of patches of the target along each side, for each size."""
 
 EVEN = 0.01
@@ -165,7 +165,7 @@ class PatchTransport(TextureDistance):
         self._expected = []
         self._scales = []
         for level in pyramid(target[None], level_count(target.shape[-1])):
-            stride = -(-level.shape[-1] // TARGET_PLACES)
+            stride = -(-level.shape[-1] // TARGET_POSITIONS)
             rows = patches(level, MATCHED_PATCH, stride=stride, wrap=options.tiles)[0].contiguous()
             spread = (rows.double() - rows.double().mean(0)).square().mean()
             self._expected.append(rows)
@@ -176,28 +176,28 @@ class PatchTransport(TextureDistance):
         total = images.new_zeros(len(images))
         levels = pyramid(images, len(self._expected))
         for level, expected, scale in zip(levels, self._expected, self._scales, strict=True):
-            stride = -(-level.shape[-1] // MATCHED_PLACES)
-            found = patches(level, MATCHED_PATCH, stride=stride, wrap=True)
-            total = total + scale.to(total) * _matched(found, expected.to(found))
+            stride = -(-level.shape[-1] // WORLD_POSITIONS)
+            rows = patches(level, MATCHED_PATCH, stride=stride, wrap=True)
+            total = total + scale.to(total) * _matched(rows, expected.to(rows))
         return total / len(self._expected)
 
 
-def _matched(found: Tensor, expected: Tensor) -> Tensor:
+def _matched(rows: Tensor, expected: Tensor) -> Tensor:
     """Return the larger mean squared distance to nearest patches, of both directions; shape [B]."""
     with torch.no_grad():
-        squares = found.square().sum(2)[:, :, None] + expected.square().sum(1)
-        costs = squares - 2.0 * (found @ expected.T)
+        squares = rows.square().sum(2)[:, :, None] + expected.square().sum(1)
+        costs = squares - 2.0 * (rows @ expected.T)
         there, back = costs.argmin(2), costs.argmin(1)
         # The target patches to which each patch of a world is nearest: their number and sum.
-        chosen = (back[:, None] == torch.arange(found.shape[1], device=found.device)[:, None]).to(
-            found
+        chosen = (back[:, None] == torch.arange(rows.shape[1], device=rows.device)[:, None]).to(
+            rows
         )
         times, sums = chosen.sum(2, keepdim=True), chosen @ expected
         rest = expected.square().mean()
-    forward = (found - expected[there]).square()
+    forward = (rows - expected[there]).square()
     # Σ (p − t)² over the target's patches, gathered by the world's: its gradient has a fixed order.
-    ratio = found.shape[1] / expected.shape[0]
-    backward = ratio * (times * found.square() - 2.0 * found * sums)
+    ratio = rows.shape[1] / expected.shape[0]
+    backward = ratio * (times * rows.square() - 2.0 * rows * sums)
     both = [world_mean(part.flatten(1)[..., None])[:, 0] for part in (forward, backward)]
     return torch.maximum(both[0], both[1] + rest)
 
@@ -241,29 +241,30 @@ class MultiScaleSimilarity:
         self._windows = [_window(size).float().to(device) for size in sizes]
         self._halvings = [_halving(size).to(device) for size in sizes[:-1]]
 
-    def __call__(self, found: Tensor, wanted: Tensor) -> Tensor:
+    def __call__(self, pictures: Tensor, target: Tensor) -> Tensor:
         """Return the similarity of pictures [..., R, R] of one channel, at most 1, shape [...]."""
-        total = found.new_zeros(found.shape[:-2])
+        total = pictures.new_zeros(pictures.shape[:-2])
         last = len(WEIGHTS) - 1
         for size, (weight, window) in enumerate(zip(WEIGHTS, self._windows, strict=True)):
-            whole, contrast = _similarity(found, wanted, window.to(found))
+            whole, contrast = _similarity(pictures, target, window.to(pictures))
             factor = whole if size == last else contrast
             total = total + weight * factor.clamp_min(FLOOR).log()
             if size < last:
-                halving = self._halvings[size].to(found)
-                found, wanted = _from_both_sides(found, halving), _from_both_sides(wanted, halving)
+                halving = self._halvings[size].to(pictures)
+                pictures = _from_both_sides(pictures, halving)
+                target = _from_both_sides(target, halving)
         return total.exp()
 
 
-def _similarity(found: Tensor, wanted: Tensor, window: Tensor) -> tuple[Tensor, Tensor]:
+def _similarity(pictures: Tensor, target: Tensor, window: Tensor) -> tuple[Tensor, Tensor]:
     """Return the SSIM of pictures at one size, and its factor of contrast and structure."""
     mean, square, product = _from_both_sides(
-        torch.stack((found, found.square(), found * wanted)), window
+        torch.stack((pictures, pictures.square(), pictures * target)), window
     )
-    wanted_mean, wanted_square = _from_both_sides(torch.stack((wanted, wanted.square())), window)
+    target_mean, target_square = _from_both_sides(torch.stack((target, target.square())), window)
     of_means, of_deviations = STABILISERS
-    mixed, squares = mean * wanted_mean, mean.square() + wanted_mean.square()
-    spread = square + wanted_square - squares
+    mixed, squares = mean * target_mean, mean.square() + target_mean.square()
+    spread = square + target_square - squares
     contrast = (2.0 * (product - mixed) + of_deviations) / (spread + of_deviations)
     light = (2.0 * mixed + of_means) / (squares + of_means)
     return (light * contrast).mean(dim=(-2, -1)), contrast.mean(dim=(-2, -1))

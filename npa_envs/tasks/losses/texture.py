@@ -59,12 +59,12 @@ class LossEntry:
 
 def check_loss_name(name: str) -> None:
     """Check that a name, or every name joined by "+", is of a texture loss."""
-    parts = name.split("+") if isinstance(name, str) else []
-    for part in parts or [name]:
-        if not isinstance(part, str) or part not in TEXTURE_LOSSES:
-            hint = suggest(part, TEXTURE_LOSSES)
+    names = name.split("+") if isinstance(name, str) else [name]
+    for one in names:
+        if not isinstance(one, str) or one not in TEXTURE_LOSSES:
+            hint = suggest(one, TEXTURE_LOSSES)
             raise NPAError(f"loss must be a texture loss that exists, got {shown(name)}: {hint}")
-    if len(parts) > 1 and not all(TEXTURE_LOSSES[part].joint for part in parts):
+    if len(names) > 1 and not all(TEXTURE_LOSSES[one].joint for one in names):
         joint = ", ".join(key for key, entry in TEXTURE_LOSSES.items() if entry.joint)
         raise NPAError(f"losses that are summed must be joint ones, got {shown(name)}: {joint}")
 
@@ -92,7 +92,7 @@ def make_texture_loss(
             f"target must be a floating tensor of shape [K, R, R], got {target.dtype} "
             f"{tuple(target.shape)}: channels come first"
         )
-    losses = [TEXTURE_LOSSES[part].make(target.detach(), options) for part in name.split("+")]
+    losses = [TEXTURE_LOSSES[one].make(target.detach(), options) for one in name.split("+")]
     return losses[0] if len(losses) == 1 else partial(_summed, losses)
 
 
@@ -125,7 +125,7 @@ class SlicedWasserstein(TextureDistance):
     Args:
         describe: Class of a descriptor, which returns the features at each position of images,
             [B, M, F] for each size. With `wrap` opposite edges meet, else positions near them are
-            left out; `thinned`: at most `PLACES` along each side.
+            left out; `thinned`: at most `POSITIONS` along each side.
     """
 
     same_in_every_batch = True
@@ -141,8 +141,8 @@ class SlicedWasserstein(TextureDistance):
             thinned = self.descriptor(target[None], wrap=True, thinned=True)
             described = self.descriptor(target[None].double(), wrap=options.tiles, thinned=False)
             self._quantiles = [
-                quantiles(features[0].T, found.shape[1]).to(target)
-                for features, found in zip(described, thinned, strict=True)
+                quantiles(features[0].T, compared.shape[1]).to(target)
+                for features, compared in zip(described, thinned, strict=True)
             ]
             self._scales = [1.0 / (each[0].var(0).mean() + FLOOR) for each in described]
 
@@ -223,10 +223,10 @@ class FilterDescriptor:
 # torchvision: the layers are few. Average pooling replaces maximum pooling, and worlds are padded
 # periodically.
 
-VGG_PLACES = 1024
+VGG_POSITIONS = 1024
 """Largest number of positions of a layer that are compared."""
 
-VGG_SMALLEST = 32
+VGG_MIN_SIDE = 32
 """Least side of images with more than one position in the deepest layer [pixels]."""
 
 WEIGHTS_FILE = "vgg16-397923af.pth"
@@ -261,15 +261,15 @@ class VGGTransport(TextureDistance):
         channels, side, _ = target.shape
         if channels not in (1, 3):
             raise NPAError(f"vgg_ot compares images of 1 or 3 channels, got {channels}")
-        if side < VGG_SMALLEST:
+        if side < VGG_MIN_SIDE:
             raise NPAError(
-                f"resolution must be at least {VGG_SMALLEST} pixels for vgg_ot, got {side}: "
+                f"resolution must be at least {VGG_MIN_SIDE} pixels for vgg_ot, got {side}: "
                 "for example 128"
             )
         file = load_vgg_weights(options.vgg_weights)
         generator = torch.Generator().manual_seed(options.seed)
         self._groups: list[list[tuple[Tensor, Tensor]]] = []
-        self._places: list[Tensor | None] = []
+        self._positions: list[Tensor | None] = []
         channels = 3
         for numbers, width in VGG_LAYERS.items():
             group = []
@@ -279,11 +279,11 @@ class VGGTransport(TextureDistance):
                 group.append((weight.to(target), bias.to(target)))
                 channels = width
             self._groups.append(group)
-            places = None
-            if side * side > VGG_PLACES:
-                drawn = torch.randperm(side * side, generator=generator)[:VGG_PLACES]
-                places = drawn.sort().values.to(target.device)
-            self._places.append(places)
+            positions = None
+            if side * side > VGG_POSITIONS:
+                drawn = torch.randperm(side * side, generator=generator)[:VGG_POSITIONS]
+                positions = drawn.sort().values.to(target.device)
+            self._positions.append(positions)
             side //= 2
         self._mean = target.new_tensor(VGG_MEAN)[:, None, None]
         self._deviation = target.new_tensor(VGG_DEVIATION)[:, None, None]
@@ -296,14 +296,14 @@ class VGGTransport(TextureDistance):
         # In the weights' precision.
         field = (images.to(self._mean) - self._mean) / self._deviation
         features: list[Tensor] = []
-        for group, places in zip(self._groups, self._places, strict=True):
+        for group, positions in zip(self._groups, self._positions, strict=True):
             if features:
                 field = F.avg_pool2d(field, 2)
             for number, (weight, bias) in enumerate(group):
                 field = F.conv2d(F.pad(field, (1, 1, 1, 1), mode=mode), weight, bias).relu()
                 if number == 0:
                     rows = field.flatten(2)
-                    rows = rows if places is None else rows.index_select(2, places)
+                    rows = rows if positions is None else rows.index_select(2, positions)
                     features.append(rows.transpose(1, 2))
         return features
 
@@ -376,9 +376,9 @@ def load_vgg_weights(path: str | Path = "") -> dict[str, Any]:
 def _checked(weights: Mapping[str, Any], name: str, shape: tuple[int, ...]) -> Tensor:
     tensor = weights.get(name)
     if not isinstance(tensor, Tensor) or tuple(tensor.shape) != shape:
-        found = tuple(tensor.shape) if isinstance(tensor, Tensor) else "nothing"
+        got = tuple(tensor.shape) if isinstance(tensor, Tensor) else "nothing"
         raise NPAError(
-            f"VGG16's weights must hold {name} of shape {shape}, got {found}: "
+            f"VGG16's weights must hold {name} of shape {shape}, got {got}: "
             f"give torchvision's file, {WEIGHTS_URL}"
         )
     return tensor.detach()

@@ -89,13 +89,13 @@ def ellipsoid(
     return Mesh(ball.vertices * np.asarray(radii) + np.asarray(centre), ball.faces, ball.colours)
 
 
-def joined(parts: Sequence[Mesh]) -> Mesh:
+def joined(meshes: Sequence[Mesh]) -> Mesh:
     """Return several meshes as one."""
-    starts = np.cumsum([0] + [len(part.vertices) for part in parts[:-1]])
+    starts = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes[:-1]])
     return Mesh(
-        np.concatenate([part.vertices for part in parts]),
-        np.concatenate([part.faces + k for part, k in zip(parts, starts, strict=True)]),
-        np.concatenate([part.colours for part in parts]),
+        np.concatenate([mesh.vertices for mesh in meshes]),
+        np.concatenate([mesh.faces + k for mesh, k in zip(meshes, starts, strict=True)]),
+        np.concatenate([mesh.colours for mesh in meshes]),
     )
 
 
@@ -149,26 +149,28 @@ def make_rocket() -> Mesh:
     height = np.linspace(-0.6, 1.0, 60)
     body = [(0.0, -0.78), (0.22, -0.78), (0.17, -0.62)]
     body += [(0.30 * float(np.sqrt(max(0.0, 1.0 - ((h + 0.1) / 1.1) ** 2))), h) for h in height]
-    parts = [turned(body, paint), ellipsoid((0.0, 0.28, 0.25), (0.13, 0.13, 0.08), (0.2, 0.5, 0.9))]
+    window = ellipsoid((0.0, 0.28, 0.25), (0.13, 0.13, 0.08), (0.2, 0.5, 0.9))
+    meshes = [turned(body, paint), window]
     outline = np.array([(0.20, -0.15), (0.58, -0.62), (0.58, -0.92), (0.20, -0.62)])
     for turn in np.arange(3) * 2.0 * np.pi / 3.0 + np.pi:
-        parts.append(_fin(outline, float(turn), 0.05, np.array([0.95, 0.55, 0.12])))
-    return joined(parts)
+        meshes.append(_fin(outline, float(turn), 0.05, np.array([0.95, 0.55, 0.12])))
+    return joined(meshes)
 
 
 def make_duck() -> Mesh:
     """Return a bath duck: yellow, with an orange bill and dark eyes."""
     yellow, bill, eye = (0.98, 0.82, 0.14), (0.95, 0.45, 0.08), (0.08, 0.08, 0.12)
-    parts = [
+    meshes = [
         ellipsoid((0.0, -0.30, 0.0), (0.52, 0.40, 0.70), yellow),
         ellipsoid((0.0, 0.35, 0.35), (0.36, 0.36, 0.36), yellow),
         ellipsoid((0.0, -0.05, -0.66), (0.22, 0.16, 0.26), yellow),
         ellipsoid((0.0, 0.28, 0.74), (0.20, 0.07, 0.20), bill),
     ]
     for side in (-1.0, 1.0):
-        parts.append(ellipsoid((0.19 * side, 0.48, 0.62), (0.07, 0.07, 0.07), eye))
-        parts.append(ellipsoid((0.50 * side, -0.22, -0.08), (0.12, 0.24, 0.40), (0.90, 0.66, 0.08)))
-    return joined(parts)
+        meshes.append(ellipsoid((0.19 * side, 0.48, 0.62), (0.07, 0.07, 0.07), eye))
+        wing = (0.50 * side, -0.22, -0.08), (0.12, 0.24, 0.40), (0.90, 0.66, 0.08)
+        meshes.append(ellipsoid(*wing))
+    return joined(meshes)
 
 
 def make_doughnut() -> Mesh:
@@ -309,7 +311,7 @@ AMBIENT = 0.6
 SAMPLES = 2
 """Samples along each side of a pixel."""
 
-TOGETHER = 2**22
+BATCH_LIMIT = 2**22
 """Largest number of samples, of vertices, and of triangles' vertices of views that are drawn in one
 batch; a single view may have more."""
 
@@ -332,10 +334,10 @@ def draw_mesh(mesh: Mesh, cameras: Cameras) -> NDArray[np.float32]:
     motions = cameras.world_to_camera.double().cpu()
     lenses = SAMPLES * cameras.intrinsics.double().cpu().expand(len(motions), 4)[:, None]
     height, width = SAMPLES * cameras.height, SAMPLES * cameras.width
-    together = max(1, TOGETHER // max(height * width, len(vertices), 3 * len(faces)))
+    batch_size = max(1, BATCH_LIMIT // max(height * width, len(vertices), 3 * len(faces)))
     pictures = []
-    parts = (torch.split(each, together) for each in (motions, lenses))
-    for motion, lens in zip(*parts, strict=True):
+    batches = (torch.split(each, batch_size) for each in (motions, lenses))
+    for motion, lens in zip(*batches, strict=True):
         local = vertices @ motion[:, :3, :3].mT + motion[:, None, :3, 3]
         depth = local[..., 2].clamp(min=cameras.near)
         fine = nearest_triangles(
