@@ -241,8 +241,8 @@ def bubbles(u: Array, v: Array, random: np.random.Generator) -> Array:
     """Rings of several sizes with a glint, nothing around them."""
     centres = _scattered(random, 12, 0.23)
     gaps = [
-        min(math.hypot(*_away(*centre, other)) for other in centres if other is not centre)
-        for centre in centres
+        min(math.hypot(*_away(one[0], one[1], other)) for other in centres if other is not one)
+        for one in centres
     ]
     tints = _colours("#48cae4", "#0096c7", "#5e60ce", "#80ffdb")
     colour = np.zeros((*u.shape, 3))
@@ -383,7 +383,7 @@ def _scattered(random: np.random.Generator, count: int, gap: float) -> list[Arra
     centres: list[Array] = []
     while len(centres) < count:
         centre = random.random(2)
-        if all(math.hypot(*_away(*centre, other)) >= gap for other in centres):
+        if all(math.hypot(*_away(centre[0], centre[1], other)) >= gap for other in centres):
             centres.append(centre)
         # Lowered at each try, so that the loop ends.
         gap *= 0.999
