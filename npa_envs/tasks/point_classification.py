@@ -160,15 +160,11 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         """Return the task whose losses and pictures use the rule's read-out."""
         return self._with(_rule=rule)
 
-    def on(self, split: Split) -> Self:
-        """Return the task with the clouds of "train" or "test"."""
-        task = self._with(split=split)
-        vars(task).pop("clouds", None)
-        return task
-
     def held_out(self) -> Self:
         """Return the task with the clouds of "test"."""
-        return self.on("test")
+        task = self._with(split="test")
+        vars(task).pop("clouds", None)
+        return task
 
     def seed(
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"

@@ -11,7 +11,6 @@ from training_runs import make_cycle
 import npa_envs
 from npa_envs.cli import main
 from npa_envs.errors import NPAError
-from npa_envs.measure.quality import picture_rows
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.picture_codes import Codes
 from npa_envs.tasks.many_pictures import ManyPictures, named_targets
@@ -163,22 +162,10 @@ def test_the_command_trains_and_evaluates_by_name(tmp_path, capsys):
     assert main(["evaluate", out, *options, "--json", f"{out}/all.json"]) == 0
     rows = json.loads((tmp_path / "many" / "all.json").read_text(encoding="utf-8"))["pictures"]
     assert [row["target"] for row in rows] == [*TARGETS, "(median)"]
+    assert rows[3]["loss"] == sorted(row["loss"] for row in rows[:3])[1]
+    assert one["growth"][0]["loss"] == pytest.approx(rows[2]["loss"], rel=0.1)
     assert "3 pictures, 1 worlds each" in capsys.readouterr().out
     assert main(["evaluate", out, "--healing", *options]) == 2
     assert "measured of one picture at a time" in capsys.readouterr().err
     assert main(["evaluate", out, "--target=gecko", *options]) == 2
     assert "unknown code 'gecko'" in capsys.readouterr().err
-
-
-def test_rows_tell_the_right_code_from_another():
-    rule = task_of().make_rule(generator())
-    tasks = [Morphogenesis2D(config_of(target=t, targets=())).for_rule(rule) for t in TARGETS]
-    rows = picture_rows(rule, tasks, checkpoints=(1, 2), seeds=(1, 2))
-    names = [*TARGETS, "(median)"]
-    assert [(row.step, row.target) for row in rows] == [(k, name) for k in (1, 2) for name in names]
-    assert rows[3].loss == sorted(row.loss for row in rows[:3])[1]
-    # A rule that has learned nothing does not care: all worlds stay disks.
-    x, s, *_ = tasks[0].seed(2, generator=npa_envs.WorldRandom((1, 2)))
-    assert rows[0].loss == pytest.approx(float(tasks[0].metric(x, s).mean()), rel=0.2)
-    with pytest.raises(NPAError, match="two or more"):
-        picture_rows(rule, tasks[:1], seeds=(1,))

@@ -70,12 +70,11 @@ def test_worlds_are_clouds_of_their_class_with_blank_states(task, device):
 
 def test_test_clouds_are_others_and_never_varied(folder):
     task = task_of(folder, rotation=90.0, jitter=0.1)
-    for split, count in (("train", 36), ("test", 18)):
-        on_split = task.on(split)
-        assert len(on_split.clouds.label) == count
-        x, *_ = on_split.seed(5, generator=random())
-        is_cloud = [bool((on_split.clouds.x == cloud).flatten(1).all(1).any()) for cloud in x]
-        assert is_cloud == [split == "test"] * 5
+    for part, count in ((task, 36), (task.held_out(), 18)):
+        assert len(part.clouds.label) == count
+        x, *_ = part.seed(5, generator=random())
+        is_cloud = [bool((part.clouds.x == cloud).flatten(1).all(1).any()) for cloud in x]
+        assert is_cloud == [part is not task] * 5
 
 
 def test_loss_is_the_error_to_the_class_and_the_overflow(task, device):
@@ -170,7 +169,7 @@ def test_mutated_worlds_keep_their_states(folder):
 
 
 def test_accuracies_are_those_of_a_rollout(folder, device):
-    task = task_of(folder, device, readout_hidden_dim=5, update_prob=1.0).on("test")
+    task = task_of(folder, device, readout_hidden_dim=5, update_prob=1.0).held_out()
     rule = task.make_rule(random(3))
     with torch.no_grad():
         for parameter in rule.parameters():
@@ -223,7 +222,7 @@ def trained(folder, tmp_path_factory):
 def test_particles_learn_to_say_what_they_form(trained):
     rule = load_rule(trained.folder / "rule.safetensors")
     config = json.loads((trained.folder / "config.json").read_text(encoding="utf-8"))
-    task = PointClassification(PointClassificationConfig(**config["task"])).on("test")
+    task = PointClassification(PointClassificationConfig(**config["task"])).held_out()
     (row,) = accuracies(rule, task, checkpoints=(16,))
     assert row.majority >= 0.9
     assert row.particle >= 0.85
@@ -260,15 +259,3 @@ def test_a_static_rule_of_no_known_task_is_refused(task, tmp_path, capsys):
     assert main(["evaluate", str(path), "--no-progress"]) != 0
     message = "runs moving rules in the 2D worlds of morphogenesis2d, got space_dim=2, static=True"
     assert message in capsys.readouterr().err
-
-
-def test_the_paper_recipe_runs_on_files_of_mnists_format(folder, tmp_path):
-    fields = {"iterations": 2, "pool_size": 64, "log_interval": 1, "tensorboard": False}
-    fields |= {"data": str(folder), "class_count": 3, "out": tmp_path}
-    config = preset("paper", "point_classification", **fields)
-    assert (config.world_count, config.steps, config.fresh_count) == (64, (12, 24), 32)
-    assert config.task.particle_count == 512
-    result = train(config, "point_classification", progress=False)
-    assert result.finished
-    # Blank outputs would have 1/3.
-    assert 0.05 < result.record["error"] < 0.6

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from npa_envs.errors import NPAError
+from npa_envs.measure.quality import picture_rows
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.damage import clump, cut, random_particle, wipe_state
 from npa_envs.tasks.losses.texture import TEXTURE_LOSSES, make_texture_loss
@@ -137,6 +138,7 @@ def many(*targets, **fields):
         (lambda: load_pictures("digit"), "did you mean 'digits'"),
         (lambda: load_pictures("digits", "half"), "split must be"),
         (lambda: many("heart", "hart"), "unknown|emoji"),
+        (lambda: picture_rows(NINE, [None], seeds=(1,)), "pictures must be two or more, got 1"),
         (lambda: many(equivariant=True), "targets need a rule that knows directions"),
         (lambda: Texture(SMALL_TEXTURE, target=DOTS), "target must have 24 x 24 pixels"),
         (lambda: Morphogenesis3D(SMALL, target=VIEWS), "views must have 16 x 16 pixels"),
