@@ -321,7 +321,7 @@ def switched_rows(
     """
     (before,) = grown(rule, tasks, checkpoints=(STEP,), seeds=SEEDS, device=device)
     x, s = (torch.roll(part, -1, dims=0) for part in before[:2])
-    coded = torch.stack([task.coded(own) for task, own in zip(tasks, s, strict=True)])
+    coded = torch.stack([task.with_target_code(own) for task, own in zip(tasks, s, strict=True)])
     x, s = npa_envs.rollout(
         rule,
         x.flatten(0, 1),

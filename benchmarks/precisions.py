@@ -124,7 +124,7 @@ def metric(name: str, precision: Precision, device: torch.device) -> float:
     trained = task_of_rule(name, rule, device)
     generator = torch.Generator(device).manual_seed(0)
     x, s, _, goal = trained.task.seed(1, generator=generator, device=device)
-    task = trained.task.toward(goal)
+    task = trained.task.with_goal(goal)
     x, s, own = x.float(), precision.kept(s.float()), precision.rule(rule)
     x, s = x.to(precision.dtype), s.to(precision.dtype)
     steps = HORIZONS.get(trained.task_name or "", 512)

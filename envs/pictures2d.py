@@ -93,7 +93,7 @@ class PicturesTask(PictureEnvTask[Pictures2DEnvConfig]):
         self.names = self.task.names
         """Names of the pictures of the split, by their indices."""
         everyone = torch.arange(len(self.names), device=device)
-        pictures = self.task.toward(everyone).target_picture.permute(0, 3, 1, 2)
+        pictures = self.task.with_goal(everyone).target_picture.permute(0, 3, 1, 2)
         small = F.avg_pool2d(pictures, config.resolution // config.picture_size)
         limit = config.observation_limit
         if config.observe_target:

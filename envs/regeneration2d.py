@@ -111,7 +111,9 @@ class RegenerationTask(GrownTask[Regeneration2DEnvConfig]):
         damaged = Particles(x, s)
         for k, kind in enumerate(kinds):
             size = SIZES[kind] if self.config.damage_size is None else self.config.damage_size
-            new_x, new_s = damage_worlds(x, s, kind=kind, size=size, generator=random)
+            new_x, new_s = damage_worlds(
+                x, s, kind=kind, size=size, box=self.periodic_sides, generator=random
+            )
             # Each kind changes either positions or states.
             if new_x is not x:
                 damaged = damaged._replace(x=torch.where(chosen == k, new_x, damaged.x))

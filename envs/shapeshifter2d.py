@@ -170,7 +170,7 @@ class ShapeshifterTask(RuleDriven, PictureEnvTask[Shapeshifter2DEnvConfig]):
         x = torch.full((len(goals), 1, 2), 1e3, device=self.device)
         s = x.new_zeros(len(goals), 1, self.config.state_dim)
         # Without particles in the picture colours do not count, and nothing is centred.
-        goal_task = self.task.toward(goals)
+        goal_task = self.task.with_goal(goals)
         difference = goal_task.picture(x, s, centred=False) - goal_task.target_picture
         error = difference[..., 3].square() + difference[..., 3].abs()
         return error.flatten(1).mean(dim=1)
@@ -223,7 +223,7 @@ class ShapeshifterTask(RuleDriven, PictureEnvTask[Shapeshifter2DEnvConfig]):
 
     def observe(self, particles: Particles, loss: Tensor, context: PictureGoals) -> Tensor:
         """Return coarse pictures of worlds and of their goals, shape [B, 8 G²]."""
-        goal_task = self.task.toward(context.goal)
+        goal_task = self.task.with_goal(context.goal)
         picture = goal_task.picture(particles.x, particles.s)
         both = torch.cat((picture, goal_task.target_picture), dim=-1)
         pixels = self.config.resolution // self.config.picture_size

@@ -68,7 +68,12 @@ class _DamagesWorlds(WrapperBase):
                 chosen = world_indices(mask, x.device)
                 stream = worlds.random.take(chosen).substream(StreamId.DAMAGE).substream(k)
                 x[chosen], s[chosen] = damage_worlds(
-                    x[chosen], s[chosen], kind=event.kind, size=event.size, generator=stream
+                    x[chosen],
+                    s[chosen],
+                    kind=event.kind,
+                    size=event.size,
+                    box=worlds.physics.box,
+                    generator=stream,
                 )
         return x, s
 

@@ -178,9 +178,9 @@ class EnvironmentTask(ParticleTask[Any]):
         x, s, *rest = self.inner.start(WorldRandom.from_keys(keys))
         return Particles(x, s, goal=rest[1] if rest else None)
 
-    def toward(self, goal: Tensor | None) -> Self:
+    def with_goal(self, goal: Tensor | None) -> Self:
         """Return a copy of the task whose losses are for these goals, shape [B]."""
-        return self if goal is None else self._with(inner=self.inner.toward(goal))
+        return self if goal is None else self._with(inner=self.inner.with_goal(goal))
 
     def compare(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the loss, averaged over worlds and species, and its terms by name."""
@@ -193,7 +193,7 @@ class EnvironmentTask(ParticleTask[Any]):
 
     def world_losses(self, worlds: Particles) -> Tensor:
         """Return the loss of each world, averaged over its species, shape [B]."""
-        losses = self.toward(worlds.goal)._losses(worlds)
+        losses = self.with_goal(worlds.goal)._losses(worlds)
         total = torch.stack(list(losses.values())).sum(dim=0)
         return total.flatten(1).mean(dim=1) if total.dim() > 1 else total
 

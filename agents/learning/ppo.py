@@ -194,7 +194,7 @@ class PPOLearner:
         self._play_graphs.run(self._find_values)
         for step, observation in last_observations.items():
             memory.next_values[step].copy_(self.critic(observation))
-        self._play_graphs.run(self._find_advantages, recorded=not self.ranks.together)
+        self._play_graphs.run(self._find_advantages, recorded=not self.ranks.distributed)
         return memory.round
 
     @torch.no_grad()

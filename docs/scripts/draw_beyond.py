@@ -183,7 +183,7 @@ def pictures(paths: list[str]) -> Shots:
     blank = tasks[0].seed(1, generator=torch.Generator().manual_seed(SEEDS[0]))[:2]
     shots = [(f"{task.target.name}, target", enlarged(task.target_picture)) for task in tasks]
     for task in tasks:
-        x, s = run(rule, task, blank[0], task.coded(blank[1]), GROWN, seed=SEEDS[0])
+        x, s = run(rule, task, blank[0], task.with_target_code(blank[1]), GROWN, seed=SEEDS[0])
         shots.append((f"grown, step {GROWN}", as_it_lies(task, x, s)))
     first, task = names[0], tasks[0]
     x, s = run(rule, task, *blank, GROWN, seed=SEEDS[0])

@@ -179,7 +179,7 @@ class RewardedWorlds(WorldState):
             self.particle_rewards = ParticleRewards(self.particles, by_loss=by_loss)
         self.goal = zeros(torch.int64)
         """Index of each world's goal, shape [B]; zeros where the task has one goal."""
-        self.goal_task: EnvTask[Any] = self.task.toward(self.goal)
+        self.goal_task: EnvTask[Any] = self.task.with_goal(self.goal)
         """The task with losses for the worlds' goals."""
         self._start_loss = zeros()
         self._success_loss = zeros()
@@ -241,7 +241,7 @@ class RewardedWorlds(WorldState):
         if self.goal_task is not task:
             goal = self.goal[worlds] if goal is None else goal
             self.goal.index_copy_(0, worlds, goal)
-            task = task.toward(goal)
+            task = task.with_goal(goal)
         terms = task.losses(placed.x, placed.s)
         values = torch.stack(checked_losses(task, terms, len(placed.x), self.term_names))
         if not self.term_names:

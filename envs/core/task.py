@@ -167,7 +167,7 @@ class EnvTask(WorldTask[Config]):
             )
         return Start(*result)
 
-    def toward(self, goal: Tensor) -> Self:
+    def with_goal(self, goal: Tensor) -> Self:
         """Return a task whose losses are for worlds of these goals; by default the task itself.
 
         Goals are int64, shape [B]; each call of `losses` reads their values.
@@ -202,9 +202,7 @@ class EnvTask(WorldTask[Config]):
         Raises:
             NPAError: The losses have no gradient.
         """
-        box = self.config.periodic_box
-        sides = None if box is None else (box,) * self.space_dim
-        gains = marginal_gains(self.losses, before, after, sides)
+        gains = marginal_gains(self.losses, before, after, self.periodic_sides)
         if gains is None:
             raise NPAError(
                 f"the losses of {type(self).__name__} must be differentiable for "
@@ -212,6 +210,12 @@ class EnvTask(WorldTask[Config]):
                 "'particle' or 'dense', or give it a particle_gains method"
             )
         return gains
+
+    @property
+    def periodic_sides(self) -> tuple[float, ...] | None:
+        """Sides of the periodic box [length units]; None: open space, or walls."""
+        box = self.config.periodic_box
+        return None if box is None else (box,) * self.space_dim
 
     @property
     def start_is_short(self) -> bool:
@@ -316,15 +320,15 @@ class TargetEnvTask(EnvTask[Config]):
         x, s, *_ = self.task.seed(random.world_count, generator=random, device=self.device)
         return x, s
 
-    def toward(self, goal: Tensor) -> Self:
+    def with_goal(self, goal: Tensor) -> Self:
         """Return a task whose losses are for worlds of these goals."""
         goal_task = copy.copy(self)
-        goal_task.task = self.task.toward(goal)
+        goal_task.task = self.task.with_goal(goal)
         return goal_task
 
     def particle_losses(self, x: Tensor, s: Tensor) -> Tensor:
         """Return the training task's loss of each particle."""
-        losses: Tensor = self.task.particle_shares(x, s)
+        losses: Tensor = self.task.particle_contributions(x, s)
         return losses
 
 

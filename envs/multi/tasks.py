@@ -196,7 +196,9 @@ class CoMorphogenesisTask(PictureLossTask):
 
     def particle_losses(self, population: Population) -> Mapping[str, Tensor]:
         """Return each particle's share of its species' splat loss, shape [B, N]."""
-        losses = [self.tasks[k].particle_shares(*population.of(k)) for k in _present(population)]
+        losses = [
+            self.tasks[k].particle_contributions(*population.of(k)) for k in _present(population)
+        ]
         return {"picture": torch.cat(losses, dim=1)}
 
 
@@ -241,7 +243,7 @@ class InvasionTask(PictureLossTask):
 
     def particle_losses(self, population: Population) -> Mapping[str, Tensor]:
         """Return each particle's loss; an invader's is −(sum of species 0) / (invader count)."""
-        losses = self.task.particle_shares(*population.of(0))
+        losses = self.task.particle_contributions(*population.of(0))
         count, invader_count = losses.shape[1], sum(population.counts[1:])
         part = world_mean(losses[..., None])[:, 0] * (-count / max(invader_count, 1))
         return {"picture": torch.cat((losses, part[:, None].expand(-1, invader_count)), dim=1)}
@@ -289,7 +291,7 @@ class SymbiosisTask(PictureLossTask):
 
     def particle_losses(self, population: Population) -> Mapping[str, Tensor]:
         """Return each particle's share of the splat loss, shape [B, N]."""
-        return {"picture": self.task.particle_shares(population.x, population.s)}
+        return {"picture": self.task.particle_contributions(population.x, population.s)}
 
     # There is one picture, in the middle.
     open_half_width = SpeciesTask.open_half_width

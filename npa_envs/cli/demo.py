@@ -89,7 +89,7 @@ def grow_and_heal(options: DemoOptions, device: torch.device) -> Iterator[str]:
     trained = task_of_rule(options.rule, rule, device)
     generator = torch.Generator(device).manual_seed(options.seed)
     worlds = trained.task.seed(1, generator=generator, device=device)
-    task = trained.task.toward(worlds.goal)
+    task = trained.task.with_goal(worlds.goal)
     yield f"{options.rule}: {worlds.x.shape[1]} particles, {rule.weight_count} weights"
     figures, film, step = [], WorldFilm(), 0
     with common.progress_bar(GROW_STEPS + 2 * HEAL_STEPS, show=options.progress) as advance:

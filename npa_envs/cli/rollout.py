@@ -88,7 +88,7 @@ def main(arguments: Sequence[str]) -> int:
     generator = torch.Generator(device).manual_seed(options.seed)
     worlds = task.seed(1, generator=generator, device=device)
     goal = worlds.goal
-    task = task.toward(goal)
+    task = task.with_goal(goal)
     with stop_flag() as stop, common.progress_bar(options.steps, show=options.progress) as advance:
         worlds, film = film_world(
             rule,

@@ -166,7 +166,7 @@ def healing(
         len(x), x.shape[2], generator=runner.generator, dtype=x.dtype, device=x.device
     )
     centre = random_particle(x, generator=runner.generator)
-    wiped = task.coded(wipe_state(x, s, centre=centre, radius=wipe_radius, box=task.box))
+    wiped = task.with_target_code(wipe_state(x, s, centre=centre, radius=wipe_radius, box=task.box))
     slit = cut(x, s, centre=x.mean(1), normal=normal, gap=cut_gap, box=task.box)
     damaged = {
         f"cut, gap {cut_gap:g}": Particles(*slit),
@@ -255,7 +255,7 @@ def accuracies(
 
     def figures(index: Tensor) -> Iterator[tuple[Tensor, ...]]:
         label, clouds = task.clouds.label[index], _blank_clouds(runner, index)
-        labelled = runner.task.toward(label)
+        labelled = runner.task.with_goal(label)
         for _, (x, s, *_) in runner.at(checkpoints, clouds):
             outputs = runner.task.outputs(s)
             votes, most = outputs.argmax(-1), majority(outputs)

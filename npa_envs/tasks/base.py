@@ -206,7 +206,7 @@ class ParticleTask(Generic[ConfigT]):
         """
         return self
 
-    def toward(self, goal: Tensor | None) -> Self:
+    def with_goal(self, goal: Tensor | None) -> Self:
         """Return the task with loss and metric for worlds with these goals, int64, shape [B].
 
         By default worlds have none. The tensor is read at each call. The task is not changed. On
@@ -233,10 +233,10 @@ class ParticleTask(Generic[ConfigT]):
     def goal(self) -> Tensor:
         """Goals of the worlds, int64, shape [B]."""
         if self._goal is None:
-            raise NPAError("the worlds' goals must be given first: task.toward(goal), int64 [B]")
+            raise NPAError("the worlds' goals must be given first: task.with_goal(goal), int64 [B]")
         return self._goal
 
-    def coded(self, s: Tensor) -> Tensor:
+    def with_target_code(self, s: Tensor) -> Tensor:
         """Return states with each world's target code restored, which damage may have erased.
 
         Without codes they are unchanged. They are differentiable in codes that are learned.
@@ -256,38 +256,37 @@ class ParticleTask(Generic[ConfigT]):
         return task
 
     def compare(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the weighted distance from the target, and its named parts, unweighted."""
+        """Return the batch's weighted distance from the target, and its named terms, unweighted.
+
+        All have shape [].
+        """
         raise NotImplementedError
 
     def penalties(self, worlds: Particles) -> dict[str, tuple[float, Tensor]]:
-        """Return the terms that the loss adds to `compare`: name -> (weight, term)."""
-        overflow = (worlds.s - worlds.s.clamp(-1.0, 1.0)).abs().mean()
-        return {"overflow": (self.config.overflow_weight, overflow)}
+        """Return the terms that the loss adds to `compare`: name -> (weight, term of shape []).
 
-    def loss(self, x: Tensor, s: Tensor, path_length: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the training loss and its named parts, unweighted.
+        By default "overflow" penalises states outside of [-1, 1].
+        """
+        outside = (worlds.s - worlds.s.clamp(-1.0, 1.0)).abs().mean()
+        return {"overflow": (self.config.overflow_weight, outside)}
 
-        Args:
-            x: Positions [length units], shape [B, N, D].
-            s: States (dimensionless), shape [B, N, C].
-            path_length: Length of each particle's path in the rollout [length units], shape [B, N].
+    def loss(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the training loss of worlds after a rollout, and its named terms, unweighted.
+
+        All have shape [].
 
         Raises:
-            NPAError: The shapes do not fit each other.
+            NPAError: The worlds lack path lengths, or these have another shape than [B, N].
         """
-        if path_length.shape != x.shape[:2]:
-            raise NPAError(
-                f"path_length must have shape {tuple(x.shape[:2])}, got {tuple(path_length.shape)}"
-            )
-        return self.loss_of(Particles(x, s, path_length))
-
-    def loss_of(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return `loss` of worlds at the end of a rollout."""
-        total, parts = self.compare(worlds)
+        path, expected = worlds.path_length, tuple(worlds.x.shape[:2])
+        if path is None or path.shape != expected:
+            got = "none" if path is None else str(tuple(path.shape))
+            raise NPAError(f"path_length must have shape {expected}, got {got}")
+        total, terms = self.compare(worlds)
         for name, (weight, term) in self.penalties(worlds).items():
-            parts[name] = term
+            terms[name] = term
             total = total + weight * term
-        return total, parts
+        return total, terms
 
     def picture(self, x: Tensor, s: Tensor) -> Tensor:
         """Return the picture of each world: rgb sums and density, shape [B, R, R, 4]."""
@@ -393,7 +392,7 @@ class GrowthTask(ParticleTask[GrowthConfigT]):
         return damage_pool(worlds, self.config, generator=generator)
 
     def penalties(self, worlds: Particles) -> dict[str, tuple[float, Tensor]]:
-        """Return terms for motion, overflow, positions outside of [-1, 1]^D, and motion there."""
+        """Return terms for motion, states outside of [-1, 1], positions there, and motion there."""
         config, bounded = self.config, self.bounded(worlds.x)
         terms = {"motion": (config.motion_weight, distances_moved(worlds).mean())}
         terms |= super().penalties(worlds)
@@ -413,7 +412,7 @@ def distances_moved(worlds: Particles) -> Tensor:
     return worlds.path_length
 
 
-def shares_of_loss(loss: Tensor, amounts: Tensor) -> Tensor:
+def contributions_to_loss(loss: Tensor, amounts: Tensor) -> Tensor:
     """Return each particle's contribution to its world's loss, times N; shape [B, N].
 
     It is the loss [B] plus N times the difference between the particle's amount and its world's
@@ -431,7 +430,7 @@ def untrained_rule(generator: torch.Generator, **hyper_parameters: Any) -> NPARu
         return NPARule(**hyper_parameters)
 
 
-def differing_fields(rule: NPARule, wanted: NPARule) -> list[str]:
+def differing_fields(rule: NPARule, task_rule: NPARule) -> list[str]:
     """Return the names of the hyper-parameters in which a rule differs from one of a task."""
-    own, expected = rule.hyper_parameters(), wanted.hyper_parameters()
-    return [name for name in expected if own[name] != expected[name]]
+    actual, expected = rule.hyper_parameters(), task_rule.hyper_parameters()
+    return [name for name in expected if actual[name] != expected[name]]

@@ -115,18 +115,18 @@ class CoMorphogenesis2D(ParticleTask[Any]):
     def damage(self, worlds: Particles, generator: Randomness) -> Particles:
         """Return the worlds with each species damaged independently."""
         species = zip(self.tasks, worlds.split(self.config.counts), strict=True)
-        return _together([task.damage(own, generator) for task, own in species])
+        return _together([task.damage(each, generator) for task, each in species])
 
-    def loss_of(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the sum of the species' training losses and its parts, named "k.part"."""
+    def loss(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the sum of the species' training losses and its terms, named "k.term"."""
         total = worlds.x.new_zeros(())
-        parts: dict[str, Tensor] = {}
+        terms: dict[str, Tensor] = {}
         for k, species in enumerate(worlds.split(self.config.counts)):
-            # Positions relative to the seed: the loss bounds each species around its own.
-            loss, terms = self.tasks[k].loss_of(_shifted(species, -self.config.centres[k]))
+            # Positions relative to the species' seed, around which its loss bounds them.
+            loss, species_terms = self.tasks[k].loss(_shifted(species, -self.config.centres[k]))
             total = total + loss
-            parts |= {f"{k}.{name}": term for name, term in terms.items()}
-        return total, parts
+            terms |= {f"{k}.{name}": term for name, term in species_terms.items()}
+        return total, terms
 
     def picture(self, x: Tensor, s: Tensor) -> Tensor:
         """Return each world's picture with all species, shape [B, R, R, 4].
@@ -149,7 +149,7 @@ class CoMorphogenesis2D(ParticleTask[Any]):
     def metrics(self, x: Tensor, s: Tensor) -> Tensor:
         """Return each species' splat loss in each world, shape [B, K]."""
         species = zip(self.tasks, Particles(x, s).split(self.config.counts), strict=True)
-        return torch.stack([task.metric(own.x, own.s) for task, own in species], dim=1)
+        return torch.stack([task.metric(each.x, each.s) for task, each in species], dim=1)
 
     def metric(self, x: Tensor, s: Tensor) -> Tensor:
         """Return each world's mean splat loss of its species, shape [B]."""

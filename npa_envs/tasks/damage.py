@@ -206,7 +206,7 @@ def escape_motion(x: Tensor, distances: Tensor) -> Tensor:
     return (outside * distances).sum() / torch.where(count > 0.0, count, 1.0)
 
 
-SHARE = 0.25
+CHANCE = 0.25
 """Probability of a world to be clumped, to be cut, to lose a flake (dimensionless)."""
 
 
@@ -224,7 +224,7 @@ class PoolDamage:
     cut_gap: float = 0.0
     """Width of the slit through `cut_share` of the worlds from the pool [length units]; 0: none."""
 
-    cut_share: float = SHARE
+    cut_share: float = CHANCE
     """Probability of a world from the pool to be cut (dimensionless)."""
 
     flake_radius: float = 0.0
@@ -254,7 +254,7 @@ def damage_pool(worlds: Particles, damage: PoolDamage, *, generator: Randomness)
         s = wipe_state(x, s, centre=centre, radius=damage.damage_radius)
     if damage.clump_radius > 0.0:
         centre = random_particle(x, generator)
-        radius = damage.clump_radius * chosen_worlds(SHARE)
+        radius = damage.clump_radius * chosen_worlds(CHANCE)
         x, s = clump(x, s, centre=centre, radius=radius, factor=1.0)
     if damage.cut_gap > 0.0:
         # Directions need not be uniform; a zero vector cuts nothing.
@@ -262,7 +262,7 @@ def damage_pool(worlds: Particles, damage: PoolDamage, *, generator: Randomness)
         hit = chosen_worlds(damage.cut_share)
         x, s = cut(x, s, centre=world_mean(x), normal=normal, gap=damage.cut_gap * hit)
     if damage.flake_radius > 0.0:
-        x = tear_off(x, radius=damage.flake_radius, probability=SHARE, generator=generator)
+        x = tear_off(x, radius=damage.flake_radius, probability=CHANCE, generator=generator)
     if damage.escape_share > 0.0:
         x = displace(x, probability=damage.escape_share, generator=generator)
     return worlds._replace(x=x, s=s)

@@ -131,7 +131,7 @@ class ManyPictures(Morphogenesis2D):
         switched = drawn_worlds(x, generator, self.config.switch_share)
         return worlds._replace(goal=torch.where(switched, other, goal))
 
-    def coded(self, s: Tensor) -> Tensor:
+    def with_target_code(self, s: Tensor) -> Tensor:
         """Return states with the codes of their worlds' goals; differentiable in the codes."""
         if self._codes is None or self._goal is None:
             return s

@@ -118,8 +118,8 @@ class Morphogenesis2DConfig(GrowthConfig):
         check_non_negative(self, "splat_weight", "colour_weight", "drift_weight")
         check_non_negative(self, "seed_axis", "seed_across")
         check_flag(self, "equivariant", "chiral", "encoder", "division", "keep_background")
-        rule, cure = "be a tuple of names, emoji, files or folders", "targets=('gecko', 'heart')"
-        check_field(self, "targets", are_texts(self.targets), rule, f"for example {cure}")
+        rule, hint = "be a tuple of names, emoji, files or folders", "targets=('gecko', 'heart')"
+        check_field(self, "targets", are_texts(self.targets), rule, f"for example {hint}")
         check_positive(self, int, "code_dim", at_most=MAX_CODE)
         check_non_negative(self, "switch_share", at_most=1.0)
         check_positive(self, int, "angles", at_least=0)
@@ -228,10 +228,11 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
             if config.seed_across > 0.0:
                 s[..., 1] = config.seed_across * across / config.seed_radius
         if self._code is not None:
-            s = self.coded(torch.cat((s.new_zeros(*s.shape[:2], len(self._code)), s), dim=-1))
+            blank = s.new_zeros(*s.shape[:2], len(self._code))
+            s = self.with_target_code(torch.cat((blank, s), dim=-1))
         return Particles(x, s)
 
-    def coded(self, s: Tensor) -> Tensor:
+    def with_target_code(self, s: Tensor) -> Tensor:
         """Return states with the task's code, or unchanged where it has none."""
         return s if self._code is None else carrying(s, self._code)
 
@@ -297,7 +298,7 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         return density + self.config.colour_weight * colour
 
     def compare(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the batch's splat loss, weighted, and its density and colour terms."""
+        """Return the batch's weighted splat loss, and its terms, each of shape []."""
         density, colour = (term.mean() for term in self.splat_losses(worlds.x, worlds.s))
         total = self.config.splat_weight * (density + self.config.colour_weight * colour)
         return total, {"density": density, "colour": colour}
@@ -321,14 +322,14 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         return x.square().sum(dim=-1, keepdim=True).add(1e-12).sqrt() / self._radius
 
     def penalties(self, worlds: Particles) -> dict[str, tuple[float, Tensor]]:
-        """Return the penalties of growth, and the drift of centroids from the origin."""
+        """Return terms of `GrowthTask`, and for the drift of centroids from the origin."""
         terms = super().penalties(worlds)
         if self.config.drift_weight > 0.0:
             drift = world_mean(worlds.x).square().sum(dim=-1).add(1e-12).sqrt().mean()
             terms["drift"] = self.config.drift_weight, drift
         return terms
 
-    def particle_shares(self, x: Tensor, s: Tensor) -> Tensor:
+    def particle_contributions(self, x: Tensor, s: Tensor) -> Tensor:
         """Return each particle's contribution to its world's splat loss, times N; [B, N].
 
         A pixel's error is divided among the particles that cover it, by their weights there; the

@@ -22,7 +22,7 @@ from npa_envs.checks import (
 from npa_envs.errors import NPAError
 from npa_envs.ops import Cameras, render_gaussians, world_mean
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.base import GrowthConfig, GrowthTask, shares_of_loss
+from npa_envs.tasks.base import GrowthConfig, GrowthTask, contributions_to_loss
 from npa_envs.tasks.gaussian_outputs import OUTPUTS, Gaussians, appearance
 from npa_envs.tasks.losses.image_distances import MultiScaleSimilarity
 from npa_envs.tasks.targets.views import (
@@ -169,7 +169,7 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
         self.target = target.to(device)
         """The views of the target."""
         self._shown = some_views(self.target.held_out, torch.tensor([visible], device=device))
-        # Pictures show this view, from the bottom row up.
+        # The first row of a picture is the bottom.
         self._target_picture = self._shown.pictures[0].flip(0)
         self.schedule = ViewSchedule(len(target.training.pictures), config, device)
         """Views, blur and backgrounds of an iteration."""
@@ -205,7 +205,7 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
         return self._draw(x, self.gaussians(s), cameras)
 
     def picture(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return one held-out view of each world, from the bottom row up, shape [B, R, R, 4]."""
+        """Return a held-out view of each world, shape [B, R, R, 4]; the first row is the bottom."""
         return self.views(x, s, self._shown.cameras)[:, 0].flip(1)
 
     def metric(self, x: Tensor, s: Tensor) -> Tensor:
@@ -219,30 +219,30 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
         error = over(views, white).clamp(0.0, 1.0) - over(targets, white)
         return (-10.0 * error.square().mean(dim=(2, 3, 4)).log10()).mean(dim=1)
 
-    def particle_shares(self, x: Tensor, s: Tensor) -> Tensor:
+    def particle_contributions(self, x: Tensor, s: Tensor) -> Tensor:
         """Return each particle's contribution to its world's view loss, times N; [B, N].
 
-        See `shares_of_loss`; amounts are the slope of the loss times the particle's opacity.
+        See `contributions_to_loss`; amounts are the slope of the loss times the particle's opacity.
         """
         with torch.enable_grad():
             gaussians = self.gaussians(s.detach())
             opacities = gaussians.opacities.detach().requires_grad_()
             loss = self._metric(x.detach(), gaussians._replace(opacities=opacities))
             (slope,) = torch.autograd.grad(loss.sum(), opacities)
-        return shares_of_loss(loss.detach(), opacities.detach() * slope)
+        return contributions_to_loss(loss.detach(), opacities.detach() * slope)
 
     def compare(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the weighted loss of this iteration's views, and its parts."""
+        """Return the batch's weighted loss of this iteration's views, and its terms; shape []."""
         config, schedule, x = self.config, self.schedule, worlds.x
         gaussians = self.gaussians(worlds.s)
         target = some_views(self.target.training, schedule.index)
         target = Views(target.cameras, blurred(target.pictures.to(x), schedule.sigma))
         backgrounds = schedule.backgrounds.to(x)[:, None, None]
-        terms = self._compare(x, gaussians, target, backgrounds)
-        parts = {name: term.mean() for name, term in terms.items()}
-        parts["isotropy"] = gaussians.stretch.abs().mean()
-        total = config.view_weight * self._weighted(parts)
-        return total + config.isotropy_weight * parts["isotropy"], parts
+        by_world = self._compare(x, gaussians, target, backgrounds)
+        terms = {name: values.mean() for name, values in by_world.items()}
+        terms["isotropy"] = gaussians.stretch.abs().mean()
+        total = config.view_weight * self._weighted(terms)
+        return total + config.isotropy_weight * terms["isotropy"], terms
 
     def _metric(self, x: Tensor, gaussians: Gaussians) -> Tensor:
         grey = x.new_full((3,), GREY)

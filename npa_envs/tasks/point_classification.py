@@ -160,15 +160,11 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         """Return the task whose losses and pictures use the rule's read-out."""
         return self._with(_rule=rule)
 
-    def on(self, split: Split) -> Self:
-        """Return the task with the clouds of "train" or "test"."""
-        task = self._with(split=split)
-        vars(task).pop("clouds", None)
-        return task
-
     def held_out(self) -> Self:
         """Return the task with the clouds of "test"."""
-        return self.on("test")
+        task = self._with(split="test")
+        vars(task).pop("clouds", None)
+        return task
 
     def seed(
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
@@ -208,8 +204,8 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         """Return each particle's mean squared error to the one-hot of its world's class, [B, N]."""
         outputs = self.outputs(s)
         classes = torch.arange(self.config.class_count, device=s.device)
-        wanted = (self.goal[:, None] == classes).to(outputs.dtype)
-        return channel_mean((outputs - wanted[:, None]).square())
+        one_hot = (self.goal[:, None] == classes).to(outputs.dtype)
+        return channel_mean((outputs - one_hot[:, None]).square())
 
     def mistakes(self, s: Tensor) -> Tensor:
         """Return 1 for particles whose largest class score is of a wrong class, else 0, [B, N]."""
@@ -217,9 +213,9 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
 
     def cross_entropies(self, s: Tensor, sharpness: float) -> Tensor:
         """Return each particle's cross-entropy of softmax(sharpness × outputs), [B, N]."""
-        chances = torch.log_softmax(sharpness * self.outputs(s), dim=-1)
-        wanted = self.goal[:, None, None].expand(*s.shape[:2], 1)
-        return -chances.gather(-1, wanted).squeeze(-1)
+        log_probabilities = torch.log_softmax(sharpness * self.outputs(s), dim=-1)
+        label = self.goal[:, None, None].expand(*s.shape[:2], 1)
+        return -log_probabilities.gather(-1, label).squeeze(-1)
 
     def metric(self, x: Tensor, s: Tensor) -> Tensor:
         """Return each world's mean squared error of class scores to the one-hot class, [B]."""
@@ -238,7 +234,7 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         return channel_mean((s - s.clamp(-1.0, 1.0)).abs())
 
     def compare(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the batch's mean squared error, and a dict of this `error` and the `accuracy`."""
+        """Return the batch's mean squared error, and the terms "error" and "accuracy"; shape []."""
         error = self.errors(worlds.s).mean()
         accuracy = 1.0 - self.mistakes(worlds.s.detach()).mean()
         return error, {"error": error, "accuracy": accuracy}

@@ -65,12 +65,12 @@ def uniform_box(
     device = check_device(device)
     world_count = checked_count("world_count", world_count)
     particle_count = checked_count("particle_count", particle_count)
-    given = entries(box)
-    if not given:
+    values = entries(box)
+    if not values:
         raise NPAError(
             f"box must hold a side for each dimension, got {shown(box)}: give (2.0, 2.0)"
         )
-    sides = [checked_finite("a side of box", side, " [length units]") for side in given]
+    sides = [checked_finite("a side of box", side, " [length units]") for side in values]
     _check_points(world_count * particle_count * len(sides), dtype)
     check_generator(generator, device, world_count)
     if isinstance(generator, WorldRandom):

@@ -20,7 +20,7 @@ from npa_envs.checks import (
 from npa_envs.errors import NPAError
 from npa_envs.ops import periodic_splat
 from npa_envs.rule.rule import COLOUR_OFFSET
-from npa_envs.tasks.base import ParticleTask, TaskConfig, distances_moved, shares_of_loss
+from npa_envs.tasks.base import ParticleTask, TaskConfig, contributions_to_loss, distances_moved
 from npa_envs.tasks.damage import random_particle
 from npa_envs.tasks.losses.image_distances import LossOptions
 from npa_envs.tasks.losses.texture import (
@@ -105,8 +105,8 @@ class TextureConfig(TaskConfig):
             self, "damage_radius", "colour_weight", "density_weight", "motion_weight"
         )
         rule = f"be at least 2 eps = {2.0 * self.eps:g}"
-        cure = "enlarge the box or perceive at a smaller eps"
-        check_field(self, "box_size", self.box_size >= 2.0 * self.eps, rule, cure)
+        hint = "enlarge the box or perceive at a smaller eps"
+        check_field(self, "box_size", self.box_size >= 2.0 * self.eps, rule, hint)
 
 
 MAX_EPS = 0.3
@@ -238,10 +238,10 @@ class Texture(ParticleTask[TextureConfig]):
         """Return each world's texture loss, colour and density weighted, shape [B]."""
         return self.weighted(*self.texture_losses(x, s))
 
-    def particle_shares(self, x: Tensor, s: Tensor) -> Tensor:
+    def particle_contributions(self, x: Tensor, s: Tensor) -> Tensor:
         """Return each particle's contribution to its world's texture loss, times N; [B, N].
 
-        See `shares_of_loss`; amounts are the slope of the loss times the particle's splat.
+        See `contributions_to_loss`; amounts are the slope of the loss times the particle's splat.
         """
         x, s = x.detach(), s.detach()
         x = x - x[:, :1]
@@ -258,16 +258,16 @@ class Texture(ParticleTask[TextureConfig]):
             (density,) = torch.autograd.grad(drawn, blank, by_density)
         red, green, blue = ((s[..., -3:] + COLOUR_OFFSET) * pulled).unbind(dim=-1)
         amounts = red + green + blue + density[..., 0]
-        return shares_of_loss(loss.detach(), amounts)
+        return contributions_to_loss(loss.detach(), amounts)
 
     def compare(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the batch's texture loss, weighted, and its colour and density terms."""
+        """Return the batch's weighted texture loss, and its terms, each of shape []."""
         losses = self.texture_losses(worlds.x, worlds.s)
         colour, density = (term.mean() for term in losses)
         return self.weighted(colour, density), {"colour": colour, "density": density}
 
     def penalties(self, worlds: Particles) -> dict[str, tuple[float, Tensor]]:
-        """Return motion and overflow."""
+        """Return terms for motion and for states outside of [-1, 1]."""
         motion = self.config.motion_weight, distances_moved(worlds).mean()
         return {"motion": motion, **super().penalties(worlds)}
 

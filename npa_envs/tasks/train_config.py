@@ -259,19 +259,19 @@ class TrainConfig(Generic[TaskConfigT]):
         """`dtype` as torch's own."""
         return torch.float64 if self.dtype == "float64" else torch.float32
 
-    def learning_rate_at(self, iteration: int, share: float = 0.0) -> float:
+    def learning_rate_at(self, iteration: int, elapsed: float = 0.0) -> float:
         """Return the learning rate of an iteration, counted from 0 over all repeats.
 
         A resumed run needs no scheduler state. Each repeat restarts it: steps at the milestones, or
-        a short linear rise and a cosine (Loshchilov and Hutter, arXiv 1608.03983). `share` is the
-        least fraction of the cosine that is over.
+        a short linear rise and a cosine (Loshchilov and Hutter, arXiv 1608.03983). The cosine is at
+        least at the fraction `elapsed` of its way, also in earlier iterations.
         """
         within = iteration % self.iterations
         if self.schedule == "milestones":
             passed = sum(milestone <= within for milestone in self.milestones)
             return float(self.learning_rate * float(DECAY**passed))
-        over = min(1.0, max(share, within / self.iterations))
-        fall = 0.5 + 0.5 * math.cos(math.pi * over)
+        elapsed = min(1.0, max(elapsed, within / self.iterations))
+        fall = 0.5 + 0.5 * math.cos(math.pi * elapsed)
         rate = self.learning_rate * (LOWEST + (1.0 - LOWEST) * fall)
         return rate * min(1.0, (within + 1) / (RISE * self.iterations))
 
@@ -296,9 +296,9 @@ class JointTrainConfig(TrainConfig[TaskConfigT]):
                 f"initial_rule is for one rule, got {shown(self.initial_rule)}: give "
                 "initial_rules, one for each species"
             )
-        cure = "for example initial_rules=('gecko', 'heart')"
+        hint = "for example initial_rules=('gecko', 'heart')"
         rule = "be a tuple of names or files"
-        check_field(self, "initial_rules", are_texts(self.initial_rules), rule, cure)
+        check_field(self, "initial_rules", are_texts(self.initial_rules), rule, hint)
         frozen = self.frozen
         numbers = isinstance(frozen, tuple) and all(is_whole(n) and n >= 0 for n in frozen)
         check_field(self, "frozen", numbers, "be a tuple of species' numbers from 0")

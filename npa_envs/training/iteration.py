@@ -57,7 +57,7 @@ class EagerIteration:
     ) -> None:
         self.start = worlds.map(torch.clone)
         self.end = self.start._replace(x=torch.empty_like(worlds.x), s=torch.empty_like(worlds.s))
-        task = task.toward(self.start.goal)
+        task = task.with_goal(self.start.goal)
         self.grown = torch.zeros_like(worlds.x[:, 0, 0], dtype=torch.bool)
         """Worlds to which the stillness loss applies, bool, shape [B]."""
         self._stillness_weight = config.stillness_weight
@@ -66,7 +66,7 @@ class EagerIteration:
         self._divides = bool(fate_parameters(rule))
         self._task = task
         with torch.no_grad():
-            total, parts = self._loss(self.start.begun())
+            total, parts = self._loss(self.start.with_zero_paths())
         self.term_names: tuple[str, ...] = ("loss", *parts)
         """Names of `terms`."""
         self.terms = total.new_zeros(len(self.term_names))
@@ -83,7 +83,7 @@ class EagerIteration:
     def run(self, steps: int) -> None:
         """Run the rollout, the loss and the backward pass."""
         # Gradients of codes flow through these states; `start` keeps their values.
-        first_states = self._task.coded(self.start.s)
+        first_states = self._task.with_target_code(self.start.s)
         if first_states is not self.start.s:
             self.start.s.copy_(first_states.detach())
         fields = self._rollout(
@@ -122,9 +122,9 @@ class EagerIteration:
 
     def _loss(self, end: Particles) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the task's loss plus the stillness loss of grown worlds, and named parts."""
-        x, s, path = end.per_particle()
-        total, parts = self._task.loss(x, s, path)
+        total, parts = self._task.loss(end)
         if self._stillness_weight > 0.0:
+            x, s, path = end.per_particle()
             change = s - self.start.s
             if self._divides:
                 # Births and deaths do not count.

@@ -170,5 +170,5 @@ def _has_finite_loss(task: Task, world: Particles) -> bool:
     if not all(bool(torch.isfinite(value).all()) for value in world.tensors()):
         return False
     with torch.no_grad():
-        total, parts = task.toward(world.goal).loss(*world.begun().per_particle())
+        total, parts = task.with_goal(world.goal).loss(world.with_zero_paths())
     return all(bool(torch.isfinite(value).all()) for value in (total, *parts.values()))

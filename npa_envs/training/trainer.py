@@ -182,7 +182,7 @@ class Trainer:
         """
         check_seconds(max_seconds)
         config, total, first = self.config, self.config.total_iterations, self._processes.first
-        options = {"total": total, "initial": self.iteration, "unit": "it"}
+        options: dict[str, Any] = {"total": total, "initial": self.iteration, "unit": "it"}
         start = time.perf_counter()
 
         def step() -> None:

@@ -307,7 +307,7 @@ class RuleWorld(LiveWorld):
         comparable = self.trained.doubt is None and len(self.live_rules) == 1 and self._present
         if not comparable or start < self._loss_due:
             return None
-        loss = float(self.task.toward(self._goal).metric(*self.particles[:2]))
+        loss = float(self.task.with_goal(self._goal).metric(*self.particles[:2]))
         self._loss_due = start + (time.perf_counter() - start) / LOSS_FRACTION
         return loss
 
@@ -373,7 +373,7 @@ class RuleWorld(LiveWorld):
             return s
         is_main = live_rule.name == self.main.name
         task = self.task if is_main else self._trained(live_rule.name, None).task
-        return task.coded(s)
+        return task.with_target_code(s)
 
     def _joining(self, name: Any) -> LiveRule:
         live_rule = self._live_rule(name)

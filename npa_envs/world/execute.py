@@ -248,7 +248,7 @@ def execute(
         remaining, part = remaining - steps, 2 * part
         if remaining and not particles.x.isfinite().all():
             # A world has diverged: the next call raises an error for it, this one does not.
-            return spec._replace(steps=remaining).run(rules, particles.begun(), source)
+            return spec._replace(steps=remaining).run(rules, particles.with_zero_paths(), source)
     # The generator ends where it would be after all steps.
     skip_draws(particles.x, spec.physics, remaining, source)
     # The caller may write to the results.
@@ -273,7 +273,7 @@ def run_all_steps(
     if particles.x.is_cuda and torch.is_grad_enabled():
         # Gradients are added in the order of a recording: first those of this rollout.
         particles = particles.map(lambda value: value.view_as(value))
-    return spec.run(rules, particles.begun(), source, watch)
+    return spec.run(rules, particles.with_zero_paths(), source, watch)
 
 
 def resting(

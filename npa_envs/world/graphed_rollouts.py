@@ -173,7 +173,7 @@ def _run_and_compare(call: _Call, kind: CallKind, use: _RecordingUse) -> Particl
         shared = torch_generator(generator, device)
         source = torch.Generator(device).manual_seed(shared.initial_seed())
         source.set_offset(shared.get_offset())
-    worlds = particles.map(lambda value: value.view_as(value)).begun()
+    worlds = particles.map(lambda value: value.view_as(value)).with_zero_paths()
     launched = call.spec.run(call.rules, worlds, generator)
     with torch.no_grad():
         replayed = use.recording.replay(call._replace(weights=copies, generator=source), use)
@@ -394,7 +394,7 @@ class _Recording:
     def __init__(self, call: _Call) -> None:
         x = call.particles.x
         self.device = x.device
-        worlds = call.particles.begun()
+        worlds = call.particles.with_zero_paths()
         self._no_paths = worlds.per_particle()[-1]
         """Path lengths at the start, zeros."""
         self.bytes = 0
@@ -437,7 +437,7 @@ class _Recording:
 
     def _inputs_of(self, call: _Call) -> list[Tensor]:
         """Return all inputs of a rollout, in the order of the fixed tensors."""
-        return [*call.particles.begun(self._no_paths).tensors(), *call.weights]
+        return [*call.particles.with_zero_paths(self._no_paths).tensors(), *call.weights]
 
     def record(self, steps: int, call: _Call) -> None:
         """Record rollouts of a number of steps, after a warm-up with the inputs of a call."""

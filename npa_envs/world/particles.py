@@ -21,7 +21,7 @@ class Particles(NamedTuple):
     goal: Tensor | None = None
     """Index of the target that a world is to become, int64, shape [B]; after all other fields."""
 
-    def begun(self, zeros: Tensor | None = None) -> Particles:
+    def with_zero_paths(self, zeros: Tensor | None = None) -> Particles:
         """Return the worlds with paths of length 0, in `zeros` if it is given, shape [B, N]."""
         if zeros is None:
             zeros = self.x.new_zeros(self.x.shape[:2])

@@ -27,6 +27,7 @@ from npa_envs.agents.learning.shac import SHACLearner, SHACOptions, td_lambda_ta
 from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.envs.morphogenesis2d import PictureEnvTask
 from npa_envs.rule.rule import NPARule
+from npa_envs.world.particles import Particles
 
 GROWTH = {"eps": 0.2, "eps0": 0.2, "colour_weight": 20.0, "resolution": 32, "state_scale": 0.1}
 
@@ -78,7 +79,7 @@ def test_what_is_differentiated_is_the_environments_own_episode(problem):
     task, random = EnvironmentTask(problem, torch.device("cpu")), npa_envs.WorldRandom(5)
     x, s, *rest = problem.make_task().start(random)
     if rest and rest[1] is not None:
-        task = task.toward(rest[1])
+        task = task.with_goal(rest[1])
     steps = problem.episode_steps - 1
     for _ in range(steps):
         largest = max(largest, rules.mean(observation).abs().max().item())
@@ -92,7 +93,7 @@ def test_what_is_differentiated_is_the_environments_own_episode(problem):
     )  # fmt: skip
     for ours, theirs in ((envs.worlds.x, x), (envs.worlds.s, s)):
         torch.testing.assert_close(ours, theirs.detach(), atol=STEP_TOLERANCE, rtol=0.0)
-    loss, _ = task.loss(x, s, path_length)
+    loss, _ = task.loss(Particles(x, s, path_length))
     assert loss.item() == pytest.approx(infos["loss"][0].item(), abs=2e-4)
     bars = torch.autograd.grad(loss, [rule.output.weight for rule in rules])
     assert all(bar.abs().sum() > 0.0 for bar in bars)

@@ -72,7 +72,7 @@ def test_marginal_rewards_are_what_the_world_would_have_lost_without_an_action(n
     task = env.task
     goal = info.get("label", info.get("target"))
     if goal is not None:
-        task = task.toward(torch.full((24,), goal))
+        task = task.with_goal(torch.full((24,), goal))
 
     def losses(others, own):
         """The loss of 24 worlds, in each of which one particle is as in `own`."""
@@ -350,7 +350,7 @@ def test_rows_end_with_the_picture_that_is_asked_for(device):
     assert wide.shape[-1] == rows.shape[-1] + TARGET_DIM
     assert_same(wide[..., :-TARGET_DIM], rows)
     task = wider.unwrapped.task
-    pictures = task.task.toward(torch.arange(2, device=device)).target_picture.cpu().numpy()
+    pictures = task.task.with_goal(torch.arange(2, device=device)).target_picture.cpu().numpy()
     for k, number in enumerate(infos["target"]):
         context_info = wide[k, :, -TARGET_DIM:].reshape(-1, 4, 4, 4)
         assert (context_info == context_info[0]).all()

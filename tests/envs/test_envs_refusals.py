@@ -65,7 +65,7 @@ OF_ONE = {
     functools.partial(make, "npa/Texture-v0"): [
         ({"target": "cels"}, "did you mean 'cells'"),
         ({"boundary": "open"}, "boundary must be 'periodic' for textures"),
-        ({"loss": "swd"}, "did you mean 'patch_swd'|known: filter_ot"),
+        ({"loss": "swd"}, "did you mean 'patch_swd'|known: filter_swd"),
         ({"resolution": 8}, "resolution must be a whole number of at least 12"),
     ],
     functools.partial(make, POINTS): [

@@ -377,14 +377,14 @@ def test_a_step_is_paid_by_the_goal_that_was_seen_before_it(coded):
         goal = info["goal"]
         _, reward, _, _, info = env.step(action)
         x, s = (part[None] for part in env.unwrapped.particles())
-        loss = sum(task.toward(torch.tensor([goal])).losses(x, s).values())
+        loss = sum(task.with_goal(torch.tensor([goal])).losses(x, s).values())
         blank = float(task.blank_losses[goal])
         assert reward == pytest.approx(max(-1.0, 1.0 - float(loss) / blank), rel=1e-5)
 
 
 def test_a_goal_itself_earns_one_and_an_empty_picture_nothing(coded):
     task = make(SHAPESHIFTER, **coded, resolution=32).unwrapped.task
-    single = task.task.toward(torch.tensor([1]))
+    single = task.task.with_goal(torch.tensor([1]))
     context = PictureGoals(torch.tensor([1]), torch.tensor([[1]]))
     no_loss, blank = torch.zeros(1), task.blank_losses[1:2]
     nothing = Particles(torch.zeros(1, 1, 2), torch.zeros(1, 1, 1))
@@ -399,7 +399,7 @@ def test_the_goals_picture_is_seen_beside_the_worlds(coded):
     seen, info = env.reset(seed=2)
     assert seen.shape == (128,)
     task = env.unwrapped.task
-    target = task.task.toward(torch.tensor([info["goal"]])).target_picture[0]
+    target = task.task.with_goal(torch.tensor([info["goal"]])).target_picture[0]
     coarse = target.view(4, 4, 4, 4, 4).mean(dim=(1, 3)).permute(2, 0, 1)
     assert seen[64:] == pytest.approx(coarse.flatten().numpy(), abs=1e-6)
 

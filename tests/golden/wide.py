@@ -33,6 +33,7 @@ from npa_envs.envs import gardeners_v0, multispecies_v0, particles_v0
 from npa_envs.tasks.damage import damage_worlds
 from npa_envs.training.task_of_rule import task_of_rule
 from npa_envs.world import brushes
+from npa_envs.world.particles import Particles
 
 TRAINED = ("morphogenesis2d", "co_morphogenesis2d", "morphogenesis3d", "texture")
 """Tasks of `npa-envs train` besides `point_classification`, whose data are drawn elsewhere."""
@@ -74,14 +75,14 @@ def of_rule(name):
     task = task_of_rule(name, rule, torch.device("cpu"), particle_count=160).task
     run = functools.partial(rollout, rule, eps=task.eps, box=task.box)
     x, s, _, goal = task.seed(2, generator=WorldRandom([3, 4]), device=torch.device("cpu"))
-    task = task.toward(goal)
+    task = task.with_goal(goal)
     with torch.no_grad():
         x, s = run(x, s, 16, generator=WorldRandom([5, 6]))
     results = {"x": x, "s": s, "colour": rule.colour(s), "picture": task.picture(x, s)}
     x.requires_grad_()
     s.requires_grad_()
     after = run(x, s, 3, generator=WorldRandom([7, 8]), return_path_length=True)
-    loss, terms = task.loss(*after)
+    loss, terms = task.loss(Particles(*after))
     results |= {"loss": loss, "terms": terms, "metric": task.metric(*after[:2])}
     return results | {"gradients": gradients(loss.sum(), rule, x=x, s=s)}
 

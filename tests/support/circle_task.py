@@ -45,11 +45,12 @@ class CircleTask(ParticleTask):
         blank = torch.rand(s.shape[:2], generator=generator, device=s.device) < 0.2
         return worlds._replace(s=s.masked_fill(blank[..., None], 0.0))
 
-    def loss(self, x: Tensor, s: Tensor, path_length: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+    def loss(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:
         self.loss_calls += 1
-        distance = self.metric(x, s).mean()
-        state = s.square().mean()
-        motion = path_length.mean()
+        distance = self.metric(worlds.x, worlds.s).mean()
+        state = worlds.s.square().mean()
+        assert worlds.path_length is not None
+        motion = worlds.path_length.mean()
         total = distance + 0.01 * state + 0.001 * motion
         return total, {"distance": distance, "state": state, "motion": motion}
 

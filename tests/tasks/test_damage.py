@@ -2,17 +2,34 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
+import small_envs
 import torch
 
+from npa_envs import load_rule
 from npa_envs.errors import NPAError
+from npa_envs.render.world_film import film_world
 from npa_envs.tasks import damage
-from npa_envs.tasks.damage import FARTHEST, NEAREST, SHARE, PoolDamage, damage_pool
+from npa_envs.tasks.damage import (
+    CHANCE,
+    FARTHEST,
+    NEAREST,
+    PoolDamage,
+    damage_pool,
+    damage_worlds,
+    parse_damage,
+)
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 from npa_envs.tasks.seeds import uniform_ball
+from npa_envs.tasks.texture import Texture, TextureConfig
+from npa_envs.training.task_of_rule import task_of_rule
+from npa_envs.web.rule_world import RuleWorld
 from npa_envs.world import brushes
+from npa_envs.world.brushes import nearest_image
 from npa_envs.world.particles import Particles
-from npa_envs.world.randomness import WorldRandom
+from npa_envs.world.randomness import WorldRandom, normal_draws
+from npa_envs.wrappers import DamageEvents
 
 B, N, C = 3, 257, 5
 
@@ -22,40 +39,11 @@ def world(request, device):
     space_dim, dtype = request.param
     g = torch.Generator().manual_seed(3)
     x = 2 * torch.rand(B, N, space_dim, generator=g, dtype=dtype) - 1
-    s = torch.randn(B, N, C, generator=g, dtype=dtype)
-    centre = 0.6 * torch.rand(B, space_dim, generator=g, dtype=dtype) - 0.3
-    return x.to(device), s.to(device), centre.to(device)
-
-
-def test_brushes_move_and_wipe_as_their_formulas_say(world):
-    x, s, centre = world
-    offset = x - centre[:, None]
-    distance = offset.norm(dim=-1, keepdim=True)
-    # Each world may have a radius of its own.
-    for radius in (x.new_tensor(0.4), x.new_tensor([0.0, 0.4, 9.0])):
-        wiped = brushes.wipe_state(x, s, centre=centre, radius=radius)
-        assert torch.equal(wiped, s.masked_fill(distance <= radius.view(-1, 1, 1), 0.0))
-    moves = []
-    for radius, factor in ((0.5, 0.75), (9.0, 1.0), (9.0, 0.0)):
-        after = brushes.clump(x, s, centre=centre, radius=radius, factor=factor)
-        moves.append((after, distance <= radius, -factor * offset))
-    normal = torch.randn(B, x.shape[-1], generator=torch.Generator().manual_seed(1)).to(x)
-    unit = torch.nn.functional.normalize(normal, dim=-1)[:, None]
-    before = (offset * unit).sum(dim=-1, keepdim=True)
-    after = brushes.cut(x, s, centre=centre, normal=normal, gap=0.2)
-    moves.append((after, before.abs() < 0.2, (0.1 * before.sign() - before / 2.0) * unit))
-    for (moved, states), inside, move in moves:
-        inside = inside[..., 0]
-        assert int(inside.sum()) > 10
-        torch.testing.assert_close(moved[inside], (x + move)[inside], rtol=1e-5, atol=1e-6)
-        assert torch.equal(moved[~inside], x[~inside])
-        assert states is s
-    moved, _ = brushes.cut(x, s, centre=centre, normal=torch.zeros_like(centre), gap=0.2)
-    assert torch.equal(moved, x)
+    return x.to(device), torch.randn(B, N, C, generator=g, dtype=dtype).to(device)
 
 
 def test_random_particle_is_one_of_its_own_world(world):
-    x, _, _ = world
+    x, _ = world
     chosen = damage.random_particle(x, torch.Generator(x.device).manual_seed(0))
     for b in range(B):
         assert (x[b] == chosen[b]).all(dim=-1).any()
@@ -67,8 +55,8 @@ def test_generator_of_another_device_is_a_clear_error():
         damage.random_particle(torch.zeros(1, 4, 2, device="cuda"), torch.Generator())
 
 
-def seeded(seed):
-    return torch.Generator().manual_seed(seed)
+def seeded(seed, device="cpu"):
+    return torch.Generator(device).manual_seed(seed)
 
 
 def worlds(count, space_dim=2, particles=200):
@@ -93,7 +81,7 @@ def test_a_ball_of_states_is_wiped_in_every_world(space_dim):
 @pytest.mark.parametrize(
     ("fields", "fraction"),
     [
-        *(({name: 0.5}, SHARE) for name in ("clump_radius", "cut_gap", "flake_radius")),
+        *(({name: 0.5}, CHANCE) for name in ("clump_radius", "cut_gap", "flake_radius")),
         ({"cut_gap": 0.5, "cut_share": 0.7}, 0.7),
     ],
 )
@@ -155,6 +143,103 @@ def test_each_world_suffers_what_it_would_suffer_alone(device):
     assert (untouched.x, untouched.s) == (before.x, before.s)
 
 
+@pytest.mark.parametrize("kind", ["wipe", "cut", "clump"])
+@pytest.mark.parametrize("boxed", [False, True])
+def test_damage_is_as_its_formula_says_and_continues_across_the_edges_of_a_box(
+    world, device, kind, boxed
+):
+    x, s = world
+    sides = x.new_tensor((2.0, 2.6, 2.4)[: x.shape[2]])
+    x, box, size = 0.5 * sides * x, tuple(sides.tolist()) if boxed else None, 0.5
+    normal = normal_draws(seeded(2, device), (B, len(sides)), x)
+    centre = x.mean(dim=1) if kind == "cut" else damage.random_particle(x, seeded(2, device))
+    shifts = sides * torch.cartesian_prod(*[x.new_tensor([-1.0, 0.0, 1.0])] * len(sides))
+    # The offset to the nearest of all images, [B, N, D].
+    images = (x - centre[:, None])[..., None, :] + (shifts if boxed else 0.0 * shifts)
+    nearest = images.norm(dim=-1).argmin(dim=-1)
+    offset = images.take_along_dim(nearest[..., None, None], dim=2)[:, :, 0]
+    inside = offset.norm(dim=-1, keepdim=True) <= size
+    moved, states = x, s
+    if kind == "wipe":
+        states = torch.where(inside, 0.0, s)
+    elif kind == "clump":
+        moved = torch.where(inside, x - 0.9 * offset, x)
+    else:
+        unit = torch.nn.functional.normalize(normal, dim=-1)[:, None]
+        height = (offset * unit).sum(-1, keepdim=True)
+        inside = height.abs() < size
+        moved = torch.where(inside, x + 0.5 * (size * height.sign() - height) * unit, x)
+    # Of some particles that are hit another image is the nearest.
+    across = (inside[..., 0] & (shifts[nearest] != 0.0).any(dim=-1)).sum()
+    assert int(inside.sum()) > 10
+    assert int(across) > 5 or not boxed
+    options = {"kind": kind, "size": size, "box": box, "generator": seeded(2, device)}
+    found_x, found_s = damage_worlds(x, s, **options)
+    torch.testing.assert_close(found_x, moved, rtol=1e-5, atol=1e-6)
+    assert torch.equal(found_s, states)
+    if kind == "cut":
+        blank = torch.zeros_like(centre)
+        assert torch.equal(brushes.cut(x, s, centre=centre, normal=blank, gap=size)[0], x)
+
+
+def wiped_in_the_viewer():
+    world = RuleWorld("dots", device=torch.device("cpu"), particle_count=300)
+    world.s.fill_(1.0)
+    world.x[:] = nearest_image(0.3 * torch.rand(1, 300, 2, generator=seeded(1)) + 0.85, (2.0, 2.0))
+    world.handle({"type": "damage", "name": "wipe"})
+    return world.x, world.s, 0.2
+
+
+def wiped_in_a_film():
+    rule = load_rule("dots")
+    task = task_of_rule("dots", rule, torch.device("cpu"), particle_count=300).task
+    x = task.seed(1, generator=seeded(1)).x
+    worlds, events = Particles(x, torch.ones(1, 300, rule.state_dim)), [parse_damage("0:wipe:0.6")]
+    options = {"generator": seeded(3), "stop": lambda: True}
+    worlds, _ = film_world(rule, task, worlds, 1, damages=events, **options)
+    return worlds.x, worlds.s, 0.6
+
+
+def wiped_in_a_pool():
+    task = Texture(TextureConfig(target="dots", particle_count=300, damage_radius=0.6))
+    worlds = task.seed(1, generator=seeded(1))
+    worlds = task.damage(worlds._replace(s=worlds.s + 1.0), seeded(3))
+    assert task.damage(worlds, seeded(3)).x is worlds.x
+    return worlds.x, worlds.s, 0.6
+
+
+def wiped_by_a_wrapper():
+    env = DamageEvents(small_envs.make("npa/Texture-v0", update_prob=1.0), "1:wipe:0.6")
+    env.reset(seed=0)
+    env.step(np.ones(env.action_space.shape, np.float32))
+    return *(value[None] for value in env.unwrapped.particles()), 0.6
+
+
+def wiped_at_the_start():
+    fields = {"boundary": "periodic", "box_size": 1.7, "damage": "wipe", "damage_size": 0.7}
+    env = small_envs.begun(small_envs.make("npa/Regeneration2D-v0", **fields))
+    return *(value[None] for value in env.unwrapped.particles()), 0.7
+
+
+@pytest.mark.parametrize(
+    "wiped",
+    [
+        wiped_in_the_viewer,
+        wiped_in_a_film,
+        wiped_in_a_pool,
+        wiped_by_a_wrapper,
+        wiped_at_the_start,
+    ],
+)
+def test_whoever_damages_a_periodic_world_wipes_a_whole_disk(wiped):
+    (x,), (s,), radius = wiped()
+    side = 1.7 if wiped is wiped_at_the_start else 2.0
+    away = x[:, None] - x
+    disks = [v.norm(dim=-1) <= radius for v in (away, nearest_image(away, (side, side)))]
+    is_disk = [bool((disk == (s == 0.0).all(dim=-1)).all(dim=-1).any()) for disk in disks]
+    assert is_disk == [False, True]
+
+
 TINY = {"state_dim": 6, "hidden_dim": 24, "eps": 0.3, "resolution": 24, "particle_count": 96}
 SMALL = Morphogenesis2DConfig(
     target="ring", target_point_count=96, escape_share=0.1, escape_weight=1.0, **TINY
@@ -193,9 +278,9 @@ def test_a_share_throws_particles_of_the_pool_out_and_a_weight_counts_their_path
     hurt_x, *_ = task.damage(Particles(x, s), generator)
     out = hurt_x.norm(dim=-1) > 1.0
     assert 0 < int(out.sum()) < 60
-    path = torch.ones(2, 96)
-    total, parts = task.loss(hurt_x, s, path)
-    plain, without = Morphogenesis2D(replace(SMALL, escape_weight=0.0)).loss(hurt_x, s, path)
+    hurt = Particles(hurt_x, s, torch.ones(2, 96))
+    total, parts = task.loss(hurt)
+    plain, without = Morphogenesis2D(replace(SMALL, escape_weight=0.0)).loss(hurt)
     assert float(parts["stray"]) == 1.0
     assert "stray" not in without
     assert float(total) == pytest.approx(float(plain) + 1.0)
@@ -205,8 +290,8 @@ def test_the_distance_of_the_centroid_from_where_worlds_begin_is_paid_for():
     task = Morphogenesis2D(replace(SMALL, drift_weight=2.0))
     x, s, *_ = task.seed(1, generator=seeded(0))
     moved = (x + torch.tensor([0.3, -0.4])).requires_grad_()
-    still = x.new_zeros(x.shape[:2])
-    near, there = task.loss(x - x.mean(1, keepdim=True), s, still), task.loss(moved, s, still)
+    still = Particles(x - x.mean(1, keepdim=True), s).with_zero_paths()
+    near, there = task.loss(still), task.loss(still._replace(x=moved))
     assert float(near[1]["drift"]) < 2e-6
     assert float(there[1]["drift"].detach()) == pytest.approx(0.5, abs=0.05)
     (pull,) = torch.autograd.grad(there[1]["drift"], moved)
@@ -214,4 +299,4 @@ def test_the_distance_of_the_centroid_from_where_worlds_begin_is_paid_for():
     torch.testing.assert_close(
         pull.sum(1), moved.mean(1) / moved.mean(1).norm(dim=-1), rtol=1e-5, atol=1e-6
     )
-    assert "drift" not in Morphogenesis2D(SMALL).loss(x, s, still)[1]
+    assert "drift" not in Morphogenesis2D(SMALL).loss(still)[1]

@@ -14,7 +14,6 @@ from npa_envs.tasks.targets.digit_clouds import (
     sample_ink,
     varied,
 )
-from npa_envs.world.randomness import WorldRandom
 
 
 def write_training_files(folder, images, labels):
@@ -162,10 +161,3 @@ def test_stretched_clouds_are_linear_and_shaken_ones_are_off_by_a_little():
     shaken = varied(x, rotation=0.0, stretch=0.0, jitter=0.01, generator=generator) - x
     # 1200 numbers: the standard deviation is within 10 % but for one case in a million.
     assert shaken.std() == pytest.approx(0.01, rel=0.1)
-
-
-def test_a_world_is_varied_as_it_would_be_alone():
-    x = torch.rand(3, 7, 2)
-    many, one = WorldRandom([4, 5, 6]), WorldRandom([5])
-    how = {"rotation": 40.0, "stretch": 0.1, "jitter": 0.02}
-    assert torch.equal(varied(x, **how, generator=many)[1], varied(x[1:2], **how, generator=one)[0])

@@ -12,6 +12,7 @@ from npa_envs.measure.quality import evaluate
 from npa_envs.rule.files import load_rule
 from npa_envs.tasks.losses.texture import TEXTURE_LOSSES
 from npa_envs.training import TASKS, Trainer, preset, task_entry, train
+from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import WorldRandom
 
 NAMES = [name for name, entry in TASKS.items() if not entry.joint]
@@ -45,7 +46,8 @@ def task_of(name, config, device="cpu"):
     [
         *((name, {}) for name in NAMES),
         ("morphogenesis2d", {"equivariant": True, "seed_across": 0.2}),
-        ("texture", {"loss": "patch_ot+filter_ot"}),
+        ("texture", {"loss": "patch_ot+joint_swd"}),
+        ("point_classification", {"rotation": 40.0, "stretch": 0.1, "jitter": 0.02}),
     ],
 )
 def test_a_world_is_seeded_and_measured_alone_as_in_a_batch(tiny, name, fields):
@@ -56,12 +58,12 @@ def test_a_world_is_seeded_and_measured_alone_as_in_a_batch(tiny, name, fields):
     assert torch.equal(seeds.s[1:2], alone.s)
     assert bool(seeds.s.any()) == bool(fields.get("equivariant"))
     s = 0.3 * torch.randn(seeds.s.shape, generator=torch.Generator().manual_seed(0))
-    together = task.toward(seeds.goal).metric(seeds.x, s)
+    together = task.with_goal(seeds.goal).metric(seeds.x, s)
     for k in range(3):
         one = seeds._replace(s=s).take(torch.tensor([k]))
-        assert torch.equal(task.toward(one.goal).metric(one.x, one.s), together[k : k + 1])
+        assert torch.equal(task.with_goal(one.goal).metric(one.x, one.s), together[k : k + 1])
     with pytest.raises(NPAError, match="path_length must have shape"):
-        task.toward(seeds.goal).loss(seeds.x, s, torch.zeros(1, 7))
+        task.with_goal(seeds.goal).loss(Particles(seeds.x, s, torch.zeros(1, 7)))
 
 
 # In 2D part of the loss weighs another without gradient.
@@ -86,13 +88,13 @@ def test_gradients_equal_finite_differences(tiny, name, fields):
         # The particle around which a texture is drawn has no gradient.
         direction[:, 0] = 0.0
         leaf.requires_grad_()
-        total, _ = task.loss(x, s, path_length)
+        total, _ = task.loss(Particles(x, s, path_length))
         (gradient,) = torch.autograd.grad(total, leaf)
         leaf.requires_grad_(False)
         values, start = [], leaf.clone()
         for step in (1e-8, -1e-8):
             leaf.copy_(start + step * direction)
-            values.append(float(task.loss(x, s, path_length)[0]))
+            values.append(float(task.loss(Particles(x, s, path_length))[0]))
         leaf.copy_(start)
         slope = (values[0] - values[1]) / 2e-8
         # Of textures up to 2e-6 was seen; it falls with the step, as sorting has kinks.
@@ -121,7 +123,7 @@ def slope_of(task, x, s, k):
 def test_shares_average_to_the_loss_and_show_what_a_particle_changes(tiny, name, fields):
     task = task_of(name, tiny(name, **fields))
     x, s = worlds_of(task, 2, torch.float64)
-    shares = task.particle_shares(x, s)
+    shares = task.particle_contributions(x, s)
     torch.testing.assert_close(shares.mean(1), task.metric(x, s), rtol=1e-9, atol=0.0)
     slopes = [slope_of(task, x[:1], s[:1], k) for k in (3, 40, 41)]
     for contribution, expected in zip(shares[0, [3, 41]], (slopes[0], slopes[2]), strict=True):
@@ -155,7 +157,7 @@ def test_loss_is_the_weighted_sum_of_its_parts(tiny, name):
     task = task.for_rule(lively_rule(task))
     x, s = worlds_of(task, 2)
     x, s = x if task.box else 6.0 * x, 4.0 * s
-    total, parts = task.loss(x, s, torch.full(x.shape[:2], 0.4))
+    total, parts = task.loss(Particles(x, s, torch.full(x.shape[:2], 0.4)))
     assert parts.keys() == weights.keys()
     torch.testing.assert_close(total, sum(weights[part] * value for part, value in parts.items()))
     assert min(float(value) for value in parts.values()) > 0.0
@@ -334,7 +336,7 @@ def test_losses_and_gradients_on_cuda_are_those_on_the_cpu(tiny, name, fields):
     for device in ("cpu", "cuda"):
         task = task_of(name, config, device)
         x, s = (t.to(device).requires_grad_() for t in worlds_of(task, 2, torch.float64))
-        value, _ = task.loss(x, s, torch.zeros_like(x[..., 0]))
+        value, _ = task.loss(Particles(x, s, torch.zeros_like(x[..., 0])))
         results.append([t.detach().cpu() for t in (value, *torch.autograd.grad(value, (x, s)))])
     # Sorted numbers that are equal up to rounding may change places.
     for on_cpu, on_cuda in zip(*results, strict=True):

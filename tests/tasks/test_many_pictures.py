@@ -11,7 +11,6 @@ from training_runs import make_cycle
 import npa_envs
 from npa_envs.cli import main
 from npa_envs.errors import NPAError
-from npa_envs.measure.quality import picture_rows
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.picture_codes import Codes
 from npa_envs.tasks.many_pictures import ManyPictures, named_targets
@@ -61,7 +60,7 @@ def test_each_world_is_compared_with_its_own_target(device):
     alone = [config_of(target=name, targets=()) for name in TARGETS]
     singles = [Morphogenesis2D(config, device=device) for config in alone]
     goal = torch.tensor([2, 0, 1], device=device)
-    aimed = task.toward(goal)
+    aimed = task.with_goal(goal)
     worlds = [singles[k].target for k in goal.tolist()]
     for number, target in enumerate(worlds):
         x = target.points[None].expand(3, -1, -1)
@@ -81,11 +80,11 @@ def test_gradients_of_the_loss_reach_the_worlds_codes_alone(device):
     task = task.for_rule(rule)
     x, s, _, goal = task.seed(2, generator=generator(1, device), device=device)
     goal.fill_(1)
-    aimed = task.toward(goal)
-    s = aimed.coded(s)
+    aimed = task.with_goal(goal)
+    s = aimed.with_target_code(s)
     assert torch.equal(s[..., :3], rule.codes.table[1].expand(2, 48, 3))
     x, s, path = npa_envs.rollout(rule, x, s, 3, eps=task.eps, return_path_length=True)
-    total, parts = aimed.loss(x, s, path)
+    total, parts = aimed.loss(Particles(x, s, path))
     (gradient,) = torch.autograd.grad(total, rule.codes.table)
     assert float(gradient[1].abs().min()) > 0.0
     assert float(gradient[[0, 2]].abs().max()) == 0.0
@@ -98,7 +97,7 @@ def test_switched_worlds_get_another_goal_and_its_code(device):
     x, s, _, goal = task.seed(16, generator=generator(1, device), device=device)
     _, hurt, _, switched = task.damage(Particles(x, s, goal=goal), generator(2, device))
     assert 0 < int((switched != goal).sum()) < 16
-    after = task.toward(switched).coded(hurt)
+    after = task.with_goal(switched).with_target_code(hurt)
     codes = after[..., :3].unique(dim=1)[:, 0]
     assert len(codes.unique(dim=0)) == 2
     steady = task_of(device, switch_share=0.0)
@@ -163,22 +162,10 @@ def test_the_command_trains_and_evaluates_by_name(tmp_path, capsys):
     assert main(["evaluate", out, *options, "--json", f"{out}/all.json"]) == 0
     rows = json.loads((tmp_path / "many" / "all.json").read_text(encoding="utf-8"))["pictures"]
     assert [row["target"] for row in rows] == [*TARGETS, "(median)"]
+    assert rows[3]["loss"] == sorted(row["loss"] for row in rows[:3])[1]
+    assert one["growth"][0]["loss"] == pytest.approx(rows[2]["loss"], rel=0.1)
     assert "3 pictures, 1 worlds each" in capsys.readouterr().out
     assert main(["evaluate", out, "--healing", *options]) == 2
     assert "measured of one picture at a time" in capsys.readouterr().err
     assert main(["evaluate", out, "--target=gecko", *options]) == 2
     assert "unknown code 'gecko'" in capsys.readouterr().err
-
-
-def test_rows_tell_the_right_code_from_another():
-    rule = task_of().make_rule(generator())
-    tasks = [Morphogenesis2D(config_of(target=t, targets=())).for_rule(rule) for t in TARGETS]
-    rows = picture_rows(rule, tasks, checkpoints=(1, 2), seeds=(1, 2))
-    names = [*TARGETS, "(median)"]
-    assert [(row.step, row.target) for row in rows] == [(k, name) for k in (1, 2) for name in names]
-    assert rows[3].loss == sorted(row.loss for row in rows[:3])[1]
-    # A rule that has learned nothing does not care: all worlds stay disks.
-    x, s, *_ = tasks[0].seed(2, generator=npa_envs.WorldRandom((1, 2)))
-    assert rows[0].loss == pytest.approx(float(tasks[0].metric(x, s).mean()), rel=0.2)
-    with pytest.raises(NPAError, match="two or more"):
-        picture_rows(rule, tasks[:1], seeds=(1,))

@@ -16,6 +16,7 @@ from npa_envs.tasks.gaussian_outputs import FLAT, OUTPUTS, appearance
 from npa_envs.tasks.morphogenesis3d import Morphogenesis3D, Morphogenesis3DConfig
 from npa_envs.tasks.targets.meshes import AMBIENT, LIGHT, load_mesh
 from npa_envs.tasks.targets.views import ANGLE, DISTANCE, load_views, over, some_views
+from npa_envs.world.particles import Particles
 
 WORLD = {"target": "doughnut", "particle_count": 150, "eps": 0.3, "sigma": 0.1, "opacity": 0.5}
 RULE = {"hidden_dim": 16, "readout_hidden_dim": 8}
@@ -59,7 +60,8 @@ def test_outputs_stretch_within_the_bound_and_colour_as_the_rule_says(task):
     opacities = look.opacities.detach()
     assert 0.0 < float(opacities.min()) < 0.4 < 0.6 < float(opacities.max()) < 1.0
     assert float(look.colours[..., 1:, :].detach().abs().max()) > 0.5
-    _, parts = task.for_rule(rule).loss(torch.zeros(1, 150, 3), 20.0 * s, torch.zeros(1, 150))
+    worlds = Particles(torch.zeros(1, 150, 3), 20.0 * s).with_zero_paths()
+    _, parts = task.for_rule(rule).loss(worlds)
     assert float(parts["isotropy"]) == pytest.approx(float(look.stretch.detach().abs().mean()))
 
 
@@ -145,9 +147,9 @@ def test_pictures_show_a_held_out_view_with_rows_up(task):
 def test_loss_sees_the_views_of_its_iteration_before_their_backgrounds(task):
     x, s = worlds(task, 2)
     far = torch.zeros(2, 150)
-    first, _ = task.loss(x, s, far)
+    first, _ = task.loss(Particles(x, s, far))
     task.begin(37)
-    later, parts = task.loss(x, s, far)
+    later, parts = task.loss(Particles(x, s, far))
     assert float(first) != float(later)
     # No blur is left: by hand, over the training views that the schedule says.
     schedule = task.schedule
@@ -162,7 +164,7 @@ def test_loss_sees_the_views_of_its_iteration_before_their_backgrounds(task):
         error += float(torch.cat((colours, alpha), dim=-1).abs().mean()) / 2
     assert float(parts["views"]) == pytest.approx(error, rel=1e-5)
     task.begin(0)
-    assert float(task.loss(x, s, far)[0]) == float(first)
+    assert float(task.loss(Particles(x, s, far))[0]) == float(first)
 
 
 def read_ply(path):

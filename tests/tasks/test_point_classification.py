@@ -2,7 +2,6 @@
 
 import json
 
-import gymnasium
 import pytest
 import torch
 from training_runs import make_cycle
@@ -71,21 +70,20 @@ def test_worlds_are_clouds_of_their_class_with_blank_states(task, device):
 
 def test_test_clouds_are_others_and_never_varied(folder):
     task = task_of(folder, rotation=90.0, jitter=0.1)
-    for split, count in (("train", 36), ("test", 18)):
-        on_split = task.on(split)
-        assert len(on_split.clouds.label) == count
-        x, *_ = on_split.seed(5, generator=random())
-        is_cloud = [bool((on_split.clouds.x == cloud).flatten(1).all(1).any()) for cloud in x]
-        assert is_cloud == [split == "test"] * 5
+    for part, count in ((task, 36), (task.held_out(), 18)):
+        assert len(part.clouds.label) == count
+        x, *_ = part.seed(5, generator=random())
+        is_cloud = [bool((part.clouds.x == cloud).flatten(1).all(1).any()) for cloud in x]
+        assert is_cloud == [part is not task] * 5
 
 
 def test_loss_is_the_error_to_the_class_and_the_overflow(task, device):
     rule = task.make_rule(random()).to(device).double()
     goal = torch.tensor([2, 0], device=device)
-    aimed = task.for_rule(rule).toward(goal)
+    aimed = task.for_rule(rule).with_goal(goal)
     s = 2.0 * torch.randn(2, 24, 6, dtype=torch.float64, device=device)
     x = torch.rand(2, 24, 2, dtype=torch.float64, device=device)
-    total, parts = aimed.loss(x, s, x[..., 0])
+    total, parts = aimed.loss(Particles(x, s, x[..., 0]))
     wanted = torch.nn.functional.one_hot(goal, 3)[:, None]
     outputs = rule.readout(s)
     error = (outputs - wanted).square().mean()
@@ -99,14 +97,14 @@ def test_loss_is_the_error_to_the_class_and_the_overflow(task, device):
     torch.testing.assert_close(aimed.metric(x, s).mean(), error, rtol=1e-6, atol=0)
     # The goals are read when they are asked for.
     goal.copy_(torch.tensor([1, 1]))
-    assert aimed.loss(x, s, x[..., 0])[1]["error"] != error
+    assert aimed.loss(Particles(x, s, x[..., 0]))[1]["error"] != error
 
 
 def test_without_read_out_the_last_channels_are_the_classes(task, device):
     s = torch.zeros(1, 24, 6, device=device)
     s[..., 4] = 1.0
     goals = [torch.tensor([k], device=device) for k in range(3)]
-    errors = [task.toward(goal).metric(s, s).item() for goal in goals]
+    errors = [task.with_goal(goal).metric(s, s).item() for goal in goals]
     assert errors == pytest.approx([2 / 3, 0.0, 2 / 3])
     with pytest.raises(NPAError, match="goals must be given first"):
         task.metric(s, s)
@@ -171,7 +169,7 @@ def test_mutated_worlds_keep_their_states(folder):
 
 
 def test_accuracies_are_those_of_a_rollout(folder, device):
-    task = task_of(folder, device, readout_hidden_dim=5, update_prob=1.0).on("test")
+    task = task_of(folder, device, readout_hidden_dim=5, update_prob=1.0).held_out()
     rule = task.make_rule(random(3))
     with torch.no_grad():
         for parameter in rule.parameters():
@@ -224,7 +222,7 @@ def trained(folder, tmp_path_factory):
 def test_particles_learn_to_say_what_they_form(trained):
     rule = load_rule(trained.folder / "rule.safetensors")
     config = json.loads((trained.folder / "config.json").read_text(encoding="utf-8"))
-    task = PointClassification(PointClassificationConfig(**config["task"])).on("test")
+    task = PointClassification(PointClassificationConfig(**config["task"])).held_out()
     (row,) = accuracies(rule, task, checkpoints=(16,))
     assert row.majority >= 0.9
     assert row.particle >= 0.85
@@ -261,52 +259,3 @@ def test_a_static_rule_of_no_known_task_is_refused(task, tmp_path, capsys):
     assert main(["evaluate", str(path), "--no-progress"]) != 0
     message = "runs moving rules in the 2D worlds of morphogenesis2d, got space_dim=2, static=True"
     assert message in capsys.readouterr().err
-
-
-def test_the_paper_recipe_runs_on_files_of_mnists_format(folder, tmp_path):
-    fields = {"iterations": 2, "pool_size": 64, "log_interval": 1, "tensorboard": False}
-    fields |= {"data": str(folder), "class_count": 3, "out": tmp_path}
-    config = preset("paper", "point_classification", **fields)
-    assert (config.world_count, config.steps, config.fresh_count) == (64, (12, 24), 32)
-    assert config.task.particle_count == 512
-    result = train(config, "point_classification", progress=False)
-    assert result.finished
-    # Blank outputs would have 1/3.
-    assert 0.05 < result.record["error"] < 0.6
-
-
-def classes(env):
-    """The class of each world: particles that almost say it have almost no loss."""
-    env = env.unwrapped
-    x, s = env.particles()
-    losses = []
-    for k in range(3):
-        said = torch.zeros_like(s)
-        said[..., 3 + k] = 0.9
-        env.place_particles(x, said)
-        *_, info = env.step(0.0 * env.action_space.sample())
-        losses.append(torch.as_tensor(info["loss"]))
-    least, *others = torch.stack(losses).sort(dim=0).values
-    assert least.max() < 0.01
-    assert min(other.min() for other in others) > 0.6
-    return torch.stack(losses).argmin(dim=0)
-
-
-def test_worlds_have_their_own_classes_and_keep_them(folder):
-    fields = {
-        "particle_count": 32,
-        "state_dim": 6,
-        "class_count": 3,
-        "data": str(folder),
-        "rule": "",
-    }
-    single = gymnasium.make("npa/PointClassification-v0", split="test", **fields)
-    many = {"num_envs": 5, "vectorization_mode": "vector_entry_point"}
-    batch = gymnasium.make_vec(single.spec.id, **many, **single.spec.kwargs)
-    single.reset(seed=3)
-    batch.reset(seed=3)
-    before = classes(batch)
-    assert len(set(before.tolist())) > 1
-    assert classes(single) == before[0]
-    batch.reset(options={"reset_mask": torch.tensor([True, False, False, True, False]).numpy()})
-    assert torch.equal(classes(batch)[[1, 2, 4]], before[[1, 2, 4]])

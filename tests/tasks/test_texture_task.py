@@ -10,7 +10,6 @@ from npa_envs.cli import main
 from npa_envs.rule.files import load_rule
 from npa_envs.tasks.texture import Texture, TextureConfig, colour_image, density_image
 from npa_envs.training import override, preset, train
-from npa_envs.world.particles import Particles
 
 SMALL = TextureConfig(target="bubbles", particle_count=300, resolution=24, eps=0.3)
 
@@ -98,20 +97,6 @@ def test_particles_in_the_target_s_place_are_nearer_than_any_others():
     # 0.07, 0.98 and 3.7 were seen.
     assert drawn < 0.1
     assert min(shuffled, blank) > 5.0 * drawn
-
-
-def test_damage_wipes_a_disk_that_reaches_across_the_seam():
-    task = Texture(dataclasses.replace(SMALL, damage_radius=0.4))
-    x, _ = worlds_of(task, 1)
-    x = x.new_tensor([[[0.95, -0.95]] * 50]) + 0.02 * x[:, :50]
-    corners = x.new_tensor([[[-0.95, 0.95], [0.95, 0.95], [0.0, 0.0], [-0.3, -0.95]]])
-    before = Particles(torch.cat((x, corners), dim=1), torch.ones(1, 54, 16))
-    after = task.damage(before, torch.Generator().manual_seed(0))
-    assert torch.equal(after.x, before.x)
-    # Drawn is one of the fifty in the corner, but for a chance of 4 in 54.
-    assert (after.s[0, :, 0] == 0.0).tolist() == [True] * 52 + [False, False]
-    unhurt = Texture(dataclasses.replace(SMALL, damage_radius=0.0))
-    assert unhurt.damage(before, torch.Generator()).s is before.s
 
 
 def test_a_loss_is_refused_where_there_is_none_to_choose(capsys):

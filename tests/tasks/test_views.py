@@ -67,31 +67,6 @@ def test_surfaces_are_lit_alike_from_wherever_one_looks():
         assert pixel == pytest.approx([lit] * 3 + [1.0], rel=1e-5)
 
 
-def test_near_triangles_hide_far_ones_and_colours_follow_perspective():
-    far = np.array([(-2.0, -2.0, -1.0), (2.0, -2.0, -1.0), (0.0, 3.0, -1.0)])
-    near = np.array([(-0.1, -0.1, 1.0), (0.1, -0.1, 1.0), (0.0, 0.2, 1.0)])
-    red, green = np.tile((1.0, 0.0, 0.0), (3, 1)), np.tile((0.0, 1.0, 0.0), (3, 1))
-    cameras = orbit(1, 0.0, DISTANCE, ANGLE, width=33, height=33)
-    for order in (1, -1):
-        faces = np.array([(0, 1, 2), (3, 4, 5)])[::order]
-        both = Mesh(np.concatenate((far, near)), faces, np.concatenate((red, green)))
-        picture = draw_mesh(both, cameras)[0]
-        assert picture[16, 16, 0] == 0.0
-        assert picture[16, 16, 1] > 0.5
-        assert picture[2, 16, 1] == 0.0
-        assert picture[2, 16, 0] > 0.5
-    # A floor from near to far, black to white: where the depth is the mean, so is the colour.
-    floor = np.array([(-1.0, 0.0, 1.2), (1.0, 0.0, 1.2), (1.0, 0.0, -2.8), (-1.0, 0.0, -2.8)])
-    shade = np.repeat(np.array([0.0, 0.0, 1.0, 1.0])[:, None], 3, axis=1)
-    mesh = Mesh(floor, np.array([(0, 1, 2), (0, 2, 3)]), shade)
-    cameras = orbit(1, 10.0, DISTANCE, ANGLE, width=201, height=201)
-    place = torch.tensor([0.0, 0.0, -0.8, 1.0])
-    point = cameras.world_to_camera[0] @ place
-    row = float(cameras.intrinsics[1] * point[1] / point[2] + cameras.intrinsics[3])
-    lit = AMBIENT + (1 - AMBIENT) * 0.8 / math.sqrt(0.35**2 + 0.80**2 + 0.50**2)
-    assert draw_mesh(mesh, cameras)[0, int(row), 100, 0] / lit == pytest.approx(0.5, abs=0.02)
-
-
 def test_cameras_surround_the_world_evenly_and_held_out_ones_are_others():
     cameras, others = (surrounding_cameras(40, 16, turn=turn) for turn in (0.0, 0.5))
     positions = [

@@ -9,6 +9,7 @@ from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2D, CoMorphogenesis
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2DConfig
 from npa_envs.tasks.train_config import tiny_run
 from npa_envs.training import train_together
+from npa_envs.world.particles import Particles
 
 
 def small(target, count=48, **fields):
@@ -55,10 +56,11 @@ class TestTask:
         x, s, _ = worlds(task)
         x = 3.0 * x  # Some leave the bounds around their seed.
         path = torch.rand(3, 80, generator=torch.Generator().manual_seed(1))
-        total, parts = task.loss(x, s, path)
+        total, parts = task.loss(Particles(x, s, path))
+        one, other = Particles(x, s, path).split([48, 32])
         shift = torch.tensor([0.4, 0.0])
-        first, first_parts = task.tasks[0].loss(x[:, :48] + shift, s[:, :48], path[:, :48])
-        second, second_parts = task.tasks[1].loss(x[:, 48:] - shift, s[:, 48:], path[:, 48:])
+        first, first_parts = task.tasks[0].loss(one._replace(x=one.x + shift))
+        second, second_parts = task.tasks[1].loss(other._replace(x=other.x - shift))
         assert first_parts["bound"] > 0.0
         assert total.item() == pytest.approx((first + second).item(), rel=1e-6)
         expected = {f"0.{k}": v.item() for k, v in first_parts.items()}

@@ -169,7 +169,7 @@ def test_iteration_leaves_the_worlds_the_terms_and_the_gradients(tmp_path):
         rule, iteration.start.x, iteration.start.s, 5, eps=task.eps, box=None, update_prob=0.5,
         memory="store", generator=generator, return_path_length=True
     )  # fmt: skip
-    total, parts = task.loss(x, s, path_length)
+    total, parts = task.loss(Particles(x, s, path_length))
     rule.zero_grad()
     total.backward()
     assert torch.equal(iteration.end.x, x.detach())

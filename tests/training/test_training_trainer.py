@@ -316,11 +316,11 @@ class BrokenTask(CircleTask):
         super().__init__()
         self.bad_call = iteration
 
-    def loss(self, x, s, path_length):
+    def loss(self, worlds):
         if self.loss_calls == self.bad_call:
-            s = s.clone()
-            s[1] = math.nan
-        return super().loss(x, s, path_length)
+            worlds = worlds._replace(s=worlds.s.clone())
+            worlds.s[1] = math.nan
+        return super().loss(worlds)
 
 
 def explode_after(iterations):

@@ -40,10 +40,10 @@ def test_gathered_particles_keep_the_goals_of_their_worlds():
     assert result.goal is two.goal
 
 
-@pytest.mark.parametrize("path_length", [None, torch.ones(2, 3)])
-def test_species_keep_the_goals_of_their_worlds(path_length):
-    two = worlds(2)._replace(path_length=path_length)
-    first, second = two.split([1, 2])
-    assert_same((first.x, second.s), (two.x[:, :1], two.s[:, 1:]))
-    assert first.goal is second.goal is two.goal
-    assert (second.path_length is None) == (path_length is None)
+@pytest.mark.parametrize("path", [None, torch.arange(6.0).view(2, 3)])
+def test_species_have_their_particles_and_the_goals_of_their_worlds(path):
+    two = worlds(2)._replace(path_length=path)
+    for species, some in zip(two.split([1, 2]), (slice(0, 1), slice(1, 3)), strict=True):
+        fields = [value[:, some] for value in two.per_particle() if value is not None]
+        assert_same(species.tensors(), [*fields, two.goal])
+        assert (species.path_length is None) == (path is None)

@@ -76,7 +76,7 @@ def rule_worlds(
         session.cache[name, particles] = rule, trained.task
     rule, task = session.cache[name, particles]
     x, s, _, goal = task.seed(world_count, generator=session.generator(), device=session.device)
-    return RuleWorlds(rule, task.toward(goal), Particles(x.float(), s.float(), goal=goal))
+    return RuleWorlds(rule, task.with_goal(goal), Particles(x.float(), s.float(), goal=goal))
 
 
 # The group `time`: every shipped rule for 100 000 steps.

@@ -242,7 +242,7 @@ class RuleTrial:
         """Return states whose first channels have their world's target code again, if any."""
         s = s.clone()
         for task, index in self._by_task(x):
-            s[index] = task.coded(s[index])
+            s[index] = task.with_target_code(s[index])
         return s
 
     def initial_worlds(self, fraction: float = 1.0, shape: str = "trained") -> Particles:
@@ -295,7 +295,7 @@ class RuleTrial:
         for task, index in self._by_task(worlds.x):
             for some in torch.split(index, size):
                 chosen = worlds.take(some)
-                losses[some] = task.toward(chosen.goal).trial_metric(chosen)
+                losses[some] = task.with_goal(chosen.goal).trial_metric(chosen)
         return losses
 
     def by_seed(self, losses: Tensor) -> Tensor:

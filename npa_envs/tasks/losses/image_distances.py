@@ -1,10 +1,8 @@
-"""Parts of losses that compare pictures: patches, features, optimal transport, MS-SSIM."""
+"""Distances between pictures: by patches at several sizes, by their transport, MS-SSIM."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -15,17 +13,14 @@ from npa_envs.ops import world_mean
 LEVELS = 4
 """Largest number of image sizes, each half of the one before."""
 
-SMALLEST = 12
+MIN_SIDE = 12
 """Least side of the smallest image size [pixels]."""
 
-PLACES = 64
+POSITIONS = 64
 """Largest number of positions along each side that are compared; larger images are subsampled."""
 
 ALIGNMENT = 64
 """Alignment of the matrices that are multiplied [bytes]."""
-
-TINY_SQUARE = 1e-12
-"""Added to the squared length of a feature vector before it is normalised."""
 
 
 @dataclass(frozen=True)
@@ -49,9 +44,9 @@ class TextureDistance:
     """Whether `compare` returns the same for an image, bit for bit, in every batch."""
 
     def __init__(self, target: Tensor) -> None:
-        if target.shape[-1] < SMALLEST:
+        if target.shape[-1] < MIN_SIDE:
             raise NPAError(
-                f"resolution must be at least {SMALLEST} pixels, got {target.shape[-1]}: for "
+                f"resolution must be at least {MIN_SIDE} pixels, got {target.shape[-1]}: for "
                 "example 64"
             )
         self._shape = tuple(target.shape)
@@ -79,7 +74,7 @@ class TextureDistance:
 def level_count(resolution: int) -> int:
     """Return the number of image sizes to compare at a resolution."""
     count = 1
-    while count < LEVELS and resolution % 2 == 0 and resolution // 2 >= SMALLEST:
+    while count < LEVELS and resolution % 2 == 0 and resolution // 2 >= MIN_SIDE:
         resolution //= 2
         count += 1
     return count
@@ -98,7 +93,7 @@ def pyramid(images: Tensor, count: int) -> list[Tensor]:
 
 def stride_of(level: Tensor, thinned: bool) -> int:
     """Return the stride in pixels between compared positions; 1 unless `thinned`."""
-    return max(1, level.shape[-1] // PLACES) if thinned else 1
+    return max(1, level.shape[-1] // POSITIONS) if thinned else 1
 
 
 def patches(images: Tensor, size: int, *, stride: int, wrap: bool) -> Tensor:
@@ -142,44 +137,13 @@ def quantiles(values: Tensor, count: int) -> Tensor:
     return ordered[:, low] * (1.0 - part) + ordered[:, (low + 1).clamp(max=total - 1)] * part
 
 
-def relaxed_transport(first: Tensor, second: Tensor) -> Tensor:
-    """Return the relaxed earth mover's distance of rows under the cosine distance, shape [B].
-
-    Every row moves to the nearest row of the other side. The larger of both directions' mean costs
-    is returned; each is a lower bound of the cost of transport.
-    """
-    costs = 1.0 - _directions(first) @ _directions(second).transpose(1, 2)
-    there, back = costs.amin(dim=2).mean(dim=1), costs.amin(dim=1).mean(dim=1)
-    return torch.maximum(there, back)
-
-
-def moment_distance(first: Tensor, second: Tensor) -> Tensor:
-    """Return the mean absolute differences of means and of covariances, added, shape [B]."""
-    (mean, covariance), (other_mean, other_covariance) = _moments(first), _moments(second)
-    difference = (mean - other_mean).abs().mean(dim=(1, 2))
-    return difference + (covariance - other_covariance).abs().mean(dim=(1, 2))
-
-
-def _directions(rows: Tensor) -> Tensor:
-    return rows * (rows.square().sum(dim=-1, keepdim=True) + TINY_SQUARE).rsqrt()
-
-
-def _moments(rows: Tensor) -> tuple[Tensor, Tensor]:
-    mean = rows.mean(dim=1, keepdim=True)
-    centred = rows - mean
-    return mean, centred.transpose(1, 2) @ centred / (rows.shape[1] - 1)
-
-
-# Losses that compare shapes, by patches matched with patches or features with features, of all
-# channels together.
-
 MATCHED_PATCH = 7
 """Side of a matched patch [pixels]; at the smallest of four sizes it spans 56 image pixels."""
 
-MATCHED_PLACES = 32
+WORLD_POSITIONS = 32
 """Largest number of patches of a world along each side, for each size."""
 
-TARGET_PLACES = 64
+TARGET_POSITIONS = 64
 """Largest number of patches of the target along each side, for each size."""
 
 EVEN = 0.01
@@ -201,7 +165,7 @@ class PatchTransport(TextureDistance):
         self._expected = []
         self._scales = []
         for level in pyramid(target[None], level_count(target.shape[-1])):
-            stride = -(-level.shape[-1] // TARGET_PLACES)
+            stride = -(-level.shape[-1] // TARGET_POSITIONS)
             rows = patches(level, MATCHED_PATCH, stride=stride, wrap=options.tiles)[0].contiguous()
             spread = (rows.double() - rows.double().mean(0)).square().mean()
             self._expected.append(rows)
@@ -212,100 +176,30 @@ class PatchTransport(TextureDistance):
         total = images.new_zeros(len(images))
         levels = pyramid(images, len(self._expected))
         for level, expected, scale in zip(levels, self._expected, self._scales, strict=True):
-            stride = -(-level.shape[-1] // MATCHED_PLACES)
-            found = patches(level, MATCHED_PATCH, stride=stride, wrap=True)
-            total = total + scale.to(total) * _matched(found, expected.to(found))
+            stride = -(-level.shape[-1] // WORLD_POSITIONS)
+            rows = patches(level, MATCHED_PATCH, stride=stride, wrap=True)
+            total = total + scale.to(total) * _matched(rows, expected.to(rows))
         return total / len(self._expected)
 
 
-def _matched(found: Tensor, expected: Tensor) -> Tensor:
+def _matched(rows: Tensor, expected: Tensor) -> Tensor:
     """Return the larger mean squared distance to nearest patches, of both directions; shape [B]."""
     with torch.no_grad():
-        squares = found.square().sum(2)[:, :, None] + expected.square().sum(1)
-        costs = squares - 2.0 * (found @ expected.T)
+        squares = rows.square().sum(2)[:, :, None] + expected.square().sum(1)
+        costs = squares - 2.0 * (rows @ expected.T)
         there, back = costs.argmin(2), costs.argmin(1)
         # The target patches to which each patch of a world is nearest: their number and sum.
-        chosen = (back[:, None] == torch.arange(found.shape[1], device=found.device)[:, None]).to(
-            found
+        chosen = (back[:, None] == torch.arange(rows.shape[1], device=rows.device)[:, None]).to(
+            rows
         )
         times, sums = chosen.sum(2, keepdim=True), chosen @ expected
         rest = expected.square().mean()
-    forward = (found - expected[there]).square()
+    forward = (rows - expected[there]).square()
     # Σ (p − t)² over the target's patches, gathered by the world's: its gradient has a fixed order.
-    ratio = found.shape[1] / expected.shape[0]
-    backward = ratio * (times * found.square() - 2.0 * found * sums)
+    ratio = rows.shape[1] / expected.shape[0]
+    backward = ratio * (times * rows.square() - 2.0 * rows * sums)
     both = [world_mean(part.flatten(1)[..., None])[:, 0] for part in (forward, backward)]
     return torch.maximum(both[0], both[1] + rest)
-
-
-FILTER_SIZES = (3, 5, 7, 11, 15, 23, 37, 55)
-"""Sides of random filters for images of `REFERENCE` pixels [pixels]."""
-
-FILTERS = 32
-"""Random filters of each size."""
-
-REFERENCE = 128
-"""Side of the images that `FILTER_SIZES` refers to [pixels]."""
-
-
-class RandomFilters:
-    """Features of images: their channels and the rectified responses of random filters.
-
-    After Ustyuzhaninov, Brendel, Gatys and Bethge, arXiv 1606.00021.
-    """
-
-    def __init__(self, like: Tensor, options: LossOptions) -> None:
-        channels, side, _ = like.shape
-        generator = torch.Generator().manual_seed(options.seed)
-        banks = []
-        for size in FILTER_SIZES:
-            width = min(side, max(2, round(size * side / REFERENCE)))
-            drawn = torch.randn(FILTERS, channels, width, width, generator=generator)
-            drawn -= drawn.mean(dim=(2, 3), keepdim=True)
-            bank = torch.zeros(FILTERS, channels, side, side)
-            bank[..., :width, :width] = drawn / drawn.flatten(1).norm(dim=1)[:, None, None, None]
-            banks.append(bank)
-        self._largest = width
-        self.filter_waves = torch.fft.rfft2(torch.cat(banks).to(like)).conj()
-        """The filters' conjugate Fourier transforms."""
-
-    def __call__(self, images: Tensor, *, wrap: bool) -> list[Tensor]:
-        """Return the features at every second pixel or fewer, [B, M, F]; `wrap`: edges meet."""
-        waves = torch.fft.rfft2(images)
-        responses = torch.einsum("bkrc,fkrc->bfrc", waves, self.filter_waves.to(waves))
-        fields = torch.fft.irfft2(responses, s=images.shape[-2:]).relu()
-        inside = images.shape[-1] - (0 if wrap else self._largest - 1)
-        features = torch.cat((images, fields), dim=1)[..., :inside:2, :inside:2]
-        stride = -(-features.shape[-1] // MATCHED_PLACES)
-        return [features[..., ::stride, ::stride].flatten(2).transpose(1, 2)]
-
-
-class FeatureTransport(TextureDistance):
-    """Relaxed optimal transport of features and their moments, summed over layers.
-
-    For each layer it is the relaxed earth mover's distance under the cosine distance of features,
-    plus the mean absolute differences of their means and of their covariances (Kolkin, Salavon and
-    Shakhnarovich 2019).
-
-    Args:
-        features: Class of a network, which returns features of images, [B, M, F] for each layer.
-    """
-
-    def __init__(
-        self, features: Callable[[Tensor, LossOptions], Any], target: Tensor, options: LossOptions
-    ) -> None:
-        super().__init__(target)
-        self._features = features(target, options)
-        with torch.no_grad():
-            self._expected = self._features(target[None], wrap=options.tiles)
-
-    def compare(self, images: Tensor) -> Tensor:
-        """Return the distance of each of some checked images, [B]."""
-        total = images.new_zeros(len(images))
-        for found, target in zip(self._features(images, wrap=True), self._expected, strict=True):
-            expected = target.to(found)
-            total = total + relaxed_transport(found, expected) + moment_distance(found, expected)
-        return total
 
 
 # MS-SSIM: structural similarity at several sizes (Wang et al. 2003).
@@ -347,29 +241,30 @@ class MultiScaleSimilarity:
         self._windows = [_window(size).float().to(device) for size in sizes]
         self._halvings = [_halving(size).to(device) for size in sizes[:-1]]
 
-    def __call__(self, found: Tensor, wanted: Tensor) -> Tensor:
+    def __call__(self, pictures: Tensor, target: Tensor) -> Tensor:
         """Return the similarity of pictures [..., R, R] of one channel, at most 1, shape [...]."""
-        total = found.new_zeros(found.shape[:-2])
+        total = pictures.new_zeros(pictures.shape[:-2])
         last = len(WEIGHTS) - 1
         for size, (weight, window) in enumerate(zip(WEIGHTS, self._windows, strict=True)):
-            whole, contrast = _similarity(found, wanted, window.to(found))
+            whole, contrast = _similarity(pictures, target, window.to(pictures))
             factor = whole if size == last else contrast
             total = total + weight * factor.clamp_min(FLOOR).log()
             if size < last:
-                halving = self._halvings[size].to(found)
-                found, wanted = _from_both_sides(found, halving), _from_both_sides(wanted, halving)
+                halving = self._halvings[size].to(pictures)
+                pictures = _from_both_sides(pictures, halving)
+                target = _from_both_sides(target, halving)
         return total.exp()
 
 
-def _similarity(found: Tensor, wanted: Tensor, window: Tensor) -> tuple[Tensor, Tensor]:
+def _similarity(pictures: Tensor, target: Tensor, window: Tensor) -> tuple[Tensor, Tensor]:
     """Return the SSIM of pictures at one size, and its factor of contrast and structure."""
     mean, square, product = _from_both_sides(
-        torch.stack((found, found.square(), found * wanted)), window
+        torch.stack((pictures, pictures.square(), pictures * target)), window
     )
-    wanted_mean, wanted_square = _from_both_sides(torch.stack((wanted, wanted.square())), window)
+    target_mean, target_square = _from_both_sides(torch.stack((target, target.square())), window)
     of_means, of_deviations = STABILISERS
-    mixed, squares = mean * wanted_mean, mean.square() + wanted_mean.square()
-    spread = square + wanted_square - squares
+    mixed, squares = mean * target_mean, mean.square() + target_mean.square()
+    spread = square + target_square - squares
     contrast = (2.0 * (product - mixed) + of_deviations) / (spread + of_deviations)
     light = (2.0 * mixed + of_means) / (squares + of_means)
     return (light * contrast).mean(dim=(-2, -1)), contrast.mean(dim=(-2, -1))

@@ -18,10 +18,8 @@ from npa_envs.atomic_files import check_torch_archive, home_path, open_regular
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.ops import world_mean
 from npa_envs.tasks.losses.image_distances import (
-    FeatureTransport,
     LossOptions,
     PatchTransport,
-    RandomFilters,
     TextureDistance,
     level_count,
     orthogonal,
@@ -61,12 +59,12 @@ class LossEntry:
 
 def check_loss_name(name: str) -> None:
     """Check that a name, or every name joined by "+", is of a texture loss."""
-    parts = name.split("+") if isinstance(name, str) else []
-    for part in parts or [name]:
-        if not isinstance(part, str) or part not in TEXTURE_LOSSES:
-            hint = suggest(part, TEXTURE_LOSSES)
+    names = name.split("+") if isinstance(name, str) else [name]
+    for one in names:
+        if not isinstance(one, str) or one not in TEXTURE_LOSSES:
+            hint = suggest(one, TEXTURE_LOSSES)
             raise NPAError(f"loss must be a texture loss that exists, got {shown(name)}: {hint}")
-    if len(parts) > 1 and not all(TEXTURE_LOSSES[part].joint for part in parts):
+    if len(names) > 1 and not all(TEXTURE_LOSSES[one].joint for one in names):
         joint = ", ".join(key for key, entry in TEXTURE_LOSSES.items() if entry.joint)
         raise NPAError(f"losses that are summed must be joint ones, got {shown(name)}: {joint}")
 
@@ -94,7 +92,7 @@ def make_texture_loss(
             f"target must be a floating tensor of shape [K, R, R], got {target.dtype} "
             f"{tuple(target.shape)}: channels come first"
         )
-    losses = [TEXTURE_LOSSES[part].make(target.detach(), options) for part in name.split("+")]
+    losses = [TEXTURE_LOSSES[one].make(target.detach(), options) for one in name.split("+")]
     return losses[0] if len(losses) == 1 else partial(_summed, losses)
 
 
@@ -127,7 +125,7 @@ class SlicedWasserstein(TextureDistance):
     Args:
         describe: Class of a descriptor, which returns the features at each position of images,
             [B, M, F] for each size. With `wrap` opposite edges meet, else positions near them are
-            left out; `thinned`: at most `PLACES` along each side.
+            left out; `thinned`: at most `POSITIONS` along each side.
     """
 
     same_in_every_batch = True
@@ -143,8 +141,8 @@ class SlicedWasserstein(TextureDistance):
             thinned = self.descriptor(target[None], wrap=True, thinned=True)
             described = self.descriptor(target[None].double(), wrap=options.tiles, thinned=False)
             self._quantiles = [
-                quantiles(features[0].T, found.shape[1]).to(target)
-                for features, found in zip(described, thinned, strict=True)
+                quantiles(features[0].T, compared.shape[1]).to(target)
+                for features, compared in zip(described, thinned, strict=True)
             ]
             self._scales = [1.0 / (each[0].var(0).mean() + FLOOR) for each in described]
 
@@ -221,16 +219,14 @@ class FilterDescriptor:
         return result
 
 
-# The paper's loss: relaxed optimal transport between features of VGG16, and their moments, after
-# Kolkin, Salavon and Shakhnarovich, "Style Transfer by Relaxed Optimal Transport and Self-
-# Similarity" (2019). Of VGG16 (Simonyan and Zisserman 2014) only the weights are needed, not
+# The paper's loss. Of VGG16 (Simonyan and Zisserman 2014) only the weights are needed, not
 # torchvision: the layers are few. Average pooling replaces maximum pooling, and worlds are padded
 # periodically.
 
-VGG_PLACES = 1024
+VGG_POSITIONS = 1024
 """Largest number of positions of a layer that are compared."""
 
-VGG_SMALLEST = 32
+VGG_MIN_SIDE = 32
 """Least side of images with more than one position in the deepest layer [pixels]."""
 
 WEIGHTS_FILE = "vgg16-397923af.pth"
@@ -243,63 +239,109 @@ VGG_LAYERS = {(0, 2): 64, (5, 7): 128, (10, 12, 14): 256, (17, 19, 21): 512, (24
 """Convolutions in torchvision's counting -> their channels; a pooling layer follows each group.
 Features are read after the first rectifier of a group."""
 
+TINY_SQUARE = 1e-12
+"""Added to the squared length of a feature vector before it is normalised."""
+
 VGG_MEAN, VGG_DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 """Mean and standard deviation of ImageNet's red, green and blue."""
 
 
-class VGGFeatures:
-    """VGG16's features of images of 1 or 3 channels at five layers.
+class VGGTransport(TextureDistance):
+    """Relaxed optimal transport of VGG16's features and their moments, summed over five layers.
 
-    A layer with more than 1024 positions is read at 1024 random ones, the same in all calls.
+    For each layer it is the relaxed earth mover's distance under the cosine distance of features,
+    plus the mean absolute differences of their means and of their covariances (Kolkin, Salavon and
+    Shakhnarovich, "Style Transfer by Relaxed Optimal Transport and Self-Similarity", 2019). Images
+    have 1 or 3 channels. A layer with more than 1024 positions is read at 1024 random ones, the
+    same in all calls.
     """
 
-    def __init__(self, like: Tensor, options: LossOptions) -> None:
-        channels, side, _ = like.shape
+    def __init__(self, target: Tensor, options: LossOptions) -> None:
+        super().__init__(target)
+        channels, side, _ = target.shape
         if channels not in (1, 3):
             raise NPAError(f"vgg_ot compares images of 1 or 3 channels, got {channels}")
-        if side < VGG_SMALLEST:
+        if side < VGG_MIN_SIDE:
             raise NPAError(
-                f"resolution must be at least {VGG_SMALLEST} pixels for vgg_ot, got {side}: "
+                f"resolution must be at least {VGG_MIN_SIDE} pixels for vgg_ot, got {side}: "
                 "for example 128"
             )
         file = load_vgg_weights(options.vgg_weights)
         generator = torch.Generator().manual_seed(options.seed)
         self._groups: list[list[tuple[Tensor, Tensor]]] = []
-        self._places: list[Tensor | None] = []
+        self._positions: list[Tensor | None] = []
         channels = 3
         for numbers, width in VGG_LAYERS.items():
             group = []
             for number in numbers:
                 weight = _checked(file, f"features.{number}.weight", (width, channels, 3, 3))
                 bias = _checked(file, f"features.{number}.bias", (width,))
-                group.append((weight.to(like), bias.to(like)))
+                group.append((weight.to(target), bias.to(target)))
                 channels = width
             self._groups.append(group)
-            places = None
-            if side * side > VGG_PLACES:
-                drawn = torch.randperm(side * side, generator=generator)[:VGG_PLACES]
-                places = drawn.sort().values.to(like.device)
-            self._places.append(places)
+            positions = None
+            if side * side > VGG_POSITIONS:
+                drawn = torch.randperm(side * side, generator=generator)[:VGG_POSITIONS]
+                positions = drawn.sort().values.to(target.device)
+            self._positions.append(positions)
             side //= 2
-        self._mean = like.new_tensor(VGG_MEAN)[:, None, None]
-        self._deviation = like.new_tensor(VGG_DEVIATION)[:, None, None]
+        self._mean = target.new_tensor(VGG_MEAN)[:, None, None]
+        self._deviation = target.new_tensor(VGG_DEVIATION)[:, None, None]
+        with torch.no_grad():
+            self._expected = self.features(target[None], wrap=options.tiles)
 
-    def __call__(self, images: Tensor, *, wrap: bool) -> list[Tensor]:
+    def features(self, images: Tensor, *, wrap: bool) -> list[Tensor]:
         """Return features [B, M, F] of each layer; pads periodically (`wrap`) or mirrored."""
         mode = "circular" if wrap else "reflect"
         # In the weights' precision.
         field = (images.to(self._mean) - self._mean) / self._deviation
         features: list[Tensor] = []
-        for group, places in zip(self._groups, self._places, strict=True):
+        for group, positions in zip(self._groups, self._positions, strict=True):
             if features:
                 field = F.avg_pool2d(field, 2)
             for number, (weight, bias) in enumerate(group):
                 field = F.conv2d(F.pad(field, (1, 1, 1, 1), mode=mode), weight, bias).relu()
                 if number == 0:
                     rows = field.flatten(2)
-                    rows = rows if places is None else rows.index_select(2, places)
+                    rows = rows if positions is None else rows.index_select(2, positions)
                     features.append(rows.transpose(1, 2))
         return features
+
+    def compare(self, images: Tensor) -> Tensor:
+        """Return the distance of each of some checked images, [B]."""
+        total = images.new_zeros(len(images))
+        for actual, target in zip(self.features(images, wrap=True), self._expected, strict=True):
+            expected = target.to(actual)
+            total = total + relaxed_transport(actual, expected) + moment_distance(actual, expected)
+        return total
+
+
+def relaxed_transport(first: Tensor, second: Tensor) -> Tensor:
+    """Return the relaxed earth mover's distance of rows under the cosine distance, shape [B].
+
+    Every row moves to the nearest row of the other side. The larger of both directions' mean costs
+    is returned; each is a lower bound of the cost of transport.
+    """
+    costs = 1.0 - _directions(first) @ _directions(second).transpose(1, 2)
+    there, back = costs.amin(dim=2).mean(dim=1), costs.amin(dim=1).mean(dim=1)
+    return torch.maximum(there, back)
+
+
+def moment_distance(first: Tensor, second: Tensor) -> Tensor:
+    """Return the mean absolute differences of means and of covariances, added, shape [B]."""
+    (mean, covariance), (other_mean, other_covariance) = _moments(first), _moments(second)
+    difference = (mean - other_mean).abs().mean(dim=(1, 2))
+    return difference + (covariance - other_covariance).abs().mean(dim=(1, 2))
+
+
+def _directions(rows: Tensor) -> Tensor:
+    return rows * (rows.square().sum(dim=-1, keepdim=True) + TINY_SQUARE).rsqrt()
+
+
+def _moments(rows: Tensor) -> tuple[Tensor, Tensor]:
+    mean = rows.mean(dim=1, keepdim=True)
+    centred = rows - mean
+    return mean, centred.transpose(1, 2) @ centred / (rows.shape[1] - 1)
 
 
 def load_vgg_weights(path: str | Path = "") -> dict[str, Any]:
@@ -334,9 +376,9 @@ def load_vgg_weights(path: str | Path = "") -> dict[str, Any]:
 def _checked(weights: Mapping[str, Any], name: str, shape: tuple[int, ...]) -> Tensor:
     tensor = weights.get(name)
     if not isinstance(tensor, Tensor) or tuple(tensor.shape) != shape:
-        found = tuple(tensor.shape) if isinstance(tensor, Tensor) else "nothing"
+        got = tuple(tensor.shape) if isinstance(tensor, Tensor) else "nothing"
         raise NPAError(
-            f"VGG16's weights must hold {name} of shape {shape}, got {found}: "
+            f"VGG16's weights must hold {name} of shape {shape}, got {got}: "
             f"give torchvision's file, {WEIGHTS_URL}"
         )
     return tensor.detach()
@@ -345,7 +387,7 @@ def _checked(weights: Mapping[str, Any], name: str, shape: tuple[int, ...]) -> T
 TEXTURE_LOSSES: Mapping[str, LossEntry] = {
     "vgg_ot": LossEntry(
         "the paper's: optimal transport of VGG16 features; needs weights",
-        partial(FeatureTransport, VGGFeatures),
+        VGGTransport,
     ),
     "patch_swd": LossEntry(
         "sliced Wasserstein distance of raw patches at several sizes",
@@ -362,11 +404,6 @@ TEXTURE_LOSSES: Mapping[str, LossEntry] = {
     ),
     "patch_ot": LossEntry(
         "relaxed optimal transport of raw patches at several sizes", PatchTransport, joint=True
-    ),
-    "filter_ot": LossEntry(
-        "relaxed optimal transport of one layer of random filters of many sizes",
-        partial(FeatureTransport, RandomFilters),
-        joint=True,
     ),
 }
 """Every texture loss by name."""

@@ -196,7 +196,7 @@ def varied(
 BUILT_IN = ("digits", "mnist")
 """Data sets by name; everything else is a folder of IDX files."""
 
-TEST_SHARE = 0.2
+TEST_FRACTION = 0.2
 """Fraction of scikit-learn's digits, class by class, in the test split."""
 
 SPLIT_SEED = 0
@@ -299,8 +299,8 @@ def _digits(split: Split) -> DigitPictures:
     random = np.random.default_rng(SPLIT_SEED)
     is_test = np.zeros(len(label), bool)
     for number in range(10):
-        own = random.permutation(np.flatnonzero(label == number))
-        is_test[own[: round(TEST_SHARE * len(own))]] = True
+        indices = random.permutation(np.flatnonzero(label == number))
+        is_test[indices[: round(TEST_FRACTION * len(indices))]] = True
     chosen = is_test if split == "test" else ~is_test
     return DigitPictures(np.asarray(bunch.images, np.float32)[chosen] / 16.0, label[chosen])
 

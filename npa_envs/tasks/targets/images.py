@@ -21,7 +21,7 @@ OPAQUE = 128
 """Least alpha of a pixel of the target, of 255."""
 
 _BACKGROUND_TOLERANCE = 28
-_UNIFORM_SHARE = 0.95
+_UNIFORM = 0.95
 _MAX_CUT_OUT = 2048
 _MAX_FILE = 256 * 2**20
 _MAX_PADDED = 9216
@@ -121,9 +121,9 @@ def looks_like_path(source: str) -> bool:
 
 def scaled_square(image: Image.Image, side: int) -> FloatImage:
     """Return a square picture scaled to [S, S, 4]: colours times alpha, and alpha, in [0, 1]."""
-    kind = Image.Resampling.BOX if image.width >= side else Image.Resampling.BICUBIC
+    method = Image.Resampling.BOX if image.width >= side else Image.Resampling.BICUBIC
     # Pillow's premultiplied mode: colours of transparent pixels do not leak.
-    scaled = image.convert("RGBa").resize((side, side), kind)
+    scaled = image.convert("RGBa").resize((side, side), method)
     return np.asarray(scaled).astype(np.float32) / np.float32(255.0)
 
 
@@ -151,9 +151,9 @@ def cut_out_background(image: Image.Image, *, label: str) -> Image.Image:
     border = np.concatenate([rgb[0], rgb[-1], rgb[:, 0], rgb[:, -1]])
     background = np.median(border, axis=0)
     uniform = (np.abs(border - background).max(axis=-1) <= _BACKGROUND_TOLERANCE).mean()
-    if uniform < _UNIFORM_SHARE:
+    if uniform < _UNIFORM:
         raise NPAError(
-            f"target {shown(label)} has no transparency, so at least {_UNIFORM_SHARE:.0%} of its "
+            f"target {shown(label)} has no transparency, so at least {_UNIFORM:.0%} of its "
             f"border must have one colour (the background), but only {uniform:.0%} have: give a "
             "PNG or WebP with a transparent background, or grow the whole picture (keep_background)"
         )
@@ -213,12 +213,12 @@ def resample(image: Image.Image, point_count: int, *, label: str = "picture") ->
     best, best_miss = pitch, abs(count(pitch) - point_count)
     for _ in range(24):
         middle = 0.5 * (fine + coarse)
-        found = count(middle)
-        if abs(found - point_count) < best_miss:
-            best, best_miss = middle, abs(found - point_count)
+        reached = count(middle)
+        if abs(reached - point_count) < best_miss:
+            best, best_miss = middle, abs(reached - point_count)
         if best_miss == 0:
             break
-        fine, coarse = (middle, coarse) if found > point_count else (fine, middle)
+        fine, coarse = (middle, coarse) if reached > point_count else (fine, middle)
     if best_miss == point_count and count(best) == 0:
         raise NPAError(
             f"target {shown(label)} is too thin to be resampled to {point_count} points, no opaque "
@@ -237,8 +237,8 @@ def _sample(padded: Image.Image, span: int, pitch: float) -> Image.Image:
     low = 0.5 * (padded.width - side * pitch)
     high = low + side * pitch
     # Above one source pixel a grid pixel LANCZOS averages; below, where it would ring, BICUBIC.
-    kind = Image.Resampling.LANCZOS if pitch > 1 else Image.Resampling.BICUBIC
-    return padded.resize((side, side), kind, box=(low, low, high, high))
+    method = Image.Resampling.LANCZOS if pitch > 1 else Image.Resampling.BICUBIC
+    return padded.resize((side, side), method, box=(low, low, high, high))
 
 
 def _opaque_count(image: Image.Image) -> int:
@@ -290,8 +290,8 @@ def _unmix_edge(
     # The object's colour at an edge pixel is the mean of the inner pixels that touch it.
     known = edge & (near > 0)
     colour, alpha = rgb.copy(), inside.astype(np.float32)
-    own = total[known] / near[known][:, None]
-    contrast = np.linalg.norm(own - background, axis=-1)
+    inner = total[known] / near[known][:, None]
+    contrast = np.linalg.norm(inner - background, axis=-1)
     ratio = np.linalg.norm(rgb[known] - background, axis=-1) / np.maximum(contrast, 1)
-    colour[known], alpha[known] = own, ratio.clip(0, 1)
+    colour[known], alpha[known] = inner, ratio.clip(0, 1)
     return colour, alpha

@@ -145,7 +145,7 @@ AMBIENT = 0.6
 SAMPLES = 2
 """Samples along each side of a pixel."""
 
-TOGETHER = 2**22
+BATCH_LIMIT = 2**22
 """Largest number of samples, of vertices, and of triangles' vertices of views that are drawn in one
 batch; a single view may have more."""
 
@@ -168,10 +168,10 @@ def draw_mesh(mesh: Mesh, cameras: Cameras) -> NDArray[np.float32]:
     motions = cameras.world_to_camera.double().cpu()
     lenses = SAMPLES * cameras.intrinsics.double().cpu().expand(len(motions), 4)[:, None]
     height, width = SAMPLES * cameras.height, SAMPLES * cameras.width
-    together = max(1, TOGETHER // max(height * width, len(vertices), 3 * len(faces)))
+    batch_size = max(1, BATCH_LIMIT // max(height * width, len(vertices), 3 * len(faces)))
     pictures = []
-    parts = (torch.split(each, together) for each in (motions, lenses))
-    for motion, lens in zip(*parts, strict=True):
+    batches = (torch.split(each, batch_size) for each in (motions, lenses))
+    for motion, lens in zip(*batches, strict=True):
         local = vertices @ motion[:, :3, :3].mT + motion[:, None, :3, 3]
         depth = local[..., 2].clamp(min=cameras.near)
         fine = nearest_triangles(

@@ -43,7 +43,7 @@ class TextureTarget:
 
     picture: Tensor
     """Red, green and blue, each times the density, and the density, dimensionless, shape
-    [R, R, 4], float32, from the bottom row up, as in the pictures of worlds."""
+    [R, R, 4], float32, as pictures of worlds: the first row is the bottom."""
 
     tiles: bool
     """Whether opposite edges fit together."""
@@ -65,8 +65,8 @@ class TextureTarget:
         edge = covered & (_around(~covered) > 0.0)
         owner, position = _things(covered)[edge], edge.nonzero().double()
         gaps = []
-        for own in sorted(set(owner.tolist())):
-            apart = position[owner == own][:, None] - position[owner != own]
+        for thing in sorted(set(owner.tolist())):
+            apart = position[owner == thing][:, None] - position[owner != thing]
             if apart.numel() == 0:
                 return 0.0
             apart -= side * (apart / side).round()
@@ -175,7 +175,7 @@ OVERSAMPLING = 4
 
 
 def draw_pattern(name: str, resolution: int, *, seed: int = 0) -> Array:
-    """Draw a texture: colours times alpha, and alpha, float64, [R, R, 4], bottom row first.
+    """Draw a texture: colours times alpha, and alpha, float64, [R, R, 4].
 
     The first row is the bottom. Pixel r is centred at (r + 1/2) / R.
     """
@@ -226,8 +226,8 @@ def dots(u: Array, v: Array, _: np.random.Generator) -> Array:
 
 def cells(u: Array, v: Array, random: np.random.Generator) -> Array:
     """Polygons around scattered points, dark between them."""
-    places = _scattered(random, 20, 0.17)
-    distance = np.stack([np.hypot(*_away(u, v, place)) for place in places])
+    centres = _scattered(random, 20, 0.17)
+    distance = np.stack([np.hypot(*_away(u, v, centre)) for centre in centres])
     order = np.argsort(distance, axis=0)
     nearest = np.take_along_axis(distance, order[:2], axis=0)
     shades = _colours("#e9c46a", "#f4a261", "#e76f51", "#d4a373", "#faedcd")
@@ -239,19 +239,19 @@ def cells(u: Array, v: Array, random: np.random.Generator) -> Array:
 
 def bubbles(u: Array, v: Array, random: np.random.Generator) -> Array:
     """Rings of several sizes with a glint, nothing around them."""
-    places = _scattered(random, 12, 0.23)
+    centres = _scattered(random, 12, 0.23)
     gaps = [
-        min(math.hypot(*_away(place[0], place[1], other)) for other in places if other is not place)
-        for place in places
+        min(math.hypot(*_away(one[0], one[1], other)) for other in centres if other is not one)
+        for one in centres
     ]
     tints = _colours("#48cae4", "#0096c7", "#5e60ce", "#80ffdb")
     colour = np.zeros((*u.shape, 3))
     covered = np.zeros(u.shape, dtype=bool)
-    for k, place in enumerate(places):
+    for k, centre in enumerate(centres):
         radius = 0.46 * gaps[k]
-        away = np.hypot(*_away(u, v, place))
+        away = np.hypot(*_away(u, v, centre))
         body, rim = away < radius, (away > 0.72 * radius) & (away < radius)
-        glint = np.hypot(*_away(u, v, place + radius * np.array([-0.3, 0.35]))) < 0.2 * radius
+        glint = np.hypot(*_away(u, v, centre + radius * np.array([-0.3, 0.35]))) < 0.2 * radius
         colour[body] = 0.45 + 0.55 * tints[k % len(tints)]
         colour[rim] = 0.75 * tints[k % len(tints)]
         colour[glint] = 1.0
@@ -290,12 +290,12 @@ def maze(u: Array, v: Array, random: np.random.Generator) -> Array:
 
 def hearts(u: Array, v: Array, _: np.random.Generator) -> Array:
     """Upright hearts in rows, alternately red and pink, nothing between them."""
-    places = [((k + 0.5 * (j % 2)) / 4.0, j / 4.0) for j in range(4) for k in range(4)]
+    centres = [((k + 0.5 * (j % 2)) / 4.0, j / 4.0) for j in range(4) for k in range(4)]
     colour = np.zeros((*u.shape, 3))
     covered = np.zeros(u.shape, dtype=bool)
     inner, rim = _colours("#e63946", "#ffafcc"), _colours("#8d0f20", "#d6407f")
-    for number, place in enumerate(places):
-        across, up = (offset / 0.084 for offset in _away(u, v, np.array(place)))
+    for number, centre in enumerate(centres):
+        across, up = (offset / 0.084 for offset in _away(u, v, np.array(centre)))
         # Two round halves above a point.
         depth = across**2 + (1.15 * up - 0.25 - 0.72 * np.sqrt(np.abs(across))) ** 2
         depth = np.where(np.abs(across) < 1.5, depth, np.inf)
@@ -307,12 +307,12 @@ def hearts(u: Array, v: Array, _: np.random.Generator) -> Array:
 
 def droplets(u: Array, v: Array, random: np.random.Generator) -> Array:
     """Slanted drops of three blues, dark at the rim, with a glint; transparent background."""
-    places = _scattered(random, 14, 0.21)
+    centres = _scattered(random, 14, 0.21)
     body_tints, rim_tints = _colours("#90e0ef", "#4895ef", "#3f37c9"), _colours("#03045e")
     colour = np.zeros((*u.shape, 3))
     covered = np.zeros(u.shape, dtype=bool)
-    for number, place in enumerate(places):
-        across, up = (offset / 0.068 for offset in _away(u, v, place))
+    for number, centre in enumerate(centres):
+        across, up = (offset / 0.068 for offset in _away(u, v, centre))
         across, up = 0.94 * across + 0.34 * up, 0.94 * up - 0.34 * across
         # A disk below, drawn out to a point above.
         taper = np.where(up > 0.0, np.clip(1.0 - up / 2.0, 0.0, 1.0) ** 0.9, 1.0)
@@ -329,12 +329,12 @@ def droplets(u: Array, v: Array, random: np.random.Generator) -> Array:
 
 def stars(u: Array, v: Array, random: np.random.Generator) -> Array:
     """Five-pointed stars of two colours, turned and scattered, on a night-blue ground."""
-    places = _scattered(random, 13, 0.23)
-    turns = random.random(len(places)) * 0.8 - 0.4
+    centres = _scattered(random, 13, 0.23)
+    turns = random.random(len(centres)) * 0.8 - 0.4
     ground, *tints = _colours("#14213d", "#fca311", "#f1faee")
     colour = np.broadcast_to(ground, (*u.shape, 3)).copy()
-    for number, (place, turn) in enumerate(zip(places, turns, strict=True)):
-        across, up = _away(u, v, place)
+    for number, (centre, turn) in enumerate(zip(centres, turns, strict=True)):
+        across, up = _away(u, v, centre)
         # The angle to the nearest of the five points, and the straight edge that lies there.
         fifth, inner = 2.0 * math.pi / 5.0, 0.45
         half = 0.5 * fifth
@@ -372,19 +372,19 @@ def _opaque(colour: Array) -> Array:
     return _with_alpha(colour, np.ones(colour.shape[:2], dtype=bool))
 
 
-def _away(u: Any, v: Any, place: Array) -> tuple[Any, Any]:
-    """Return the shortest offsets of positions (u, v) from `place` in the periodic unit square."""
-    across, along = u - place[0], v - place[1]
+def _away(u: Any, v: Any, centre: Array) -> tuple[Any, Any]:
+    """Return the shortest offsets of positions (u, v) from `centre` in the periodic unit square."""
+    across, along = u - centre[0], v - centre[1]
     return across - np.round(across), along - np.round(along)
 
 
 def _scattered(random: np.random.Generator, count: int, gap: float) -> list[Array]:
     """Return random positions at least `gap` apart, or less where that is too hard to find."""
-    places: list[Array] = []
-    while len(places) < count:
-        place = random.random(2)
-        if all(math.hypot(*_away(place[0], place[1], other)) >= gap for other in places):
-            places.append(place)
+    centres: list[Array] = []
+    while len(centres) < count:
+        centre = random.random(2)
+        if all(math.hypot(*_away(centre[0], centre[1], other)) >= gap for other in centres):
+            centres.append(centre)
         # Lowered at each try, so that the loop ends.
         gap *= 0.999
-    return places
+    return centres
