@@ -337,8 +337,8 @@ def _cut(x: Tensor, s: Tensor, generator: torch.Generator) -> tuple[Tensor, Tens
     """Return clouds without the particles farthest in a direction, which is random for each."""
     normal = torch.randn(len(x), 2, generator=generator, device=x.device, dtype=x.dtype)
     order = (x * normal[:, None]).sum(-1).argsort(dim=1)
-    kept = order[:, : max(1, round((1.0 - CUT_FRACTION) * x.shape[1])), None]
-    return x.gather(1, kept.expand(-1, -1, 2)), s.gather(1, kept.expand(-1, -1, s.shape[2]))
+    indices = order[:, : max(1, round((1.0 - CUT_FRACTION) * x.shape[1])), None]
+    return x.gather(1, indices.expand(-1, -1, 2)), s.gather(1, indices.expand(-1, -1, s.shape[2]))
 
 
 def _chimera(x: Tensor, s: Tensor, other_x: Tensor) -> tuple[Tensor, Tensor]:
@@ -530,13 +530,13 @@ def grown(
     at_a_time = max(1, WORLDS // len(seeds))
     batches: list[list[Particles]] = [[] for _ in checkpoints]
     for first in range(0, len(tasks), at_a_time):
-        some = tasks[first : first + at_a_time]
+        batch_tasks = tasks[first : first + at_a_time]
         fresh = [
             task.seed(len(seeds), generator=WorldRandom(seeds, device=device), device=device)
-            for task in some
+            for task in batch_tasks
         ]
-        random = WorldRandom([*seeds] * len(some), device=device)
-        runner = RuleRunner(rule, some[0], random, progress)
+        random = WorldRandom([*seeds] * len(batch_tasks), device=device)
+        runner = RuleRunner(rule, batch_tasks[0], random, progress)
         worlds = combined(torch.cat, fresh)
         for batch, (_, now) in zip(batches, runner.at(checkpoints, worlds), strict=True):
             batch.append(now)

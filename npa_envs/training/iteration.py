@@ -91,12 +91,10 @@ class EagerIteration:
             self.start.x,
             first_states,
             steps,
-            eps=self._task.eps,
-            box=self._task.box,
-            update_prob=self._task.update_prob,
             memory=self._memory,
             generator=self._generator,
             return_path_length=True,
+            **self._task.rollout_options,
         )
         end = Particles(*fields)
         single = self._take_means is None

@@ -94,8 +94,8 @@ class RuleOptimiser:
         """Restore what `state_dict` returned."""
         moments, indices = state["state"], self._indices()
         for optimiser in self._optimisers:
-            own = [indices[id(p)] for group in optimiser.param_groups for p in group["params"]]
-            load_moments(optimiser, {k: moments[i] for k, i in enumerate(own) if i in moments})
+            order = [indices[id(p)] for group in optimiser.param_groups for p in group["params"]]
+            load_moments(optimiser, {k: moments[i] for k, i in enumerate(order) if i in moments})
 
     def _indices(self) -> dict[int, int]:
         """Return the index of each parameter by its `id`."""

@@ -199,11 +199,9 @@ class RunRandomness:
             indices = processes.indices(total, section)
             return world_streams((config.seed, purpose), total, indices, device)
 
-        self.pool, self.worlds, self.masks = (
-            streams(0, pool, section=pool // batch),
-            streams(1, batch),
-            streams(2, batch),
-        )
+        self.pool = streams(0, pool, section=pool // batch)
+        self.worlds = streams(1, batch)
+        self.masks = streams(2, batch)
 
     def _sources(self) -> dict[str, Randomness]:
         return {"schedule": self.schedule, "worlds": self.worlds, "masks": self.masks}

@@ -153,7 +153,7 @@ def joined_processes() -> Iterator[ProcessGroup]:
         if processes.count > 1:
             # A separate connection: that of the group blocks while the group waits.
             address, port = os.environ["MASTER_ADDR"], int(os.environ["MASTER_PORT"])
-            store = dist.TCPStore(address, port, wait_for_workers=False)  # type: ignore[attr-defined]
+            store: Any = dist.TCPStore(address, port, wait_for_workers=False)  # type: ignore[attr-defined]
             # Torchrun may keep the store when it restarts processes.
             prefix = processes.broadcast(uuid.uuid4().hex)
             store = dist.PrefixStore(prefix, store)  # type: ignore[attr-defined]

@@ -226,6 +226,7 @@ class RunFolder:
         self.tensorboard = path / "tensorboard"
         self.lock = path / ".lock"
         """Locked while a trainer writes to the folder; names the trainer's process and computer."""
+        self._files = (self.log, self.rule, self.diagnosis, self.checkpoint, self.config)
         self._known: tuple[int, int] | None = None
 
     def prepare(self, byte_count: int, *, pictures: bool = True) -> None:
@@ -293,25 +294,18 @@ class RunFolder:
 
     def tidy(self) -> None:
         """Remove temporary files that interrupted writes have left."""
-        own = [self.checkpoint, self.rule, self.log, self.config, self.diagnosis]
-        own += [self.rule_of("*"), self.pictures / "[0-9]*.png"]
-        for path in own:
+        for path in (*self._files, self.rule_of("*"), self.pictures / "[0-9]*.png"):
             remove_unfinished(path)
 
     def clear(self) -> None:
         """Remove an earlier run's files, and no others."""
-        patterns = (
-            "rule-[0-9]*.safetensors",
-            "pictures/[0-9]*.png",
-            "report/*.*",
-            "tensorboard/events.out.tfevents.*",
-        )
-        for pattern in patterns:
+        patterns = ["rule-[0-9]*.safetensors", "pictures/[0-9]*.png", "report/*.*"]
+        for pattern in (*patterns, "tensorboard/events.out.tfevents.*"):
             for path in self.path.glob(pattern):
                 path.unlink()
         # The checkpoint last but one: if this is interrupted, there is either a run that can be
         # resumed or none.
-        for path in (self.log, self.rule, self.diagnosis, self.checkpoint, self.config):
+        for path in self._files:
             path.unlink(missing_ok=True)
 
     def rule_of(self, species: int | str) -> Path:

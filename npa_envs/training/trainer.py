@@ -182,7 +182,6 @@ class Trainer:
         """
         check_seconds(max_seconds)
         config, total, first = self.config, self.config.total_iterations, self._processes.first
-        options: dict[str, Any] = {"total": total, "initial": self.iteration, "unit": "it"}
         start = time.perf_counter()
 
         def step() -> None:
@@ -203,7 +202,9 @@ class Trainer:
         with (
             self._run.locked(),
             self._log.opened(config.tensorboard and first, self.iteration),
-            tqdm(**options, disable=not (progress and first)) as bar,
+            tqdm(
+                total=total, initial=self.iteration, disable=not (progress and first), unit="it"
+            ) as bar,
         ):
             self._started = start
             seconds = math.inf if max_seconds is None else max_seconds

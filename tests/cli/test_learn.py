@@ -117,14 +117,14 @@ def test_worlds_are_those_of_shac_when_given(tmp_path):
 
 
 def test_what_is_written_takes_no_time_and_what_is_over_has_finished(tmp_path, monkeypatch):
-    clock, write = Clock(tick=1 / 64), Run.keep
+    clock, write = Clock(tick=1 / 64), Run.write_checkpoint
     monkeypatch.setattr("npa_envs.agents.learning.progress.time", clock)
 
     def slow(run, content):
         clock.sleep(1.0)
         write(run, content)
 
-    monkeypatch.setattr(Run, "keep", slow)
+    monkeypatch.setattr(Run, "write_checkpoint", slow)
     words = [*WORDS, "--learning-seconds", "0.5", "--no-progress", "--out", str(tmp_path)]
     assert main(words) == 0
     seconds = [point["seconds"] for point in points(tmp_path)]

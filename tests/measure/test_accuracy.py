@@ -35,9 +35,9 @@ def session(device: torch.device | None = None) -> CheckSession:
     return CheckSession(device or torch.device("cpu"), quick=True)
 
 
-def told(name: str, **fields) -> Check:
-    """A check that finds what it is told to."""
-    return Check(name, "as told", lambda session: CheckResult(**{"figures": {}, **fields}))
+def stub_check(name: str, **fields) -> Check:
+    """A check with this result."""
+    return Check(name, "as given", lambda session: CheckResult(**{"figures": {}, **fields}))
 
 
 # The registry
@@ -100,9 +100,9 @@ def test_what_raises_has_failed_and_the_others_go_on():
 
     record = check_runner.StressRecord(FACTS)
     errors = (ZeroDivisionError("by\nzero"), Skipped("no device"), torch.OutOfMemoryError("much"))
-    check_runner.run_checks([*map(raising, errors), told("values/last")], session(), record)
-    found = {entry.name: (entry.verdict, entry.note) for entry in record.rows}
-    assert found == {
+    check_runner.run_checks([*map(raising, errors), stub_check("values/last")], session(), record)
+    verdicts = {entry.name: (entry.verdict, entry.note) for entry in record.rows}
+    assert verdicts == {
         "values/ZeroDivisionError": ("fail", "ZeroDivisionError: by zero"),
         "values/Skipped": ("skipped", "no device"),
         "values/OutOfMemoryError": ("skipped", "not enough memory"),
@@ -121,9 +121,9 @@ def test_a_record_comes_back_as_it_was_written(tmp_path: Path):
     figures = {"a": 1.5, "b": math.inf, "c": math.nan}
     record = check_runner.StressRecord(FACTS, path)
     record.put(CheckResult(figures, {"a": 1.0}, note="n", name="x/y", expected="s"))
-    held = json.loads(path.read_text(encoding="utf-8"))
-    assert held["counts"] == {"pass": 0, "range": 0, "fail": 1, "skipped": 0}
-    assert held["checks"][0]["figures"] == {"a": 1.5, "b": "inf", "c": "nan"}
+    stored = json.loads(path.read_text(encoding="utf-8"))
+    assert stored["counts"] == {"pass": 0, "range": 0, "fail": 1, "skipped": 0}
+    assert stored["checks"][0]["figures"] == {"a": 1.5, "b": "inf", "c": "nan"}
     assert repr(check_runner.StressRecord(FACTS, path).read().rows) == repr(record.rows)
 
 
@@ -131,7 +131,7 @@ def test_a_run_goes_on_where_it_was_and_repeats_what_did_not_pass():
     ran: list[str] = []
 
     def counted(name: str, **fields) -> Check:
-        check = told(name, **fields)
+        check = stub_check(name, **fields)
         return dataclasses.replace(check, run=lambda here: ran.append(name) or check.run(here))
 
     failing = {"figures": {"x": 2.0}, "limits": {"x": 1.0}}
@@ -275,7 +275,7 @@ def test_the_command_writes_a_record_draws_it_and_goes_on(tmp_path, capsys, monk
     assert record["facts"]["commit"] == "x"
     assert (tmp_path / "stress_cpu_quick_geometry.png").read_bytes().startswith(b"\x89PNG")
     assert "5 pass" in capsys.readouterr().out
-    broken = told("values/nan_position", figures={"x": 1.0}, limits={"x": 0.0})
+    broken = stub_check("values/nan_position", figures={"x": 1.0}, limits={"x": 0.0})
     monkeypatch.setattr(accuracy, "all_checks", lambda **_: [broken, CHECKS["time/heart"]])
     assert main(["stress", "--no-progress", "--only", "values"]) == 1
     assert "values/nan_position failed: x 1 (at most 0)" in capsys.readouterr().out
@@ -293,8 +293,8 @@ def test_checks_of_a_rule_that_was_trained_anew_are_run_again(tmp_path, capsys):
 
     def verdict():
         main(words)
-        held = json.loads((tmp_path / "stress_cpu_quick.json").read_text(encoding="utf-8"))
-        (entry,) = held["checks"]
+        stored = json.loads((tmp_path / "stress_cpu_quick.json").read_text(encoding="utf-8"))
+        (entry,) = stored["checks"]
         return entry["weights"], entry["verdict"]
 
     assert verdict() == (rule_digest(rule), "pass")

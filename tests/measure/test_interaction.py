@@ -217,7 +217,7 @@ def words_of(rules, out, *more):
     return ["interact", *paths, "--out", str(out), "--no-progress", *more]
 
 
-def held_in(folder):
+def record_in(folder):
     return json.loads((folder / "interactions.json").read_text(encoding="utf-8"))
 
 
@@ -241,9 +241,9 @@ def test_every_pair_is_measured_and_a_stopped_run_ends_as_one_that_was_not(
     few = ["--seed-count", "2", "--steps", "6", "--distances", "0", "2"]
     assert main(words_of(rules, whole, *few)) == 0
     pairs = [(a, b) for a in ("one", "two") for b in ("one", "two")]
-    rows = held_in(whole)["rows"]
+    rows = record_in(whole)["rows"]
     assert [(row["rule"], row["beside"]) for row in rows[::2]] == pairs
-    assert held_in(whole)["settings"]["particle_count"] == COUNT
+    assert record_in(whole)["settings"]["particle_count"] == COUNT
     for a, b in pairs:
         with Image.open(whole / f"{a}-{b}.png") as strip:
             assert strip.width > strip.height
@@ -258,12 +258,12 @@ def test_every_pair_is_measured_and_a_stopped_run_ends_as_one_that_was_not(
 
     monkeypatch.setattr(interaction.Encounters, "meet", stopped)
     assert main(words_of(rules, parts, *few)) == 130
-    assert len(held_in(parts)["rows"]) == 4
+    assert len(record_in(parts)["rows"]) == 4
     capsys.readouterr()
     assert main(words_of(rules, parts, *few)) == 0
     assert "2 of 4 pairs were measured before" in capsys.readouterr().out
     assert met[3:] == pairs[2:]
-    assert held_in(whole) == held_in(parts)
+    assert record_in(whole) == record_in(parts)
     # Results of other settings are not mixed with these.
     assert main(words_of(rules, parts, *few, "--update-prob", "0.9")) == 2
     error = capsys.readouterr().err
@@ -288,7 +288,7 @@ def test_pairs_whose_names_look_alike_have_files_of_their_own(rules, tmp_path):
 def test_quick_leaves_what_was_said(rules, tmp_path):
     words = ["--quick", "--steps", "3", "--seed-count", "1", "--distances", "0", "0.5", "1"]
     assert main(words_of(rules, tmp_path, *words)) == 0
-    told = held_in(tmp_path)["settings"]
+    stored = record_in(tmp_path)["settings"]
     # The last is the default, and was said all the same.
-    assert (told["steps"], told["seeds"], told["distances"]) == (3, [1_000_000], [0, 0.5, 1])
-    assert told["particle_count"] == 512
+    assert (stored["steps"], stored["seeds"], stored["distances"]) == (3, [1_000_000], [0, 0.5, 1])
+    assert stored["particle_count"] == 512

@@ -17,7 +17,7 @@ FACTS = {"commit": "0", "seeds": (1, 2)}
 
 
 def read(path: Path, facts=FACTS, **options):
-    return records.read_record(path, facts, lambda held: held["rows"], command="x", **options)
+    return records.read_record(path, facts, lambda content: content["rows"], command="x", **options)
 
 
 def test_a_record_comes_back_with_null_for_what_is_not_finite(tmp_path):
@@ -59,8 +59,8 @@ def test_facts_name_the_machine_the_commit_and_the_versions():
 
 def test_a_commands_folders_are_not_told():
     words = ["heart", "--out", "a/b", "--output=c", "--seed", "a/b"]
-    told = "npa-envs stress heart --out OUT --output=OUTPUT --seed a/b"
-    assert records.command_text("stress", words, "--out", "--output") == told
+    text = "npa-envs stress heart --out OUT --output=OUTPUT --seed a/b"
+    assert records.command_text("stress", words, "--out", "--output") == text
 
 
 def test_a_time_limit_passes_once_and_never_without_one():
@@ -112,6 +112,6 @@ def test_tables_as_text_markdown_and_comma_separated_values():
 
 def test_plots_without_matplotlib_name_the_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "matplotlib", None)
-    (told,) = write_plots(lambda: pytest.fail("drawn"), tmp_path / "*.png", "curves")
-    assert told.startswith("no curves: ")
-    assert "pip install 'npa-envs[bench]'" in told
+    (text,) = write_plots(lambda: pytest.fail("drawn"), tmp_path / "*.png", "curves")
+    assert text.startswith("no curves: ")
+    assert "pip install 'npa-envs[bench]'" in text

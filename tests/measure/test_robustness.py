@@ -167,11 +167,11 @@ def test_a_course_counts_its_seeds():
 
 def record(*found: trials.LossCurve, **changed) -> report.RuleRecord:
     values = [("eps", 1.0), ("eps", 2.0), ("particles", 1.0), ("update_prob", 0.5)]
-    told = tuple(report.Response(name, value, 8, (0.5, value)) for name, value in values)
-    lost = report.Response("eps", 4.0, 8, (0.5, math.nan))
+    responses = tuple(report.Response(name, value, 8, (0.5, value)) for name, value in values)
+    diverged = report.Response("eps", 4.0, 8, (0.5, math.nan))
     left_out = report.Response("particles", 2.0, 0, (), note="256 particles in all")
     fields = {"rule": "heart", "task": "morphogenesis2d", "metric": "loss", "update_prob": 0.5}
-    fields |= {"curves": found, "responses": (*told, lost, left_out)}
+    fields |= {"curves": found, "responses": (*responses, diverged, left_out)}
     return report.RuleRecord({"a": 1}, **fields | changed)
 
 
@@ -180,9 +180,9 @@ def record(*found: trials.LossCurve, **changed) -> report.RuleRecord:
 
 def responding(condition: str, *losses_by_value) -> report.RuleRecord:
     """A record of one condition beside the loss as trained, which is 1 unless it says so."""
-    told = [report.Response(condition, value, 8, losses) for value, losses in losses_by_value]
+    responses = [report.Response(condition, value, 8, losses) for value, losses in losses_by_value]
     trained = () if condition == "eps" else (report.Response("eps", 1.0, 8, (0.5, 1.5)),)
-    return record(responses=(*trained, *told))
+    return record(responses=(*trained, *responses))
 
 
 @pytest.mark.parametrize(
@@ -363,8 +363,8 @@ def test_records_come_back_as_they_were_written_and_curves_are_drawn_by_task(tmp
     records = [record(curve), record(curve, task="texture", rule="dots")]
     path = records[0].path = tmp_path / "robustness_heart.json"
     records[0].write()
-    (held,) = json.loads(path.read_text(encoding="utf-8"))["courses"]
-    assert held["recovery_steps"] == [16, None]
+    (stored,) = json.loads(path.read_text(encoding="utf-8"))["courses"]
+    assert stored["recovery_steps"] == [16, None]
     found = report.RuleRecord({"a": 1}, path).read()
     assert repr((found.rows, found.curves)) == repr((records[0].rows, records[0].curves))
     assert found.about == records[0].about
@@ -392,15 +392,15 @@ def test_the_command_measures_writes_and_goes_on(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(report, "healing", lambda *_: pytest.fail("measured"))
     assert main(words) == 0
     first = capsys.readouterr().out
-    held = json.loads(path.read_text(encoding="utf-8"))
-    assert held["command"].startswith("npa-envs robustness heart --quick")
-    assert str(tmp_path) not in held["command"]
+    stored = json.loads(path.read_text(encoding="utf-8"))
+    assert stored["command"].startswith("npa-envs robustness heart --quick")
+    assert str(tmp_path) not in stored["command"]
     # A rule that is trained again keeps its name, but not its weights.
-    assert held["facts"]["weights"] == files.rule_digest(files.load_rule("heart"))
-    assert held["facts"]["seeds"] == [1_000_000, 1_000_001]
-    assert {row["condition"] for row in held["responses"]} == set(CONDITIONS)
-    assert all(math.isfinite(v) for row in held["responses"] for v in row["losses"])
-    assert (held["courses"], held["responses"][:3]) == (part["courses"], part["responses"])
+    assert stored["facts"]["weights"] == files.rule_digest(files.load_rule("heart"))
+    assert stored["facts"]["seeds"] == [1_000_000, 1_000_001]
+    assert {row["condition"] for row in stored["responses"]} == set(CONDITIONS)
+    assert all(math.isfinite(v) for row in stored["responses"] for v in row["losses"])
+    assert (stored["courses"], stored["responses"][:3]) == (part["courses"], part["responses"])
     assert (tmp_path / "robustness.md").read_text(encoding="utf-8") in first
     monkeypatch.undo()
     # What was stopped ends as what was not.
@@ -408,7 +408,7 @@ def test_the_command_measures_writes_and_goes_on(tmp_path, capsys, monkeypatch):
     assert main([*words[:-1], str(whole)]) == 0
     (path,) = whole.glob("*.json")
     whole = json.loads(path.read_text(encoding="utf-8"))
-    assert (whole["courses"], whole["responses"]) == (held["courses"], held["responses"])
+    assert (whole["courses"], whole["responses"]) == (stored["courses"], stored["responses"])
 
 
 def test_a_rule_that_names_no_task_is_refused(tmp_path, capsys):

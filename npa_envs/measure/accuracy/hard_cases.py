@@ -75,18 +75,19 @@ def _run_threshold(space_dim: int, session: CheckSession) -> CheckResult:
     fields = reference.fields(x, s, EPS)
     corrected = fields.grad0 @ torch.linalg.pinv(fields.moment)
     right = reference.perceive(x, s, EPS, EPS)
-    others = right.clone()
+    on_other_side = right.clone()
     start, end = 2 * STATE_DIM, (2 + space_dim) * STATE_DIM
     inverted = torch.linalg.det(fields.moment).abs() >= reference.MOMENT_THRESHOLD
     other = torch.where(inverted[..., None, None], fields.grad0, corrected)
-    others[..., start:end] = reference.log_scale(other).flatten(2)
+    on_other_side[..., start:end] = reference.log_scale(other).flatten(2)
     figures, limits = {}, {}
     for name, dtype in PRECISIONS.items():
         z = perceive(x.to(session.device, dtype), s.to(session.device, dtype), EPS).cpu().double()
         # Either result is right for a determinant that rounding may move over the threshold.
         near = offsets.abs() <= 1e2 * torch.finfo(dtype).eps / reference.MOMENT_THRESHOLD
         errors, errors_of_other = (
-            ((z - exact).norm(dim=-1) / exact.norm(dim=-1))[:, 0] for exact in (right, others)
+            ((z - exact).norm(dim=-1) / exact.norm(dim=-1))[:, 0]
+            for exact in (right, on_other_side)
         )
         corner = torch.where(near, torch.minimum(errors, errors_of_other), errors)
         figures[f"z_{name}"] = float(corner.max())
@@ -260,10 +261,10 @@ def _run_infinite_channel(space_dim: int, session: CheckSession) -> CheckResult:
     touched = torch.zeros(z.shape[2], dtype=torch.bool)
     touched[[2, 18, *gradients[2].tolist()]] = True
     touched = touched.to(z.device)
-    others = torch.arange(WORLD_COUNT, device=z.device) != WORLD
+    other_worlds = torch.arange(WORLD_COUNT, device=z.device) != WORLD
     away = (x[WORLD] - x[WORLD, PARTICLE]).norm(dim=-1) > EPS
     figures = {
-        "other_worlds": differing(z[others], clean[others]),
+        "other_worlds": differing(z[other_worlds], clean[other_worlds]),
         "other_channels": differing(z[..., ~touched], clean[..., ~touched]),
         "out_of_sight": differing(z[WORLD, away], clean[WORLD, away]),
         "touched_numbers": float((~z.isfinite()).sum()),
@@ -304,7 +305,7 @@ def _run_gradient(session: CheckSession) -> CheckResult:
     """Cotangents and states that are NaN in one world change no bit of other worlds' gradients
     by states and positions."""
     x, s = _worlds(session, 2, 16)
-    others = torch.arange(WORLD_COUNT, device=x.device) != WORLD
+    other_worlds = torch.arange(WORLD_COUNT, device=x.device) != WORLD
 
     broken, weights = s.clone(), functional_weights(x, s)
     broken[WORLD, PARTICLE, 0] = math.nan
@@ -312,8 +313,8 @@ def _run_gradient(session: CheckSession) -> CheckResult:
     weights[WORLD, PARTICLE + 1] = math.nan
     result = perceived(x, broken, None, weights=weights)
     figures = {
-        "states": differing(result.states[others], clean.states[others]),
-        "positions": differing(result.positions[others], clean.positions[others]),
+        "states": differing(result.states[other_worlds], clean.states[other_worlds]),
+        "positions": differing(result.positions[other_worlds], clean.positions[other_worlds]),
     }
     return CheckResult(figures, dict.fromkeys(figures, 0.0))
 
@@ -330,12 +331,12 @@ def _run_nan_state(session: CheckSession) -> CheckResult:
         rollout(rule, x, states, STEPS, generator=session.generator())
         for states in (with_nan, clean)
     )
-    others = torch.arange(WORLD_COUNT, device=x.device) != WORLD
+    other_worlds = torch.arange(WORLD_COUNT, device=x.device) != WORLD
     broken = (~s[WORLD].isfinite()).any(-1) | (~x[WORLD].isfinite()).any(-1)
     away = (clean_x[WORLD] - clean_x[WORLD, PARTICLE]).norm(dim=-1) > (2 * STEPS) * EPS
     figures = {
-        "other_worlds_x": differing(x[others], clean_x[others]),
-        "other_worlds_s": differing(s[others], clean_s[others]),
+        "other_worlds_x": differing(x[other_worlds], clean_x[other_worlds]),
+        "other_worlds_s": differing(s[other_worlds], clean_s[other_worlds]),
         "out_of_reach": float((broken & away).sum()),
         "not_found": float(not bool(broken.any())),
         "lost_particles": float(broken.sum()),
@@ -467,13 +468,13 @@ def _run_batch(space_dim: int, session: CheckSession) -> CheckResult:
     figures = {"open": 0.0, "periodic": 0.0}
     for periodic in (False, True):
         every = scenes(space_dim, periodic=periodic, seed=session.seed)
-        some = [scene for scene in every if scene.name != "tight_box"]
+        batch = [scene for scene in every if scene.name != "tight_box"]
         # Repeat each scene's particles until all worlds have equally many.
-        count = max(scene.x.shape[1] for scene in some)
-        x = torch.cat([scene.x.repeat(1, count, 1)[:, :count] for scene in some])
+        count = max(scene.x.shape[1] for scene in batch)
+        x = torch.cat([scene.x.repeat(1, count, 1)[:, :count] for scene in batch])
         x, s = (tensor.to(session.device, torch.float32) for tensor in (x, states_at(x)))
-        together = perceive(x, s, EPS, box=some[0].box)
+        together = perceive(x, s, EPS, box=batch[0].box)
         for k in range(len(x)):
-            alone = perceive(x[k : k + 1], s[k : k + 1], EPS, box=some[0].box)
+            alone = perceive(x[k : k + 1], s[k : k + 1], EPS, box=batch[0].box)
             figures["periodic" if periodic else "open"] += differing(together[k], alone[0])
     return CheckResult(figures, dict.fromkeys(figures, 0.0))

@@ -169,15 +169,15 @@ def threshold_scenes(space_dim: int, threshold: float) -> tuple[Tensor, Tensor]:
     worlds[:, 1:] = 0.4 * EPS * torch.eye(space_dim).double()
     worlds[:, -1, 0] = 0.5 * EPS
     s = torch.zeros(*worlds.shape[:2], 1, dtype=torch.float64)
-    wanted = threshold * (1.0 + offsets)
+    targets = threshold * (1.0 + offsets)
     # Bisection, as the determinant grows with the height.
     low, high = torch.zeros_like(offsets), torch.full_like(offsets, 0.4 * EPS)
     for _ in range(50):
         worlds[:, -1, -1] = 0.5 * (low + high)
         determinants = torch.linalg.det(reference.fields(worlds, s, EPS).moment[:, 0])
-        low = torch.where(determinants < wanted, worlds[:, -1, -1], low)
-        high = torch.where(determinants < wanted, high, worlds[:, -1, -1])
-    torch.testing.assert_close(determinants, wanted, rtol=1e-9, atol=0.0)
+        low = torch.where(determinants < targets, worlds[:, -1, -1], low)
+        high = torch.where(determinants < targets, high, worlds[:, -1, -1])
+    torch.testing.assert_close(determinants, targets, rtol=1e-9, atol=0.0)
     return worlds.float().double(), offsets
 
 
@@ -292,9 +292,9 @@ def error_limits(x: Tensor, s: Tensor, box: Box, expected: PerceptionOutcome) ->
 
     limits = dict(LIMITS)
     for _ in range(4):
-        others = perceived(x, s, box, by_reference=True, changed=rounded)
+        perturbed = perceived(x, s, box, by_reference=True, changed=rounded)
         for name, dtype in PRECISIONS.items():
             rounding = 0.5 * torch.finfo(dtype).eps
-            for key, error in perception_errors(others, expected, name).items():
+            for key, error in perception_errors(perturbed, expected, name).items():
                 limits[key] = max(limits[key], 4.0 * rounding * (error / change))
     return limits

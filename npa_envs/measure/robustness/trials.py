@@ -98,8 +98,10 @@ CONDITIONS = {
 
 def trained_value(condition: str, update_prob: float) -> float | str:
     """Return the trained value of a condition; `update_prob` is that of the task."""
-    others: dict[str, float | str] = {"update_prob": update_prob, "noise": 0.0, "shape": "trained"}
-    return others.get(condition, 1.0)
+    absolute: dict[str, float | str] = {"update_prob": update_prob, "noise": 0.0}
+    absolute["shape"] = "trained"
+    # All other conditions are factors on what was trained.
+    return absolute.get(condition, 1.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -371,8 +373,8 @@ def remove_side(x: Tensor, s: Tensor, random: WorldRandom, box: Box) -> tuple[Te
 
 def _lowest_half(x: Tensor, s: Tensor, key: Tensor) -> tuple[Tensor, Tensor]:
     """Keep the N // 2 particles with the lowest keys [B, N], in their order."""
-    kept = key.argsort(dim=1)[:, : x.shape[1] // 2].sort(dim=1).values[..., None]
-    return x.take_along_dim(kept, dim=1), s.take_along_dim(kept, dim=1)
+    indices = key.argsort(dim=1)[:, : x.shape[1] // 2].sort(dim=1).values[..., None]
+    return x.take_along_dim(indices, dim=1), s.take_along_dim(indices, dim=1)
 
 
 DAMAGES = {

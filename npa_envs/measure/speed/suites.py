@@ -198,8 +198,8 @@ def varied(axis: str, value: int, *, small: bool = False) -> Workload:
 def _scaling_row(session: TimingSession, axis: str, value: int) -> ScalingRow:
     workload = varied(axis, value, small=session.small)
     cost = throughput_row(session, workload)
-    own = (axis, value, cost.workload, workload.neighbour_count, workload.state_dim)
-    return ScalingRow(*own, cost.infer_us, cost.train_us, cost.infer_mib, cost.train_mib)
+    fields = (axis, value, cost.workload, workload.neighbour_count, workload.state_dim)
+    return ScalingRow(*fields, cost.infer_us, cost.train_us, cost.infer_mib, cost.train_mib)
 
 
 # Suite `skips`: time saved by computations that a scene does not need.
