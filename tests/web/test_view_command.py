@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 import torch
 
 from npa_envs import NPAError, load_rule, save_rule
 from npa_envs.cli import main
 from npa_envs.cli import view as command
-from npa_envs.cli.common import examples_of
 from npa_envs.cli.view import ViewOptions, open_browser, world_maker
 from npa_envs.web.environment_world import EnvironmentWorld
 from npa_envs.web.rule_world import RuleWorld, RunWorld
@@ -37,8 +38,8 @@ def test_a_rule_a_run_and_an_environment_are_told_apart(tmp_path):
 
 
 def test_the_environment_and_the_policy_of_the_commands_examples_fit():
-    (words,) = (words.split() for words in examples_of("view") if "--policy" in words)
-    assert type(make(words[1], policy=words[-1])) is EnvironmentWorld
+    ((env, policy),) = re.findall(r"npa-envs view (\S+) --policy (\S+)", ViewOptions.__doc__)
+    assert type(make(env, policy=policy)) is EnvironmentWorld
 
 
 def test_an_environment_gets_the_keywords_that_a_rule_needs():
