@@ -72,8 +72,7 @@ const TOOLS = {
     icon: "M12 20c-4 0-6-3-7-7 2-1 3 0 4 2V6a1.4 1.4 0 0 1 3 0v5a1.4 1.4 0 0 1 3 0v1a1.4 1.4 0 0 1 3 0v3c0 3-2 5-6 5z",
   },
   clump: {
-    label: "Clump", sends: "frame",
-    icon: "M4 4l5 5M20 4l-5 5M4 20l5-5M20 20l-5-5M9 6v3H6M15 6v3h3M9 18v-3H6M15 18v-3h3",
+    label: "Clump", sends: "frame", icon: "M4 4l5 5M20 4l-5 5M4 20l5-5M20 20l-5-5M9 6v3H6M15 6v3h3M9 18v-3H6M15 18v-3h3",
   },
   cut: { label: "Cut along a line", sends: "line", icon: "M5 19L19 5M6 8a2 2 0 1 0 0-.1M16 18a2 2 0 1 0 0-.1M8 9l8 8" },
   inject: {
