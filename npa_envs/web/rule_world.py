@@ -23,14 +23,7 @@ from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.run_folder import JsonlLog, RunFolder
 from npa_envs.training.task_of_rule import TrainedTask, task_of_rule, trained_config
 from npa_envs.training.task_table import load_config, preset
-from npa_envs.web.live_world import (
-    ColouredWorld,
-    Colouring,
-    LiveWorld,
-    Range,
-    Touch,
-    shows_of,
-)
+from npa_envs.web.live_world import ColouredWorld, Colouring, LiveWorld, Range, Touch, shows_of
 from npa_envs.world.brushes import inside_ball, wipe_state
 from npa_envs.world.division import living
 from npa_envs.world.particles import Particles, combined
@@ -129,7 +122,7 @@ class RuleWorld(LiveWorld):
         seed_world = self.task.seed(1, generator=self._generator, device=self._device)
         # The goal is the world's: it is no field of particles that come and go.
         self.particles, self._goal = seed_world._replace(goal=None), seed_world.goal
-        self.count = self._present
+        self.count = self.particles.x.shape[1]
         """Particles of a fresh world."""
         self.live_rules = [replace(self.main, count=self.count, divisor=float(self.count))]
         self._colouring = Colouring()
@@ -140,11 +133,6 @@ class RuleWorld(LiveWorld):
     def task(self) -> Task:
         """The task of the chosen rule."""
         return self.trained.task
-
-    @property
-    def _present(self) -> int:
-        """Particles in the world now."""
-        return self.particles.x.shape[1]
 
     @property
     def counts(self) -> list[int]:
@@ -161,7 +149,6 @@ class RuleWorld(LiveWorld):
         frame = self.task.frame
         return super().describe() | {
             "title": self.main.name,
-            "note": "",
             "dimension": self.main.rule.space_dim,
             "half_width": frame.half_width,
             "centre": list(frame.centre),
@@ -228,7 +215,7 @@ class RuleWorld(LiveWorld):
     @torch.no_grad()
     def _run(self, steps: int) -> None:
         self.step += steps
-        if self._present == 0:
+        if self.particles.x.shape[1] == 0:
             return
         watched = self.show in ("mask", "speed")
         if not watched and self._rests():
@@ -304,8 +291,8 @@ class RuleWorld(LiveWorld):
     def _loss(self) -> float | None:
         """Return the metric, or None where it has no meaning, or too early (`LOSS_FRACTION`)."""
         start = time.perf_counter()
-        comparable = self.trained.doubt is None and len(self.live_rules) == 1 and self._present
-        if not comparable or start < self._loss_due:
+        comparable = self.trained.doubt is None and len(self.live_rules) == 1
+        if not comparable or not self.counts[0] or start < self._loss_due:
             return None
         loss = float(self.task.with_goal(self._goal).metric(*self.particles[:2]))
         self._loss_due = start + (time.perf_counter() - start) / LOSS_FRACTION
@@ -313,7 +300,7 @@ class RuleWorld(LiveWorld):
 
     @torch.no_grad()
     def _damage(self, name: str) -> None:
-        if self._present:
+        if self.particles.x.shape[1]:
             x, s, *_ = self.particles
             x, s = damage_worlds(x, s, kind=name, box=self.box, generator=self._generator)
             self.particles = self.particles._replace(x=x, s=self._all_coded(s))
@@ -348,7 +335,7 @@ class RuleWorld(LiveWorld):
 
     def _add(self, touch: Touch, live_rule: LiveRule) -> None:
         count = max(MIN_SEED, round(touch.strength * SEED_FRACTION * self.count))
-        room = MAX_PARTICLES[self._device.type] - self._present
+        room = MAX_PARTICLES[self._device.type] - self.particles.x.shape[1]
         if count > room:
             raise NPAError(f"the world has room for {max(room, 0)} particles more, got {count}")
         zeros = self.particles.map(lambda value: value.new_zeros(1, count, *value.shape[2:]))
@@ -400,7 +387,7 @@ class RuleWorld(LiveWorld):
     def _arrange(self, particles: Particles, species: Tensor) -> None:
         """Set the world's particles, sorted by species."""
         order = species.argsort(stable=True)
-        if not torch.equal(order, torch.arange(self._present, device=order.device)):
+        if not torch.equal(order, torch.arange(self.particles.x.shape[1], device=order.device)):
             # The page's tracers follow particles by their index.
             self._events.append({"type": "reordered"})
         self.particles = _taken(particles, order)
@@ -476,8 +463,7 @@ class RunWorld(RuleWorld):
             world.x[..., 0] += centre
             worlds.append(world._replace(goal=None))
             # As in training, each species divides densities by its own number of particles.
-            live_rule.count = world.x.shape[1]
-            live_rule.divisor = float(live_rule.count)
+            live_rule.count = live_rule.divisor = world.x.shape[1]
         self.particles = _joined(worlds)
         self.count = sum(self.counts)
 

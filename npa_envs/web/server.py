@@ -29,6 +29,7 @@ from PIL import Image
 from npa_envs.atomic_files import made_folder
 from npa_envs.errors import MissingDependencyError, NPAError, shown
 from npa_envs.render import write_gif, write_mp4
+from npa_envs.web.export import PAGE
 from npa_envs.web.live_world import LiveWorld, WorldView
 
 try:
@@ -45,9 +46,6 @@ except ImportError as error:
         f"the viewer needs starlette and uvicorn, which are not installed ({error}): "
         "pip install 'npa-envs[view]'"
     ) from error
-
-PAGE = Path(__file__).resolve().parent / "page"
-"""The folder of the page's files."""
 
 PORT = 8765
 """First default port."""

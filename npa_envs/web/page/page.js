@@ -50,7 +50,7 @@
 // components of the state as red, green and blue), "state 0", "state 1", ...
 
 import { Camera, Tracers, makePainter } from "./drawing.js";
-import { Plot, short } from "./plots.js";
+import { Plot, make, short } from "./plots.js";
 
 const BLANK = {
   title: "npa-envs", note: "", dimension: 2, box: null, half_width: 1.1, spot: 0.015, rules: [], rule: null,
@@ -72,8 +72,7 @@ const TOOLS = {
     icon: "M12 20c-4 0-6-3-7-7 2-1 3 0 4 2V6a1.4 1.4 0 0 1 3 0v5a1.4 1.4 0 0 1 3 0v1a1.4 1.4 0 0 1 3 0v3c0 3-2 5-6 5z",
   },
   clump: {
-    label: "Clump", sends: "frame",
-    icon: "M4 4l5 5M20 4l-5 5M4 20l5-5M20 20l-5-5M9 6v3H6M15 6v3h3M9 18v-3H6M15 18v-3h3",
+    label: "Clump", sends: "frame", icon: "M4 4l5 5M20 4l-5 5M4 20l5-5M20 20l-5-5M9 6v3H6M15 6v3h3M9 18v-3H6M15 18v-3h3",
   },
   cut: { label: "Cut along a line", sends: "line", icon: "M5 19L19 5M6 8a2 2 0 1 0 0-.1M16 18a2 2 0 1 0 0-.1M8 9l8 8" },
   inject: {
@@ -129,9 +128,14 @@ class Page {
     this.painter = makePainter(this.canvas, wanted ?? "auto");
     this.tracers = new Tracers();
     this.tool = "look"; // a name of TOOLS
+    this.described = false; // whether the event "world" has come
     this.pointers = new Map();
+    this.looking = false; // whether pressed pointers move the camera
+    this.stroke = null; // that of the pressed brush
+    this.pressing = false; // whether a slider is pressed
     this.recording = null;
     this.frameTimes = [];
+    this.reported = 0; // when the step was last written
     this.plots = {
       loss: new Plot($("plots"), "Loss", "", { log: true }),
       milliseconds: new Plot($("plots"), "Time of a step", "ms"),
@@ -206,8 +210,7 @@ class Page {
   }
 
   offerFile(name, url) {
-    const item = document.createElement("li"), link = document.createElement("a");
-    Object.assign(link, { href: url, download: name, textContent: name });
+    const item = make("li"), link = make("a", { href: url, download: name, textContent: name });
     item.append(link);
     $("files").prepend(item);
     $("film").open = true;
@@ -217,8 +220,8 @@ class Page {
   showError(message) {
     $("message").textContent = message;
     $("message").hidden = false;
-    clearTimeout(this.quiet);
-    this.quiet = setTimeout(() => ($("message").hidden = true), 9000);
+    clearTimeout(this.messageTimer);
+    this.messageTimer = setTimeout(() => ($("message").hidden = true), 9000);
   }
 
   // Controls.
@@ -282,13 +285,13 @@ class Page {
     if ($("tools").dataset.names === names.join()) return;
     $("tools").dataset.names = names.join();
     $("tools").replaceChildren(...names.map((name, k) => {
-      const button = document.createElement("button");
-      button.innerHTML = icon(TOOLS[name].icon);
-      button.title = `${TOOLS[name].label} (${k + 1})`;
+      const { icon: path, label } = TOOLS[name];
+      const button = make("button", {
+        innerHTML: icon(path), title: `${label} (${k + 1})`, onclick: () => this.choose(name),
+      });
       button.dataset.tool = name;
       button.setAttribute("role", "radio");
       button.setAttribute("aria-label", name);
-      button.onclick = () => this.choose(name);
       return button;
     }));
     this.choose(this.tool);
@@ -304,13 +307,9 @@ class Page {
 
   showDamages() {
     $("damages").hidden = !this.world.damages.length;
-    $("damages").replaceChildren(...this.world.damages.map((name) => {
-      const button = document.createElement("button");
-      button.textContent = name;
-      button.title = `Damage: ${name}`;
-      button.onclick = () => this.send({ type: "damage", name });
-      return button;
-    }));
+    $("damages").replaceChildren(...this.world.damages.map((name) => make("button", {
+      textContent: name, title: `Damage: ${name}`, onclick: () => this.send({ type: "damage", name }),
+    })));
   }
 
   showSettings() {
@@ -337,10 +336,10 @@ class Page {
     input.onpointerup = () => (this.pressing = false);
     input.oninput = () => {
       output.textContent = short(read());
-      clearTimeout(this.settling);
+      clearTimeout(this.countTimer);
       // Another number of particles restarts the world: sent only once the slider rests.
       const send = () => this.send({ type: "set", name, value: read() });
-      if (name === "count") this.settling = setTimeout(send, 150);
+      if (name === "count") this.countTimer = setTimeout(send, 150);
       else send();
     };
   }
@@ -527,7 +526,7 @@ class Page {
     while (this.frameTimes[0] < now - 2000) this.frameTimes.shift();
     this.plots.milliseconds.add(frame.step, frame.milliseconds);
     if (frame.loss !== undefined) this.plots.loss.add(frame.step, frame.loss);
-    if (now - (this.reported ?? 0) > 250) {
+    if (now - this.reported > 250) {
       this.reported = now;
       const { length } = this.frameTimes;
       const rate = length > 1 ? (1000 * (length - 1)) / (now - this.frameTimes[0]) : 0;
@@ -574,7 +573,7 @@ class Page {
       this.recording.stop();
       this.recording = null;
     } else if (this.world.capabilities.includes("film")) {
-      const picture = Object.assign(document.createElement("canvas"), { width: FILM_SIZE, height: FILM_SIZE });
+      const picture = make("canvas", { width: FILM_SIZE, height: FILM_SIZE });
       this.recording = { picture, last: 0, stop: () => this.send({ type: "film", action: "stop" }) };
       this.send({ type: "film", action: "start" });
       this.dirty = true;

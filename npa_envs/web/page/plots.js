@@ -8,14 +8,11 @@ export class Plot {
     this.unit = unit;
     this.log = log;
     this.points = [];
-    this.figure = document.createElement("figure");
-    this.figure.className = "plot";
-    const caption = document.createElement("figcaption");
-    const name = document.createElement("span");
-    this.value = document.createElement("output");
-    name.textContent = title;
-    caption.append(name, this.value);
-    this.canvas = document.createElement("canvas");
+    this.figure = make("figure", { className: "plot" });
+    const caption = make("figcaption");
+    this.value = make("output");
+    caption.append(make("span", { textContent: title }), this.value);
+    this.canvas = make("canvas");
     this.canvas.setAttribute("role", "img");
     this.canvas.setAttribute("aria-label", title);
     this.figure.append(caption, this.canvas);
@@ -60,6 +57,11 @@ export class Plot {
     context.strokeStyle = style.getPropertyValue("--accent") || "#888";
     context.stroke();
   }
+}
+
+// Returns a new element of the page with some properties.
+export function make(tag, properties = {}) {
+  return Object.assign(document.createElement(tag), properties);
 }
 
 export function short(number) {
