@@ -108,7 +108,7 @@ class RegenerationTask(GrownTask[Regeneration2DEnvConfig]):
             random = random.substream(StreamId.TEST)
         kinds = RANDOM_KINDS if self.config.damage == RANDOM_DAMAGE else (self.config.damage,)
         chosen = random.integers(len(kinds), 1, 1)
-        damaged = Particles(x, s)
+        intact = damaged = Particles(x, s)
         for k, kind in enumerate(kinds):
             size = SIZES[kind] if self.config.damage_size is None else self.config.damage_size
             new_x, new_s = damage_worlds(
@@ -120,10 +120,10 @@ class RegenerationTask(GrownTask[Regeneration2DEnvConfig]):
             if new_s is not s:
                 damaged = damaged._replace(s=torch.where(chosen == k, new_s, damaged.s))
         if threshold is None:
-            intact, loss = self._loss(Particles(x, s)), self._loss(damaged)
-            healed = intact + (1.0 - self.config.healed_share) * (loss - intact)
-            never = torch.full_like(intact, -torch.inf)
-            threshold = torch.where(loss - intact >= MIN_RISE * intact, healed, never)
+            least, loss = self._loss(intact), self._loss(damaged)
+            healed = least + (1.0 - self.config.healed_share) * (loss - least)
+            never = torch.full_like(least, -torch.inf)
+            threshold = torch.where(loss - least >= MIN_RISE * least, healed, never)
         return Start(damaged.x, damaged.s, threshold)
 
     def _loss(self, particles: Particles) -> Tensor:
