@@ -90,11 +90,7 @@ def run_recorded(
     *,
     cuda_graph: CudaGraph,
 ) -> Particles | None:
-    """Run a checked rollout by replaying a recording; None if it has to be launched.
-
-    Raises:
-        NPAError: A position is not finite.
-    """
+    """Run a checked rollout by replaying a recording; None if it has to be launched."""
     x = particles.x
     # In this order: a compiler cannot trace queries of streams.
     if cuda_graph is False or not x.is_cuda or torch.compiler.is_compiling() or spec.steps == 0:
@@ -280,10 +276,7 @@ class CallKinds(collections.OrderedDict[Hashable, CallKind]):
 
 
 class _RecordingUse:
-    """One use of a recording, which ends with this object; autograd keeps it until a backward pass.
-
-    The recording is then free for other calls.
-    """
+    """One use of a recording, which is free again once autograd and the caller drop this object."""
 
     def __init__(self, recording: _Recording, kind: CallKind) -> None:
         self.recording = recording
@@ -534,7 +527,6 @@ class _Recording:
         return settings
 
     def _versions(self) -> list[int]:
-        """Return the versions of inputs, which each write changes."""
         return [tensor._version for tensor in self._inputs]
 
     def _cotangents_of(self, steps: int) -> list[Tensor]:

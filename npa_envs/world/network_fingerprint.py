@@ -53,19 +53,20 @@ def rule_settings(rule: nn.Module, device: torch.device) -> dict[str, Hashable]:
     return settings
 
 
-def _setting(value: Any, device: torch.device) -> Hashable:
+def _setting(value: Any, device: torch.device, *, in_container: bool = False) -> Hashable:
+    """Return what identifies an attribute, or an entry of a container, as long as it is equal."""
     if isinstance(value, NUMBERS):
         return type(value), value
     if isinstance(value, Tensor):
         form = (value.shape, value.dtype, value.device)
-        # Values of tensors on the device are read again in each call.
-        return form if value.device == device else (form, id(value), value._version)
+        # Values of attributes on the device are read again in each call.
+        read_again = value.device == device and not in_container
+        return form if read_again else (form, id(value), value._version)
     if isinstance(value, list | tuple):
-        return type(value), tuple(_contained(entry, device) for entry in value)
+        return type(value), tuple(_setting(entry, device, in_container=True) for entry in value)
     if isinstance(value, dict):
-        return tuple(
-            (_contained(key, device), _contained(entry, device)) for key, entry in value.items()
-        )
+        entries = (entry for item in value.items() for entry in item)
+        return tuple(_setting(entry, device, in_container=True) for entry in entries)
     if inspect.ismethod(value):
         return id(value.__self__), value.__func__
     try:
@@ -74,9 +75,3 @@ def _setting(value: Any, device: torch.device) -> Hashable:
     except TypeError:
         return id(value)
     return reference
-
-
-def _contained(value: Any, device: torch.device) -> Hashable:
-    """Return the setting of an entry of a container, whose tensors are not read again."""
-    setting = _setting(value, device)
-    return (setting, id(value), value._version) if isinstance(value, Tensor) else setting

@@ -67,7 +67,6 @@ class Particles(NamedTuple):
 
     def gather(self, order: Tensor) -> Particles:
         """Return particles reordered by indices among all B N, shape [B N]; differentiable."""
-
         fields = self._replace(goal=None).map(
             lambda value: value.flatten(0, 1).index_select(0, order).view_as(value)
         )

@@ -63,7 +63,8 @@ def checked_physics(
     )
 
 
-def _check_one_species(rule: NPARule) -> None:
+def _check_rule_of_one_species(rule: NPARule) -> None:
+    check_rule(rule)
     if rule.species_count:
         raise NPAError(
             f"the rule must not perceive species separately, got species_count="
@@ -164,13 +165,12 @@ def at_rest(
     Raises:
         NPAError: As `rollout`, or the rule divides.
     """
-    check_rule(rule)
+    _check_rule_of_one_species(rule)
     if rule.divides:
         raise NPAError(
             "at_rest is for rules whose particles do not divide, got one with divides=True: its "
             "worlds change by chance"
         )
-    _check_one_species(rule)
     worlds = Particles(x, s)
     constants = checked_physics(rule, worlds, eps=eps, box=box, boundary=boundary, dt=dt)
     return resting((rule,), worlds, constants, "auto")
@@ -258,8 +258,7 @@ def rollout(
     interval = checked_keep_every(keep_every, steps)
     checked_choice("memory", memory, get_args(Memory))
     checked_choice("cuda_graph", cuda_graph, CUDA_GRAPH_CHOICES)
-    check_rule(rule)
-    _check_one_species(rule)
+    _check_rule_of_one_species(rule)
     worlds = Particles(x, s)
     constants = checked_physics(
         rule,

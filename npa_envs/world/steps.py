@@ -400,12 +400,9 @@ class SpeciesStep(Step):
     def _perceived(
         self, species: Species, z: Tensor, fields: Tensor | None, particle: Tensor
     ) -> Tensor:
-        """Return rows of perception with a species' divisor of densities and, if any, `fields`.
+        """Return rows of perception z with a species' divisor of densities and, if any, `fields`.
 
-        Args:
-            z: Rows of perception, [R, P] or wider, with densities divided by N.
-            fields: Each species' density and density gradient at all particles, or None.
-            particle: Indices of the rows' particles among those of the species, [R].
+        `fields` are each species' density and density gradient, `particle` [R] the rows' particles.
         """
         ratio, space_dim = species.count_ratio, self.physics.space_dim
         if ratio != 1.0 and self.physics.terms.density_gradient:
