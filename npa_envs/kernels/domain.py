@@ -189,9 +189,7 @@ def domain_types(space_dim: int, scalar: type) -> SimpleNamespace:
             result[d] = entry[d]
         return result
 
-    functions = [cell_of, cell_index, cell_at, cells_around, wrapped, segment_count]
-    functions += [segment_cells, minimum_image, periodic_image, position_of]
-    return native.named(*functions, vector=vector, particle=particle, Domain=Domain)
+    return native.namespace(locals(), vector=vector, particle=particle, Domain=Domain)
 
 
 @functools.lru_cache(maxsize=256)

@@ -21,7 +21,6 @@ BOTH_DEVICES = ("primitives.cuh", "mathematics.cuh")
 
 CUDA_ONLY = (
     "cuda/sort.cuh",
-    "cuda/world_mean.cuh",
     "cuda/neighbour_list.cuh",
     "cuda/density.cuh",
     "cuda/perceive.cuh",
@@ -90,9 +89,12 @@ def _native(stub: Any, name: str, parameters: tuple[Any, ...]) -> Any:
     return wp.func_native(f"    {'return ' * returns}{call}\n")(stub)
 
 
-def named(*functions: Any, **others: Any) -> SimpleNamespace:
-    """Return a namespace of kernels and Warp functions by their own names, and of other values."""
-    return SimpleNamespace(**{function.func.__name__: function for function in functions}, **others)
+def namespace(scope: dict[str, Any], **others: Any) -> SimpleNamespace:
+    """Return a namespace of a factory's kernels and Warp functions, from its `locals()`."""
+    functions = {
+        k: value for k, value in scope.items() if isinstance(value, wp.Function | wp.Kernel)
+    }
+    return SimpleNamespace(**functions, **others)
 
 
 def _in_cpp(parameter: Any) -> str:

@@ -103,12 +103,7 @@ class CustomOp(Generic[Arguments, Result]):
         self._operator = torch.library.custom_op(
             name, self._taking_lists(function), mutates_args=()
         )
-        self.register_fake(tracing()(function))
-
-    def register_fake(self, fake: Callable[..., Any]) -> Callable[..., Any]:
-        """Register another function that returns results of the right shapes, for tracing."""
-        self._operator.register_fake(self._taking_lists(fake))
-        return fake
+        self._operator.register_fake(self._taking_lists(tracing()(function)))
 
     def _taking_lists(self, function: Callable[..., Any]) -> Callable[..., Any]:
         """Return the function with a list of numbers in place of each `Physics`."""

@@ -4,7 +4,6 @@ v are a particle's perceived gradients, u = mixing^T v linear combinations of th
 the world rotates all of them and leaves u_a · u_b unchanged, in 2D also u_a × u_b, whose sign
 changes in a mirror. Each formula exists twice: in plain torch, for any tensors (`invariants`,
 `steered`), and as kernels with hand-written adjoints, for rollouts (`read_rows`, `steer_rows`).
-
 Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
 """
 

@@ -118,7 +118,7 @@ def _run_network(
     out_width: int,
     unit_count: int,
     mode: str,
-    noted: Tensor | None,
+    stored_signs: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
     """Run `two_layer_kernel` on rows [K, width]; mode "note" also returns the ReLU masks."""
     steps, tiles = -(-int(rows.shape[1]) // 16), -(-out_width // 8)
@@ -134,7 +134,7 @@ def _run_network(
         unit_count,
         aligned(rows),
         *arranged[:3],
-        signs if noted is None else noted,
+        signs if stored_signs is None else stored_signs,
         output,
         block_dim=LAYER_BLOCK,
     )
@@ -152,8 +152,8 @@ def _weight_gradients(
         -(-width // 16), -(-width // 8), -(-out_width // 8), warps, unit_blocks, int(signs.shape[1])
     )
     processors = multiprocessor_count(rows.device)
-    each = 1 if count <= FEW_ROWS * processors else BLOCKS_PER_PROCESSOR
-    most = max(each * processors // unit_blocks, 1)
+    blocks_each = 1 if count <= FEW_ROWS * processors else BLOCKS_PER_PROCESSOR
+    most = max(blocks_each * processors // unit_blocks, 1)
     part_rows = max(-(-count // (most * ROW_GROUP)), 1) * ROW_GROUP
     part_count = -(-count // part_rows)
     partial_sums = rows.new_empty(part_count, unit_count * (width + out_width))
@@ -226,13 +226,13 @@ def run_network(
             where that was without gradients and gradients are enabled now.
     """
     out_width, unit_count = output_shape
-    noting = torch.is_grad_enabled() and (rows.requires_grad or weights.requires_grad)
-    if noting and not arranged.backward:
+    needs_gradient = torch.is_grad_enabled() and (rows.requires_grad or weights.requires_grad)
+    if needs_gradient and not arranged.backward:
         end = unit_count * rows.shape[1]
         hidden_weight = weights[:end].view(unit_count, -1)
         output_weight = weights[end:].view(out_width, unit_count)
         arranged = arrange(hidden_weight, output_weight, with_backward=True)
-    if not noting:
+    if not needs_gradient:
         return _run_network(rows, arranged.forward, out_width, unit_count, "rectify", None)[0]
     update: Tensor = _Network.apply(  # type: ignore[no-untyped-call]
         rows, weights, out_width, unit_count, arranged

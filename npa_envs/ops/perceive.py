@@ -2,7 +2,6 @@
 
 Each is a custom torch operator, which torch.compile does not trace. The autograd functions save
 only tensors that the adjoint of the case reads.
-
 Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
 """
 
@@ -239,7 +238,7 @@ def _perceive_rows(
 
 
 class _PerceiveRows(torch.autograd.Function):
-    """Autograd function of active particles' perception; backward gathers, without atomics."""
+    """Rows of perception of the active particles; the backward pass gathers over neighbours."""
 
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
@@ -369,15 +368,15 @@ def updates_in_parts(
     perception = x.new_empty(min(ROWS_TOGETHER, row_capacity), row_width)
     updates = None
     for first in range(0, row_capacity, ROWS_TOGETHER):
-        some = perception[: min(ROWS_TOGETHER, row_capacity - first)]
+        part = perception[: min(ROWS_TOGETHER, row_capacity - first)]
         arguments = perception_launch(
-            plan, ordered, densities, some, first_row=first, row_count=len(some)
+            plan, ordered, densities, part, first_row=first, row_count=len(part)
         )
         launch(*arguments)
-        mapped = network(some)
+        mapped = network(part)
         if updates is None:
             updates = mapped.new_empty(row_capacity, mapped.shape[1])
-        updates[first : first + len(some)] = mapped
+        updates[first : first + len(part)] = mapped
     assert updates is not None, "worlds have particles"
     return updates, Rows(ordered.row_of, ordered.row_source, ordered.starts, plan.row_base)
 

@@ -104,7 +104,7 @@ def compute_densities(
     particles = positions.new_empty(plan.total if with_particles else 0, plan.space_dim + 1)
     steps = positions.new_empty(listing.shape(plan.row_capacity), dtype=torch.int16)
     lengths = positions.new_empty(plan.row_capacity, dtype=torch.int32)
-    where = (
+    arrays = (
         ordered.starts,
         ordered.cell,
         positions,
@@ -123,7 +123,7 @@ def compute_densities(
             positions.device,
             plan.domain,
             plan.particle_count,
-            *where,
+            *arrays,
             block_dim=WARP,
         )
     else:
@@ -134,7 +134,7 @@ def compute_densities(
             -(-plan.total * listing.lanes // WARP) * WARP,
             positions.device,
             plan.domain,
-            *where,
+            *arrays,
             block_dim=LIST_BLOCK,
         )
     no_gradient = positions.new_empty(0, plan.space_dim, dtype=torch.float64)
@@ -185,9 +185,9 @@ def perception_launch(
         row_kernel_sum: Output of the rows' sums of v K, shape [K, D], for the adjoint.
         first_row: Row that is written to the first row of `out`, a multiple of `INTERLEAVED_LISTS`.
     """
-    some = row_count is not None
+    has_part = row_count is not None
     row_count = plan.row_capacity if row_count is None else row_count
-    row_index = ordered.row_index[first_row:] if plan.masked or some else None
+    row_index = ordered.row_index[first_row:] if plan.masked or has_part else None
     terms = plan.physics.terms
     numbers = (
         plan.state_dim,
@@ -197,7 +197,7 @@ def perception_launch(
         plan.row_base + first_row,
     )
     lists = densities.lists
-    if lists is not None and some:
+    if lists is not None and has_part:
         shifted = lists.steps[first_row // INTERLEAVED_LISTS :], lists.lengths[first_row:]
         lists = lists._replace(steps=shifted[0], lengths=shifted[1])
     if lists is not None:

@@ -6,7 +6,7 @@ import functools
 import math
 from collections.abc import Callable
 from types import NoneType
-from typing import Any, Literal, NamedTuple, ParamSpec, get_args
+from typing import Any, Literal, NamedTuple, ParamSpec, cast, get_args
 
 import torch
 
@@ -163,15 +163,13 @@ Arguments = ParamSpec("Arguments")
 
 def _cached(make: Callable[Arguments, Physics]) -> Callable[Arguments, Physics]:
     """Return a function that remembers results of immutable arguments, except for compilers."""
-    remembered = functools.lru_cache(maxsize=256, typed=True)(make)
+    remembered = cast("Callable[Arguments, Physics]", functools.lru_cache(256, typed=True)(make))
 
     @functools.wraps(make)
     def cached(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Physics:
-        if not torch.compiler.is_compiling() and IMMUTABLE.issuperset(
-            map(type, (*args, *kwargs.values()))
-        ):
-            return remembered(*args, **kwargs)  # type: ignore[arg-type]
-        return make(*args, **kwargs)
+        values = *args, *kwargs.values()
+        known = not torch.compiler.is_compiling() and IMMUTABLE.issuperset(map(type, values))
+        return (remembered if known else make)(*args, **kwargs)
 
     return cached
 

@@ -108,7 +108,7 @@ def _list_neighbours(plan: KernelPlan, starts: Tensor, particles: Tensor) -> lis
 
 
 def prepare_static(x: Tensor, physics: Physics) -> StaticWorlds:
-    """Return static particles sorted by cell, with neighbours; x is validated; no gradient."""
+    """Return checked worlds, whose particles do not move, sorted by cell; not differentiable."""
     return StaticWorlds.of(_prepare_static(x.detach().contiguous(), physics.state_dim, physics))
 
 

@@ -326,6 +326,7 @@ class PreparedActions:
         self._worlds = worlds
         self._physics = physics
         self._tape: Tape | None = None
+        self._action_slots: Any = None
         worlds.check(self._buffer, physics)
 
     def __getstate__(self) -> dict[str, Any]:

@@ -46,8 +46,8 @@ def warmup(
         NPAError: There is no such device, or no such kernels.
     """
     device = check_device(device)
-    space_dims = _chosen("space_dims", space_dims, (2, 3))
-    dtypes = _chosen("dtypes", dtypes, DTYPES)
+    space_dims = _checked_choice("space_dims", space_dims, (2, 3))
+    dtypes = _checked_choice("dtypes", dtypes, DTYPES)
     keys = torch.zeros(1, dtype=torch.int64, device=device)
     counts = torch.zeros(1, dtype=torch.int32, device=device)
     streams = keys, counts, counts, 0
@@ -84,12 +84,12 @@ def warmup(
                 _warm_views(x)
 
 
-def _chosen(name: str, value: Any, known: tuple[Any, ...]) -> list[Any]:
+def _checked_choice(name: str, value: Any, known: tuple[Any, ...]) -> list[Any]:
     """Return the values given, one or several, after checking that each is known."""
-    chosen = entries(value)
-    if not chosen or not all(value in known for value in chosen):
+    choice = entries(value)
+    if not choice or not all(value in known for value in choice):
         raise NPAError(f"{name} must be some of {known}, got {shown(value)}: name one or both")
-    return chosen
+    return choice
 
 
 def _warm_rewards(elapsed: torch.Tensor) -> None:
@@ -111,8 +111,8 @@ def _warm_rewards(elapsed: torch.Tensor) -> None:
 def _warm_steps(x: torch.Tensor, s: torch.Tensor, physics: Physics) -> None:
     """Run perception and update as in rollouts, of all particles and of those in a mask."""
     count, width = x.shape[1], physics.perception_dim + 1
-    every = torch.ones(x.shape[:2], dtype=torch.uint8, device=x.device)
-    for mask, gradients in itertools.product((None, every), (False, True)):
+    all_active = torch.ones(x.shape[:2], dtype=torch.uint8, device=x.device)
+    for mask, gradients in itertools.product((None, all_active), (False, True)):
         worlds = x, s.clone().requires_grad_(gradients)
         rows, maps = perceive_rows(*worlds, physics, mask=mask, row_capacity=count, row_width=width)
         paths = x.new_zeros(x.shape[:2])

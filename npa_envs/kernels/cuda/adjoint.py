@@ -4,7 +4,6 @@ The same sums as the portable `gather_state_cotangents`, in another order of wor
 eight consecutive particles of the sorted order: it lists the rows within eps of their bounding box,
 and multiplies the rows' cotangents by the weights of all eight on tensor cores. So a row's
 cotangents are read once for eight particles.
-
 Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
 """
 
@@ -140,82 +139,12 @@ def smallest_in_tile(value: float) -> float:
 read_channels = make_read_columns(THREAD_CHANNELS)
 
 
-@cached_under_lock()
-def listed_adjoint(
-    space_dim: int, width: int, state_gradient: bool, periodic: bool, grouped: bool
-) -> SimpleNamespace:
-    """Return the kernels of one variant.
-
-    A variant is for a box or open space, and for one or several groups of channels. Cotangents of a
-    row and group are contiguous: [1 + D, W], first of the smoothed state, then of the state
-    gradient. An entry of zeros follows that of the last row.
-    """
+def row_search(space_dim: int, periodic: bool) -> SimpleNamespace:
+    """Return the functions that search rows near a tile: runs of cells and bounding boxes."""
     scalar = wp.float32
     space = domain_types(space_dim, scalar)
     vector, Domain = space.vector, space.Domain
     cell_vector = wp.types.vector(space_dim, wp.int32)
-    thread_gradient = wp.types.matrix((space_dim, THREAD_CHANNELS), scalar)
-    weight_count = 1 + space_dim if state_gradient else 1
-    topic = "listed_adjoint" if state_gradient else "listed_smoothing_adjoint"
-    topic += "_in_box" * periodic + "_grouped" * grouped
-    module = kernel_module(topic, space_dim, scalar, width)
-    load_vector = make_wide_load(vector)
-    parts = width // THREAD_CHANNELS
-    sum_listed = make_sum_listed(space_dim, width, weight_count, periodic)
-    log_scale_pull = make_log_scale_pull(vector)
-    read_gradients = make_read_columns(THREAD_CHANNELS * space_dim)
-
-    @wp.kernel(enable_backward=False, module=module, grid_stride=False)
-    def unscale_cotangents(
-        state_dim: int,
-        gradient_scale: scalar,
-        blur_scale: scalar,
-        row_base: int,
-        row_capacity: int,
-        group_count: int,
-        starts: wp.array[wp.int32],
-        perception: wp.array2d[scalar],
-        perception_bar: wp.array2d[scalar],
-        # outputs
-        cotangents: wp.array[CHANNELS],
-    ):
-        """Write the cotangents of each row's unscaled sums from the cotangent of z.
-
-        Those of smoothed states are multiplied by `blur_scale`.
-        """
-        await_earlier()
-        allow_next_launch()
-        thread = wp.tid()
-        row_parts = group_count * wp.static(parts)
-        row = wp.int32(wp.uint32(thread) / wp.uint32(row_parts))
-        part = thread - row * row_parts
-        channel = part * wp.static(THREAD_CHANNELS)
-        entry = row * group_count + part / wp.static(parts)
-        index = entry * wp.static(weight_count * parts) + part % wp.static(parts)
-        if row == row_capacity and part < wp.static(parts):
-            for n in range(wp.static(weight_count)):
-                wide_store(cotangents, index + n * wp.static(parts), CHANNELS())
-        if row < wp.min(load_integer(starts, starts.shape[0] - 1) - row_base, row_capacity):
-            column = state_dim + channel
-            blur = read_channels(perception_bar, row, column, 2 * state_dim)
-            wide_store(cotangents, index, blur_scale * blur)
-            if wp.static(state_gradient):
-                column = 2 * state_dim + channel * wp.static(space_dim)
-                end = (2 + wp.static(space_dim)) * state_dim
-                scaled = read_gradients(perception, row, column, end)
-                bars = read_gradients(perception_bar, row, column, end)
-                pulled = thread_gradient()
-                for c in range(wp.static(THREAD_CHANNELS)):
-                    value = vector()
-                    bar = vector()
-                    for d in range(wp.static(space_dim)):
-                        value[d] = scaled[c * wp.static(space_dim) + d]
-                        bar[d] = bars[c * wp.static(space_dim) + d]
-                    pull = gradient_scale * log_scale_pull(value, bar)
-                    for d in range(wp.static(space_dim)):
-                        pulled[d, c] = pull[d]
-                for d in range(wp.static(space_dim)):
-                    wide_store(cotangents, index + (d + 1) * wp.static(parts), pulled[d])
 
     @wp.func
     def line_of(domain: Domain, cell: cell_vector):
@@ -323,6 +252,86 @@ def listed_adjoint(
             finite = finite and wp.isfinite(position[d])
         return finite
 
+    return native.namespace(locals())
+
+
+@cached_under_lock()
+def listed_adjoint(
+    space_dim: int, width: int, state_gradient: bool, periodic: bool, grouped: bool
+) -> SimpleNamespace:
+    """Return the kernels of one variant.
+
+    A variant is for a box or open space, and for one or several groups of channels. Cotangents of a
+    row and group are contiguous: [1 + D, W], first of the smoothed state, then of the state
+    gradient. An entry of zeros follows that of the last row.
+    """
+    scalar = wp.float32
+    space = domain_types(space_dim, scalar)
+    vector, Domain = space.vector, space.Domain
+    thread_gradient = wp.types.matrix((space_dim, THREAD_CHANNELS), scalar)
+    weight_count = 1 + space_dim if state_gradient else 1
+    topic = "listed_adjoint" if state_gradient else "listed_smoothing_adjoint"
+    topic += "_in_box" * periodic + "_grouped" * grouped
+    module = kernel_module(topic, space_dim, scalar, width)
+    load_vector = make_wide_load(vector)
+    search = row_search(space_dim, periodic)
+    parts = width // THREAD_CHANNELS
+    sum_listed = make_sum_listed(space_dim, width, weight_count, periodic)
+    log_scale_pull = make_log_scale_pull(vector)
+    read_gradients = make_read_columns(THREAD_CHANNELS * space_dim)
+
+    @wp.kernel(enable_backward=False, module=module, grid_stride=False)
+    def unscale_cotangents(
+        state_dim: int,
+        gradient_scale: scalar,
+        blur_scale: scalar,
+        row_base: int,
+        row_capacity: int,
+        group_count: int,
+        starts: wp.array[wp.int32],
+        perception: wp.array2d[scalar],
+        perception_bar: wp.array2d[scalar],
+        # outputs
+        cotangents: wp.array[CHANNELS],
+    ):
+        """Write the cotangents of each row's unscaled sums from the cotangent of z.
+
+        Those of smoothed states are multiplied by `blur_scale`.
+        """
+        await_earlier()
+        allow_next_launch()
+        thread = wp.tid()
+        row_parts = group_count * wp.static(parts)
+        row = wp.int32(wp.uint32(thread) / wp.uint32(row_parts))
+        part = thread - row * row_parts
+        channel = part * wp.static(THREAD_CHANNELS)
+        entry = row * group_count + part / wp.static(parts)
+        index = entry * wp.static(weight_count * parts) + part % wp.static(parts)
+        if row == row_capacity and part < wp.static(parts):
+            for n in range(wp.static(weight_count)):
+                wide_store(cotangents, index + n * wp.static(parts), CHANNELS())
+        if row < wp.min(load_integer(starts, starts.shape[0] - 1) - row_base, row_capacity):
+            column = state_dim + channel
+            blur = read_channels(perception_bar, row, column, 2 * state_dim)
+            wide_store(cotangents, index, blur_scale * blur)
+            if wp.static(state_gradient):
+                column = 2 * state_dim + channel * wp.static(space_dim)
+                end = (2 + wp.static(space_dim)) * state_dim
+                scaled = read_gradients(perception, row, column, end)
+                bars = read_gradients(perception_bar, row, column, end)
+                pulled = thread_gradient()
+                for c in range(wp.static(THREAD_CHANNELS)):
+                    value = vector()
+                    bar = vector()
+                    for d in range(wp.static(space_dim)):
+                        value[d] = scaled[c * wp.static(space_dim) + d]
+                        bar[d] = bars[c * wp.static(space_dim) + d]
+                    pull = gradient_scale * log_scale_pull(value, bar)
+                    for d in range(wp.static(space_dim)):
+                        pulled[d, c] = pull[d]
+                for d in range(wp.static(space_dim)):
+                    wide_store(cotangents, index + (d + 1) * wp.static(parts), pulled[d])
+
     @wp.kernel(
         enable_backward=False, module=module, cuda_max_registers=CUDA_REGISTERS, grid_stride=False
     )
@@ -372,16 +381,16 @@ def listed_adjoint(
         part = lane >> 3
         channel = g * wp.static(width) + part * wp.static(THREAD_CHANNELS)
         i = load_integer(source, wp.min(written, end - 1))
-        position = load_position(particles, wp.min(k, end - 1))
+        position = search.load_position(particles, wp.min(k, end - 1))
         own_row = load_integer(row_of, i)
         if own_row >= 0 and channel < state_dim:
             prefetch_columns(perception_bar, own_row, channel)
         cell = space.cell_of(domain, position)
-        line = line_of(domain, cell)
+        line = search.line_of(domain, cell)
         address = row_list_address()
         total = CHANNELS()
         # A position that is not finite has no neighbours.
-        waiting = k < end and is_finite(position)
+        waiting = k < end and search.is_finite(position)
         while any_in_warp(waiting):
             # Serve the first particle that is left, and all others on its line of cells.
             leader = first_in_warp(waiting)
@@ -392,10 +401,10 @@ def listed_adjoint(
             origin = vector()
             for d in range(wp.static(space_dim)):
                 origin[d] = scalar_of_warp(position[d], leader)
-            middle, half = box_around(domain, position, origin, served)
+            middle, half = search.box_around(domain, position, origin, served)
             last_column = largest_in_warp(wp.where(served, cell[0], 0))
-            from_column, to_column = columns_around(domain, column, last_column)
-            run_count = count_runs(domain, to_column)
+            from_column, to_column = search.columns_around(domain, column, last_column)
+            run_count = search.count_runs(domain, to_column)
             votes = vote_of_warp(served) >> wp.uint32(8 * (lane & 3))
             count = wp.int32(0)
             block = wp.int32(0)
@@ -405,7 +414,9 @@ def listed_adjoint(
                 run_begin = wp.int32(0)
                 length = wp.int32(0)
                 if run < run_count:
-                    from_cell, to_cell = run_cells(domain, middle_line, from_column, to_column, run)
+                    from_cell, to_cell = search.run_cells(
+                        domain, middle_line, from_column, to_column, run
+                    )
                     run_begin = load_integer(starts, base + from_cell) - row_base
                     run_end = load_integer(starts, base + to_cell) - row_base
                     length = wp.max(wp.min(run_end, row_capacity) - run_begin, 0)
@@ -418,8 +429,8 @@ def listed_adjoint(
                     row = candidate + of_warp(shift, thread_of(run_ends, candidate))
                     inside = candidate < candidates
                     other = load_vector(row_positions, wp.where(inside, row, 0))
-                    near = near_box(domain, (other - origin) - middle, half)
-                    entry = entry_of(other, row * group_count + g)
+                    near = search.near_box(domain, (other - origin) - middle, half)
+                    entry = search.entry_of(other, row * group_count + g)
                     count = append_entry(address, count, inside and near, entry)
                     candidate += wp.static(WARP)
                     searching = candidate - lane < candidates
@@ -428,7 +439,7 @@ def listed_adjoint(
                         summed_count = count & ~wp.int32(wp.static(TILE_PARTICLES - 1))
                         if finished:
                             # The entry after the last row is zero.
-                            nothing = entry_of(origin, row_capacity * group_count)
+                            nothing = search.entry_of(origin, row_capacity * group_count)
                             summed_count = pad_list(address, count, nothing)
                         block_sums = sum_listed(
                             address,

@@ -3,7 +3,6 @@
 The formulas are those of `npa_envs/ops/equivariance.py`. Compared with
 `kernels/portable/equivariance.py` there are fewer passes over rows, and one of them also computes
 the gradient of the mixing weights.
-
 Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
 """
 

@@ -80,19 +80,19 @@ __device__ inline void two_layers(
     for (int half = 0; half < 2; ++half) {
         const int row = first + 8 * half;
         const float* from = rows.data + (size_t)row * width + 4 * t;
-        float part[STEPS][4];
+        float values[STEPS][4];
         float largest = 0.0f;
         #pragma unroll
         for (int k = 0; k < STEPS; ++k) {
             #pragma unroll
-            for (int i = 0; i < 4; ++i) part[k][i] = 0.0f;
+            for (int i = 0; i < 4; ++i) values[k][i] = 0.0f;
             if (row < count && 16 * k + 4 * t < width) {
                 asm volatile("ld.global.L1::no_allocate.v4.f32 {%0, %1, %2, %3}, [%4];"
-                    : "=f"(part[k][0]), "=f"(part[k][1]), "=f"(part[k][2]), "=f"(part[k][3])
+                    : "=f"(values[k][0]), "=f"(values[k][1]), "=f"(values[k][2]), "=f"(values[k][3])
                     : "l"(from + 16 * k));
             }
             #pragma unroll
-            for (int i = 0; i < 4; ++i) largest = fmaxf(largest, fabsf(part[k][i]));
+            for (int i = 0; i < 4; ++i) largest = fmaxf(largest, fabsf(values[k][i]));
         }
         largest = fmaxf(largest, __shfl_xor_sync(~0u, largest, 1));
         largest = fmaxf(largest, __shfl_xor_sync(~0u, largest, 2));
@@ -102,7 +102,7 @@ __device__ inline void two_layers(
         for (int k = 0; k < STEPS; ++k) {
             #pragma unroll
             for (int i = 0; i < 2; ++i) {
-                split_half(part[k][2 * i] * scale, part[k][2 * i + 1] * scale,
+                split_half(values[k][2 * i] * scale, values[k][2 * i + 1] * scale,
                     high[k][2 * i + half], low[k][2 * i + half]);
             }
         }
@@ -110,70 +110,71 @@ __device__ inline void two_layers(
 
     float total[TILES][4] = {};
     unsigned signs[2] = {};
-    const uint4* hidden = reinterpret_cast<const uint4*>(hidden_weights.data) + lane;
-    const uint4* outer = reinterpret_cast<const uint4*>(output_weights.data) + lane;
+    const uint4* hidden_weight = reinterpret_cast<const uint4*>(hidden_weights.data) + lane;
+    const uint4* output_weight = reinterpret_cast<const uint4*>(output_weights.data) + lane;
     #pragma unroll 1
     for (int unit = 0; unit < units; ++unit) {
-        // Three independent sums of products.
-        float sum[2][4] = {}, rest[2][2][4] = {};
+        // Three independent sums of products: of high parts, and small ones with a low part.
+        float sum[2][4] = {}, small[2][2][4] = {};
         #pragma unroll
         for (int k = 0; k < STEPS; ++k) {
             #pragma unroll
             for (int tile = 0; tile < 2; ++tile) {
-                const uint4 weight = hidden[(tile * STEPS + k) * 32];
+                const uint4 weight = hidden_weight[(tile * STEPS + k) * 32];
                 multiply_half(sum[tile], high[k], weight.x, weight.y);
-                multiply_half(rest[0][tile], low[k], weight.x, weight.y);
-                multiply_half(rest[1][tile], high[k], weight.z, weight.w);
+                multiply_half(small[0][tile], low[k], weight.x, weight.y);
+                multiply_half(small[1][tile], high[k], weight.z, weight.w);
             }
         }
-        hidden += 2 * STEPS * 32;
-        unsigned left[4], left_rest[4];
+        hidden_weight += 2 * STEPS * 32;
+        unsigned high_units[4], low_units[4];
         #pragma unroll
         for (int half = 0; half < 2; ++half) {
             const int row = first + 8 * half;
             int* word = signs_of.data + (size_t)row * words + (unit / 8) * 4 + t;
-            unsigned& kept = signs[half];
+            unsigned& mask = signs[half];
             if constexpr (BETWEEN == MASK) {
-                if ((unit & 7) == 0 && row < count) kept = *word;
+                if ((unit & 7) == 0 && row < count) mask = *word;
             }
             #pragma unroll
             for (int tile = 0; tile < 2; ++tile) {
                 float value[2];
                 #pragma unroll
                 for (int i = 0; i < 2; ++i) {
-                    const int place = 2 * half + i;
-                    value[i] = rest[0][tile][place] + rest[1][tile][place] + sum[tile][place];
+                    const int entry = 2 * half + i;
+                    value[i] = small[0][tile][entry] + small[1][tile][entry] + sum[tile][entry];
                     const unsigned bit = 1u << (2 * tile + i);
                     if constexpr (BETWEEN == MASK) {
-                        if (!(kept & bit)) value[i] = 0.0f;
+                        if (!(mask & bit)) value[i] = 0.0f;
                     } else if (value[i] <= 0.0f) {
                         // A hidden unit that is NaN stays so, as it does in torch.
                         value[i] = 0.0f;
                     } else if (BETWEEN == NOTE) {
-                        kept |= bit << (4 * (unit & 7));
+                        mask |= bit << (4 * (unit & 7));
                     }
                 }
-                split_half(value[0], value[1], left[2 * tile + half], left_rest[2 * tile + half]);
+                split_half(
+                    value[0], value[1], high_units[2 * tile + half], low_units[2 * tile + half]);
             }
             if constexpr (BETWEEN == NOTE) {
                 if ((unit & 7) == 7 || unit + 1 == units) {
-                    if (row < count) *word = kept;
-                    kept = 0u;
+                    if (row < count) *word = mask;
+                    mask = 0u;
                 }
             }
-            if constexpr (BETWEEN == MASK) kept >>= 4;
+            if constexpr (BETWEEN == MASK) mask >>= 4;
         }
         #pragma unroll
         for (int tile = 0; tile < TILES; ++tile) {
-            const uint4 weight = outer[tile * 32];
-            float part[4] = {};
-            multiply_half(part, left_rest, weight.x, weight.y);
-            multiply_half(part, left, weight.z, weight.w);
-            multiply_half(part, left, weight.x, weight.y);
+            const uint4 weight = output_weight[tile * 32];
+            float product[4] = {};
+            multiply_half(product, low_units, weight.x, weight.y);
+            multiply_half(product, high_units, weight.z, weight.w);
+            multiply_half(product, high_units, weight.x, weight.y);
             #pragma unroll
-            for (int i = 0; i < 4; ++i) total[tile][i] += part[i];
+            for (int i = 0; i < 4; ++i) total[tile][i] += product[i];
         }
-        outer += TILES * 32;
+        output_weight += TILES * 32;
     }
 
     #pragma unroll

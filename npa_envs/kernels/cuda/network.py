@@ -2,7 +2,6 @@
 
 Each factor of a product is split into two numbers of 16 bits; `network.cuh` has the layout in a
 warp. float16 has a small range, so rows are first scaled by powers of two, which is exact.
-
 Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
 """
 
@@ -224,4 +223,4 @@ def arrangement_kernels() -> SimpleNamespace:
             fragments[first + i] = high
             fragments[first + 8 * wp.static(WARP) + i] = wp.bfloat16(value - wp.float32(high))
 
-    return native.named(arrange_hidden, arrange_output, arrange_left)
+    return native.namespace(locals())

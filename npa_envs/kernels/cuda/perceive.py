@@ -158,9 +158,7 @@ def slot_functions(variant: PerceptionVariant, lane_channels: type) -> SimpleNam
         """Return a number of neighbours, rounded up to a multiple of the lanes."""
         return (count + wp.static(lanes - 1)) & ~wp.int32(wp.static(lanes - 1))
 
-    numbers = append_number, number_at, padded
-    functions = slot_address, part_address, part_of_state, *numbers, put_entry, entry_at
-    return native.named(*functions, write_rows=write_rows)
+    return native.namespace(locals())
 
 
 def weighing_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> SimpleNamespace:
@@ -338,7 +336,7 @@ def weighing_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> Si
         sync_warp()
         return steps, sums
 
-    return native.named(centre_at, weigh_searched, weigh_listed, Sums=Sums)
+    return native.namespace(locals(), Sums=Sums)
 
 
 def make_add_states(
@@ -439,7 +437,7 @@ def search_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> Simp
             total = slots.append_number(slot, total, candidate < end and near, candidate)
         return total
 
-    return native.named(look_up_run, append_near, ahead=ahead)
+    return native.namespace(locals(), ahead=ahead)
 
 
 def row_functions(variant: PerceptionVariant) -> SimpleNamespace:
@@ -511,7 +509,7 @@ def row_functions(variant: PerceptionVariant) -> SimpleNamespace:
             scaled = scaled_gradient(gradient_scale, gradient)
             stage(slot, wp.static(2 * width) + first_channel * wp.static(space_dim), scaled)
 
-    return native.named(scaled_vector, stage_sums)
+    return native.namespace(locals())
 
 
 @cached_under_lock()

@@ -93,9 +93,7 @@ def block_functions(capacity: int) -> SimpleNamespace:
     def member_at(address: wp.uint64, provisional: int) -> int:
         """Return the index of the particle at a provisional position."""
 
-    functions = [block_memory, clear_counts, arrive, add_up_counts]
-    functions += [start_of, place_arrived, span_of_slice, ranked_at, member_at]
-    return native.named(*functions)
+    return native.namespace(locals())
 
 
 @cached_under_lock()

@@ -13,7 +13,6 @@ On CUDA a block serves a tile and a thread a pixel; sums over pixels use shuffle
 shared memory among warps. On a CPU a thread serves a tile, one Gaussian after the other, each only
 at the pixels that it covers. Either way every pair of a tile and a Gaussian has its own slot for
 the cotangents from that tile (its pull): no sum depends on the order of threads.
-
 Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
 """
 
@@ -24,7 +23,7 @@ import warp as wp
 from npa_envs.kernels import native_functions as native
 from npa_envs.kernels.domain import scalar_name
 from npa_envs.kernels.mathematics import make_fast_exp2
-from npa_envs.kernels.native_functions import TILES, in_ranges, named
+from npa_envs.kernels.native_functions import TILES, in_ranges, namespace
 from npa_envs.kernels.pictures.gaussians import (
     CHANNELS,
     MIN_ALPHA,
@@ -134,7 +133,7 @@ def blending_functions(scalar: type) -> SimpleNamespace:
         """Return the coordinate of the centre of a row's or column's pixels."""
         return scalar(pixel) + scalar(0.5)
 
-    return named(strength, colours_of, pull, channels_at, pixel_of, middle_of)
+    return namespace(locals())
 
 
 @cached_under_lock()

@@ -45,7 +45,8 @@ ROUND_TILES = WARP_TILES * BLOCK_WARPS
 
 @cached_under_lock()
 def make_pixel_errors(scalar: type) -> wp.Function:
-    """Return a Warp function: a pixel's density error, and the sum of its three colour errors."""
+    """Return a Warp function of a pixel's errors: |d| + d² of its density difference d, and the sum
+    of the same over red, green and blue, times exp(-density error)."""
     colour_type = splat_types(scalar).colour
 
     @wp.func

@@ -8,7 +8,6 @@ Zwicker et al. 2002, "EWA Splatting". A Gaussian of mean p and covariance P = (R
 equation 6) lies at c = W p + t in a camera's frame and at (fx x/z + cx, fy y/z + cy) on its
 picture. There its covariance is Q⁻¹ = J W P Wᵀ Jᵀ + dilation (Kerbl, equation 5), where J is the
 projection's derivative at c, the local affine approximation (Zwicker).
-
 Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
 """
 
@@ -19,7 +18,7 @@ import warp as wp
 
 from npa_envs.kernels import native_functions as native
 from npa_envs.kernels.domain import scalar_name
-from npa_envs.kernels.native_functions import PAIRS, in_ranges, named
+from npa_envs.kernels.native_functions import PAIRS, in_ranges, namespace
 from npa_envs.kernels.primitives import make_wide_load, wide_store
 from npa_envs.thread_lock import cached_under_lock
 
@@ -112,16 +111,13 @@ def make_covered(scalar: type) -> wp.Function:
 
 
 @cached_under_lock()
-def gaussian_kernels(scalar: type) -> SimpleNamespace:
-    """Return the kernels that draw 3D Gaussians, of one scalar type."""
+def gaussian_functions(scalar: type) -> SimpleNamespace:
+    """Return the functions of several kernels: rotations, projection, colours and tiles."""
     types = gaussian_types(scalar)
     Frame, pair, triple, quad = types.Frame, types.pair, types.triple, types.quad
-    footprint_type, pulls_type, harmonics_type = types.footprint, types.pulls, types.harmonics
-    square, flat, cube, motion_type = types.square, types.flat, types.cube, types.motion
+    footprint_type, harmonics_type = types.footprint, types.harmonics
+    flat, cube, motion_type = types.flat, types.cube, types.motion
     covered = make_covered(scalar)
-    module = native.module(f"npa_envs.kernels.gaussians_{scalar_name(scalar)}")
-    load_footprint = make_wide_load(footprint_type)
-    load_pulls = make_wide_load(pulls_type)
 
     @wp.func
     def unit_quaternion(quaternion: quad):
@@ -273,6 +269,20 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
             )
         return result
 
+    return namespace(locals())
+
+
+@cached_under_lock()
+def gaussian_kernels(scalar: type) -> SimpleNamespace:
+    """Return the kernels that draw 3D Gaussians, of one scalar type."""
+    types, gaussian = gaussian_types(scalar), gaussian_functions(scalar)
+    Frame, pair, triple, quad = types.Frame, types.pair, types.triple, types.quad
+    footprint_type, pulls_type, harmonics_type = types.footprint, types.pulls, types.harmonics
+    square, cube, motion_type = types.square, types.cube, types.motion
+    module = native.module(f"npa_envs.kernels.gaussians_{scalar_name(scalar)}")
+    load_footprint = make_wide_load(footprint_type)
+    load_pulls = make_wide_load(pulls_type)
+
     @in_ranges(PAIRS)
     @wp.kernel(enable_backward=False, module=module)
     def project_gaussians(
@@ -303,15 +313,15 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
         camera = intrinsics[image % intrinsics.shape[0]]
         mean = means[i]
         opacity = opacities[i]
-        rotation = rotation_part(motion)
-        position = rotation * mean + shift_part(motion)
+        rotation = gaussian.rotation_part(motion)
+        position = rotation * mean + gaussian.shift_part(motion)
         depth = scalar(wp.inf)
         count = wp.int32(0)
         footprint = footprint_type()
         if position[2] >= frame.near and opacity >= scalar(MIN_ALPHA):
-            unit, _inverse = unit_quaternion(quaternions[i])
-            spread = scaled_columns(rotation * rotation_of(unit), scales[i])
-            root = jacobian_of(frame, camera, position) * spread
+            unit, _inverse = gaussian.unit_quaternion(quaternions[i])
+            spread = gaussian.scaled_columns(rotation * gaussian.rotation_of(unit), scales[i])
+            root = gaussian.jacobian_of(frame, camera, position) * spread
             x = root[0]
             y = root[1]
             squared_x = wp.dot(x, x)
@@ -330,7 +340,7 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
             footprint[3] = -wp.dot(x, y) * inverse
             footprint[4] = squared_x * inverse
             footprint[5] = opacity
-            colour = colours_of(colours, i, motion, mean)
+            colour = gaussian.colours_of(colours, i, motion, mean)
             for c in range(wp.static(CHANNELS)):
                 footprint[6 + c] = colour[c]
             footprint[10] = wp.sqrt(extent * squared_x)
@@ -339,7 +349,7 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
             for k in range(wp.static(FOOTPRINT)):
                 total += footprint[k]
             if wp.isfinite(total) and determinant > scalar(0.0):
-                tiles = covered_tiles(frame, footprint)
+                tiles = gaussian.covered_tiles(frame, footprint)
                 count = (tiles[2] - tiles[0]) * (tiles[3] - tiles[1])
                 if count > 0:
                     depth = position[2]
@@ -376,7 +386,7 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
         slot = wp.int32(-1)
         if begin < end and end <= wp.int64(room):
             slot = image * room + wp.int32(begin)
-            covers = covered_tiles(frame, load_footprint(footprints, entry))
+            covers = gaussian.covered_tiles(frame, load_footprint(footprints, entry))
             next_slot = slot
             for row in range(covers[1], covers[3]):
                 for column in range(covers[0], covers[2]):
@@ -412,8 +422,8 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
         world = i / frame.particle_count
         mean = means[i]
         scale = scales[i]
-        unit, inverse = unit_quaternion(quaternions[i])
-        own_rotation = rotation_of(unit)
+        unit, inverse = gaussian.unit_quaternion(quaternions[i])
+        own_rotation = gaussian.rotation_of(unit)
         mean_bar = triple()
         scale_bar = triple()
         rotation_bar = cube()
@@ -433,26 +443,26 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
                 footprint = load_footprint(footprints, entry)
                 motion = motions[image % motions.shape[0]]
                 camera = intrinsics[image % intrinsics.shape[0]]
-                rotation = rotation_part(motion)
-                position = rotation * mean + shift_part(motion)
+                rotation = gaussian.rotation_part(motion)
+                position = rotation * mean + gaussian.shift_part(motion)
                 conic = square(footprint[2], footprint[3], footprint[3], footprint[4])
                 centre_bar = conic * pair(pull[1], pull[2])
                 opacity_bar += pull[0] / footprint[5]
 
                 # Of Q = (A Aᵀ + dilation)⁻¹ with A = J W R S.
                 moments = square(pull[3], pull[4], pull[4], pull[5])
-                jacobian = jacobian_of(frame, camera, position)
+                jacobian = gaussian.jacobian_of(frame, camera, position)
                 axes = rotation * own_rotation
-                spread = scaled_columns(axes, scale)
+                spread = gaussian.scaled_columns(axes, scale)
                 root_bar = conic * moments * conic * (jacobian * spread)
                 jacobian_bar = root_bar * wp.transpose(spread)
                 spread_bar = wp.transpose(jacobian) * root_bar
                 for d in range(3):
                     for row in range(3):
                         scale_bar[d] += spread_bar[row, d] * axes[row, d]
-                rotation_bar += wp.transpose(rotation) * scaled_columns(spread_bar, scale)
+                rotation_bar += wp.transpose(rotation) * gaussian.scaled_columns(spread_bar, scale)
 
-                ratios = limited_ratios(frame, camera, position)
+                ratios = gaussian.limited_ratios(frame, camera, position)
                 position_bar = triple()
                 for d in range(2):
                     focal = camera[d] / position[2]
@@ -475,10 +485,10 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
                     for c in range(3):
                         if footprint[6 + c] > scalar(0.0):
                             seen_colour_bar[c] = pull[6 + c]
-                    way = outlook(motion, mean)
+                    way = gaussian.outlook(motion, mean)
                     direction = wp.normalize(way)
-                    harmonics_bar += wp.outer(harmonic_basis(direction), seen_colour_bar)
-                    basis_bar = harmonics_at(colours, i) * seen_colour_bar
+                    harmonics_bar += wp.outer(gaussian.harmonic_basis(direction), seen_colour_bar)
+                    basis_bar = gaussian.harmonics_at(colours, i) * seen_colour_bar
                     factor = scalar(HARMONIC_1) / wp.length(way)
                     way_bar = factor * triple(-basis_bar[3], -basis_bar[1], basis_bar[2])
                     mean_bar += way_bar - wp.dot(way_bar, direction) * direction
@@ -486,7 +496,7 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
         scales_bar[i] = scale_bar
         quaternion_bar = quad()
         if is_drawn:
-            unit_bar = pull_back_rotation(unit, rotation_bar)
+            unit_bar = gaussian.pull_back_rotation(unit, rotation_bar)
             quaternion_bar = inverse * (unit_bar - wp.dot(unit_bar, unit) * unit)
         quaternions_bar[i] = quaternion_bar
         opacities_bar[i] = opacity_bar
@@ -499,4 +509,4 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
                 for c in range(3):
                     colours_bar[i, 3 * k + c] = harmonics_bar[k, c]
 
-    return named(project_gaussians, list_pairs, pull_back_gaussians)
+    return namespace(locals())

@@ -9,7 +9,6 @@ row of the sums. Particles are sorted by cells, the tiles that contain their pat
 origin r pixels before the picture: the particles that cover tiles along a row of cells are then one
 contiguous run. Small worlds are sorted by `kernels/cuda/sort.py`. On a CPU a thread draws a
 world, particle by particle. Either way the order of a pixel's sum depends only on its own world.
-
 Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
 """
 
@@ -22,7 +21,7 @@ import warp as wp
 from npa_envs.kernels import native_functions as native
 from npa_envs.kernels.domain import scalar_name
 from npa_envs.kernels.mathematics import make_fast_exp2
-from npa_envs.kernels.native_functions import PAIRS, WORLDS, in_ranges, named
+from npa_envs.kernels.native_functions import PAIRS, WORLDS, in_ranges, namespace
 from npa_envs.kernels.primitives import (
     await_earlier,
     load_integer,
@@ -204,9 +203,7 @@ def splat_functions(scalar: type) -> SimpleNamespace:
     def footprint_colours(footprint: footprint_type):
         return colour_type(footprint[4], footprint[5], footprint[6], footprint[7])
 
-    functions = [patch_weight, pixel_position, patch_centre]
-    functions += [visible, cell_of_centre, footprint_of, footprint_colours]
-    return named(*functions)
+    return namespace(locals())
 
 
 @cached_under_lock()
@@ -548,6 +545,4 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
             for c in range(3):
                 colours_bar[i, c] = colour_bar[c]
 
-    return named(
-        count_splats, place_splats, order_splats, gather_splats, scatter_splats, pull_back_splats
-    )
+    return namespace(locals())

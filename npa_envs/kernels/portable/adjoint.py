@@ -23,7 +23,7 @@ from npa_envs.kernels.mathematics import (
     spiky_factor,
     spiky_radial_slope,
 )
-from npa_envs.kernels.native_functions import PAIRS, in_ranges, named
+from npa_envs.kernels.native_functions import PAIRS, in_ranges, namespace
 from npa_envs.kernels.portable.search import make_search
 from npa_envs.kernels.primitives import make_add_scaled, make_wide_load
 from npa_envs.thread_lock import cached_under_lock
@@ -357,6 +357,4 @@ def adjoint_kernels(
                     pull -= pair_pull(domain, -offset, squared, as_centre, centre_kernel)
         positions_bar[source[k]] = pull
 
-    functions = [unscale_cotangents, gather_state_cotangents]
-    functions += [gather_density_cotangents, gather_position_cotangents]
-    return named(*functions)
+    return namespace(locals())

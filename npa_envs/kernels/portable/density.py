@@ -11,7 +11,7 @@ import warp as wp
 
 from npa_envs.kernels.domain import TERMS_PER_SUM, domain_types, kernel_module
 from npa_envs.kernels.mathematics import log_scaled, smoothing, spiky_factor, spiky_factor_f64
-from npa_envs.kernels.native_functions import PAIRS, in_ranges, named
+from npa_envs.kernels.native_functions import PAIRS, in_ranges, namespace
 from npa_envs.kernels.portable.search import make_search
 from npa_envs.thread_lock import cached_under_lock
 
@@ -140,7 +140,7 @@ def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespa
                 next_entry += count
         counts[k] = next_entry - begin
 
-    return named(compute_density, list_neighbours)
+    return namespace(locals())
 
 
 @cached_under_lock()

@@ -1,7 +1,6 @@
 """Vectors of equivariant rules: mixed vectors, rotation-invariant products, steering.
 
 `npa_envs/ops/equivariance.py` has the formulas. A thread computes a few numbers of a row.
-
 Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
 """
 
@@ -10,7 +9,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from npa_envs.kernels.domain import domain_types, kernel_module
-from npa_envs.kernels.native_functions import ELEMENTS, in_ranges, named
+from npa_envs.kernels.native_functions import ELEMENTS, in_ranges, namespace
 from npa_envs.thread_lock import cached_under_lock
 
 
@@ -235,6 +234,4 @@ def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
                 value = update_bar[row, update_column]
         output_bar[row, column] = value
 
-    return named(
-        mix_vectors, write_inputs, pull_back_products, pull_back_rows, steer, pull_back_steering
-    )
+    return namespace(locals())

@@ -27,7 +27,7 @@ def update_episodes(
     first_loss: wp.array[wp.float32],
     success_loss: wp.array[wp.float32],
     broken: wp.array[wp.uint8],
-    # changed in index
+    # changed in place
     elapsed: wp.array[wp.int32],
     numbers: wp.array[wp.float32],
     flags: wp.array[wp.uint8],

@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from npa_envs.kernels.domain import domain_types, kernel_module
-from npa_envs.kernels.native_functions import PARTICLES, WORLDS, in_ranges, named
+from npa_envs.kernels.native_functions import PARTICLES, WORLDS, in_ranges, namespace
 from npa_envs.kernels.primitives import (
     await_earlier,
     load_integer,
@@ -228,7 +228,7 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
         if masked:
             starts[active_offset + first_cell] = first_row
 
-    return named(count_cells, place_by_arrival, order_particles, sort_worlds)
+    return namespace(locals())
 
 
 @cached_under_lock()

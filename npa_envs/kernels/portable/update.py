@@ -3,7 +3,6 @@
 A displacement is alpha eps delta / (1 + |delta|): it never exceeds alpha eps. Actions are fractions
 of alpha eps.
 Source: arXiv 2601.16096, section 3.
-
 Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
 """
 
@@ -13,7 +12,7 @@ import warp as wp
 
 from npa_envs.kernels import native_functions as native
 from npa_envs.kernels.domain import domain_types, kernel_module, scalar_name
-from npa_envs.kernels.native_functions import ELEMENTS, in_ranges, named
+from npa_envs.kernels.native_functions import ELEMENTS, in_ranges, namespace
 from npa_envs.kernels.primitives import (
     allow_next_launch,
     await_earlier,
@@ -351,7 +350,7 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         if clipped_count != 0:
             diverged[i / particle_count] = wp.uint8(1)
 
-    return named(apply_update, pull_back_update, apply_actions)
+    return namespace(locals())
 
 
 QUAD = 4

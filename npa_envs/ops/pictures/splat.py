@@ -84,12 +84,6 @@ def device_kernels(like: Tensor) -> Any:
     return splat_kernels(SCALARS[like.dtype], splat_lanes(like.device))
 
 
-def gather_threads(world_count: int, resolution: int, device: torch.device) -> int:
-    """Return the number of threads that gather pictures."""
-    group = GROUP_WIDTH * GROUP_HEIGHT * splat_lanes(device)
-    return world_count * group_count(resolution) * group
-
-
 def _check_size(largest: int, world_count: int, view: Any) -> None:
     if largest >= MAX_INDEX:
         raise NPAError(
@@ -158,7 +152,8 @@ def _draw(splats: Splats, view: Any) -> tuple[Tensor, Tensor, Tensor]:
     _check_size(x.shape[0] * CHANNELS * view.resolution**2, x.shape[0], view)
     starts, footprints, source = sort_splats(splats, view)
     picture = x.new_empty(x.shape[0], view.resolution, view.resolution, CHANNELS)
-    threads = gather_threads(x.shape[0], view.resolution, x.device)
+    groups = x.shape[0] * group_count(view.resolution)
+    threads = groups * GROUP_WIDTH * GROUP_HEIGHT * TILE_LANES
     flat = picture.view(-1, CHANNELS)
     launch(device_kernels(x).gather_splats, threads, x.device, view, starts, footprints, flat)
     return picture, footprints, source
