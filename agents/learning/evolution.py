@@ -82,9 +82,9 @@ class RuleWeights:
     """
 
     def __init__(self, rules: Iterable[NPARule]) -> None:
-        self._each = list(rules)
-        self._parts = [part for rule in self._each for part in layers_of(rule)]
-        for rule in self._each:
+        self._rules = list(rules)
+        self._layers = [layer for rule in self._rules for layer in layers_of(rule)]
+        for rule in self._rules:
             if not rule.is_plain():
                 raise NPAError(
                     "rules must be plain NPARules, whose networks are their two layers, got one "
@@ -94,20 +94,20 @@ class RuleWeights:
     def vector(self) -> NDArray[np.float64]:
         """Return the current weights of the rules, shape [W]."""
         with torch.no_grad():
-            return nn.utils.parameters_to_vector(self._parts).double().cpu().numpy()
+            return nn.utils.parameters_to_vector(self._layers).double().cpu().numpy()
 
     def set_vector(self, vector: NDArray[np.float64]) -> None:
         """Set the weights of the rules in place from a vector, shape [W]."""
-        first = self._parts[0]
+        first = self._layers[0]
         with torch.no_grad():
             nn.utils.vector_to_parameters(
-                torch.as_tensor(vector, dtype=first.dtype, device=first.device), self._parts
+                torch.as_tensor(vector, dtype=first.dtype, device=first.device), self._layers
             )
 
     def scales(self) -> NDArray[np.float64]:
         """Return each weight's standard deviation by Xavier, gain 1, shape [W]; biases as W1."""
         sizes = []
-        for rule in self._each:
+        for rule in self._rules:
             hidden, bias, output = layers_of(rule)
             first = math.sqrt(2.0 / sum(hidden.shape))
             sizes += [np.full(hidden.numel() + bias.numel(), first)]
@@ -186,12 +186,15 @@ def _strategy(
             "pip install 'npa-envs[evolution]'"
         ) from error
 
-    def normal(*shape: int) -> NDArray[np.float64]:
-        return draws.standard_normal(shape)
-
-    # The library takes no seed with `randn`.
-    settings = {"popsize": options.population, "randn": normal, "seed": math.nan, "verbose": -9}
-    settings |= {"CMA_diagonal": True, "CMA_stds": rule_weights.scales()}
+    settings = {
+        "popsize": options.population,
+        "randn": lambda *shape: draws.standard_normal(shape),
+        # The library takes no seed with `randn`.
+        "seed": math.nan,
+        "verbose": -9,
+        "CMA_diagonal": True,
+        "CMA_stds": rule_weights.scales(),
+    }
     return cma.CMAEvolutionStrategy(rule_weights.vector(), options.sigma, settings)
 
 

@@ -118,7 +118,7 @@ class Problem:
         return self.task_type.controls
 
     @cached_property
-    def registration(self) -> Registration:
+    def registration(self) -> RegisteredEnv:
         """What the id is registered with."""
         return registration_of(self.env_id)
 
@@ -255,7 +255,7 @@ class Problem:
             ) from error
 
 
-class Registration(NamedTuple):
+class RegisteredEnv(NamedTuple):
     """What an id is registered with."""
 
     task_type: type[EnvTask[Any]] | type[SpeciesTask]
@@ -268,12 +268,12 @@ class Registration(NamedTuple):
     """Name of the task of several species; None: there is one species."""
 
 
-def registration_of(env_id: Any) -> Registration:
+def registration_of(env_id: Any) -> RegisteredEnv:
     """Return what an id is registered with; raises NPAError without a batched environment."""
     if isinstance(env_id, str) and env_id in SPECIES:
         name, keywords = task_settings(env_id)
         steps = keywords.pop("max_cycles", DEFAULT_STEPS)
-        return Registration(species_task_type(name), keywords, steps, name)
+        return RegisteredEnv(species_task_type(name), keywords, steps, name)
     spec = gymnasium.registry.get(env_id) if isinstance(env_id, str) else None
     entry: Any = None if spec is None else spec.vector_entry_point
     if isinstance(entry, str):
@@ -285,7 +285,7 @@ def registration_of(env_id: Any) -> Registration:
             f"{suggest(env_id, [*known, *SPECIES])}"
         )
     steps = DEFAULT_STEPS if spec.max_episode_steps is None else spec.max_episode_steps
-    return Registration(entry.task_type, dict(spec.kwargs), steps)
+    return RegisteredEnv(entry.task_type, dict(spec.kwargs), steps)
 
 
 def check_run_seed(seed: Any) -> None:

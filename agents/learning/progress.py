@@ -96,15 +96,8 @@ class Learner(Protocol):
 class Progress:
     """Counts what a learner spends, evaluates its rules at regular parts of the budget, saves them.
 
-    A learner makes its worlds, compiles what it needs, and then calls `run`, which is
-
-    ```python
-    progress.start(rules)
-    while not progress.over:
-        progress.advance(iteration())  # learns, and returns the particle-steps done
-        progress.look(rules)
-    progress.look(rules, force=True)
-    ```
+    A learner makes its worlds, compiles what it needs, and then calls `run`, or itself `start`, and
+    until the budget is `over`, `advance` and `look` after each iteration.
 
     Set-up before `start`, evaluations and checkpoints do not count as time. On CUDA only these
     synchronise; `advance` keeps the CPU at most one iteration ahead of the device, so that the time

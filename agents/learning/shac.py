@@ -32,7 +32,6 @@ from npa_envs.training.optimiser import normalise_gradients
 from npa_envs.training.process_group import restart
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import WorldRandom
-from npa_envs.world.rollout import Memory
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,11 +61,9 @@ class SHACOptions:
     the mean over its particles."""
     target_rate: float = 0.2
     """Rate at which the target critic follows the critic after each window (dimensionless)."""
-    memory: Memory = "store"
-    """What the backward pass reads: "store", "recompute" or "minimal", as in `rollout`."""
 
     def __post_init__(self) -> None:
-        """Check every field; raises NPAError. `memory` is checked where rollouts begin."""
+        """Check every field; raises NPAError."""
         check_positive(self, int, "steps", "num_envs", "critic_epochs", "minibatches")
         check_word(self, "critic", get_args(CriticInput))
         check_positive(self, float, "learning_rate")
@@ -171,7 +168,6 @@ class SHACLearner:
             steps,
             eps=task.eps,
             update_prob=task.update_prob,
-            memory=self.options.memory,
             generator=self.random,
             keep_every=1,
             cuda_graph=True,
