@@ -112,7 +112,7 @@ def test_rows_come_back_from_their_files(tmp_path):
 
 
 def test_a_row_of_ones_own_says_what_was_run(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
     code = "def train(progress, *, patience=1): progress.start(progress.first_rules())"
     (tmp_path / "still.py").write_text(code, encoding="utf-8")
     plan = plan_of(

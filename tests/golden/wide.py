@@ -252,7 +252,7 @@ def of_film(rule, *words):
 def page():
     """The collection of rules that the authors' web demo reads."""
     with contextlib.redirect_stdout(io.StringIO()):
-        npa_envs_command(["export-web", "gecko", "dots", "-o", "models.json"])
+        npa_envs_command(["export-web", "gecko", "dots", "--out", "models.json"])
     return json.loads(Path("models.json").read_text(encoding="utf-8"))
 
 

@@ -28,8 +28,8 @@ class ReadOutTask(CircleTask):
         bound.rule = rule
         return bound
 
-    def loss(self, x, s, path_length):
-        error = self.metric(x, s).mean()
+    def loss(self, worlds):
+        error = self.metric(worlds.x, worlds.s).mean()
         return error, {"error": error}
 
     def metric(self, x, s):

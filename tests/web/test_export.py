@@ -360,7 +360,7 @@ def test_the_command_writes_pages_and_collections(tmp_path, capsys):
     (tmp_path / "run").mkdir()
     save_rule(NPARule(), tmp_path / "run" / "rule.safetensors")
     run_folder = str(tmp_path / "run")
-    assert main(["export-web", "gecko", run_folder, "-o", str(page)]) == 0
+    assert main(["export-web", "gecko", run_folder, "--out", str(page)]) == 0
     assert f"wrote {page}" in capsys.readouterr().out
     written = re.search(r'id="rules">(.*?)</script>', page.read_text(encoding="utf-8"))[1]
     assert [rule["name"] for rule in json.loads(written)["rules"]] == ["gecko", "run"]
@@ -381,5 +381,5 @@ def test_the_command_writes_pages_and_collections(tmp_path, capsys):
         (["gecko", "--particle-count", "0"], "particle_count must be at least 1"),
         ([str(tmp_path / "unfinished")], "must hold the rule.safetensors of a run"),
     ):
-        assert main(["export-web", *words, "-o", str(collection)]) == 2
+        assert main(["export-web", *words, "--out", str(collection)]) == 2
         assert error in capsys.readouterr().err
