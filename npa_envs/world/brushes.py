@@ -151,7 +151,7 @@ def inject(
 def state_around(
     x: Tensor, s: Tensor, *, centre: Tensor, radius: float | Tensor, box: Sides = None
 ) -> tuple[Tensor, Tensor]:
-    """Return the weighted mean state under a soft brush, [B, C], and whether any is, bool, [B].
+    """Return the mean state [B, C] by weights `softness`, and whether any is positive, bool [B].
 
     Arguments and errors are those of `inject`.
     """
@@ -250,7 +250,7 @@ def clump(
 
 
 def _per_world(name: str, value: float | Tensor, x: Tensor, *, highest: float = math.inf) -> Tensor:
-    """Return a checked number of each world, shape [B, 1, 1] or [1, 1, 1]."""
+    """Return a number, or one for each world, as a tensor [1, 1, 1] or [B, 1, 1]."""
     if isinstance(value, Tensor):
         if value.shape not in ((), (x.shape[0],)):
             raise NPAError(
@@ -267,7 +267,7 @@ def _per_world(name: str, value: float | Tensor, x: Tensor, *, highest: float = 
 
 
 def _check_vector(name: str, vector: Tensor, like: Tensor, letter: str = "D") -> None:
-    """Check that a tensor has a vector for each world, like positions (D) or states (C)."""
+    """Check that `vector` has shape [B, D], or [B, C], where `like` is [B, N, D] or [B, N, C]."""
     shape = (like.shape[0], like.shape[2])
     if not isinstance(vector, Tensor) or vector.shape != shape:
         got = tuple(vector.shape) if isinstance(vector, Tensor) else shown(vector)

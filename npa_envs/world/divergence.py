@@ -22,7 +22,7 @@ MAX_REPORT = 8
 
 
 class Divergence(NamedTuple):
-    """Which worlds have diverged; both tensors stay on the worlds' device."""
+    """Which worlds have diverged: flags on the worlds' device."""
 
     non_finite: Tensor
     """Worlds with an infinite or NaN value, bool, shape [B]."""
@@ -97,7 +97,7 @@ def describe_divergence(x: Tensor, s: Tensor, *, limit: float = RUNAWAY) -> str:
 
 
 def term_name(entry: int, space_dim: int) -> str:
-    """Return the name of an entry of a particle's coordinates and then channels."""
+    """Return the name of number `entry` of a particle's D coordinates and then C channels."""
     if entry < space_dim:
         return f"positions coordinate {entry}"
     return f"states channel {entry - space_dim}"

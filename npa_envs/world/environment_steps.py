@@ -31,7 +31,10 @@ from npa_envs.world.steps import draw_step
 
 
 def perceive_each_species(x: Tensor, counts: Sequence[int], physics: Physics) -> Tensor:
-    """Return `perceive_by_species`, clipped, shape [B, N, K (1 + D)]; zeros for empty species."""
+    """Return the densities of K species, then their gradients, clipped, [B, N, K (1 + D)].
+
+    Species k has `counts[k]` consecutive particles; an empty one has zeros.
+    """
     limit = physics.limits.perception
     return perceive_by_species(x, tuple(counts), physics).clamp(-limit, limit)
 

@@ -101,7 +101,7 @@ def run_recorded(
     plain = [rule.has_network() for rule in rules]
     if not all(plain) and (not explicit or torch.is_autocast_enabled(x.device.type)):
         return None
-    forms, rule_weights = zip(*map(_form, rules, plain), strict=True)
+    forms, rule_weights = zip(*map(_settings_and_weights, rules, plain), strict=True)
     weights = list(itertools.chain.from_iterable(rule_weights))
     grad_flags = _grad_flags(particles, weights)
     per_world_streams = isinstance(generator, WorldRandom)
@@ -142,7 +142,7 @@ def _saves_tensors_elsewhere() -> bool:
 
 
 def _blocks(spec: RolloutSpec, *, with_gradients: bool) -> list[int]:
-    """Return the steps of each graph to replay: without gradients a long rollout has several."""
+    """Return the steps of each graph to replay, one after the other; with gradients it is one."""
     if with_gradients:
         return [spec.steps]
     interval = spec.keep_every or 1
@@ -154,7 +154,7 @@ def _blocks(spec: RolloutSpec, *, with_gradients: bool) -> list[int]:
 def _run_and_compare(call: _Call, kind: CallKind, use: _RecordingUse) -> Particles:
     """Launch a rollout and compare it with its replay, which custom Python code may break.
 
-    If results differ, calls of this kind are launched from then on.
+    If results differ, calls with these shapes and options are launched from then on.
     """
     particles, weights, generator = call.particles, call.weights, call.generator
     device = particles.x.device
@@ -188,8 +188,8 @@ rule_form: Callable[[NPARule], Hashable] = operator.attrgetter(
 """Returns all settings of a plain rule that its steps depend on, except weights."""
 
 
-def _form(rule: NPARule, plain: bool) -> tuple[Hashable, list[Tensor]]:
-    """Return a rule's settings that a recording depends on, and its weights."""
+def _settings_and_weights(rule: NPARule, plain: bool) -> tuple[Hashable, list[Tensor]]:
+    """Return a rule's settings, which a recording depends on, and its weights."""
     if plain:
         weights = rule.network_weights()
         return (rule_form(rule), *map(_tensor_form, weights)), weights
@@ -203,15 +203,15 @@ def _tensor_form(tensor: Tensor) -> Hashable:
     return tensor.shape, tensor.dtype, tensor.device
 
 
-def _clone(rule: NPARule, like: Tensor) -> NPARule:
-    """Return a rule of the same form with separate memory for its weights."""
+def _clone(rule: NPARule, x: Tensor) -> NPARule:
+    """Return a rule of the same shapes and settings, with new memory for weights of x's dtype."""
     if not rule.has_network():
         return copy.deepcopy(rule)
     form = rule.hyper_parameters() | {"readout_dim": 0, "readout_hidden_dim": 0}
     # On the meta device no initial weights are drawn.
     with torch.device("meta"):
         clone = NPARule(**form)
-    clone = clone.to(like.dtype).to_empty(device=like.device)
+    clone = clone.to(x.dtype).to_empty(device=x.device)
     forms = [list(map(_tensor_form, each.network_weights())) for each in (rule, clone)]
     if forms[0] != forms[1]:
         raise NPAError(
@@ -240,7 +240,7 @@ class _Call(NamedTuple):
 
 # Kinds of calls: which recording serves a call, and which are deleted to make room.
 class CallKind:
-    """Calls of one kind: their number, and their recordings or taped steps."""
+    """Calls with the same shapes and options: their number, and their recordings or tapes."""
 
     def __init__(self) -> None:
         self.calls = 0
@@ -254,7 +254,7 @@ class CallKind:
 
 
 class CallKinds(collections.OrderedDict[Hashable, CallKind]):
-    """How often each kind of call was seen, and its recordings; the least recently used first."""
+    """All kinds of calls by shapes and options, the least recently used first."""
 
     def count(self, key: Hashable, most: int) -> CallKind:
         """Count a call and return its kind; beyond `most` kinds delete the least recently used."""
@@ -312,7 +312,7 @@ def release_recordings() -> None:
 
 
 def _take_recording(kind: CallKind, call: _Call) -> _RecordingUse | None:
-    """Return the use of a free or new recording with graphs for a call; None if impossible."""
+    """Reserve a recording with the graphs for a call; None: the call has to be launched."""
     with _lock:
         use = None
         with contextlib.suppress(IndexError):
@@ -347,7 +347,7 @@ def _take_recording(kind: CallKind, call: _Call) -> _RecordingUse | None:
 
 
 def _make_room(device: torch.device) -> bool:
-    """Delete other kinds, the least recently used first, until a device has room for a graph."""
+    """Delete recordings until a device has room for another; return whether it has."""
     limit = MEMORY_FRACTION * torch.cuda.get_device_properties(device).total_memory
     for key in list(_kinds)[:-1]:
         if recorded_memory(device) < limit:
@@ -397,11 +397,11 @@ class _Recording:
         self._spec = call.spec
         self._rules = [_clone(rule, x) for rule in call.rules]
         self._custom_rules = [rule for rule in self._rules if not rule.has_network()]
-        weights = [weight for rule in self._rules for weight in _form(rule, rule.has_network())[1]]
+        weights = (_settings_and_weights(rule, rule.has_network())[1] for rule in self._rules)
         self._worlds = worlds.map(
             lambda value: torch.empty(value.shape, dtype=value.dtype, device=value.device)
         )
-        self._inputs = [*self._worlds.tensors(), *weights]
+        self._inputs = [*self._worlds.tensors(), *itertools.chain.from_iterable(weights)]
         self._grad_flags = call.grad_flags or (False,) * len(self._inputs)
         self.differentiable = any(self._grad_flags)
         """Whether backward passes are recorded."""
@@ -540,7 +540,7 @@ class _Recording:
         return self._cotangents[count]
 
     def _run(self, spec: RolloutSpec, saved: list[Tensor]) -> Particles:
-        """Launch a rollout; tensors of its backward pass are added to `saved`."""
+        """Launch a rollout of the fixed tensors; append what its backward pass reads to `saved`."""
 
         def save(tensor: Tensor) -> Tensor:
             saved.append(tensor.detach())
@@ -567,7 +567,7 @@ class _Recording:
         return [gradient.contiguous() for gradient in gradients]
 
     def replay(self, call: _Call, use: _RecordingUse) -> Particles:
-        """Replay a rollout's graphs in order; copy buffers that they change back to the rule."""
+        """Replay the graphs of a call, and copy buffers that they change back to the rule."""
         generator = call.generator
         inputs = self._inputs_of(call)
         self.ready.record(current_stream(self.device))

@@ -21,7 +21,7 @@ from npa_envs.ops.sort import MAX_INDEX
 
 @enum.unique
 class StreamId(enum.IntEnum):
-    """Purposes of the package's separate random streams, as for `WorldRandom.substream`.
+    """What the package's random streams are for; arguments of `WorldRandom.substream`.
 
     Numbers below 1000 are reserved for the package; use others in your own code.
     """
@@ -301,14 +301,14 @@ def check_generator(generator: Randomness | None, device: torch.device, world_co
 
 
 def uniform_draws(generator: Randomness | None, shape: Sequence[int], like: Tensor) -> Tensor:
-    """Return uniform numbers in [0, 1) of a shape whose first dimension is the worlds."""
+    """Return uniform numbers in [0, 1), shape [B, ...], of `like`'s dtype and device."""
     if isinstance(generator, WorldRandom):
         return generator.uniform(*shape[1:], dtype=like.dtype)
     return torch.rand(tuple(shape), generator=generator, device=like.device, dtype=like.dtype)
 
 
 def normal_draws(generator: Randomness | None, shape: Sequence[int], like: Tensor) -> Tensor:
-    """Return standard normal numbers for worlds, as `uniform_draws` does."""
+    """Return standard normal numbers, shape [B, ...], of `like`'s dtype and device."""
     if isinstance(generator, WorldRandom):
         return generator.normal(*shape[1:], dtype=like.dtype)
     return torch.randn(tuple(shape), generator=generator, device=like.device, dtype=like.dtype)
@@ -319,7 +319,7 @@ MIXERS = ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB), (31, 1))
 
 
 def _mixed(keys: Tensor, number: int) -> Tensor:
-    """Return entry `number`, from 0 on, of the SplitMix64 sequence that begins at each key."""
+    """Return number `number`, from 0 on, of the SplitMix64 sequence of each key."""
     # Steele, Lea and Flood, "Fast splittable pseudorandom number generators" (OOPSLA 2014).
     bits = keys + _signed((number + 1) * GOLDEN)
     for shift, factor in MIXERS:

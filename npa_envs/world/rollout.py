@@ -73,7 +73,7 @@ def _check_rule_of_one_species(rule: NPARule) -> None:
 
 
 def returned_fields(after: Particles, return_path_length: bool) -> tuple[Tensor, ...]:
-    """Return worlds as public functions do: x, s and, if asked, path lengths."""
+    """Return x, s and, if asked for, path lengths."""
     if not return_path_length:
         return after.x, after.s
     assert after.path_length is not None, "rollouts measure paths"

@@ -209,7 +209,7 @@ def _check_agreement(rules: list[NPARule], species_count: int, perception: str) 
 
 
 def _for_each_species(name: str, numbers: Any, species_count: int) -> list[Any]:
-    """Return one number for each species, whose values are not checked."""
+    """Return one number for each species; their values are not checked."""
     each = entries(numbers)
     if each is None:
         return [numbers] * species_count
