@@ -117,8 +117,10 @@ class FiniteCheck:
     def __init__(self, x: Tensor, ready: torch.cuda.Event | None = None) -> None:
         self._x = x.detach()
         self._copied: torch.cuda.Event | None = None
+        # The largest absolute value, NaN if there is any NaN, takes one kernel.
+        self._size: Tensor
         if not x.is_cuda:
-            self._size = _largest_size(self._x)
+            self._size = torch.linalg.vector_norm(self._x, math.inf)
             return
         stream = torch.cuda.current_stream(x.device)
         if ready is not None:
@@ -126,7 +128,8 @@ class FiniteCheck:
             stream.wait_event(ready)
         with torch.cuda.stream(stream):
             on_host = torch.empty((), dtype=x.dtype, device="cpu", pin_memory=True)
-            self._size = on_host.copy_(_largest_size(self._x), non_blocking=True)
+            size = torch.linalg.vector_norm(self._x, math.inf)
+            self._size = on_host.copy_(size, non_blocking=True)
             self._copied = torch.cuda.Event()  # type: ignore[no-untyped-call]
             self._copied.record(stream)
 
@@ -142,12 +145,6 @@ class FiniteCheck:
             f"x must be finite, got {self._x[world, particle].tolist()} at world {world}, particle "
             f"{particle} ({int((~finite).sum())} such particles): reset those worlds"
         )
-
-
-def _largest_size(x: Tensor) -> Tensor:
-    """Return the largest absolute value, or NaN if there is any NaN; it takes one kernel."""
-    largest: Tensor = torch.linalg.vector_norm(x, math.inf)
-    return largest
 
 
 @functools.cache

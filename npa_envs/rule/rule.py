@@ -172,36 +172,29 @@ class NPARule(nn.Module):
 
         self.hidden = nn.Linear(self.input_dim, hidden_dim)
         self.output = nn.Linear(hidden_dim, self.output_dim, bias=False)
-        self.readout = self._make_readout() if readout_dim else None
+        self.readout: nn.Sequential | None = None
+        if readout_dim:
+            self.readout = nn.Sequential(
+                nn.Linear(state_dim, readout_hidden_dim),
+                nn.ReLU(),
+                nn.Linear(readout_hidden_dim, readout_dim),
+            )
         for module in self.modules():
             if isinstance(module, nn.Linear):
                 nn.init.xavier_uniform_(module.weight, gain=INIT_GAIN)
         if self.divides:
-            self._add_fate()
+            self.fate = nn.Linear(state_dim, 2)
+            with torch.no_grad():
+                self.fate.weight.zero_()
+                self.fate.bias.copy_(torch.tensor(FIRST_FATES))
         if self.equivariant:
-            self._add_vector_weights()
+            vectors = self.vector_form
+            mixing = torch.empty(vectors.perceived, vectors.mixed)
+            self.mixing = nn.Parameter(nn.init.xavier_uniform_(mixing))
+            steering = torch.empty(1, 0 if self.static else vectors.gate_count)
+            self.steering = nn.Parameter(nn.init.xavier_uniform_(steering)[0])
         self.codes = Codes(code_names, code_dim, encoder=encoder) if code_dim else None
         """The known codes, or None without `code_dim`."""
-
-    def _make_readout(self) -> nn.Sequential:
-        return nn.Sequential(
-            nn.Linear(self.state_dim, self.readout_hidden_dim),
-            nn.ReLU(),
-            nn.Linear(self.readout_hidden_dim, self.readout_dim),
-        )
-
-    def _add_fate(self) -> None:
-        self.fate = nn.Linear(self.state_dim, 2)
-        with torch.no_grad():
-            self.fate.weight.zero_()
-            self.fate.bias.copy_(torch.tensor(FIRST_FATES))
-
-    def _add_vector_weights(self) -> None:
-        vectors = self.vector_form
-        mixing = torch.empty(vectors.perceived, vectors.mixed)
-        self.mixing = nn.Parameter(nn.init.xavier_uniform_(mixing))
-        steering = torch.empty(1, 0 if self.static else vectors.gate_count)
-        self.steering = nn.Parameter(nn.init.xavier_uniform_(steering)[0])
 
     def _check_sizes(self) -> None:
         if not is_whole(self.space_dim) or self.space_dim not in (2, 3):
@@ -346,9 +339,12 @@ class NPARule(nn.Module):
 
     def has_network(self) -> bool:
         """Return whether no subclass, hook or layer alters what `NPARule` computes."""
-        # Plain loops, as each call of a step comes here; torch.compile traces no set operation.
+        cls, own = type(self), self.__dict__
+        # Plain loops, as each rollout comes here; torch.compile traces no set operation.
         for name in STEP_PARTS:
-            if name in self.__dict__:
+            if name in own:
+                return False
+            if cls is not NPARule and getattr(cls, name) is not getattr(NPARule, name):
                 return False
         # `_modules` is faster than attributes of modules.
         layers = self._modules
@@ -357,8 +353,7 @@ class NPARule(nn.Module):
             if type(layer) is not nn.Linear or is_altered(layer) or _has_backward_hooks(layer):
                 return False
         return (
-            (type(self) is NPARule or _overrides_no_part(type(self)))
-            and getattr(layers["hidden"], "bias", None) is not None
+            getattr(layers["hidden"], "bias", None) is not None
             and getattr(layers["output"], "bias", None) is None
             and not (is_altered(self) or _has_backward_hooks(self))
             and not _has_any_global_hook()  # type: ignore[no-untyped-call]
@@ -494,11 +489,6 @@ class NPARule(nn.Module):
 
 HYPER_PARAMETERS = {k: v for k, v in get_type_hints(NPARule.__init__).items() if k != "return"}
 """Arguments of `NPARule`: name -> type."""
-
-
-def _overrides_no_part(cls: type[NPARule]) -> bool:
-    """Return whether a subclass overrides no attribute that a step uses."""
-    return all(getattr(cls, name) is getattr(NPARule, name) for name in STEP_PARTS)
 
 
 def is_altered(module: nn.Module) -> bool:

@@ -60,19 +60,11 @@ def divergence(x: Tensor, s: Tensor, *, limit: float = RUNAWAY) -> Divergence:
 def describe_divergence(x: Tensor, s: Tensor, *, limit: float = RUNAWAY) -> str:
     """Return a line for each world that has diverged, with its first diverged value.
 
-    It waits for the device.
-
-    Args:
-        x: Particle positions [length units], shape [B, N, D].
-        s: Particle states, dimensionless, shape [B, N, C].
-        limit: As for `divergence`.
+    It waits for the device. Arguments and errors are those of `divergence`.
 
     Returns:
         Lines as "world 1: states channel 3 of particle 7 is nan (2 such numbers in 1 particle)", at
         most eight of them; "" where no world has diverged.
-
-    Raises:
-        NPAError: As for `divergence`.
     """
     flags = divergence(x, s, limit=limit)
     worlds = (flags.non_finite | flags.runaway).nonzero()[:, 0].tolist()

@@ -109,7 +109,7 @@ def step(
     on_divergence: OnDivergence = "ignore",
     cuda_graph: CudaGraph = "auto",
 ) -> tuple[Tensor, Tensor]:
-    """Advance worlds by one step: `rollout` with steps=1; its arguments and errors.
+    """Advance worlds by one step: `rollout` with steps=1, whose arguments and errors it has.
 
     Returns:
         Positions [length units], shape [B, N, D], and states, dimensionless, shape [B, N, C].
@@ -150,14 +150,11 @@ def at_rest(
     fewer rows may round an update at the edge of the dead zone differently. Rules with a
     `dead_zone` bring worlds to rest.
 
+    All other arguments and errors are those of `rollout`.
+
     Args:
         rule: The rule, one whose particles do not divide; dtype and device of x.
-        x: Particle positions [length units], shape [B, N, D].
-        s: Particle states, dimensionless, shape [B, N, C].
-        eps: As for `rollout`.
         box: As for `rollout`; in one, only positions within it can be at rest.
-        boundary: As for `rollout`.
-        dt: As for `rollout`.
 
     Returns:
         Bool, shape [B], on x's device.

@@ -89,8 +89,6 @@ def rollout_species(
             channels, eps0, groups of perception, and in whether particles move; hidden units, alpha
             and readout may differ.
         x: Particle positions [length units], shape [B, N, D], species after species.
-        s: Particle states, dimensionless, shape [B, N, C].
-        steps: Number of steps T, 0 or more.
         counts: Particles of each species, which sum to N: species k owns `counts[k]` consecutive
             ones.
         update_prob: Probability of each particle's update in a step, in (0, 1], for all species or
