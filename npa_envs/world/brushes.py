@@ -2,7 +2,7 @@
 
 Damage of training pools, the viewer and agents use them. They work on batches, with a centre for
 each world, and are differentiable in positions, states, centres and amounts, except for the choice
-of particles inside. Only `removed`, which changes the number of particles, waits for the device.
+of particles inside. Nothing waits for the device.
 
 Arguments that a docstring does not describe are those of `push`, in all functions. `box` has the
 sides of the periodic box [length units], across whose edges a brush works, or is None in open
@@ -62,35 +62,6 @@ def softness(x: Tensor, *, centre: Tensor, radius: float | Tensor, box: Sides = 
     # Masked before the division: with a radius of zero weights are 0 and not NaN.
     square = square / torch.where(size > 0, size, torch.ones_like(size)).square()
     return torch.where(size > 0, (1.0 - square).clamp_min(0.0), 0.0).square()
-
-
-def removed(x: Tensor, s: Tensor, *, gone: Tensor) -> tuple[Tensor, Tensor]:
-    """Return worlds without some of their particles; waits for the device.
-
-    Other arguments and errors are those of `inject`.
-
-    Args:
-        gone: Which particles to remove, bool, shape [B, N], for example by `inside_ball`; equally
-            many of each world.
-
-    Returns:
-        Positions, shape [B, N', D], and states, shape [B, N', C], in their former order.
-    """
-    check_world(x, s)
-    if not isinstance(gone, Tensor) or gone.shape != x.shape[:2] or gone.dtype != torch.bool:
-        got = f"{gone.dtype} {list(gone.shape)}" if isinstance(gone, Tensor) else shown(gone)
-        raise NPAError(
-            f"gone must be a bool tensor of shape [B, N] = {list(x.shape[:2])}, got {got}: take "
-            "inside_ball"
-        )
-    counts = gone.sum(dim=1).tolist()
-    if len(set(counts)) > 1:
-        raise NPAError(
-            f"gone must take equally many particles of each world, got {shown(counts)}: change one "
-            "world at a time, or set states with wipe_state"
-        )
-    count = x.shape[1] - counts[0]
-    return x[~gone].view(len(x), count, x.shape[2]), s[~gone].view(len(s), count, s.shape[2])
 
 
 def push(
