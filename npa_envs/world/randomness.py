@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import enum
 import math
 import threading
@@ -136,12 +137,11 @@ class WorldRandom:
 
     def take(self, worlds: Tensor | slice) -> WorldRandom:
         """Return a copy of the streams of some worlds: indices, int64, shape [K], or a slice."""
-        copy = WorldRandom.__new__(WorldRandom)
-        copy.keys = self.keys[worlds].clone()
-        copy.episodes = self.episodes[worlds].clone()
-        copy.steps = self.steps[worlds].clone()
-        copy._draw_count = self._draw_count
-        return copy
+        taken = copy.copy(self)
+        taken.keys = self.keys[worlds].clone()
+        taken.episodes = self.episodes[worlds].clone()
+        taken.steps = self.steps[worlds].clone()
+        return taken
 
     def substream(self, purpose: int) -> WorldRandom:
         """Return streams that are independent of these and of those of other purposes.

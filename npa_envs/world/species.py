@@ -11,7 +11,6 @@ from npa_envs.checks import (
     Box,
     check_world,
     checked_choice,
-    checked_count,
     checked_flag,
     checked_positive,
     entries,
@@ -22,14 +21,10 @@ from npa_envs.ops.species_density import checked_counts
 from npa_envs.rule.rule import NPARule
 from npa_envs.world.divergence import OnDivergence, make_watch
 from npa_envs.world.execute import Memory, RolloutSpec, execute
-from npa_envs.world.graphed_rollouts import CUDA_GRAPH_CHOICES, CudaGraph
+from npa_envs.world.graphed_rollouts import CudaGraph
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness, check_generator
-from npa_envs.world.rollout import (
-    checked_keep_every,
-    checked_physics,
-    returned_fields,
-)
+from npa_envs.world.rollout import checked_physics, checked_steps, returned_fields
 from npa_envs.world.steps import SpeciesSpec
 
 SpeciesPerception = Literal["shared", "per_species"]
@@ -107,7 +102,7 @@ def rollout_species(
         NPAError: Rules do not agree, counts do not fit, or as for `rollout`.
         DivergedError: As for `rollout`.
     """
-    steps = checked_count("steps", steps)
+    steps, keep_every = checked_steps(steps, keep_every, memory, cuda_graph)
     species_rules = _checked_rules(rules)
     check_world(x, s)
     sizes = checked_counts(counts, x.shape[1])
@@ -117,11 +112,8 @@ def rollout_species(
         "density_counts", x.shape[1] if density_counts is None else density_counts, len(sizes)
     )
     divisors = [checked_positive("an entry of density_counts", count) for count in divisors]
-    checked_choice("memory", memory, get_args(Memory))
     # With one species this is `rollout`.
     alone = perception == "shared" and divisors == [x.shape[1]]
-    interval = checked_keep_every(keep_every, steps)
-    checked_choice("cuda_graph", cuda_graph, CUDA_GRAPH_CHOICES)
     worlds = Particles(x, s)
     constants = [
         checked_physics(
@@ -150,7 +142,7 @@ def rollout_species(
         common,
         checked_flag("detach_positions", detach_positions),
         memory,
-        interval,
+        keep_every,
         () if alone else tuple(species),
         perception == "per_species",
     )
