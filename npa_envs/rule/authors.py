@@ -79,7 +79,7 @@ _IGNORED = {"N0"}
 
 @dataclass(frozen=True)
 class RuleParts:
-    """The arguments and the state dict of an `NPARule` that a file holds."""
+    """What a file holds of an `NPARule`: its arguments, and its state dict."""
 
     hyper_parameters: dict[str, Any]
     weights: dict[str, Tensor]
@@ -105,7 +105,7 @@ def check_weights(weights: Mapping[str, Tensor]) -> None:
 
 
 def read_state_dict(data: bytes) -> RuleParts:
-    """Return the rule in the authors' state dict, whose shapes determine D and C."""
+    """Return the `RuleParts` in the authors' state dict, whose shapes determine D and C."""
     state = _unpickle(data)
     known, rule_type, more = _WEIGHT_NAMES, "", f" and, with a read-out, {sorted(_DECODER_NAMES)}"
     if state.keys() & _EQUIVARIANT_NAMES:
@@ -137,14 +137,14 @@ def read_state_dict(data: bytes) -> RuleParts:
 def _parts(
     weights: dict[str, Tensor], scalars: Mapping[Any, Any], **hyper_parameters: Any
 ) -> RuleParts:
-    """Return a rule's parts; `scalars` hold `eps0` and `alpha`, as in all formats."""
+    """Return `RuleParts`, with `eps0` and `alpha`, which all formats have, from `scalars`."""
     common = {name: _scalar(name, scalars.get(name)) for name in ("eps0", "alpha")}
     sizes = {"space_dim": _DEMO_SPACE_DIM, "hidden_dim": len(weights["hidden.weight"])}
     return RuleParts(sizes | common | hyper_parameters, weights)
 
 
 def _equivariant_parts(tensors: Mapping[str, Tensor], scalars: Mapping[Any, Any]) -> RuleParts:
-    """Return a 2D equivariant rule's parts; tensors and scalars are named as in `models.json`."""
+    """Return `RuleParts` of a 2D equivariant rule, from what `models.json` has by these names."""
     mixing, first, second = (tensors[name] for name in ("W_hidden", "w1.weight", "w2.weight"))
     state_dim, mixed = mixing.shape[0] - 1, mixing.shape[1]
     hidden_dim = first.shape[0]
@@ -176,7 +176,7 @@ def _equivariant_parts(tensors: Mapping[str, Tensor], scalars: Mapping[Any, Any]
 
 
 def read_demo_json(data: bytes, name: str | None) -> RuleParts:
-    """Return the rule called `name` in a JSON file of the authors' web demo."""
+    """Return the `RuleParts` of the rule `name` in a JSON file of the authors' web demo."""
     entry, index = _demo_rule(parse_json(data), name)
     if "W_hidden" in entry:
         return _read_equivariant_entry(entry, index)
@@ -231,7 +231,7 @@ def _demo_rule(content: Any, name: str | None) -> tuple[Mapping[str, Any], int |
 
 
 def _read_equivariant_entry(entry: Mapping[str, Any], index: int | None) -> RuleParts:
-    """Return an equivariant rule of the web demo, without the zeros that pad its tensors."""
+    """Return the `RuleParts` of an equivariant rule, without the zeros that pad its tensors."""
     tensors = {
         name: _decode(entry, name, 1 if name.endswith("bias") else 2, index)
         for name in _EQUIVARIANT_NAMES.values()

@@ -19,7 +19,7 @@ OUTPUT_BLOCKS = 4
 
 
 def _blocked_product(hidden: Tensor, weight: Tensor) -> Tensor:
-    """Return hidden @ weight.T, summed in blocks."""
+    """Return hidden @ weight.T; the sum over hidden units is computed in blocks."""
     blocks = OUTPUT_BLOCKS if hidden.shape[1] % OUTPUT_BLOCKS == 0 else 1
     left = hidden.view(hidden.shape[0], blocks, -1).transpose(0, 1)
     right = weight.view(weight.shape[0], blocks, -1).permute(1, 2, 0)
@@ -128,10 +128,7 @@ Network = FoldedRule | FoldedInvariants
 def fold_weights(
     hidden_weight: Tensor, output_weight: Tensor, dead_zone: float = 0.0
 ) -> FoldedRule:
-    """Return a rule with these padded matrices, also in the order that the device's kernels read.
-
-    It is differentiable in both matrices.
-    """
+    """Return a `FoldedRule` of padded matrices, also as kernels read them; differentiable."""
     arranged = arrange_weights(hidden_weight, output_weight)
     if arranged is None:
         return FoldedRule(hidden_weight, output_weight, dead_zone=dead_zone)

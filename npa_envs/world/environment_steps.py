@@ -76,10 +76,9 @@ class Actions(PreparedActions):
         x, _, mask, noise, _, diverged = self._worlds
         diverged.zero_()
         drawn = draw_step(x, self._physics, self._random)
-        if mask is not None and drawn.mask is not None:
-            mask.copy_(drawn.mask)
-        if noise is not None and drawn.noise is not None:
-            noise.copy_(drawn.noise)
+        for buffer, values in ((mask, drawn.mask), (noise, drawn.noise)):
+            if buffer is not None and values is not None:
+                buffer.copy_(values)
 
     def updated(self) -> Tensor:
         """Return which particles the last draw updates, bool, shape [B, N]."""

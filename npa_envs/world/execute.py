@@ -216,7 +216,7 @@ class RecomputedSteps:
 
 
 def _version(value: Any) -> Any:
-    """Return what each write to a tensor changes; other values are returned unchanged."""
+    """Return a tensor's address and version, which each write changes; other values unchanged."""
     if not isinstance(value, Tensor):
         return value
     return value.data_ptr(), None if value.is_inference() else value._version
@@ -279,7 +279,7 @@ def run_all_steps(
 def resting(
     rules: Sequence[NPARule], particles: Particles, physics: Physics, graph: CudaGraph
 ) -> Tensor:
-    """Return which worlds an update of all their particles does not change, bool, shape [B]."""
+    """Return which worlds are at rest: an update of all particles changes none, bool, shape [B]."""
     spec = RolloutSpec(1, physics._replace(update_prob=1.0))
     with torch.no_grad():
         after = run_all_steps(spec, rules, particles, None, graph=graph)

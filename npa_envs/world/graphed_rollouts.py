@@ -269,7 +269,7 @@ class CallKinds(collections.OrderedDict[Hashable, CallKind]):
         return kind
 
     def forget(self, key: Hashable) -> None:
-        """Delete a kind; recordings in use live until their backward pass has run."""
+        """Delete a key and its recordings; those in use live until their backward pass has run."""
         for recording in self.pop(key).recordings:
             if recording.stream is not None:
                 recording.stream.synchronize()
@@ -358,7 +358,7 @@ def _make_room(device: torch.device) -> bool:
 
 
 def _refuse(kind: CallKind, reason: object, level: int) -> None:
-    """Launch all calls of a kind from now on."""
+    """Launch all further calls of a kind, without recordings; log the reason."""
     logger.log(level, "rollouts of this kind are launched, not recorded: %s", reason)
     with _lock:
         kind.refused = True
@@ -429,7 +429,7 @@ class _Recording:
         """What autograd saves in the place of tensors for the backward pass."""
 
     def _inputs_of(self, call: _Call) -> list[Tensor]:
-        """Return all inputs of a rollout, in the order of the fixed tensors."""
+        """Return a call's tensors, in the order of the fixed tensors that they are copied to."""
         return [*call.particles.with_zero_paths(self._no_paths).tensors(), *call.weights]
 
     def record(self, steps: int, call: _Call) -> None:
@@ -516,7 +516,7 @@ class _Recording:
             raise NPAError("a rule's tensors must not change in its backward pass, but one does")
 
     def _settings(self) -> dict[tuple[int, str], Hashable]:
-        """Return all settings of rules with custom networks that must not change."""
+        """Return the settings of rules with custom networks, which `forward` must not change."""
         settings: dict[tuple[int, str], Hashable] = {}
         for number, rule in enumerate(self._custom_rules):
             for name, setting in rule_settings(rule, self.device).items():
@@ -530,7 +530,7 @@ class _Recording:
         return [tensor._version for tensor in self._inputs]
 
     def _cotangents_of(self, steps: int) -> list[Tensor]:
-        """Return the buffers for cotangents of the worlds that this number of steps returns."""
+        """Return the buffers for the gradients by the worlds that so many steps return."""
         interval = self._spec.keep_every
         count = None if interval is None else steps // interval
         if count not in self._cotangents:
@@ -678,7 +678,7 @@ def _views(tensors: Sequence[Tensor]) -> list[Tensor]:
 
 
 def _copies(tensors: list[Tensor]) -> list[Tensor]:
-    """Return copies, made by one kernel."""
+    """Return copies of tensors, made by one kernel."""
     copies = [torch.empty_like(tensor) for tensor in tensors]
     torch._foreach_copy_(copies, tensors)
     return copies

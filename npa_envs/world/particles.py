@@ -22,7 +22,7 @@ class Particles(NamedTuple):
     """Index of the target that a world is to become, int64, shape [B]; after all other fields."""
 
     def with_zero_paths(self, zeros: Tensor | None = None) -> Particles:
-        """Return the worlds with paths of length 0, in `zeros` if it is given, shape [B, N]."""
+        """Return the worlds with path lengths of 0: the tensor `zeros` [B, N], or a new one."""
         if zeros is None:
             zeros = self.x.new_zeros(self.x.shape[:2])
         # Not by `_replace`: torch.compile cannot trace it.
@@ -44,11 +44,11 @@ class Particles(NamedTuple):
         return Particles(x, s, *rest)
 
     def take(self, worlds: Tensor) -> Particles:
-        """Return some worlds, by their indices."""
+        """Return the worlds with these indices."""
         return self.map(lambda value: value.index_select(0, worlds))
 
     def put_(self, worlds: Tensor, other: Particles) -> None:
-        """Write other worlds to these indices."""
+        """Overwrite the worlds with these indices by `other`."""
         for field, new in zip(self.tensors(), other.tensors(), strict=True):
             field.index_copy_(0, worlds, new)
 

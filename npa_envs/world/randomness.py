@@ -109,12 +109,12 @@ class WorldRandom:
 
     @property
     def device(self) -> torch.device:
-        """Where the numbers are drawn."""
+        """Device on which the numbers are drawn."""
         return self.keys.device
 
     @property
     def world_count(self) -> int:
-        """Worlds B."""
+        """Number of worlds B."""
         return self.keys.shape[0]
 
     def advance(self, steps: int = 1) -> None:

@@ -58,7 +58,7 @@ def row_capacity(particle_total: int, update_prob: float) -> int:
 
 
 def row_count(mask: Tensor | None, x: Tensor, update_prob: float) -> int:
-    """Return the number of rows to allocate for the particles of a mask; None: all particles."""
+    """Return the number of rows of perception for the particles of a mask; None: all."""
     total = x.shape[0] * x.shape[1]
     if mask is None:
         return total
@@ -221,7 +221,7 @@ class StaticStep(RuleStep):
         return particles._replace(x=self.x).gather(self.sorted.source)
 
     def draw(self, like: Tensor, steps: int, source: Randomness | None) -> Iterator[Draws]:
-        """Yield each step's rows, assigned for several steps at a time in few launches."""
+        """Yield each step's draws; few launches assign the rows of several steps together."""
         total = like.shape[0] * like.shape[1]
         physics = self.physics
         together = max(min(16, ROWS_TOGETHER // total), 1)
@@ -281,7 +281,7 @@ class DivisionStep(RuleStep):
 
 
 class SpeciesSpec(NamedTuple):
-    """The constants of one species."""
+    """The constants of one species of a rollout."""
 
     size: int
     """Number of its particles in a world."""
@@ -292,7 +292,7 @@ class SpeciesSpec(NamedTuple):
 
 
 class Species(NamedTuple):
-    """One species of checked worlds."""
+    """One species of a rollout: its rule, its particles and its constants."""
 
     rule: NPARule
     network: Network | None
@@ -350,7 +350,7 @@ class SpeciesStep(Step):
             self.update_fraction = torch.cat(fractions)
 
     def draw_step(self, like: Tensor, source: Randomness | None) -> Draws:
-        """Return mask and noise as for one rule; of the mask each species keeps its fraction."""
+        """Return mask and noise as for one rule; each species keeps its fraction of the mask."""
         drawn = super().draw_step(like, source)
         if self.update_fraction is None:
             return drawn
@@ -400,9 +400,9 @@ class SpeciesStep(Step):
     def _perceived(
         self, species: Species, z: Tensor, fields: Tensor | None, particle: Tensor
     ) -> Tensor:
-        """Return rows of perception z with a species' divisor of densities and, if any, `fields`.
+        """Return a species' rows of perception z, with its own divisor of densities, and `fields`.
 
-        `fields` are each species' density and density gradient, `particle` [R] the rows' particles.
+        `fields` has all species' densities and gradients, `particle` [R] the index of a row's.
         """
         ratio, space_dim = species.count_ratio, self.physics.space_dim
         if ratio != 1.0 and self.physics.terms.density_gradient:
@@ -423,7 +423,7 @@ class SpeciesStep(Step):
 def _rows_of_species(
     row_of: Tensor, species: Species, row_count: int, mask: Tensor | None
 ) -> tuple[Tensor, Tensor]:
-    """Return the rows of a species' active particles, and the indices of these particles.
+    """Return the rows of perception of a species' active particles, and these particles' indices.
 
     Both are int64, shape [R]. On CUDA R does not depend on the draw, so that nothing waits for the
     device; unused entries have the row `row_count`.

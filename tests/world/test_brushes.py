@@ -148,10 +148,7 @@ PUSH = AT | {"move": points(X)}
         (lambda: push(X, **PUSH | {"radius": -1.0}), "radius must be finite .* at least 0, got -1"),
         (lambda: push(X, **PUSH, strength=1.5), r"strength must be in \[0, 1\], got 1\.5"),
         (lambda: push(X, **PUSH | {"move": points(X)[:, :1]}), r"move must have shape \[B, D\]"),
-        (
-            lambda: push(X, **PUSH | {"centre": AT["centre"].float()}),
-            "centre and x must share",
-        ),
+        (lambda: push(X, **PUSH | {"centre": AT["centre"].float()}), "centre and x must share"),
         (lambda: inject(X, S, **AT, state=S[:, 0].float()), "state and s must share .*32 .*64"),
         (lambda: inject(X, S, **AT, state=S[:, 0, :2]), r"state must have .* \[B, C\] = \(2, 3\)"),
         (lambda: inside_ball(X, **AT, box=(2.0, 2.0, 2.0)), "box must have 2 sides"),
