@@ -223,7 +223,7 @@ def checked_side(name: str, value: Any) -> int:
     return side
 
 
-def entries(value: Any) -> list[Any] | None:
+def as_list(value: Any) -> list[Any] | None:
     """Return a sequence, array or tensor as a list; None for text and for single numbers."""
     if isinstance(value, str | bytes) or getattr(value, "ndim", 1) == 0:
         return None
@@ -277,7 +277,7 @@ def checked_box(
     """
     if box is None:
         return None
-    several = entries(box)
+    several = as_list(box)
     if several is None:
         sides = (checked_number("box", box),) * space_dim
     else:

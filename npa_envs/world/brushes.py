@@ -16,7 +16,7 @@ import math
 import torch
 from torch import Tensor
 
-from npa_envs.checks import check_alike, check_world, checked_number, entries
+from npa_envs.checks import as_list, check_alike, check_world, checked_number
 from npa_envs.errors import NPAError, shown
 
 Sides = tuple[float, ...] | None
@@ -29,7 +29,7 @@ def offsets_from(x: Tensor, centre: Tensor, box: Sides = None) -> Tensor:
     """
     check_world(x, x)
     _check_vector("centre", centre, x)
-    if box is not None and len(entries(box) or ()) != x.shape[2]:
+    if box is not None and len(as_list(box) or ()) != x.shape[2]:
         raise NPAError(f"box must have {x.shape[2]} sides, got {shown(box)}: give one for each")
     return nearest_image(x - centre[:, None], box)
 

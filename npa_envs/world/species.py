@@ -9,11 +9,11 @@ from torch import Tensor
 
 from npa_envs.checks import (
     Box,
+    as_list,
     check_world,
     checked_choice,
     checked_flag,
     checked_positive,
-    entries,
 )
 from npa_envs.errors import NPAError, shown
 from npa_envs.ops.physics_constants import Boundary
@@ -159,7 +159,7 @@ def rollout_species(
 
 
 def _checked_rules(rules: Any) -> list[NPARule]:
-    checked = None if isinstance(rules, NPARule) else entries(rules)
+    checked = None if isinstance(rules, NPARule) else as_list(rules)
     if checked is None or not all(isinstance(rule, NPARule) for rule in checked):
         types = [type(entry).__name__ for entry in ([rules] if checked is None else checked)]
         raise NPAError(
@@ -200,7 +200,7 @@ def _check_agreement(rules: list[NPARule], species_count: int, perception: str) 
 
 def _for_each_species(name: str, numbers: Any, species_count: int) -> list[Any]:
     """Return one number for each species; their values are not checked."""
-    each = entries(numbers)
+    each = as_list(numbers)
     if each is None:
         return [numbers] * species_count
     if len(each) != species_count:
