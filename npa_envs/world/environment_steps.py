@@ -61,11 +61,9 @@ class Actions(PreparedActions):
     ) -> None:
         self._random = random
         self._everyone = torch.ones((), dtype=torch.bool, device=x.device).expand(x.shape[:2])
-        mask = noise = None
-        if physics.update_prob < 1.0:
-            mask = torch.zeros(x.shape[:2], dtype=torch.uint8, device=x.device)
-        if physics.position_noise > 0.0:
-            noise = torch.zeros_like(x)
+        masked, noisy = physics.update_prob < 1.0, physics.position_noise > 0.0
+        mask = torch.zeros(x.shape[:2], dtype=torch.uint8, device=x.device) if masked else None
+        noise = torch.zeros_like(x) if noisy else None
         super().__init__(ActedWorlds(x, s, mask, noise, enabled, diverged), physics)
 
     apply = PreparedActions.__call__

@@ -103,10 +103,9 @@ def rollout_species(
         DivergedError: As for `rollout`.
     """
     steps, keep_every = checked_steps(steps, keep_every, memory, cuda_graph)
-    species_rules = _checked_rules(rules)
     check_world(x, s)
     sizes = checked_counts(counts, x.shape[1])
-    _check_agreement(species_rules, len(sizes), perception)
+    species_rules = _checked_rules(rules, len(sizes), perception)
     probabilities = _for_each_species("update_prob", update_prob, len(sizes))
     divisors = _for_each_species(
         "density_counts", x.shape[1] if density_counts is None else density_counts, len(sizes)
@@ -158,7 +157,9 @@ def rollout_species(
     return returned_fields(after, return_path_length)
 
 
-def _checked_rules(rules: Any) -> list[NPARule]:
+def _checked_rules(rules: Any, species_count: int, perception: str) -> list[NPARule]:
+    """Return rules that fit each other, the number of species and the mode of perception."""
+    checked_choice("perception", perception, get_args(SpeciesPerception))
     checked = None if isinstance(rules, NPARule) else as_list(rules)
     if checked is None or not all(isinstance(rule, NPARule) for rule in checked):
         types = [type(entry).__name__ for entry in ([rules] if checked is None else checked)]
@@ -166,26 +167,20 @@ def _checked_rules(rules: Any) -> list[NPARule]:
             f"rules must have one NPARule for each species, got {', '.join(types)}: give (rule,) "
             "for one species, and load rules with npa_envs.load_rule"
         )
-    return checked
-
-
-def _check_agreement(rules: list[NPARule], species_count: int, perception: str) -> None:
-    """Check that rules fit each other, the number of species and the mode of perception."""
-    checked_choice("perception", perception, get_args(SpeciesPerception))
-    if len(rules) != species_count:
+    if len(checked) != species_count:
         raise NPAError(
-            f"rules and counts must be one for each species, got {len(rules)} rules and "
+            f"rules and counts must be one for each species, got {len(checked)} rules and "
             f"{species_count} counts"
         )
     expected = 0 if perception == "shared" else species_count
-    for number, rule in enumerate(rules):
+    for number, rule in enumerate(checked):
         if rule.divides:
             raise NPAError(
                 f"rules of several species must not divide, got divides=True for rule {number}: "
                 "run it alone with npa_envs.rollout"
             )
         for name in AGREEMENTS:
-            first, other = getattr(rules[0], name), getattr(rule, name)
+            first, other = getattr(checked[0], name), getattr(rule, name)
             if first != other:
                 raise NPAError(
                     f"rules must agree in {name}, got {first} for rule 0 and {other} for rule "
@@ -196,6 +191,7 @@ def _check_agreement(rules: list[NPARule], species_count: int, perception: str) 
                 f"perception {shown(perception)} of {species_count} species needs rules with "
                 f"species_count={expected}, got {rule.species_count} for rule {number}"
             )
+    return checked
 
 
 def _for_each_species(name: str, numbers: Any, species_count: int) -> list[Any]:
