@@ -33,7 +33,7 @@ NEARLY_FULL_BYTES = 64 * 1024
 
 
 def checked_path(path: str | Path) -> Path:
-    """Return a path as a pathlib.Path, checked."""
+    """Return `path` as a pathlib.Path; raise NPAError if it is no text or has null characters."""
     if not isinstance(path, str | os.PathLike):
         raise NPAError(f"a path must be text or a pathlib.Path, got {shown(path)}")
     try:
@@ -51,7 +51,10 @@ def home_path(path: str | Path) -> Path:
 
 
 def open_regular(path: str | Path, *, limit: int, what: str = "the file") -> IO[bytes]:
-    """Open a regular file for reading bytes; raise NPAError for pipes, devices and folders."""
+    """Open a file for reading bytes; raise NPAError unless it is a regular one of <= `limit` bytes.
+
+    `what` names the file in errors.
+    """
     path = checked_path(path)
     try:
         # Without this flag, opening a pipe without a writer would block.
@@ -71,13 +74,8 @@ def open_regular(path: str | Path, *, limit: int, what: str = "the file") -> IO[
     return os.fdopen(descriptor, "rb")
 
 
-def check_regular(path: str | Path, *, limit: int, what: str = "the file") -> None:
-    """Check a file as `open_regular` does, before a library opens it by its path."""
-    open_regular(path, limit=limit, what=what).close()
-
-
 def read_bytes(path: str | Path, *, limit: int, what: str = "the file") -> bytes:
-    """Return the content of a regular file."""
+    """Return the bytes of a file that `open_regular` opens."""
     with open_regular(path, limit=limit, what=what) as file:
         try:
             # Some system files contain more than their size says.
@@ -87,7 +85,7 @@ def read_bytes(path: str | Path, *, limit: int, what: str = "the file") -> bytes
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Return the value of a JSON text."""
+    """Return the Python value of a JSON text."""
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -95,15 +93,14 @@ def parse_json(text: str | bytes) -> Any:
 
 
 def read_json(path: str | Path, *, limit: int = 16 * _MIB) -> Any:
-    """Return the value of a JSON file."""
+    """Return the Python value of a JSON file of at most `limit` bytes."""
     return parse_json(read_bytes(path, limit=limit))
 
 
 def check_torch_archive(file: IO[bytes], *, checksums: bool = True) -> None:
-    """Check an archive of `torch.save` before it is unpacked; torch does not compare checksums.
+    """Check the checksums of a file of `torch.save` before torch, which does not, unpacks it.
 
-    Torch does not compress entries: one that declares more bytes than the file has is refused, as
-    it could take any amount of memory.
+    Compressed content, which torch does not write, is refused: it could take any amount of memory.
     """
     try:
         size = file.seek(0, os.SEEK_END)
@@ -176,7 +173,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def made_folder(path: Path) -> Iterator[None]:
-    """Create a folder and missing parents; if the block raises, remove those that are empty."""
+    """Create a folder and its missing parents; if the block raises, remove them if empty."""
     missing = [folder for folder in (path, *path.parents) if not folder.exists()]
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -189,7 +186,7 @@ def made_folder(path: Path) -> Iterator[None]:
 
 
 def remove_unfinished(path: Path) -> None:
-    """Remove temporary files of a file that interrupted writes have left in its folder."""
+    """Remove the temporary files that interrupted writes of `path` have left in its folder."""
     pattern = _temporary_name(path, "[0-9a-f]" * 2 * _TOKEN_BYTES)
     for unfinished in path.parent.glob(pattern):
         with contextlib.suppress(OSError):

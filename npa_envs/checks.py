@@ -51,7 +51,7 @@ def check_dense(name: str, tensor: Tensor) -> None:
 
 
 def check_floating(name: str, tensor: Any, shape: str = "") -> None:
-    """Check for a dense tensor of float32 or float64; `shape` is for the error message."""
+    """Check that a tensor is dense, float32 or float64; errors name the `shape` that it needs."""
     if not isinstance(tensor, Tensor):
         wanted = f" of shape {shape}" if shape else ""
         raise NPAError(
@@ -108,16 +108,19 @@ def check_finite_positions(x: Tensor) -> None:
 
 
 class FiniteCheck:
-    """A check that every position is finite, started on the device and finished by `wait`.
+    """A check that all positions are finite: it starts when it is made, and `wait` raises.
 
-    x must not change before that. With an event, on CUDA, x is read on another stream after it.
+    x must not change until `wait` returns. With a CUDA event `ready`, the check runs on another
+    stream, after that event.
     """
 
     def __init__(self, x: Tensor, ready: torch.cuda.Event | None = None) -> None:
         self._x = x.detach()
         self._copied: torch.cuda.Event | None = None
+        # The largest absolute value, NaN if there is any NaN, takes one kernel.
+        self._size: Tensor
         if not x.is_cuda:
-            self._size = _largest_size(self._x)
+            self._size = torch.linalg.vector_norm(self._x, math.inf)
             return
         stream = torch.cuda.current_stream(x.device)
         if ready is not None:
@@ -125,12 +128,13 @@ class FiniteCheck:
             stream.wait_event(ready)
         with torch.cuda.stream(stream):
             on_host = torch.empty((), dtype=x.dtype, device="cpu", pin_memory=True)
-            self._size = on_host.copy_(_largest_size(self._x), non_blocking=True)
+            size = torch.linalg.vector_norm(self._x, math.inf)
+            self._size = on_host.copy_(size, non_blocking=True)
             self._copied = torch.cuda.Event()  # type: ignore[no-untyped-call]
             self._copied.record(stream)
 
     def wait(self) -> None:
-        """Wait for the result, not for later work; raise NPAError if a position is not finite."""
+        """Wait for the check, not for work after it; raise NPAError if a position is not finite."""
         if self._copied is not None:
             self._copied.synchronize()
         if math.isfinite(self._size):
@@ -143,21 +147,15 @@ class FiniteCheck:
         )
 
 
-def _largest_size(x: Tensor) -> Tensor:
-    """Return the largest absolute value, NaN if there is one, by one kernel."""
-    largest: Tensor = torch.linalg.vector_norm(x, math.inf)
-    return largest
-
-
 @functools.cache
 def _side_stream(device: torch.device) -> torch.cuda.Stream:
     return torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
 
 
 def constant(number: float) -> float:
-    """Return a number; within `torch.compile(dynamic=True)`, specialised to its present value.
+    """Return `number`; while `torch.compile(dynamic=True)` traces, its value and not a symbol.
 
-    Custom operators take Python numbers, not the compiler's symbolic ones.
+    Custom operators take Python numbers, not the compiler's symbols.
     """
     if not torch.compiler.is_compiling():
         return number
@@ -166,14 +164,16 @@ def constant(number: float) -> float:
 
 
 def checked_flag(name: str, value: Any) -> bool:
-    """Return a value as a bool, by its truth."""
+    """Return `value` as a bool; raise NPAError if it has no truth value."""
+    if isinstance(value, bool):
+        return value
     with contextlib.suppress(TypeError, ValueError, RuntimeError):
         return bool(value)
     raise NPAError(f"{name} must be True or False, got {shown(value)}")
 
 
 def checked_choice(name: str, value: Any, choices: Sequence[Choice]) -> Choice:
-    """Return an option, one of at least two words or flags."""
+    """Return the one of two or more `choices` that equals `value` and has its type."""
     for choice in choices:
         if isinstance(value, type(choice)) and value == choice:
             return choice
@@ -216,15 +216,15 @@ def checked_finite(name: str, value: Any, unit: str = "") -> float:
 
 
 def checked_side(name: str, value: Any) -> int:
-    """Return the side of a picture in pixels, checked."""
+    """Return the side of a picture [pixels] as an int in [1, `MAX_SIDE`]."""
     side = checked_count(name, value)
     if not 1 <= side <= MAX_SIDE:
         raise NPAError(f"{name} must lie in [1, {MAX_SIDE}] pixels, got {shown(side)}")
     return side
 
 
-def entries(value: Any) -> list[Any] | None:
-    """Return the entries of a sequence of any library as a list, or None if it is not one."""
+def as_list(value: Any) -> list[Any] | None:
+    """Return a sequence, array or tensor as a list; None for text and for single numbers."""
     if isinstance(value, str | bytes) or getattr(value, "ndim", 1) == 0:
         return None
     with contextlib.suppress(TypeError, ValueError, RuntimeError):
@@ -233,7 +233,7 @@ def entries(value: Any) -> list[Any] | None:
 
 
 def number_tensor(name: str, value: Any) -> Tensor:
-    """Return real numbers of any library as a tensor."""
+    """Return real numbers, as NumPy arrays or lists have them, as a dense tensor."""
     try:
         numbers = torch.as_tensor(value)
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:
@@ -245,7 +245,7 @@ def number_tensor(name: str, value: Any) -> Tensor:
 
 
 def checked_eps(name: str, eps: float, space_dim: int, dtype: torch.dtype) -> float:
-    """Return a perception radius as a float [length units], in `LENGTH_RANGE`."""
+    """Return a perception radius as a float [length units] within its `LENGTH_RANGE`."""
     value = checked_positive(name, eps, " [length units]")
     low, high = LENGTH_RANGE[space_dim, dtype]
     if not low <= value <= high:
@@ -271,10 +271,13 @@ def check_scale(eps: float, eps0: float, space_dim: int, dtype: torch.dtype) -> 
 def checked_box(
     box: Box, space_dim: int, eps: float | None, dtype: torch.dtype
 ) -> tuple[float, ...] | None:
-    """Return the sides of a box as D floats, or None for open space; eps None: walls reflect."""
+    """Return the sides of a box as D floats, or None for open space.
+
+    Sides must be at least 2 `eps`, as in a periodic box; `eps` None: any positive sides.
+    """
     if box is None:
         return None
-    several = entries(box)
+    several = as_list(box)
     if several is None:
         sides = (checked_number("box", box),) * space_dim
     else:
@@ -302,25 +305,28 @@ def checked_box(
 
 
 def check_field(
-    config: object, name: str, ok: bool, rule: str, hint: str = "", *, otherwise: object = None
+    config: object, name: str, ok: bool, requirement: str, hint: str = "", *, example: object = None
 ) -> None:
-    """Raise unless `ok`; the error ends with `hint`, else the field's default or `otherwise`."""
+    """Raise NPAError unless `ok`: the field `name` of a configuration must `requirement`.
+
+    The error ends with `hint`; without one, with the field's default, or `example` if it has none.
+    """
     if not ok:
-        hint = hint or f"for example {name}={getattr(type(config), name, otherwise)!r}"
-        raise NPAError(f"{name} must {rule}, got {shown(getattr(config, name))}: {hint}")
+        hint = hint or f"for example {name}={getattr(type(config), name, example)!r}"
+        raise NPAError(f"{name} must {requirement}, got {shown(getattr(config, name))}: {hint}")
 
 
 def _check_fields(
-    config: object, names: Sequence[str], ok: Callable[[Any], bool], rule: str, otherwise: object
+    config: object, names: Sequence[str], ok: Callable[[Any], bool], rule: str, example: object
 ) -> None:
     for name in names:
-        check_field(config, name, ok(getattr(config, name)), rule, otherwise=otherwise)
+        check_field(config, name, ok(getattr(config, name)), rule, example=example)
 
 
 def check_positive(
     config: object, cls: type, *names: str, at_least: int = 1, at_most: int = sys.maxsize
 ) -> None:
-    """Check that fields are whole numbers >= `at_least` (`cls` int) or finite and > 0 (float)."""
+    """Check that fields are ints in [`at_least`, `at_most`]; if `cls` is float, finite and > 0."""
     if cls is float:
         rule = "be a finite number greater than 0"
         _check_fields(config, names, lambda v: is_real(v) and v > 0, rule, 1.0)
@@ -343,7 +349,7 @@ def check_fraction(config: object, *names: str) -> None:
 
 
 def check_word(config: object, name: str, words: Sequence[str | None]) -> None:
-    """Check that a field is one of some words, or None if that is one of them."""
+    """Check that a field is one of `words`, among which None may be."""
     value, known = getattr(config, name), [word for word in words if word is not None]
     check_field(config, name, value in words, "be a known word", suggest(value, known))
 
@@ -354,12 +360,12 @@ def check_flag(config: object, *names: str) -> None:
 
 
 def check_text(config: object, name: str, what: str) -> None:
-    """Check that a field is a non-empty string; the error describes it as `what`."""
+    """Check that a field is a non-empty string; the error says that it must be `what`."""
     _check_fields(config, (name,), lambda v: isinstance(v, str) and v != "", f"be {what}", "name")
 
 
 def check_seed(config: object, name: str, *, bits: int = 63) -> None:
-    """Check that a field can seed a random generator: a whole number in [0, 2**bits)."""
+    """Check that a field is the seed of a random generator: an int in [0, 2**bits)."""
     rule = f"be a whole number of at least 0 and below 2**{bits}"
     _check_fields(config, (name,), lambda v: is_whole(v) and 0 <= v < 2**bits, rule, 0)
 

@@ -8,7 +8,7 @@ from npa_envs.errors import NPAError, shown
 
 
 def parse_device(name: str) -> torch.device:
-    """Return the torch device of a name, without checking that it exists."""
+    """Return the torch.device called `name`, such as "cuda:1"; it need not exist."""
     hint = "use 'cpu', 'cuda' or 'cuda:1'"
     if not isinstance(name, str):
         raise NPAError(f"device must be text, got {shown(name)}: {hint}")
@@ -30,7 +30,7 @@ def parse_device(name: str) -> torch.device:
 
 
 def check_device(name: str | torch.device) -> torch.device:
-    """Return an existing device by name; a CUDA device with its number."""
+    """Return the torch.device called `name`, a CUDA one with its number; it must exist."""
     device = parse_device(str(name) if isinstance(name, torch.device) else name)
     if device.type != "cuda":
         return device

@@ -30,9 +30,9 @@ class DivergedError(NPAError):
 
 
 class UnknownKeywordError(NPAError, TypeError):
-    """A keyword that an environment does not have, with the type and message of Python's error.
+    """An environment has no such keyword; type and message are those of Python's own error.
 
-    Libraries recognise them and leave the keyword out.
+    Libraries recognise that error and leave the keyword out.
     """
 
 
@@ -50,9 +50,9 @@ def importing(library: str, purpose: str, hint: str) -> Iterator[None]:
 
 
 def shown(value: object) -> str:
-    """Return a value as text for an error, in about 200 characters.
+    """Return a value as text of about 200 characters at most, for an error.
 
-    The cost is limited too, for nested values that share parts, long numbers and whole files.
+    The time is limited too, for deeply nested values, long numbers and whole files.
     """
     try:
         brief = str(value) if isinstance(value, BaseException) else _brief.repr(value)

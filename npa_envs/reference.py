@@ -22,7 +22,7 @@ MOMENT_SOFTENING = 1e-2
 
 
 class ReferenceFields(NamedTuple):
-    """The unscaled fields; shapes and units as in `npa_envs.PerceptionFields`."""
+    """SPH fields, not scaled by eps0; shapes and units as in `npa_envs.PerceptionFields`."""
 
     rho: Tensor
     blur: Tensor
@@ -82,7 +82,7 @@ def log_scale(v: Tensor) -> Tensor:
 
 
 def threshold_inverse(moment: Tensor) -> Tensor:
-    """Return M^-1 where |det M| is at least the threshold, else the identity, shape [..., D, D]."""
+    """Return M^-1 where |det M| >= `MOMENT_THRESHOLD`, else the identity, shape [..., D, D]."""
     invertible = torch.linalg.det(moment).abs() >= MOMENT_THRESHOLD
     unit = torch.eye(moment.shape[-1], dtype=moment.dtype, device=moment.device).expand_as(moment)
     inverse: Tensor = torch.linalg.inv(torch.where(invertible[..., None, None], moment, unit))
@@ -90,7 +90,7 @@ def threshold_inverse(moment: Tensor) -> Tensor:
 
 
 def adjugate(moment: Tensor) -> Tensor:
-    """Return the adjugates of symmetric matrices M, det M M^-1 if invertible, [..., D, D]."""
+    """Return adj M, det M M^-1 if M is invertible, of symmetric matrices M, shape [..., D, D]."""
     trace = torch.diagonal(moment, dim1=-2, dim2=-1).sum(dim=-1)[..., None, None]
     unit = torch.eye(moment.shape[-1], dtype=moment.dtype, device=moment.device)
     if moment.shape[-1] == 2:
@@ -120,7 +120,7 @@ def fields(
     box: tuple[float, ...] | None = None,
     moment_inverse: str = "threshold",
 ) -> ReferenceFields:
-    """Return the unscaled SPH fields of every particle, differentiable in x and s."""
+    """Return the SPH fields of every particle, differentiable in x and s."""
     r = differences(x, box)
     weight = smoothing_kernel((r * r).sum(dim=-1), eps, x.shape[2])
     kernel = spiky_gradient(r, eps)

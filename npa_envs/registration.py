@@ -13,13 +13,13 @@ import gymnasium
 
 
 class Registration:
-    """An entry of the table: one environment, or a variant of another size.
+    """An environment to register with Gymnasium, or a variant of another size.
 
     Args:
-        name: Name of its classes, without the suffixes `Env` and `VectorEnv`.
+        name: Name of the environment: its classes are `nameEnv` and `nameVectorEnv`.
         max_episode_steps: Steps after which an episode is truncated.
-        size: End of the id's name.
-        keywords: Keywords of the classes that differ from their defaults.
+        size: "Small", "Large" or "", which the id has after the name.
+        keywords: Keyword arguments of the classes.
     """
 
     def __init__(self, name: str, max_episode_steps: int, size: str = "", **keywords: Any) -> None:
@@ -117,11 +117,11 @@ _LARGE_SPECIES: Mapping[str, Any] = {"particle_count": 4096, "max_cycles": 256}
 
 
 class SpeciesRegistration:
-    """A variant of a task of several species, for PettingZoo and for batches.
+    """A small or large variant of a task of several species, for PettingZoo and for batches.
 
     Args:
-        name: Name of the task in its ids.
-        size: End of the id's name.
+        name: Name of the task in its ids, such as "Mixing".
+        size: "Small" or "Large", which the id has after the name.
         keywords: Fields of the task's configuration.
     """
 
@@ -154,7 +154,7 @@ SPECIES_SIZES = (
 
 
 def register_environments() -> None:
-    """Register the table with Gymnasium; ids that are registered already are skipped."""
+    """Register all environments with Gymnasium, except ids that are registered already."""
     for environment in ALL:
         if environment.id not in gymnasium.registry:
             gymnasium.register(

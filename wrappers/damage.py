@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.checks import entries
+from npa_envs.checks import as_list
 from npa_envs.envs.core.base import to_output
 from npa_envs.errors import NPAError
 from npa_envs.tasks.damage import DamageEvent, damage_worlds, parse_damage
@@ -32,7 +32,7 @@ class _DamagesWorlds(WrapperBase):
     """Mixin with the events and their damage, for one world or many."""
 
     def __init__(self, env: Any, events: Event | Sequence[Event]) -> None:
-        several = entries(events)
+        several = as_list(events)
         if several is None:
             several = [events]
         if not several:

@@ -13,7 +13,7 @@ from pathlib import PurePosixPath
 from typing import Any, Literal, get_args
 
 from npa_envs.agents.learning.problem import Problem
-from npa_envs.process_queue import part_of
+from npa_envs.measure.process_queue import part_of
 
 GROWTH = {
     "target": "heart",
@@ -149,7 +149,7 @@ class ComparisonPlan:
         ]
 
     def part(self, part: str | None) -> list[Job]:
-        """Return the runs of one of several machines, as `npa_envs.process_queue.part_of`.
+        """Return the runs of one of several machines, as `npa_envs.measure.process_queue.part_of`.
 
         All methods on a task from a seed run on one machine, as some use rules that others learned.
         """

@@ -38,7 +38,7 @@ from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.learning.progress import Budget, CurvePoint
 from npa_envs.errors import DivergedError, NPAError
 from npa_envs.measure.benchmark_records import number, read_record, write_record
-from npa_envs.process_queue import Child, Slots, run_children
+from npa_envs.measure.process_queue import Child, Slots, run_children
 from npa_envs.render import write_png
 
 Status = Literal["done", "diverged", "failed"]

@@ -90,7 +90,7 @@ def main(arguments: Sequence[str]) -> int:
     from npa_envs.agents.comparison.report import write_pictures, write_table
     from npa_envs.agents.comparison.single_run import held_records, run_jobs
     from npa_envs.measure.benchmark_records import command_text
-    from npa_envs.process_queue import Slots
+    from npa_envs.measure.process_queue import Slots
 
     command = command_text("compare", arguments, "--out")
     # Methods of the user are imported from the current folder, as in the runs' processes.

@@ -19,7 +19,7 @@ from npa_envs.atomic_files import read_json, write_text
 from npa_envs.cli import common
 from npa_envs.errors import NPAError, suggest
 from npa_envs.measure.benchmark_records import NONE, markdown_table, read_record, write_record
-from npa_envs.process_queue import Child, Slots, part_of, run_children
+from npa_envs.measure.process_queue import Child, Slots, part_of, run_children
 
 RECORD, OUTPUT, TABLE = "run.json", "output.txt", "sweep.md"
 """Files: record and output of a run, and the table of all runs."""

@@ -11,11 +11,11 @@ from torch import Tensor
 
 from npa_envs.checks import (
     Box,
+    as_list,
     check_finite_positions,
     check_world,
     checked_count,
     checked_eps,
-    entries,
 )
 from npa_envs.errors import NPAError, shown
 from npa_envs.kernels.portable.density import species_kernel
@@ -40,7 +40,7 @@ class SpeciesFields(NamedTuple):
 
 def checked_counts(counts: Sequence[int], particle_count: int) -> tuple[int, ...]:
     """Return how many particles each species has, integers of at least 1 that sum to N."""
-    numbers = entries(counts)
+    numbers = as_list(counts)
     if numbers is None:
         raise NPAError(
             f"counts must have one number of particles for each species, got {shown(counts)}: "

@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from npa_envs.checks import DTYPES, entries
+from npa_envs.checks import DTYPES, as_list
 from npa_envs.devices import check_device
 from npa_envs.errors import NPAError, shown
 from npa_envs.ops.backend import SHARED_WORLD
@@ -86,7 +86,7 @@ def warmup(
 
 def _checked_choice(name: str, value: Any, known: tuple[Any, ...]) -> list[Any]:
     """Return the values given, one or several, after checking that each is known."""
-    choice = entries(value)
+    choice = as_list(value)
     if not choice or not all(value in known for value in choice):
         raise NPAError(f"{name} must be some of {known}, got {shown(value)}: name one or both")
     return choice

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from PIL import ImageColor
 from torch import Tensor
 
-from npa_envs.checks import check_dense, checked_number, entries
+from npa_envs.checks import as_list, check_dense, checked_number
 from npa_envs.errors import NPAError, shown
 
 Background = str | tuple[float, float, float]
@@ -65,7 +65,7 @@ def background_colour(background: Background) -> tuple[float, float, float]:
                 "give 'white', 'black', another name of CSS, or '#rrggbb'"
             ) from error
         return red / 255, green / 255, blue / 255
-    parts = entries(background) or []
+    parts = as_list(background) or []
     channels = [checked_number("a channel of background", part) for part in parts]
     if len(channels) != 3 or not all(0 <= channel <= 1 for channel in channels):
         raise NPAError(

@@ -16,7 +16,7 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from npa_envs.atomic_files import atomic_path, write_bytes
-from npa_envs.checks import check_count, checked_count, checked_finite, entries, is_real
+from npa_envs.checks import as_list, check_count, checked_count, checked_finite, is_real
 from npa_envs.errors import NPAError, importing, shown
 from npa_envs.ops import Cameras, orbit
 from npa_envs.render.colours import Background, background_colour, to_uint8
@@ -173,7 +173,7 @@ def write_filmstrip(
     """
     pictures = checked_frames(frames)
     count = len(pictures)
-    texts: list[Any] = [] if captions is None else entries(captions) or []
+    texts: list[Any] = [] if captions is None else as_list(captions) or []
     right = len(texts) == count and all(isinstance(text, str) for text in texts)
     if captions is not None and not right:
         raise NPAError(

@@ -79,14 +79,14 @@ _IGNORED = {"N0"}
 
 @dataclass(frozen=True)
 class RuleParts:
-    """A rule's hyper-parameters, and its weights by `NPARule`'s names."""
+    """What a file holds of an `NPARule`: its arguments, and its state dict."""
 
     hyper_parameters: dict[str, Any]
     weights: dict[str, Tensor]
 
 
 def check_weights(weights: Mapping[str, Tensor]) -> None:
-    """Check that all weights are finite, and float32, or all float64."""
+    """Check that all weights are finite, and all float32 or all float64."""
     dtypes = {tensor.dtype for tensor in weights.values()}
     if len(dtypes) != 1 or not dtypes <= {torch.float32, torch.float64}:
         raise NPAError(
@@ -105,7 +105,7 @@ def check_weights(weights: Mapping[str, Tensor]) -> None:
 
 
 def read_state_dict(data: bytes) -> RuleParts:
-    """Read the authors' state dict; shapes determine D and C."""
+    """Return the `RuleParts` in the authors' state dict, whose shapes determine D and C."""
     state = _unpickle(data)
     known, rule_type, more = _WEIGHT_NAMES, "", f" and, with a read-out, {sorted(_DECODER_NAMES)}"
     if state.keys() & _EQUIVARIANT_NAMES:
@@ -137,14 +137,14 @@ def read_state_dict(data: bytes) -> RuleParts:
 def _parts(
     weights: dict[str, Tensor], scalars: Mapping[Any, Any], **hyper_parameters: Any
 ) -> RuleParts:
-    """Return a rule's parts, with the hyper-parameters that all formats have: `scalars`."""
+    """Return `RuleParts`, with `eps0` and `alpha`, which all formats have, from `scalars`."""
     common = {name: _scalar(name, scalars.get(name)) for name in ("eps0", "alpha")}
     sizes = {"space_dim": _DEMO_SPACE_DIM, "hidden_dim": len(weights["hidden.weight"])}
     return RuleParts(sizes | common | hyper_parameters, weights)
 
 
 def _equivariant_parts(tensors: Mapping[str, Tensor], scalars: Mapping[Any, Any]) -> RuleParts:
-    """Return a 2D equivariant rule's parts, from tensors and scalars named as in `models.json`."""
+    """Return `RuleParts` of a 2D equivariant rule, from what `models.json` has by these names."""
     mixing, first, second = (tensors[name] for name in ("W_hidden", "w1.weight", "w2.weight"))
     state_dim, mixed = mixing.shape[0] - 1, mixing.shape[1]
     hidden_dim = first.shape[0]
@@ -176,7 +176,7 @@ def _equivariant_parts(tensors: Mapping[str, Tensor], scalars: Mapping[Any, Any]
 
 
 def read_demo_json(data: bytes, name: str | None) -> RuleParts:
-    """Read one rule of the authors' web demo."""
+    """Return the `RuleParts` of the rule `name` in a JSON file of the authors' web demo."""
     entry, index = _demo_rule(parse_json(data), name)
     if "W_hidden" in entry:
         return _read_equivariant_entry(entry, index)
@@ -204,9 +204,9 @@ def read_demo_json(data: bytes, name: str | None) -> RuleParts:
 
 
 def _demo_rule(content: Any, name: str | None) -> tuple[Mapping[str, Any], int | None]:
-    """Return the entry of one rule, and its index in a stack, or None without a stack.
+    """Return the JSON object with the rule `name`, and the rule's index there if it is a stack.
 
-    The names of a stack's rules are their indices, from 0.
+    The rules of a stack are called "0", "1", ...; a single rule has the index None.
     """
     rules: dict[str, tuple[Mapping[str, Any], int | None]] = {}
     if isinstance(content, dict) and isinstance(content.get("w1.weight"), dict):
@@ -231,7 +231,7 @@ def _demo_rule(content: Any, name: str | None) -> tuple[Mapping[str, Any], int |
 
 
 def _read_equivariant_entry(entry: Mapping[str, Any], index: int | None) -> RuleParts:
-    """Read an equivariant rule of the web demo, without the padding."""
+    """Return the `RuleParts` of an equivariant rule, without the zeros that pad its tensors."""
     tensors = {
         name: _decode(entry, name, 1 if name.endswith("bias") else 2, index)
         for name in _EQUIVARIANT_NAMES.values()
@@ -302,7 +302,7 @@ def _demo_entry(name: str, rule: NPARule, particle_count: int) -> dict[str, Any]
 
 
 def _texels(matrix: Tensor) -> Tensor:
-    """Return a matrix padded with columns of zeros to a multiple of `_TEXEL`."""
+    """Return a matrix with columns of zeros added, up to a multiple of `_TEXEL`."""
     return torch.nn.functional.pad(matrix, (0, -matrix.shape[1] % _TEXEL))
 
 
@@ -345,7 +345,7 @@ def _check_plain(name: str, tensor: Tensor) -> None:
 
 
 def _matrix(name: str, value: Any) -> Tensor:
-    """Return a weight or a bias; 1x1 convolutions become matrices."""
+    """Return a checked weight or bias; the weight of a 1x1 convolution as a matrix."""
     rank = 1 if name.endswith("bias") else 2
     if not isinstance(value, Tensor):
         raise NPAError(f"{name} must be a tensor, got a {type(value).__name__}")
@@ -379,7 +379,7 @@ def _infer_dimensions(
 
 
 def _scalar(name: str, value: Any) -> float:
-    """Return a number as the shortest decimal that rounds to it in float32."""
+    """Return the shortest decimal number that rounds to `value` in float32."""
     if isinstance(value, Tensor):
         _check_plain(name, value)
     number = checked_finite(name, value)
@@ -395,7 +395,7 @@ def _as_float32(number: float) -> float:
 
 
 def _decode(entry: Mapping[str, Any], name: str, rank: int, index: int | None) -> Tensor:
-    """Return a tensor of an entry, or of the rule `index` of a stack."""
+    """Return a rule's tensor of `rank` dimensions, in a stack that of the rule `index`."""
     stacked = index is not None
     rank += stacked
     packed = entry.get(name)

@@ -20,8 +20,8 @@ from safetensors.torch import save as serialise
 from torch import Tensor
 
 from npa_envs.atomic_files import (
-    check_regular,
     checked_path,
+    open_regular,
     parse_json,
     read_bytes,
     write_bytes,
@@ -147,7 +147,7 @@ def save_rule(
     check_rule(rule)
     # A module of torch.compile has other names of weights.
     rule = getattr(rule, "_orig_mod", rule)
-    if not _is_as_made(rule):
+    if not _fits_a_file(rule):
         raise NPAError(
             f"rule must have the network of NPARule, got a {type(rule).__name__} with another "
             "one, which the file would not contain: remove its hooks, or keep its state_dict "
@@ -185,8 +185,8 @@ def save_rule(
     write_bytes(path, _with_sorted_metadata(serialise(weights, metadata=header)))
 
 
-def _is_as_made(rule: NPARule) -> bool:
-    """Return whether the rule that its file would be loaded as computes the same."""
+def _fits_a_file(rule: NPARule) -> bool:
+    """Return whether a file would hold all that the rule computes: no hooks or own layers."""
     loaded = _without_weights(rule.hyper_parameters())
     same_shapes = _shapes(rule.state_dict()) == _shapes(loaded.state_dict())
     if type(rule).forward is not NPARule.forward or is_altered(rule) or not same_shapes:
@@ -226,12 +226,12 @@ def rule_digest(rule: NPARule) -> str:
 
 
 def rule_file(source: str | Path) -> Path:
-    """Return the file of a rule, given as for `load_rule`."""
+    """Return the file from which `load_rule(source)` loads a rule."""
     return _locate(source)[0]
 
 
 def _locate(source: str | Path) -> tuple[Path, str | None]:
-    """Return the file of `source`, and the name after '#' or None."""
+    """Return the file of a rule, and the rule's name in it, after '#', or None."""
     if not isinstance(source, str | os.PathLike):
         raise NPAError(
             f"source must be a rule's name or the path of its file, got {shown(source)}: "
@@ -265,8 +265,8 @@ def _locate(source: str | Path) -> tuple[Path, str | None]:
 
 
 def _read_ours(path: Path, *, with_weights: bool) -> tuple[dict[str, str], dict[str, Tensor]]:
-    """Return the metadata of a file that `save_rule` wrote, and its weights if asked for."""
-    check_regular(path, limit=_MAX_FILE)
+    """Return the metadata of a file that `save_rule` wrote, and, `with_weights`, its weights."""
+    open_regular(path, limit=_MAX_FILE).close()
     try:
         with safe_open(path, framework="pt") as file:
             header: dict[str, str] = file.metadata() or {}
@@ -318,7 +318,7 @@ def _parse(header: Mapping[str, str], name: str, cls: type) -> Any:
 
 
 def _without_weights(hyper_parameters: Mapping[str, Any]) -> NPARule:
-    """Return a rule on the meta device: its weights have shapes and no memory."""
+    """Return a rule on torch's meta device: its weights have shapes and no memory."""
     with torch.device("meta"):
         return NPARule(**hyper_parameters)
 
@@ -328,7 +328,7 @@ def _shapes(weights: Mapping[str, Tensor]) -> dict[str, tuple[int, ...]]:
 
 
 def _assemble(parts: RuleParts) -> NPARule:
-    """Return the rule of these parts, without drawing random weights."""
+    """Return the rule with these hyper-parameters and weights; no random weights are drawn."""
     try:
         rule = _without_weights(parts.hyper_parameters)
     except (RuntimeError, TypeError, OverflowError) as error:

@@ -19,7 +19,7 @@ OUTPUT_BLOCKS = 4
 
 
 def _blocked_product(hidden: Tensor, weight: Tensor) -> Tensor:
-    """Return hidden @ weight.T, summed in blocks."""
+    """Return hidden @ weight.T; the sum over hidden units is computed in blocks."""
     blocks = OUTPUT_BLOCKS if hidden.shape[1] % OUTPUT_BLOCKS == 0 else 1
     left = hidden.view(hidden.shape[0], blocks, -1).transpose(0, 1)
     right = weight.view(weight.shape[0], blocks, -1).permute(1, 2, 0)
@@ -55,10 +55,10 @@ def without_small(update: Tensor, dead_zone: float) -> Tensor:
 
 
 class FoldedRule(NamedTuple):
-    """A rule's weights as two matrix products: the bias is a column of the first matrix.
+    """A rule's network as two matrix products: the bias is a column of the first matrix.
 
-    A row of perception is followed by 1 and zero padding. That saves the passes over all rows that
-    a bias and its gradient cost, and aligns the rows.
+    A row of input is a particle's perception vector z, then 1, then zeros. That saves the passes
+    over all rows that a bias and its gradient cost, and aligns the rows.
     """
 
     hidden_weight: Tensor
@@ -74,16 +74,16 @@ class FoldedRule(NamedTuple):
 
     @property
     def row_width(self) -> int:
-        """Columns of a row of perception: P + 1, rounded up to a multiple of `FOLD`."""
+        """Length of a row of input: that of z plus 1, rounded up to a multiple of `FOLD`."""
         return self.hidden_weight.shape[1]
 
     @property
     def update_width(self) -> int:
-        """Columns of an update, A': A, rounded up to a multiple of `FOLD`."""
+        """Length A' of an output: that of an update, A, rounded up to a multiple of `FOLD`."""
         return self.output_weight.shape[0]
 
     def __call__(self, rows: Tensor) -> Tensor:
-        """Map rows [K, row_width], z, then 1, then zeros, to updates y, then zeros, [K, A']."""
+        """Map K rows of input, [K, row_width], to K updates, each followed by zeros, [K, A']."""
         update: Tensor
         if self.arranged is not None and self.joined is not None:
             update = run_network(rows, self.joined, self.output_weight.shape, self.arranged)
@@ -96,7 +96,7 @@ class FoldedRule(NamedTuple):
 
 
 class FoldedInvariants(NamedTuple):
-    """An equivariant rule's weights: mix vectors, two matrix products, gate the mixed vectors."""
+    """An equivariant rule's network: it mixes vectors, and its two matrix products gate these."""
 
     products: FoldedRule
     """The matrix products; inputs are scalars and products of mixed vectors, outputs are gates,
@@ -108,12 +108,12 @@ class FoldedInvariants(NamedTuple):
     form: VectorForm
     """Positions of vectors in a row."""
     row_width: int
-    """Columns of a row of perception: P + 1, rounded up to a multiple of `FOLD`."""
+    """As in `FoldedRule`."""
     update_width: int
-    """Columns of an update, A': A, rounded up to a multiple of `FOLD`."""
+    """As in `FoldedRule`."""
 
     def __call__(self, rows: Tensor) -> Tensor:
-        """Map rows [K, row_width], z, then 1, then zeros, to updates y, then zeros, [K, A']."""
+        """Map K rows of input, [K, row_width], to K updates, each followed by zeros, [K, A']."""
         mixed, inputs = read_rows(rows, self.mixing, self.form, self.products.row_width)
         output = self.products(inputs)
         if len(self.signs) == 0:
@@ -128,7 +128,7 @@ Network = FoldedRule | FoldedInvariants
 def fold_weights(
     hidden_weight: Tensor, output_weight: Tensor, dead_zone: float = 0.0
 ) -> FoldedRule:
-    """Return fused weights, arranged for the device's kernels; differentiable in both."""
+    """Return a `FoldedRule` of padded matrices, also as kernels read them; differentiable."""
     arranged = arrange_weights(hidden_weight, output_weight)
     if arranged is None:
         return FoldedRule(hidden_weight, output_weight, dead_zone=dead_zone)

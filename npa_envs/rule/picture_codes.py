@@ -24,11 +24,11 @@ WIDTHS = (16, 32, 64)
 
 
 class Codes(nn.Module):
-    """Codes by name, each a vector of length `dim`, K, in about [-1, 1] (dimensionless).
+    """The codes of a rule of many pictures: one vector of length K = `dim` for each picture's name.
 
-    A code is the first K state channels of each particle, which a rule perceives and never changes.
-    Codes are parameters, or a trained network, the encoder, computes them from pictures, also from
-    pictures that were not trained on.
+    A code, in about [-1, 1] (dimensionless), tells the rule which picture to grow. It is the first
+    K state channels of each particle, which the rule perceives and never changes. Codes are
+    parameters, or a trained network, the encoder, computes them from any pictures.
     """
 
     table: Tensor
@@ -50,13 +50,13 @@ class Codes(nn.Module):
         return len(self.names)
 
     def __getitem__(self, name: str) -> Tensor:
-        """Return the code of a name, shape [K]."""
+        """Return the code of the picture called `name`, shape [K]."""
         if name not in self.names:
             raise NPAError(f"unknown code {shown(name)}: {suggest(name, self.names)}")
         return self.table[self.names.index(name)]
 
     def blend(self, shares: Mapping[str, float]) -> Tensor:
-        """Return the mean of codes with weights `shares`, by name, shape [K]."""
+        """Return the weighted mean of codes, shape [K]; `shares` maps names to weights."""
         total = sum(shares.values())
         if not (math.isfinite(total) and total > 0.0):
             raise NPAError(
@@ -67,7 +67,7 @@ class Codes(nn.Module):
         return torch.stack(parts).sum(dim=0)
 
     def encode(self, pictures: Tensor) -> Tensor:
-        """Return the codes of pictures, shape [B, K], differentiable."""
+        """Return the codes of pictures [B, R, R, 4], shape [B, K]; differentiable."""
         if self.encoder is None:
             raise NPAError("this rule has no encoder: train one with encoder=True (--encoder)")
         if pictures.ndim != 4 or pictures.shape[3] != 4 or pictures.shape[1] != pictures.shape[2]:
@@ -79,14 +79,14 @@ class Codes(nn.Module):
         return codes
 
 
-def carrying(states: Tensor, code: Tensor) -> Tensor:
-    """Return states [..., C] whose first channels are a code, which expands to [..., K]."""
+def replace_code(states: Tensor, code: Tensor) -> Tensor:
+    """Return states [..., C] with a code, [K] to [..., K], in the place of the first K channels."""
     expanded = code.to(states).expand(*states.shape[:-1], code.shape[-1])
     return torch.cat((expanded, states[..., code.shape[-1] :]), dim=-1)
 
 
 def checked_names(names: Any) -> tuple[str, ...]:
-    """Return names of codes as a tuple, checked: a collection of different strings."""
+    """Return names of codes as a tuple; raise NPAError unless they are different strings."""
     is_list = isinstance(names, Collection) and not isinstance(names, str)
     if not is_list or not all(isinstance(name, str) for name in names):
         raise NPAError(
@@ -102,7 +102,7 @@ def checked_names(names: Any) -> tuple[str, ...]:
 
 
 class PictureEncoder(nn.Module):
-    """A small convolutional network from a picture to a code in [-1, 1]."""
+    """A small convolutional network that maps a picture to a code, in [-1, 1]."""
 
     def __init__(self, dim: int) -> None:
         super().__init__()

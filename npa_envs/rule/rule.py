@@ -31,7 +31,7 @@ from npa_envs.rule.folded_network import (
     fold_weights,
     without_small,
 )
-from npa_envs.rule.picture_codes import Codes, carrying, checked_names
+from npa_envs.rule.picture_codes import Codes, checked_names, replace_code
 
 COLOUR_OFFSET = 0.5
 """Added to a particle's last three outputs to get its colour, dimensionless."""
@@ -172,36 +172,29 @@ class NPARule(nn.Module):
 
         self.hidden = nn.Linear(self.input_dim, hidden_dim)
         self.output = nn.Linear(hidden_dim, self.output_dim, bias=False)
-        self.readout = self._make_readout() if readout_dim else None
+        self.readout: nn.Sequential | None = None
+        if readout_dim:
+            self.readout = nn.Sequential(
+                nn.Linear(state_dim, readout_hidden_dim),
+                nn.ReLU(),
+                nn.Linear(readout_hidden_dim, readout_dim),
+            )
         for module in self.modules():
             if isinstance(module, nn.Linear):
                 nn.init.xavier_uniform_(module.weight, gain=INIT_GAIN)
         if self.divides:
-            self._add_fate()
+            self.fate = nn.Linear(state_dim, 2)
+            with torch.no_grad():
+                self.fate.weight.zero_()
+                self.fate.bias.copy_(torch.tensor(FIRST_FATES))
         if self.equivariant:
-            self._add_vector_weights()
+            vectors = self.vector_form
+            mixing = torch.empty(vectors.perceived, vectors.mixed)
+            self.mixing = nn.Parameter(nn.init.xavier_uniform_(mixing))
+            steering = torch.empty(1, 0 if self.static else vectors.gate_count)
+            self.steering = nn.Parameter(nn.init.xavier_uniform_(steering)[0])
         self.codes = Codes(code_names, code_dim, encoder=encoder) if code_dim else None
         """The known codes, or None without `code_dim`."""
-
-    def _make_readout(self) -> nn.Sequential:
-        return nn.Sequential(
-            nn.Linear(self.state_dim, self.readout_hidden_dim),
-            nn.ReLU(),
-            nn.Linear(self.readout_hidden_dim, self.readout_dim),
-        )
-
-    def _add_fate(self) -> None:
-        self.fate = nn.Linear(self.state_dim, 2)
-        with torch.no_grad():
-            self.fate.weight.zero_()
-            self.fate.bias.copy_(torch.tensor(FIRST_FATES))
-
-    def _add_vector_weights(self) -> None:
-        vectors = self.vector_form
-        mixing = torch.empty(vectors.perceived, vectors.mixed)
-        self.mixing = nn.Parameter(nn.init.xavier_uniform_(mixing))
-        steering = torch.empty(1, 0 if self.static else vectors.gate_count)
-        self.steering = nn.Parameter(nn.init.xavier_uniform_(steering)[0])
 
     def _check_sizes(self) -> None:
         if not is_whole(self.space_dim) or self.space_dim not in (2, 3):
@@ -216,7 +209,7 @@ class NPARule(nn.Module):
             )
 
     def _check_combinations(self) -> None:
-        """Check requirements of the dead zone, equivariance, codes and division."""
+        """Raise NPAError for arguments that exclude each other."""
         zone, species_count, code_dim = self.dead_zone, self.species_count, self.code_dim
         name_count, encoder = len(self.code_names), self.encoder
         if not 0.0 <= zone < math.inf:
@@ -262,13 +255,13 @@ class NPARule(nn.Module):
 
     @property
     def terms(self) -> Terms:
-        """Which groups of entries the shared part of the perception vector has."""
+        """Which gradients the rule perceives, and how the state gradient is corrected."""
         inverse = self.moment_inverse if self.moment_correction else None
         return Terms(self.state_gradient, inverse, self.density_gradient)
 
     @property
     def vector_form(self) -> VectorForm:
-        """How an equivariant rule reads the perception vector."""
+        """How many scalars and vectors an equivariant rule perceives, and how many it mixes."""
         vectors = self.state_dim * self.state_gradient + self.density_gradient
         return VectorForm(
             self.space_dim, 2 * self.state_dim, vectors, self.mixed_vectors, self.chiral
@@ -276,12 +269,12 @@ class NPARule(nn.Module):
 
     @property
     def input_dim(self) -> int:
-        """Inputs of the hidden layer: P, or the scalars and products of an equivariant rule."""
+        """Inputs of the hidden layer: P; for an equivariant rule its scalars and products."""
         return self.vector_form.input_dim if self.equivariant else self.perception_dim
 
     @property
     def output_dim(self) -> int:
-        """Outputs of the network: A - K without the code, or an equivariant rule's gates + C."""
+        """Outputs of the second layer: A - K; for an equivariant rule its gates and Δs."""
         if not self.equivariant or self.static:
             return self.update_dim - self.code_dim
         return self.vector_form.gate_count + self.state_dim
@@ -303,7 +296,7 @@ class NPARule(nn.Module):
         return sum(parameter.numel() for parameter in self.parameters())
 
     def forward(self, perception: Tensor) -> Tensor:
-        """Map perception vectors to raw updates, row by row.
+        """Map perception vectors to updates, each by itself.
 
         Args:
             perception: Perception vectors z, dimensionless, shape [..., P].
@@ -318,11 +311,11 @@ class NPARule(nn.Module):
 
     @property
     def update_weight(self) -> Tensor:
-        """W2, with rows of zeros for the code; shape [A, H]."""
+        """W2 [A, H]: the second layer's weight, with rows of zeros where the code is."""
         return self._with_code_zeros(self.output.weight, dim=0)
 
     def _with_code_zeros(self, outputs: Tensor, *, dim: int) -> Tensor:
-        """Insert zeros for the code, which no update changes, between δ and Δs in a dimension."""
+        """Insert K zeros for the code, which no update changes, between δ and Δs in a dimension."""
         if self.code_dim == 0:
             return outputs
         moves, states = outputs.tensor_split([self.update_dim - self.state_dim], dim=dim)
@@ -331,7 +324,7 @@ class NPARule(nn.Module):
         return torch.cat((moves, states.new_zeros(shape), states), dim=dim)
 
     def _update_by_invariants(self, perception: Tensor) -> Tensor:
-        """Map perception vectors to raw updates by rotation-invariant inputs."""
+        """Do as `forward`, for an equivariant rule."""
         mixed, inputs = invariants(perception, self.mixing, self.vector_form)
         output: Tensor = self.output(torch.relu(self.hidden(inputs)))
         return output if self.static else steered(output, mixed, self.steering, self.vector_form)
@@ -339,38 +332,41 @@ class NPARule(nn.Module):
     def is_plain(self) -> bool:
         """Return whether the rule computes only its two layers, so that `folded` may replace it.
 
-        It does not if it is equivariant, has hooks, or there are global hooks, or if a subclass or
-        the object itself overrides an attribute of `STEP_PARTS`, a layer, or a layer's `forward`.
+        It does not if it is equivariant, if there are hooks, or if the subclass or the object
+        overrides an attribute of `STEP_PARTS`, a layer, or a layer's `forward`.
         """
         return not self.equivariant and self.has_network()
 
     def has_network(self) -> bool:
-        """Return whether the rule's network is that of `NPARule`: it is plain, or equivariant."""
-        names = ("hidden", "output", "fate") if self.divides else ("hidden", "output")
+        """Return whether no subclass, hook or layer alters what `NPARule` computes."""
+        cls, own = type(self), self.__dict__
+        # Plain loops, as each rollout comes here; torch.compile traces no set operation.
+        for name in STEP_PARTS:
+            if name in own:
+                return False
+            if cls is not NPARule and getattr(cls, name) is not getattr(NPARule, name):
+                return False
         # `_modules` is faster than attributes of modules.
-        layers = [layer for layer in map(self._modules.get, names) if type(layer) is nn.Linear]
-        if len(layers) < len(names):
-            return False
-        hidden, output = layers[:2]
+        layers = self._modules
+        for name in ("hidden", "output", "fate") if self.divides else ("hidden", "output"):
+            layer = layers.get(name)
+            if type(layer) is not nn.Linear or is_altered(layer) or _has_backward_hooks(layer):
+                return False
         return (
-            (type(self) is NPARule or _overrides_no_part(type(self)))
-            # A list, as torch.compile traces no set operation on these attributes.
-            and True not in [name in self.__dict__ for name in STEP_PARTS]
-            and getattr(hidden, "bias", None) is not None
-            and getattr(output, "bias", None) is None
-            and not any(is_altered(module) or _has_backward_hooks(module) for module in layers)
+            getattr(layers["hidden"], "bias", None) is not None
+            and getattr(layers["output"], "bias", None) is None
             and not (is_altered(self) or _has_backward_hooks(self))
             and not _has_any_global_hook()  # type: ignore[no-untyped-call]
         )
 
     def network(self) -> Network | None:
-        """Return fused weights that map rows to updates; None: call the rule as a module."""
+        """Return the network in the form that kernels run; None: only the module can run it."""
         if self.is_plain():
             return self.folded()
         return self._folded_invariants() if self.has_network() else None
 
     def _folded_invariants(self) -> FoldedInvariants:
-        """Return an equivariant rule's fused weights, differentiable in the parameters."""
+        """Return the network of an equivariant rule; differentiable in the parameters."""
         width = self.perception_dim + 1
         weight, signs = signed_gates(self.output.weight, self.steering)
         return FoldedInvariants(
@@ -392,7 +388,7 @@ class NPARule(nn.Module):
         return weights + ([self.fate.weight, self.fate.bias] if self.divides else [])
 
     def folded(self) -> FoldedRule:
-        """Return the weights as two matrix products, differentiable in the parameters."""
+        """Return the network of a plain rule; differentiable in the parameters."""
         return self._folded(self.update_weight)
 
     def _folded(self, update_weight: Tensor) -> FoldedRule:
@@ -454,7 +450,7 @@ class NPARule(nn.Module):
             )
         shape = (*states.shape[:-1], self.code_dim)
         try:
-            return carrying(states, code.expand(shape))
+            return replace_code(states, code.expand(shape))
         except RuntimeError as error:
             raise NPAError(
                 f"code must have shape [K], [B, 1, K] or [B, N, K] for {shape}, got "
@@ -487,7 +483,7 @@ class NPARule(nn.Module):
         return f"<table>{caption}{''.join(shown_rows)}</table>"
 
     def hyper_parameters(self) -> dict[str, Any]:
-        """Return the arguments of `NPARule` for a rule of the same shape."""
+        """Return the arguments of `NPARule` that make an untrained rule like this one."""
         return {name: getattr(self, name) for name in HYPER_PARAMETERS}
 
 
@@ -495,13 +491,8 @@ HYPER_PARAMETERS = {k: v for k, v in get_type_hints(NPARule.__init__).items() if
 """Arguments of `NPARule`: name -> type."""
 
 
-def _overrides_no_part(cls: type[NPARule]) -> bool:
-    """Return whether a subclass overrides none of `STEP_PARTS`."""
-    return all(getattr(cls, name) is getattr(NPARule, name) for name in STEP_PARTS)
-
-
 def is_altered(module: nn.Module) -> bool:
-    """Return whether a module has its own `forward` or forward hooks."""
+    """Return whether a module has forward hooks, or a `forward` other than its class's."""
     return bool("forward" in vars(module) or module._forward_hooks or module._forward_pre_hooks)
 
 
@@ -538,15 +529,15 @@ def with_codes(rule: NPARule, untrained: NPARule) -> NPARule:
     return untrained
 
 
-def dividing(rule: NPARule) -> NPARule:
-    """Return a copy of a rule with division, whose weights of division are untrained."""
+def with_division(rule: NPARule) -> NPARule:
+    """Return a copy of a rule whose particles also divide, with untrained weights for that."""
     copied = NPARule(**rule.hyper_parameters() | {"divides": True}).to(rule.hidden.weight)
     copied.load_state_dict(copied.state_dict() | rule.state_dict())
     return copied
 
 
 def fate_parameters(rules: nn.Module) -> list[nn.Parameter]:
-    """Return the weights of division and death, of one rule or several in a module."""
+    """Return the weights that decide division and death, of all rules in a module."""
     every = (module for module in rules.modules() if isinstance(module, NPARule))
     return [parameter for rule in every if rule.divides for parameter in rule.fate.parameters()]
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from npa_envs.atomic_files import home_path
 from npa_envs.errors import NPAError, shown
-from npa_envs.rule.picture_codes import Codes, carrying
+from npa_envs.rule.picture_codes import Codes, replace_code
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 from npa_envs.tasks.seeds import drawn_indices, drawn_worlds
@@ -118,7 +118,7 @@ class ManyPictures(Morphogenesis2D):
         blank = s.new_zeros(*s.shape[:2], self.config.code_dim)
         s = torch.cat((blank, s), dim=-1)
         if self._codes is not None:
-            s = carrying(s, self._codes.table.detach().index_select(0, goal)[:, None])
+            s = replace_code(s, self._codes.table.detach().index_select(0, goal)[:, None])
         return Particles(x, s, goal=goal)
 
     def damage(self, worlds: Particles, generator: Randomness) -> Particles:
@@ -135,7 +135,7 @@ class ManyPictures(Morphogenesis2D):
         """Return states with the codes of their worlds' goals; differentiable in the codes."""
         if self._codes is None or self._goal is None:
             return s
-        return carrying(s, self._read_codes(self._codes).index_select(0, self.goal)[:, None])
+        return replace_code(s, self._read_codes(self._codes).index_select(0, self.goal)[:, None])
 
     def _read_codes(self, codes: Codes) -> Tensor:
         """Return the targets' codes, shape [T, K]; an encoder also writes them to the table."""

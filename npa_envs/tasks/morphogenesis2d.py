@@ -21,7 +21,7 @@ from npa_envs.checks import (
 from npa_envs.errors import NPAError
 from npa_envs.ops import splat, world_mean
 from npa_envs.ops.pictures.splat import picture_losses
-from npa_envs.rule.picture_codes import carrying
+from npa_envs.rule.picture_codes import replace_code
 from npa_envs.rule.rule import COLOUR_OFFSET, LIFE, NPARule
 from npa_envs.tasks.base import GrowthConfig, GrowthTask
 from npa_envs.tasks.damage import damage_pool
@@ -234,7 +234,7 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
 
     def with_target_code(self, s: Tensor) -> Tensor:
         """Return states with the task's code, or unchanged where it has none."""
-        return s if self._code is None else carrying(s, self._code)
+        return s if self._code is None else replace_code(s, self._code)
 
     def damage(self, worlds: Particles, generator: Randomness) -> Particles:
         """Return the worlds, damaged; where particles divide, some die, but never all."""

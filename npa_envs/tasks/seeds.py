@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from npa_envs.checks import DTYPES, checked_count, checked_finite, entries
+from npa_envs.checks import DTYPES, as_list, checked_count, checked_finite
 from npa_envs.devices import check_device
 from npa_envs.errors import NPAError, shown
 from npa_envs.ops.sort import MAX_INDEX
@@ -65,7 +65,7 @@ def uniform_box(
     device = check_device(device)
     world_count = checked_count("world_count", world_count)
     particle_count = checked_count("particle_count", particle_count)
-    values = entries(box)
+    values = as_list(box)
     if not values:
         raise NPAError(
             f"box must hold a side for each dimension, got {shown(box)}: give (2.0, 2.0)"

@@ -21,7 +21,7 @@ from npa_envs.checks import is_real
 from npa_envs.devices import check_device
 from npa_envs.errors import DivergedError, NPAError, shown
 from npa_envs.rule.files import load_rule, preset_rules, save_rule
-from npa_envs.rule.rule import NPARule, dividing, with_codes
+from npa_envs.rule.rule import NPARule, with_codes, with_division
 from npa_envs.tasks.base import Task, differing_fields, untrained_rule
 from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.checkpoint import (
@@ -456,7 +456,7 @@ def initial_rule(config: TrainConfig[Any], untrained: NPARule) -> NPARule:
         rule.moment_inverse = config.moment_inverse
     rule.dead_zone = untrained.dead_zone
     if untrained.divides and not rule.divides:
-        rule = dividing(rule)
+        rule = with_division(rule)
     theirs, ours = rule.hyper_parameters(), untrained.hyper_parameters()
     differences = [
         f"{'eps0, the eps it learned at' if name == 'eps0' else name} "

@@ -2,7 +2,7 @@
 
 Damage of training pools, the viewer and agents use them. They work on batches, with a centre for
 each world, and are differentiable in positions, states, centres and amounts, except for the choice
-of particles inside. Only `removed`, which changes the number of particles, waits for the device.
+of particles inside. Nothing waits for the device.
 
 Arguments that a docstring does not describe are those of `push`, in all functions. `box` has the
 sides of the periodic box [length units], across whose edges a brush works, or is None in open
@@ -16,7 +16,7 @@ import math
 import torch
 from torch import Tensor
 
-from npa_envs.checks import check_alike, check_world, checked_number, entries
+from npa_envs.checks import as_list, check_alike, check_world, checked_number
 from npa_envs.errors import NPAError, shown
 
 Sides = tuple[float, ...] | None
@@ -29,7 +29,7 @@ def offsets_from(x: Tensor, centre: Tensor, box: Sides = None) -> Tensor:
     """
     check_world(x, x)
     _check_vector("centre", centre, x)
-    if box is not None and len(entries(box) or ()) != x.shape[2]:
+    if box is not None and len(as_list(box) or ()) != x.shape[2]:
         raise NPAError(f"box must have {x.shape[2]} sides, got {shown(box)}: give one for each")
     return nearest_image(x - centre[:, None], box)
 
@@ -62,35 +62,6 @@ def softness(x: Tensor, *, centre: Tensor, radius: float | Tensor, box: Sides = 
     # Masked before the division: with a radius of zero weights are 0 and not NaN.
     square = square / torch.where(size > 0, size, torch.ones_like(size)).square()
     return torch.where(size > 0, (1.0 - square).clamp_min(0.0), 0.0).square()
-
-
-def removed(x: Tensor, s: Tensor, *, gone: Tensor) -> tuple[Tensor, Tensor]:
-    """Return worlds without some of their particles; waits for the device.
-
-    Other arguments and errors are those of `inject`.
-
-    Args:
-        gone: Which particles to remove, bool, shape [B, N], for example by `inside_ball`; equally
-            many of each world.
-
-    Returns:
-        Positions, shape [B, N', D], and states, shape [B, N', C], in their former order.
-    """
-    check_world(x, s)
-    if not isinstance(gone, Tensor) or gone.shape != x.shape[:2] or gone.dtype != torch.bool:
-        got = f"{gone.dtype} {list(gone.shape)}" if isinstance(gone, Tensor) else shown(gone)
-        raise NPAError(
-            f"gone must be a bool tensor of shape [B, N] = {list(x.shape[:2])}, got {got}: take "
-            "inside_ball"
-        )
-    counts = gone.sum(dim=1).tolist()
-    if len(set(counts)) > 1:
-        raise NPAError(
-            f"gone must take equally many particles of each world, got {shown(counts)}: change one "
-            "world at a time, or set states with wipe_state"
-        )
-    count = x.shape[1] - counts[0]
-    return x[~gone].view(len(x), count, x.shape[2]), s[~gone].view(len(s), count, s.shape[2])
 
 
 def push(
@@ -151,7 +122,7 @@ def inject(
 def state_around(
     x: Tensor, s: Tensor, *, centre: Tensor, radius: float | Tensor, box: Sides = None
 ) -> tuple[Tensor, Tensor]:
-    """Return the weighted mean state under a soft brush, [B, C], and whether any is, bool, [B].
+    """Return the mean state [B, C] by weights `softness`, and whether any is positive, bool [B].
 
     Arguments and errors are those of `inject`.
     """
@@ -250,7 +221,7 @@ def clump(
 
 
 def _per_world(name: str, value: float | Tensor, x: Tensor, *, highest: float = math.inf) -> Tensor:
-    """Return a checked number of each world, shape [B, 1, 1] or [1, 1, 1]."""
+    """Return a number, or one for each world, as a tensor [1, 1, 1] or [B, 1, 1]."""
     if isinstance(value, Tensor):
         if value.shape not in ((), (x.shape[0],)):
             raise NPAError(
@@ -267,7 +238,7 @@ def _per_world(name: str, value: float | Tensor, x: Tensor, *, highest: float = 
 
 
 def _check_vector(name: str, vector: Tensor, like: Tensor, letter: str = "D") -> None:
-    """Check that a tensor has a vector for each world, like positions (D) or states (C)."""
+    """Check that `vector` has shape [B, D], or [B, C], where `like` is [B, N, D] or [B, N, C]."""
     shape = (like.shape[0], like.shape[2])
     if not isinstance(vector, Tensor) or vector.shape != shape:
         got = tuple(vector.shape) if isinstance(vector, Tensor) else shown(vector)

@@ -73,7 +73,7 @@ def _is_plain() -> bool:
 
 @contextlib.contextmanager
 def plain_tensors() -> Iterator[None]:
-    """Leave inference mode and the caller's default device inside the block.
+    """Leave inference mode and the caller's default device within the block.
 
     New tensors can then be written to anywhere, and are on the CPU unless a device is given.
     """
@@ -101,7 +101,7 @@ def makes_plain_tensors(function: Callable[Arguments, Result]) -> Callable[Argum
 
 @contextlib.contextmanager
 def no_garbage_collection() -> Iterator[None]:
-    """Disable garbage collection inside: freeing an old graph would break a capture."""
+    """Disable garbage collection within the block: freeing an old graph would break a capture."""
     enabled = gc.isenabled()
     gc.disable()
     try:
@@ -117,7 +117,7 @@ def _stream(device: torch.device, handle: int) -> torch.cuda.Stream:
 
 
 def current_stream(device: torch.device) -> torch.cuda.Stream:
-    """Return torch's current stream of an indexed CUDA device, as a cached object.
+    """Return torch's current stream of a CUDA device with a number, as a cached object.
 
     `torch.cuda.current_stream` makes a new object each time, which takes ten times as long.
     """
@@ -142,9 +142,10 @@ def prepare_capture(function: Callable[[], object], device: torch.device) -> Non
 
 
 class GraphSequence:
-    """Recorded work: CUDA graphs, one after the other, and Python functions called between them.
+    """A captured function: CUDA graphs, one after the other, and Python functions between them.
 
-    `generator` draws new numbers in each replay; `alone`: torch's own generator is not used.
+    Each replay draws new numbers from `generator`. `alone`: torch's own generator is not used, so
+    that other threads may use it during the capture.
     """
 
     abandoned = 0
@@ -197,7 +198,7 @@ class GraphSequence:
 
 @contextlib.contextmanager
 def _stand_in(graph: torch.cuda.CUDAGraph) -> Iterator[None]:
-    """Replace torch's own generator while a capture begins inside.
+    """Replace torch's own generator within the block, in which a capture begins.
 
     Torch registers its own generator with every graph, and then other threads cannot draw from it
     until the capture ends.
@@ -232,7 +233,7 @@ def host_call(work: Callable[[], object]) -> None:
 
 
 def draws_alone() -> bool:
-    """Return whether this thread records without access to torch's own generator."""
+    """Return whether this thread is capturing a `GraphSequence` with `alone`."""
     sequence = _capturing.get()
     return sequence is not None and sequence.alone
 
@@ -321,7 +322,7 @@ class WeakFunction:
         self._get = weakref.WeakMethod(function) if inspect.ismethod(function) else lambda: function
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Support copy and pickle, as the method of the copied object."""
+        """Support copy and pickle: a copy refers to the method of the copied object."""
         return WeakFunction, (self(),)
 
     def __call__(self) -> Callable[..., Any]:
@@ -365,7 +366,7 @@ class GraphedCallable:
         return self.__dict__ | {"_warm": False, "_graph": None, "_attempts": 0}
 
     def __call__(self) -> None:
-        """Run the function."""
+        """Run the function, kernel by kernel or as a graph."""
         function = self._function()
         if not self._recorded or not self._warm:
             function()
@@ -415,7 +416,7 @@ class SideStream:
 
     @contextlib.contextmanager
     def overlap(self) -> Iterator[None]:
-        """Launch on this stream inside, after the current stream's work so far."""
+        """Launch on this stream within the block, after the current stream's work so far."""
         self._begin.record(current_stream(self._device))
         self._stream.wait_event(self._begin)
         with torch.cuda.stream(self._stream):

@@ -22,7 +22,7 @@ MAX_REPORT = 8
 
 
 class Divergence(NamedTuple):
-    """Which worlds have diverged; both tensors stay on the worlds' device."""
+    """Which worlds have diverged: flags on the worlds' device."""
 
     non_finite: Tensor
     """Worlds with an infinite or NaN value, bool, shape [B]."""
@@ -60,19 +60,11 @@ def divergence(x: Tensor, s: Tensor, *, limit: float = RUNAWAY) -> Divergence:
 def describe_divergence(x: Tensor, s: Tensor, *, limit: float = RUNAWAY) -> str:
     """Return a line for each world that has diverged, with its first diverged value.
 
-    It waits for the device.
-
-    Args:
-        x: Particle positions [length units], shape [B, N, D].
-        s: Particle states, dimensionless, shape [B, N, C].
-        limit: As for `divergence`.
+    It waits for the device. Arguments and errors are those of `divergence`.
 
     Returns:
         Lines as "world 1: states channel 3 of particle 7 is nan (2 such numbers in 1 particle)", at
         most eight of them; "" where no world has diverged.
-
-    Raises:
-        NPAError: As for `divergence`.
     """
     flags = divergence(x, s, limit=limit)
     worlds = (flags.non_finite | flags.runaway).nonzero()[:, 0].tolist()
@@ -97,7 +89,7 @@ def describe_divergence(x: Tensor, s: Tensor, *, limit: float = RUNAWAY) -> str:
 
 
 def term_name(entry: int, space_dim: int) -> str:
-    """Return the name of an entry of a particle's coordinates and then channels."""
+    """Return the name of number `entry` of a particle's D coordinates and then C channels."""
     if entry < space_dim:
         return f"positions coordinate {entry}"
     return f"states channel {entry - space_dim}"

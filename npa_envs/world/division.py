@@ -29,7 +29,7 @@ PARKING_GAP = 2.5
 
 
 class Births(NamedTuple):
-    """Random numbers of a step with divisions."""
+    """Random numbers that decide which particles divide or die, and where children are."""
 
     uniform: Tensor
     """Decides whether each particle divides, stays or dies, uniform in [0, 1), shape [B, N]."""
@@ -43,7 +43,7 @@ def living(s: Tensor) -> Tensor:
 
 
 def parked(x: Tensor, alive: Tensor, eps: float) -> Tensor:
-    """Return positions with dead slots far away from all particles and from each other."""
+    """Return positions in which dead slots are far from all particles and from each other."""
     count, space_dim = x.shape[1:]
     side = 1
     while side**space_dim < count:

@@ -31,7 +31,10 @@ from npa_envs.world.steps import draw_step
 
 
 def perceive_each_species(x: Tensor, counts: Sequence[int], physics: Physics) -> Tensor:
-    """Return `perceive_by_species`, clipped, shape [B, N, K (1 + D)]; zeros for empty species."""
+    """Return the densities of K species, then their gradients, clipped, [B, N, K (1 + D)].
+
+    Species k has `counts[k]` consecutive particles; an empty one has zeros.
+    """
     limit = physics.limits.perception
     return perceive_by_species(x, tuple(counts), physics).clamp(-limit, limit)
 
@@ -58,11 +61,9 @@ class Actions(PreparedActions):
     ) -> None:
         self._random = random
         self._everyone = torch.ones((), dtype=torch.bool, device=x.device).expand(x.shape[:2])
-        mask = noise = None
-        if physics.update_prob < 1.0:
-            mask = torch.zeros(x.shape[:2], dtype=torch.uint8, device=x.device)
-        if physics.position_noise > 0.0:
-            noise = torch.zeros_like(x)
+        masked, noisy = physics.update_prob < 1.0, physics.position_noise > 0.0
+        mask = torch.zeros(x.shape[:2], dtype=torch.uint8, device=x.device) if masked else None
+        noise = torch.zeros_like(x) if noisy else None
         super().__init__(ActedWorlds(x, s, mask, noise, enabled, diverged), physics)
 
     apply = PreparedActions.__call__
@@ -73,10 +74,9 @@ class Actions(PreparedActions):
         x, _, mask, noise, _, diverged = self._worlds
         diverged.zero_()
         drawn = draw_step(x, self._physics, self._random)
-        if mask is not None and drawn.mask is not None:
-            mask.copy_(drawn.mask)
-        if noise is not None and drawn.noise is not None:
-            noise.copy_(drawn.noise)
+        for buffer, values in ((mask, drawn.mask), (noise, drawn.noise)):
+            if buffer is not None and values is not None:
+                buffer.copy_(values)
 
     def updated(self) -> Tensor:
         """Return which particles the last draw updates, bool, shape [B, N]."""

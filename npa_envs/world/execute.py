@@ -64,7 +64,7 @@ GPU idles during a check."""
 
 
 class RolloutSpec(NamedTuple):
-    """A checked rollout without its tensors; hashable: recordings have it in their keys."""
+    """The checked arguments of a rollout except its tensors; hashable, for keys of recordings."""
 
     steps: int
     physics: Physics
@@ -78,7 +78,7 @@ class RolloutSpec(NamedTuple):
     """Whether rules perceive each species' density and density gradient."""
 
     def make_step(self, rules: Sequence[NPARule], particles: Particles) -> Step:
-        """Return the step of these worlds."""
+        """Return the `Step` that advances these worlds."""
         if self.species:
             return SpeciesStep(
                 rules,
@@ -216,7 +216,7 @@ class RecomputedSteps:
 
 
 def _version(value: Any) -> Any:
-    """Return a tensor's version, which each write changes; other values unchanged."""
+    """Return a tensor's address and version, which each write changes; other values unchanged."""
     if not isinstance(value, Tensor):
         return value
     return value.data_ptr(), None if value.is_inference() else value._version
@@ -234,8 +234,8 @@ def execute(
 ) -> Particles:
     """Run a checked rollout in the fastest way that its options allow.
 
-    With a watch for divergence, steps are launched one by one and checked. `may_rest`: steps of
-    resting worlds may be skipped.
+    With a watch, steps are launched one by one and checked for divergence. With `may_rest`, steps
+    may be skipped once all worlds are at rest.
     """
     if watch is not None or not may_rest or not _can_rest(spec, rules, particles.x):
         return run_all_steps(spec, rules, particles, source, graph=graph, watch=watch)
@@ -264,7 +264,7 @@ def run_all_steps(
     graph: CudaGraph = "auto",
     watch: DivergenceWatch | None = None,
 ) -> Particles:
-    """Run a checked rollout as `execute`, without skipping steps of resting worlds."""
+    """Run a checked rollout as `execute` does, without skipping steps."""
     if watch is None:
         recorded = run_recorded(spec, rules, particles, source, cuda_graph=graph)
         if recorded is not None:
@@ -279,7 +279,7 @@ def run_all_steps(
 def resting(
     rules: Sequence[NPARule], particles: Particles, physics: Physics, graph: CudaGraph
 ) -> Tensor:
-    """Return which worlds do not change if all particles are updated, bool, shape [B]."""
+    """Return which worlds are at rest: an update of all particles changes none, bool, shape [B]."""
     spec = RolloutSpec(1, physics._replace(update_prob=1.0))
     with torch.no_grad():
         after = run_all_steps(spec, rules, particles, None, graph=graph)
@@ -310,7 +310,10 @@ def _can_rest(spec: RolloutSpec, rules: Sequence[NPARule], x: Tensor) -> bool:
 
 
 class _TapedStep:
-    """A step from one buffer to another; during recording it is called in place of the network."""
+    """A tape of the launches of one step, which reads one buffer of worlds and writes another.
+
+    While the tape is recorded, this object is called in place of the network.
+    """
 
     def __init__(self, step: RuleStep, particles: Particles, mask: Tensor | None) -> None:
         assert step.network is not None
@@ -324,7 +327,7 @@ class _TapedStep:
         self.slots = self.tape.argument_slots(self._updates)
 
     def __call__(self, rows: Tensor) -> Tensor:
-        """Store the network's input rows, [B N, row_width], and its position on the tape."""
+        """Store the network's input rows, [B N, row_width], and where on the tape it runs."""
         self.rows = rows
         self.split = len(self.tape)
         self._updates = rows.new_zeros(len(rows), self._update_width)
@@ -332,7 +335,7 @@ class _TapedStep:
 
 
 class TapedSteps:
-    """Taped steps of worlds of one shape, back and forth between two buffers."""
+    """Two taped steps of worlds of one shape: from a first buffer to a second one, and back."""
 
     def __init__(self, step: RuleStep, particles: Particles) -> None:
         # With all particles active there is a row for each.
@@ -350,7 +353,7 @@ class TapedSteps:
     def run(
         self, network: Network, particles: Particles, masks: Iterable[Tensor | None], every: int
     ) -> list[Particles]:
-        """Step worlds once with each mask; return copies at the given interval."""
+        """Step worlds once with each update mask; return copies after `every` steps each."""
         self._buffers[0].copy_(particles)
         trajectory: list[Particles] = []
         for number, mask in enumerate(masks):
@@ -382,9 +385,10 @@ def run_taped(
     steps: int,
     keep_every: int | None,
 ) -> Particles | None:
-    """Run a rollout by taped steps; None in the first calls of its kind.
+    """Run a rollout by replaying taped steps; None: its steps must be launched.
 
-    Only steps of small worlds on a CPU, without gradients, may be on a tape.
+    They are launched with gradients, for large worlds, on CUDA, and in the first calls with the
+    same shapes and options.
     """
     x, s, *_ = particles
     if (

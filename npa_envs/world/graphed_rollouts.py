@@ -101,7 +101,7 @@ def run_recorded(
     plain = [rule.has_network() for rule in rules]
     if not all(plain) and (not explicit or torch.is_autocast_enabled(x.device.type)):
         return None
-    forms, rule_weights = zip(*map(_form, rules, plain), strict=True)
+    forms, rule_weights = zip(*map(_settings_and_weights, rules, plain), strict=True)
     weights = list(itertools.chain.from_iterable(rule_weights))
     grad_flags = _grad_flags(particles, weights)
     per_world_streams = isinstance(generator, WorldRandom)
@@ -142,7 +142,7 @@ def _saves_tensors_elsewhere() -> bool:
 
 
 def _blocks(spec: RolloutSpec, *, with_gradients: bool) -> list[int]:
-    """Return the steps of each graph to replay: without gradients a long rollout has several."""
+    """Return the steps of each graph to replay, one after the other; with gradients it is one."""
     if with_gradients:
         return [spec.steps]
     interval = spec.keep_every or 1
@@ -154,7 +154,7 @@ def _blocks(spec: RolloutSpec, *, with_gradients: bool) -> list[int]:
 def _run_and_compare(call: _Call, kind: CallKind, use: _RecordingUse) -> Particles:
     """Launch a rollout and compare it with its replay, which custom Python code may break.
 
-    If results differ, calls of this kind are launched from then on.
+    If results differ, calls with these shapes and options are launched from then on.
     """
     particles, weights, generator = call.particles, call.weights, call.generator
     device = particles.x.device
@@ -188,8 +188,8 @@ rule_form: Callable[[NPARule], Hashable] = operator.attrgetter(
 """Returns all settings of a plain rule that its steps depend on, except weights."""
 
 
-def _form(rule: NPARule, plain: bool) -> tuple[Hashable, list[Tensor]]:
-    """Return a rule's settings that a recording depends on, and its weights."""
+def _settings_and_weights(rule: NPARule, plain: bool) -> tuple[Hashable, list[Tensor]]:
+    """Return a rule's settings, which a recording depends on, and its weights."""
     if plain:
         weights = rule.network_weights()
         return (rule_form(rule), *map(_tensor_form, weights)), weights
@@ -203,15 +203,15 @@ def _tensor_form(tensor: Tensor) -> Hashable:
     return tensor.shape, tensor.dtype, tensor.device
 
 
-def _clone(rule: NPARule, like: Tensor) -> NPARule:
-    """Return a rule of the same form with separate memory for its weights."""
+def _clone(rule: NPARule, x: Tensor) -> NPARule:
+    """Return a rule of the same shapes and settings, with new memory for weights of x's dtype."""
     if not rule.has_network():
         return copy.deepcopy(rule)
     form = rule.hyper_parameters() | {"readout_dim": 0, "readout_hidden_dim": 0}
     # On the meta device no initial weights are drawn.
     with torch.device("meta"):
         clone = NPARule(**form)
-    clone = clone.to(like.dtype).to_empty(device=like.device)
+    clone = clone.to(x.dtype).to_empty(device=x.device)
     forms = [list(map(_tensor_form, each.network_weights())) for each in (rule, clone)]
     if forms[0] != forms[1]:
         raise NPAError(
@@ -240,7 +240,7 @@ class _Call(NamedTuple):
 
 # Kinds of calls: which recording serves a call, and which are deleted to make room.
 class CallKind:
-    """Calls of one kind: their number, and their recordings or taped steps."""
+    """Calls with the same shapes and options: their number, and their recordings or tapes."""
 
     def __init__(self) -> None:
         self.calls = 0
@@ -254,7 +254,7 @@ class CallKind:
 
 
 class CallKinds(collections.OrderedDict[Hashable, CallKind]):
-    """How often each kind of call was seen, and its recordings; the least recently used first."""
+    """All kinds of calls by shapes and options, the least recently used first."""
 
     def count(self, key: Hashable, most: int) -> CallKind:
         """Count a call and return its kind; beyond `most` kinds delete the least recently used."""
@@ -269,7 +269,7 @@ class CallKinds(collections.OrderedDict[Hashable, CallKind]):
         return kind
 
     def forget(self, key: Hashable) -> None:
-        """Delete a kind; recordings in use live until their backward pass has run."""
+        """Delete a key and its recordings; those in use live until their backward pass has run."""
         for recording in self.pop(key).recordings:
             if recording.stream is not None:
                 recording.stream.synchronize()
@@ -312,7 +312,7 @@ def release_recordings() -> None:
 
 
 def _take_recording(kind: CallKind, call: _Call) -> _RecordingUse | None:
-    """Return the use of a free or new recording with graphs for a call; None if impossible."""
+    """Reserve a recording with the graphs for a call; None: the call has to be launched."""
     with _lock:
         use = None
         with contextlib.suppress(IndexError):
@@ -347,7 +347,7 @@ def _take_recording(kind: CallKind, call: _Call) -> _RecordingUse | None:
 
 
 def _make_room(device: torch.device) -> bool:
-    """Delete other kinds, the least recently used first, until a device has room for a graph."""
+    """Delete recordings until a device has room for another; return whether it has."""
     limit = MEMORY_FRACTION * torch.cuda.get_device_properties(device).total_memory
     for key in list(_kinds)[:-1]:
         if recorded_memory(device) < limit:
@@ -358,7 +358,7 @@ def _make_room(device: torch.device) -> bool:
 
 
 def _refuse(kind: CallKind, reason: object, level: int) -> None:
-    """Launch all calls of a kind from now on."""
+    """Launch all further calls of a kind, without recordings; log the reason."""
     logger.log(level, "rollouts of this kind are launched, not recorded: %s", reason)
     with _lock:
         kind.refused = True
@@ -397,11 +397,11 @@ class _Recording:
         self._spec = call.spec
         self._rules = [_clone(rule, x) for rule in call.rules]
         self._custom_rules = [rule for rule in self._rules if not rule.has_network()]
-        weights = [weight for rule in self._rules for weight in _form(rule, rule.has_network())[1]]
+        weights = (_settings_and_weights(rule, rule.has_network())[1] for rule in self._rules)
         self._worlds = worlds.map(
             lambda value: torch.empty(value.shape, dtype=value.dtype, device=value.device)
         )
-        self._inputs = [*self._worlds.tensors(), *weights]
+        self._inputs = [*self._worlds.tensors(), *itertools.chain.from_iterable(weights)]
         self._grad_flags = call.grad_flags or (False,) * len(self._inputs)
         self.differentiable = any(self._grad_flags)
         """Whether backward passes are recorded."""
@@ -429,7 +429,7 @@ class _Recording:
         """What autograd saves in the place of tensors for the backward pass."""
 
     def _inputs_of(self, call: _Call) -> list[Tensor]:
-        """Return all inputs of a rollout, in the order of the fixed tensors."""
+        """Return a call's tensors, in the order of the fixed tensors that they are copied to."""
         return [*call.particles.with_zero_paths(self._no_paths).tensors(), *call.weights]
 
     def record(self, steps: int, call: _Call) -> None:
@@ -516,7 +516,7 @@ class _Recording:
             raise NPAError("a rule's tensors must not change in its backward pass, but one does")
 
     def _settings(self) -> dict[tuple[int, str], Hashable]:
-        """Return all settings of rules with custom networks that must not change."""
+        """Return the settings of rules with custom networks, which `forward` must not change."""
         settings: dict[tuple[int, str], Hashable] = {}
         for number, rule in enumerate(self._custom_rules):
             for name, setting in rule_settings(rule, self.device).items():
@@ -530,7 +530,7 @@ class _Recording:
         return [tensor._version for tensor in self._inputs]
 
     def _cotangents_of(self, steps: int) -> list[Tensor]:
-        """Return the buffers for cotangents of the worlds that this number of steps returns."""
+        """Return the buffers for the gradients by the worlds that so many steps return."""
         interval = self._spec.keep_every
         count = None if interval is None else steps // interval
         if count not in self._cotangents:
@@ -540,7 +540,7 @@ class _Recording:
         return self._cotangents[count]
 
     def _run(self, spec: RolloutSpec, saved: list[Tensor]) -> Particles:
-        """Launch a rollout; tensors of its backward pass are added to `saved`."""
+        """Launch a rollout of the fixed tensors; append what its backward pass reads to `saved`."""
 
         def save(tensor: Tensor) -> Tensor:
             saved.append(tensor.detach())
@@ -567,7 +567,7 @@ class _Recording:
         return [gradient.contiguous() for gradient in gradients]
 
     def replay(self, call: _Call, use: _RecordingUse) -> Particles:
-        """Replay a rollout's graphs in order; copy buffers that they change back to the rule."""
+        """Replay the graphs of a call, and copy buffers that they change back to the rule."""
         generator = call.generator
         inputs = self._inputs_of(call)
         self.ready.record(current_stream(self.device))
@@ -678,7 +678,7 @@ def _views(tensors: Sequence[Tensor]) -> list[Tensor]:
 
 
 def _copies(tensors: list[Tensor]) -> list[Tensor]:
-    """Return copies, made by one kernel."""
+    """Return copies of tensors, made by one kernel."""
     copies = [torch.empty_like(tensor) for tensor in tensors]
     torch._foreach_copy_(copies, tensors)
     return copies

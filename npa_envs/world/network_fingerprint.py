@@ -54,7 +54,7 @@ def rule_settings(rule: nn.Module, device: torch.device) -> dict[str, Hashable]:
 
 
 def _setting(value: Any, device: torch.device, *, in_container: bool = False) -> Hashable:
-    """Return what identifies an attribute, or an entry of a container, as long as it is equal."""
+    """Return what stays equal as long as an attribute, or a value in a container, is the same."""
     if isinstance(value, NUMBERS):
         return type(value), value
     if isinstance(value, Tensor):

@@ -22,14 +22,14 @@ class Particles(NamedTuple):
     """Index of the target that a world is to become, int64, shape [B]; after all other fields."""
 
     def with_zero_paths(self, zeros: Tensor | None = None) -> Particles:
-        """Return the worlds with paths of length 0, in `zeros` if it is given, shape [B, N]."""
+        """Return the worlds with path lengths of 0: the tensor `zeros` [B, N], or a new one."""
         if zeros is None:
             zeros = self.x.new_zeros(self.x.shape[:2])
         # Not by `_replace`: torch.compile cannot trace it.
         return Particles(self.x, self.s, zeros, self.goal)
 
     def per_particle(self) -> tuple[Tensor, Tensor, Any]:
-        """Return the fields of particles, without those of worlds, in the order of updates."""
+        """Return x, s and the path lengths, in the order that `update_particles` takes."""
         return self[:-1]
 
     def tensors(self) -> list[Tensor]:
@@ -37,18 +37,18 @@ class Particles(NamedTuple):
         return [value for value in self if value is not None]
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Particles:
-        """Return worlds with a function applied to every field."""
+        """Return worlds with a function applied to every field that is not None."""
         x, s, *rest = (None if value is None else function(value) for value in self)
         assert x is not None
         assert s is not None
         return Particles(x, s, *rest)
 
     def take(self, worlds: Tensor) -> Particles:
-        """Return some worlds, by their indices."""
+        """Return the worlds with these indices."""
         return self.map(lambda value: value.index_select(0, worlds))
 
     def put_(self, worlds: Tensor, other: Particles) -> None:
-        """Write other worlds to these indices."""
+        """Overwrite the worlds with these indices by `other`."""
         for field, new in zip(self.tensors(), other.tensors(), strict=True):
             field.index_copy_(0, worlds, new)
 
@@ -66,14 +66,14 @@ class Particles(NamedTuple):
         return torch.stack([(a == b).flatten(1).all(dim=1) for a, b in pairs]).all(dim=0)
 
     def gather(self, order: Tensor) -> Particles:
-        """Return particles reordered by indices among all B N, shape [B N]; differentiable."""
+        """Return particles in another order: indices into all B N of them; differentiable."""
         fields = self._replace(goal=None).map(
             lambda value: value.flatten(0, 1).index_select(0, order).view_as(value)
         )
         return fields._replace(goal=self.goal)
 
     def split(self, counts: Sequence[int]) -> list[Particles]:
-        """Return the particles of each species, which lie one species after the other."""
+        """Return the particles of each species; species k has `counts[k]` consecutive ones."""
         fields = [
             [None] * len(counts) if value is None else torch.split(value, [*counts], dim=1)
             for value in self.per_particle()

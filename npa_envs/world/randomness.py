@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import enum
 import math
 import threading
@@ -21,7 +22,7 @@ from npa_envs.ops.sort import MAX_INDEX
 
 @enum.unique
 class StreamId(enum.IntEnum):
-    """Purposes of the package's separate random streams, as for `WorldRandom.substream`.
+    """What the package's random streams are for; arguments of `WorldRandom.substream`.
 
     Numbers below 1000 are reserved for the package; use others in your own code.
     """
@@ -108,12 +109,12 @@ class WorldRandom:
 
     @property
     def device(self) -> torch.device:
-        """Where the numbers are drawn."""
+        """Device on which the numbers are drawn."""
         return self.keys.device
 
     @property
     def world_count(self) -> int:
-        """Worlds B."""
+        """Number of worlds B."""
         return self.keys.shape[0]
 
     def advance(self, steps: int = 1) -> None:
@@ -136,12 +137,11 @@ class WorldRandom:
 
     def take(self, worlds: Tensor | slice) -> WorldRandom:
         """Return a copy of the streams of some worlds: indices, int64, shape [K], or a slice."""
-        copy = WorldRandom.__new__(WorldRandom)
-        copy.keys = self.keys[worlds].clone()
-        copy.episodes = self.episodes[worlds].clone()
-        copy.steps = self.steps[worlds].clone()
-        copy._draw_count = self._draw_count
-        return copy
+        taken = copy.copy(self)
+        taken.keys = self.keys[worlds].clone()
+        taken.episodes = self.episodes[worlds].clone()
+        taken.steps = self.steps[worlds].clone()
+        return taken
 
     def substream(self, purpose: int) -> WorldRandom:
         """Return streams that are independent of these and of those of other purposes.
@@ -301,14 +301,14 @@ def check_generator(generator: Randomness | None, device: torch.device, world_co
 
 
 def uniform_draws(generator: Randomness | None, shape: Sequence[int], like: Tensor) -> Tensor:
-    """Return uniform numbers in [0, 1) of a shape whose first dimension is the worlds."""
+    """Return uniform numbers in [0, 1), shape [B, ...], of `like`'s dtype and device."""
     if isinstance(generator, WorldRandom):
         return generator.uniform(*shape[1:], dtype=like.dtype)
     return torch.rand(tuple(shape), generator=generator, device=like.device, dtype=like.dtype)
 
 
 def normal_draws(generator: Randomness | None, shape: Sequence[int], like: Tensor) -> Tensor:
-    """Return standard normal numbers for worlds, as `uniform_draws` does."""
+    """Return standard normal numbers, shape [B, ...], of `like`'s dtype and device."""
     if isinstance(generator, WorldRandom):
         return generator.normal(*shape[1:], dtype=like.dtype)
     return torch.randn(tuple(shape), generator=generator, device=like.device, dtype=like.dtype)
@@ -319,7 +319,7 @@ MIXERS = ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB), (31, 1))
 
 
 def _mixed(keys: Tensor, number: int) -> Tensor:
-    """Return entry `number`, from 0 on, of the SplitMix64 sequence that begins at each key."""
+    """Return number `number`, from 0 on, of the SplitMix64 sequence of each key."""
     # Steele, Lea and Flood, "Fast splittable pseudorandom number generators" (OOPSLA 2014).
     bits = keys + _signed((number + 1) * GOLDEN)
     for shift, factor in MIXERS:

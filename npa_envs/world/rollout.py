@@ -73,24 +73,28 @@ def _check_rule_of_one_species(rule: NPARule) -> None:
 
 
 def returned_fields(after: Particles, return_path_length: bool) -> tuple[Tensor, ...]:
-    """Return worlds as public functions do: x, s and, if asked, path lengths."""
+    """Return x, s and, if asked for, path lengths."""
     if not return_path_length:
         return after.x, after.s
     assert after.path_length is not None, "rollouts measure paths"
     return after.x, after.s, after.path_length
 
 
-def checked_keep_every(keep_every: int | None, steps: int) -> int | None:
-    """Check that `keep_every` divides the number of steps, and return it."""
-    if keep_every is None:
-        return None
-    interval = checked_count("keep_every", keep_every)
-    if interval == 0 or steps == 0 or steps % interval:
-        raise NPAError(
-            f"steps must be a multiple of keep_every, got {steps} and {interval}: the last world "
-            f"kept is the one at the end"
-        )
-    return interval
+def checked_steps(
+    steps: int, keep_every: int | None, memory: Memory, cuda_graph: CudaGraph
+) -> tuple[int, int | None]:
+    """Return `steps` and `keep_every`, which must divide it, as ints; also check two choices."""
+    steps = checked_count("steps", steps)
+    if keep_every is not None:
+        keep_every = checked_count("keep_every", keep_every)
+        if keep_every == 0 or steps == 0 or steps % keep_every:
+            raise NPAError(
+                f"steps must be a multiple of keep_every, got {steps} and {keep_every}: the last "
+                f"world kept is the one at the end"
+            )
+    checked_choice("memory", memory, get_args(Memory))
+    checked_choice("cuda_graph", cuda_graph, CUDA_GRAPH_CHOICES)
+    return steps, keep_every
 
 
 def step(
@@ -109,7 +113,7 @@ def step(
     on_divergence: OnDivergence = "ignore",
     cuda_graph: CudaGraph = "auto",
 ) -> tuple[Tensor, Tensor]:
-    """Advance worlds by one step: `rollout` with steps=1; its arguments and errors.
+    """Advance worlds by one step: `rollout` with steps=1, whose arguments and errors it has.
 
     Returns:
         Positions [length units], shape [B, N, D], and states, dimensionless, shape [B, N, C].
@@ -150,14 +154,11 @@ def at_rest(
     fewer rows may round an update at the edge of the dead zone differently. Rules with a
     `dead_zone` bring worlds to rest.
 
+    All other arguments and errors are those of `rollout`.
+
     Args:
         rule: The rule, one whose particles do not divide; dtype and device of x.
-        x: Particle positions [length units], shape [B, N, D].
-        s: Particle states, dimensionless, shape [B, N, C].
-        eps: As for `rollout`.
         box: As for `rollout`; in one, only positions within it can be at rest.
-        boundary: As for `rollout`.
-        dt: As for `rollout`.
 
     Returns:
         Bool, shape [B], on x's device.
@@ -254,10 +255,7 @@ def rollout(
         DivergedError: A world diverged and `on_divergence` is "raise"; the message says which, in
             which step, and which number of which particle.
     """
-    steps = checked_count("steps", steps)
-    interval = checked_keep_every(keep_every, steps)
-    checked_choice("memory", memory, get_args(Memory))
-    checked_choice("cuda_graph", cuda_graph, CUDA_GRAPH_CHOICES)
+    steps, keep_every = checked_steps(steps, keep_every, memory, cuda_graph)
     _check_rule_of_one_species(rule)
     worlds = Particles(x, s)
     constants = checked_physics(
@@ -278,7 +276,7 @@ def rollout(
             "from all others"
         )
     after = execute(
-        RolloutSpec(steps, constants, detach_positions, memory, interval),
+        RolloutSpec(steps, constants, detach_positions, memory, keep_every),
         (rule,),
         worlds,
         generator,

@@ -9,12 +9,11 @@ from torch import Tensor
 
 from npa_envs.checks import (
     Box,
+    as_list,
     check_world,
     checked_choice,
-    checked_count,
     checked_flag,
     checked_positive,
-    entries,
 )
 from npa_envs.errors import NPAError, shown
 from npa_envs.ops.physics_constants import Boundary
@@ -22,14 +21,10 @@ from npa_envs.ops.species_density import checked_counts
 from npa_envs.rule.rule import NPARule
 from npa_envs.world.divergence import OnDivergence, make_watch
 from npa_envs.world.execute import Memory, RolloutSpec, execute
-from npa_envs.world.graphed_rollouts import CUDA_GRAPH_CHOICES, CudaGraph
+from npa_envs.world.graphed_rollouts import CudaGraph
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness, check_generator
-from npa_envs.world.rollout import (
-    checked_keep_every,
-    checked_physics,
-    returned_fields,
-)
+from npa_envs.world.rollout import checked_physics, checked_steps, returned_fields
 from npa_envs.world.steps import SpeciesSpec
 
 SpeciesPerception = Literal["shared", "per_species"]
@@ -89,8 +84,6 @@ def rollout_species(
             channels, eps0, groups of perception, and in whether particles move; hidden units, alpha
             and readout may differ.
         x: Particle positions [length units], shape [B, N, D], species after species.
-        s: Particle states, dimensionless, shape [B, N, C].
-        steps: Number of steps T, 0 or more.
         counts: Particles of each species, which sum to N: species k owns `counts[k]` consecutive
             ones.
         update_prob: Probability of each particle's update in a step, in (0, 1], for all species or
@@ -109,21 +102,17 @@ def rollout_species(
         NPAError: Rules do not agree, counts do not fit, or as for `rollout`.
         DivergedError: As for `rollout`.
     """
-    steps = checked_count("steps", steps)
-    species_rules = _checked_rules(rules)
+    steps, keep_every = checked_steps(steps, keep_every, memory, cuda_graph)
     check_world(x, s)
     sizes = checked_counts(counts, x.shape[1])
-    _check_agreement(species_rules, len(sizes), perception)
+    species_rules = _checked_rules(rules, len(sizes), perception)
     probabilities = _for_each_species("update_prob", update_prob, len(sizes))
     divisors = _for_each_species(
         "density_counts", x.shape[1] if density_counts is None else density_counts, len(sizes)
     )
     divisors = [checked_positive("an entry of density_counts", count) for count in divisors]
-    checked_choice("memory", memory, get_args(Memory))
     # With one species this is `rollout`.
     alone = perception == "shared" and divisors == [x.shape[1]]
-    interval = checked_keep_every(keep_every, steps)
-    checked_choice("cuda_graph", cuda_graph, CUDA_GRAPH_CHOICES)
     worlds = Particles(x, s)
     constants = [
         checked_physics(
@@ -152,7 +141,7 @@ def rollout_species(
         common,
         checked_flag("detach_positions", detach_positions),
         memory,
-        interval,
+        keep_every,
         () if alone else tuple(species),
         perception == "per_species",
     )
@@ -168,34 +157,30 @@ def rollout_species(
     return returned_fields(after, return_path_length)
 
 
-def _checked_rules(rules: Any) -> list[NPARule]:
-    checked = None if isinstance(rules, NPARule) else entries(rules)
+def _checked_rules(rules: Any, species_count: int, perception: str) -> list[NPARule]:
+    """Return rules that fit each other, the number of species and the mode of perception."""
+    checked_choice("perception", perception, get_args(SpeciesPerception))
+    checked = None if isinstance(rules, NPARule) else as_list(rules)
     if checked is None or not all(isinstance(rule, NPARule) for rule in checked):
         types = [type(entry).__name__ for entry in ([rules] if checked is None else checked)]
         raise NPAError(
             f"rules must have one NPARule for each species, got {', '.join(types)}: give (rule,) "
             "for one species, and load rules with npa_envs.load_rule"
         )
-    return checked
-
-
-def _check_agreement(rules: list[NPARule], species_count: int, perception: str) -> None:
-    """Check that rules fit each other, the number of species and the mode of perception."""
-    checked_choice("perception", perception, get_args(SpeciesPerception))
-    if len(rules) != species_count:
+    if len(checked) != species_count:
         raise NPAError(
-            f"rules and counts must be one for each species, got {len(rules)} rules and "
+            f"rules and counts must be one for each species, got {len(checked)} rules and "
             f"{species_count} counts"
         )
     expected = 0 if perception == "shared" else species_count
-    for number, rule in enumerate(rules):
+    for number, rule in enumerate(checked):
         if rule.divides:
             raise NPAError(
                 f"rules of several species must not divide, got divides=True for rule {number}: "
                 "run it alone with npa_envs.rollout"
             )
         for name in AGREEMENTS:
-            first, other = getattr(rules[0], name), getattr(rule, name)
+            first, other = getattr(checked[0], name), getattr(rule, name)
             if first != other:
                 raise NPAError(
                     f"rules must agree in {name}, got {first} for rule 0 and {other} for rule "
@@ -206,11 +191,12 @@ def _check_agreement(rules: list[NPARule], species_count: int, perception: str) 
                 f"perception {shown(perception)} of {species_count} species needs rules with "
                 f"species_count={expected}, got {rule.species_count} for rule {number}"
             )
+    return checked
 
 
 def _for_each_species(name: str, numbers: Any, species_count: int) -> list[Any]:
-    """Return one number for each species, whose values are not checked."""
-    each = entries(numbers)
+    """Return one number for each species; their values are not checked."""
+    each = as_list(numbers)
     if each is None:
         return [numbers] * species_count
     if len(each) != species_count:

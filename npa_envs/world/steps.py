@@ -45,7 +45,7 @@ OVERFLOW_LOG_PROBABILITY = 34.5
 
 
 def row_capacity(particle_total: int, update_prob: float) -> int:
-    """Return an upper bound on the active particles of a step, by Bernstein's inequality.
+    """Return an upper bound on the particles that a step updates, by Bernstein's inequality.
 
     On CUDA the number of rows must not depend on the draw: reading it would wait for the device. On
     a CPU the exact number is used instead.
@@ -58,7 +58,7 @@ def row_capacity(particle_total: int, update_prob: float) -> int:
 
 
 def row_count(mask: Tensor | None, x: Tensor, update_prob: float) -> int:
-    """Return the number of rows for the active particles of worlds at x; without a mask all are."""
+    """Return the number of rows of perception for the particles of a mask; None: all."""
     total = x.shape[0] * x.shape[1]
     if mask is None:
         return total
@@ -67,7 +67,7 @@ def row_count(mask: Tensor | None, x: Tensor, update_prob: float) -> int:
 
 
 class Draws(NamedTuple):
-    """The random numbers of a step, and the rows that they imply."""
+    """The random numbers of a step, and the rows of the particles that they select."""
 
     mask: Tensor | None
     """Update mask, uint8, shape [B, N]; None: all particles are updated."""
@@ -97,7 +97,7 @@ def draw_step(x: Tensor, physics: Physics, generator: Randomness | None) -> Draw
 
 
 def skip_draws(x: Tensor, physics: Physics, steps: int, generator: Randomness | None) -> None:
-    """Advance a random source as some steps of worlds at x would."""
+    """Advance a random source as so many steps of worlds at x would."""
     if steps == 0:
         return
     if isinstance(generator, WorldRandom):
@@ -119,11 +119,11 @@ class Step:
     physics: Physics
 
     def enter(self, particles: Particles) -> Particles:
-        """Return worlds as the steps need them, for example in sorted order."""
+        """Return worlds as `advance` needs them, for example in sorted order."""
         return particles
 
     def draw_step(self, like: Tensor, source: Randomness | None) -> Draws:
-        """Return the draws of the next step, for positions like these."""
+        """Return the draws of the next step, for positions of the shape and dtype of `like`."""
         return draw_step(like, self.physics, source)
 
     def draw(self, like: Tensor, steps: int, source: Randomness | None) -> Iterator[Draws]:
@@ -161,7 +161,7 @@ class Step:
 def _updated(
     particles: Particles, update: Tensor, active: Rows, draws: Draws, physics: Physics
 ) -> Particles:
-    """Return particles after updates of the active ones and the position noise of all."""
+    """Return particles after the updates of the active ones and the position noise of all."""
     if draws.noise is not None:
         particles = particles._replace(x=particles.x + draws.noise)
     fields = update_particles(update, *particles.per_particle(), active, physics)
@@ -207,7 +207,7 @@ class RuleStep(Step):
 
 
 class StaticStep(RuleStep):
-    """The step of a rule with static particles, which are sorted and searched once."""
+    """The step of a rule with static particles, whose neighbours are searched only once."""
 
     def __init__(self, rule: NPARule, physics: Physics, x: Tensor) -> None:
         # Later parts of a rollout begin inside the box, so the first must as well.
@@ -221,7 +221,7 @@ class StaticStep(RuleStep):
         return particles._replace(x=self.x).gather(self.sorted.source)
 
     def draw(self, like: Tensor, steps: int, source: Randomness | None) -> Iterator[Draws]:
-        """Yield each step's rows, assigned for several steps at a time in few launches."""
+        """Yield each step's draws; few launches assign the rows of several steps together."""
         total = like.shape[0] * like.shape[1]
         physics = self.physics
         together = max(min(16, ROWS_TOGETHER // total), 1)
@@ -281,7 +281,7 @@ class DivisionStep(RuleStep):
 
 
 class SpeciesSpec(NamedTuple):
-    """The constants of one species."""
+    """The constants of one species of a rollout."""
 
     size: int
     """Number of its particles in a world."""
@@ -292,7 +292,7 @@ class SpeciesSpec(NamedTuple):
 
 
 class Species(NamedTuple):
-    """One species of checked worlds."""
+    """One species of a rollout: its rule, its particles and its constants."""
 
     rule: NPARule
     network: Network | None
@@ -306,7 +306,7 @@ class Species(NamedTuple):
     """Number of particles of a world divided by this species' divisor of densities."""
 
     def capacity(self, world_count: int) -> int:
-        """Return the number of rows for its active particles in B worlds."""
+        """Return the number of rows to allocate for its active particles in B worlds."""
         return row_capacity(world_count * self.spec.size, self.spec.update_prob)
 
 
@@ -350,7 +350,7 @@ class SpeciesStep(Step):
             self.update_fraction = torch.cat(fractions)
 
     def draw_step(self, like: Tensor, source: Randomness | None) -> Draws:
-        """Return mask and noise as for one rule; the mask is thinned out by species."""
+        """Return mask and noise as for one rule; each species keeps its fraction of the mask."""
         drawn = super().draw_step(like, source)
         if self.update_fraction is None:
             return drawn
@@ -400,9 +400,9 @@ class SpeciesStep(Step):
     def _perceived(
         self, species: Species, z: Tensor, fields: Tensor | None, particle: Tensor
     ) -> Tensor:
-        """Return rows of perception z with a species' divisor of densities and, if any, `fields`.
+        """Return a species' rows of perception z, with its own divisor of densities, and `fields`.
 
-        `fields` are each species' density and density gradient, `particle` [R] the rows' particles.
+        `fields` has all species' densities and gradients, `particle` [R] the index of a row's.
         """
         ratio, space_dim = species.count_ratio, self.physics.space_dim
         if ratio != 1.0 and self.physics.terms.density_gradient:
@@ -423,7 +423,7 @@ class SpeciesStep(Step):
 def _rows_of_species(
     row_of: Tensor, species: Species, row_count: int, mask: Tensor | None
 ) -> tuple[Tensor, Tensor]:
-    """Return the rows of a species' active particles, and the indices of these particles.
+    """Return the rows of perception of a species' active particles, and these particles' indices.
 
     Both are int64, shape [R]. On CUDA R does not depend on the draw, so that nothing waits for the
     device; unused entries have the row `row_count`.
@@ -447,7 +447,7 @@ def _rows_of_species(
 
 
 def _recounted(scaled: Tensor, ratio: float) -> Tensor:
-    """Return L(ratio v) from L(v), of vectors in the last dimension; differentiable."""
+    """Return L(ratio v) from L(v) = log(1 + |v|) v / |v|, along the last dimension."""
     length = torch.linalg.vector_norm(scaled, dim=-1, keepdim=True)
     nonzero = length > 0.0
     divisor = torch.where(nonzero, length, 1.0)
@@ -456,7 +456,7 @@ def _recounted(scaled: Tensor, ratio: float) -> Tensor:
 
 
 def _update_of(species: Species, z: Tensor) -> Tensor:
-    """Return a species' raw updates, [R, A] or wider, for its rows of perception."""
+    """Return the updates [R, A], or wider with zeros, of a species' rows z of perception."""
     rule = species.rule
     if species.network is None:
         update: Tensor = rule(z[:, : rule.perception_dim])

@@ -38,7 +38,7 @@ from npa_envs.agents.learning import METHODS, CurvePoint, RuleSet
 from npa_envs.cli import main
 from npa_envs.cli.compare import CompareOptions, make_plan
 from npa_envs.cli.compare import _jobs as jobs_of
-from npa_envs.process_queue import Slots
+from npa_envs.measure.process_queue import Slots
 
 FACTS = {"problem": {}, "budget": 1.0, "options": {}, "episodes": 2}
 

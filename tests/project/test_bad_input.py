@@ -28,7 +28,7 @@ from npa_envs.tasks.seeds import uniform_ball, uniform_box
 from npa_envs.tasks.texture import TextureConfig
 from npa_envs.training import preset, train
 from npa_envs.web.export import export_web
-from npa_envs.world.brushes import inject, wipe_state
+from npa_envs.world.brushes import wipe_state
 from npa_envs.wrappers import RowPolicy, TorchNormalizeReward
 
 X, X3, S = torch.zeros(1, 4, 2), torch.zeros(1, 4, 3), torch.zeros(1, 4, 16)
@@ -141,14 +141,7 @@ WIDE = NPARule(state_dim=2)
         (lambda: export_web("gecko", "p.html"), "sources must be a list of rules, got 'gecko'"),
         (lambda: export_web([NPARule()], "p.html"), "names or files of rules, got a NPARule"),
         (lambda: export_web(["gecko"], "p.html", title=3), "title must be text"),
-        (
-            lambda: wipe_state(X, S, centre=(0.0, 0.0), radius=0.2),
-            "centre must have shape",
-        ),
-        (
-            lambda: inject(X, S, centre=X[:, 0], radius=0.2, state=0.5, strength=1.0),
-            "state must have shape",
-        ),
+        (lambda: wipe_state(X, S, centre=(0.0, 0.0), radius=0.2), "centre must have shape"),
         (lambda: RowPolicy("model.zip"), "model must be one of Stable-Baselines3"),
         (
             lambda: multispecies_v0.batched("npa/MixingSmall-v0", num_envs=2),

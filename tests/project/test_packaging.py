@@ -57,7 +57,8 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_wheel_holds_every_source_file_the_rules_and_the_license(site: Path) -> None:
     sources = [p for kind in ("*.py", "*.cuh") for p in (ROOT / "npa_envs").rglob(kind)]
-    for folder in ("rule/shipped", "rule/initial", "tasks/targets/drawings", "tasks/targets/mesh_files", "web/page"):
+    targets = ("tasks/targets/drawings", "tasks/targets/mesh_files")
+    for folder in ("rule/shipped", "rule/initial", *targets, "web/page"):
         sources += (ROOT / "npa_envs" / folder).glob("*.*")
     kinds = ("*.py", "*.schema.json")
     mapped = [p for name in MAPPED_PACKAGES for k in kinds for p in (ROOT / name).rglob(k)]

@@ -456,10 +456,7 @@ BAD_EQUIVARIANT_STATES = {
     "a missing key": (lambda s: s.pop("model.W_out"), r"missing: \['model.W_out'\]"),
 }
 BAD_STACKS = {
-    "fewer rules": (
-        lambda e: e.update({"w2.bias": ones(1, 8)}),
-        "w2.bias must have as many ru",
-    ),
+    "fewer rules": (lambda e: e.update({"w2.bias": ones(1, 8)}), "w2.bias must have as many ru"),
     "a huge stack": (
         lambda e: e["w1.weight"]["shape"].__setitem__(0, 10**9),
         "or be a stack of rules whose",
@@ -494,10 +491,7 @@ FORMATS = {
     "rule.safetensors": (write_ours, BAD_HEADERS),
     "npa.pth": (changed(lambda: authors_state(NPARule()), write_state), BAD_STATES),
     "equivariant.pth": (changed(equivariant_state, write_state), BAD_EQUIVARIANT_STATES),
-    "models.json": (
-        changed(lambda: demo_entry(demo_tensors(NPARule())), write_entry),
-        BAD_ENTRIES,
-    ),
+    "models.json": (changed(lambda: demo_entry(demo_tensors(NPARule())), write_entry), BAD_ENTRIES),
     "equivariant.json": (
         changed(lambda: demo_entry(equivariant_demo()), write_entry),
         BAD_EQUIVARIANT,

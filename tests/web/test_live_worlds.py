@@ -14,7 +14,7 @@ import torch
 from npa_envs import NPAError, load_rule, rollout, rollout_species, save_rule
 from npa_envs.agents.policies import ZeroPolicy
 from npa_envs.rule.files import preset_rules, rule_metadata, shipped_rules
-from npa_envs.rule.rule import NPARule, dividing
+from npa_envs.rule.rule import NPARule, with_division
 from npa_envs.tasks.damage import DAMAGE_SIZES
 from npa_envs.training import config_to_dict, preset
 from npa_envs.training.run_folder import JsonlLog
@@ -189,7 +189,7 @@ def test_a_world_at_rest_is_not_stepped_until_something_changes_it(tmp_path, dev
 
 
 def test_a_world_that_divides_shows_its_living_particles(tmp_path, device):
-    rule, path = dividing(load_rule("gecko")), tmp_path / "dividing.safetensors"
+    rule, path = with_division(load_rule("gecko")), tmp_path / "dividing.safetensors"
     world = world_of(rule, path, device, division=True, particle_count=64)
     assert len(world.frame().positions) == 1
     assert not {"inject", "graft", "add"} & set(world.describe()["tools"])

@@ -10,7 +10,6 @@ from npa_envs.world.brushes import (
     inject,
     inside_ball,
     push,
-    removed,
     softness,
     state_around,
     wipe_state,
@@ -32,18 +31,12 @@ def points(x, seed=1):
 
 
 @pytest.mark.parametrize("space_dim", [2, 3])
-def test_wiped_particles_are_gone_and_the_others_are_as_they_were(space_dim):
-    x, s = worlds(1, 200, space_dim)
+def test_a_ball_holds_the_particles_within_its_radius(space_dim):
+    x, _ = worlds(1, 200, space_dim)
     centre, radius = points(x), 0.6
-    gone = inside_ball(x, centre=centre, radius=radius)
-    left_x, left_s = removed(x, s, gone=gone)
-    assert 0 < int(gone.sum()) < 200
-    assert left_x.shape == (1, 200 - int(gone.sum()), space_dim)
-    assert (left_x - centre[:, None]).norm(dim=-1).min() > radius
-    assert torch.equal(left_x[0], x[0, ~gone[0]])
-    assert torch.equal(left_s[0], s[0, ~gone[0]])
-    nobody, _ = removed(x, s, gone=torch.ones(1, 200, dtype=torch.bool))
-    assert nobody.shape == (1, 0, space_dim)
+    inside = inside_ball(x, centre=centre, radius=radius)
+    assert 0 < int(inside.sum()) < 200
+    assert torch.equal(inside, (x - centre[:, None]).norm(dim=-1) <= radius)
 
 
 def test_brushes_reach_across_the_edges_of_a_box():
@@ -145,7 +138,7 @@ def test_each_world_of_a_batch_is_brushed_as_it_is_alone():
 
 
 X, S = worlds()
-AT, ONE = {"centre": points(X), "radius": 0.1}, torch.arange(24).view(2, 12) == 3
+AT = {"centre": points(X), "radius": 0.1}
 PUSH = AT | {"move": points(X)}
 
 
@@ -155,15 +148,9 @@ PUSH = AT | {"move": points(X)}
         (lambda: push(X, **PUSH | {"radius": -1.0}), "radius must be finite .* at least 0, got -1"),
         (lambda: push(X, **PUSH, strength=1.5), r"strength must be in \[0, 1\], got 1\.5"),
         (lambda: push(X, **PUSH | {"move": points(X)[:, :1]}), r"move must have shape \[B, D\]"),
-        (
-            lambda: push(X, **PUSH | {"centre": AT["centre"].float()}),
-            "centre and x must share",
-        ),
+        (lambda: push(X, **PUSH | {"centre": AT["centre"].float()}), "centre and x must share"),
         (lambda: inject(X, S, **AT, state=S[:, 0].float()), "state and s must share .*32 .*64"),
         (lambda: inject(X, S, **AT, state=S[:, 0, :2]), r"state must have .* \[B, C\] = \(2, 3\)"),
-        (lambda: removed(X, S, gone=None), "gone must be a bool tensor of shape .* got None"),
-        (lambda: removed(X, S, gone=ONE.float()), r"gone must be a bool .*\[B, N\] = \[2, 12\]"),
-        (lambda: removed(X, S, gone=ONE), r"equally many particles of each world, got \[1, 0\]"),
         (lambda: inside_ball(X, **AT, box=(2.0, 2.0, 2.0)), "box must have 2 sides"),
         (lambda: inside_ball(X[0], **AT), r"x must have shape \[B, N, D\]"),
     ],

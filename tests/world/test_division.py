@@ -6,7 +6,7 @@ from worlds import assert_near, assert_same, lively_rule, random_world
 
 import npa_envs
 from npa_envs.errors import NPAError
-from npa_envs.rule.rule import LIFE, dividing
+from npa_envs.rule.rule import LIFE, with_division
 from npa_envs.world.division import Births, divided, living
 from npa_envs.world.particles import Particles
 
@@ -213,7 +213,7 @@ def test_one_particle_fills_its_world_and_stays_within_it(device):
 
 def test_a_rule_learns_to_divide_with_the_weights_it_has(device):
     plain = lively_rule(device, state_dim=6, eps0=EPS)
-    divider = dividing(plain)
+    divider = with_division(plain)
     assert divider.divides
     assert_same([divider.state_dict()[name] for name in plain.state_dict()], plain.state_dict())
     odds = divider.division_probabilities(torch.randn(3, 6, dtype=torch.float64).to(device))

@@ -233,10 +233,7 @@ def with_rule(**options):
         ({"update_prob": [0.5]}, "one for each of 2 species, got 1"),
         ({"update_prob": [0.5, 1.5]}, r"lie in \(0, 1\], got 1\.5"),
         ({"update_prob": "half"}, "must be a number, got 'half'"),
-        (
-            lambda: npa_envs.rollout(BY_SPECIES, X, S, 1),
-            "species_count=2: run it with",
-        ),
+        (lambda: npa_envs.rollout(BY_SPECIES, X, S, 1), "species_count=2: run it with"),
         (lambda: make_rule("cpu", species_count=-1), "number of at least 0, got -1"),
         (lambda: npa_envs.species_fields(X[0], [60], eps=0.3), r"shape \[B, N, D\]"),
         (lambda: npa_envs.perceive_species(X, S, [50], 0.3), "sum to the 60 particles"),

@@ -119,10 +119,7 @@ def test_every_way_of_running_gives_the_same(name, way, device):
         pytest.skip("this rule changes in each call")
     expected, expected_gradients = run(name, device, cuda_graph=False)
     worlds, gradients = run(name, device, function, **options)
-    if device.type == "cpu" or name in ("plain", "periodic", "walls"):
-        assert_same((worlds, gradients), (expected, expected_gradients[: len(gradients)]))
-    for value, answer in zip((*worlds, *gradients), (*expected, *expected_gradients), strict=False):
-        torch.testing.assert_close(value, answer, rtol=1e-4, atol=1e-5)
+    assert_same((worlds, gradients), (expected, expected_gradients[: len(gradients)]))
 
 
 @pytest.mark.parametrize("name", [name for name in RULES if name not in CHANGING])

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from npa_envs.atomic_files import check_regular, home_path
+from npa_envs.atomic_files import home_path, open_regular
 from npa_envs.errors import MissingDependencyError, NPAError, shown, suggest
 from npa_envs.ops import Cameras
 from npa_envs.ops.pictures.triangles import nearest_triangles
@@ -80,7 +80,7 @@ def load_mesh(source: str | Path) -> Mesh:
             f"target must be a built-in mesh, the path of a mesh file ({', '.join(MESH_SUFFIXES)}) "
             f"or a folder of views, got {shown(str(source))}: {suggest(source, MESHES)}"
         )
-    check_regular(path, limit=_MAX_FILE, what="target")
+    open_regular(path, limit=_MAX_FILE, what="target").close()
     return _read_mesh(path).fitted()
 
 

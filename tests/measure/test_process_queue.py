@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from npa_envs.process_queue import Child, Slots, run_children
+from npa_envs.measure.process_queue import Child, Slots, run_children
 
 SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
 

@@ -29,7 +29,7 @@ STOPPING = ("SIGINT", "SIGTERM", "SIGHUP")
 
 @dataclass(frozen=True)
 class Slots:
-    """The slots in which processes run."""
+    """How many child processes run at a time, and on which devices."""
 
     devices: Sequence[str]
     """Devices; each process gets one."""
@@ -45,11 +45,11 @@ class Slots:
 
 
 class Child(ABC):
-    """A child process, which gets its device when its turn comes."""
+    """A child process; the queue gives it a device by `begin_work`."""
 
     @abstractmethod
     def begin_work(self, device: str) -> None:
-        """Begin its work on a device."""
+        """Begin the work on a device, such as "cuda:1"."""
 
     @property
     @abstractmethod
@@ -75,11 +75,13 @@ def run_children(
     starts_early: bool,
     max_seconds: float = math.inf,
 ) -> None:
-    """Run child processes until none is left; an interruption ends all of them.
+    """Run child processes until `start` returns no more; a signal or an error ends all of them.
 
-    All are asked to end before the first is waited for; a second signal ends them at once. `start`
-    gets the children that have not ended, and returns the next one, or None if none is left or can
-    begin yet. With `starts_early`, up to `slots.jobs` more children start and wait for their turn.
+    `start` gets the children that have not ended, and returns the next one, or None if none is left
+    or can start yet. `finished` gets each child that has ended. With `starts_early`, up to
+    `slots.jobs` more children start and wait for a free slot. After `max_seconds` none begins its
+    work. After a signal all are asked to end before the first is waited for; a second signal ends
+    them at once.
     """
     waiting, running = deque[SomeChild](), dict[int, SomeChild]()
     deadline = time.monotonic() + max_seconds
@@ -120,7 +122,7 @@ def run_children(
 
 
 def _end(children: Sequence[Child]) -> None:
-    """End children: all are asked first, so that they save their work at the same time."""
+    """End children; all are asked before the first is waited for, so that they save in parallel."""
     try:
         _stop(children, at_once=False)
     except BaseException:
@@ -181,17 +183,17 @@ Item = TypeVar("Item")
 
 
 def part_of(
-    items: Sequence[Item], part: str | None, together: Callable[[Item], Hashable]
+    items: Sequence[Item], part: str | None, group_of: Callable[[Item], Hashable]
 ) -> list[Item]:
     """Return part K of N of the items, for `part` "K/N" such as "2/8"; None: all of them.
 
-    Items must be in the same order on all machines. Items with equal `together` are in one part.
+    Items must be in the same order on all machines. Those of equal `group_of` are in one part.
     """
     if part is None:
         return list(items)
     number, mark, count = part.partition("/")
     if not (mark and number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count)):
         raise NPAError(f"part must be K/N with K from 1 to N, got {part!r}: --part 2/8")
-    groups = list(dict.fromkeys(map(together, items)))
+    groups = list(dict.fromkeys(map(group_of, items)))
     mine = set(groups[int(number) - 1 :: int(count)])
-    return [item for item in items if together(item) in mine]
+    return [item for item in items if group_of(item) in mine]
