@@ -29,7 +29,7 @@ Event = str | DamageEvent
 
 
 class _DamagesWorlds(WrapperBase):
-    """Mixin with the events and their damage, for one world or many."""
+    """Mixin that damages worlds at the steps of `events`, for one world or many."""
 
     def __init__(self, env: Any, events: Event | Sequence[Event]) -> None:
         several = entries(events)
@@ -55,12 +55,12 @@ class _DamagesWorlds(WrapperBase):
             env = env.env
 
     def _due(self, elapsed: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return which events are due in which worlds, [E, B], by steps of their episodes, [B]."""
+        """Return whether each event is due in each world, [E, B], after `elapsed` [B] steps."""
         due: NDArray[np.bool_] = np.array([[event.step] for event in self.events]) == elapsed
         return due
 
-    def _particles(self, due: NDArray[np.bool_]) -> tuple[Tensor, Tensor]:
-        """Return positions and states of all worlds, damaged where events are due, shape [E, B]."""
+    def _damaged_particles(self, due: NDArray[np.bool_]) -> tuple[Tensor, Tensor]:
+        """Return positions and states of all worlds, damaged by the events `due` there [E, B]."""
         worlds = self._base.worlds
         x, s = worlds.x.clone(), worlds.s.clone()
         for k, (event, mask) in enumerate(zip(self.events, due, strict=True), self._first):
@@ -104,13 +104,13 @@ class DamageEvents(_DamagesWorlds, AnyWrapper):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Start an episode; as for the environment itself."""
+        """Start an episode; arguments and results are those of the environment."""
         observation, info = self.env.reset(seed=seed, options=options)
         self._elapsed = 0
         return self._damaged(observation, info)
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Step; as for the environment itself."""
+        """Step the world; arguments and results are those of the environment."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         self._elapsed += 1
         if not (terminated or truncated):
@@ -123,7 +123,7 @@ class DamageEvents(_DamagesWorlds, AnyWrapper):
             return observation, info
         worlds = self._base.worlds
         before = float(worlds.loss[0])
-        x, s = self._particles(due)
+        x, s = self._damaged_particles(due)
         observation = self._base.place_particles(x[0], s[0])
         losses = self._base.losses_of(worlds.report.numbers[:, 0].tolist())
         losses["loss_damage"] = info.get("loss_damage", 0.0) + losses["loss"] - before
@@ -131,7 +131,7 @@ class DamageEvents(_DamagesWorlds, AnyWrapper):
 
 
 class VectorDamageEvents(_DamagesWorlds, EpisodeWrapper):
-    """`DamageEvents` for vector environments, by the steps of each world's own episode.
+    """`DamageEvents` for vector environments; steps are counted in each world's own episode.
 
     World k is damaged as the single environment with the same seed, bit for bit. Arguments and
     errors are those of `DamageEvents`, except `env`, a vector environment of this package.
@@ -160,7 +160,7 @@ class VectorDamageEvents(_DamagesWorlds, EpisodeWrapper):
         before = worlds.loss.clone()
         damaged = np.asarray(due.any(axis=0))
         chosen = world_indices(damaged, base.task.device)
-        x, s = self._particles(due)
+        x, s = self._damaged_particles(due)
         observations = base.place_particles(x[chosen], s[chosen], chosen)
         output = base.config.output
         # Arrays are float64, as in environments, and differences equal those of single ones.

@@ -67,7 +67,7 @@ class RslRlParticleEnv(ParticleRowsBase, VecEnv):  # type: ignore[misc]
         )
 
     def get_observations(self) -> TensorDict:
-        """Return the current observations, "policy" of shape [B N, P]."""
+        """Return the current observations, shape [B N, P], as the entry "policy"."""
         rows = self._observations.reshape(self.num_envs, -1)
         return TensorDict({"policy": rows}, batch_size=[self.num_envs], device=self.device)
 
@@ -97,7 +97,7 @@ class RslRlParticleEnv(ParticleRowsBase, VecEnv):  # type: ignore[misc]
 
 
 def _episode_log(infos: dict[str, Any]) -> dict[str, Tensor]:
-    """Return means over the worlds whose episodes are over, without synchronising."""
+    """Return mean final loss and success of the episodes that ended, without synchronising."""
     final, which = infos["final_info"], infos["_final_info"]
     return {
         f"Episode/{name}": torch.where(which, final[name].float(), 0.0).sum() / which.sum()

@@ -33,10 +33,10 @@ def parse_options(
     description: str | None = None,
     default: OptionsT | None = None,
 ) -> OptionsT:
-    """Parse a command's arguments over `default`, or over the dataclass's defaults.
+    """Parse a command's arguments to the dataclass `cls`; `default` has the values of the others.
 
     Ends the process after `--help`, and with code 2 for a wrong argument. The help begins with
-    `description` or the dataclass's docstring.
+    `description`, by default the dataclass's docstring.
     """
     kwargs: dict[str, Any] = {} if default is None else {"default": default}
     options: OptionsT = tyro.cli(
@@ -58,7 +58,7 @@ class DeviceOptions:
     """Where to run: cpu, cuda, cuda:1."""
 
     def checked_device(self) -> torch.device:
-        """Return the checked device."""
+        """Return `device`; raise NPAError if this machine has no such device."""
         from npa_envs.devices import check_device
 
         return check_device(self.device)
@@ -94,13 +94,13 @@ class RuleOptions(RunOptions):
 
     @property
     def world(self) -> dict[str, Any]:
-        """The options of the rule's world, as keywords of `task_of_rule`."""
+        """Options that change the rule's task and world, as keywords of `task_of_rule`."""
         names = ("target", "loss", "data", "particle_count", "eps", "update_prob")
         return {name: getattr(self, name) for name in names}
 
 
 def named_rules(arguments: Iterable[str]) -> dict[str, str]:
-    """Return the sources of rules by name: the package's rules, then files and run folders."""
+    """Return rules by name: shipped and initial ones, then the paths of files and run folders."""
     from npa_envs.rule.files import preset_rules, shipped_rules
     from npa_envs.web.rule_world import name_of
 
@@ -188,7 +188,10 @@ class MeasureOptions(RunOptions):
 
 
 def check_numbers(options: Any, **least: int) -> None:
-    """Check that options are None or at least so large, and that `max_seconds` is positive."""
+    """Check that each option named in `least` is None or at least its value there.
+
+    Also check that the option `max_seconds`, if there is one, is positive.
+    """
     for name, smallest in least.items():
         value = getattr(options, name)
         if value is not None and value < smallest:
@@ -199,7 +202,7 @@ def check_numbers(options: Any, **least: int) -> None:
 
 
 def named_values(name: str, arguments: Iterable[str]) -> dict[str, Any]:
-    """Parse arguments NAME=VALUE of an option; values are JSON or plain text."""
+    """Parse the arguments NAME=VALUE of the option `name`; values are JSON or plain text."""
     values: dict[str, Any] = {}
     for word in arguments:
         key, mark, value = word.partition("=")
@@ -213,7 +216,7 @@ def named_values(name: str, arguments: Iterable[str]) -> dict[str, Any]:
 
 
 def first_options(arguments: Sequence[str]) -> argparse.Namespace:
-    """Return the options of a run that decide the defaults of others, before all are parsed."""
+    """Parse only those options of a run that decide the defaults of others, such as `--preset`."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     for name in ("preset", "device", "gpus"):
         parser.add_argument(f"--{name}")
@@ -228,9 +231,10 @@ def first_options(arguments: Sequence[str]) -> argparse.Namespace:
 
 
 def resolve_run(arguments: Sequence[str], out_of: Callable[[Sequence[str]], Path]) -> list[str]:
-    """Return arguments with the device of `--gpus`, and `--resume` or nothing for `--resume auto`.
+    """Return a run's arguments with `--device cuda` if there are `--gpus`, and without `auto`.
 
-    `out_of` returns the folder of the run, in which a checkpoint is looked for.
+    `--resume auto` becomes `--resume` if there is a checkpoint in the run's folder, which `out_of`
+    returns; else it is removed.
     """
     first = first_options(arguments)
     resolved = list(arguments)
@@ -262,7 +266,7 @@ def chosen_names(noun: str, names: Sequence[str], known: Iterable[str]) -> list[
 
 @contextlib.contextmanager
 def torch_threads(count: int) -> Iterator[None]:
-    """Set torch's number of CPU threads within the block."""
+    """Set torch's number of CPU threads within a `with` block."""
     import torch
 
     before = torch.get_num_threads()
@@ -290,7 +294,7 @@ def progress_bar(
 def measuring(
     options: Any, total: int | None, unit: str = "step"
 ) -> Iterator[Callable[[int], None]]:
-    """Show a progress bar and use `options.threads` CPU threads within the block."""
+    """Show a progress bar and use `options.threads` CPU threads within a `with` block."""
     with (
         progress_bar(total, show=options.progress, unit=unit) as advance,
         torch_threads(options.threads),

@@ -84,7 +84,7 @@ class CompareOptions(common.PartOptions, common.MeasureOptions):
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run what is missing, print and write; return 1 if a run failed."""
+    """Run the comparison's missing runs, print and write its table; return 1 if a run failed."""
     options = common.parse_options(CompareOptions, "compare", arguments)
     from npa_envs.agents.comparison.npa_bench import SUITES, check_rows, write_rows
     from npa_envs.agents.comparison.report import write_pictures, write_table
@@ -139,7 +139,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def make_plan(options: CompareOptions) -> ComparisonPlan:
-    """Return the plan of the options; with a suite they choose only tasks, methods and seeds."""
+    """Return the tasks, methods, seeds and budgets to compare; a suite fixes tasks and budgets."""
     from npa_envs.agents.comparison import npa_bench
     from npa_envs.agents.comparison.plan import LEFT_OUT, PROBLEMS, ComparisonPlan, make_problem
     from npa_envs.agents.learning import METHODS
@@ -225,7 +225,7 @@ def _budgets(options: CompareOptions) -> dict[Axis, float]:
 def _chosen_methods(
     arguments: Sequence[str], known: Iterable[str]
 ) -> tuple[list[str], dict[str, str]]:
-    """Return the names of the methods to run, and the methods of new names (NAME=METHOD)."""
+    """Return the names of the methods to run; of those given as NAME=METHOD also METHOD by NAME."""
     from npa_envs.agents.learning import method_options
 
     known = list(known)
@@ -271,7 +271,7 @@ def _method_options(
 
 
 def _jobs(options: CompareOptions) -> int:
-    """Return the number of runs at the same time; with --learning-seconds, equal on all devices."""
+    """Return the number of runs at a time; with --learning-seconds a multiple of the devices'."""
     count = len(options.devices or (options.device,))
     jobs = count if options.jobs is None else options.jobs
     if options.learning_seconds is not None and jobs % count:
@@ -283,7 +283,7 @@ def _jobs(options: CompareOptions) -> int:
 
 
 def _settings(options: CompareOptions) -> dict[str, Any]:
-    """Return the machine, versions and threads, which the record names."""
+    """Return the record's entries on machine, versions and CPU threads."""
     from npa_envs.devices import check_device
     from npa_envs.measure.benchmark_records import installed_version, machine, measured_facts
 

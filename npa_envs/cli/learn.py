@@ -62,7 +62,7 @@ class LearnOptions(common.SharedRunOptions, common.RunOptions):
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Learn; return 130 if it was stopped."""
+    """Learn an environment; return 0, or 130 if learning was stopped."""
     from npa_envs.training.process_launcher import (
         joined_processes,
         launch,

@@ -87,7 +87,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def problem_of(options: RecordOptions) -> Problem:
-    """Return the environment with its keywords."""
+    """Return the environment to record, checked to be of one species."""
     from npa_envs.agents.learning.problem import Problem, registration_of
 
     problem = Problem(
@@ -104,7 +104,7 @@ def problem_of(options: RecordOptions) -> Problem:
 
 
 def policy_of(options: RecordOptions, problem: Problem) -> Callable[[Any], Any]:
-    """Return the policy that the options name."""
+    """Return the policy named by `options.policy`, loaded or made for the environment."""
     from npa_envs.agents.learning import Budget, RuleSet, train
     from npa_envs.agents.learning.problem import WORLDS_PER_SEED
 

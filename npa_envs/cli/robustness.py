@@ -19,8 +19,8 @@ QUICK_SEEDS, QUICK_PARTICLES = 2, 256
 class RobustnessOptions(common.MeasureOptions):
     """Measure how rules grow under changed conditions, and how they recover from damage.
 
-    The result is a table of figures over seeds; `npa-envs stress` is the command with verdicts.
-    With --out a rule's JSON file is written after each value, and a stopped run continues there.
+    The result is a table of losses over seeds, without a verdict (`npa-envs stress` has those).
+    With --out each rule's JSON file is saved after each measurement, and a stopped run continues.
 
     Examples:
       npa-envs robustness heart --quick
@@ -47,7 +47,7 @@ class RobustnessOptions(common.MeasureOptions):
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Measure, print and write."""
+    """Measure rules that are not measured yet, print all tables and write them to `--out`."""
     options = common.parse_options(RobustnessOptions, "robustness", arguments)
     from npa_envs.atomic_files import write_text
     from npa_envs.measure.accuracy.trained_rule_checks import task_name

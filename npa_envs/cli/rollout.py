@@ -48,7 +48,7 @@ class RolloutCommand(common.RuleOptions):
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Grow, film and write; return 0."""
+    """Grow the rule, print its loss, and write films and point files."""
     options = common.parse_options(RolloutCommand, "rollout", arguments)
     import torch
 
