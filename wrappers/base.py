@@ -41,7 +41,7 @@ VectorStep = tuple[Any, Any, Any, Any, dict[str, Any]]
 
 
 def base_env(env: Any, wrapper: str, cls: type[BaseEnv]) -> BaseEnv:
-    """Return the `cls`, an environment of this package, under wrappers; errors name `wrapper`."""
+    """Return the environment of class `cls` under all wrappers of `env`; errors name `wrapper`."""
     base = getattr(env, "unwrapped", None)
     if isinstance(base, cls):
         return base
@@ -57,7 +57,7 @@ def base_env(env: Any, wrapper: str, cls: type[BaseEnv]) -> BaseEnv:
 
 
 def vector_env(env: Any, wrapper: str) -> NPAVectorEnv:
-    """Return the vector environment of this package under wrappers; errors name `wrapper`."""
+    """Return this package's vector environment under all wrappers; errors name `wrapper`."""
     return base_env(env, wrapper, NPAVectorEnv)
 
 
@@ -75,17 +75,6 @@ def torch_env(env: Any, adapter: str) -> NPAVectorEnv:
             "make the environment with copy=True, the default"
         )
     return base
-
-
-def check_untouched(env: Any, wrapper: str) -> None:
-    """Check that the wrappers in `env` do not change the observation space."""
-    name = "single_observation_space" if isinstance(env, VectorEnv) else "observation_space"
-    space, base_space = getattr(env, name), getattr(env.unwrapped, name)
-    if space != base_space:
-        raise NPAError(
-            f"env must give observations as the environment makes them, {base_space}, got {space}: "
-            f"put {wrapper} under the wrappers that change observations"
-        )
 
 
 def autoreset_mode(env: AnyVectorEnv) -> AutoresetMode:
@@ -111,11 +100,6 @@ def check_autoreset(mode: AutoresetMode, name: str) -> None:
 def as_tensor(values: Any) -> Tensor:
     """Return an array or tensor as a tensor, without a copy."""
     return values if isinstance(values, Tensor) else torch.from_numpy(np.asarray(values))
-
-
-def in_type_of(result: Tensor, values: Any) -> Any:
-    """Return a tensor as an array if `values` are an array, else unchanged."""
-    return result if isinstance(values, Tensor) else result.numpy()
 
 
 def to_host(values: Any) -> NDArray[Any]:
@@ -178,8 +162,12 @@ class ParticleRowsBase:
 
     num_envs: int
 
-    def set_env(self, env: Any, base: NPAVectorEnv) -> None:
-        """Set the environment whose particles are rows; `base` is the one below its wrappers."""
+    def set_env(self, env: Any, base: NPAVectorEnv, mode: str) -> None:
+        """Set the environment whose particles are rows, and check its autoreset mode.
+
+        `base` is the one under its wrappers; `mode` is the mode's name.
+        """
+        check_autoreset(autoreset_mode(env), mode)
         self.vector_env = env
         """The environment whose particles these are."""
         self.world_count = base.num_envs
@@ -189,7 +177,7 @@ class ParticleRowsBase:
         self.num_envs = self.world_count * self.particle_count
 
     def step_worlds(self, actions: Any) -> VectorStep:
-        """Step all worlds by actions [B N, A]; return what rows get, [B N, ...], and the infos."""
+        """Step all worlds by actions [B N, A]; return rows' results [B N, ...] and the infos."""
         check_row_actions(actions, self.num_envs, *self.vector_env.single_action_space.shape[1:])
         by_world = actions.reshape(self.world_count, self.particle_count, -1)
         observations, rewards, ended, cut, infos = self.vector_env.step(by_world)

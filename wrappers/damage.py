@@ -20,7 +20,6 @@ from npa_envs.wrappers.base import (
     EpisodeWrapper,
     VectorStep,
     WrapperBase,
-    check_untouched,
     world_indices,
 )
 
@@ -46,7 +45,12 @@ class _DamagesWorlds(WrapperBase):
         self.events = tuple(parse_damage(e) if isinstance(e, str) else e for e in several)
         """The events; those of one step are applied in this order."""
         super().__init__(env, events=[str(event) for event in self.events])
-        check_untouched(env, type(self).__name__)
+        space, base_space = (getattr(e, self.space_name) for e in (env, env.unwrapped))
+        if space != base_space:
+            raise NPAError(
+                f"env must give observations as the environment makes them, {base_space}, got "
+                f"{space}: put {type(self).__name__} under the wrappers that change observations"
+            )
         # Events of nested wrappers have different numbers, so that they draw different places.
         self._first = 0
         while hasattr(env, "env"):

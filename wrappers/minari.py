@@ -92,9 +92,6 @@ def _recorded(env: Any, policy: Callable[[Any], Any], seeds: list[int]) -> list[
         observations.append(_host(observation))
         losses.append(loss)
 
-    def stacked(*arrays: Any) -> Any:
-        return np.stack(arrays)
-
     names = ("actions", "rewards", "terminations", "truncations")
     episodes = []
     for k, length in enumerate(lengths.tolist()):
@@ -103,7 +100,7 @@ def _recorded(env: Any, policy: Callable[[Any], Any], seeds: list[int]) -> list[
             for number, name in enumerate(names)
         }
         world = [*(_of_world(one, k) for one in observations[:length]), last[k]]
-        episode["observations"] = _mapped(stacked, *world)
+        episode["observations"] = _mapped(lambda *arrays: np.stack(arrays), *world)
         world_losses = [loss[k] for loss in losses[: length + 1]]
         episode["infos"] = {"loss": np.array(world_losses, np.float64)}
         episodes.append(EpisodeBuffer(seed=seeds[k], **episode))

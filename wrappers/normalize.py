@@ -25,7 +25,6 @@ from npa_envs.wrappers.base import (
     WrapperBase,
     as_tensor,
     check_tensor,
-    in_type_of,
     world_indices,
 )
 
@@ -143,7 +142,8 @@ class _PerceptionNormalizer(WrapperBase):
         z = as_tensor(observations)
         mean = self._spread(self.statistics.mean).to(z)
         scale = self._spread((self.statistics.var + self.epsilon).rsqrt()).to(z)
-        return in_type_of(((z - mean) * scale).clamp_(-self.clip, self.clip), observations)
+        normal = ((z - mean) * scale).clamp_(-self.clip, self.clip)
+        return normal if isinstance(observations, Tensor) else normal.numpy()
 
     def _spread(self, statistics: Tensor) -> Tensor:
         """Repeat statistics [3 C + 1] for the components of gradients, to shape [P]."""
@@ -249,7 +249,7 @@ class TorchNormalizeReward(RewardSums):
         return self.sums
 
     def use_sums(self, rewards: Tensor, sums: Tensor) -> tuple[Tensor, dict[str, Any]]:
-        """Return rewards [B] over the standard deviation of discounted returns, and no infos."""
+        """Return rewards [B] divided by the standard deviation of returns, and no infos."""
         restarted = self.clock.restarted
         if restarted.any() and not self.clock.same_step:
             # With next-step autoreset the step that restarts belongs to no episode.

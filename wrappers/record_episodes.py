@@ -78,6 +78,6 @@ class TorchRecordEpisodeStatistics(RewardSums):
         return rewards, {self._key: episode, f"_{self._key}": mask}
 
     def reset_sums(self, worlds: NDArray[np.bool_]) -> None:
-        """Set rewards' sums and starting times of the worlds in a mask, [B], for new episodes."""
+        """Reset reward sums and starting times of the worlds in a mask, [B]."""
         super().reset_sums(worlds)
         self._began[worlds] = time.perf_counter()

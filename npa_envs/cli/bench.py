@@ -25,7 +25,7 @@ class BenchOptions(common.MeasureOptions):
     quick: bool = False
     """Small worlds only: about a minute on a CPU."""
     repeats: int = 7
-    """Readings of every time; tables show their median and range."""
+    """How often each time is measured; tables show median and range."""
     out: Path | None = None
     """Folder for SUITE_DEVICE.json and plots; default: nothing is written."""
     max_seconds: float | None = None

@@ -171,10 +171,10 @@ class SharedRunOptions:
     gpus: int | None = None
     """GPUs that share the run: `--gpus 4` means `--device cuda --processes 4`."""
     resume: bool = False
-    """Continue from the checkpoint in the folder `out`, `train` with the configuration of that
-    folder. `--resume auto`: if there is one; else start."""
+    """Continue from the checkpoint in the folder `--out`; `train` also takes its configuration from
+    there. `--resume auto` starts a new run if there is no checkpoint."""
     overwrite: bool = False
-    """Start again even if the folder `out` contains a run; the run's files are removed."""
+    """Start again even if the folder `--out` contains a run; the run's files are removed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -182,7 +182,7 @@ class MeasureOptions(RunOptions):
     """Options of the commands that measure and keep records."""
 
     threads: int = 1
-    """CPU threads of torch and the kernels in each run; they change times, not figures."""
+    """CPU threads of torch and the kernels in each run; they change times, not other results."""
     commit: str | None = None
     """The measured commit, for the record; default: that of the checkout."""
 

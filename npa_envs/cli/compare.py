@@ -139,7 +139,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def make_plan(options: CompareOptions) -> ComparisonPlan:
-    """Return the tasks, methods, seeds and budgets to compare; a suite fixes tasks and budgets."""
+    """Return the tasks, methods, seeds and budgets to compare; a suite fixes the budgets."""
     from npa_envs.agents.comparison import npa_bench
     from npa_envs.agents.comparison.plan import LEFT_OUT, PROBLEMS, ComparisonPlan, make_problem
     from npa_envs.agents.learning import METHODS
@@ -167,14 +167,16 @@ def make_plan(options: CompareOptions) -> ComparisonPlan:
     if suite and quick and not options.tasks:
         tasks = tasks[:1]
     methods, own = _chosen_methods(options.methods, suite.methods if suite else METHODS)
-    changed_options = _method_options(options.options, methods, own) if suite else {}
-    for name in changed_options.keys() - own.keys():
-        raise NPAError(
-            f"options of {name!r} are frozen in {options.suite}: give it a name of its own, "
-            f"--methods my_{name}={name} --options my_{name}.NAME=VALUE"
-        )
+    if not (suite or options.methods):
+        methods = [name for name in methods if name != "clone"]  # It needs a teacher.
+    changed_options = _method_options(options.options, methods, own)
     budgets: dict[Axis, dict[str, float]]
     if suite:
+        for name in changed_options.keys() - own.keys():
+            raise NPAError(
+                f"options of {name!r} are frozen in {options.suite}: give it a name of its own, "
+                f"--methods my_{name}={name} --options my_{name}.NAME=VALUE"
+            )
         problems = {name: suite.problem_of(name) for name in tasks}
         part = npa_bench.QUICK_FRACTION if quick else 1.0
         steps = {name: part * suite.budgets[suite.tasks[name]] for name in tasks}
@@ -186,11 +188,8 @@ def make_plan(options: CompareOptions) -> ComparisonPlan:
         ]
         seeds, episodes = 1 if quick else npa_bench.MIN_SEEDS, npa_bench.EPISODES
     else:
-        if not options.methods:
-            methods = [name for name in methods if name != "clone"]  # It needs a teacher.
         problems = {name: make_problem(name, quick=quick) for name in tasks}
         budgets = {axis: dict.fromkeys(tasks, limit) for axis, limit in _budgets(options).items()}
-        changed_options = _method_options(options.options, methods, own)
         left_out = [] if options.methods else list(LEFT_OUT)
         seeds, episodes = 3, 32
     return ComparisonPlan(
@@ -271,7 +270,7 @@ def _method_options(
 
 
 def _jobs(options: CompareOptions) -> int:
-    """Return the number of runs at a time; with --learning-seconds a multiple of the devices'."""
+    """Return how many runs run at a time; a multiple of the device count for equal wall time."""
     count = len(options.devices or (options.device,))
     jobs = count if options.jobs is None else options.jobs
     if options.learning_seconds is not None and jobs % count:

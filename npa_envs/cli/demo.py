@@ -52,7 +52,7 @@ class DemoOptions(common.RunOptions):
     train_seconds: float = 30.0
     """Time for the training [s]."""
     seed: int = 0
-    """Randomness."""
+    """Seed of all random numbers."""
 
 
 def main(arguments: Sequence[str]) -> int:

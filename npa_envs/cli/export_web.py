@@ -30,7 +30,7 @@ class ExportOptions:
     out: Path = Path("page.html")
     """The file to write."""
     gallery: bool = False
-    """Begin with pictures to choose from; default of RULE: all shipped 2D rules."""
+    """Begin with pictures to choose from; without RULE: of all shipped 2D rules."""
     title: str | None = None
     """Title of the page; default: the first rule's name."""
     particle_count: int | None = None

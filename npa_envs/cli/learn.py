@@ -56,7 +56,7 @@ class LearnOptions(common.SharedRunOptions, common.RunOptions):
     episodes: int = 16
     """Episodes that evaluate each point of the curve."""
     curve_points: int = 20
-    """Points of the curve after the first, and checkpoints."""
+    """Points of the learning curve after the first; each writes a checkpoint."""
     out: Path = Path("runs/learn")
     """Folder for checkpoint, rules and curve."""
 

@@ -43,7 +43,7 @@ class RecordOptions(common.RunOptions):
     episodes: int = 16
     """Episodes to record, each from a different seed."""
     first_seed: int = 0
-    """The first one's seed; the others follow."""
+    """Seed of the first episode; the others have the seeds after it."""
     num_envs: int = 16
     """Worlds that run at the same time."""
     keywords: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE")] = ()

@@ -31,9 +31,9 @@ class RobustnessOptions(common.MeasureOptions):
     """Shipped rules (`npa-envs list`), initial rules of presets (`seven-pictures`), files of rules,
     or folders of runs; default: all shipped ones, or one of each task when quick."""
     seed_count: int | None = None
-    """Seeds for each figure; default: 8, or 2 when quick."""
+    """Worlds of each condition, each from its own seed; default: 8, or 2 when quick."""
     first_seed: int = 1_000_000
-    """The first seed's number; training uses others."""
+    """The first seed; training uses others."""
     most_particles: int | None = None
     """Conditions with more particles in all seeds' worlds together are left out; default: 131072 on
     a CPU, 2097152 on CUDA."""

@@ -28,8 +28,8 @@ class SearchOptions(common.RunOptions, SearchWorld):
     """
 
     method: Literal["map-elites", "cma-me", "cma-es", "random"] = "map-elites"
-    """What proposes candidates: mutants of elites; CMA-ES rewarded for what is new, or for quality
-    alone; chance."""
+    """How candidates are proposed: as mutants of elites, by CMA-ES rewarded for new elites (cma-me)
+    or for quality (cma-es), or at random."""
     budget: float = 2e7
     """Particle-steps of the whole search: candidates times worlds, particles and steps."""
     batch_size: int = 20
@@ -39,7 +39,7 @@ class SearchOptions(common.RunOptions, SearchWorld):
     threads: int = 1
     """CPU threads of torch and of the kernels."""
     max_seconds: float | None = None
-    """Stop after this time; the same command goes on. Default: never."""
+    """Stop after this time [s]; the same command continues. Default: never."""
     out: Path = Path("runs/search")
     """Folder to write to; created where missing."""
 

@@ -62,7 +62,7 @@ class SweepOptions(common.PartOptions):
 
 @dataclass
 class SweepRun(Child):
-    """A training process for one combination of values; it resumes a run in its folder."""
+    """A training process for one combination of values; starts or resumes the run in a folder."""
 
     values: Mapping[str, str]
     """Values by option."""
