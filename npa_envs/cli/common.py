@@ -22,6 +22,8 @@ from npa_envs.errors import NPAError, suggest
 if TYPE_CHECKING:
     import torch
 
+    from npa_envs.agents.learning import Problem
+
 OptionsT = TypeVar("OptionsT")
 
 
@@ -188,10 +190,7 @@ class MeasureOptions(RunOptions):
 
 
 def check_numbers(options: Any, **least: int) -> None:
-    """Check that each option named in `least` is None or at least its value there.
-
-    Also check that the option `max_seconds`, if there is one, is positive.
-    """
+    """Check that options are None or at least their value in `least`, and `max_seconds` > 0."""
     for name, smallest in least.items():
         value = getattr(options, name)
         if value is not None and value < smallest:
@@ -213,6 +212,15 @@ def named_values(name: str, arguments: Iterable[str]) -> dict[str, Any]:
         except ValueError:
             values[key] = value
     return values
+
+
+def problem_of(options: Any, num_envs: int, steps: int | None = None) -> Problem:
+    """Return the environment of the options `env` and `keywords`; `steps`: length of episodes."""
+    from npa_envs.agents.learning.problem import Problem, registration_of
+
+    steps = registration_of(options.env).steps if steps is None else steps
+    keywords = named_values("keywords", options.keywords)
+    return Problem(env_id=options.env, keywords=keywords, episode_steps=steps, num_envs=num_envs)
 
 
 def first_options(arguments: Sequence[str]) -> argparse.Namespace:

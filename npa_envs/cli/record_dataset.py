@@ -88,14 +88,7 @@ def main(arguments: Sequence[str]) -> int:
 
 def problem_of(options: RecordOptions) -> Problem:
     """Return the environment to record, checked to be of one species."""
-    from npa_envs.agents.learning.problem import Problem, registration_of
-
-    problem = Problem(
-        env_id=options.env,
-        keywords=common.named_values("keywords", options.keywords),
-        episode_steps=registration_of(options.env).steps,
-        num_envs=min(options.num_envs, options.episodes),
-    )
+    problem = common.problem_of(options, min(options.num_envs, options.episodes))
     if problem.controlled == "species":
         raise NPAError(
             f"env must be of one species, as Minari keeps one agent's episodes, got {options.env}"

@@ -113,10 +113,7 @@ class SweepRun(Child):
         write_record(self.folder / RECORD, {"facts": {"words": self.arguments}, **result})
 
     def record(self) -> tuple[int, float] | None:
-        """Return the recorded exit code and wall time [s], or None if the run has no record.
-
-        Raises an NPAError if the record is of other arguments.
-        """
+        """Return the recorded exit code and wall time [s], or None if the run has no record."""
         return read_record(
             self.folder / RECORD,
             {"words": self.arguments},
@@ -176,10 +173,7 @@ def main(arguments: Sequence[str]) -> int:
 def combinations(
     over: Sequence[str], task_words: Sequence[str], folder: Path = Path(), threads: int = 1
 ) -> list[SweepRun]:
-    """Return a run for each combination of the values NAME=A,B,C in `over`.
-
-    `task_words` are the other arguments of `npa-envs train`: the task, and options of all runs.
-    """
+    """Return a run of `npa-envs train TASK_WORDS` with each combination of values NAME=A,B,C."""
     from npa_envs.training import TASKS
 
     if not task_words or task_words[0] not in TASKS:

@@ -117,10 +117,7 @@ def parse_run(task_name: str, arguments: Sequence[str]) -> tuple[TrainOptions, T
 def _check_preset(
     name: str, run: TrainConfig[Any], task_name: str, folder: RunFolder, arguments: Sequence[str]
 ) -> None:
-    """Check that the resumed run, of configuration `run`, was started with the preset `name`.
-
-    Fields that `arguments` set may differ.
-    """
+    """Check that a resumed run has the fields of the preset `name`, except those in `arguments`."""
     presets = {name: config_to_dict(one) for name, one in task_entry(task_name).presets.items()}
     values = config_to_dict(run)
     changed = {word.partition("=")[0].lstrip("-").replace("-", "_") for word in arguments}
