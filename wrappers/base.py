@@ -207,13 +207,13 @@ class EpisodeClock:
         self.elapsed = np.zeros(env.num_envs, dtype=np.int64)
         """Steps since the start of the running episode, shape [B]."""
         self.lengths = np.zeros_like(self.elapsed)
-        """Steps, after the last one, of the episode that it belonged to, shape [B]."""
+        """Length, after the last step, of the episode that the step belonged to, shape [B]."""
         self.ended = np.zeros(env.num_envs, dtype=bool)
         """Whether the last step ended an episode, shape [B]."""
         self.restarted = np.zeros_like(self.ended)
         """Whether the last observation is the first of an episode, shape [B]."""
         self.observed = np.ones_like(self.ended)
-        """Whether the last observation is new, shape [B]; not if a reset was of other worlds."""
+        """Whether the last observation is new, shape [B]; a reset of other worlds repeats it."""
 
     def reset(self, options: dict[str, Any] | None) -> None:
         """Restart the counters of the worlds in `options["reset_mask"]`, by default of all."""

@@ -51,7 +51,7 @@ class _DamagesWorlds(WrapperBase):
                 f"env must give observations as the environment makes them, {base_space}, got "
                 f"{space}: put {type(self).__name__} under the wrappers that change observations"
             )
-        # Events of nested wrappers have different numbers, so that they draw different places.
+        # Events of nested wrappers have different numbers, so that they draw different positions.
         self._first = 0
         while hasattr(env, "env"):
             if isinstance(env, _DamagesWorlds):
@@ -86,10 +86,10 @@ class DamageEvents(_DamagesWorlds, AnyWrapper):
     """Damage the world after certain steps of each episode.
 
     An event happens after its step: the observation of that step shows the damage, its reward does
-    not include it. Step 0 damages the initial world. Places and angles come from the world's seed,
-    and are the same in a vector environment (`VectorDamageEvents`). A world whose episode is over
-    is not damaged, so put the wrapper around the result of `gym.make`, which includes the step
-    limit.
+    not include it. Step 0 damages the initial world. Position and angle of damage come from the
+    world's seed, and are the same in a vector environment (`VectorDamageEvents`). A world whose
+    episode is over is not damaged, so put the wrapper around the result of `gym.make`, which
+    includes the step limit.
 
     On such steps `info["loss_damage"]` is the rise of the loss; `info["loss"]`, its terms and
     further entries are those of the damaged world. Nested wrappers act as one with all their

@@ -373,7 +373,7 @@ class SpeciesVecEnv(RowVecEnv):
 
     Args:
         env: From `multispecies_v0.batched`, with same-step autoreset.
-        others: Policies of the species that are no rows, by name.
+        others: Policies of the species that are not rows, by name.
 
     Raises:
         NPAError: `env` is another environment or has another autoreset mode, a name in `others` is

@@ -35,7 +35,7 @@ def parse_options(
     description: str | None = None,
     default: OptionsT | None = None,
 ) -> OptionsT:
-    """Parse a command's arguments to the dataclass `cls`; `default` has the values of the others.
+    """Parse a command's arguments to the dataclass `cls`; options not given are as in `default`.
 
     Ends the process after `--help`, and with code 2 for a wrong argument. The help begins with
     `description`, by default the dataclass's docstring.
@@ -102,7 +102,7 @@ class RuleOptions(RunOptions):
 
 
 def named_rules(arguments: Iterable[str]) -> dict[str, str]:
-    """Return rules by name: shipped and initial ones, then the paths of files and run folders."""
+    """Return a dict from rules' names to what `load_rule` takes: a name, a file or a run folder."""
     from npa_envs.rule.files import preset_rules, shipped_rules
     from npa_envs.web.rule_world import name_of
 
@@ -215,7 +215,7 @@ def named_values(name: str, arguments: Iterable[str]) -> dict[str, Any]:
 
 
 def problem_of(options: Any, num_envs: int, steps: int | None = None) -> Problem:
-    """Return the environment of the options `env` and `keywords`; `steps`: length of episodes."""
+    """Return the environment `options.env`, with episodes of `steps`, by default as registered."""
     from npa_envs.agents.learning.problem import Problem, registration_of
 
     steps = registration_of(options.env).steps if steps is None else steps
@@ -239,7 +239,7 @@ def first_options(arguments: Sequence[str]) -> argparse.Namespace:
 
 
 def resolve_run(arguments: Sequence[str], out_of: Callable[[Sequence[str]], Path]) -> list[str]:
-    """Return a run's arguments with `--device cuda` if there are `--gpus`, and without `auto`.
+    """Return a run's arguments after replacing `--resume auto`, and adding the device of `--gpus`.
 
     `--resume auto` becomes `--resume` if there is a checkpoint in the run's folder, which `out_of`
     returns; else it is removed.

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from npa_envs.agents.comparison.single_run import RunRecord
 
 ROWS = "rows"
-"""Folder of a suite's rows in that of the comparison."""
+"""Folder, within that of the comparison, of the results of each method on a suite."""
 
 QUICK_EPISODES, QUICK_STEPS = 4, 200_000
 """Held-out episodes and particle-steps of a quick comparison."""

@@ -46,8 +46,9 @@ class InteractOptions(common.RunOptions, InteractionSettings):
     For every ordered pair of rules, distance, ratio and radius it measures: the first rule's task
     loss on its own particles, together and alone; how much the two mix; how far its centroid moves.
     "cooperates": the loss falls by more than the margin; "disrupted": it rises by more; "mixes":
-    the mixing index is 0.25 or more. Densities of each rule are divided by its own particles. The
-    folder gets a JSON file, a heat map, and a filmstrip of each pair. A stopped run continues.
+    the mixing index is 0.25 or more. Density gradients of each rule are divided by the number of
+    its own particles. The folder gets a JSON file, a heat map, and a filmstrip of each pair. A
+    stopped run continues.
 
     Examples:
       npa-envs interact gecko heart

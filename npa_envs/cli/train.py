@@ -99,7 +99,7 @@ class TrainOptions(common.SharedRunOptions):
 
 
 def resolve_task(task_name: str, arguments: Sequence[str]) -> list[str]:
-    """Return arguments of `npa-envs train` with `--resume auto` and `--gpus` resolved."""
+    """Return arguments after replacing `--resume auto`, and adding the device of `--gpus`."""
     return common.resolve_run(arguments, lambda words: parse_run(task_name, words)[1].out)
 
 
