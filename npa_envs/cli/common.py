@@ -79,8 +79,8 @@ class RuleOptions(RunOptions):
     """Options of commands that run one rule: the rule, its world and the device."""
 
     rule: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RULE")]
-    """A shipped rule (`npa-envs list`), the folder of a run, a file of ours or the authors'
-    (.safetensors, .pth), or a rule of their web demo (models.json#name)."""
+    """A shipped rule (`npa-envs list`), the folder of a run, a file of this package or of the
+    paper's authors (.safetensors, .pth), or a rule of their web demo (models.json#name)."""
     target: str | None = None
     """The target to measure against; default: the one that the rule was trained on."""
     loss: str | None = None

@@ -23,7 +23,7 @@ class DoctorOptions:
 
 
 class DoctorLine(NamedTuple):
-    """One line of the report."""
+    """A line of the report of `npa-envs doctor`."""
 
     subject: str
     text: str
@@ -39,7 +39,7 @@ class DoctorLine(NamedTuple):
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Print the report; return 1 if something is broken."""
+    """Print the report on this machine; return 1 if something is broken."""
     if arguments:
         # Imported late: the report must also appear if the parser's package is missing.
         from npa_envs.cli import common

@@ -176,7 +176,7 @@ ConfigT = TypeVar("ConfigT", bound=TrainConfig[Any])
 
 @dataclass(frozen=True)
 class Command(Generic[ConfigT]):
-    """All options of a command line, in the groups of its help."""
+    """All options of `npa-envs train TASK`, in the groups of its help."""
 
     run: TrainOptions
     training: ConfigT

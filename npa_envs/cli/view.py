@@ -64,7 +64,7 @@ class ViewOptions(common.DeviceOptions):
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Serve the world until Ctrl-C; return 0."""
+    """Serve a live world to the browser until Ctrl-C; return 0."""
     options = common.parse_options(ViewOptions, "view", arguments)
     if not 1 <= options.threads <= 256:
         raise NPAError(f"threads must be in [1, 256], got {options.threads}")
