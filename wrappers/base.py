@@ -275,14 +275,14 @@ class EpisodeWrapper(AnyVectorWrapper):
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Start episodes; arguments and results are those of the environment."""
+        """Start episodes, as the environment does."""
         # A copy, as wrappers of Gymnasium remove the mask from the dict.
         observations, infos = self.env.reset(seed=seed, options=options and dict(options))
         self.clock.reset(options)
         return self.after_reset(observations, infos)
 
     def step(self, actions: Any) -> VectorStep:
-        """Step all worlds; arguments and results are those of the environment."""
+        """Step all worlds, as the environment does."""
         outcome: VectorStep = self.env.step(actions)
         self.clock.step(*outcome[2:])
         return self.after_step(outcome)

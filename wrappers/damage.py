@@ -108,13 +108,13 @@ class DamageEvents(_DamagesWorlds, AnyWrapper):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Start an episode; arguments and results are those of the environment."""
+        """Start an episode, as the environment does."""
         observation, info = self.env.reset(seed=seed, options=options)
         self._elapsed = 0
         return self._damaged(observation, info)
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Step the world; arguments and results are those of the environment."""
+        """Step the world, as the environment does."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         self._elapsed += 1
         if not (terminated or truncated):

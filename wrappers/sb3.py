@@ -98,9 +98,9 @@ class RowVecEnv(VecEnv):
         return actions
 
     def infos(self, rows: NDArray[np.int64], entries: Mapping[str, Any]) -> list[dict[str, Any]]:
-        """Return the info of each row: `entries` in the M rows of index `rows`, else the empty one.
+        """Return the info of each row: the empty one, except in the M rows of index `rows`.
 
-        Each of `entries` has M values, one for each of these rows.
+        Each of their `entries` has M values, one for each of these rows.
         """
         infos: list[dict[str, Any]] = [self.shared_info] * self.num_envs
         for k, row in enumerate(rows.tolist()):

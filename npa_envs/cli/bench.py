@@ -54,7 +54,7 @@ class BenchOptions(common.MeasureOptions):
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Measure the suite's times, print its tables and write them to `--out`."""
+    """Measure times; print and write their tables."""
     options = common.parse_options(BenchOptions, "bench", arguments)
     from npa_envs.atomic_files import write_text
     from npa_envs.measure import benchmark_records, plots

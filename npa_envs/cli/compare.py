@@ -84,7 +84,7 @@ class CompareOptions(common.PartOptions, common.MeasureOptions):
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run the comparison's missing runs, print and write its table; return 1 if a run failed."""
+    """Do the missing runs, print and write the table; return 1 if a run failed."""
     options = common.parse_options(CompareOptions, "compare", arguments)
     from npa_envs.agents.comparison.npa_bench import SUITES, check_rows, write_rows
     from npa_envs.agents.comparison.report import write_pictures, write_table

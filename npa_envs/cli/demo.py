@@ -56,7 +56,7 @@ class DemoOptions(common.RunOptions):
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Grow, heal and train rules; print losses and files and write them to report.txt."""
+    """Grow, heal and train rules; print and write a report."""
     options = common.parse_options(DemoOptions, "demo", arguments)
     from npa_envs.atomic_files import write_text
 

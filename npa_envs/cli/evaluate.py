@@ -47,7 +47,7 @@ class EvaluateOptions(common.RuleOptions):
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Measure a rule's quality; print the tables and write them to `--json`."""
+    """Measure a rule's quality; print and write its tables."""
     options = common.parse_options(EvaluateOptions, "evaluate", arguments)
     from npa_envs.atomic_files import write_text
     from npa_envs.measure import quality

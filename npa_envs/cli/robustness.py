@@ -47,7 +47,7 @@ class RobustnessOptions(common.MeasureOptions):
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Measure rules that are not measured yet, print all tables and write them to `--out`."""
+    """Measure the rules that are left; print and write all tables."""
     options = common.parse_options(RobustnessOptions, "robustness", arguments)
     from npa_envs.atomic_files import write_text
     from npa_envs.measure.accuracy.trained_rule_checks import task_name

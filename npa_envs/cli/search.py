@@ -45,7 +45,7 @@ class SearchOptions(common.RunOptions, SearchWorld):
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Search; write the elites' rules and the atlas, a page and a picture that show them."""
+    """Search; write the elites' rules, and a page and a picture that show them."""
     options = common.parse_options(SearchOptions, "search", arguments)
     common.check_numbers(options, threads=1)
     from npa_envs.agents.search.atlas import PAGE, figure, page, write_elites
