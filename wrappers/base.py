@@ -41,7 +41,7 @@ VectorStep = tuple[Any, Any, Any, Any, dict[str, Any]]
 
 
 def base_env(env: Any, wrapper: str, cls: type[BaseEnv]) -> BaseEnv:
-    """Return this package's environment below wrappers; `wrapper` is named in errors."""
+    """Return the environment of class `cls` under all wrappers of `env`; errors name `wrapper`."""
     base = getattr(env, "unwrapped", None)
     if isinstance(base, cls):
         return base
@@ -57,12 +57,12 @@ def base_env(env: Any, wrapper: str, cls: type[BaseEnv]) -> BaseEnv:
 
 
 def vector_env(env: Any, wrapper: str) -> NPAVectorEnv:
-    """Return this package's vector environment below wrappers."""
+    """Return this package's vector environment under all wrappers; errors name `wrapper`."""
     return base_env(env, wrapper, NPAVectorEnv)
 
 
 def torch_env(env: Any, adapter: str) -> NPAVectorEnv:
-    """Return this package's vector environment with tensors that an adapter can keep."""
+    """Return the vector environment under wrappers, checked to give new tensors in each step."""
     base = vector_env(env, adapter)
     if base.config.output != "torch":
         raise NPAError(
@@ -75,17 +75,6 @@ def torch_env(env: Any, adapter: str) -> NPAVectorEnv:
             "make the environment with copy=True, the default"
         )
     return base
-
-
-def check_untouched(env: Any, wrapper: str) -> None:
-    """Check that the wrappers below do not change the observation space."""
-    name = "single_observation_space" if isinstance(env, VectorEnv) else "observation_space"
-    space, base_space = getattr(env, name), getattr(env.unwrapped, name)
-    if space != base_space:
-        raise NPAError(
-            f"env must give observations as the environment makes them, {base_space}, got {space}: "
-            f"put {wrapper} under the wrappers that change observations"
-        )
 
 
 def autoreset_mode(env: AnyVectorEnv) -> AutoresetMode:
@@ -102,7 +91,7 @@ RESTARTS = {
 
 
 def check_autoreset(mode: AutoresetMode, name: str) -> None:
-    """Check that an environment's autoreset mode is the one of this name."""
+    """Check that an environment's autoreset mode is the one called `name`."""
     if mode is not AUTORESET_MODES[name]:
         hint = f"make it with autoreset_mode={shown(name)}"
         raise NPAError(f"env must {RESTARTS[name]}, got {mode}: {hint}")
@@ -113,18 +102,13 @@ def as_tensor(values: Any) -> Tensor:
     return values if isinstance(values, Tensor) else torch.from_numpy(np.asarray(values))
 
 
-def like(result: Tensor, values: Any) -> Any:
-    """Return a tensor in the type of `values`: array or tensor."""
-    return result if isinstance(values, Tensor) else result.numpy()
-
-
 def to_host(values: Any) -> NDArray[Any]:
     """Return an array or tensor as an array; synchronises with the device."""
     return values.cpu().numpy() if isinstance(values, Tensor) else np.asarray(values)
 
 
 def check_tensor(values: Any, wrapper: str) -> None:
-    """Check that an environment returned a tensor to a wrapper."""
+    """Check that `values`, which an environment returned to a wrapper, are a tensor."""
     if not isinstance(values, Tensor):
         raise NPAError(
             f"{wrapper} needs torch tensors, got {type(values).__name__}: make the environment "
@@ -133,14 +117,14 @@ def check_tensor(values: Any, wrapper: str) -> None:
 
 
 def world_indices(mask: NDArray[np.bool_], device: torch.device) -> Tensor:
-    """Return the indices at which a mask, [B], is True, int64, shape [M]."""
+    """Return the indices of the M worlds at which a mask [B] is True, int64, shape [M]."""
     return torch.from_numpy(np.flatnonzero(mask)).to(device)
 
 
 def own_rewards(infos: dict[str, Any]) -> Any:
-    """Return each particle's reward of the last step, shape [B, N]; None without such rewards.
+    """Return each particle's reward of the last step, shape [B, N]; None if rewards are of worlds.
 
-    With same-step autoreset the rewards of worlds that restarted are in their final infos.
+    With same-step autoreset the rewards of worlds that restarted are taken from `final_info`.
     """
     rewards = infos.get("particle_reward")
     last = infos.get("final_info", {}).get("particle_reward")
@@ -151,7 +135,7 @@ def own_rewards(infos: dict[str, Any]) -> Any:
 
 
 def row_space(space: Any) -> Box:
-    """Return the space of one particle, from a world's box of shape [N, ...]."""
+    """Return the space of one particle, for a world's space of shape [N, ...]."""
     if not isinstance(space, Box) or len(space.shape) < 2:
         raise NPAError(
             "rows need an environment that gives and takes one for each particle, got the space "
@@ -171,15 +155,19 @@ def check_row_actions(actions: Any, *shape: int) -> None:
 
 
 class ParticleRowsBase:
-    """Base class of adapters whose row w N + i is particle i of world w of a vector environment.
+    """Base class of adapters in which each particle is a row: w N + i is particle i of world w.
 
-    A row's reward is its particle's if there is one, else its world's.
+    A row's reward is its particle's if the environment has those, else its world's.
     """
 
     num_envs: int
 
-    def set_env(self, env: Any, base: NPAVectorEnv) -> None:
-        """Set the environment whose particles are rows; `base` is the one below its wrappers."""
+    def set_env(self, env: Any, base: NPAVectorEnv, mode: str) -> None:
+        """Set the environment whose particles are rows, and check its autoreset mode.
+
+        `base` is the one under its wrappers; `mode` is the mode's name.
+        """
+        check_autoreset(autoreset_mode(env), mode)
         self.vector_env = env
         """The environment whose particles these are."""
         self.world_count = base.num_envs
@@ -189,7 +177,7 @@ class ParticleRowsBase:
         self.num_envs = self.world_count * self.particle_count
 
     def step_worlds(self, actions: Any) -> VectorStep:
-        """Step all worlds by actions of rows, [B N, A]; return the rows' outcome, [B N, ...]."""
+        """Step all worlds by actions [B N, A]; return rows' results [B N, ...] and the infos."""
         check_row_actions(actions, self.num_envs, *self.vector_env.single_action_space.shape[1:])
         by_world = actions.reshape(self.world_count, self.particle_count, -1)
         observations, rewards, ended, cut, infos = self.vector_env.step(by_world)
@@ -199,7 +187,7 @@ class ParticleRowsBase:
         return rows, rewards, self.spread(ended), self.spread(cut), infos
 
     def spread(self, values: Any) -> Any:
-        """Repeat values of worlds, [B], for each of their rows, shape [B N]."""
+        """Repeat the value of each world, [B], for its N rows, shape [B N]."""
         if isinstance(values, Tensor):
             return values.repeat_interleave(self.particle_count, output_size=self.num_envs)
         return np.repeat(values, self.particle_count)
@@ -219,16 +207,16 @@ class EpisodeClock:
         self.elapsed = np.zeros(env.num_envs, dtype=np.int64)
         """Steps since the start of the running episode, shape [B]."""
         self.lengths = np.zeros_like(self.elapsed)
-        """Steps, after the last one, of the episode that it belonged to, shape [B]."""
+        """Length, after the last step, of the episode that the step belonged to, shape [B]."""
         self.ended = np.zeros(env.num_envs, dtype=bool)
         """Whether the last step ended an episode, shape [B]."""
         self.restarted = np.zeros_like(self.ended)
         """Whether the last observation is the first of an episode, shape [B]."""
         self.observed = np.ones_like(self.ended)
-        """Whether the last observation is new, shape [B]; not if a reset was of other worlds."""
+        """Whether the last observation is new, shape [B]; a reset of other worlds repeats it."""
 
     def reset(self, options: dict[str, Any] | None) -> None:
-        """Restart the counters of the worlds in the option `reset_mask`; without it, of all."""
+        """Restart the counters of the worlds in `options["reset_mask"]`, by default of all."""
         mask = None if options is None else options.get("reset_mask")
         self.restarted = np.ones_like(self.ended) if mask is None else to_host(mask).copy()
         self.observed = self.restarted
@@ -237,7 +225,7 @@ class EpisodeClock:
         self.ended = self.ended & ~self.restarted
 
     def step(self, terminations: Any, truncations: Any, infos: dict[str, Any]) -> None:
-        """Update for a step with these results, arrays or tensors, shape [B]."""
+        """Count a step, which returned these flags, arrays or tensors [B], and infos."""
         self.observed = np.ones_like(self.ended)
         self.restarted = self.ended if self._next_step else np.zeros_like(self.ended)
         self.lengths = np.where(self.restarted, 0, self.elapsed + 1)
@@ -259,14 +247,14 @@ class ChangesObservations:
 
     @abstractmethod
     def changed(self, observations: Any) -> Any:
-        """Return changed observations, [N, P] or [B, N, P]."""
+        """Return the wrapper's observations for those of the environment, [N, P] or [B, N, P]."""
 
 
 class Observations(ChangesObservations, AnyObservationWrapper):
     """Base class of wrappers that change the observations of one world."""
 
     def observation(self, observation: Any) -> Any:
-        """Update with an observation and return it changed, for Gymnasium's `reset` and `step`."""
+        """Update the statistics with an observation and return it changed; Gymnasium calls it."""
         self.update(observation)
         return self.changed(observation)
 
@@ -287,29 +275,29 @@ class EpisodeWrapper(AnyVectorWrapper):
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Start episodes; as for the environment itself."""
+        """Start episodes, as the environment does."""
         # A copy, as wrappers of Gymnasium remove the mask from the dict.
         observations, infos = self.env.reset(seed=seed, options=options and dict(options))
         self.clock.reset(options)
         return self.after_reset(observations, infos)
 
     def step(self, actions: Any) -> VectorStep:
-        """Step; as for the environment itself."""
+        """Step all worlds, as the environment does."""
         outcome: VectorStep = self.env.step(actions)
         self.clock.step(*outcome[2:])
         return self.after_step(outcome)
 
     @abstractmethod
     def after_reset(self, observations: Any, infos: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
-        """Return the results of a reset, after the clock's update."""
+        """Return the wrapper's results of a reset; called when the clock is up to date."""
 
     @abstractmethod
     def after_step(self, outcome: VectorStep) -> VectorStep:
-        """Return the results of a step, after the clock's update."""
+        """Return the wrapper's results of a step; called when the clock is up to date."""
 
 
 class RewardSums(EpisodeWrapper):
-    """Base class of wrappers with a sum of the rewards of each running episode."""
+    """Base class of wrappers that sum the rewards of each running episode."""
 
     gamma = 1.0
     """Factor on the sum in each step (dimensionless)."""
@@ -318,29 +306,32 @@ class RewardSums(EpisodeWrapper):
     """Sums of the rewards, float64, shape [B]."""
 
     @abstractmethod
-    def summed(self, rewards: Tensor, sums: Tensor) -> tuple[Tensor, dict[str, Any]]:
-        """Return the rewards, [B], changed, and entries for infos; before sums are reset."""
+    def use_sums(self, rewards: Tensor, sums: Tensor) -> tuple[Tensor, dict[str, Any]]:
+        """Return the wrapper's rewards [B] of a step, and entries that its infos get.
+
+        `sums` [B] include the step's rewards; those of episodes that ended are not reset yet.
+        """
 
     def after_reset(self, observations: Any, infos: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
-        """Set the sums of new episodes to zero."""
+        """Set the sums of the worlds that restarted to zero."""
         self.reset_sums(self.clock.restarted)
         return observations, infos
 
     def after_step(self, outcome: VectorStep) -> VectorStep:
-        """Add the rewards to the sums."""
+        """Add a step's rewards to the sums, and change rewards and infos by `use_sums`."""
         observations, rewards, terminations, truncations, infos = outcome
         check_tensor(rewards, type(self).__name__)
         sums = rewards.double()
         if self.sums is not None:
             sums = self.sums * self.gamma + sums
         self.sums = sums
-        rewards, entries = self.summed(rewards, sums)
+        rewards, entries = self.use_sums(rewards, sums)
         # With next-step autoreset the step that restarts belongs to no episode.
         self.reset_sums(self.clock.restarted)
         return observations, rewards, terminations, truncations, infos | entries
 
     def reset_sums(self, worlds: NDArray[np.bool_]) -> None:
-        """Set the sums of some worlds to zero."""
+        """Set the sums of the worlds in a mask, [B], to zero."""
         if self.sums is not None and worlds.any():
             self.sums = self.sums.index_fill(0, world_indices(worlds, self.sums.device), 0.0)
 
@@ -350,23 +341,23 @@ class VectorObservations(ChangesObservations, EpisodeWrapper):
 
     @cached_property
     def observation_space(self) -> Space[Any]:  # type: ignore[override]
-        """Space of all worlds' observations; large, so made at the first use."""
+        """Space of all worlds' observations, made at the first use as it is large."""
         return batch_space(self.single_observation_space, self.num_envs)
 
     def after_reset(self, observations: Any, infos: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
-        """Return changed observations and infos."""
-        return self._counted(observations), infos
+        """Return the changed observations of a reset, and its infos."""
+        return self._updated(observations), infos
 
     def after_step(self, outcome: VectorStep) -> VectorStep:
-        """Return changed observations, the final ones included, and the rest as it is."""
+        """Return a step's results with its observations and final observations changed."""
         observations, rewards, terminations, truncations, infos = outcome
-        observations = self._counted(observations)
+        observations = self._updated(observations)
         if "final_obs" in infos:
             infos = infos | {"final_obs": self.changed(infos["final_obs"])}
         return observations, rewards, terminations, truncations, infos
 
-    def _counted(self, observations: Any) -> Any:
-        """Return observations changed, after counting those of worlds that are new."""
+    def _updated(self, observations: Any) -> Any:
+        """Update the statistics with those observations that are new, and return all changed."""
         observed: Any = self.clock.observed
         if observed.all():
             self.update(observations)
@@ -378,7 +369,7 @@ class VectorObservations(ChangesObservations, EpisodeWrapper):
 
 
 class WrapperBase(RecordConstructorArgs):
-    """Mixin of a wrapper of one world and of its vector form; their first base class."""
+    """First base class of wrappers that exist for one world and, named "Vector...", for many."""
 
     def __init__(self, env: Any, **recorded: Any) -> None:
         self.many = isinstance(self, EpisodeWrapper)

@@ -20,7 +20,6 @@ from npa_envs.wrappers.base import (
     EpisodeWrapper,
     VectorStep,
     WrapperBase,
-    check_untouched,
     world_indices,
 )
 
@@ -29,7 +28,7 @@ Event = str | DamageEvent
 
 
 class _DamagesWorlds(WrapperBase):
-    """Mixin with the events and their damage, for one world or many."""
+    """Mixin that damages worlds at the steps of `events`, for one world or many."""
 
     def __init__(self, env: Any, events: Event | Sequence[Event]) -> None:
         several = as_list(events)
@@ -46,8 +45,13 @@ class _DamagesWorlds(WrapperBase):
         self.events = tuple(parse_damage(e) if isinstance(e, str) else e for e in several)
         """The events; those of one step are applied in this order."""
         super().__init__(env, events=[str(event) for event in self.events])
-        check_untouched(env, type(self).__name__)
-        # Events of nested wrappers have different numbers, so that they draw different places.
+        space, base_space = (getattr(e, self.space_name) for e in (env, env.unwrapped))
+        if space != base_space:
+            raise NPAError(
+                f"env must give observations as the environment makes them, {base_space}, got "
+                f"{space}: put {type(self).__name__} under the wrappers that change observations"
+            )
+        # Events of nested wrappers have different numbers, so that they draw different positions.
         self._first = 0
         while hasattr(env, "env"):
             if isinstance(env, _DamagesWorlds):
@@ -55,12 +59,12 @@ class _DamagesWorlds(WrapperBase):
             env = env.env
 
     def _due(self, elapsed: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return which events are due in which worlds, [E, B], by steps of their episodes, [B]."""
+        """Return whether each event is due in each world, [E, B], after `elapsed` [B] steps."""
         due: NDArray[np.bool_] = np.array([[event.step] for event in self.events]) == elapsed
         return due
 
-    def _particles(self, due: NDArray[np.bool_]) -> tuple[Tensor, Tensor]:
-        """Return positions and states of all worlds, damaged where events are due, shape [E, B]."""
+    def _damaged_particles(self, due: NDArray[np.bool_]) -> tuple[Tensor, Tensor]:
+        """Return positions and states of all worlds, damaged by the events `due` there [E, B]."""
         worlds = self._base.worlds
         x, s = worlds.x.clone(), worlds.s.clone()
         for k, (event, mask) in enumerate(zip(self.events, due, strict=True), self._first):
@@ -82,10 +86,10 @@ class DamageEvents(_DamagesWorlds, AnyWrapper):
     """Damage the world after certain steps of each episode.
 
     An event happens after its step: the observation of that step shows the damage, its reward does
-    not include it. Step 0 damages the initial world. Places and angles come from the world's seed,
-    and are the same in a vector environment (`VectorDamageEvents`). A world whose episode is over
-    is not damaged, so put the wrapper around the result of `gym.make`, which includes the step
-    limit.
+    not include it. Step 0 damages the initial world. Position and angle of damage come from the
+    world's seed, and are the same in a vector environment (`VectorDamageEvents`). A world whose
+    episode is over is not damaged, so put the wrapper around the result of `gym.make`, which
+    includes the step limit.
 
     On such steps `info["loss_damage"]` is the rise of the loss; `info["loss"]`, its terms and
     further entries are those of the damaged world. Nested wrappers act as one with all their
@@ -104,13 +108,13 @@ class DamageEvents(_DamagesWorlds, AnyWrapper):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Start an episode; as for the environment itself."""
+        """Start an episode, as the environment does."""
         observation, info = self.env.reset(seed=seed, options=options)
         self._elapsed = 0
         return self._damaged(observation, info)
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Step; as for the environment itself."""
+        """Step the world, as the environment does."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         self._elapsed += 1
         if not (terminated or truncated):
@@ -123,7 +127,7 @@ class DamageEvents(_DamagesWorlds, AnyWrapper):
             return observation, info
         worlds = self._base.worlds
         before = float(worlds.loss[0])
-        x, s = self._particles(due)
+        x, s = self._damaged_particles(due)
         observation = self._base.place_particles(x[0], s[0])
         losses = self._base.losses_of(worlds.report.numbers[:, 0].tolist())
         losses["loss_damage"] = info.get("loss_damage", 0.0) + losses["loss"] - before
@@ -131,7 +135,7 @@ class DamageEvents(_DamagesWorlds, AnyWrapper):
 
 
 class VectorDamageEvents(_DamagesWorlds, EpisodeWrapper):
-    """`DamageEvents` for vector environments, by the steps of each world's own episode.
+    """`DamageEvents` for vector environments; steps are counted in each world's own episode.
 
     World k is damaged as the single environment with the same seed, bit for bit. Arguments and
     errors are those of `DamageEvents`, except `env`, a vector environment of this package.
@@ -160,7 +164,7 @@ class VectorDamageEvents(_DamagesWorlds, EpisodeWrapper):
         before = worlds.loss.clone()
         damaged = np.asarray(due.any(axis=0))
         chosen = world_indices(damaged, base.task.device)
-        x, s = self._particles(due)
+        x, s = self._damaged_particles(due)
         observations = base.place_particles(x[chosen], s[chosen], chosen)
         output = base.config.output
         # Arrays are float64, as in environments, and differences equal those of single ones.

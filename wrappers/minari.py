@@ -69,7 +69,7 @@ def record_episodes(
 
 
 def _recorded(env: Any, policy: Callable[[Any], Any], seeds: list[int]) -> list[EpisodeBuffer]:
-    """Return the first episode of each world after a reset with its seed."""
+    """Reset each world with its seed, and return the first episode of each."""
     observation, infos = env.reset(seed=seeds)
     observations, losses = [_host(observation)], [_host(infos["loss"])]
     steps: list[tuple[Any, ...]] = []
@@ -92,9 +92,6 @@ def _recorded(env: Any, policy: Callable[[Any], Any], seeds: list[int]) -> list[
         observations.append(_host(observation))
         losses.append(loss)
 
-    def stacked(*arrays: Any) -> Any:
-        return np.stack(arrays)
-
     names = ("actions", "rewards", "terminations", "truncations")
     episodes = []
     for k, length in enumerate(lengths.tolist()):
@@ -103,7 +100,7 @@ def _recorded(env: Any, policy: Callable[[Any], Any], seeds: list[int]) -> list[
             for number, name in enumerate(names)
         }
         world = [*(_of_world(one, k) for one in observations[:length]), last[k]]
-        episode["observations"] = _mapped(stacked, *world)
+        episode["observations"] = _mapped(lambda *arrays: np.stack(arrays), *world)
         world_losses = [loss[k] for loss in losses[: length + 1]]
         episode["infos"] = {"loss": np.array(world_losses, np.float64)}
         episodes.append(EpisodeBuffer(seed=seeds[k], **episode))
@@ -111,14 +108,14 @@ def _recorded(env: Any, policy: Callable[[Any], Any], seeds: list[int]) -> list[
 
 
 def _mapped(function: Callable[..., Any], *values: Any) -> Any:
-    """Return a function's value for arrays; dictionaries entry by entry."""
+    """Return `function(*values)`; for dictionaries of arrays a dictionary of its values."""
     if isinstance(values[0], dict):
         return {name: _mapped(function, *(v[name] for v in values)) for name in values[0]}
     return function(*values)
 
 
 def _host(values: Any) -> Any:
-    """Return tensors or arrays as new arrays."""
+    """Copy a tensor or array, or a dictionary of them, to new arrays on the host."""
     return _mapped(
         lambda v: v.cpu().numpy().copy() if isinstance(v, Tensor) else np.array(v), values
     )
@@ -193,7 +190,7 @@ def write_dataset(
 
 
 def spec_of(env_id: str, keywords: dict[str, Any], episode_steps: int) -> EnvSpec:
-    """Return the spec of a single environment with keywords and a step limit."""
+    """Return the Gymnasium spec of a single environment with keywords and a step limit."""
     spec = deepcopy(gymnasium.spec(env_id))
     spec.kwargs = {**spec.kwargs, **keywords, "episode_steps": episode_steps}
     spec.max_episode_steps = episode_steps

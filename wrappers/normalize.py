@@ -25,7 +25,6 @@ from npa_envs.wrappers.base import (
     WrapperBase,
     as_tensor,
     check_tensor,
-    like,
     world_indices,
 )
 
@@ -34,7 +33,7 @@ PRIOR_COUNT = 1e-4
 
 
 class RunningMoments:
-    """Mean and variance of all samples so far, float64, without synchronising."""
+    """Running mean and variance of samples, float64; nothing synchronises with the device."""
 
     def __init__(self, *shape: int) -> None:
         self.mean = torch.zeros(shape, dtype=torch.float64)
@@ -42,7 +41,10 @@ class RunningMoments:
         self.count = PRIOR_COUNT
 
     def update(self, mean: Tensor, var: Tensor, count: int) -> None:
-        """Add a batch of samples by its mean, biased variance and count; takes its device."""
+        """Add a batch of `count` samples, given by its mean and biased variance.
+
+        The statistics move to the batch's device.
+        """
         old_mean, old_var = self.mean.to(mean.device), self.var.to(mean.device)
         total = self.count + count
         delta = mean.double() - old_mean
@@ -52,7 +54,7 @@ class RunningMoments:
         self.count = total
 
     def update_from(self, samples: Tensor) -> None:
-        """Add samples, in dimension 0."""
+        """Add a batch of samples, one for each index of dimension 0."""
         var, mean = torch.var_mean(samples, dim=0, correction=0)
         self.update(mean, var, len(samples))
 
@@ -62,7 +64,7 @@ class RunningMoments:
         return {"mean": self.mean.cpu().clone(), "var": self.var.cpu().clone(), "count": count}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Set the state that `state_dict` returned."""
+        """Set mean, variance and count to those that `state_dict` returned."""
         expected = {"mean": self.mean.shape, "var": self.var.shape, "count": torch.Size()}
         for name in state.keys() ^ expected.keys():
             fault = "unknown" if name in state else "missing"
@@ -118,7 +120,7 @@ class _PerceptionNormalizer(WrapperBase):
         self.statistics.load_state_dict(state)
 
     def update(self, observations: Any) -> None:
-        """While training, add new observations to the statistics."""
+        """Add new observations, [N, P] or [M, N, P], to the statistics if `training` is True."""
         if not self.training:
             return
         z = as_tensor(observations).flatten(0, -2)
@@ -136,14 +138,15 @@ class _PerceptionNormalizer(WrapperBase):
         )
 
     def changed(self, observations: Any) -> Any:
-        """Return perception normalised and clipped, as new float32 values."""
+        """Return perception normalised and clipped, in new float32 arrays or tensors."""
         z = as_tensor(observations)
         mean = self._spread(self.statistics.mean).to(z)
         scale = self._spread((self.statistics.var + self.epsilon).rsqrt()).to(z)
-        return like(((z - mean) * scale).clamp_(-self.clip, self.clip), observations)
+        normal = ((z - mean) * scale).clamp_(-self.clip, self.clip)
+        return normal if isinstance(observations, Tensor) else normal.numpy()
 
     def _spread(self, statistics: Tensor) -> Tensor:
-        """Expand statistics to the entries of a perception vector, shape [P]."""
+        """Repeat statistics [3 C + 1] for the components of gradients, to shape [P]."""
         centred = 2 * self._physics.state_dim
         gradients = statistics[centred:].repeat_interleave(self._physics.space_dim)
         return torch.cat((statistics[:centred], gradients))
@@ -205,13 +208,13 @@ class TorchNormalizeObservation(VectorObservations):
         """Whether new observations update the statistics."""
 
     def update(self, observations: Any) -> None:
-        """Add new observations to the statistics unless they are frozen."""
+        """Add new observations to the statistics if `update_running_mean` is True."""
         check_tensor(observations, type(self).__name__)
         if self.update_running_mean:
             self.obs_rms.update_from(observations)
 
     def changed(self, observations: Any) -> Any:
-        """Return observations normalised."""
+        """Return observations with mean subtracted, divided by the standard deviation."""
         scale = (self.obs_rms.var + self.epsilon).rsqrt().to(observations)
         return (observations - self.obs_rms.mean.to(observations)) * scale
 
@@ -245,8 +248,8 @@ class TorchNormalizeReward(RewardSums):
         """Discounted return of each running episode, float64, shape [B]."""
         return self.sums
 
-    def summed(self, rewards: Tensor, sums: Tensor) -> tuple[Tensor, dict[str, Any]]:
-        """Return rewards divided by the standard deviation of the discounted return."""
+    def use_sums(self, rewards: Tensor, sums: Tensor) -> tuple[Tensor, dict[str, Any]]:
+        """Return rewards [B] divided by the standard deviation of returns, and no infos."""
         restarted = self.clock.restarted
         if restarted.any() and not self.clock.same_step:
             # With next-step autoreset the step that restarts belongs to no episode.

@@ -27,13 +27,13 @@ class NumericInfos(BaseParallelWrapper):  # type: ignore[misc]
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], Infos]:
-        """Start an episode; as for the environment itself."""
+        """Start an episode, as the environment does."""
         observations, infos = self.env.reset(seed=seed, options=options)
         self._names = {agent: tuple(info) for agent, info in infos.items()}
         return observations, infos
 
     def step(self, actions: Mapping[str, Any]) -> tuple[Any, ...]:
-        """Step; as for the environment itself."""
+        """Step the world, as the environment does, and keep only numeric infos."""
         *outcome, infos = self.env.step(actions)
         numeric = {a: {name: info[name] for name in self._names[a]} for a, info in infos.items()}
         return (*outcome, numeric)

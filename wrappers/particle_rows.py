@@ -8,15 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from npa_envs.envs.core.vector import BatchedSpaces
-from npa_envs.wrappers.base import (
-    AnyVectorEnv,
-    ParticleRowsBase,
-    autoreset_mode,
-    check_autoreset,
-    row_space,
-    to_host,
-    vector_env,
-)
+from npa_envs.wrappers.base import AnyVectorEnv, ParticleRowsBase, row_space, to_host, vector_env
 
 
 class ParticleRows(ParticleRowsBase, BatchedSpaces):
@@ -41,9 +33,7 @@ class ParticleRows(ParticleRowsBase, BatchedSpaces):
     closed = True
 
     def __init__(self, env: AnyVectorEnv) -> None:
-        base = vector_env(env, type(self).__name__)
-        check_autoreset(autoreset_mode(env), "next-step")
-        self.set_env(env, base)
+        self.set_env(env, vector_env(env, type(self).__name__), "next-step")
         self.metadata = env.metadata
         self.render_mode = env.render_mode
         self.single_observation_space = row_space(env.single_observation_space)

@@ -16,7 +16,7 @@ from npa_envs.wrappers.base import AnyVectorEnv, RewardSums, world_indices
 
 
 class TorchRecordEpisodeStatistics(RewardSums):
-    """Keep track of returns and lengths of episodes.
+    """Record returns, lengths and times of episodes in the infos and in queues.
 
     A step in which episodes end has `infos["episode"]` with the tensors `r` (returns), `l` (lengths
     in steps) and `t` (time [s]), shape [B], 0 for the other worlds, and `infos["_episode"]`, True
@@ -24,8 +24,8 @@ class TorchRecordEpisodeStatistics(RewardSums):
 
     Args:
         env: A vector environment with torch tensors.
-        buffer_length: Episodes in the queues.
-        stats_key: The key in `infos`.
+        buffer_length: Number of last episodes in the queues.
+        stats_key: Replaces "episode" as the key in `infos`.
 
     Raises:
         NPAError: `env` is no vector environment, or `buffer_length` no integer of at least 1.
@@ -54,12 +54,12 @@ class TorchRecordEpisodeStatistics(RewardSums):
 
     @property
     def return_queue(self) -> deque[float]:
-        """Returns of the last episodes; reading it synchronises."""
+        """Returns of the last episodes; reading them synchronises with the device."""
         returns = torch.cat(tuple(self._returns)).tolist() if self._returns else []
         return deque(returns, maxlen=self._returns.maxlen)
 
-    def summed(self, rewards: Tensor, sums: Tensor) -> tuple[Tensor, dict[str, Any]]:
-        """Return the rewards, and the statistics of the episodes that ended."""
+    def use_sums(self, rewards: Tensor, sums: Tensor) -> tuple[Tensor, dict[str, Any]]:
+        """Return the rewards unchanged, and infos with statistics of the episodes that ended."""
         ended, device = self.clock.ended, sums.device
         if not ended.any():
             return rewards, {}
@@ -78,6 +78,6 @@ class TorchRecordEpisodeStatistics(RewardSums):
         return rewards, {self._key: episode, f"_{self._key}": mask}
 
     def reset_sums(self, worlds: NDArray[np.bool_]) -> None:
-        """Set sums and times of some worlds to zero."""
+        """Reset reward sums and starting times of the worlds in a mask, [B]."""
         super().reset_sums(worlds)
         self._began[worlds] = time.perf_counter()

@@ -36,8 +36,8 @@ WHOLE_IDS = frozenset((*GARDEN_IDS, *(row.id for row in CODED)))
 """Ids of environments whose actions are for a whole world."""
 
 
-def _rows(name: str, keywords: dict[str, Any]) -> AnyVectorEnv:
-    """Make the worlds of an id for `num_envs` rows, as a creator for RLlib."""
+def _make_rows(name: str, keywords: dict[str, Any]) -> AnyVectorEnv:
+    """Make the vector environment called `name`, with `keywords["num_envs"]` rows, for RLlib."""
     fields = dict(keywords)
     row_count = fields.pop("num_envs")
     if name in WHOLE_IDS:
@@ -55,7 +55,7 @@ def _worlds(name: str, count: int, fields: dict[str, Any]) -> AnyVectorEnv:
 
 
 def _flat(worlds: AnyVectorEnv) -> AnyVectorEnv:
-    """Return worlds with flattened observations and actions, as RLlib's networks need."""
+    """Wrap worlds to flatten observations and actions, as RLlib's networks need."""
     space, flat = worlds.single_action_space, FlattenObservation(worlds)
     if not isinstance(space, Box):
         return flat
@@ -75,9 +75,9 @@ def rllib_config(name: str, *, shared: bool = False, **keywords: Any) -> PPOConf
     else is RLlib's default, which you can change: `rllib_config(...).training(...)`.
 
     Args:
-        name: An id of PettingZoo's registry.
-        shared: All agents have one policy, "everyone".
-        keywords: Of `parallel_env`.
+        name: Id of an environment of several agents, such as `npa/MixingParticles-v0`.
+        shared: Whether all agents have one policy, "everyone".
+        keywords: Keywords of `parallel_env`.
 
     Raises:
         NPAError: There is no such id, or a keyword is wrong.
@@ -109,9 +109,9 @@ def rllib_rows_config(name: str, *, world_count: int = 4, **keywords: Any) -> PP
     object for each row, so hundreds of rows suit it better than many thousands.
 
     Args:
-        name: An id of Gymnasium's registry, of any size.
-        world_count: Worlds B of an environment runner.
-        keywords: Of `gymnasium.make_vec`, for example `particle_count`, `max_episode_steps`.
+        name: Gymnasium's id of an environment.
+        world_count: Worlds B of each environment runner.
+        keywords: Keywords of `gymnasium.make_vec`, for example `particle_count`.
 
     Raises:
         NPAError: There is no such id, or a keyword is wrong.
@@ -123,7 +123,7 @@ def rllib_rows_config(name: str, *, world_count: int = 4, **keywords: Any) -> PP
         keywords["particle_count"] = vector_env(world, "rllib_rows_config").config.particle_count
         rows *= keywords["particle_count"]
     world.close()
-    register_env(name, partial(_rows, name))
+    register_env(name, partial(_make_rows, name))
     config: PPOConfig = (
         PPOConfig()
         .environment(name, env_config=keywords)
@@ -136,7 +136,7 @@ def rllib_rows_config(name: str, *, world_count: int = 4, **keywords: Any) -> PP
 
 
 def _check_id(name: str, known: Collection[str], others: Collection[str], function: str) -> None:
-    """Check that an id is among the known ones; `function` takes the others."""
+    """Check that an id is `known`; for one of `others` the error advises to call `function`."""
     if name not in known:
         hint = f"take {function} for it; " if name in others else ""
         raise NPAError(f"name must be a known id, got {shown(name)}: {hint}{suggest(name, known)}")

@@ -8,13 +8,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError, importing
-from npa_envs.wrappers.base import (
-    AnyVectorEnv,
-    ParticleRowsBase,
-    autoreset_mode,
-    check_autoreset,
-    torch_env,
-)
+from npa_envs.wrappers.base import AnyVectorEnv, ParticleRowsBase, torch_env
 
 with importing("RSL-RL", "RslRlParticleEnv", "pip install 'npa-envs[rslrl]'"):
     from rsl_rl.env import VecEnv
@@ -45,8 +39,7 @@ class RslRlParticleEnv(ParticleRowsBase, VecEnv):  # type: ignore[misc]
 
     def __init__(self, env: AnyVectorEnv, *, seed: int | None = None) -> None:
         base = torch_env(env, type(self).__name__)
-        check_autoreset(autoreset_mode(env), "same-step")
-        self.set_env(env, base)
+        self.set_env(env, base, "same-step")
         self.num_actions = base.worlds.physics.action_dim
         self.max_episode_length = base.worlds.episode_steps or 2**31 - 1
         self.device = base.worlds.x.device
@@ -67,7 +60,7 @@ class RslRlParticleEnv(ParticleRowsBase, VecEnv):  # type: ignore[misc]
         )
 
     def get_observations(self) -> TensorDict:
-        """Return the current observations, "policy" of shape [B N, P]."""
+        """Return the current observations, shape [B N, P], as the entry "policy"."""
         rows = self._observations.reshape(self.num_envs, -1)
         return TensorDict({"policy": rows}, batch_size=[self.num_envs], device=self.device)
 
@@ -97,7 +90,7 @@ class RslRlParticleEnv(ParticleRowsBase, VecEnv):  # type: ignore[misc]
 
 
 def _episode_log(infos: dict[str, Any]) -> dict[str, Tensor]:
-    """Return means over the worlds whose episodes are over, without synchronising."""
+    """Return mean final loss and success of the episodes that ended, without synchronising."""
     final, which = infos["final_info"], infos["_final_info"]
     return {
         f"Episode/{name}": torch.where(which, final[name].float(), 0.0).sum() / which.sum()

@@ -36,7 +36,7 @@ RowSteps = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], li
 
 
 class SharedInfo(dict[str, Any]):
-    """The read-only empty info that all rows share whose episodes go on."""
+    """The read-only empty info shared by all rows whose episode continues."""
 
     def _refuse(self, *_: Any, **__: Any) -> NoReturn:
         raise NPAError(
@@ -48,7 +48,7 @@ class SharedInfo(dict[str, Any]):
 
 
 class RowVecEnv(VecEnv):
-    """Base class: a `VecEnv` with equally many rows for each world; subclasses define rows."""
+    """Base class of `VecEnv`s with R rows for each of B worlds; subclasses say what a row is."""
 
     def __init__(
         self,
@@ -66,7 +66,7 @@ class RowVecEnv(VecEnv):
         """Rows of a world, R."""
         self.spec = getattr(env, "spec", None)
         """Gymnasium's spec of the environment."""
-        self.nothing: dict[str, Any] = SharedInfo()
+        self.shared_info: dict[str, Any] = SharedInfo()
         """The info of all rows whose episodes go on."""
         self._actions: NDArray[np.float32] | None = None
         self._observations: Any = None
@@ -83,7 +83,7 @@ class RowVecEnv(VecEnv):
 
     @abstractmethod
     def _row_observations(self, observations: Any) -> Any:
-        """Return the rows' observations for those of all or some worlds."""
+        """Return rows' observations [M R, ...] for the observations of M worlds, all or some."""
 
     def step_async(self, actions: NDArray[Any]) -> None:
         """Store the actions of all rows, shape [B R, A], for `step_wait`."""
@@ -91,18 +91,18 @@ class RowVecEnv(VecEnv):
         self._actions = actions.reshape(self.world_count, self.row_count, -1)
 
     def taken_actions(self) -> NDArray[np.float32]:
-        """Return the stored actions, shape [B, R, A], and delete them."""
+        """Return the actions that `step_async` stored, shape [B, R, A], and delete them."""
         if self._actions is None:
             raise NPAError("step_wait needs actions: call step_async, or step")
         actions, self._actions = self._actions, None
         return actions
 
     def infos(self, rows: NDArray[np.int64], entries: Mapping[str, Any]) -> list[dict[str, Any]]:
-        """Return infos of all rows: `entries` for some, [M], and the shared empty one for others.
+        """Return the info of each row: the empty one, except in the M rows of index `rows`.
 
-        Entries have a value for each of the M rows.
+        Each of their `entries` has M values, one for each of these rows.
         """
-        infos: list[dict[str, Any]] = [self.nothing] * self.num_envs
+        infos: list[dict[str, Any]] = [self.shared_info] * self.num_envs
         for k, row in enumerate(rows.tolist()):
             infos[row] = {name: values[k] for name, values in entries.items()}
         return infos
@@ -112,9 +112,9 @@ class RowVecEnv(VecEnv):
         self.vector_env.close()
 
     def seed(self, seed: int | None = None) -> list[int | None]:
-        """Set the seed of the next reset, seed + k for world k; return that of each row's world.
+        """Set the seeds of the next reset, seed + k for world k; return each row's seed.
 
-        None draws a seed.
+        If `seed` is None, it is drawn.
         """
         first = int(np.random.default_rng().integers(2**32) if seed is None else seed)
         worlds = np.arange(self.world_count).repeat(self.row_count)
@@ -122,7 +122,7 @@ class RowVecEnv(VecEnv):
         return self._seeds
 
     def get_images(self) -> list[NDArray[np.uint8] | None]:
-        """Return a picture of each world, shape [R, R, 3]; an empty list without a render mode."""
+        """Return a square RGB picture of each world; an empty list without a render mode."""
         pictures: Any = self.vector_env.render()
         return list(pictures or ())
 
@@ -148,7 +148,7 @@ class RowVecEnv(VecEnv):
         return self._for_rows(result, indices)
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: Any = None) -> list[bool]:
-        """Return for each row whether the environment is wrapped with a class."""
+        """Return for each row whether the environment is wrapped with `wrapper_class`."""
         wrapped = any(isinstance(layer, wrapper_class) for layer in self._layers())
         return self._for_rows(wrapped, indices)
 
@@ -170,7 +170,7 @@ class RowVecEnv(VecEnv):
 
 
 def on_host(*batches: Any) -> list[NDArray[Any]]:
-    """Return copies of arrays or tensors as arrays, synchronising once."""
+    """Copy arrays or tensors to arrays on the host; each device is synchronised at most once."""
     copies = []
     for values in batches:
         tensor = as_tensor(values)
@@ -185,7 +185,7 @@ def on_host(*batches: Any) -> list[NDArray[Any]]:
 
 
 class _EpisodeRows(RowVecEnv):
-    """Base class of rows whose episodes are those of their worlds."""
+    """Base class for rows that begin and end their episodes with their world."""
 
     bootstrap = True
     """Whether infos mark truncation by the step limit."""
@@ -218,9 +218,12 @@ class _EpisodeRows(RowVecEnv):
     def _end_infos(
         self, worlds: NDArray[np.int64], cut: NDArray[np.bool_], infos: dict[str, Any]
     ) -> list[dict[str, Any]]:
-        """Return the infos of all rows, after a step in which the episodes of some worlds ended."""
+        """Return the infos of all rows after a step in which the episodes of `worlds` ended.
+
+        `cut` [B] is True where an episode was truncated.
+        """
         if not len(worlds):
-            return [self.nothing] * self.num_envs
+            return [self.shared_info] * self.num_envs
         count, final = self.row_count, infos["final_info"]
         entries: dict[str, Any] = {}
         success = final.get("is_success", final.get("success"))
@@ -228,12 +231,12 @@ class _EpisodeRows(RowVecEnv):
             entries["is_success"] = on_host(success)[0][worlds].repeat(count).tolist()
         if self.bootstrap:
             entries["TimeLimit.truncated"] = cut[worlds].repeat(count).tolist()
-            entries["terminal_observation"] = self._last(infos["final_obs"], worlds)
+            entries["terminal_observation"] = self._last_observations(infos["final_obs"], worlds)
         rows = (worlds[:, None] * count + np.arange(count)).reshape(-1)
         return self.infos(rows, entries)
 
-    def _last(self, final: Any, worlds: NDArray[np.int64]) -> Any:
-        """Return the last observations of worlds that are over, one for each of their rows."""
+    def _last_observations(self, final: Any, worlds: NDArray[np.int64]) -> Any:
+        """Return, for each row of `worlds`, the last observation of the episode that ended."""
         if isinstance(final, Mapping):
             last = {n: values[worlds] for n, values in self._row_observations(final).items()}
             return [{name: rows[k] for name, rows in last.items()} for k in range(len(worlds))]
@@ -347,7 +350,7 @@ class RowPolicy:
         self.tag = tag
 
     def __call__(self, observations: Any) -> NDArray[np.float32]:
-        """Return actions, shape [B, N, A]."""
+        """Return actions [B, N, A] for observations [B, N, P]."""
         (observed,) = on_host(observations)
         rows = observed.reshape(-1, observed.shape[-1])
         if self.tag is not None:
@@ -370,7 +373,7 @@ class SpeciesVecEnv(RowVecEnv):
 
     Args:
         env: From `multispecies_v0.batched`, with same-step autoreset.
-        others: Policies of the species that are no rows, by name.
+        others: Policies of the species that are not rows, by name.
 
     Raises:
         NPAError: `env` is another environment or has another autoreset mode, a name in `others` is
@@ -420,7 +423,10 @@ class SpeciesVecEnv(RowVecEnv):
         super().__init__(env, env.world_count, int(self._counts.sum()), observed, acted)
 
     def step_wait(self) -> RowSteps:
-        """Step all worlds, the other species by their policies; return as `ParticleVecEnv`."""
+        """Step all worlds; return the rows' observations, rewards, done flags and infos.
+
+        The policies in `others` choose the actions of their species.
+        """
         if self._observations is None:
             raise NPAError("step needs worlds: call reset first")
         row_actions = np.split(self.taken_actions(), np.cumsum(self._counts)[:-1], axis=1)
@@ -475,14 +481,14 @@ class SpeciesVecEnv(RowVecEnv):
         return RowPolicy(model, deterministic=deterministic, tag=tag)
 
     def _rows(self, by_species: Mapping[str, Any]) -> Tensor:
-        """Return the rows' observations, with tags if all species are rows, shape [B, R, P]."""
+        """Return the rows' observations [B, R, P]; tags are appended if all species are rows."""
         rows = torch.cat([as_tensor(by_species[name]) for name in self.rows_of], dim=1)
         if self._tags is None:
             return rows
         return torch.cat((rows, self._tags.to(rows.device).expand(len(rows), -1, -1)), dim=2)
 
     def _repeated(self, by_species: Mapping[str, Any]) -> Tensor:
-        """Repeat values of species, [B] each, for each of their rows, shape [B, R]."""
+        """Repeat each species' values [B] for all of its rows, shape [B, R]."""
         values = [as_tensor(by_species[name]) for name in self.rows_of]
         return torch.cat(
             [value[:, None].expand(-1, n) for value, n in zip(values, self._counts, strict=True)],

@@ -16,7 +16,7 @@ from npa_envs.wrappers.base import Observations, VectorObservations, WrapperBase
 
 
 class _TagsSpecies(WrapperBase):
-    """Mixin with the species of all particles and their tags, for one world or many."""
+    """Mixin that appends one-hot species to particles' observations, for one world or many."""
 
     def __init__(self, env: Any, species_count: int = 2) -> None:
         super().__init__(env, species_count=species_count)
@@ -51,7 +51,7 @@ class _TagsSpecies(WrapperBase):
         return Box(low, high, dtype=np.float32)
 
     def changed(self, observations: Any) -> Any:
-        """Return observations with tags as their last columns."""
+        """Return observations [..., N, P + K], whose last K columns are the one-hot species."""
         if isinstance(observations, Tensor):
             return torch.cat((observations, self._tags), dim=-1)
         return np.concatenate((observations, self._tags), axis=-1)

@@ -106,7 +106,7 @@ class NPATorchRLEnv(EnvBase):  # type: ignore[misc]
         self.vector_env.close()
 
     def _chosen(self, mask: Tensor) -> Tensor:
-        """Return the mask of worlds for TorchRL's mask, bool, shape [B], on the host."""
+        """Return whether TorchRL's mask chooses each world, bool, shape [B], on the host."""
         by_world = mask.reshape(self.batch_size[0], -1).cpu()
         chosen = by_world.any(dim=1)
         if not torch.equal(chosen, by_world.all(dim=1)):
@@ -117,20 +117,20 @@ class NPATorchRLEnv(EnvBase):  # type: ignore[misc]
         return chosen
 
     def _spread(self, values: Tensor) -> Tensor:
-        """Return worlds' values [B] in a TensorDict's shape: [B, 1], or per particle [B, N, 1]."""
+        """Reshape worlds' values [B] to [B, 1], or with `rows=True` repeat them, to [B, N, 1]."""
         if not self.rows:
             return values[:, None]
         return values[:, None, None].expand(-1, self.particle_count, -1).clone()
 
     def _entries(self, observation: Tensor, **entries: Tensor) -> TensorDictBase:
-        """Return the results of a reset or a step as a TensorDict."""
+        """Return a TensorDict of an observation and other results of a reset or a step."""
         entries["observation"] = observation
         result: TensorDictBase = TensorDict(entries, self.batch_size, device=self.device)
         return result
 
 
 def _bounded(space: Any, world_count: int, device: torch.device | None) -> Bounded:
-    """Return TorchRL's spec of B worlds for the space of one."""
+    """Return TorchRL's spec of `world_count` worlds, for the space of one world."""
     assert isinstance(space, Box), "environments of this package have boxes"
     low, high = (
         torch.as_tensor(limit, device=device).expand(world_count, *space.shape).clone()

@@ -25,7 +25,7 @@ class BenchOptions(common.MeasureOptions):
     quick: bool = False
     """Small worlds only: about a minute on a CPU."""
     repeats: int = 7
-    """Readings of every time; tables show their median and range."""
+    """How often each time is measured; tables show median and range."""
     out: Path | None = None
     """Folder for SUITE_DEVICE.json and plots; default: nothing is written."""
     max_seconds: float | None = None
@@ -33,28 +33,28 @@ class BenchOptions(common.MeasureOptions):
     plots: bool = False
     """Also draw plots into the output folder; needs the extra `bench`."""
     explain: bool = False
-    """Measure nothing: print which kernels a step launches, and why. The options below set the
+    """Measure nothing: print which kernels a step launches, and why. The options below describe the
     step."""
     space_dim: Literal[2, 3] = 2
-    """Space dimension of the step."""
+    """Space dimension D."""
     world_count: int = 1
-    """Its worlds B."""
+    """Worlds B."""
     particle_count: int = 4096
-    """Its particles in each world N."""
+    """Particles N of each world."""
     state_dim: int = 16
-    """Its state channels C."""
+    """State channels C."""
     update_prob: float = 0.5
-    """Its probability of each particle's update."""
+    """Probability of each particle's update."""
     periodic: bool = False
-    """Its box is periodic."""
+    """In a periodic box instead of open space."""
     dtype: Literal["float32", "float64"] = "float32"
-    """Its precision."""
+    """Precision."""
     gradients: Literal["none", "weights", "positions"] = "weights"
-    """With respect to which inputs: none, weights and states, or also positions."""
+    """Gradients of the step: none, by weights and states, or also by positions."""
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Measure, print and write."""
+    """Measure times; print and write their tables."""
     options = common.parse_options(BenchOptions, "bench", arguments)
     from npa_envs.atomic_files import write_text
     from npa_envs.measure import benchmark_records, plots

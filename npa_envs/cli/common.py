@@ -22,6 +22,8 @@ from npa_envs.errors import NPAError, suggest
 if TYPE_CHECKING:
     import torch
 
+    from npa_envs.agents.learning import Problem
+
 OptionsT = TypeVar("OptionsT")
 
 
@@ -33,10 +35,10 @@ def parse_options(
     description: str | None = None,
     default: OptionsT | None = None,
 ) -> OptionsT:
-    """Parse a command's arguments over `default`, or over the dataclass's defaults.
+    """Parse a command's arguments to the dataclass `cls`; options not given are as in `default`.
 
     Ends the process after `--help`, and with code 2 for a wrong argument. The help begins with
-    `description` or the dataclass's docstring.
+    `description`, by default the dataclass's docstring.
     """
     kwargs: dict[str, Any] = {} if default is None else {"default": default}
     options: OptionsT = tyro.cli(
@@ -58,7 +60,7 @@ class DeviceOptions:
     """Where to run: cpu, cuda, cuda:1."""
 
     def checked_device(self) -> torch.device:
-        """Return the checked device."""
+        """Return `device`; raise NPAError if this machine has no such device."""
         from npa_envs.devices import check_device
 
         return check_device(self.device)
@@ -77,8 +79,8 @@ class RuleOptions(RunOptions):
     """Options of commands that run one rule: the rule, its world and the device."""
 
     rule: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RULE")]
-    """A shipped rule (`npa-envs list`), the folder of a run, a file of ours or the authors'
-    (.safetensors, .pth), or a rule of their web demo (models.json#name)."""
+    """A shipped rule (`npa-envs list`), the folder of a run, a file of this package or of the
+    paper's authors (.safetensors, .pth), or a rule of their web demo (models.json#name)."""
     target: str | None = None
     """The target to measure against; default: the one that the rule was trained on."""
     loss: str | None = None
@@ -94,13 +96,13 @@ class RuleOptions(RunOptions):
 
     @property
     def world(self) -> dict[str, Any]:
-        """The options of the rule's world, as keywords of `task_of_rule`."""
+        """Options that change the rule's task and world, as keywords of `task_of_rule`."""
         names = ("target", "loss", "data", "particle_count", "eps", "update_prob")
         return {name: getattr(self, name) for name in names}
 
 
 def named_rules(arguments: Iterable[str]) -> dict[str, str]:
-    """Return the sources of rules by name: the package's rules, then files and run folders."""
+    """Return a dict from rules' names to what `load_rule` takes: a name, a file or a run folder."""
     from npa_envs.rule.files import preset_rules, shipped_rules
     from npa_envs.web.rule_world import name_of
 
@@ -171,10 +173,10 @@ class SharedRunOptions:
     gpus: int | None = None
     """GPUs that share the run: `--gpus 4` means `--device cuda --processes 4`."""
     resume: bool = False
-    """Continue from the checkpoint in the folder `out`, `train` with the configuration of that
-    folder. `--resume auto`: if there is one; else start."""
+    """Continue from the checkpoint in the folder `--out`; `train` also takes its configuration from
+    there. `--resume auto` starts a new run if there is no checkpoint."""
     overwrite: bool = False
-    """Start again even if the folder `out` contains a run; the run's files are removed."""
+    """Start again even if the folder `--out` contains a run; the run's files are removed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -182,13 +184,13 @@ class MeasureOptions(RunOptions):
     """Options of the commands that measure and keep records."""
 
     threads: int = 1
-    """CPU threads of torch and the kernels in each run; they change times, not figures."""
+    """CPU threads of torch and the kernels in each run; they change times, not other results."""
     commit: str | None = None
     """The measured commit, for the record; default: that of the checkout."""
 
 
 def check_numbers(options: Any, **least: int) -> None:
-    """Check that options are None or at least so large, and that `max_seconds` is positive."""
+    """Check that options are None or at least their value in `least`, and `max_seconds` > 0."""
     for name, smallest in least.items():
         value = getattr(options, name)
         if value is not None and value < smallest:
@@ -199,7 +201,7 @@ def check_numbers(options: Any, **least: int) -> None:
 
 
 def named_values(name: str, arguments: Iterable[str]) -> dict[str, Any]:
-    """Parse arguments NAME=VALUE of an option; values are JSON or plain text."""
+    """Parse the arguments NAME=VALUE of the option `name`; values are JSON or plain text."""
     values: dict[str, Any] = {}
     for word in arguments:
         key, mark, value = word.partition("=")
@@ -212,8 +214,17 @@ def named_values(name: str, arguments: Iterable[str]) -> dict[str, Any]:
     return values
 
 
+def problem_of(options: Any, num_envs: int, steps: int | None = None) -> Problem:
+    """Return the environment `options.env`, with episodes of `steps`, by default as registered."""
+    from npa_envs.agents.learning.problem import Problem, registration_of
+
+    steps = registration_of(options.env).steps if steps is None else steps
+    keywords = named_values("keywords", options.keywords)
+    return Problem(env_id=options.env, keywords=keywords, episode_steps=steps, num_envs=num_envs)
+
+
 def first_options(arguments: Sequence[str]) -> argparse.Namespace:
-    """Return the options of a run that decide the defaults of others, before all are parsed."""
+    """Parse only those options of a run that decide the defaults of others, such as `--preset`."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     for name in ("preset", "device", "gpus"):
         parser.add_argument(f"--{name}")
@@ -228,9 +239,10 @@ def first_options(arguments: Sequence[str]) -> argparse.Namespace:
 
 
 def resolve_run(arguments: Sequence[str], out_of: Callable[[Sequence[str]], Path]) -> list[str]:
-    """Return arguments with the device of `--gpus`, and `--resume` or nothing for `--resume auto`.
+    """Return a run's arguments after replacing `--resume auto`, and adding the device of `--gpus`.
 
-    `out_of` returns the folder of the run, in which a checkpoint is looked for.
+    `--resume auto` becomes `--resume` if there is a checkpoint in the run's folder, which `out_of`
+    returns; else it is removed.
     """
     first = first_options(arguments)
     resolved = list(arguments)
@@ -262,7 +274,7 @@ def chosen_names(noun: str, names: Sequence[str], known: Iterable[str]) -> list[
 
 @contextlib.contextmanager
 def torch_threads(count: int) -> Iterator[None]:
-    """Set torch's number of CPU threads within the block."""
+    """Set torch's number of CPU threads within a `with` block."""
     import torch
 
     before = torch.get_num_threads()
@@ -290,7 +302,7 @@ def progress_bar(
 def measuring(
     options: Any, total: int | None, unit: str = "step"
 ) -> Iterator[Callable[[int], None]]:
-    """Show a progress bar and use `options.threads` CPU threads within the block."""
+    """Show a progress bar and use `options.threads` CPU threads within a `with` block."""
     with (
         progress_bar(total, show=options.progress, unit=unit) as advance,
         torch_threads(options.threads),

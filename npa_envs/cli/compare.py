@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from npa_envs.agents.comparison.single_run import RunRecord
 
 ROWS = "rows"
-"""Folder of a suite's rows in that of the comparison."""
+"""Folder, within that of the comparison, of the results of each method on a suite."""
 
 QUICK_EPISODES, QUICK_STEPS = 4, 200_000
 """Held-out episodes and particle-steps of a quick comparison."""
@@ -84,7 +84,7 @@ class CompareOptions(common.PartOptions, common.MeasureOptions):
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run what is missing, print and write; return 1 if a run failed."""
+    """Do the missing runs, print and write the table; return 1 if a run failed."""
     options = common.parse_options(CompareOptions, "compare", arguments)
     from npa_envs.agents.comparison.npa_bench import SUITES, check_rows, write_rows
     from npa_envs.agents.comparison.report import write_pictures, write_table
@@ -139,7 +139,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def make_plan(options: CompareOptions) -> ComparisonPlan:
-    """Return the plan of the options; with a suite they choose only tasks, methods and seeds."""
+    """Return the tasks, methods, seeds and budgets to compare; a suite fixes the budgets."""
     from npa_envs.agents.comparison import npa_bench
     from npa_envs.agents.comparison.plan import LEFT_OUT, PROBLEMS, ComparisonPlan, make_problem
     from npa_envs.agents.learning import METHODS
@@ -167,14 +167,16 @@ def make_plan(options: CompareOptions) -> ComparisonPlan:
     if suite and quick and not options.tasks:
         tasks = tasks[:1]
     methods, own = _chosen_methods(options.methods, suite.methods if suite else METHODS)
-    changed_options = _method_options(options.options, methods, own) if suite else {}
-    for name in changed_options.keys() - own.keys():
-        raise NPAError(
-            f"options of {name!r} are frozen in {options.suite}: give it a name of its own, "
-            f"--methods my_{name}={name} --options my_{name}.NAME=VALUE"
-        )
+    if not (suite or options.methods):
+        methods = [name for name in methods if name != "clone"]  # It needs a teacher.
+    changed_options = _method_options(options.options, methods, own)
     budgets: dict[Axis, dict[str, float]]
     if suite:
+        for name in changed_options.keys() - own.keys():
+            raise NPAError(
+                f"options of {name!r} are frozen in {options.suite}: give it a name of its own, "
+                f"--methods my_{name}={name} --options my_{name}.NAME=VALUE"
+            )
         problems = {name: suite.problem_of(name) for name in tasks}
         part = npa_bench.QUICK_FRACTION if quick else 1.0
         steps = {name: part * suite.budgets[suite.tasks[name]] for name in tasks}
@@ -186,11 +188,8 @@ def make_plan(options: CompareOptions) -> ComparisonPlan:
         ]
         seeds, episodes = 1 if quick else npa_bench.MIN_SEEDS, npa_bench.EPISODES
     else:
-        if not options.methods:
-            methods = [name for name in methods if name != "clone"]  # It needs a teacher.
         problems = {name: make_problem(name, quick=quick) for name in tasks}
         budgets = {axis: dict.fromkeys(tasks, limit) for axis, limit in _budgets(options).items()}
-        changed_options = _method_options(options.options, methods, own)
         left_out = [] if options.methods else list(LEFT_OUT)
         seeds, episodes = 3, 32
     return ComparisonPlan(
@@ -225,7 +224,7 @@ def _budgets(options: CompareOptions) -> dict[Axis, float]:
 def _chosen_methods(
     arguments: Sequence[str], known: Iterable[str]
 ) -> tuple[list[str], dict[str, str]]:
-    """Return the names of the methods to run, and the methods of new names (NAME=METHOD)."""
+    """Return the names of the methods to run; of those given as NAME=METHOD also METHOD by NAME."""
     from npa_envs.agents.learning import method_options
 
     known = list(known)
@@ -271,7 +270,7 @@ def _method_options(
 
 
 def _jobs(options: CompareOptions) -> int:
-    """Return the number of runs at the same time; with --learning-seconds, equal on all devices."""
+    """Return how many runs run at a time; a multiple of the device count for equal wall time."""
     count = len(options.devices or (options.device,))
     jobs = count if options.jobs is None else options.jobs
     if options.learning_seconds is not None and jobs % count:
@@ -283,7 +282,7 @@ def _jobs(options: CompareOptions) -> int:
 
 
 def _settings(options: CompareOptions) -> dict[str, Any]:
-    """Return the machine, versions and threads, which the record names."""
+    """Return the record's entries on machine, versions and CPU threads."""
     from npa_envs.devices import check_device
     from npa_envs.measure.benchmark_records import installed_version, machine, measured_facts
 

@@ -52,11 +52,11 @@ class DemoOptions(common.RunOptions):
     train_seconds: float = 30.0
     """Time for the training [s]."""
     seed: int = 0
-    """Randomness."""
+    """Seed of all random numbers."""
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Grow, heal and train; print and write the figures."""
+    """Grow, heal and train rules; print and write a report."""
     options = common.parse_options(DemoOptions, "demo", arguments)
     from npa_envs.atomic_files import write_text
 
@@ -76,7 +76,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def grow_and_heal(options: DemoOptions, device: torch.device) -> Iterator[str]:
-    """Grow the rule, damage it twice, write a film of it, and yield the figures."""
+    """Grow the rule, damage it twice, write a film of it, and yield the report's lines."""
     import torch
 
     from npa_envs.measure.quality import measure
@@ -109,7 +109,7 @@ def grow_and_heal(options: DemoOptions, device: torch.device) -> Iterator[str]:
 
 
 def train_small(options: DemoOptions, device: torch.device) -> Iterator[str]:
-    """Train a small rule from a picture, write a film of it, and yield the figures."""
+    """Train a small rule from a picture, write a film of it, and yield the report's lines."""
     import torch
 
     from npa_envs.measure.quality import measure

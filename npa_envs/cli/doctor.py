@@ -23,7 +23,7 @@ class DoctorOptions:
 
 
 class DoctorLine(NamedTuple):
-    """One line of the report."""
+    """A line of the report of `npa-envs doctor`."""
 
     subject: str
     text: str
@@ -39,7 +39,7 @@ class DoctorLine(NamedTuple):
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Print the report; return 1 if something is broken."""
+    """Print the report on this machine; return 1 if something is broken."""
     if arguments:
         # Imported late: the report must also appear if the parser's package is missing.
         from npa_envs.cli import common
@@ -57,7 +57,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def examine() -> list[DoctorLine]:
-    """Return the lines of the report in their order."""
+    """Check this machine and return the report's lines."""
     system = f"{platform.system()} {platform.release()}, {platform.machine()}"
     lines = [
         DoctorLine("python", f"{platform.python_version()} ({sys.executable})"),
@@ -78,7 +78,7 @@ def _numbers(version: str) -> tuple[int, ...]:
 
 
 def _packages() -> list[DoctorLine]:
-    """Return the package, each of its requirements, and each extra."""
+    """Return lines on this package, each package that it requires, and each of its extras."""
     try:
         lines = [DoctorLine("npa-envs", importlib.metadata.version("npa-envs"))]
     except importlib.metadata.PackageNotFoundError:
@@ -129,7 +129,7 @@ def _torch_devices() -> list[DoctorLine]:
 
 
 def _no_cuda(built: str | None) -> DoctorLine:
-    """Return why torch, built for this version of CUDA or for none, uses no GPU."""
+    """Return the line that says why torch uses no GPU; `built` is its CUDA version or None."""
     query = ("nvidia-smi", "--query-gpu=name,driver_version", "--format=csv,noheader")
     try:
         listed = subprocess.run(

@@ -35,7 +35,7 @@ class EvaluateOptions(common.RuleOptions):
     seed_count: int = 8
     """Worlds to measure, each from a different seed; for point clouds all test clouds."""
     first_seed: int = 1_000_000
-    """The first world's number; training uses others."""
+    """Seed of the first world; training uses others."""
     healing: bool = False
     """Also damage the grown worlds by a cut and a wipe, and measure how they heal. Point clouds are
     always damaged."""
@@ -43,11 +43,11 @@ class EvaluateOptions(common.RuleOptions):
     """Textures only: also measure three distances from the target that no loss uses, as ratios: 1
     is the distance of the target drawn by particles."""
     json: Path | None = None
-    """Also write the table to this JSON file."""
+    """Also write the tables to this JSON file."""
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Measure, print and write the table."""
+    """Measure a rule's quality; print and write its tables."""
     options = common.parse_options(EvaluateOptions, "evaluate", arguments)
     from npa_envs.atomic_files import write_text
     from npa_envs.measure import quality
@@ -77,7 +77,7 @@ def main(arguments: Sequence[str]) -> int:
         tables = {"pictures": rows}
         metric = tasks[0].metric_name
         what = f"{len(tasks)} pictures, {options.seed_count} worlds each"
-        metric_words = f"{metric}, shuffled: with the code of the next picture"
+        note = ", shuffled: with the code of the next picture"
     else:
         world = options.world | {"data_folder": options.data_folder}
         trained = task_of_rule(options.rule, rule, device, **world)
@@ -93,12 +93,11 @@ def main(arguments: Sequence[str]) -> int:
         total = None if kwargs["changed"] else max(checkpoints)
         with common.progress_bar(total, show=options.progress) as advance:
             tables = quality.tables_of(rule, task, progress=advance, **kwargs)
-        what, metric = f"{options.seed_count} worlds", task.metric_name
+        what, metric, note = f"{options.seed_count} worlds", task.metric_name, ""
         if task.classifies:
             clouds = cast("PointClassification", task)
             what = f"{len(clouds.clouds.label)} {clouds.split} clouds"
-        metric_words = metric
-    print(f"{options.rule}: {what}, loss: {metric_words}")
+    print(f"{options.rule}: {what}, loss: {metric}{note}")
     for name, table in tables.items():
         print(table_text(table, missing=UNMEASURED if name == "growth" else "never"))
     if options.json is not None:

@@ -17,8 +17,8 @@ from npa_envs.errors import NPAError
 class ExportOptions:
     """Write one HTML file that runs rules in a browser, also on a phone, with brushes and sliders.
 
-    It needs no server and no network. If the name ends in .json, it writes a collection for the
-    authors' web demo instead, without title or gallery.
+    It needs no server and no network. If the name ends in .json, it writes a collection of rules
+    for the web demo of the paper's authors instead, without title or gallery.
 
     Examples:
       npa-envs export-web gecko heart --out page.html
@@ -30,7 +30,7 @@ class ExportOptions:
     out: Path = Path("page.html")
     """The file to write."""
     gallery: bool = False
-    """Begin with pictures to choose from; default of RULE: all shipped 2D rules."""
+    """Begin with pictures to choose from; without RULE: of all shipped 2D rules."""
     title: str | None = None
     """Title of the page; default: the first rule's name."""
     particle_count: int | None = None
@@ -38,7 +38,7 @@ class ExportOptions:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Write the page or the collection; return 0."""
+    """Write the HTML page, or the JSON collection of rules; return 0."""
     options = common.parse_options(ExportOptions, "export-web", arguments)
     common.check_numbers(options, particle_count=1)
     from npa_envs.rule.authors import save_demo_json

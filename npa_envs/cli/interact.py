@@ -44,10 +44,11 @@ class InteractOptions(common.RunOptions, InteractionSettings):
     """Grow every rule next to every other one, and measure how that changes it.
 
     For every ordered pair of rules, distance, ratio and radius it measures: the first rule's task
-    loss on its own particles, together and alone; how much both mix; how far its centroid moves.
+    loss on its own particles, together and alone; how much the two mix; how far its centroid moves.
     "cooperates": the loss falls by more than the margin; "disrupted": it rises by more; "mixes":
-    the mixing index is 0.25 or more. Densities of each rule are divided by its own particles. The
-    folder gets a JSON file, a heat map, and a filmstrip of each pair. A stopped run continues.
+    the mixing index is 0.25 or more. Density gradients of each rule are divided by the number of
+    its own particles. The folder gets a JSON file, a heat map, and a filmstrip of each pair. A
+    stopped run continues.
 
     Examples:
       npa-envs interact gecko heart
@@ -65,7 +66,7 @@ class InteractOptions(common.RunOptions, InteractionSettings):
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Grow pairs of rules that have no record yet; write record and pictures, print a table."""
+    """Grow the pairs of rules that are not measured yet; write results and print their table."""
     options = common.parse_options(InteractOptions, "interact", arguments)
     if options.quick:
         defaults = InteractOptions(**QUICK)
@@ -108,7 +109,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _facts(encounters: Encounters, rules: Sequence[RuleUnderTest]) -> dict[str, Any]:
-    """Return what the figures depend on."""
+    """Return the record's facts, which all results depend on: settings and the rules' weights."""
     settings = encounters.settings
     facts = {f.name: getattr(settings, f.name) for f in fields(InteractionSettings)}
     del facts["first_seed"], facts["seed_count"]
@@ -118,7 +119,7 @@ def _facts(encounters: Encounters, rules: Sequence[RuleUnderTest]) -> dict[str, 
 
 
 def _rules(sources: Sequence[str], device: torch.device) -> list[RuleUnderTest]:
-    """Return the rules with their tasks, each under a different name."""
+    """Load rules with their tasks, and give each a different name."""
     rules: dict[str, RuleUnderTest] = {}
     for source in dict.fromkeys(sources):
         rule = load_rule(source, device=device).float().requires_grad_(False)

@@ -14,7 +14,7 @@ from npa_envs.cli import common
 from npa_envs.errors import NPAError
 
 if TYPE_CHECKING:
-    from npa_envs.agents.learning import CurvePoint, Problem
+    from npa_envs.agents.learning import CurvePoint
     from npa_envs.training.process_group import ProcessGroup
 
 
@@ -56,13 +56,13 @@ class LearnOptions(common.SharedRunOptions, common.RunOptions):
     episodes: int = 16
     """Episodes that evaluate each point of the curve."""
     curve_points: int = 20
-    """Points of the curve after the first, and checkpoints."""
+    """Points of the learning curve after the first; each writes a checkpoint."""
     out: Path = Path("runs/learn")
     """Folder for checkpoint, rules and curve."""
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Learn; return 130 if it was stopped."""
+    """Learn an environment; return 0, or 130 if learning was stopped."""
     from npa_envs.training.process_launcher import (
         joined_processes,
         launch,
@@ -123,7 +123,7 @@ def run(options: LearnOptions, ranks: ProcessGroup) -> int:
     )
     train(
         options.method,
-        problem_of(options),
+        common.problem_of(options, options.num_envs or NUM_ENVS, options.episode_steps),
         budget,
         options.seed,
         device=options.device,
@@ -140,16 +140,3 @@ def run(options: LearnOptions, ranks: ProcessGroup) -> int:
         end = "stopped; the same arguments with --resume continue" if stopped else "finished"
         print(f"{end}: rules, curve and checkpoint are in {options.out}/")
     return INTERRUPTED if stopped else 0
-
-
-def problem_of(options: LearnOptions) -> Problem:
-    """Return the environment to learn."""
-    from npa_envs.agents.learning.problem import Problem, registration_of
-
-    steps = options.episode_steps
-    return Problem(
-        env_id=options.env,
-        keywords=common.named_values("keywords", options.keywords),
-        episode_steps=registration_of(options.env).steps if steps is None else steps,
-        num_envs=NUM_ENVS if options.num_envs is None else options.num_envs,
-    )

@@ -14,7 +14,7 @@ class ListOptions:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Print the lists; return 0."""
+    """Print the names of tasks, environments, targets, losses and rules; return 0."""
     common.parse_options(ListOptions, "list", arguments)
     from npa_envs.envs.multi.tasks import ENVIRONMENTS as OF_SPECIES
     from npa_envs.measure.quality import score_line, scores

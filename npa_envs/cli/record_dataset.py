@@ -43,7 +43,7 @@ class RecordOptions(common.RunOptions):
     episodes: int = 16
     """Episodes to record, each from a different seed."""
     first_seed: int = 0
-    """The first one's seed; the others follow."""
+    """Seed of the first episode; the others have the seeds after it."""
     num_envs: int = 16
     """Worlds that run at the same time."""
     keywords: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE")] = ()
@@ -87,15 +87,8 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def problem_of(options: RecordOptions) -> Problem:
-    """Return the environment with its keywords."""
-    from npa_envs.agents.learning.problem import Problem, registration_of
-
-    problem = Problem(
-        env_id=options.env,
-        keywords=common.named_values("keywords", options.keywords),
-        episode_steps=registration_of(options.env).steps,
-        num_envs=min(options.num_envs, options.episodes),
-    )
+    """Return the environment to record, checked to be of one species."""
+    problem = common.problem_of(options, min(options.num_envs, options.episodes))
     if problem.controlled == "species":
         raise NPAError(
             f"env must be of one species, as Minari keeps one agent's episodes, got {options.env}"
@@ -104,7 +97,7 @@ def problem_of(options: RecordOptions) -> Problem:
 
 
 def policy_of(options: RecordOptions, problem: Problem) -> Callable[[Any], Any]:
-    """Return the policy that the options name."""
+    """Return the policy named by `options.policy`, loaded or made for the environment."""
     from npa_envs.agents.learning import Budget, RuleSet, train
     from npa_envs.agents.learning.problem import WORLDS_PER_SEED
 

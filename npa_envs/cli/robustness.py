@@ -19,8 +19,8 @@ QUICK_SEEDS, QUICK_PARTICLES = 2, 256
 class RobustnessOptions(common.MeasureOptions):
     """Measure how rules grow under changed conditions, and how they recover from damage.
 
-    The result is a table of figures over seeds; `npa-envs stress` is the command with verdicts.
-    With --out a rule's JSON file is written after each value, and a stopped run continues there.
+    The result is a table of losses over seeds, without a verdict (`npa-envs stress` has those).
+    With --out each rule's JSON file is saved after each measurement, and a stopped run continues.
 
     Examples:
       npa-envs robustness heart --quick
@@ -31,9 +31,9 @@ class RobustnessOptions(common.MeasureOptions):
     """Shipped rules (`npa-envs list`), initial rules of presets (`seven-pictures`), files of rules,
     or folders of runs; default: all shipped ones, or one of each task when quick."""
     seed_count: int | None = None
-    """Seeds for each figure; default: 8, or 2 when quick."""
+    """Worlds of each condition, each from its own seed; default: 8, or 2 when quick."""
     first_seed: int = 1_000_000
-    """The first seed's number; training uses others."""
+    """The first seed; training uses others."""
     most_particles: int | None = None
     """Conditions with more particles in all seeds' worlds together are left out; default: 131072 on
     a CPU, 2097152 on CUDA."""
@@ -47,7 +47,7 @@ class RobustnessOptions(common.MeasureOptions):
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Measure, print and write."""
+    """Measure the rules that are left; print and write all tables."""
     options = common.parse_options(RobustnessOptions, "robustness", arguments)
     from npa_envs.atomic_files import write_text
     from npa_envs.measure.accuracy.trained_rule_checks import task_name

@@ -44,11 +44,11 @@ class RolloutCommand(common.RuleOptions):
     fps: float = 25.0
     """Frames a second, 0.1 to 50."""
     seed: int = 0
-    """Randomness, 0 to 2^63 - 1; the same seed gives the same film."""
+    """Seed of all random numbers, 0 to 2^63 - 1; the same seed gives the same film."""
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Grow, film and write; return 0."""
+    """Grow the rule, print its loss and extent, and write films and point files."""
     options = common.parse_options(RolloutCommand, "rollout", arguments)
     import torch
 

@@ -16,11 +16,11 @@ from npa_envs.errors import NPAError
 class SearchOptions(common.RunOptions, SearchWorld):
     """Search for rules that differ from each other and stay alive.
 
-    An archive keeps the best candidate of each kind: by speed, by how crowded particles stand, and
-    by how colours mix. The best are those whose colours change most while states and positions stay
-    within [-1, 1]. The folder gets every elite as a rule's file that
-    `view` and `rollout` open, a page that shows them, and a record. The same command goes on where
-    a search was stopped, and further with a larger budget.
+    An archive has cells by speed, crowding of particles and mixing of colours, and keeps the best
+    candidate of each (its elite): the one whose colours change most while states and positions stay
+    within [-1, 1]. The folder gets every elite as a rule file that `view` and `rollout` open, a
+    page that shows them, and a record. The same command continues a stopped search, also with a
+    larger budget.
 
     Examples:
       npa-envs search
@@ -28,24 +28,24 @@ class SearchOptions(common.RunOptions, SearchWorld):
     """
 
     method: Literal["map-elites", "cma-me", "cma-es", "random"] = "map-elites"
-    """What proposes candidates: mutants of elites; CMA-ES rewarded for what is new, or for quality
-    alone; chance."""
+    """How candidates are proposed: as mutants of elites, by CMA-ES rewarded for new elites (cma-me)
+    or for quality (cma-es), or at random."""
     budget: float = 2e7
     """Particle-steps of the whole search: candidates times worlds, particles and steps."""
     batch_size: int = 20
     """Candidates that are proposed together."""
     seed: int = 0
-    """Of the proposals; all candidates meet the same worlds."""
+    """Seed of the proposals; all candidates run in the same worlds."""
     threads: int = 1
     """CPU threads of torch and of the kernels."""
     max_seconds: float | None = None
-    """Stop after this time; the same command goes on. Default: never."""
+    """Stop after this time [s]; the same command continues. Default: never."""
     out: Path = Path("runs/search")
     """Folder to write to; created where missing."""
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Search, and write elites and atlas."""
+    """Search; write the elites' rules, and a page and a picture that show them."""
     options = common.parse_options(SearchOptions, "search", arguments)
     common.check_numbers(options, threads=1)
     from npa_envs.agents.search.atlas import PAGE, figure, page, write_elites

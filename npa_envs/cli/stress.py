@@ -16,9 +16,9 @@ from npa_envs.cli import common
 class StressOptions(common.MeasureOptions):
     """Check hard geometry, hard values, long runs of rules, gradients, precision.
 
-    Every check has an expectation, figures and a verdict: pass, fail, a range in which a property
-    is true, or skipped. With --out a JSON file is written after each check, and a stopped run
-    continues: checks that passed are not repeated.
+    Every check has an expectation, measured values and a verdict: pass, fail, the range in which a
+    property is true, or skipped. With --out a JSON file is written after each check, and a stopped
+    run continues: checks that passed are not repeated.
 
     Examples:
       npa-envs stress --quick
@@ -44,7 +44,7 @@ class StressOptions(common.MeasureOptions):
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Check, print and write; return 1 if a check failed."""
+    """Run the checks, print and write their verdicts; return 1 if a check failed."""
     options = common.parse_options(StressOptions, "stress", arguments)
     from npa_envs.measure import accuracy
     from npa_envs.measure.accuracy import check_runner

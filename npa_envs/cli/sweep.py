@@ -62,7 +62,7 @@ class SweepOptions(common.PartOptions):
 
 @dataclass
 class SweepRun(Child):
-    """One combination: a process that starts or resumes training in a folder."""
+    """A training process for one combination of values; starts or resumes the run in a folder."""
 
     values: Mapping[str, str]
     """Values by option."""
@@ -74,7 +74,7 @@ class SweepRun(Child):
     start_time: float = 0.0
 
     def begin_work(self, device: str) -> None:
-        """Start it on a device."""
+        """Start the training process on a device."""
         self.start_time = time.perf_counter()
         self.folder.mkdir(parents=True, exist_ok=True)
         where = ("--out", str(self.folder), "--device", device)
@@ -96,24 +96,24 @@ class SweepRun(Child):
         return self.process is not None and self.process.poll() is not None
 
     def stop(self, *, at_once: bool) -> None:
-        """Ask it to end, after a checkpoint unless `at_once`."""
+        """Ask the process to end, after a checkpoint unless `at_once`."""
         if self.process is not None:
             (self.process.kill if at_once else self.process.terminate)()
 
     def end(self) -> None:
-        """Wait until it has ended after `stop`."""
+        """Wait until the process has ended after `stop`."""
         if self.process is not None:
             self.process.wait()
 
     def write(self) -> None:
-        """Write its arguments, exit code and wall time [s]."""
+        """Write the run's arguments, exit code and wall time [s] to its record."""
         assert self.process is not None, "it is over"
         seconds = time.perf_counter() - self.start_time
         result = {"code": int(self.process.returncode), "seconds": seconds}
         write_record(self.folder / RECORD, {"facts": {"words": self.arguments}, **result})
 
     def record(self) -> tuple[int, float] | None:
-        """Return the recorded exit code and time, or None; refuses those of other arguments."""
+        """Return the recorded exit code and wall time [s], or None if the run has no record."""
         return read_record(
             self.folder / RECORD,
             {"words": self.arguments},
@@ -123,13 +123,13 @@ class SweepRun(Child):
 
     @property
     def done(self) -> bool:
-        """Whether its record says that it ended without an error."""
+        """Whether the run's record says that it ended without an error."""
         record = self.record()
         return record is not None and record[0] == 0
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run what is missing, print and write; return 1 if a run failed."""
+    """Train the missing runs, print and write the table; return 1 if a run failed."""
     split = arguments.index("--") if "--" in arguments else len(arguments)
     options = common.parse_options(SweepOptions, "sweep", arguments[:split])
     common.check_numbers(options, jobs=1, threads=1)
@@ -173,7 +173,7 @@ def main(arguments: Sequence[str]) -> int:
 def combinations(
     over: Sequence[str], task_words: Sequence[str], folder: Path = Path(), threads: int = 1
 ) -> list[SweepRun]:
-    """Return a run for each combination of values NAME=A,B,C, with a task and its options."""
+    """Return a run of `npa-envs train TASK_WORDS` with each combination of values NAME=A,B,C."""
     from npa_envs.training import TASKS
 
     if not task_words or task_words[0] not in TASKS:
@@ -205,12 +205,12 @@ def combinations(
 
 
 def _option(word: str) -> str:
-    """Return the name of an option as `npa-envs train` shows it."""
+    """Return an option's name with hyphens and without the leading two."""
     return word.removeprefix("--").replace("_", "-")
 
 
 def table(runs: Sequence[SweepRun]) -> str:
-    """Return the runs with the scores of their reports, in Markdown."""
+    """Return a Markdown table of runs: values, end, wall time [s] and the scores of the reports."""
     from npa_envs.measure.quality import score_line
 
     rows = []

@@ -99,12 +99,12 @@ class TrainOptions(common.SharedRunOptions):
 
 
 def resolve_task(task_name: str, arguments: Sequence[str]) -> list[str]:
-    """Return the arguments with `--resume auto` replaced, and with the device of `--gpus`."""
+    """Return arguments after replacing `--resume auto`, and adding the device of `--gpus`."""
     return common.resolve_run(arguments, lambda words: parse_run(task_name, words)[1].out)
 
 
 def parse_run(task_name: str, arguments: Sequence[str]) -> tuple[TrainOptions, TrainConfig[Any]]:
-    """Return the launch options and the configuration of a command line.
+    """Parse arguments to the options of the run and its training configuration.
 
     Ends the process after `--help`, which shows the most used options, and `--help-all`.
     """
@@ -117,7 +117,7 @@ def parse_run(task_name: str, arguments: Sequence[str]) -> tuple[TrainOptions, T
 def _check_preset(
     name: str, run: TrainConfig[Any], task_name: str, folder: RunFolder, arguments: Sequence[str]
 ) -> None:
-    """Check that a resumed run was started with the preset of the arguments."""
+    """Check that a resumed run has the fields of the preset `name`, except those in `arguments`."""
     presets = {name: config_to_dict(one) for name, one in task_entry(task_name).presets.items()}
     values = config_to_dict(run)
     changed = {word.partition("=")[0].lstrip("-").replace("-", "_") for word in arguments}
@@ -137,7 +137,7 @@ def _check_preset(
 
 
 def starting_configuration(task_name: str, arguments: Sequence[str]) -> TrainConfig[Any]:
-    """Return the configuration that the options change: that of the preset, file or resumed run."""
+    """Return the configuration of the preset, file or resumed run, before options change it."""
     first = common.first_options(arguments)
     device = first.device if first.device and first.config is None else "cpu"
     base = preset(first.preset or default_preset(task_name, device), task_name)
@@ -176,7 +176,7 @@ ConfigT = TypeVar("ConfigT", bound=TrainConfig[Any])
 
 @dataclass(frozen=True)
 class Command(Generic[ConfigT]):
-    """All options of a command line, in the groups of its help."""
+    """All options of `npa-envs train TASK`, in the groups of its help."""
 
     run: TrainOptions
     training: ConfigT
@@ -185,7 +185,7 @@ class Command(Generic[ConfigT]):
 def _parse_over(
     defaults: ConfigT, task_name: str, arguments: Sequence[str]
 ) -> tuple[TrainOptions, ConfigT]:
-    """Return the launch options and the configuration, whose options change `defaults`."""
+    """Parse arguments to the options of the run, and to `defaults` with the options' changes."""
     description = f"Train on {task_name}. Defaults shown are those of the preset."
     if {"-h", "--help"} & set(arguments):
         description += f" All options: npa-envs train {task_name} --help-all"
@@ -204,7 +204,7 @@ def _parse_over(
 
 
 def _with_common_fields(config: Any) -> Any:
-    """Return a configuration whose fields that are not in `SHOWN` are hidden from the help."""
+    """Return a configuration with equal values whose help shows only the fields in `SHOWN`."""
     cls: Any = type(config)
     hints = get_type_hints(cls, include_extras=True)
     suppress: Any = tyro.conf.Suppress
@@ -224,7 +224,7 @@ def _with_common_fields(config: Any) -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class SpeciesOptions(Morphogenesis2DConfig):
-    """Options that hold for all species; a --config file can set them for each species."""
+    """Options of all species together; a --config file can set them for each species."""
 
     target: tyro.conf.Suppress[str] = "gecko"
     code_dim: tyro.conf.Suppress[int] = 8
@@ -241,7 +241,7 @@ class SpeciesOptions(Morphogenesis2DConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class JointOptions(JointTrainConfig[SpeciesOptions]):
-    """A training run of several rules in one world; options of a species hold for all."""
+    """Options of a training run of several rules in one world, the same for all species."""
 
     initial_rule: tyro.conf.Suppress[str] = ""
 
@@ -249,7 +249,7 @@ class JointOptions(JointTrainConfig[SpeciesOptions]):
 def parse_joint(
     task_name: str, base: JointTrainConfig[CoMorphogenesis2DConfig], arguments: Sequence[str]
 ) -> tuple[TrainOptions, JointTrainConfig[CoMorphogenesis2DConfig]]:
-    """Return the command line's configuration of a run of several species."""
+    """Parse arguments of a run of several species, whose configuration `base` they change."""
     task = base.task
     shared_fields = {
         "targets": tuple(one.target for one in task.species),
@@ -279,10 +279,10 @@ def parse_joint(
     return launch, _of_type(JointTrainConfig, first, task=together)
 
 
-def _of_type(cls: Any, source: Any, **others: Any) -> Any:
-    """Return a dataclass of a type with the fields of `source`, and others."""
+def _of_type(cls: Any, source: Any, **changes: Any) -> Any:
+    """Return a dataclass `cls` with the values of equally named fields of `source`, and changes."""
     names = {field.name for field in fields(cls)} & {field.name for field in fields(source)}
-    return cls(**{name: getattr(source, name) for name in names} | others)
+    return cls(**{name: getattr(source, name) for name in names} | changes)
 
 
 # The run
@@ -439,14 +439,14 @@ def process_count(task_name: str, options: TrainOptions, config: TrainConfig[Any
 
 
 def _species(config: TrainConfig[Any]) -> Sequence[Any]:
-    """Return the tasks of all species, one or several."""
+    """Return the task configuration of each species; most tasks have one species."""
     return getattr(config.task, "species", (config.task,))
 
 
 def announcement(
     task_name: str, options: TrainOptions, config: TrainConfig[Any], process_count: int = 1
 ) -> tuple[str, str]:
-    """Return two lines: a run's targets, and its size and expected time."""
+    """Return two printed lines: a run's targets, and its size and expected time."""
     species = _species(config)
     goals = [goal for task in species for goal in getattr(task, "targets", ()) or (task.goal_text,)]
     particles = " and ".join(str(task.particle_count) for task in species)

@@ -61,7 +61,7 @@ TITLES: Mapping[str, str] = {
 
 
 class Training(NamedTuple):
-    """How a rule was trained: task, arguments after `npa-envs`, iterations, time [s]."""
+    """How a rule was trained: task, words after `npa-envs`, optimiser steps, wall time [s]."""
 
     task_name: str
     arguments: Sequence[str]
@@ -72,9 +72,9 @@ class Training(NamedTuple):
 def write_report(
     path: Path, folder: Path, training: Training, device: torch.device, *, progress: bool
 ) -> tuple[Path, str]:
-    """Measure and film a trained rule, write its card, and return the card's path and scores.
+    """Measure and film the rule in a file; return the report's path and one line of scores.
 
-    The folder gets the card STEM.md, STEM.json as of `npa-envs evaluate --json`, STEM.gif,
+    The folder gets the report STEM.md, STEM.json as of `npa-envs evaluate --json`, STEM.gif,
     STEM.mp4 and STEM-filmstrip.png, for a 3D rule also a turntable and point files. On a CPU fewer
     worlds are measured, for fewer steps and without damage, as they are slow there.
     """

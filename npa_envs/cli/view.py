@@ -64,7 +64,7 @@ class ViewOptions(common.DeviceOptions):
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Serve the world until Ctrl-C; return 0."""
+    """Serve a live world to the browser until Ctrl-C; return 0."""
     options = common.parse_options(ViewOptions, "view", arguments)
     if not 1 <= options.threads <= 256:
         raise NPAError(f"threads must be in [1, 256], got {options.threads}")
@@ -92,12 +92,12 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def open_browser(address: str) -> bool:
-    """Open a page in a graphical browser; return whether there is one."""
+    """Open a page in a graphical browser; return False if there is none."""
     return has_screen() and webbrowser.open(address)
 
 
 def world_maker(options: ViewOptions, device: torch.device) -> Callable[[], LiveWorld]:
-    """Return a function that makes a world of the rule, the run or the environment."""
+    """Return a function that makes a live world of the rule, run or environment `options.what`."""
     from npa_envs.web.environment_world import EnvironmentWorld, make_environment
     from npa_envs.web.rule_world import RuleWorld, RunWorld
 

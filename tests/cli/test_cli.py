@@ -35,15 +35,18 @@ def trained(tmp_path_factory):
     return folder
 
 
+def code_of(words):
+    """Return the exit code of a command, also if the parser of its options ends it."""
+    try:
+        return main(words)
+    except SystemExit as end:
+        return end.code
+
+
 def error_of(capsys, words, lines=1):
     """Run a command that must be refused, and return its message of so many lines."""
-    try:
-        code = main(words)
-    except SystemExit as end:
-        assert lines is None, "the parser has refused it"
-        code = end.code
+    assert code_of(words) == 2
     error = capsys.readouterr().err
-    assert code == 2
     if lines:
         assert error.count("\n") == lines
         assert error.startswith("npa-envs: error: ")
@@ -64,11 +67,7 @@ def rule(trained):
 
 def help_of(capsys, *words):
     """Ask for help, and return it without colours."""
-    try:
-        code: object = main([*words])
-    except SystemExit as end:
-        code = end.code
-    assert code == 0
+    assert code_of(words) == 0
     return re.sub(r"\x1b\[[0-9;]*m", "", capsys.readouterr().out)
 
 
@@ -331,13 +330,10 @@ MISTAKES = [
     ("train morphogenesis2d --config /nowhere.yaml", "cannot read the configuration file"),
     ("train TINY --out OUT --max-seconds -1", "max_seconds must be positive"),
     ("rollout nosuchrule --out OUT", "unknown rule 'nosuchrule'"),
-    ("rollout RULE --out OUT --damage 5:burn", "unknown damage 'burn'"),
     ("rollout RULE --out OUT --damage 5", "STEP:KIND"),
-    ("rollout RULE --out OUT --damage 5:cut:-1", "positive size"),
     ("rollout RULE --out OUT --steps 20 --damage 20:cut", "before the last of 20 steps"),
     ("rollout RULE --out OUT --target nosuchtarget", "nosuchtarget"),
     ("rollout RULE --out OUT --eps -1", "eps must be"),
-    ("rollout RULE --out OUT --device cuda:99", "device must be"),
     ("rollout RULE --out FILE/inside", "out must be a folder"),
     ("rollout 3D --out OUT", "got space_dim=3"),
     ("evaluate UNTOLD --no-progress", "give --target"),
@@ -345,7 +341,6 @@ MISTAKES = [
     ("robustness --seed-count 0", "seed_count must be at least 1, got 0"),
     ("robustness --max-seconds 0", "max_seconds must be positive, got 0"),
     ("stress --only tim", "unknown check 'tim'"),
-    ("stress --max-seconds 0", "max_seconds must be positive, got 0"),
     ("stress --threads 0", "threads must be at least 1, got 0"),
     ("train JOINT --targets ring", "targets must be two or more, got 1"),
     ("rollout digits --style points", "for clouds that never move"),
@@ -354,7 +349,6 @@ WRONG_OPTIONS = [
     ("train TINY --iterations 0", "iterations must be a whole number"),
     ("train TINY --iters 3", "--iters"),
     ("rollout gecko --fps 51", "fps must be in [0.1, 50], got 51"),
-    ("rollout gecko --fps nan", "fps must be in"),
     ("rollout gecko --background mauvish", "background must be"),
     ("rollout gecko --seed -1", "seed must be in [0, 2^63), got -1"),
     ("rollout gecko --seed 9223372036854775808", "seed must be in"),

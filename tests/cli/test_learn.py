@@ -12,7 +12,8 @@ import pytest
 from clock import Clock
 
 from npa_envs.cli import main
-from npa_envs.cli.learn import parse, problem_of
+from npa_envs.cli.common import problem_of
+from npa_envs.cli.learn import parse
 from npa_envs.training.checkpoint import load_checkpoint
 from npa_envs.training.run_folder import Run
 
@@ -103,9 +104,9 @@ def test_mistakes_are_refused(words, message, tmp_path, capsys):
     [("MixingSmall", 32), ("MixingLarge", 256), ("Mixing", 256), ("Morphogenesis2DSmall", 32)],
 )
 def test_episodes_are_as_long_as_registered(env, steps):
-    words = ["ppo", f"npa/{env}-v0"]
-    assert problem_of(parse(words)).episode_steps == steps
-    assert problem_of(parse([*words, "--episode-steps", "5"])).episode_steps == 5
+    options = parse(["ppo", f"npa/{env}-v0"])
+    assert problem_of(options, 1).episode_steps == steps
+    assert problem_of(options, 1, 5).episode_steps == 5
 
 
 def test_worlds_are_those_of_shac_when_given(tmp_path):

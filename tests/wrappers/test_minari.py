@@ -162,16 +162,8 @@ def test_episodes_of_an_environment_of_ones_own_are_as_long_as_it_is_registered(
     )
     try:
         assert registration_of("mine/Growth-v0").steps == 3
-        words = [
-            "record-dataset",
-            "mine/Growth-v0",
-            "--policy",
-            "zero",
-            "--episodes",
-            "2",
-            "--no-progress",
-        ]
-        assert main([*words, "--dataset", "npa/own-v0"]) == 0
+        words = "record-dataset mine/Growth-v0 --policy zero --episodes 2 --no-progress"
+        assert main([*words.split(), "--dataset", "npa/own-v0"]) == 0
         assert minari.load_dataset("npa/own-v0").total_steps == 6
     finally:
         del gymnasium.registry["mine/Growth-v0"]
