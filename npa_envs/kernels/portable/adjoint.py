@@ -41,7 +41,7 @@ def adjoint_kernels(
     state_gradient: bool,
     listed: bool = False,
 ) -> SimpleNamespace:
-    """Return the kernels of one variant; arguments as for `perception_kernels`."""
+    """Return the kernels of perception's adjoint; arguments as for `perception_kernels`."""
     space = domain_types(space_dim, scalar)
     vector, particle, Domain = space.vector, space.particle, space.Domain
     group = wp.types.vector(width, scalar)
@@ -74,7 +74,7 @@ def adjoint_kernels(
         gradient_bar: wp.array[scalar],
         density_gradient_bar: wp.array[vector],
     ):
-        """Write the cotangents of each row's unscaled sums from the cotangent of z."""
+        """Write each row's cotangents before the scaling, from those of its perception vector."""
         row, channel = wp.tid()
         row += range_start
         if row >= starts[starts.shape[0] - 1] - row_base:
@@ -123,7 +123,7 @@ def adjoint_kernels(
         row_base: int,
         row_capacity: int,
     ):
-        """Return first and last + 1 row of a run around particle k, or entry of its list."""
+        """Return the first and last + 1 row in a run of cells; if `listed`, entry in k's list."""
         begin, end = search.run(domain, starts, ends, base, cell, k, r)
         if wp.static(not listed):
             begin -= row_base
@@ -140,7 +140,7 @@ def adjoint_kernels(
         first: int,
         end: int,
     ):
-        """Return the rows within eps among the candidates from `first` on, and their count."""
+        """Return the rows within eps of a block of candidates, from `first` on, and their count."""
         near = indices()
         count = wp.int32(0)
         if wp.static(listed):
@@ -180,9 +180,9 @@ def adjoint_kernels(
         # outputs
         states_bar: wp.array2d[scalar],
     ):
-        """Write the cotangent of every particle's state, from the active rows around it.
+        """Write the cotangent of each particle's state, summed over the active particles around it.
 
-        With listed neighbours, particles are in sorted order everywhere.
+        With neighbour lists, all arrays are in sorted order.
         """
         k, g = wp.tid()
         k += range_start
@@ -244,7 +244,7 @@ def adjoint_kernels(
         # outputs
         density_bar: wp.array[scalar],
     ):
-        """Write the cotangent of every particle's density, through its volume."""
+        """Write the cotangent of each particle's density, through its volume 1 / rho."""
         k = range_start + wp.tid()
         entry = particles[k]
         position = space.position_of(entry)
@@ -310,7 +310,7 @@ def adjoint_kernels(
         # outputs
         positions_bar: wp.array[vector],
     ):
-        """Write the cotangent of every position: as a neighbour of others, and as a centre."""
+        """Write the cotangent of each position: of a neighbour of others, and of a centre."""
         k = range_start + wp.tid()
         entry = particles[k]
         position = space.position_of(entry)
