@@ -143,7 +143,7 @@ def domain_types(space_dim: int, scalar: type) -> SimpleNamespace:
 
     @wp.func
     def segment_cells(domain: Domain, cell: cell_vector, segment: int):
-        """Return first and last + 1 cell of run number `segment` around a cell, in row-major order."""
+        """Return the first and last + 1 cell, in row-major order, of run number `segment`."""
         width = cells_around(domain, 0)
         nx = domain.cell_shape[0]
         first = wrapped(cell[0] - domain.cells_per_eps, nx)
@@ -230,8 +230,7 @@ def make_domain(
     particle_count: int,
     cells_per_eps: int = 2,
 ) -> Any:
-    """Return the `Domain` of worlds of N particles (`particle_count`), with cells of eps /
-    cells_per_eps."""
+    """Return the `Domain` of worlds of N particles, in cells of side eps / cells_per_eps."""
     types = domain_types(space_dim, scalar)
     domain = types.Domain()
     domain.inverse_eps = 1.0 / eps

@@ -63,9 +63,9 @@ load_channels = make_wide_load(CHANNELS)
 def make_sum_listed(space_dim: int, width: int, weight_count: int, periodic: bool) -> wp.Function:
     """Return a Warp function that sums cotangents of listed rows, weighted by kernels.
 
-    It sums for a warp's 8 particles. A row has `width` cotangents for each of `weight_count`
-    weights of a pair: the smoothing kernel's 1, and D of the spiky gradient kernel if gradients are
-    perceived.
+    It sums for a warp's 8 particles. A row of perception has `width` cotangents for each of
+    `weight_count` weights of a pair: 1 of the smoothing kernel, and perhaps D of the spiky
+    gradient.
     """
     vector = wp.types.vector(space_dim, wp.float32)
 
@@ -158,10 +158,10 @@ def row_search(space_dim: int, periodic: bool) -> SimpleNamespace:
 
     @wp.func
     def run_cells(domain: Domain, line: int, begin: int, end: int, run: int):
-        """Return the first cell and one past the last of run number `run` around a line of cells.
+        """Return the first and last + 1 cell of run number `run` around a line of cells.
 
-        Around a line are all lines within eps. A run has their cells in columns `begin` to `end`;
-        where these wrap around the grid, they are two runs. Cells are indexed in row-major order.
+        Runs are the columns `begin` to `end` of all lines within eps; where these columns wrap
+        around the grid, a line has two. Cells are indexed in row-major order.
         """
         nx = domain.cell_shape[0]
         first = begin
@@ -207,7 +207,7 @@ def row_search(space_dim: int, periodic: bool) -> SimpleNamespace:
 
     @wp.func
     def box_around(domain: Domain, position: vector, origin: vector, served: bool):
-        """Return the centre, relative to `origin`, and half sides of `served` particles' box."""
+        """Return centre (relative to `origin`) and half sides of a box around `served` particles."""
         relative = position - origin
         if wp.static(periodic):
             relative = space.periodic_image(domain, relative)
@@ -237,7 +237,7 @@ def row_search(space_dim: int, periodic: bool) -> SimpleNamespace:
 
     @wp.func
     def row_entry(position: vector, number: int):
-        """Return a list entry: the position of a row, and the index `number` of its cotangents."""
+        """Return a list entry of a row: its particle's position, the index of its cotangents."""
         entry = ENTRY()
         for d in range(wp.static(space_dim)):
             entry[d] = position[d]
@@ -302,7 +302,7 @@ def listed_adjoint(
         # outputs
         cotangents: wp.array[CHANNELS],
     ):
-        """Write each row's cotangents before the scaling, from those of its perception vector.
+        """Write each row's cotangents before the logarithmic scaling, from those of perception.
 
         Those of smoothed states are multiplied by `blur_scale`.
         """
@@ -367,8 +367,8 @@ def listed_adjoint(
     ):
         """Write the cotangent of each particle's state, summed over the active particles around it.
 
-        A warp serves 8 of a world's particles (`tile_count` times), and a group of their channels.
-        `norm` is the normalising constant of the kernels, which multiplies the sum.
+        A world's particles are `tile_count` tiles of 8; a warp serves a tile and a group of
+        channels. `norm` is the normalising constant of the kernels, which multiplies the sum.
         """
         await_earlier()
         allow_next_launch()

@@ -146,7 +146,7 @@ def listed_density(
         lists: wp.array3d[wp.int16],
         list_lengths: wp.array[wp.int32],
     ):
-        """Write each particle's position and volume 1 / rho, and the neighbour list of each row.
+        """Write particles' positions and volumes 1 / rho, and neighbour lists of active particles.
 
         `records` also have the index of the particle's state, in 2D; `particles` is left out if
         empty. A list that is too long is not written; its length is then larger than the capacity.
@@ -251,9 +251,9 @@ def listed_density(
 
 @cached_under_lock()
 def make_steps_at(capacity: int, tiled: bool) -> wp.Function:
-    """Return a Warp function that reads two entries of a row's neighbour list, packed in 32 bits.
+    """Return a Warp function that reads two entries of a neighbour list, packed in 32 bits.
 
-    An entry, or step, is the neighbour's sorted index minus that of the row's particle.
+    An entry, or step, is the neighbour's sorted index minus the particle's.
     """
 
     @native.func_native(capacity, tiled)
@@ -315,7 +315,7 @@ def tiled_density(periodic: bool, capacity: int, masked: bool) -> wp.Kernel:
         lists: wp.array3d[wp.int16],
         list_lengths: wp.array[wp.int32],
     ):
-        """Write the outputs of `listed_density`'s kernel, but lists one after the other."""
+        """Write what the kernel of `listed_density` writes, but lists one after the other."""
         await_earlier()
         thread = thread_number()
         tile = thread >> wp.static(WARP.bit_length() - 1)

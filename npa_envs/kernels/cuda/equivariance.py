@@ -118,8 +118,7 @@ def steering_kernels(space_dim: int, mixed_count: int, chiral: bool) -> SimpleNa
     """Return the kernels that compute updates from a network's outputs, and the adjoint.
 
     Columns of outputs are [gates | state changes | 0], of updates [displacement | state changes |
-    0]; the displacement is a sum of mixed vectors, weighted by gates. A warp serves `STEERED_ROWS`
-    rows.
+    0]: displacements are mixed vectors, weighted by gates. A warp serves `STEERED_ROWS` rows.
     """
     form = space_dim, mixed_count, chiral
     module = native.module(f"npa_envs.kernels.steering_{'_'.join(str(int(k)) for k in form)}")
@@ -134,7 +133,7 @@ def steering_kernels(space_dim: int, mixed_count: int, chiral: bool) -> SimpleNa
         # outputs
         update: wp.array2d[wp.float32],
     ):
-        """Write updates from a network's gates and state changes."""
+        """Write updates from a network's gates and state changes, and from mixed vectors."""
         await_earlier()
         steer_by_gates(output, mixed, signs, update)
 

@@ -140,8 +140,7 @@ def scale_to(size: float, exponent: wp.uint32) -> float:
 def arrangement_kernels() -> SimpleNamespace:
     """Return the kernels that lay out weights in the order in which a warp's threads read them.
 
-    Each weight is split into two numbers of 16 bits. Launches have three dimensions, the last of
-    32.
+    Each weight is split into two numbers of 16 bits. The last dimension of launches is 32.
     """
     module = native.module("npa_envs.kernels.network_arrangement")
 

@@ -112,7 +112,7 @@ class PerceptionVariant(NamedTuple):
         return self.width * (2 + self.space_dim * self.state_gradient)
 
     def module(self) -> wp.Module:
-        """Return the Warp module that has the kernel of these options."""
+        """Return the Warp module of the kernel with these options."""
         topic = "listed_" + perception_topic(self.state_gradient, self.moment_inverse)
         topic += "_in_box" * self.periodic + "_grouped" * self.grouped + f"_{self.capacity}"
         topic += "_for_adjoint" * self.for_adjoint + "_by_place" * self.per_particle
@@ -121,7 +121,7 @@ class PerceptionVariant(NamedTuple):
 
 
 def slot_functions(variant: PerceptionVariant, lane_channels: type) -> SimpleNamespace:
-    """Return the functions that access a particle's slot of shared memory, and states and rows."""
+    """Return the functions that access a particle's slot, its part of shared memory, and states."""
     space_dim, width, lanes = variant.space_dim, variant.width, variant.lanes
     row_words = variant.row_words
     vector = wp.types.vector(space_dim, wp.float32)
@@ -162,7 +162,7 @@ def slot_functions(variant: PerceptionVariant, lane_channels: type) -> SimpleNam
 
 
 def weighing_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> SimpleNamespace:
-    """Return the functions that write neighbours' kernel weights to a particle's slot.
+    """Return the functions that write neighbours' kernel weights to shared memory (the slot).
 
     They also add up what has no channels: volume times spiky kernel (v K), the moment matrix and
     the density gradient. Each thread adds up those of its own neighbours.
@@ -182,7 +182,7 @@ def weighing_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> Si
 
     @wp.struct
     class Centre:
-        """The particle that a thread works on: sorted index k, slot, position (also in float64)."""
+        """The particle of a thread: sorted index k, address `slot` of its shared memory."""
 
         k: int
         lane: int
@@ -239,10 +239,9 @@ def weighing_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> Si
         is_neighbour: bool,
         sums: Sums,
     ):
-        """Write neighbour j's kernel weights to the slot, and add its terms to this thread's sums.
+        """Write neighbour j's kernel weights to shared memory; add its terms to this thread's sums.
 
-        An entry that only pads the list is no neighbour: it repeats the particle itself, and adds
-        0.
+        An entry that only pads the list is no neighbour: it repeats the particle, and adds 0.
         """
         number = j
         if wp.static(flat):
@@ -282,7 +281,7 @@ def weighing_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> Si
         centre: Centre,
         sums: Sums,
     ):
-        """Weigh the neighbours whose indices a search has put into the slot, `begin` to `count`."""
+        """Weigh the neighbours `begin` to `count` of those whose indices a search has written."""
         sync_warp()
         for first in range(centre.lane, slots.padded(count), wp.static(PAIR * lanes)):
             indices = indices_of_pair()
@@ -315,10 +314,9 @@ def weighing_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> Si
         steps: int,
         sums: Sums,
     ):
-        """Weigh a neighbour list's entries from `begin` on, as many as fit into the slot.
+        """Weigh a neighbour list's entries from `begin` on, at most `SLOT_ENTRIES` of them.
 
-        `steps` has this thread's next two entries: they are loaded before the current ones are
-        used.
+        `steps` has this thread's next two entries, loaded before the current ones are used.
         """
         end = begin + slots.padded(wp.clamp(length - begin, 0, wp.static(SLOT_ENTRIES)))
         for first in range(begin + wp.static(PAIR) * centre.lane, end, wp.static(PAIR * lanes)):
@@ -344,7 +342,7 @@ def weighing_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> Si
 def make_add_states(
     variant: PerceptionVariant, slots: SimpleNamespace, lane_channels: type, lane_gradient: type
 ) -> wp.Function:
-    """Return the function that adds neighbours' states, times the weights in a slot, to sums."""
+    """Return the function that adds neighbours' states, times weights in shared memory, to sums."""
     scalar = wp.float32
     space_dim, lane_width, teams = variant.space_dim, variant.lane_width, variant.teams
     state_gradient = variant.state_gradient
@@ -362,7 +360,7 @@ def make_add_states(
         blur: lane_channels,
         gradient: lane_gradient,
     ):
-        """Add states of a team's neighbours, times the slot's weights, to `blur` and `gradient`.
+        """Add a team's neighbours' states, times their weights, to the sums `blur` and `gradient`.
 
         A particle's teams of threads take its neighbours in turn, this one from `first` on.
         """
@@ -408,7 +406,10 @@ def search_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> Simp
         runs: int,
         run: int,
     ):
-        """Return first and last + 1 particle of run number `run` of cells; none beyond `runs`."""
+        """Return the first and last + 1 particle of run number `run` of cells around a cell.
+
+        It is empty for numbers beyond `runs`.
+        """
         first_cell, last_cell = space.segment_cells(
             domain, cell, wp.min(run, wp.max(runs - 1, wp.int32(0)))
         )
@@ -426,9 +427,9 @@ def search_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> Simp
         end: int,
         count: int,
     ):
-        """Append indices of particles within eps to the slot; return its new number of entries.
+        """Append indices of neighbours to those in shared memory; return their new number.
 
-        This thread tests a few of them, from `first` on, before `end`.
+        This thread tests a few candidates, from `first` on, before `end`.
         """
         loaded = candidates_ahead()
         total = wp.int32(count)
@@ -449,7 +450,7 @@ def search_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> Simp
 
 
 def row_functions(variant: PerceptionVariant) -> SimpleNamespace:
-    """Return the functions that scale a particle's sums and write them to its slot, as a row."""
+    """Return the functions that scale sums and write them to shared memory, as perception rows."""
     scalar = wp.float32
     space_dim, width, lane_width = variant.space_dim, variant.width, variant.lane_width
     lane_channels = wp.types.vector(lane_width, scalar)
@@ -459,7 +460,7 @@ def row_functions(variant: PerceptionVariant) -> SimpleNamespace:
 
     @wp.func
     def scale_huge(gradient_scale: scalar, gradient: lane_gradient, scaled: lane_rows):
-        """Return `scaled`, with new values where the squared length of the gradient overflows."""
+        """Return `scaled`, corrected where the squared length of a gradient overflows."""
         result = scaled
         for c in range(wp.static(lane_width)):
             along = vector()
@@ -509,7 +510,7 @@ def row_functions(variant: PerceptionVariant) -> SimpleNamespace:
         gradient_scale: scalar,
         gradient: lane_gradient,
     ):
-        """Write a thread's part of a row to the slot: states, smoothed states, state gradients."""
+        """Write a thread's part of a perception row to shared memory, with scaled gradients."""
         first_channel = (lane & wp.static(CUDA_LANES - 1)) * wp.static(lane_width)
         stage(slot, first_channel, own_state)
         stage(slot, wp.static(width) + first_channel, blur)
@@ -522,7 +523,7 @@ def row_functions(variant: PerceptionVariant) -> SimpleNamespace:
 
 @cached_under_lock()
 def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
-    """Return the kernel of these options that perceives by neighbour lists."""
+    """Return the kernel that perceives by neighbour lists, with these options."""
     scalar = wp.float32
     space_dim, lanes, teams = variant.space_dim, variant.lanes, variant.teams
     state_gradient, moment_correction = variant.state_gradient, variant.moment_inverse is not None
@@ -582,10 +583,11 @@ def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
     ):
         """Write the perception vector of each active particle, as the portable kernel does.
 
-        Threads are numbered by lanes, teams, groups and rows, in complete warps, some beyond the
-        last row. `state_index` has the index of each sorted particle's state, by default (empty)
-        the same index; in 2D it is in `records`. Row k is written to row `row_destination[k]`, by
-        default to row k. Numbers are clipped to plus and minus `limit` unless it is 0.
+        Thread numbers count a particle's lanes and teams, channel groups and rows, in complete
+        warps, some beyond the last row. `state_index` has the index of each sorted particle's
+        state, by default (empty) the same index; in 2D it is in `records`. Row k is written to row
+        `row_destination[k]`, by default to row k. Numbers are clipped to plus and minus `limit`
+        unless it is 0.
         """
         await_earlier()
         thread = thread_number()

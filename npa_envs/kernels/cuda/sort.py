@@ -60,15 +60,15 @@ def block_functions(capacity: int) -> SimpleNamespace:
 
     @native.func_native(*sizes)
     def clear_counts(address: wp.uint64, cell_count: int, earlier: int):
-        """Set all cells' counts to 0; sum `earlier`, rows that each thread counted before."""
+        """Set all cells' counts to 0; sum `earlier`, the rows of earlier worlds by thread."""
 
     @native.func_native(*sizes)
-    def arrive(address: wp.uint64, particle: int, cell: int, active: bool):
+    def count_particle(address: wp.uint64, particle: int, cell: int, active: bool):
         """Count a particle in its cell, and note its order of arrival there."""
 
     @native.func_native(*sizes)
     def add_up_counts(address: wp.uint64, cell_count: int):
-        """Turn the cells' counts into starts: the sum of the counts of all cells before."""
+        """Replace each cell's count by its start, the sum of the counts of all cells before."""
 
     @native.func_native(*sizes)
     def start_of(address: wp.uint64, cell: int) -> wp.vec2i:
@@ -178,7 +178,7 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
                 for d in range(wp.static(space_dim)):
                     position[d] = ahead[r, d]
                 cell = space.cell_index(domain, space.cell_of(domain, position))
-                sorting.arrive(memory, i, cell, acting[r] != 0)
+                sorting.count_particle(memory, i, cell, acting[r] != 0)
         sorting.add_up_counts(memory, domain.cell_count)
 
         slice_cells = (domain.cell_count + slice_count - 1) / slice_count
@@ -233,7 +233,7 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
 
 @cached_under_lock()
 def sort_small_splats(capacity: int) -> wp.Kernel:
-    """Return the kernel that sorts footprints on pictures, for up to `capacity` particles a world.
+    """Return the kernel that sorts particles' footprints on pictures, for small worlds.
 
     They are the same, in the same order, as in `pictures/splat.py`. A block also computes the mean
     position of its world.
@@ -282,7 +282,7 @@ def sort_small_splats(capacity: int) -> wp.Kernel:
             position = load_vector(positions, first_particle + i)
             position = splat.pixel_position(view, position, mean, goal)
             cell = splat.cell_of_centre(view, splat.patch_centre(position))
-            sorting.arrive(memory, i, cell, False)
+            sorting.count_particle(memory, i, cell, False)
         sorting.add_up_counts(memory, view.cell_count)
         first_cell = world * view.cell_count
         stride = slice_count * wp.static(block)

@@ -151,7 +151,7 @@ def tile_kernels(scalar: type) -> SimpleNamespace:
 
     @wp.func
     def shared_pixels(frame: Frame, tile: int, footprint: footprint_type):
-        """Return the first column and row, then the last + 1, of a tile's pixels in a footprint."""
+        """Return first, and then last + 1, column and row of a tile's pixels in a footprint."""
         tile_in_picture = tile % frame.tile_count
         row = tile_in_picture / frame.tile_columns * wp.static(TILE_SIDE)
         column = tile_in_picture % frame.tile_columns * wp.static(TILE_SIDE)
@@ -178,7 +178,7 @@ def tile_kernels(scalar: type) -> SimpleNamespace:
         # outputs
         stops: wp.array[wp.int32],
     ):
-        """Blend the Gaussians of a tile; write the first pair that a pixel ignores to `stops`.
+        """Blend the Gaussians of a tile; `stops` gets the first pair that a pixel ignores.
 
         Pairs are of a tile and a Gaussian. Initial `stops` must be beyond all pairs.
         """
@@ -266,7 +266,7 @@ def block_kernels(scalar: type) -> SimpleNamespace:
 
     @native.func_native(BATCH, TILE_PIXELS // WARP)
     def store_or_sum(write: bool, i: int, entry: int, value: pulls_type) -> scalar:
-        """Store a warp's cotangents of pair i (`write`), or return an entry of their sum."""
+        """Store a warp's cotangents of pair i (`write`), or return an entry of the warps' sum."""
 
     @wp.func
     def own_pixel(frame: Frame, tile: int, k: int):
@@ -292,7 +292,7 @@ def block_kernels(scalar: type) -> SimpleNamespace:
         passing: wp.array[scalar],
         stops: wp.array[wp.int32],
     ):
-        """Write a pixel, and to `stops` one past the last pair of its tile and a Gaussian in it."""
+        """Write a pixel; `stops` gets the first pair of its tile and a Gaussian that it ignores."""
         t = wp.tid()
         tile = t / wp.static(TILE_PIXELS)
         column, row = own_pixel(frame, tile, t % wp.static(TILE_PIXELS))

@@ -262,7 +262,7 @@ def gaussian_functions(scalar: type) -> SimpleNamespace:
 
     @wp.func
     def covered_tiles(frame: Frame, footprint: footprint_type):
-        """Return the first column and row, then the last + 1, of the tiles in a footprint."""
+        """Return first, and then last + 1, column and row of the tiles in a footprint."""
         left, right = covered(footprint[0], footprint[10], frame.width)
         top, bottom = covered(footprint[1], footprint[11], frame.height)
         result = wp.vec4i()

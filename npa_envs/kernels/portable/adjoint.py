@@ -74,7 +74,7 @@ def adjoint_kernels(
         gradient_bar: wp.array[scalar],
         density_gradient_bar: wp.array[vector],
     ):
-        """Write each row's cotangents before the scaling, from those of its perception vector."""
+        """Write each row's cotangents before the logarithmic scaling, from those of perception."""
         row, channel = wp.tid()
         row += range_start
         if row >= starts[starts.shape[0] - 1] - row_base:
@@ -124,7 +124,7 @@ def adjoint_kernels(
         row_capacity: int,
     ):
         """Return the first and last + 1 row in a run of cells; if `listed`, entry in k's list."""
-        begin, end = search.run(domain, starts, ends, base, cell, k, r)
+        begin, end = search.run_range(domain, starts, ends, base, cell, k, r)
         if wp.static(not listed):
             begin -= row_base
             end = wp.min(end - row_base, row_capacity)

@@ -59,7 +59,7 @@ def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespa
         particles: wp.array[particle],
         density_gradients: wp.array[vector_f64],
     ):
-        """Write each particle's position and volume 1 / rho, and each row's density gradient.
+        """Write each particle's position and volume 1 / rho, and density gradients of active ones.
 
         The density gradient cancels almost fully where particles are dense, and rules amplify its
         rounding error: it stays in float64 up to its scaling, which costs little.
@@ -118,7 +118,7 @@ def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespa
     ):
         """Write each particle's number of neighbours, itself included, and their sorted indices.
 
-        These are left out if `neighbours` is empty. Particle k's end at `ends[k]`.
+        Indices are left out if `neighbours` is empty. Those of particle k end at `ends[k]`.
         """
         k = range_start + wp.tid()
         position = space.position_of(particles[k])
@@ -129,7 +129,7 @@ def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespa
             begin = ends[k - 1]
         next_entry = begin
         for r in range(search.run_count(domain, cell)):
-            first, end = search.run(domain, starts, neighbours, base, cell, k, r)
+            first, end = search.run_range(domain, starts, neighbours, base, cell, k, r)
             for candidate in range(first, end, wp.static(search.stride)):
                 near, count = search.filter_near(
                     domain, particles, neighbours, position, candidate, end

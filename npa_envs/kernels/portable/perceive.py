@@ -80,7 +80,7 @@ def perception_kernels(
         base = (k / particle_count) * domain.cell_count
         cell = space.cell_of(domain, position)
         for r in range(search.run_count(domain, cell)):
-            begin, end = search.run(domain, starts, ends, base, cell, k, r)
+            begin, end = search.run_range(domain, starts, ends, base, cell, k, r)
             for first in range(begin, end, wp.static(search.stride)):
                 near, count = search.filter_near(
                     domain, particles, neighbours, position, first, end
@@ -142,8 +142,7 @@ def perception_kernels(
         """Write the perception vector of each active particle, then a one, then zeros, as a row.
 
         Rows beyond the last active one are zero. Row k is written to row `row_destination[k]`, or
-        to row k if that array is empty. Numbers are clipped to plus and minus `limit` unless it is
-        0.
+        to row k if that array is empty. `limit`, unless 0, clips numbers to plus and minus it.
         """
         row, g = wp.tid()
         row += range_start

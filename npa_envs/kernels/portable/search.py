@@ -26,7 +26,7 @@ def make_search(
     whose first cell is `base`, the first `count` of `near` are entries within eps. They are used as
 
         for r in range(run_count(domain, cell)):
-            begin, end = run(domain, starts, ends, base, cell, k, r)
+            begin, end = run_range(domain, starts, ends, base, cell, k, r)
             for first in range(begin, end, stride):
                 near, count = filter_near(domain, entries, neighbours, position, first, end)
 
@@ -47,7 +47,7 @@ def make_search(
         return count
 
     @wp.func
-    def run(
+    def run_range(
         domain: Domain,
         starts: wp.array[wp.int32],
         ends: wp.array[wp.int32],
@@ -102,4 +102,6 @@ def make_search(
                 count += is_near(domain, entries, position, c)
         return near, count
 
-    return SimpleNamespace(stride=stride, run_count=run_count, run=run, filter_near=filter_near)
+    return SimpleNamespace(
+        stride=stride, run_count=run_count, run_range=run_range, filter_near=filter_near
+    )

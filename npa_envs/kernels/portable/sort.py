@@ -251,9 +251,9 @@ def give_rows(space_dim: int, scalar: type) -> wp.Kernel:
     ):
         """Write the row of each particle, the particle of each row, and starts of cells and rows.
 
-        It does so for several steps; a step has a thread for each particle or start, whichever are
-        more. `active_before` is the cumulative number of active particles over all steps, up to and
-        with each particle.
+        It does so for several steps of the same sorted worlds; a step has a thread for each
+        particle or start, whichever are more. `active_before` is the cumulative number of active
+        particles over all steps, up to and with each particle.
         """
         await_earlier()
         step, t = wp.tid()
