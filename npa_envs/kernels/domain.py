@@ -42,10 +42,7 @@ def kernel_module(
 ) -> wp.Module:
     """Return the Warp module named after a topic, such as "sort", and after the kernels' sizes."""
     variant = f"{space_dim}d_{scalar_name(scalar)}"
-    if width:
-        variant += f"_w{width}"
-    if lanes:
-        variant += f"_l{lanes}"
+    variant += f"_w{width}" * bool(width) + f"_l{lanes}" * bool(lanes)
     return native.module(f"npa_envs.kernels.{topic}_{variant}")
 
 

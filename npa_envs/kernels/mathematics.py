@@ -134,13 +134,22 @@ def log_scale_adjoint(scaled: Any, cotangent: Any):
     return result
 
 
-@cached_under_lock()
-def make_smooth_inverse(space_dim: int, scalar: type) -> wp.Function:
-    """Return a Warp function of a symmetric matrix M: (det M adj M + τ² I) / (det² M + τ²).
+def perception_topic(state_gradient: bool, moment_inverse: str | None) -> str:
+    """Return the part of a perception module's name that tells its kind of state gradient."""
+    if not state_gradient:
+        return "smoothing"
+    corrections = {None: "uncorrected_", "threshold": "", "smooth": "smoothly_corrected_"}
+    return corrections[moment_inverse] + "perception"
 
-    It is w M^-1 + (1 - w) I with w = det² M / (det² M + τ²), and has no singularity.
+
+@cached_under_lock()
+def make_corrected(space_dim: int, scalar: type, width: int, moment_inverse: str | None) -> Any:
+    """Return a Warp function that multiplies state gradients [D, width] by an inverse of moments M.
+
+    The inverse is "smooth", or "threshold", which leaves gradients unchanged where M is singular.
     """
     square = wp.types.matrix((space_dim, space_dim), scalar)
+    gradient_type = wp.types.matrix((space_dim, width), scalar)
 
     @wp.func
     def adjugate(moment: square):
@@ -163,6 +172,10 @@ def make_smooth_inverse(space_dim: int, scalar: type) -> wp.Function:
 
     @wp.func
     def smooth_inverse(moment: square):
+        """Return (det M adj M + τ² I) / (det² M + τ²) of symmetric M, which has no singularity.
+
+        It is w M^-1 + (1 - w) I with w = det² M / (det² M + τ²).
+        """
         determinant = wp.determinant(moment)
         softening = scalar(wp.static(MOMENT_SOFTENING * MOMENT_SOFTENING))
         factor = scalar(1.0) / (determinant * determinant + softening)
@@ -170,27 +183,6 @@ def make_smooth_inverse(space_dim: int, scalar: type) -> wp.Function:
         for d in range(wp.static(space_dim)):
             result[d, d] += factor * softening
         return result
-
-    return smooth_inverse
-
-
-def perception_topic(state_gradient: bool, moment_inverse: str | None) -> str:
-    """Return the part of a perception module's name that tells its kind of state gradient."""
-    if not state_gradient:
-        return "smoothing"
-    corrections = {None: "uncorrected_", "threshold": "", "smooth": "smoothly_corrected_"}
-    return corrections[moment_inverse] + "perception"
-
-
-@cached_under_lock()
-def make_corrected(space_dim: int, scalar: type, width: int, moment_inverse: str | None) -> Any:
-    """Return a Warp function that multiplies state gradients [D, width] by an inverse of moments M.
-
-    The inverse is "smooth", or "threshold", which leaves gradients unchanged where M is singular.
-    """
-    square = wp.types.matrix((space_dim, space_dim), scalar)
-    gradient_type = wp.types.matrix((space_dim, width), scalar)
-    smooth_inverse = make_smooth_inverse(space_dim, scalar)
 
     @wp.func
     def corrected(gradient: gradient_type, moment: square):

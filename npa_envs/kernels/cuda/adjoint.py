@@ -207,7 +207,7 @@ def row_search(space_dim: int, periodic: bool) -> SimpleNamespace:
 
     @wp.func
     def box_around(domain: Domain, position: vector, origin: vector, served: bool):
-        """Return centre (relative to `origin`) and half sides of a box around `served` particles."""
+        """Return centre (from `origin`) and half sides of a box around `served` particles."""
         relative = position - origin
         if wp.static(periodic):
             relative = space.periodic_image(domain, relative)

@@ -250,24 +250,6 @@ def listed_density(
 
 
 @cached_under_lock()
-def make_steps_at(capacity: int, tiled: bool) -> wp.Function:
-    """Return a Warp function that reads two entries of a neighbour list, packed in 32 bits.
-
-    An entry, or step, is the neighbour's sorted index minus the particle's.
-    """
-
-    @native.func_native(capacity, tiled)
-    def steps_at(lists: wp.array3d[wp.int16], row: int, pair: int) -> int: ...
-
-    return steps_at
-
-
-@native.func_native()
-def step_of(steps: int, entry: int) -> int:
-    """Return entry 0 or 1 of two packed entries of a neighbour list."""
-
-
-@cached_under_lock()
 def tiled_density(periodic: bool, capacity: int, masked: bool) -> wp.Kernel:
     """Return the kernel that computes densities and lists neighbours in 2D, a warp for 8 particles.
 

@@ -24,7 +24,7 @@ from typing import NamedTuple
 import warp as wp
 
 from npa_envs.kernels import native_functions as native
-from npa_envs.kernels.cuda.density import RECORD, make_steps_at, step_of
+from npa_envs.kernels.cuda.density import RECORD
 from npa_envs.kernels.domain import domain_types, kernel_module
 from npa_envs.kernels.mathematics import (
     inverse_root,
@@ -172,13 +172,23 @@ def weighing_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> Si
     state_gradient, for_adjoint = variant.state_gradient, variant.for_adjoint
     moment_correction = variant.moment_inverse is not None
     flat = space_dim == 2
-    steps_at = make_steps_at(variant.capacity, variant.tiled)
     space = domain_types(space_dim, scalar)
     vector, Domain = space.vector, space.Domain
     vector_f64 = wp.types.vector(space_dim, wp.float64)
     square = wp.types.matrix((space_dim, space_dim), scalar)
     indices_of_pair = wp.types.vector(PAIR, wp.int32)
     records_of_pair = wp.types.matrix((PAIR, 4), scalar)
+
+    @native.func_native(variant.capacity, variant.tiled)
+    def steps_at(lists: wp.array3d[wp.int16], row: int, pair: int) -> int:
+        """Return two entries of a neighbour list, packed in 32 bits.
+
+        An entry, or step, is the neighbour's sorted index minus the particle's.
+        """
+
+    @native.func_native()
+    def step_of(steps: int, entry: int) -> int:
+        """Return entry 0 or 1 of two packed entries of a neighbour list."""
 
     @wp.struct
     class Centre:
@@ -543,7 +553,6 @@ def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
     add_f64 = make_lane_sum(vector_f64, lanes, whole_warps=True)
     add_channels = make_lane_sum(lane_channels, lanes, whole_warps=True, stride=team)
     add_gradient = make_lane_sum(lane_gradient, lanes, whole_warps=True, stride=team)
-    steps_at = make_steps_at(capacity, variant.tiled)
     corrected = make_corrected(space_dim, scalar, lane_width, variant.moment_inverse)
     slots = slot_functions(variant, lane_channels)
     weighing = weighing_functions(variant, slots)
@@ -632,7 +641,7 @@ def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
         searching = length > wp.static(capacity)
         length = wp.where(searching, wp.int32(0), length)
         longest = largest_in_warp(length)
-        steps = steps_at(lists, list_number, lane)
+        steps = weighing.steps_at(lists, list_number, lane)
         for first_entry in range(0, longest, wp.static(SLOT_ENTRIES)):
             steps, sums = weighing.weigh_listed(
                 domain,

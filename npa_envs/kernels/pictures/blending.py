@@ -29,8 +29,8 @@ from npa_envs.kernels.pictures.gaussians import (
     MIN_ALPHA,
     PULLS,
     TILE_SIDE,
+    gaussian_functions,
     gaussian_types,
-    make_covered,
 )
 from npa_envs.kernels.primitives import (
     WARP,
@@ -146,7 +146,7 @@ def tile_kernels(scalar: type) -> SimpleNamespace:
     types = gaussian_types(scalar)
     Frame, footprint_type, pulls_type = types.Frame, types.footprint, types.pulls
     blending = blending_functions(scalar)
-    covered = make_covered(scalar)
+    covered = gaussian_functions(scalar).covered
     module = native.module(f"npa_envs.kernels.blending_tiles_{scalar_name(scalar)}")
 
     @wp.func

@@ -100,8 +100,12 @@ def make_frame(
 
 
 @cached_under_lock()
-def make_covered(scalar: type) -> wp.Function:
-    """Return a Warp function of the range of pixels along one direction that a footprint covers."""
+def gaussian_functions(scalar: type) -> SimpleNamespace:
+    """Return the functions that several kernels share: rotations, projection, colours and tiles."""
+    types = gaussian_types(scalar)
+    Frame, pair, triple, quad = types.Frame, types.pair, types.triple, types.quad
+    footprint_type, harmonics_type = types.footprint, types.harmonics
+    flat, cube, motion_type = types.flat, types.cube, types.motion
 
     @wp.func
     def covered(middle: scalar, extent: scalar, size: int):
@@ -110,18 +114,6 @@ def make_covered(scalar: type) -> wp.Function:
         first = wp.ceil(wp.clamp(middle - extent - scalar(0.5), scalar(0.0), end))
         last = wp.floor(wp.clamp(middle + extent + scalar(0.5), scalar(0.0), end))
         return wp.int32(first), wp.int32(last)
-
-    return covered
-
-
-@cached_under_lock()
-def gaussian_functions(scalar: type) -> SimpleNamespace:
-    """Return the functions that several kernels share: rotations, projection, colours and tiles."""
-    types = gaussian_types(scalar)
-    Frame, pair, triple, quad = types.Frame, types.pair, types.triple, types.quad
-    footprint_type, harmonics_type = types.footprint, types.harmonics
-    flat, cube, motion_type = types.flat, types.cube, types.motion
-    covered = make_covered(scalar)
 
     @wp.func
     def unit_quaternion(quaternion: quad):

@@ -49,7 +49,6 @@ def adjoint_kernels(
     topic = "adjoint" if state_gradient else "smoothing_adjoint"
     topic = "listed_per_particle_" * listed + "unfiltered_" * (not on_cpu) + topic
     module = kernel_module(topic, space_dim, scalar, width)
-    cell_vector = wp.types.vector(space_dim, wp.int32)
     search = make_search(space_dim, scalar, vector, on_cpu, listed)
     indices = wp.types.vector(search.stride, wp.int32)
     add_scaled = make_add_scaled(group)
@@ -110,25 +109,6 @@ def adjoint_kernels(
                     bar[d] = perception_bar[row, density_start + d]
                 pull = density_scale * log_scale_adjoint(scaled, bar)
             density_gradient_bar[row] = pull
-
-    @wp.func
-    def run_of_rows(
-        domain: Domain,
-        starts: wp.array[wp.int32],
-        ends: wp.array[wp.int32],
-        base: int,
-        cell: cell_vector,
-        k: int,
-        r: int,
-        row_base: int,
-        row_capacity: int,
-    ):
-        """Return the first and last + 1 row in a run of cells; if `listed`, entry in k's list."""
-        begin, end = search.run_range(domain, starts, ends, base, cell, k, r)
-        if wp.static(not listed):
-            begin -= row_base
-            end = wp.min(end - row_base, row_capacity)
-        return begin, end
 
     @wp.func
     def filter_rows(
@@ -192,7 +172,10 @@ def adjoint_kernels(
         base = active_offset + (k / particle_count) * domain.cell_count
         cell = space.cell_of(domain, position)
         for r in range(search.run_count(domain, cell)):
-            begin, end = run_of_rows(domain, starts, ends, base, cell, k, r, row_base, row_capacity)
+            begin, end = search.run_range(domain, starts, ends, base, cell, k, r)
+            if wp.static(not listed):
+                begin -= row_base
+                end = wp.min(end - row_base, row_capacity)
             for first in range(begin, end, wp.static(search.stride)):
                 near, count = filter_rows(
                     domain, row_positions, neighbours, row_of, position, first, end
