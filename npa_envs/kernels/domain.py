@@ -32,7 +32,7 @@ FAR = 2.0**62
 
 
 def scalar_name(scalar: type) -> str:
-    """Return "f32" or "f64"."""
+    """Return the short name of a scalar type: "f32" or "f64"."""
     return {wp.float32: "f32", wp.float64: "f64"}[scalar]
 
 
@@ -40,18 +40,15 @@ def scalar_name(scalar: type) -> str:
 def kernel_module(
     topic: str, space_dim: int, scalar: type, width: int = 0, lanes: int = 0
 ) -> wp.Module:
-    """Return the Warp module for one variant of a topic's kernels."""
+    """Return the Warp module named after a topic, such as "sort", and after the kernels' sizes."""
     variant = f"{space_dim}d_{scalar_name(scalar)}"
-    if width:
-        variant += f"_w{width}"
-    if lanes:
-        variant += f"_l{lanes}"
+    variant += f"_w{width}" * bool(width) + f"_l{lanes}" * bool(lanes)
     return native.module(f"npa_envs.kernels.{topic}_{variant}")
 
 
 @cached_under_lock()
 def domain_types(space_dim: int, scalar: type) -> SimpleNamespace:
-    """Return one variant's vector types, its `Domain` struct and the functions of it.
+    """Return vector types, the `Domain` struct and its functions, for a dimension and scalar type.
 
     The struct has the constants of all worlds: radius, norms of kernels, box and cell grid.
     """
@@ -77,7 +74,7 @@ def domain_types(space_dim: int, scalar: type) -> SimpleNamespace:
 
     @wp.func
     def cell_of(domain: Domain, position: vector):
-        """Return the cell of a position; in open space the grid repeats periodically."""
+        """Return the cell that contains a position; in open space the grid repeats periodically."""
         cell = cell_vector()
         for d in range(wp.static(space_dim)):
             count = domain.cell_shape[d]
@@ -114,7 +111,7 @@ def domain_types(space_dim: int, scalar: type) -> SimpleNamespace:
 
     @wp.func
     def cells_around(domain: Domain, d: int):
-        """Return the number of cells with neighbours of a cell, along one direction."""
+        """Return the number of cells along dimension d that may hold neighbours of a particle."""
         return wp.min(wp.int32(2) * domain.cells_per_eps + 1, domain.cell_shape[d])
 
     @wp.func
@@ -129,8 +126,10 @@ def domain_types(space_dim: int, scalar: type) -> SimpleNamespace:
 
     @wp.func
     def segment_count(domain: Domain, cell: cell_vector):
-        """Return the number of contiguous runs of cells around a cell: one for each line of cells,
-        two where lines wrap around."""
+        """Return the number of runs of adjacent cells around a cell.
+
+        There is one for each line of cells, or two where lines wrap around.
+        """
         lines = wp.int32(1)
         for d in range(1, wp.static(space_dim)):
             lines *= cells_around(domain, d)
@@ -141,7 +140,7 @@ def domain_types(space_dim: int, scalar: type) -> SimpleNamespace:
 
     @wp.func
     def segment_cells(domain: Domain, cell: cell_vector, segment: int):
-        """Return the first cell and one past the last cell of a run, in row-major order."""
+        """Return the first and last + 1 cell, in row-major order, of run number `segment`."""
         width = cells_around(domain, 0)
         nx = domain.cell_shape[0]
         first = wrapped(cell[0] - domain.cells_per_eps, nx)
@@ -200,11 +199,11 @@ def cell_grid(
     box: tuple[float, ...] | None,
     cells_per_eps: int,
 ) -> tuple[int, ...]:
-    """Return the number of cells along each dimension.
+    """Return the number of cells of a world's grid along each dimension.
 
     Open space gets about one cell for each particle (a power of two along each dimension: the grid
-    wraps around). A periodic box is divided into cells no smaller than eps / cells_per_eps, into
-    at most four times as many as open space has.
+    wraps around). A periodic box is divided into cells no smaller than eps / cells_per_eps, into at
+    most four times as many as open space has.
     """
     open_side = 8
     while open_side**space_dim < particle_count:
@@ -228,7 +227,7 @@ def make_domain(
     particle_count: int,
     cells_per_eps: int = 2,
 ) -> Any:
-    """Return the `Domain` of worlds of N particles, with cells of size eps / cells_per_eps."""
+    """Return the `Domain` of worlds of N particles, in cells of side eps / cells_per_eps."""
     types = domain_types(space_dim, scalar)
     domain = types.Domain()
     domain.inverse_eps = 1.0 / eps

@@ -22,19 +22,19 @@ MOMENT_SOFTENING = 1e-2
 
 @wp.func
 def smoothing_falloff(squared_distance: Any, inverse_squared_eps: Any):
-    """1 - r^2 / eps^2, whose cube the smoothing kernel is; negative outside its support."""
+    """1 - r^2 / eps^2; the smoothing kernel is its cube. Negative beyond eps."""
     return type(squared_distance)(1.0) - squared_distance * inverse_squared_eps
 
 
 @wp.func
 def smoothing_of(falloff: Any, norm: Any):
-    """Poly6 smoothing kernel W of a falloff [1 / length^D]."""
+    """Poly6 smoothing kernel W, from 1 - r^2 / eps^2 [1 / length^D]."""
     return norm * falloff * falloff * falloff
 
 
 @wp.func
 def smoothing(squared_distance: Any, inverse_squared_eps: Any, norm: Any):
-    """Poly6 smoothing kernel W, inside its support [1 / length^D]."""
+    """Poly6 smoothing kernel W, for distances below eps [1 / length^D]."""
     return smoothing_of(smoothing_falloff(squared_distance, inverse_squared_eps), norm)
 
 
@@ -57,9 +57,10 @@ def spiky_factor(distance: Any, inverse_eps: Any, norm: Any):
 
 @wp.func
 def spiky_factor_f64(exact: wp.float64, start: Any, inverse_eps: Any, norm: Any):
-    """Spiky factor f in float64 from `exact` = r · r; a Newton step refines `start`, about 1 / |r|.
+    """Factor f of the spiky gradient kernel in float64, from `exact` = r · r [1 / length^(D+2)].
 
-    In float64, because sums of spiky kernels cancel almost fully where particles are dense.
+    A Newton step refines `start`, about 1 / |r|. In float64, because sums of spiky kernels cancel
+    almost fully where particles are dense.
     """
     inverse = wp.float64(start)
     inverse *= wp.float64(1.5) - wp.float64(0.5) * exact * inverse * inverse
@@ -69,7 +70,7 @@ def spiky_factor_f64(exact: wp.float64, start: Any, inverse_eps: Any, norm: Any)
 
 @wp.func
 def spiky_radial_slope(distance: Any, inverse_eps: Any, norm: Any):
-    """d(f r)/dr of the spiky kernel's length f(r) r, for its adjoint [1 / length^(D+2)]."""
+    """Derivative of the spiky kernel's length f |r| by |r|, for its adjoint [1 / length^(D+2)]."""
     falloff = type(norm)(1.0) - distance * inverse_eps
     return -type(norm)(2.0) * norm * falloff * inverse_eps
 
@@ -86,7 +87,7 @@ def log1p(value: Any):
 
 @wp.func
 def log_scaled_huge(v: Any):
-    """L(v) of a vector whose squared length overflows."""
+    """Logarithmic scaling L(v) of a vector whose squared length overflows."""
     largest = wp.max(wp.abs(v))
     direction = v / largest
     length = wp.length(direction)
@@ -95,7 +96,7 @@ def log_scaled_huge(v: Any):
 
 @wp.func
 def log_scaled(v: Any):
-    """L(v) = log(1 + |v|) v / |v| of the logarithmic scaling, and 0 at 0."""
+    """Logarithmic scaling L(v) = log(1 + |v|) v / |v| of a vector, 0 at 0."""
     length = wp.length(v)
     factor = type(length)(1.0)
     if length > type(length)(0.0):
@@ -108,7 +109,7 @@ def log_scaled(v: Any):
 
 @wp.func
 def log_scale_tangential(length: Any):
-    """Derivative of L across its direction as a function of |L|: |L| / (exp|L| - 1)."""
+    """Derivative of L(v) across v, from the length |L|: |L| / (exp|L| - 1)."""
     ratio = type(length)(1.0)
     if length < type(length)(SMALL_LOG):
         series = type(length)(1.0)
@@ -122,7 +123,7 @@ def log_scale_tangential(length: Any):
 
 @wp.func
 def log_scale_adjoint(scaled: Any, cotangent: Any):
-    """Pull a cotangent of L(v) back to v, given L(v): L is radial, so its value suffices."""
+    """Cotangent of v from that of the logarithmic scaling L(v), and from `scaled` = L(v)."""
     length = wp.length(scaled)
     tangential = log_scale_tangential(length)
     result = tangential * cotangent
@@ -133,13 +134,22 @@ def log_scale_adjoint(scaled: Any, cotangent: Any):
     return result
 
 
-@cached_under_lock()
-def make_smooth_inverse(space_dim: int, scalar: type) -> wp.Function:
-    """Return a Warp function of symmetric M: (det M adj M + τ² I) / (det² M + τ²).
+def perception_topic(state_gradient: bool, moment_inverse: str | None) -> str:
+    """Return the part of a perception module's name that tells its kind of state gradient."""
+    if not state_gradient:
+        return "smoothing"
+    corrections = {None: "uncorrected_", "threshold": "", "smooth": "smoothly_corrected_"}
+    return corrections[moment_inverse] + "perception"
 
-    It is w M^-1 + (1 - w) I with w = det² M / (det² M + τ²), and has no singularity.
+
+@cached_under_lock()
+def make_corrected(space_dim: int, scalar: type, width: int, moment_inverse: str | None) -> Any:
+    """Return a Warp function that multiplies state gradients [D, width] by an inverse of moments M.
+
+    The inverse is "smooth", or "threshold", which leaves gradients unchanged where M is singular.
     """
     square = wp.types.matrix((space_dim, space_dim), scalar)
+    gradient_type = wp.types.matrix((space_dim, width), scalar)
 
     @wp.func
     def adjugate(moment: square):
@@ -162,6 +172,10 @@ def make_smooth_inverse(space_dim: int, scalar: type) -> wp.Function:
 
     @wp.func
     def smooth_inverse(moment: square):
+        """Return (det M adj M + τ² I) / (det² M + τ²) of symmetric M, which has no singularity.
+
+        It is w M^-1 + (1 - w) I with w = det² M / (det² M + τ²).
+        """
         determinant = wp.determinant(moment)
         softening = scalar(wp.static(MOMENT_SOFTENING * MOMENT_SOFTENING))
         factor = scalar(1.0) / (determinant * determinant + softening)
@@ -169,27 +183,6 @@ def make_smooth_inverse(space_dim: int, scalar: type) -> wp.Function:
         for d in range(wp.static(space_dim)):
             result[d, d] += factor * softening
         return result
-
-    return smooth_inverse
-
-
-def perception_topic(state_gradient: bool, moment_inverse: str | None) -> str:
-    """Return the part of a perception module's name that says which sums it has."""
-    if not state_gradient:
-        return "smoothing"
-    corrections = {None: "uncorrected_", "threshold": "", "smooth": "smoothly_corrected_"}
-    return corrections[moment_inverse] + "perception"
-
-
-@cached_under_lock()
-def make_corrected(space_dim: int, scalar: type, width: int, moment_inverse: str | None) -> Any:
-    """Return a Warp function that multiplies state gradients [D, width] by an inverse of M.
-
-    The inverse is "smooth", or "threshold", which leaves gradients unchanged where M is singular.
-    """
-    square = wp.types.matrix((space_dim, space_dim), scalar)
-    gradient_type = wp.types.matrix((space_dim, width), scalar)
-    smooth_inverse = make_smooth_inverse(space_dim, scalar)
 
     @wp.func
     def corrected(gradient: gradient_type, moment: square):
@@ -218,7 +211,7 @@ def make_fast_exp2(scalar: type) -> Any:
 
 @cached_under_lock()
 def make_log_scale_pull(vector: type) -> Any:
-    """Return `log_scale_adjoint` on CUDA for a vector type of float32."""
+    """Return the Warp function `log_scale_adjoint` on CUDA in float32, with fewer instructions."""
 
     @native.func_native()
     def log_scale_pull(scaled: vector, cotangent: vector) -> vector: ...
@@ -233,7 +226,7 @@ def falloff_within(squared: float, inverse_squared_eps: float) -> float:
 
 @native.func_native()
 def log_scale_of_square(squared: float) -> float:
-    """L(v) / v on CUDA, from v . v: log(1 + |v|) / |v|."""
+    """Factor L(v) / v of the logarithmic scaling, from v . v, on CUDA: log(1 + |v|) / |v|."""
 
 
 @native.func_native()

@@ -35,7 +35,7 @@ CUDA_ONLY = (
 
 @cached_under_lock()
 def build_options() -> wp.ModuleBuildOptions:
-    """Return the options that put the C++ text into a module, and into its hash."""
+    """Return Warp's options that put the text of the C++ files into a module, and into its hash."""
     for_cpu = "".join(map(_text_of, BOTH_DEVICES))
     for_cuda = for_cpu + "".join(map(_text_of, CUDA_ONLY))
     return wp.ModuleBuildOptions(extra_cpu_preamble=for_cpu, extra_cuda_preamble=for_cuda)
@@ -139,7 +139,7 @@ ELEMENTS = 16384
 
 
 def in_ranges(smallest: int) -> Callable[[Any], Any]:
-    """Return a decorator for a Warp kernel that takes `range_start`.
+    """Return a decorator for a Warp kernel whose launches CPU threads share, in ranges of indices.
 
     `smallest` indices of the first dimension take about 0.15 ms; a split costs half of that.
     """

@@ -76,7 +76,7 @@ def scalar_of(value_type: Any) -> Any:
 def make_read_at(value_type: type, alignment: int) -> Any:
     """Return a Warp function that reads a vector from an index of an array of scalars.
 
-    Its address must be a multiple of `alignment` bytes, 4, 8 or 16: the width of a load.
+    The vector's address must be a multiple of `alignment` bytes, 4, 8 or 16: the width of a load.
     """
     scalar = scalar_of(value_type)
 
@@ -115,10 +115,10 @@ write_at = native.generic("write_at", 3)
 
 @cached_under_lock()
 def make_lane_sum(value_type: type, lanes: int, whole_warps: bool = False, stride: int = 1) -> Any:
-    """Return a Warp function that sums a value over a particle's lanes; each lane gets the sum.
+    """Return a Warp function that sums a value over the threads of a particle; each gets the sum.
 
-    On a CPU there is one lane. With `whole_warps` all threads of a warp must call it together,
-    which takes fewer instructions. Every `stride`-th lane is summed, a power of two.
+    On a CPU there is one thread. With `whole_warps` all threads of a warp must call it together,
+    which takes fewer instructions. Every `stride`-th thread is summed, a power of two.
     """
 
     @native.func_native(scalar_of(value_type), lanes, whole_warps, stride)
@@ -129,10 +129,10 @@ def make_lane_sum(value_type: type, lanes: int, whole_warps: bool = False, strid
 
 @cached_under_lock()
 def make_lane_collect(value_type: Any, lanes: int) -> Any:
-    """Return a Warp function that sums matrices [D, W] over lanes; each lane gets its columns.
+    """Return a Warp function that sums matrices [D, W] over threads; each gets some columns.
 
-    In lane i the k-th group of columns has to be that of lane i ^ k, so its own group comes first:
-    then all indices are constants.
+    Those of thread i are group i of the columns. Its matrix has group i ^ k as k-th, so its own
+    comes first: then all indices are constants.
     """
     scalar, (rows, width) = scalar_of(value_type), value_type._shape_
     lane_columns = wp.types.matrix((rows, width // lanes), scalar)
@@ -158,7 +158,7 @@ def make_kept(scalar: type) -> Any:
 
 @cached_under_lock()
 def make_shuffle(scalar: type) -> wp.Function:
-    """Return a Warp function that reads another thread's value in the warp; on a CPU its own."""
+    """Return a Warp function that reads a value of another thread of the warp; on a CPU its own."""
 
     @native.func_native()
     def shuffle(value: scalar, thread: int) -> scalar: ...
@@ -172,7 +172,7 @@ scalar_of_warp = make_shuffle(wp.float32)
 
 @native.func_native()
 def of_lane(value: int, lane: int, lanes: wp.uint32) -> int:
-    """Return the value of one of the `lanes` threads that work on the same particle."""
+    """Return the value of thread number `lane` of the `lanes` threads that share a particle."""
 
 
 @native.func_native()
@@ -212,7 +212,7 @@ def first_in_warp(condition: bool) -> int:
 
 @native.func_native()
 def vote_of_warp(condition: bool) -> wp.uint32:
-    """Return a bit for each thread of the warp: whether a condition is true."""
+    """Return a number with a bit for each thread of the warp: whether a condition is true."""
 
 
 @native.func_native()
@@ -227,7 +227,7 @@ def sum_up_to(value: int) -> int:
 
 @native.func_native()
 def thread_of(ends: int, number: int) -> int:
-    """Return the first thread of the warp whose `ends`, ascending over threads, is > `number`."""
+    """Return the first thread of the warp whose `ends` is above `number`; `ends` must ascend."""
 
 
 @native.func_native()

@@ -23,13 +23,13 @@ def text_of(name):
 
 
 def function_of(text, name):
-    """The definition of a function, with the template before it."""
+    """Return the C++ text of a function's definition, with the template before it."""
     head = rf"(?:template <[^>]*>\s)?__device__ inline \w+ {name}\([^{{]*?\)\s*"
     return re.search(head + r"(?:\{[^\n]*\}\n|\{\n.*?\n\}\n)", text, re.S)[0]
 
 
 def printed_by(source, folder, includes):
-    """Return what a program of this folder prints, which runs in another folder."""
+    """Return what a C++ program prints; it is compiled and runs in `folder`."""
     compiler = shutil.which("g++")
     if compiler is None:
         pytest.skip("needs g++")
@@ -63,7 +63,7 @@ def test_tiles_find_all_neighbours_of_all_particles(tmp_path):
 
 
 def fourfold(number):
-    """The next multiple of four: widths of rows are."""
+    """The number rounded up to a multiple of four, as widths of rows are."""
     return number + -number % 4
 
 

@@ -17,7 +17,7 @@ GLOBAL_ACCESS = re.compile(r"\b(?:ld|st|atom|red|cp|prefetch)\.(?!param|shared|l
 
 
 def kernel_bodies():
-    """Yield name and statements after the docstring of each kernel in the folder."""
+    """Yield each kernel's name and its statements after the docstring."""
     for path in sorted(KERNELS.rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             marks = [ast.unparse(mark) for mark in getattr(node, "decorator_list", ())]

@@ -61,9 +61,11 @@ load_channels = make_wide_load(CHANNELS)
 
 @cached_under_lock()
 def make_sum_listed(space_dim: int, width: int, weight_count: int, periodic: bool) -> wp.Function:
-    """Return a Warp function: a warp's particles sum `width` weighted channels of listed rows.
+    """Return a Warp function that sums cotangents of listed rows, weighted by kernels.
 
-    A pair has 1 weight (smoothing kernel), or 1 + D (also the spiky gradient kernel).
+    It sums for a warp's 8 particles. A row of perception has `width` cotangents for each of
+    `weight_count` weights of a pair: 1 of the smoothing kernel, and perhaps D of the spiky
+    gradient.
     """
     vector = wp.types.vector(space_dim, wp.float32)
 
@@ -85,12 +87,12 @@ def make_sum_listed(space_dim: int, width: int, weight_count: int, periodic: boo
 
 @native.func_native(CUDA_BLOCK // WARP, LIST_ENTRIES)
 def row_list_address() -> wp.uint32:
-    """Return the address in shared memory of the warp's list of rows."""
+    """Return the address in shared memory of this warp's list of nearby rows."""
 
 
 @cached_under_lock()
 def make_read_columns(count: int) -> wp.Function:
-    """Return a Warp function that reads adjacent columns of a row, and 0 beyond its end."""
+    """Return a Warp function that reads `count` adjacent numbers of a row, 0 from `end` on."""
     result_type = wp.types.vector(count, wp.float32)
 
     @native.func_native(count)
@@ -102,45 +104,45 @@ def make_read_columns(count: int) -> wp.Function:
 
 
 @native.func_native()
-def write_columns(values: wp.array2d[wp.float32], row: int, column: int, entry: CHANNELS):
-    """Write four adjacent columns of a row, except those beyond its end."""
+def write_columns(values: wp.array2d[wp.float32], row: int, column: int, numbers: CHANNELS):
+    """Write four adjacent numbers of a matrix row, except those beyond its end."""
 
 
 @native.func_native()
 def append_entry(address: wp.uint32, count: int, accepted: bool, entry: ENTRY) -> int:
-    """Append the entries of the threads with `accepted`; return the list's new length."""
+    """Append the entries of threads with `accepted` to a list of `count`; return its new length."""
 
 
 @native.func_native()
 def pad_list(address: wp.uint32, count: int, entry: ENTRY) -> int:
-    """Pad a list with an entry up to a multiple of `TILE_PARTICLES`; return its new length."""
+    """Pad a list of `count` entries with `entry` to a multiple of 8; return its new length."""
 
 
 @native.func_native()
 def keep_unsummed(address: wp.uint32, summed_count: int, count: int):
-    """Move the last, fewer than `TILE_PARTICLES`, of a list's `count` entries to its beginning."""
+    """Move a list's entries from `summed_count` to `count`, at most seven, to its beginning."""
 
 
 @native.func_native()
 def prefetch_columns(values: wp.array2d[wp.float32], row: int, column: int):
-    """Prefetch a column of a row, which is read later."""
+    """Load the memory at a row and column of a matrix into the L2 cache, for a later read."""
 
 
 @native.func_native()
 def regroup_tile(total: CHANNELS) -> CHANNELS:
-    """Redistribute the sums of `sum_listed`: each thread gets four channels of one particle."""
+    """Exchange sums between threads: from two channels of two particles to four channels of one."""
 
 
 @native.func_native()
 def smallest_in_tile(value: float) -> float:
-    """Return the smallest value of the tile's particles, which have four threads each."""
+    """Return the smallest value among a warp's 8 particles, each of which has four threads."""
 
 
 read_channels = make_read_columns(THREAD_CHANNELS)
 
 
 def row_search(space_dim: int, periodic: bool) -> SimpleNamespace:
-    """Return the functions that search rows near a tile: runs of cells and bounding boxes."""
+    """Return the functions that list the runs of cells around 8 particles and test their rows."""
     scalar = wp.float32
     space = domain_types(space_dim, scalar)
     vector, Domain = space.vector, space.Domain
@@ -148,7 +150,7 @@ def row_search(space_dim: int, periodic: bool) -> SimpleNamespace:
 
     @wp.func
     def line_of(domain: Domain, cell: cell_vector):
-        """Return the index of the line of cells, along the grid's first direction, of a cell."""
+        """Return the index of the line of cells along the first axis that contains a cell."""
         line = cell[1]
         if wp.static(space_dim == 3):
             line += cell[wp.static(space_dim - 1)] * domain.cell_shape[1]
@@ -156,10 +158,10 @@ def row_search(space_dim: int, periodic: bool) -> SimpleNamespace:
 
     @wp.func
     def run_cells(domain: Domain, line: int, begin: int, end: int, run: int):
-        """Return the first cell and one past the last cell of a run, in row-major order.
+        """Return the first and last + 1 cell of run number `run` around a line of cells.
 
-        Runs go from column `begin` to `end` on the lines around a line; a line has two runs if the
-        columns wrap around the grid.
+        Runs are the columns `begin` to `end` of all lines within eps; where these columns wrap
+        around the grid, a line has two. Cells are indexed in row-major order.
         """
         nx = domain.cell_shape[0]
         first = begin
@@ -186,7 +188,10 @@ def row_search(space_dim: int, periodic: bool) -> SimpleNamespace:
 
     @wp.func
     def columns_around(domain: Domain, first: int, last: int):
-        """Return the range of columns with neighbours of particles in a range, not wrapped."""
+        """Return the first and last + 1 column of cells within eps of columns `first` to `last`.
+
+        The last one may lie beyond the grid, which then wraps around.
+        """
         nx = domain.cell_shape[0]
         width = wp.min(last - first + 2 * domain.cells_per_eps + 1, nx)
         begin = wp.where(width < nx, space.wrapped(first - domain.cells_per_eps, nx), 0)
@@ -194,7 +199,7 @@ def row_search(space_dim: int, periodic: bool) -> SimpleNamespace:
 
     @wp.func
     def count_runs(domain: Domain, to_column: int):
-        """Return the number of runs of cells around particles on a line, up to a column."""
+        """Return the number of runs of cells around a line, whose columns end at `to_column`."""
         runs = space.cells_around(domain, 1)
         if wp.static(space_dim == 3):
             runs *= space.cells_around(domain, wp.static(space_dim - 1))
@@ -202,7 +207,7 @@ def row_search(space_dim: int, periodic: bool) -> SimpleNamespace:
 
     @wp.func
     def box_around(domain: Domain, position: vector, origin: vector, served: bool):
-        """Return centre, relative to an origin, and half sides of served particles' bounds."""
+        """Return centre (from `origin`) and half sides of a box around `served` particles."""
         relative = position - origin
         if wp.static(periodic):
             relative = space.periodic_image(domain, relative)
@@ -217,7 +222,10 @@ def row_search(space_dim: int, periodic: bool) -> SimpleNamespace:
 
     @wp.func
     def near_box(domain: Domain, offset: vector, half: vector):
-        """Return whether a point, relative to a box's centre, is within eps of the box."""
+        """Return whether a point at `offset` from a box's centre is within eps of the box.
+
+        `half`: half the box's sides [length units].
+        """
         nearest = offset
         if wp.static(periodic):
             nearest = space.periodic_image(domain, nearest)
@@ -228,8 +236,8 @@ def row_search(space_dim: int, periodic: bool) -> SimpleNamespace:
         return squared < scalar(SLACK) * domain.squared_eps
 
     @wp.func
-    def entry_of(position: vector, number: int):
-        """Return the list entry of a row."""
+    def row_entry(position: vector, number: int):
+        """Return a list entry of a row: its particle's position, the index of its cotangents."""
         entry = ENTRY()
         for d in range(wp.static(space_dim)):
             entry[d] = position[d]
@@ -238,7 +246,7 @@ def row_search(space_dim: int, periodic: bool) -> SimpleNamespace:
 
     @wp.func
     def load_position(particles: wp.array[scalar], k: int):
-        """Return the position of a particle [length units]."""
+        """Return the position of sorted particle k [length units]."""
         position = vector()
         for d in range(wp.static(space_dim)):
             position[d] = load_scalar(particles, k * wp.static(space_dim + 1) + d)
@@ -259,11 +267,11 @@ def row_search(space_dim: int, periodic: bool) -> SimpleNamespace:
 def listed_adjoint(
     space_dim: int, width: int, state_gradient: bool, periodic: bool, grouped: bool
 ) -> SimpleNamespace:
-    """Return the kernels of one variant.
+    """Return the kernels that pull the cotangents of perception back to states.
 
-    A variant is for a box or open space, and for one or several groups of channels. Cotangents of a
-    row and group are contiguous: [1 + D, W], first of the smoothed state, then of the state
-    gradient. An entry of zeros follows that of the last row.
+    `periodic`: in a box, else in open space. `grouped`: with several groups of `width` channels.
+    The cotangents of a row and group are contiguous, [1 + D, width]: of the smoothed state, then of
+    the state gradient. Zeros follow those of the last row.
     """
     scalar = wp.float32
     space = domain_types(space_dim, scalar)
@@ -294,7 +302,7 @@ def listed_adjoint(
         # outputs
         cotangents: wp.array[CHANNELS],
     ):
-        """Write the cotangents of each row's unscaled sums from the cotangent of z.
+        """Write each row's cotangents before the logarithmic scaling, from those of perception.
 
         Those of smoothed states are multiplied by `blur_scale`.
         """
@@ -357,10 +365,10 @@ def listed_adjoint(
         # outputs
         states_bar: wp.array2d[scalar],
     ):
-        """Write the cotangent of every particle's state, from the active rows around it.
+        """Write the cotangent of each particle's state, summed over the active particles around it.
 
-        A world has `tile_count` tiles; a warp serves a group of a tile's channels. All cotangents
-        are multiplied by `norm`.
+        A world's particles are `tile_count` tiles of 8; a warp serves a tile and a group of
+        channels. `norm` is the normalising constant of the kernels, which multiplies the sum.
         """
         await_earlier()
         allow_next_launch()
@@ -430,7 +438,7 @@ def listed_adjoint(
                     inside = candidate < candidates
                     other = load_vector(row_positions, wp.where(inside, row, 0))
                     near = search.near_box(domain, (other - origin) - middle, half)
-                    entry = search.entry_of(other, row * group_count + g)
+                    entry = search.row_entry(other, row * group_count + g)
                     count = append_entry(address, count, inside and near, entry)
                     candidate += wp.static(WARP)
                     searching = candidate - lane < candidates
@@ -439,7 +447,7 @@ def listed_adjoint(
                         summed_count = count & ~wp.int32(wp.static(TILE_PARTICLES - 1))
                         if finished:
                             # The entry after the last row is zero.
-                            nothing = search.entry_of(origin, row_capacity * group_count)
+                            nothing = search.row_entry(origin, row_capacity * group_count)
                             summed_count = pad_list(address, count, nothing)
                         block_sums = sum_listed(
                             address,

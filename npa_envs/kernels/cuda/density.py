@@ -67,9 +67,10 @@ TILE_REGISTERS = 64
 def listed_density(
     space_dim: int, lanes: int, periodic: bool, capacity: int, masked: bool
 ) -> wp.Kernel:
-    """Return the density kernel of one variant.
+    """Return the kernel that computes densities and lists neighbours, `lanes` threads a particle.
 
-    With several lanes for a particle, launches have complete warps, which write lists together.
+    `capacity`: longest list. `masked`: only active particles get lists. With several lanes,
+    launches have complete warps, whose threads write lists together.
     """
     scalar = wp.float32
     flat = space_dim == 2
@@ -100,7 +101,7 @@ def listed_density(
 
     @wp.func
     def falloff_at(domain: Domain, offset: vector):
-        """Return 1 - r^2 / eps^2 of a candidate, 0 beyond eps."""
+        """Return 1 - r^2 / eps^2 for an offset r, 0 beyond eps."""
         nearest = offset
         if wp.static(periodic):
             nearest = space.periodic_image(domain, nearest)
@@ -109,10 +110,10 @@ def listed_density(
 
     @wp.func
     def cells_beyond(within_cell: vector, line: int):
-        """Return how many of the first, and of the last, of a line's five cells are beyond eps.
+        """Return how many cells at the beginning, and at the end, of a line of five are beyond eps.
 
-        `within_cell` is the particle's position in its cell, in units of a cell. Lines are numbered
-        from 0; that of the particle is 2.
+        The five lines around a particle are numbered from 0; its own is 2. `within_cell` is its
+        position in its cell, in units of a cell.
         """
         across = wp.where(
             line < 2, within_cell[1] + scalar(1 - line), scalar(line - 2) - within_cell[1]
@@ -145,10 +146,10 @@ def listed_density(
         lists: wp.array3d[wp.int16],
         list_lengths: wp.array[wp.int32],
     ):
-        """Write every particle's record, and the list of each row's neighbours.
+        """Write particles' positions and volumes 1 / rho, and neighbour lists of active particles.
 
-        Positions with volumes 1 / rho are also written to `particles`, unless it is empty. The
-        length of a list that does not fit is larger than the capacity.
+        `records` also have the index of the particle's state, in 2D; `particles` is left out if
+        empty. A list that is too long is not written; its length is then larger than the capacity.
         """
         await_earlier()
         thread = wp.tid()
@@ -249,23 +250,11 @@ def listed_density(
 
 
 @cached_under_lock()
-def make_steps_at(capacity: int, tiled: bool) -> wp.Function:
-    """Return a Warp function that reads two steps of a row's list, packed in 32 bits."""
-
-    @native.func_native(capacity, tiled)
-    def steps_at(lists: wp.array3d[wp.int16], row: int, pair: int) -> int: ...
-
-    return steps_at
-
-
-@native.func_native()
-def step_of(steps: int, entry: int) -> int:
-    """Return the first or the second of two packed steps."""
-
-
-@cached_under_lock()
 def tiled_density(periodic: bool, capacity: int, masked: bool) -> wp.Kernel:
-    """Return the density kernel of one variant, in which a block is a warp that serves a tile."""
+    """Return the kernel that computes densities and lists neighbours in 2D, a warp for 8 particles.
+
+    `capacity`: longest list. `masked`: only active particles get lists.
+    """
     space = domain_types(2, wp.float32)
     vector, particle, Domain = space.vector, space.particle, space.Domain
     load_vector = make_wide_load(vector)
@@ -308,7 +297,7 @@ def tiled_density(periodic: bool, capacity: int, masked: bool) -> wp.Kernel:
         lists: wp.array3d[wp.int16],
         list_lengths: wp.array[wp.int32],
     ):
-        """Write the outputs of `listed_density`, with lists stored one after the other."""
+        """Write what the kernel of `listed_density` writes, but lists one after the other."""
         await_earlier()
         thread = thread_number()
         tile = thread >> wp.static(WARP.bit_length() - 1)

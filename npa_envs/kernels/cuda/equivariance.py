@@ -28,14 +28,14 @@ SHARED_BYTES = 48 * 1024
 
 
 def rows_of_warp(mixed_count: int) -> int:
-    """Return the rows of a warp: a thread for each of their mixed vectors, at most four rows."""
+    """Return how many rows a warp serves: a thread for each of their mixed vectors, at most 4."""
     return min(max(WARP // mixed_count, 1), 4)
 
 
 def fits_block(
     space_dim: int, scalars: int, perceived: int, mixed_count: int, chiral: bool
 ) -> bool:
-    """Return whether rows with these vectors fit into a block's shared memory."""
+    """Return whether `row_kernels` of these sizes exist: rows must fit into shared memory."""
     weights = perceived * mixed_count
     products = mixed_count * (mixed_count + 1) // 2 + chiral * (
         mixed_count * (mixed_count - 1) // 2
@@ -49,10 +49,11 @@ def fits_block(
 def row_kernels(
     space_dim: int, scalars: int, perceived: int, mixed_count: int, chiral: bool
 ) -> SimpleNamespace:
-    """Return the kernels that map rows to inputs, and cotangents back, for one form.
+    """Return the kernels that compute a network's inputs from rows of perception, and the adjoint.
 
-    Rows are [scalars | perceived vectors | 1 | 0], inputs [scalars | products | 1 | 0]; mixed
-    vectors [K, mixed_count, D] and mixing weights [perceived, mixed_count] are flat.
+    Columns of rows are [scalars | perceived vectors | 1 | 0], of inputs [scalars | products of
+    mixed vectors | 1 | 0]. Mixed vectors [K, mixed_count, D] and mixing weights [perceived,
+    mixed_count] are flat arrays.
     """
     form = space_dim, scalars, perceived, mixed_count, chiral
     module = native.module(f"npa_envs.kernels.vector_rows_{'_'.join(str(int(k)) for k in form)}")
@@ -83,7 +84,7 @@ def row_kernels(
         rows_bar: wp.array2d[wp.float32],
         partial_sums: wp.array2d[wp.float32],
     ):
-        """Write cotangents of rows, and each block's sum of cotangents of the mixing weights."""
+        """Write the cotangents of rows, and each block's sum of those of the mixing weights."""
         await_earlier()
         pull_back_vectors(rows, mixing, mixed, mixed_bar, inputs_bar, rows_bar, partial_sums)
 
@@ -92,7 +93,7 @@ def row_kernels(
 
 @cached_under_lock()
 def mixing_sum() -> wp.Kernel:
-    """Return the kernel that adds up the blocks' gradients of the mixing weights."""
+    """Return the kernel that adds up the blocks' sums of the mixing weights' gradients."""
     add_partial_sums = native.generic("add_partial_sums", 2, MIXING_SUM_WARPS)
 
     @wp.kernel(
@@ -105,7 +106,7 @@ def mixing_sum() -> wp.Kernel:
         # outputs
         total: wp.array[wp.float32],
     ):
-        """Add up the gradients that each block of `pull_back_rows` has written."""
+        """Add up the mixing weights' gradients that the blocks of `pull_back_rows` have written."""
         await_earlier()
         add_partial_sums(partial_sums, total)
 
@@ -114,9 +115,10 @@ def mixing_sum() -> wp.Kernel:
 
 @cached_under_lock()
 def steering_kernels(space_dim: int, mixed_count: int, chiral: bool) -> SimpleNamespace:
-    """Return the kernels that map outputs to updates, and back; a warp has `STEERED_ROWS` rows.
+    """Return the kernels that compute updates from a network's outputs, and the adjoint.
 
-    Outputs are [gates | state changes | 0], updates [displacement | state changes | 0].
+    Columns of outputs are [gates | state changes | 0], of updates [displacement | state changes |
+    0]: displacements are mixed vectors, weighted by gates. A warp serves `STEERED_ROWS` rows.
     """
     form = space_dim, mixed_count, chiral
     module = native.module(f"npa_envs.kernels.steering_{'_'.join(str(int(k)) for k in form)}")
@@ -131,7 +133,7 @@ def steering_kernels(space_dim: int, mixed_count: int, chiral: bool) -> SimpleNa
         # outputs
         update: wp.array2d[wp.float32],
     ):
-        """Write updates from gates and state changes."""
+        """Write updates from a network's gates and state changes, and from mixed vectors."""
         await_earlier()
         steer_by_gates(output, mixed, signs, update)
 
@@ -145,7 +147,7 @@ def steering_kernels(space_dim: int, mixed_count: int, chiral: bool) -> SimpleNa
         output_bar: wp.array2d[wp.float32],
         mixed_bar: wp.array[wp.float32],
     ):
-        """Write cotangents of outputs and mixed vectors."""
+        """Write the cotangents of outputs and mixed vectors from those of updates."""
         await_earlier()
         pull_back_gates(output, mixed, signs, update_bar, output_bar, mixed_bar)
 

@@ -39,19 +39,16 @@ WIDE, WIDE_REGISTERS = range(81, 97), 128
 
 @cached_under_lock()
 def two_layer_kernel(steps: int, tiles: int, mode: str) -> wp.Kernel:
-    """Return the kernel that maps rows through two layers, 16 rows a warp.
+    """Return the kernel that applies a network of two layers to rows; a warp serves 16 rows.
 
-    There are `steps` groups of 16 input columns and `tiles` of 8 output columns. Mode "rectify"
-    applies ReLU between the layers, "note" also stores the ReLU mask, and "mask" applies a stored
-    mask instead.
+    Rows have at most 16 `steps` columns, outputs at most 8 `tiles`. `mode` "rectify" applies ReLU
+    to hidden units, "note" also stores its mask, and "mask" applies a stored mask instead.
 
-    The kernel takes a number of hidden units H, a multiple of 16; rows [K, width] of at most 16
-    `steps` columns; both layers' fragments, as `arrange_hidden` and `arrange_output` leave them;
-    the outputs' scales [8 `tiles`]; for each row, 4 words with the ReLU masks of 128 hidden units,
-    [K, 4 ceil(H / 128)], which "note" writes and "mask" reads; and writes outputs [K, out_width]
-    of at most 8 `tiles` columns. All are dimensionless. Rows are read 16 bytes at a time and
-    outputs written 8 at a time: rows must be dense, begin at a multiple of 16 bytes and have a
-    multiple of 4 columns, outputs of 8 bytes and 2 columns; fragments begin at 16 bytes, too.
+    Arguments: number of hidden units H, a multiple of 16; rows [K, width]; weights of both layers,
+    from `arrange_hidden` and `arrange_output`; scales of the outputs [8 `tiles`]; masks of ReLU, a
+    bit for each hidden unit, [K, 4 ceil(H / 128)]; outputs [K, out_width]. All are dimensionless.
+    Rows are read 16 bytes at a time and outputs written 8 at a time: both must be dense, begin at a
+    multiple of that and have a multiple of 4, or 2, columns. Weights begin at 16 bytes, too.
     """
     name = f"npa_envs.kernels.network_{mode}_{steps}_{tiles}"
     registers = WIDE_REGISTERS if max(16 * steps, 8 * tiles) in WIDE else LAYER_REGISTERS
@@ -69,7 +66,7 @@ def two_layer_kernel(steps: int, tiles: int, mode: str) -> wp.Kernel:
         # outputs
         output: wp.array2d[wp.float32],
     ):
-        """Map rows through both layers; the hidden units between stay in registers."""
+        """Write a network's outputs for rows of inputs; its hidden units stay in registers."""
         await_earlier()
         two_layers(unit_count, rows, hidden_weights, output_weights, output_unscale, signs, output)
 
@@ -80,12 +77,13 @@ def two_layer_kernel(steps: int, tiles: int, mode: str) -> wp.Kernel:
 def weight_gradient_kernels(
     steps: int, tiles: int, out_tiles: int, warps: int, unit_blocks: int, words: int
 ) -> SimpleNamespace:
-    """Return the kernels of the weights' gradients: partial sums over parts of the rows, their sum.
+    """Return the kernels of both layers' weight gradients: sums over ranges of rows, and their sum.
 
-    A block sums a part of the rows, each of its warps for `WARP_UNITS` hidden units. It recomputes
-    their values and cotangents, transposed, so that they are left operands of the gradients'
-    products. Numbers are pairs of bfloat16, which need no scaling: scales differ among rows, and
-    sums run over rows. A row has groups of 16 columns (`steps`) or of 8 (`tiles`).
+    Rows have 16 `steps` or 8 `tiles` columns, output cotangents 8 `out_tiles`, masks `words` words.
+    A block sums a range of rows for 1 / `unit_blocks` of the hidden units, each of its `warps` for
+    `WARP_UNITS`. It recomputes hidden values and cotangents, transposed, as left operands of the
+    gradients' products. Numbers are pairs of bfloat16, which need no scaling: scales differ among
+    rows, and sums run over rows.
     """
     variant = f"{steps}_{tiles}_{out_tiles}_{warps}_{unit_blocks}_{words}"
     module = native.module(f"npa_envs.kernels.network_gradients_{variant}")
@@ -105,7 +103,7 @@ def weight_gradient_kernels(
         # outputs
         partial_sums: wp.array2d[wp.float32],
     ):
-        """Sum both weights' gradients over each part of the rows."""
+        """Write both layers' weight gradients, summed over each range of `part_rows` rows."""
         await_earlier()
         allow_next_launch()
         weight_sums(
@@ -125,7 +123,7 @@ def weight_gradient_kernels(
         # outputs
         total: wp.array[wp.float32],
     ):
-        """Add the partial sums."""
+        """Add up the weight gradients of all ranges of rows."""
         await_earlier()
         allow_next_launch()
         add_partial_sums(partial_sums, total)
@@ -134,15 +132,15 @@ def weight_gradient_kernels(
 
 
 @native.func_native()
-def scale_to(size: float, target: wp.uint32) -> float:
-    """Return the power of two that scales a positive number into [2^target, 2^(target + 1))."""
+def scale_to(size: float, exponent: wp.uint32) -> float:
+    """Return the power of two that scales a positive number into [2^exponent, 2^(exponent + 1))."""
 
 
 @cached_under_lock()
 def arrangement_kernels() -> SimpleNamespace:
     """Return the kernels that lay out weights in the order in which a warp's threads read them.
 
-    Each number is split into two numbers of 16 bits.
+    Each weight is split into two numbers of 16 bits. The last dimension of launches is 32.
     """
     module = native.module("npa_envs.kernels.network_arrangement")
 
@@ -153,7 +151,7 @@ def arrangement_kernels() -> SimpleNamespace:
         unit_unscale: wp.array[wp.float32],
         fragments: wp.array[wp.float16],
     ):
-        """Scale and lay out a first layer [H, width]; threads (H / 8, width / 16, lanes)."""
+        """Scale and lay out a first layer's weights [H, width]: H / 8, ceil(width / 16) warps."""
         await_earlier()
         tile, step, lane = wp.tid()
         unit = 8 * tile + lane / 4
@@ -181,7 +179,7 @@ def arrangement_kernels() -> SimpleNamespace:
         output_unscale: wp.array[wp.float32],
         fragments: wp.array[wp.float16],
     ):
-        """Scale and lay out a second layer [width, H]; threads (H / 16, width / 8, lanes)."""
+        """Scale and lay out a second layer's weights [width, H]: H / 16, ceil(width / 8) warps."""
         await_earlier()
         step, tile, lane = wp.tid()
         column = 8 * tile + lane / 4
@@ -208,7 +206,7 @@ def arrangement_kernels() -> SimpleNamespace:
         # outputs
         fragments: wp.array[wp.bfloat16],
     ):
-        """Write [H, width] as left operands of tensor cores; threads (H / 16, width / 16, 32)."""
+        """Lay out weights [H, width] as products' left operand: H / 16, ceil(width / 16) warps."""
         await_earlier()
         group, step, lane = wp.tid()
         fragment = (group * ((weights.shape[1] + 15) / 16) + step) * 2 * wp.static(WARP)

@@ -24,7 +24,7 @@ from typing import NamedTuple
 import warp as wp
 
 from npa_envs.kernels import native_functions as native
-from npa_envs.kernels.cuda.density import RECORD, make_steps_at, step_of
+from npa_envs.kernels.cuda.density import RECORD
 from npa_envs.kernels.domain import domain_types, kernel_module
 from npa_envs.kernels.mathematics import (
     inverse_root,
@@ -74,7 +74,7 @@ stage = native.generic("stage", 3)
 
 
 class PerceptionVariant(NamedTuple):
-    """Switches of the perception kernel; each combination is a kernel of its own."""
+    """Options of the perception kernel; each combination is compiled as a kernel of its own."""
 
     space_dim: int
     width: int
@@ -103,16 +103,16 @@ class PerceptionVariant(NamedTuple):
 
     @property
     def lane_width(self) -> int:
-        """Channels of a group that one lane sums."""
+        """Channels that one thread sums, of a group of channels."""
         return self.width // CUDA_LANES
 
     @property
     def row_words(self) -> int:
-        """Entries of a row that belong to a group of channels."""
+        """Numbers of a perception row for one group of channels."""
         return self.width * (2 + self.space_dim * self.state_gradient)
 
     def module(self) -> wp.Module:
-        """Return the Warp module of the variant."""
+        """Return the Warp module of the kernel with these options."""
         topic = "listed_" + perception_topic(self.state_gradient, self.moment_inverse)
         topic += "_in_box" * self.periodic + "_grouped" * self.grouped + f"_{self.capacity}"
         topic += "_for_adjoint" * self.for_adjoint + "_by_place" * self.per_particle
@@ -121,7 +121,7 @@ class PerceptionVariant(NamedTuple):
 
 
 def slot_functions(variant: PerceptionVariant, lane_channels: type) -> SimpleNamespace:
-    """Return the functions on a particle's slot, on its neighbours' states and on its row."""
+    """Return the functions that access a particle's slot, its part of shared memory, and states."""
     space_dim, width, lanes = variant.space_dim, variant.width, variant.lanes
     row_words = variant.row_words
     vector = wp.types.vector(space_dim, wp.float32)
@@ -155,24 +155,23 @@ def slot_functions(variant: PerceptionVariant, lane_channels: type) -> SimpleNam
 
     @wp.func
     def padded(count: int):
-        """Return a number of neighbours, rounded up to a multiple of the lanes."""
+        """Return a number of neighbours, rounded up to a multiple of the threads of a particle."""
         return (count + wp.static(lanes - 1)) & ~wp.int32(wp.static(lanes - 1))
 
     return native.namespace(locals())
 
 
 def weighing_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> SimpleNamespace:
-    """Return the functions that write neighbours' weights to a slot of shared memory.
+    """Return the functions that write neighbours' kernel weights to shared memory (the slot).
 
-    They also add up the sums without state channels: of v K, the moment matrix and the density
-    gradient. Each lane adds up those of its own neighbours.
+    They also add up what has no channels: volume times spiky kernel (v K), the moment matrix and
+    the density gradient. Each thread adds up those of its own neighbours.
     """
     scalar = wp.float32
     space_dim, lanes, periodic = variant.space_dim, variant.lanes, variant.periodic
     state_gradient, for_adjoint = variant.state_gradient, variant.for_adjoint
     moment_correction = variant.moment_inverse is not None
     flat = space_dim == 2
-    steps_at = make_steps_at(variant.capacity, variant.tiled)
     space = domain_types(space_dim, scalar)
     vector, Domain = space.vector, space.Domain
     vector_f64 = wp.types.vector(space_dim, wp.float64)
@@ -180,9 +179,20 @@ def weighing_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> Si
     indices_of_pair = wp.types.vector(PAIR, wp.int32)
     records_of_pair = wp.types.matrix((PAIR, 4), scalar)
 
+    @native.func_native(variant.capacity, variant.tiled)
+    def steps_at(lists: wp.array3d[wp.int16], row: int, pair: int) -> int:
+        """Return two entries of a neighbour list, packed in 32 bits.
+
+        An entry, or step, is the neighbour's sorted index minus the particle's.
+        """
+
+    @native.func_native()
+    def step_of(steps: int, entry: int) -> int:
+        """Return entry 0 or 1 of two packed entries of a neighbour list."""
+
     @wp.struct
     class Centre:
-        """A row's particle, by the thread of a lane; numbers in the types that its pairs need."""
+        """The particle of a thread: sorted index k, address `slot` of its shared memory."""
 
         k: int
         lane: int
@@ -193,7 +203,7 @@ def weighing_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> Si
 
     @wp.struct
     class Sums:
-        """A lane's sums over neighbours: v K, moment matrix, density gradient / `spiky_norm`."""
+        """A thread's sums over neighbours: v K, moment matrix, density gradient / `spiky_norm`."""
 
         kernel: vector
         moment: square
@@ -201,7 +211,7 @@ def weighing_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> Si
 
     @wp.func
     def centre_at(domain: Domain, k: int, lane: int, slot: wp.uint32, position: vector):
-        """Return the centre of sorted particle k."""
+        """Return the `Centre` of sorted particle k, for thread `lane` of its threads."""
         centre = Centre()
         centre.k = k
         centre.lane = lane
@@ -214,7 +224,7 @@ def weighing_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> Si
 
     @wp.func
     def spiky_f64(domain: Domain, centre: Centre, neighbour: vector, squared: scalar):
-        """Return a pair's spiky factor / `spiky_norm`, and its offset r, both in float64."""
+        """Return a pair's spiky factor f / `spiky_norm` and its offset r, in float64."""
         r = vector_f64()
         start = squared
         for d in range(wp.static(space_dim)):
@@ -236,12 +246,12 @@ def weighing_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> Si
         j: int,
         centre: Centre,
         record: RECORD,
-        counts: bool,
+        is_neighbour: bool,
         sums: Sums,
     ):
-        """Write neighbour j's weights to the slot, and add its terms to this lane's `Sums`.
+        """Write neighbour j's kernel weights to shared memory; add its terms to this thread's sums.
 
-        Entries that only pad a list have `counts` False and the centre's position: they add 0.
+        An entry that only pads the list is no neighbour: it repeats the particle, and adds 0.
         """
         number = j
         if wp.static(flat):
@@ -251,7 +261,7 @@ def weighing_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> Si
         neighbour = vector()
         for d in range(wp.static(space_dim)):
             neighbour[d] = record[d]
-        volume = wp.where(counts, record[wp.static(space_dim)], scalar(0.0))
+        volume = wp.where(is_neighbour, record[wp.static(space_dim)], scalar(0.0))
         offset = neighbour - centre.position
         if wp.static(periodic):
             offset = space.periodic_image(domain, offset)
@@ -281,7 +291,7 @@ def weighing_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> Si
         centre: Centre,
         sums: Sums,
     ):
-        """Call `weigh` for neighbours whose indices are in the slot, from `begin` to `count`."""
+        """Weigh the neighbours `begin` to `count` of those whose indices a search has written."""
         sync_warp()
         for first in range(centre.lane, slots.padded(count), wp.static(PAIR * lanes)):
             indices = indices_of_pair()
@@ -294,9 +304,9 @@ def weighing_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> Si
                 loaded[a] = load_record(records, indices[a])
             for a in range(wp.static(PAIR)):
                 entry = first + a * wp.static(lanes)
-                counts = entry >= begin and entry < count
+                is_neighbour = entry >= begin and entry < count
                 sums = weigh(
-                    domain, state_index, entry, indices[a], centre, loaded[a], counts, sums
+                    domain, state_index, entry, indices[a], centre, loaded[a], is_neighbour, sums
                 )
         sync_warp()
         return sums
@@ -314,9 +324,9 @@ def weighing_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> Si
         steps: int,
         sums: Sums,
     ):
-        """Call `weigh` for a list's entries from `begin` on, up to a full slot.
+        """Weigh a neighbour list's entries from `begin` on, at most `SLOT_ENTRIES` of them.
 
-        The steps of a lane's next pair are loaded before the current ones are used.
+        `steps` has this thread's next two entries, loaded before the current ones are used.
         """
         end = begin + slots.padded(wp.clamp(length - begin, 0, wp.static(SLOT_ENTRIES)))
         for first in range(begin + wp.static(PAIR) * centre.lane, end, wp.static(PAIR * lanes)):
@@ -329,9 +339,9 @@ def weighing_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> Si
             steps = steps_at(lists, row, (first >> 1) + wp.static(lanes))
             for a in range(wp.static(PAIR)):
                 entry = first + a - begin
-                counts = first + a < length
+                is_neighbour = first + a < length
                 sums = weigh(
-                    domain, state_index, entry, indices[a], centre, loaded[a], counts, sums
+                    domain, state_index, entry, indices[a], centre, loaded[a], is_neighbour, sums
                 )
         sync_warp()
         return steps, sums
@@ -342,7 +352,7 @@ def weighing_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> Si
 def make_add_states(
     variant: PerceptionVariant, slots: SimpleNamespace, lane_channels: type, lane_gradient: type
 ) -> wp.Function:
-    """Return the function that adds neighbours' states to the long sums, by a slot's weights."""
+    """Return the function that adds neighbours' states, times weights in shared memory, to sums."""
     scalar = wp.float32
     space_dim, lane_width, teams = variant.space_dim, variant.lane_width, variant.teams
     state_gradient = variant.state_gradient
@@ -360,7 +370,10 @@ def make_add_states(
         blur: lane_channels,
         gradient: lane_gradient,
     ):
-        """Add weighted states of this team's neighbours, from `first` on, to the long sums."""
+        """Add a team's neighbours' states, times their weights, to the sums `blur` and `gradient`.
+
+        A particle's teams of threads take its neighbours in turn, this one from `first` on.
+        """
         for entry in range(first, slots.padded(count), wp.static(teams * TOGETHER)):
             packed = entries_together()
             loaded = states_together()
@@ -385,7 +398,7 @@ def make_add_states(
 
 
 def search_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> SimpleNamespace:
-    """Return the functions that search cells for the neighbours of particles without a list."""
+    """Return the functions that search cells for neighbours of particles with too long a list."""
     space_dim, lanes = variant.space_dim, variant.lanes
     space = domain_types(space_dim, wp.float32)
     vector, Domain = space.vector, space.Domain
@@ -403,7 +416,10 @@ def search_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> Simp
         runs: int,
         run: int,
     ):
-        """Return first and last + 1 particle of a run of cells; none beyond the last run."""
+        """Return the first and last + 1 particle of run number `run` of cells around a cell.
+
+        It is empty for numbers beyond `runs`.
+        """
         first_cell, last_cell = space.segment_cells(
             domain, cell, wp.min(run, wp.max(runs - 1, wp.int32(0)))
         )
@@ -421,7 +437,10 @@ def search_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> Simp
         end: int,
         count: int,
     ):
-        """Append this lane's candidates within eps to a slot; return its number of entries."""
+        """Append indices of neighbours to those in shared memory; return their new number.
+
+        This thread tests a few candidates, from `first` on, before `end`.
+        """
         loaded = candidates_ahead()
         total = wp.int32(count)
         for a in range(wp.static(ahead)):
@@ -441,7 +460,7 @@ def search_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> Simp
 
 
 def row_functions(variant: PerceptionVariant) -> SimpleNamespace:
-    """Return the functions that scale sums and write them as rows."""
+    """Return the functions that scale sums and write them to shared memory, as perception rows."""
     scalar = wp.float32
     space_dim, width, lane_width = variant.space_dim, variant.width, variant.lane_width
     lane_channels = wp.types.vector(lane_width, scalar)
@@ -451,7 +470,7 @@ def row_functions(variant: PerceptionVariant) -> SimpleNamespace:
 
     @wp.func
     def scale_huge(gradient_scale: scalar, gradient: lane_gradient, scaled: lane_rows):
-        """Return scaled gradients, correct also where the squared length overflows."""
+        """Return `scaled`, corrected where the squared length of a gradient overflows."""
         result = scaled
         for c in range(wp.static(lane_width)):
             along = vector()
@@ -465,7 +484,7 @@ def row_functions(variant: PerceptionVariant) -> SimpleNamespace:
 
     @wp.func
     def scaled_gradient(gradient_scale: scalar, gradient: lane_gradient):
-        """Return a lane's scaled state gradients, channel by channel."""
+        """Return the logarithmic scaling of a thread's state gradients, channel after channel."""
         scaled = lane_rows()
         largest_square = scalar(0.0)
         for c in range(wp.static(lane_width)):
@@ -483,7 +502,7 @@ def row_functions(variant: PerceptionVariant) -> SimpleNamespace:
 
     @wp.func
     def scaled_vector(v: vector):
-        """Return L(v)."""
+        """Return the logarithmic scaling L(v) of a vector."""
         result = v
         squared = wp.dot(v, v)
         if wp.isinf(squared):
@@ -501,7 +520,7 @@ def row_functions(variant: PerceptionVariant) -> SimpleNamespace:
         gradient_scale: scalar,
         gradient: lane_gradient,
     ):
-        """Write a lane's columns of the row to the slot."""
+        """Write a thread's part of a perception row to shared memory, with scaled gradients."""
         first_channel = (lane & wp.static(CUDA_LANES - 1)) * wp.static(lane_width)
         stage(slot, first_channel, own_state)
         stage(slot, wp.static(width) + first_channel, blur)
@@ -514,7 +533,7 @@ def row_functions(variant: PerceptionVariant) -> SimpleNamespace:
 
 @cached_under_lock()
 def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
-    """Return the perception kernel of a variant."""
+    """Return the kernel that perceives by neighbour lists, with these options."""
     scalar = wp.float32
     space_dim, lanes, teams = variant.space_dim, variant.lanes, variant.teams
     state_gradient, moment_correction = variant.state_gradient, variant.moment_inverse is not None
@@ -534,7 +553,6 @@ def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
     add_f64 = make_lane_sum(vector_f64, lanes, whole_warps=True)
     add_channels = make_lane_sum(lane_channels, lanes, whole_warps=True, stride=team)
     add_gradient = make_lane_sum(lane_gradient, lanes, whole_warps=True, stride=team)
-    steps_at = make_steps_at(capacity, variant.tiled)
     corrected = make_corrected(space_dim, scalar, lane_width, variant.moment_inverse)
     slots = slot_functions(variant, lane_channels)
     weighing = weighing_functions(variant, slots)
@@ -572,12 +590,13 @@ def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
         perception: wp.array2d[scalar],
         row_kernel_sum: wp.array[vector],
     ):
-        """Write the perception vector of each row, as `perception_kernels` does.
+        """Write the perception vector of each active particle, as the portable kernel does.
 
-        Threads are numbered by lanes, teams, groups and rows, in complete warps, some beyond the
-        last row. `state_index` has the index of each sorted particle's state, by default (empty)
-        the same index; in 2D it is in `records`. Row k is written to row `row_destination[k]`, by
-        default to row k. Entries are clipped to plus and minus `limit` unless it is 0.
+        Thread numbers count a particle's lanes and teams, channel groups and rows, in complete
+        warps, some beyond the last row. `state_index` has the index of each sorted particle's
+        state, by default (empty) the same index; in 2D it is in `records`. Row k is written to row
+        `row_destination[k]`, by default to row k. Numbers are clipped to plus and minus `limit`
+        unless it is 0.
         """
         await_earlier()
         thread = thread_number()
@@ -622,7 +641,7 @@ def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
         searching = length > wp.static(capacity)
         length = wp.where(searching, wp.int32(0), length)
         longest = largest_in_warp(length)
-        steps = steps_at(lists, list_number, lane)
+        steps = weighing.steps_at(lists, list_number, lane)
         for first_entry in range(0, longest, wp.static(SLOT_ENTRIES)):
             steps, sums = weighing.weigh_listed(
                 domain,

@@ -52,7 +52,7 @@ __device__ inline void clear_counts(unsigned long long address, int cell_count, 
 }
 
 template <int CAPACITY, int BLOCK, int GRID>
-__device__ inline void arrive(unsigned long long address, int particle, int cell, bool active)
+__device__ inline void count_particle(unsigned long long address, int particle, int cell, bool active)
 {
     auto& memory = memory_at<CAPACITY, BLOCK, GRID>(address);
     const int before = atomicAdd(&memory.starts[cell], active ? 1 << 16 | 1 : 1);

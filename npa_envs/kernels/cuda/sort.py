@@ -46,12 +46,12 @@ THREAD_CHANNELS = 4
 
 @native.func_native()
 def count_active(mask: wp.array[wp.uint8], count: int) -> int:
-    """Return this thread's count of active particles among the first `count` of all worlds."""
+    """Return the number of active particles in this thread's part of `mask`, up to `count`."""
 
 
 @cached_under_lock()
 def block_functions(capacity: int) -> SimpleNamespace:
-    """Return the functions for blocks that each sort a world of up to `capacity` particles."""
+    """Return the functions by which a block sorts a world of up to `capacity` particles."""
     sizes = capacity, BLOCKS[capacity], MAX_GRID
 
     @native.func_native(*sizes)
@@ -60,45 +60,48 @@ def block_functions(capacity: int) -> SimpleNamespace:
 
     @native.func_native(*sizes)
     def clear_counts(address: wp.uint64, cell_count: int, earlier: int):
-        """Set the counts of all cells to zero, and sum the threads' counts of earlier rows."""
+        """Set all cells' counts to 0; sum `earlier`, the rows of earlier worlds by thread."""
 
     @native.func_native(*sizes)
-    def arrive(address: wp.uint64, particle: int, cell: int, active: bool):
-        """Count a particle in its cell."""
+    def count_particle(address: wp.uint64, particle: int, cell: int, active: bool):
+        """Count a particle in its cell, and note its order of arrival there."""
 
     @native.func_native(*sizes)
     def add_up_counts(address: wp.uint64, cell_count: int):
-        """Turn counts into starts."""
+        """Replace each cell's count by its start, the sum of the counts of all cells before."""
 
     @native.func_native(*sizes)
     def start_of(address: wp.uint64, cell: int) -> wp.vec2i:
-        """Return a cell's first sorted index in the world, and its first row among all worlds."""
+        """Return the sorted index in the world, and row among all worlds, where a cell begins."""
 
     @native.func_native(*sizes)
     def place_arrived(address: wp.uint64, particle: int):
-        """Assign a particle its provisional position."""
+        """Write a particle to its provisional index: its cell's start plus its order of arrival."""
 
     @native.func_native(*sizes)
     def span_of_slice(address: wp.uint64, begin: int, end: int) -> wp.vec2i:
-        """Return the range of provisional positions whose particles may belong to a slice."""
+        """Return the range of provisional indices of all particles that may be sorted into a slice.
+
+        The slice consists of the sorted indices from `begin` to `end`.
+        """
 
     @native.func_native(*sizes)
     def ranked_at(address: wp.uint64, provisional: int, unordered: int) -> wp.vec3i:
-        """Return sorted index, cell and row (-1: none) of the particle at a provisional position.
+        """Return the sorted index, cell and row (-1: none) of the particle at a provisional index.
 
-        In the cell `unordered` (-1: none) provisional positions are final.
+        In the cell `unordered` (-1: none) provisional indices are final.
         """
 
     @native.func_native(*sizes)
     def member_at(address: wp.uint64, provisional: int) -> int:
-        """Return the index of the particle at a provisional position."""
+        """Return the particle at a provisional index, by its index in the world."""
 
     return native.namespace(locals())
 
 
 @cached_under_lock()
 def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
-    """Return the kernel that sorts worlds of float32 and of up to `capacity` particles."""
+    """Return the kernel that sorts worlds of up to `capacity` particles in float32, by blocks."""
     scalar = wp.float32
     block = BLOCKS[capacity]
     rounds = capacity // block
@@ -140,7 +143,7 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
         row_positions: wp.array[vector],
         sorted_states: wp.array[channels],
     ):
-        """Sort every world by cell, then index; write one slice of it.
+        """Sort the particles of a world by cell, then index; a block writes a slice of them.
 
         States and rows are left out where their arrays are empty.
         """
@@ -175,7 +178,7 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
                 for d in range(wp.static(space_dim)):
                     position[d] = ahead[r, d]
                 cell = space.cell_index(domain, space.cell_of(domain, position))
-                sorting.arrive(memory, i, cell, acting[r] != 0)
+                sorting.count_particle(memory, i, cell, acting[r] != 0)
         sorting.add_up_counts(memory, domain.cell_count)
 
         slice_cells = (domain.cell_count + slice_count - 1) / slice_count
@@ -230,10 +233,10 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
 
 @cached_under_lock()
 def sort_small_splats(capacity: int) -> wp.Kernel:
-    """Return the kernel that sorts splats of float32, of worlds of up to `capacity` particles.
+    """Return the kernel that sorts particles' footprints on pictures, for small worlds.
 
-    The same footprints in the same order as in `pictures/splat.py`. The block also computes its
-    world's mean.
+    They are the same, in the same order, as in `pictures/splat.py`. A block also computes the mean
+    position of its world.
     """
     scalar = wp.float32
     block = BLOCKS[capacity]
@@ -244,7 +247,7 @@ def sort_small_splats(capacity: int) -> wp.Kernel:
 
     @native.func_native(capacity, CHUNK)
     def mean_of_world(positions: wp.array[vector], first: int, count: int) -> vector:
-        """Return the mean of a world's positions; the whole block calls it."""
+        """Return the mean position of a world; all threads of the block must call it."""
 
     @wp.kernel(
         enable_backward=False,
@@ -264,7 +267,7 @@ def sort_small_splats(capacity: int) -> wp.Kernel:
         footprints: wp.array[footprint_type],
         source: wp.array[wp.int32],
     ):
-        """Sort every world's splats by cell, then index; write one slice of them."""
+        """Write the footprints of a world, sorted by cell, then index; a block writes a slice."""
         await_earlier()
         world = block_number() / slice_count
         slice_number = block_number() - world * slice_count
@@ -279,7 +282,7 @@ def sort_small_splats(capacity: int) -> wp.Kernel:
             position = load_vector(positions, first_particle + i)
             position = splat.pixel_position(view, position, mean, goal)
             cell = splat.cell_of_centre(view, splat.patch_centre(position))
-            sorting.arrive(memory, i, cell, False)
+            sorting.count_particle(memory, i, cell, False)
         sorting.add_up_counts(memory, view.cell_count)
         first_cell = world * view.cell_count
         stride = slice_count * wp.static(block)
@@ -318,7 +321,7 @@ def sort_small_splats(capacity: int) -> wp.Kernel:
 
 @cached_under_lock()
 def order_particles(space_dim: int, width: int) -> wp.Kernel:
-    """Return the last kernel of sorting large worlds, which moves states a warp at a time."""
+    """Return the last kernel of sorting large worlds; a warp moves the states of 32 particles."""
     scalar = wp.float32
     vector = domain_types(space_dim, scalar).vector
     thread_width = width // CUDA_LANES
@@ -348,7 +351,7 @@ def order_particles(space_dim: int, width: int) -> wp.Kernel:
         row_positions: wp.array[vector],
         sorted_states: wp.array[channels],
     ):
-        """Write particles sorted by cell, and by index within a cell; number active ones' rows.
+        """Write particles sorted by cell, then index, and number the rows of active ones.
 
         States and rows are left out where their arrays are empty. Launched with whole warps;
         threads beyond the last particle help to move states.

@@ -29,8 +29,8 @@ from npa_envs.kernels.pictures.gaussians import (
     MIN_ALPHA,
     PULLS,
     TILE_SIDE,
+    gaussian_functions,
     gaussian_types,
-    make_covered,
 )
 from npa_envs.kernels.primitives import (
     WARP,
@@ -63,14 +63,14 @@ TO_POWER_OF_TWO = -0.7213475204444817
 
 @cached_under_lock()
 def blending_functions(scalar: type) -> SimpleNamespace:
-    """Return the functions of all kernels: one Gaussian's effect on one pixel, and its adjoint."""
+    """Return the functions of all kernels: a Gaussian's effect on a pixel, and its adjoint."""
     types = gaussian_types(scalar)
     Frame, quad, footprint_type, pulls_type = types.Frame, types.quad, types.footprint, types.pulls
     fast_exp2 = make_fast_exp2(scalar)
 
     @wp.func
     def strength(footprint: footprint_type, x: scalar, y: scalar):
-        """Return a footprint's alpha at a pixel (x, y), before it is limited."""
+        """Return a Gaussian's alpha at offset (x, y) [pixels] from its centre, not yet limited."""
         power = footprint[2] * x * x + footprint[4] * y * y
         power += scalar(2.0) * footprint[3] * x * y
         return footprint[5] * fast_exp2(scalar(TO_POWER_OF_TWO) * power)
@@ -89,7 +89,11 @@ def blending_functions(scalar: type) -> SimpleNamespace:
         through: scalar,
         behind: scalar,
     ):
-        """Return a pixel's pull on a footprint, the transmittance before it, and the updated b."""
+        """Return a pixel's cotangents of a Gaussian, and `through` and `behind` in front of it.
+
+        Given are those behind it: `through` is the transmittance T, `behind` the final T times its
+        cotangent plus (c . c̄) alpha T of farther Gaussians. `bar` is c̄, the colours' cotangent.
+        """
         alpha = wp.min(strength, scalar(MAX_ALPHA))
         rest = scalar(1.0) / (scalar(1.0) - alpha)
         before = through * rest
@@ -122,7 +126,7 @@ def blending_functions(scalar: type) -> SimpleNamespace:
 
     @wp.func
     def pixel_of(frame: Frame, image: int, row: int, column: int):
-        """Return the index of a pixel among all pictures, -1 outside of them."""
+        """Return the index of a pixel among those of all pictures, -1 outside of its picture."""
         pixel = wp.int32(-1)
         if row < frame.height and column < frame.width:
             pixel = (image * frame.height + row) * frame.width + column
@@ -130,7 +134,7 @@ def blending_functions(scalar: type) -> SimpleNamespace:
 
     @wp.func
     def middle_of(pixel: int):
-        """Return the coordinate of the centre of a row's or column's pixels."""
+        """Return the coordinate [pixels] of a pixel's centre along one direction."""
         return scalar(pixel) + scalar(0.5)
 
     return namespace(locals())
@@ -138,16 +142,16 @@ def blending_functions(scalar: type) -> SimpleNamespace:
 
 @cached_under_lock()
 def tile_kernels(scalar: type) -> SimpleNamespace:
-    """Return the kernels of one scalar type in which a thread serves a tile; for the CPU."""
+    """Return the kernels that blend Gaussians, and the adjoint, one thread a tile; for CPUs."""
     types = gaussian_types(scalar)
     Frame, footprint_type, pulls_type = types.Frame, types.footprint, types.pulls
     blending = blending_functions(scalar)
-    covered = make_covered(scalar)
+    covered = gaussian_functions(scalar).covered
     module = native.module(f"npa_envs.kernels.blending_tiles_{scalar_name(scalar)}")
 
     @wp.func
     def shared_pixels(frame: Frame, tile: int, footprint: footprint_type):
-        """Return first, and last + 1, column and row of a tile's pixels that a footprint covers."""
+        """Return first, and then last + 1, column and row of a tile's pixels in a footprint."""
         tile_in_picture = tile % frame.tile_count
         row = tile_in_picture / frame.tile_columns * wp.static(TILE_SIDE)
         column = tile_in_picture % frame.tile_columns * wp.static(TILE_SIDE)
@@ -174,9 +178,9 @@ def tile_kernels(scalar: type) -> SimpleNamespace:
         # outputs
         stops: wp.array[wp.int32],
     ):
-        """Draw a tile; `stops` becomes one past the last pair that a pixel blends.
+        """Blend the Gaussians of a tile; `stops` gets the first pair that a pixel ignores.
 
-        Its initial values must be beyond all pairs.
+        Pairs are of a tile and a Gaussian. Initial `stops` must be beyond all pairs.
         """
         tile = range_start + wp.tid()
         image = tile / frame.tile_count
@@ -219,7 +223,7 @@ def tile_kernels(scalar: type) -> SimpleNamespace:
         # outputs
         pulls: wp.array[pulls_type],
     ):
-        """Write a tile's pull on each of its Gaussians to the pair's slot."""
+        """Write the cotangents of a tile's Gaussians, each to the slot of its pair with a tile."""
         tile = range_start + wp.tid()
         image = tile / frame.tile_count
         begin = starts[tile]
@@ -250,7 +254,7 @@ def tile_kernels(scalar: type) -> SimpleNamespace:
 
 @cached_under_lock()
 def block_kernels(scalar: type) -> SimpleNamespace:
-    """Return the kernels of one scalar type in which a block serves a tile; for CUDA."""
+    """Return the kernels that blend Gaussians, and the adjoint, one block a tile; for CUDA."""
     types = gaussian_types(scalar)
     Frame, quad, footprint_type, pulls_type = types.Frame, types.quad, types.footprint, types.pulls
     blending = blending_functions(scalar)
@@ -261,12 +265,12 @@ def block_kernels(scalar: type) -> SimpleNamespace:
     add_warp = make_lane_sum(pulls_type, WARP, whole_warps=True)
 
     @native.func_native(BATCH, TILE_PIXELS // WARP)
-    def keep(write: bool, i: int, entry: int, value: pulls_type) -> scalar:
-        """Store a warp's pulls of pair i (`write`), or return an entry of their sum over warps."""
+    def store_or_sum(write: bool, i: int, entry: int, value: pulls_type) -> scalar:
+        """Store a warp's cotangents of pair i (`write`), or return an entry of the warps' sum."""
 
     @wp.func
     def own_pixel(frame: Frame, tile: int, k: int):
-        """Return column and row of a thread's pixel; a warp has a patch of its tile."""
+        """Return column and row of thread k's pixel in a tile; a warp has a rectangle of pixels."""
         patch = k / wp.static(WARP)
         lane = k % wp.static(WARP)
         across = wp.static(TILE_SIDE // PATCH_WIDTH)
@@ -288,7 +292,7 @@ def block_kernels(scalar: type) -> SimpleNamespace:
         passing: wp.array[scalar],
         stops: wp.array[wp.int32],
     ):
-        """Draw a pixel; `stops` becomes one past the last pair that it blends."""
+        """Write a pixel; `stops` gets the first pair of its tile and a Gaussian that it ignores."""
         t = wp.tid()
         tile = t / wp.static(TILE_PIXELS)
         column, row = own_pixel(frame, tile, t % wp.static(TILE_PIXELS))
@@ -333,7 +337,7 @@ def block_kernels(scalar: type) -> SimpleNamespace:
         # outputs
         pulls: wp.array[scalar],
     ):
-        """Write a tile's pull on each of its Gaussians to the pair's slot.
+        """Write the cotangents of a tile's Gaussians, each to the slot of its pair with a tile.
 
         A block serves a tile; all its threads go through all pairs, as they sum together.
         """
@@ -372,13 +376,13 @@ def block_kernels(scalar: type) -> SimpleNamespace:
                                 footprint, x, y, strength, bar, through, behind
                             )
                         total = add_warp(total)
-                keep(True, i, 0, total)
+                store_or_sum(True, i, 0, total)
             sync_block()
             for entry in range(k, count * wp.static(PULLS), wp.static(TILE_PIXELS)):
                 i = entry / wp.static(PULLS)
                 part = entry - i * wp.static(PULLS)
                 slot = wp.int32(pair_slots[end - 1 - i])
-                pulls[slot * wp.static(PULLS) + part] = keep(False, i, part, pulls_type())
+                pulls[slot * wp.static(PULLS) + part] = store_or_sum(False, i, part, pulls_type())
             sync_block()
             end -= count
 

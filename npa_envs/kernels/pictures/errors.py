@@ -45,8 +45,11 @@ ROUND_TILES = WARP_TILES * BLOCK_WARPS
 
 @cached_under_lock()
 def make_pixel_errors(scalar: type) -> wp.Function:
-    """Return a Warp function of a pixel's errors: |d| + d² of its density difference d, and the sum
-    of the same over red, green and blue, times exp(-density error)."""
+    """Return a Warp function of a pixel's density error and colour error.
+
+    The density error is |d| + d² of the difference d in density; the colour error is the sum of the
+    same over red, green and blue, times exp(-density error).
+    """
     colour_type = splat_types(scalar).colour
 
     @wp.func
@@ -66,7 +69,7 @@ def make_pixel_errors(scalar: type) -> wp.Function:
 
 @cached_under_lock()
 def gather_errors(scalar: type) -> wp.Kernel:
-    """Return the kernel of one scalar type that gathers and compares; for CUDA."""
+    """Return the kernel that sums particles at pixels and compares with a target; for CUDA."""
     types = splat_types(scalar)
     View, colour_type, footprint_type = types.View, types.colour, types.footprint
     row_type = wp.types.matrix((CHANNELS, TILE_WIDTH), scalar)
@@ -77,11 +80,11 @@ def gather_errors(scalar: type) -> wp.Kernel:
 
     @native.func_native(BLOCK_TILES)
     def rank_tiles(tile_count: int, candidates: int):
-        """Rank the block's first tiles, one of each thread, by their candidates."""
+        """Sort the block's tiles, one a thread, by descending numbers of particles around."""
 
     @native.func_native(BLOCK_TILES)
     def ranked_tile(rank: int) -> wp.vec2i:
-        """Return the tile of a rank and its number of candidates, -1 for no tile."""
+        """Return the tile of a rank in the block and its number of particles, -1 for no tile."""
 
     @wp.kernel(
         enable_backward=False,
@@ -98,7 +101,7 @@ def gather_errors(scalar: type) -> wp.Kernel:
         # outputs
         partial_sums: wp.array2d[wp.vec2d],
     ):
-        """Write the sums of both errors over each tile."""
+        """Write the sums of density and colour errors over each tile."""
         await_earlier()
         # Adjacent tiles belong to different blocks, so that all blocks of a world do equal work.
         tiles = view.tile_columns * view.tile_rows
@@ -148,7 +151,7 @@ def gather_errors(scalar: type) -> wp.Kernel:
 
 @cached_under_lock()
 def sum_errors(scalar: type) -> wp.Kernel:
-    """Return the kernel of one scalar type that compares drawn pictures; for the CPU."""
+    """Return the kernel that compares drawn pictures with a target; for the CPU."""
     colour_type = splat_types(scalar).colour
     pixel_errors = make_pixel_errors(scalar)
 
@@ -162,7 +165,7 @@ def sum_errors(scalar: type) -> wp.Kernel:
         # outputs
         partial_sums: wp.array2d[wp.vec2d],
     ):
-        """Write the sums of both errors over each row of the pictures."""
+        """Write the sums of density and colour errors over each row of the pictures."""
         world, row = wp.tid()
         sums = wp.vec2d()
         for column in range(picture.shape[2]):

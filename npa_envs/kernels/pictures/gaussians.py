@@ -51,7 +51,7 @@ HARMONIC_0, HARMONIC_1 = 0.28209479177387814, 0.4886025119029199
 
 @cached_under_lock()
 def gaussian_types(scalar: type) -> SimpleNamespace:
-    """Return the `Frame` struct and the vector and matrix types of one scalar type."""
+    """Return the `Frame` struct of sizes, and the vector and matrix types, of one scalar type."""
 
     @wp.struct
     class Frame:
@@ -84,7 +84,11 @@ def gaussian_types(scalar: type) -> SimpleNamespace:
 def make_frame(
     scalar: type, shape: tuple[int, int, int], sizes: tuple[int, int], near: float, dilation: float
 ) -> Any:
-    """Return the `Frame` of a batch of pictures."""
+    """Return the `Frame` of a batch of pictures.
+
+    `shape`: particles, views and channels. `sizes`: width and height [pixels]. `near`: least depth
+    [length units]. `dilation`: variance that is added to Gaussians [pixels²].
+    """
     frame = gaussian_types(scalar).Frame()
     frame.particle_count, frame.view_count, frame.channels = shape
     frame.width, frame.height = sizes
@@ -96,28 +100,20 @@ def make_frame(
 
 
 @cached_under_lock()
-def make_covered(scalar: type) -> wp.Function:
-    """Return a Warp function for the pixels along one direction that a footprint covers."""
-
-    @wp.func
-    def covered(middle: scalar, extent: scalar, size: int):
-        """Return first and last + 1 pixel along one direction whose centre is within `extent`."""
-        end = scalar(size)
-        first = wp.ceil(wp.clamp(middle - extent - scalar(0.5), scalar(0.0), end))
-        last = wp.floor(wp.clamp(middle + extent + scalar(0.5), scalar(0.0), end))
-        return wp.int32(first), wp.int32(last)
-
-    return covered
-
-
-@cached_under_lock()
 def gaussian_functions(scalar: type) -> SimpleNamespace:
-    """Return the functions of several kernels: rotations, projection, colours and tiles."""
+    """Return the functions that several kernels share: rotations, projection, colours and tiles."""
     types = gaussian_types(scalar)
     Frame, pair, triple, quad = types.Frame, types.pair, types.triple, types.quad
     footprint_type, harmonics_type = types.footprint, types.harmonics
     flat, cube, motion_type = types.flat, types.cube, types.motion
-    covered = make_covered(scalar)
+
+    @wp.func
+    def covered(middle: scalar, extent: scalar, size: int):
+        """Return first and last + 1 pixel of `size` whose centre is within `extent` of `middle`."""
+        end = scalar(size)
+        first = wp.ceil(wp.clamp(middle - extent - scalar(0.5), scalar(0.0), end))
+        last = wp.floor(wp.clamp(middle + extent + scalar(0.5), scalar(0.0), end))
+        return wp.int32(first), wp.int32(last)
 
     @wp.func
     def unit_quaternion(quaternion: quad):
@@ -153,7 +149,7 @@ def gaussian_functions(scalar: type) -> SimpleNamespace:
 
     @wp.func
     def pull_back_rotation(q: quad, bar: cube):
-        """Return the cotangent of a unit quaternion from that of its rotation."""
+        """Return the cotangent of a unit quaternion from that of its rotation matrix."""
         w = q[0]
         x = q[1]
         y = q[2]
@@ -189,7 +185,7 @@ def gaussian_functions(scalar: type) -> SimpleNamespace:
 
     @wp.func
     def limited(ratio: scalar, focal: scalar, middle: scalar, size: scalar):
-        """Return x/z clamped to the picture with its margin, for the Jacobian of the projection."""
+        """Return x/z (`ratio`), clamped to a margin around the picture, for J of the projection."""
         margin = scalar(wp.static(0.5 * CLAMP_MARGIN)) * size
         return wp.clamp(ratio, (-middle - margin) / focal, (size - middle + margin) / focal)
 
@@ -202,7 +198,7 @@ def gaussian_functions(scalar: type) -> SimpleNamespace:
 
     @wp.func
     def jacobian_of(frame: Frame, camera: quad, position: triple):
-        """Return J, the derivative of picture coordinates by those in the camera's frame."""
+        """Return J, the derivative of a point's picture coordinates by its camera coordinates."""
         ratios = limited_ratios(frame, camera, position)
         x = camera[0] / position[2]
         y = camera[1] / position[2]
@@ -217,7 +213,7 @@ def gaussian_functions(scalar: type) -> SimpleNamespace:
         return result
 
     @wp.func
-    def outlook(motion: motion_type, mean: triple):
+    def offset_from_camera(motion: motion_type, mean: triple):
         """Return the vector from the camera to a mean [length units], on which colours depend."""
         return mean + wp.transpose(rotation_part(motion)) * shift_part(motion)
 
@@ -241,14 +237,14 @@ def gaussian_functions(scalar: type) -> SimpleNamespace:
 
     @wp.func
     def colours_of(colours: wp.array2d[scalar], i: int, motion: motion_type, mean: triple):
-        """Return a Gaussian's colours, padded with 0; from spherical harmonics if it has 12."""
+        """Return a Gaussian's colours, padded with 0; 12 numbers are of spherical harmonics."""
         result = quad()
         if colours.shape[1] <= wp.static(CHANNELS):
             for c in range(wp.static(CHANNELS)):
                 if c < colours.shape[1]:
                     result[c] = colours[i, c]
         else:
-            basis = harmonic_basis(wp.normalize(outlook(motion, mean)))
+            basis = harmonic_basis(wp.normalize(offset_from_camera(motion, mean)))
             colour = basis * harmonics_at(colours, i)
             for c in range(3):
                 value = colour[c] + scalar(0.5)
@@ -258,7 +254,7 @@ def gaussian_functions(scalar: type) -> SimpleNamespace:
 
     @wp.func
     def covered_tiles(frame: Frame, footprint: footprint_type):
-        """Return first, and last + 1, column and row of the tiles that a footprint covers."""
+        """Return first, and then last + 1, column and row of the tiles in a footprint."""
         left, right = covered(footprint[0], footprint[10], frame.width)
         top, bottom = covered(footprint[1], footprint[11], frame.height)
         result = wp.vec4i()
@@ -274,7 +270,7 @@ def gaussian_functions(scalar: type) -> SimpleNamespace:
 
 @cached_under_lock()
 def gaussian_kernels(scalar: type) -> SimpleNamespace:
-    """Return the kernels that draw 3D Gaussians, of one scalar type."""
+    """Return the kernels that project 3D Gaussians, list the tiles they cover, and pull back."""
     types, gaussian = gaussian_types(scalar), gaussian_functions(scalar)
     Frame, pair, triple, quad = types.Frame, types.pair, types.triple, types.quad
     footprint_type, pulls_type, harmonics_type = types.footprint, types.pulls, types.harmonics
@@ -303,8 +299,8 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
         """Write footprint, depth and number of covered tiles of each Gaussian in each picture.
 
         An invisible Gaussian, or one with a number that is not finite, covers no tile and has
-        infinite depth. There is one motion and one set of intrinsics for each picture, for each
-        view of all worlds, or for all pictures.
+        infinite depth. `motions` (from world to camera) and `intrinsics` are one for each picture,
+        for each view of all worlds, or for all pictures.
         """
         entry = range_start + wp.tid()
         image = entry / frame.particle_count
@@ -371,9 +367,10 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
         owners: wp.array[wp.int32],
         slots: wp.array[wp.int32],
     ):
-        """List tile and Gaussian of each pair, near ones first, and each Gaussian's first slot.
+        """Write the pairs of a tile and a Gaussian that covers it, near Gaussians first.
 
-        A picture has `room` slots. Gaussians without room, or without a tile, get slot -1.
+        A picture has room for `room` pairs. `slots` has the index of each Gaussian's first pair, -1
+        if it covers no tile or has no room.
         """
         k = range_start + wp.tid()
         image = k / frame.particle_count
@@ -485,7 +482,7 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
                     for c in range(3):
                         if footprint[6 + c] > scalar(0.0):
                             seen_colour_bar[c] = pull[6 + c]
-                    way = gaussian.outlook(motion, mean)
+                    way = gaussian.offset_from_camera(motion, mean)
                     direction = wp.normalize(way)
                     harmonics_bar += wp.outer(gaussian.harmonic_basis(direction), seen_colour_bar)
                     basis_bar = gaussian.harmonics_at(colours, i) * seen_colour_bar

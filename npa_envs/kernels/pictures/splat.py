@@ -61,7 +61,7 @@ PATCH_SIGMAS = 3.0
 
 @cached_under_lock()
 def splat_types(scalar: type) -> SimpleNamespace:
-    """Return the vector types and the `View` struct of one scalar type."""
+    """Return the `View` struct of sizes, and the vector and matrix types, of one scalar type."""
 
     @wp.struct
     class View:
@@ -96,7 +96,11 @@ def splat_types(scalar: type) -> SimpleNamespace:
 def make_view(
     scalar: type, resolution: int, pixel_size: float, sigma: float, low: float, high: float
 ) -> Any:
-    """Return the `View`: the sizes that follow from a picture's resolution, window and Gaussian."""
+    """Return the `View` of pictures: the sizes that follow from resolution, window and Gaussian.
+
+    A target's pixels have sides of `pixel_size`; the window is [low, high] along both directions,
+    and Gaussians have standard deviation `sigma` [length units].
+    """
     pixels = resolution * pixel_size / (high - low)
     view = splat_types(scalar).View()
     view.resolution = resolution
@@ -118,19 +122,19 @@ def make_view(
 
 
 def gather_registers(scalar: type) -> int | None:
-    """Return the register limit of a CUDA thread that gathers; None: no limit."""
+    """Return the most registers of a CUDA thread that gathers splats; None: no limit."""
     return CUDA_REGISTERS if scalar == wp.float32 else None
 
 
 def group_count(resolution: int) -> int:
-    """Return the number of groups of tiles of a picture."""
+    """Return the number of groups of tiles in a picture; a warp gathers one."""
     across = -(-resolution // (TILE_WIDTH * GROUP_WIDTH))
     return across * -(-resolution // (TILE_HEIGHT * GROUP_HEIGHT))
 
 
 @cached_under_lock()
 def splat_functions(scalar: type) -> SimpleNamespace:
-    """Return the functions of several kernels: positions in pixels, and footprints."""
+    """Return the functions that several kernels share: positions in pixels, and footprints."""
     types = splat_types(scalar)
     View, vector, colour_type = types.View, types.vector, types.colour
     footprint_type = types.footprint
@@ -138,7 +142,7 @@ def splat_functions(scalar: type) -> SimpleNamespace:
 
     @wp.func
     def patch_weight(falloff: scalar, slope: scalar, offset: scalar):
-        """Return the Gaussian along one direction at a pixel's offset o from the patch's centre.
+        """Return a Gaussian along one direction, at offset o [pixels] from the patch's centre.
 
         It is relative to the value at the centre, so that narrow ones stay finite: with n from the
         particle to the centre, n^2 - (n + o)^2 is -o (2 n + o), and `slope` is -2 n falloff.
@@ -147,7 +151,7 @@ def splat_functions(scalar: type) -> SimpleNamespace:
 
     @wp.func
     def pixel_position(view: View, position: vector, mean: vector, goal: wp.array[vector]):
-        """Return a particle's position in pixels; if there is a goal, its world's mean is there."""
+        """Return a position in pixels; with a goal, the world's mean is first moved there."""
         moved = position
         if goal.shape[0] > 0:
             moved = (position - mean) + goal[0]
@@ -162,7 +166,7 @@ def splat_functions(scalar: type) -> SimpleNamespace:
 
     @wp.func
     def visible(view: View, centre: vector):
-        """Return whether a patch covers a pixel of the picture; False for NaN."""
+        """Return whether the patch around a centre covers a pixel of the picture; False for NaN."""
         begin = -scalar(view.radius)
         end = scalar(view.resolution - 1 + view.radius)
         across = centre[0] >= begin and centre[0] <= end
@@ -181,7 +185,7 @@ def splat_functions(scalar: type) -> SimpleNamespace:
     def footprint_of(
         view: View, position: vector, i: int, states: wp.array2d[scalar], shift: scalar
     ):
-        """Return a particle's footprint, with its last three states plus a shift as colours."""
+        """Return a particle's footprint, with its last three states plus `shift` as colours."""
         centre = patch_centre(position)
         near = centre - position
         slope = scalar(-2.0) * view.falloff * near
@@ -208,7 +212,7 @@ def splat_functions(scalar: type) -> SimpleNamespace:
 
 @cached_under_lock()
 def gather_functions(scalar: type, lanes: int) -> SimpleNamespace:
-    """Return functions that sum a tile's particles; `lanes`: 1, or a thread per pixel row."""
+    """Return functions that sum the particles around a tile, by 1 thread or by one a row."""
     assert lanes in (1, TILE_HEIGHT)
     types, splat = splat_types(scalar), splat_functions(scalar)
     View, footprint_type, tile_type = types.View, types.footprint, types.tile
@@ -240,7 +244,7 @@ def gather_functions(scalar: type, lanes: int) -> SimpleNamespace:
         starts: wp.array[wp.int32],
         footprints: wp.array[footprint_type],
     ):
-        """Return a lane's pixels of a tile, each the weighted sum over its particles."""
+        """Return this thread's pixels of a tile: weighted sums over the particles around it."""
         across = columns_type()
         for c in range(wp.static(TILE_WIDTH)):
             across[c] = kept(scalar(tile_column * wp.static(TILE_WIDTH) + c))
@@ -296,7 +300,7 @@ def gather_functions(scalar: type, lanes: int) -> SimpleNamespace:
 
 @cached_under_lock()
 def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
-    """Return the kernels of one scalar type; `lanes` threads share a tile, or a particle."""
+    """Return the kernels that draw worlds, and the adjoint; `lanes` threads a tile or particle."""
     types = splat_types(scalar)
     View, vector, colour_type = types.View, types.vector, types.colour
     footprint_type, pulls_type = types.footprint, types.pulls
@@ -330,8 +334,10 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         arrival: wp.array[wp.int32],
         counts: wp.array[wp.int32],
     ):
-        """Store each particle's cell and order of arrival, and count particles at counts[cell + 1];
-        counts[0] stays 0 for the prefix sum."""
+        """Write each particle's cell and order of arrival, and count the particles of each cell.
+
+        Those of cell c are counted at counts[c + 1]; counts[0] stays 0 for the prefix sum.
+        """
         await_earlier()
         i = wp.tid()
         world = i / particle_count
@@ -348,7 +354,7 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         # outputs
         arrived: wp.array[wp.int32],
     ):
-        """List the particles of each cell in the order in which they were counted."""
+        """List the particles by cell, in the order in which they were counted."""
         await_earlier()
         i = wp.tid()
         arrived[starts[cell[i]] + arrival[i]] = i
@@ -369,7 +375,7 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         footprints: wp.array[footprint_type],
         source: wp.array[wp.int32],
     ):
-        """Write each particle's footprint at its rank by index within its cell."""
+        """Write the particles' footprints sorted by cell, and by index within a cell."""
         await_earlier()
         k = wp.tid()
         i = arrived[k]
@@ -390,7 +396,7 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
 
     @wp.func
     def tile_of(view: View, t: int):
-        """Return the world, the tile's row and column, and the lane of a thread."""
+        """Return world, row and column of thread t's tile, and the thread's number in it."""
         across = (view.tile_columns + wp.static(GROUP_WIDTH - 1)) / wp.static(GROUP_WIDTH)
         down = (view.tile_rows + wp.static(GROUP_HEIGHT - 1)) / wp.static(GROUP_HEIGHT)
         tile = t / wp.static(lanes)
@@ -420,7 +426,7 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         # outputs
         picture: wp.array[colour_type],
     ):
-        """Write each pixel of the pictures."""
+        """Write colours and density of each pixel of the pictures."""
         world, row, column, lane = tile_of(view, wp.tid())
         if row < view.tile_rows and column < view.tile_columns:
             values = gather_tile(view, world, row, column, lane, starts, footprints)
@@ -449,7 +455,7 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         footprints: wp.array[footprint_type],
         source: wp.array[wp.int32],
     ):
-        """Draw a world, particle after particle; for devices with few threads."""
+        """Draw the picture of a world, particle after particle; for devices with few threads."""
         world = range_start + wp.tid()
         for i in range(world * particle_count, (world + 1) * particle_count):
             position = position_in_world(view, positions[i], means, goal, world)
@@ -487,7 +493,7 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         positions_bar: wp.array[vector],
         colours_bar: wp.array2d[scalar],
     ):
-        """Write the cotangents of each particle's position and colours from its patch."""
+        """Write the cotangents of particles' positions and colours from those of the pixels."""
         k, lane = wp.tid()
         k += range_start
         world = k / particle_count

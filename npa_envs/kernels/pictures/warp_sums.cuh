@@ -5,7 +5,7 @@ namespace npa {
 // Writes the value that a warp's first thread has for pair i, or returns an entry of the sum over
 // the warps; both in one function, as they share its memory.
 template <int BATCH, int WARPS, unsigned PULLS, typename Part>
-__device__ inline Part keep(bool write, int i, int entry, wp::vec_t<PULLS, Part> value)
+__device__ inline Part store_or_sum(bool write, int i, int entry, wp::vec_t<PULLS, Part> value)
 {
     __shared__ Part kept[BATCH][WARPS][PULLS];
     Part sum = 0;

@@ -41,7 +41,7 @@ def adjoint_kernels(
     state_gradient: bool,
     listed: bool = False,
 ) -> SimpleNamespace:
-    """Return the kernels of one variant; arguments as for `perception_kernels`."""
+    """Return the kernels of perception's adjoint; arguments as for `perception_kernels`."""
     space = domain_types(space_dim, scalar)
     vector, particle, Domain = space.vector, space.particle, space.Domain
     group = wp.types.vector(width, scalar)
@@ -49,7 +49,6 @@ def adjoint_kernels(
     topic = "adjoint" if state_gradient else "smoothing_adjoint"
     topic = "listed_per_particle_" * listed + "unfiltered_" * (not on_cpu) + topic
     module = kernel_module(topic, space_dim, scalar, width)
-    cell_vector = wp.types.vector(space_dim, wp.int32)
     search = make_search(space_dim, scalar, vector, on_cpu, listed)
     indices = wp.types.vector(search.stride, wp.int32)
     add_scaled = make_add_scaled(group)
@@ -74,7 +73,7 @@ def adjoint_kernels(
         gradient_bar: wp.array[scalar],
         density_gradient_bar: wp.array[vector],
     ):
-        """Write the cotangents of each row's unscaled sums from the cotangent of z."""
+        """Write each row's cotangents before the logarithmic scaling, from those of perception."""
         row, channel = wp.tid()
         row += range_start
         if row >= starts[starts.shape[0] - 1] - row_base:
@@ -112,25 +111,6 @@ def adjoint_kernels(
             density_gradient_bar[row] = pull
 
     @wp.func
-    def run_of_rows(
-        domain: Domain,
-        starts: wp.array[wp.int32],
-        ends: wp.array[wp.int32],
-        base: int,
-        cell: cell_vector,
-        k: int,
-        r: int,
-        row_base: int,
-        row_capacity: int,
-    ):
-        """Return first and last + 1 row of a run around particle k, or entry of its list."""
-        begin, end = search.run(domain, starts, ends, base, cell, k, r)
-        if wp.static(not listed):
-            begin -= row_base
-            end = wp.min(end - row_base, row_capacity)
-        return begin, end
-
-    @wp.func
     def filter_rows(
         domain: Domain,
         row_positions: wp.array[vector],
@@ -140,7 +120,7 @@ def adjoint_kernels(
         first: int,
         end: int,
     ):
-        """Return the rows within eps among the candidates from `first` on, and their count."""
+        """Return the rows within eps of a block of candidates, from `first` on, and their count."""
         near = indices()
         count = wp.int32(0)
         if wp.static(listed):
@@ -180,9 +160,9 @@ def adjoint_kernels(
         # outputs
         states_bar: wp.array2d[scalar],
     ):
-        """Write the cotangent of every particle's state, from the active rows around it.
+        """Write the cotangent of each particle's state, summed over the active particles around it.
 
-        With listed neighbours, particles are in sorted order everywhere.
+        With neighbour lists, all arrays are in sorted order.
         """
         k, g = wp.tid()
         k += range_start
@@ -192,7 +172,10 @@ def adjoint_kernels(
         base = active_offset + (k / particle_count) * domain.cell_count
         cell = space.cell_of(domain, position)
         for r in range(search.run_count(domain, cell)):
-            begin, end = run_of_rows(domain, starts, ends, base, cell, k, r, row_base, row_capacity)
+            begin, end = search.run_range(domain, starts, ends, base, cell, k, r)
+            if wp.static(not listed):
+                begin -= row_base
+                end = wp.min(end - row_base, row_capacity)
             for first in range(begin, end, wp.static(search.stride)):
                 near, count = filter_rows(
                     domain, row_positions, neighbours, row_of, position, first, end
@@ -244,7 +227,7 @@ def adjoint_kernels(
         # outputs
         density_bar: wp.array[scalar],
     ):
-        """Write the cotangent of every particle's density, through its volume."""
+        """Write the cotangent of each particle's density, through its volume 1 / rho."""
         k = range_start + wp.tid()
         entry = particles[k]
         position = space.position_of(entry)
@@ -310,7 +293,7 @@ def adjoint_kernels(
         # outputs
         positions_bar: wp.array[vector],
     ):
-        """Write the cotangent of every position: as a neighbour of others, and as a centre."""
+        """Write the cotangent of each position: of a neighbour of others, and of a centre."""
         k = range_start + wp.tid()
         entry = particles[k]
         position = space.position_of(entry)

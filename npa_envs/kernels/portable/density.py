@@ -18,7 +18,7 @@ from npa_envs.thread_lock import cached_under_lock
 
 @cached_under_lock()
 def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespace:
-    """Return the kernels of one variant: one thread a particle."""
+    """Return the kernels of densities and neighbour lists, with one thread a particle."""
     space = domain_types(space_dim, scalar)
     vector, particle, Domain = space.vector, space.particle, space.Domain
     vector_f64 = wp.types.vector(space_dim, wp.float64)
@@ -59,7 +59,7 @@ def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespa
         particles: wp.array[particle],
         density_gradients: wp.array[vector_f64],
     ):
-        """Write positions with volumes 1 / rho, and density gradients of particles with rows.
+        """Write each particle's position and volume 1 / rho, and density gradients of active ones.
 
         The density gradient cancels almost fully where particles are dense, and rules amplify its
         rounding error: it stays in float64 up to its scaling, which costs little.
@@ -116,9 +116,9 @@ def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespa
         counts: wp.array[wp.int32],
         neighbours: wp.array[wp.int32],
     ):
-        """Write each particle's number of neighbours, itself included.
+        """Write each particle's number of neighbours, itself included, and their sorted indices.
 
-        Unless `neighbours` is empty, also write them, after those of the particle before.
+        Indices are left out if `neighbours` is empty. Those of particle k end at `ends[k]`.
         """
         k = range_start + wp.tid()
         position = space.position_of(particles[k])
@@ -129,7 +129,7 @@ def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespa
             begin = ends[k - 1]
         next_entry = begin
         for r in range(search.run_count(domain, cell)):
-            first, end = search.run(domain, starts, neighbours, base, cell, k, r)
+            first, end = search.run_range(domain, starts, neighbours, base, cell, k, r)
             for candidate in range(first, end, wp.static(search.stride)):
                 near, count = search.filter_near(
                     domain, particles, neighbours, position, candidate, end
@@ -145,7 +145,7 @@ def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespa
 
 @cached_under_lock()
 def species_kernel(space_dim: int, scalar: type, species_count: int) -> wp.Kernel:
-    """Return the kernel of each species' density and density gradient at every particle.
+    """Return the kernel of each species' density and density gradient at each particle.
 
     A thread runs through a particle's neighbourhood once, for all species. Sums are in float64:
     gradients cancel almost fully where particles are dense.

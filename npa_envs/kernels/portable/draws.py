@@ -28,7 +28,7 @@ words = wp.types.vector(4, wp.uint32)
 
 @wp.func
 def high_word(a: wp.uint32, b: wp.uint32):
-    """Upper 32 bits of a product."""
+    """Upper 32 bits of the product of two words of 32 bits."""
     return wp.uint32((wp.uint64(a) * wp.uint64(b)) >> wp.uint64(32))
 
 
@@ -59,7 +59,7 @@ def world_words(
     episodes: wp.array[wp.int32],
     steps: wp.array[wp.int32],
 ):
-    """Return the four words number `block` of a world's draw, for its next 4 or 2 elements."""
+    """Return four random words of a world: words 4 `block` to 4 `block` + 3 of its draw `draw`."""
     key = wp.uint64(keys[world])
     counter = words(
         wp.uint32(block), wp.uint32(steps[world]), wp.uint32(draw), wp.uint32(episodes[world])
@@ -152,7 +152,7 @@ def draw_kernel(distribution: str, value_type: type) -> tuple[wp.Kernel, int]:
         # outputs
         values: wp.array2d[value_type],
     ):
-        """Write random numbers of each world."""
+        """Write the random numbers of draw `number` in each world."""
         world, block = wp.tid()
         drawn = numbers_of(world_words(world, block, number, keys, episodes, steps), bound)
         for k in range(wp.static(count)):

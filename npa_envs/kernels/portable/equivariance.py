@@ -15,7 +15,7 @@ from npa_envs.thread_lock import cached_under_lock
 
 @cached_under_lock()
 def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
-    """Return the kernels of one variant."""
+    """Return the kernels of equivariant rules: mixed vectors, products, steering, and adjoints."""
     vector = domain_types(space_dim, scalar).vector
     numbers = wp.array2d[scalar]
     vectors = wp.array2d[vector]
@@ -46,7 +46,7 @@ def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         # outputs
         mixed: vectors,
     ):
-        """Mix the vectors of each row."""
+        """Write the mixed vectors of each row: its perceived vectors times the mixing weights."""
         t = range_start + wp.tid()
         count = mixing.shape[1]
         row = t / count
@@ -70,7 +70,10 @@ def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         # outputs
         inputs: numbers,
     ):
-        """Write the network's inputs: scalars, products, the row's constant in `one`, zeros."""
+        """Write the network's inputs: scalars, products of mixed vectors, the row's constant, 0.
+
+        `one` is the column of the constant.
+        """
         # A thread writes the pairs that end with its vector, and some scalars: adjacent threads
         # write adjacent entries.
         t = range_start + wp.tid()
@@ -105,7 +108,7 @@ def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         # outputs
         whole_bar: vectors,
     ):
-        """Write each mixed vector's cotangent, the given one plus that through the products."""
+        """Write each mixed vector's cotangent: the given one, plus that through the products."""
         t = range_start + wp.tid()
         count = mixed.shape[1]
         row = t / count
@@ -137,7 +140,7 @@ def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         # outputs
         rows_bar: numbers,
     ):
-        """Write the cotangent of each row, zero for its constant and padding."""
+        """Write the cotangent of each row of perception, zero for its constant and padding."""
         # A thread writes a perceived vector, and some scalars.
         t = range_start + wp.tid()
         count = mixing.shape[0]
@@ -165,7 +168,7 @@ def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         # outputs
         update: numbers,
     ):
-        """Write updates from gates and state changes, and zeros in further columns."""
+        """Write updates from a network's gates and state changes, and zeros in further columns."""
         t = range_start + wp.tid()
         # Directions come first, so that adjacent threads take the same branch.
         directions = update.shape[0] * wp.static(space_dim)
@@ -205,7 +208,7 @@ def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         output_bar: numbers,
         mixed_bar: vectors,
     ):
-        """Write cotangents of a row's outputs and mixed vectors."""
+        """Write the cotangents of outputs and mixed vectors from those of updates."""
         t = range_start + wp.tid()
         width = output.shape[1]
         row = t / width

@@ -37,10 +37,10 @@ def perception_kernels(
     moment_inverse: str | None,
     listed: bool = False,
 ) -> SimpleNamespace:
-    """Return the kernels of one variant.
+    """Return the kernels of perception vectors and fields, for groups of `width` channels.
 
-    A variant without `state_gradient`, or without its correction by a `moment_inverse`, leaves out
-    the sums that only these need.
+    Without `state_gradient`, or without its correction by a `moment_inverse`, they leave out the
+    sums that only these need. `listed`: they read neighbour lists instead of cells.
     """
     moment_correction = moment_inverse is not None
     space = domain_types(space_dim, scalar)
@@ -70,7 +70,7 @@ def perception_kernels(
         g: int,
         group_count: int,
     ):
-        """Return the smoothed state, the state gradient, the sum of v K and the moment matrix."""
+        """Return smoothed state, state gradient, sum of v K and moment matrix of particle k."""
         position = space.position_of(particles[k])
         own = load_group(states, k * group_count + g)
         blur = group()
@@ -80,7 +80,7 @@ def perception_kernels(
         base = (k / particle_count) * domain.cell_count
         cell = space.cell_of(domain, position)
         for r in range(search.run_count(domain, cell)):
-            begin, end = search.run(domain, starts, ends, base, cell, k, r)
+            begin, end = search.run_range(domain, starts, ends, base, cell, k, r)
             for first in range(begin, end, wp.static(search.stride)):
                 near, count = search.filter_near(
                     domain, particles, neighbours, position, first, end
@@ -139,11 +139,10 @@ def perception_kernels(
         perception: wp.array2d[scalar],
         row_kernel_sum: wp.array[vector],
     ):
-        """Write the perception vector of each row, a one and zeros up to the row's width.
+        """Write the perception vector of each active particle, then a one, then zeros, as a row.
 
         Rows beyond the last active one are zero. Row k is written to row `row_destination[k]`, or
-        to row k if that array is empty. Entries are clipped to plus and minus `limit` unless it is
-        0.
+        to row k if that array is empty. `limit`, unless 0, clips numbers to plus and minus it.
         """
         row, g = wp.tid()
         row += range_start
@@ -209,7 +208,10 @@ def perception_kernels(
         moment_field: wp.array[square],
         corrected_field: wp.array3d[scalar],
     ):
-        """Write the unscaled fields of every particle, in the caller's order."""
+        """Write density, smoothed state, gradients and moments of each particle, before scaling.
+
+        They are in the caller's order of particles.
+        """
         k, g = wp.tid()
         k += range_start
         i = source[k]

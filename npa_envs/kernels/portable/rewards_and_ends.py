@@ -34,7 +34,11 @@ def update_episodes(
     # outputs
     endings: wp.array[wp.uint8],
 ):
-    """Write rewards, losses, flags and endings; if not enabled, only endings (all 0)."""
+    """Write each world's reward, losses, flags and ending; if not enabled, only endings, all 0.
+
+    `numbers` are the reward, the loss, its parts and their decreases; `flags` are terminated,
+    truncated, success and diverged.
+    """
     await_earlier()
     world = wp.tid()
     count = elapsed.shape[0]

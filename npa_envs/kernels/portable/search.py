@@ -20,13 +20,13 @@ FILTER_BLOCK = 32
 def make_search(
     space_dim: int, scalar: type, entry_type: type, on_cpu: bool, listed: bool = False
 ) -> SimpleNamespace:
-    """Return the Warp functions of a search among sorted vectors that begin with a position.
+    """Return the Warp functions that find the neighbours of a particle, in cells or in a list.
 
-    For particle k in `cell`, of the world whose first cell is `base`, the first `count` of `near`
-    are candidates within eps. They are used as
+    `entries` are sorted vectors that begin with a position. For particle k in `cell`, of the world
+    whose first cell is `base`, the first `count` of `near` are entries within eps. They are used as
 
         for r in range(run_count(domain, cell)):
-            begin, end = run(domain, starts, ends, base, cell, k, r)
+            begin, end = run_range(domain, starts, ends, base, cell, k, r)
             for first in range(begin, end, stride):
                 near, count = filter_near(domain, entries, neighbours, position, first, end)
 
@@ -40,14 +40,14 @@ def make_search(
 
     @wp.func
     def run_count(domain: Domain, cell: cell_vector):
-        """Return the number of runs of candidates around a cell."""
+        """Return the number of runs of cells around a cell; 1 for a neighbour list."""
         count = wp.int32(1)
         if wp.static(not listed):
             count = space.segment_count(domain, cell)
         return count
 
     @wp.func
-    def run(
+    def run_range(
         domain: Domain,
         starts: wp.array[wp.int32],
         ends: wp.array[wp.int32],
@@ -56,8 +56,10 @@ def make_search(
         k: int,
         r: int,
     ):
-        """Return first and last + 1 candidate of a run of particle k, in the world whose first cell
-        is `base`."""
+        """Return the first and last + 1 candidate of particle k in run number r.
+
+        `base` is the first cell of the particle's world.
+        """
         begin = wp.int32(0)
         end = wp.int32(0)
         if wp.static(listed):
@@ -88,8 +90,7 @@ def make_search(
         first: int,
         end: int,
     ):
-        """Return the candidates of the block from `first` on within eps of a position; their
-        count."""
+        """Return the candidates within eps in the block from `first` on, and their count."""
         near = indices()
         count = wp.int32(0)
         for c in range(first, wp.min(first + wp.static(stride), end)):
@@ -101,4 +102,6 @@ def make_search(
                 count += is_near(domain, entries, position, c)
         return near, count
 
-    return SimpleNamespace(stride=stride, run_count=run_count, run=run, filter_near=filter_near)
+    return SimpleNamespace(
+        stride=stride, run_count=run_count, run_range=run_range, filter_near=filter_near
+    )

@@ -24,7 +24,7 @@ from npa_envs.thread_lock import cached_under_lock
 
 @cached_under_lock()
 def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
-    """Return the kernels of one variant."""
+    """Return the kernels that sort particles by cell."""
     space = domain_types(space_dim, scalar)
     vector, Domain = space.vector, space.Domain
     group = wp.types.vector(width, scalar)
@@ -43,7 +43,7 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
         arrival: wp.array[wp.int32],
         counts: wp.array[wp.int32],
     ):
-        """Count the particles, and the active ones, of each cell; counts[0] stays zero."""
+        """Count particles, and the active ones, of cell c at counts[c + 1]; counts[0] stays 0."""
         await_earlier()
         i = wp.tid()
         index = (i / particle_count) * domain.cell_count
@@ -62,7 +62,7 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
         # outputs
         arrived: wp.array[wp.vec2i],
     ):
-        """List the particles of each cell in the order in which atomics counted them.
+        """List the particles by cell, in the order in which atomics counted them.
 
         An entry is twice the particle's index, plus one if it is active; then its cell.
         """
@@ -99,7 +99,7 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
         row_positions: wp.array[vector],
         sorted_states: wp.array[group],
     ):
-        """Move every particle to its rank by index within its cell; give active ones rows.
+        """Write particles sorted by cell, then index, and number the rows of active ones.
 
         States and rows are left out where their arrays are empty.
         """
@@ -158,7 +158,7 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
         row_positions: wp.array[vector],
         sorted_states: wp.array[group],
     ):
-        """Sort a world by cell, then index, in one thread: all of the three kernels above.
+        """Sort a world by cell, then index, in one thread, as the three other kernels do.
 
         States and rows are left out where their arrays are empty.
         """
@@ -233,7 +233,7 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
 
 @cached_under_lock()
 def give_rows(space_dim: int, scalar: type) -> wp.Kernel:
-    """Return the kernel that assigns rows to the active particles of sorted worlds."""
+    """Return the kernel that numbers the rows of the active particles of sorted worlds."""
     vector = wp.types.vector(space_dim, scalar)
 
     @wp.kernel(enable_backward=False, module=kernel_module("rows", space_dim, scalar))
@@ -251,9 +251,9 @@ def give_rows(space_dim: int, scalar: type) -> wp.Kernel:
     ):
         """Write the row of each particle, the particle of each row, and starts of cells and rows.
 
-        It does so for several steps; a step has a thread for each particle or start, whichever are
-        more. `active_before` is the cumulative number of active particles over all steps, up to and
-        with each particle.
+        It does so for several steps of the same sorted worlds; a step has a thread for each
+        particle or start, whichever are more. `active_before` is the cumulative number of active
+        particles over all steps, up to and with each particle.
         """
         await_earlier()
         step, t = wp.tid()

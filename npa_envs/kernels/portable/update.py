@@ -38,7 +38,7 @@ MOVED_TOGETHER = 32
 
 @cached_under_lock()
 def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
-    """Return the kernels of one variant."""
+    """Return the kernels that move particles and change states, by updates or by actions."""
     vector = domain_types(space_dim, scalar).vector
     vector_f64 = wp.types.vector(space_dim, wp.float64)
     channels = wp.types.vector(THREAD_CHANNELS, scalar)
@@ -61,7 +61,7 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
 
     @wp.func
     def bounded(position: vector, boundary: int, box: vector):
-        """Return a position's image in the box around the origin; walls mirror odd images."""
+        """Return a position's image in the box around 0; reflecting walls mirror odd images."""
         result = position
         if boundary != wp.static(OPEN):
             for d in range(wp.static(space_dim)):
@@ -74,7 +74,7 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
 
     @wp.func
     def clipped(value: scalar, limit: scalar):
-        """Return a value clipped to its limit, 0 for NaN, and whether it was changed."""
+        """Return a value clipped to plus and minus a limit (NaN: 0), and whether it changed."""
         result = value
         changed = wp.int32(0)
         if wp.isnan(value):
@@ -90,7 +90,7 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
 
     @wp.func
     def acted_state(state: scalar, action: scalar, largest_change: wp.float64):
-        """Return a state after an action, which is clipped to [-1, 1]."""
+        """Return a state plus `largest_change` times an action, which is clipped to [-1, 1]."""
         # Comparisons keep NaN; a clamp would not.
         part = action
         if part > scalar(1.0):
@@ -101,7 +101,7 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
 
     @wp.func
     def acted_position(position: vector, action: vector_f64, largest_step: wp.float64):
-        """Return a position after an action, which is scaled down to a length of at most 1."""
+        """Return a position moved by `largest_step` times an action, shortened to at most 1."""
         length = wp.length(action)
         step = largest_step
         # Written in this way, one NaN coordinate makes all of them NaN.
@@ -131,7 +131,7 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         new_states: wp.array[scalar],
         new_path_length: wp.array[scalar],
     ):
-        """Move and change the particles that have a row; copy the others."""
+        """Write positions, states and path lengths, updated where a particle has a row."""
         await_earlier()
         # Of the threads of a group of particles, the first move one particle each, and the others
         # change some channels each.
@@ -362,7 +362,7 @@ VALUES_PER_THREAD = 8
 
 @cached_under_lock()
 def find_not_finite(scalar: type) -> wp.Kernel:
-    """Return the kernel of one scalar type."""
+    """Return the kernel that checks whether all numbers of an array are finite."""
     module = native.module(f"npa_envs.kernels.finite_{scalar_name(scalar)}")
     read_quad = make_read_at(wp.types.vector(QUAD, scalar), 16)
 
@@ -373,7 +373,7 @@ def find_not_finite(scalar: type) -> wp.Kernel:
         # outputs
         finite: wp.array[wp.uint8],
     ):
-        """Write 0 if any of the values, aligned to 16 bytes in memory, is infinite or NaN."""
+        """Write 0 to `finite` if a value is infinite or NaN; values are aligned to 16 bytes."""
         await_earlier()
         t = wp.tid()
         wild = wp.int32(0)

@@ -21,7 +21,7 @@ MEAN_LANES = 32
 
 @cached_under_lock()
 def mean_kernels(scalar: type, lanes: int) -> SimpleNamespace:
-    """Return the kernels of one scalar type; `lanes` threads share a sum."""
+    """Return the kernels that average over worlds; `lanes` threads share a sum."""
     module = native.module(f"npa_envs.kernels.worlds_{scalar_name(scalar)}_l{lanes}")
     lane_sum = make_lane_sum(wp.float64, lanes, whole_warps=True)
 
@@ -31,7 +31,7 @@ def mean_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         # outputs
         partial_sums: wp.array3d[wp.float64],
     ):
-        """Sum each chunk of a world's values."""
+        """Write the sum of each chunk of `CHUNK` values of a world."""
         await_earlier()
         world, k, chunk, lane = wp.tid()
         total = wp.float64(0.0)
