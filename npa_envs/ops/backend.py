@@ -40,7 +40,7 @@ may be too small to fill a GPU."""
 
 
 class KernelRequest(NamedTuple):
-    """Properties of an operator call by which the table chooses; tensors' values are not read."""
+    """Properties of an operator call that decide which implementation in `TABLE` runs it."""
 
     device: torch.device
     dtype: torch.dtype
@@ -67,7 +67,7 @@ class KernelRequest(NamedTuple):
 
 
 class Implementation(NamedTuple):
-    """A row of the table."""
+    """Kernels that implement an operator, and the calls that they can run."""
 
     operator: Operator
     """The operator that it implements."""
@@ -214,12 +214,12 @@ TABLE: tuple[Implementation, ...] = (
 
 @functools.lru_cache(maxsize=4096)
 def choose(operator: Operator, request: KernelRequest) -> Implementation:
-    """Return the implementation of an operator that a call takes."""
+    """Return the first implementation of an operator in `TABLE` that can run a call."""
     return next(row for row in TABLE if row.operator == operator and row.holds(request))
 
 
 def describe(request: KernelRequest) -> list[str]:
-    """Return a line for each operator: the chosen implementation, its file and its condition."""
+    """Return a text line for each operator: the chosen implementation, its file, when it runs."""
     chosen: dict[Operator, Implementation] = {}
     for row in TABLE:
         if row.holds(request):
@@ -231,10 +231,10 @@ def describe(request: KernelRequest) -> list[str]:
 
 
 class Listing(NamedTuple):
-    """How the CUDA backend lists neighbours, and how threads share particles.
+    """Length of neighbour lists on CUDA, and how many threads compute a particle together.
 
     It depends on the device and on one world's size and box, never on the number of worlds: it
-    decides the order of a world's sums, which are the same in every batch.
+    decides the order in which a world's sums are added, which must be the same in every batch.
     """
 
     capacity: int
@@ -247,7 +247,7 @@ class Listing(NamedTuple):
     """Whether the density pass is `tiled_density`."""
 
     def shape(self, row_count: int) -> tuple[int, int, int]:
-        """Return the shape of the array that stores the lists, in groups of 32."""
+        """Return the shape of the array of `row_count` neighbour lists, 32 of them interleaved."""
         return -(-row_count // 32), self.capacity, 32
 
 
@@ -268,7 +268,7 @@ DENSITY_LANES = 4
 
 
 def rollout_listing(request: KernelRequest, mean_neighbours: float = 0.0) -> Listing:
-    """Return how rollouts list neighbours: also a few worlds have to fill a GPU."""
+    """Return the `Listing` of rollouts: more threads a particle, so that few worlds fill a GPU."""
     if request.particle_count <= SHARED_WORLD:
         crowded = int(mean_neighbours) in CROWD
         capacity = CROWDED_CAPACITY if crowded else CAPACITY
@@ -280,7 +280,7 @@ def rollout_listing(request: KernelRequest, mean_neighbours: float = 0.0) -> Lis
 
 
 def batch_listing(request: KernelRequest) -> Listing:
-    """Return how environments list neighbours: their batches fill a GPU with less work a world."""
+    """Return the `Listing` of environments: fewer threads a world, as many worlds fill a GPU."""
     if request.particle_count <= SMALL_WORLD:
         return Listing(SMALL_WORLD_CAPACITY, lanes=1, teams=1)
     tiled = choose("density", request).name == "tiles"

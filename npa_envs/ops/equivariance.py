@@ -39,7 +39,7 @@ MIN_STEERING = 1e-19
 
 
 class VectorForm(NamedTuple):
-    """How many scalars and vectors an equivariant rule perceives, and how many it makes of them."""
+    """Numbers of scalars and vectors that an equivariant rule perceives, and of mixed vectors."""
 
     space_dim: int
     """Space dimension D."""
@@ -48,13 +48,13 @@ class VectorForm(NamedTuple):
     perceived: int
     """Perceived vectors, D numbers each."""
     mixed: int
-    """Mixed vectors."""
+    """Mixed vectors: linear combinations of the perceived ones."""
     chiral: bool
     """Whether the rule distinguishes left from right."""
 
     @classmethod
-    def of(cls, numbers: list[int]) -> VectorForm:
-        """Return the form whose fields are these numbers, as in a torch operator."""
+    def from_list(cls, numbers: list[int]) -> VectorForm:
+        """Return the sizes from the list of integers that torch operators take."""
         space_dim, scalars, perceived, mixed, chiral = numbers
         return cls(space_dim, scalars, perceived, mixed, bool(chiral))
 
@@ -65,25 +65,26 @@ class VectorForm(NamedTuple):
 
     @property
     def product_count(self) -> int:
-        """Products u_a · u_b of pairs a <= b, and, where chiral, u_a × u_b of pairs a < b."""
+        """Number of products u_a · u_b with a <= b and, where chiral, u_a × u_b with a < b."""
         pairs = self.mixed * (self.mixed + 1) // 2
         return pairs + self.chiral * (pairs - self.mixed)
 
     @property
     def input_dim(self) -> int:
-        """Scalars and products."""
+        """Length of the network's input: perceived scalars, then products of mixed vectors."""
         return self.scalars + self.product_count
 
     @property
     def gate_count(self) -> int:
-        """Gates: one for each mixed vector, and, where chiral, for each turned by 90 degrees."""
+        """Number of gates: one a mixed vector and, where chiral, one a vector turned by 90°."""
         return self.mixed * (1 + self.chiral)
 
 
 def invariants(perception: Tensor, mixing: Tensor, form: VectorForm) -> tuple[Tensor, Tensor]:
-    """Return mixed vectors u, [..., mixed, D], and rotation-invariant inputs, [..., input_dim].
+    """Return mixed vectors u, [..., mixed, D], and the network's inputs, [..., input_dim].
 
-    The inputs are scalars and products of mixed vectors. `mixing` has shape [perceived, mixed].
+    u = mixing^T v, where v are the perceived vectors and `mixing` has shape [perceived, mixed].
+    Inputs do not change with rotations: they are the scalars and the products of mixed vectors.
     """
     shape = (*perception.shape[:-1], form.perceived, form.space_dim)
     vectors = perception[..., form.scalars :].reshape(shape)
@@ -97,10 +98,10 @@ def invariants(perception: Tensor, mixing: Tensor, form: VectorForm) -> tuple[Te
 
 
 def steered(output: Tensor, mixed: Tensor, steering: Tensor, form: VectorForm) -> Tensor:
-    """Return raw updates [δ (D) ; Δs] from gates and state changes: δ = Σ relu(g_a) steering_a u_a.
+    """Return updates [δ (D) ; Δs (C)] from a network's gates g and state changes Δs.
 
-    `output` has gates and then state changes, shape [..., gate_count + C]; `steering` is the
-    displacement of a gate of 1 along its vector, in units of the vector, shape [gate_count].
+    δ = Σ_a relu(g_a) steering_a u_a, over mixed vectors u_a and, where chiral, those turned by 90
+    degrees. `output` is [g ; Δs], shape [..., gate_count + C]; `steering` has shape [gate_count].
     """
     gates = torch.relu(output[..., : form.gate_count]) * steering
     along = torch.cat((mixed, _turned(mixed)), dim=-2) if form.chiral else mixed
@@ -109,7 +110,7 @@ def steered(output: Tensor, mixed: Tensor, steering: Tensor, form: VectorForm) -
 
 
 def _turned(vectors: Tensor) -> Tensor:
-    """Return vectors [..., 2] rotated by 90 degrees."""
+    """Return 2D vectors [..., 2] rotated counterclockwise by 90 degrees."""
     x, y = vectors.unbind(dim=-1)
     return torch.stack((-y, x), dim=-1)
 
@@ -118,8 +119,8 @@ def _kernels(like: Tensor, space_dim: int) -> Any:
     return equivariance_kernels(space_dim, SCALARS[like.dtype])
 
 
-def _is_for_warps(like: Tensor, form: VectorForm) -> bool:
-    """Return whether the CUDA kernels support a form, for such a tensor."""
+def _cuda_runs(like: Tensor, form: VectorForm) -> bool:
+    """Return whether CUDA kernels run these sizes on the device and dtype of `like`."""
     return choose("vectors", KernelRequest(like.device, like.dtype, vectors=form)).name == "cuda"
 
 
@@ -128,7 +129,7 @@ BLOCKS_PER_PROCESSOR = 5
 
 
 def _launch_blocks(kernel: Any, blocks: int, warps: int, *tensors: Tensor) -> None:
-    """Launch a CUDA kernel in `blocks` blocks of `warps` warps each."""
+    """Launch a kernel on CUDA in `blocks` blocks of `warps` warps each."""
     block = warps * WARP
     launch(kernel, blocks * block, tensors[0].device, *tensors, block_dim=block)
 
@@ -137,10 +138,10 @@ def _launch_blocks(kernel: Any, blocks: int, warps: int, *tensors: Tensor) -> No
 def _read_rows(
     rows: Tensor, mixing: Tensor, width: int, form_numbers: list[int]
 ) -> tuple[Tensor, Tensor]:
-    form = VectorForm.of(form_numbers)
+    form = VectorForm.from_list(form_numbers)
     mixed = rows.new_empty(rows.shape[0], form.mixed, form.space_dim)
     inputs = rows.new_empty(rows.shape[0], width)
-    if _is_for_warps(rows, form):
+    if _cuda_runs(rows, form):
         blocks = -(-rows.shape[0] // (rows_of_warp(form.mixed) * READ_WARPS))
         kernel = row_kernels(*form).read_rows
         _launch_blocks(kernel, blocks, READ_WARPS, rows, mixing, mixed, inputs)
@@ -162,10 +163,10 @@ def _read_rows_backward(
     form_numbers: list[int],
     with_mixing: bool,
 ) -> tuple[Tensor, Tensor]:
-    form, row_count, device = VectorForm.of(form_numbers), mixed.shape[0], rows.device
+    form, row_count, device = VectorForm.from_list(form_numbers), mixed.shape[0], rows.device
     space_dim, scalars, perceived, count, chiral = form
     rows_bar = torch.empty_like(rows)
-    if _is_for_warps(rows, form):
+    if _cuda_runs(rows, form):
         blocks = -(-row_count // (rows_of_warp(count) * PULL_WARPS))
         blocks = min(blocks, BLOCKS_PER_PROCESSOR * multiprocessor_count(device))
         partial_sums, mixing_bar = rows.new_empty(blocks, mixing.numel()), torch.empty_like(mixing)
@@ -189,19 +190,19 @@ def _read_rows_backward(
     return rows_bar, pairs.diagonal(dim1=1, dim2=3).sum(dim=-1)
 
 
-def _steers_by_warps(mixed: Tensor, gate_count: int) -> tuple[int, int, bool] | None:
-    """Return D, mixed vectors and chirality if CUDA kernels steer these rows, else None."""
+def _cuda_steering(mixed: Tensor, gate_count: int) -> tuple[int, int, bool] | None:
+    """Return D, number of mixed vectors and chirality if CUDA kernels can steer, else None."""
     count, space_dim = map(int, mixed.shape[1:])
     chiral = gate_count > count
     # Steering needs no shared memory, so it runs wherever the smallest rows fit.
     least = VectorForm(space_dim, 0, 1, count, chiral)
-    return (space_dim, count, chiral) if _is_for_warps(mixed, least) else None
+    return (space_dim, count, chiral) if _cuda_runs(mixed, least) else None
 
 
 @custom_op("npa::steer_rows")
 def _steer_rows(output: Tensor, mixed: Tensor, signs: Tensor, width: int) -> Tensor:
     update = output.new_empty(output.shape[0], width)
-    form = _steers_by_warps(mixed, len(signs))
+    form = _cuda_steering(mixed, len(signs))
     if form is not None:
         blocks = -(-output.shape[0] // (STEERED_ROWS * STEER_WARPS))
         kernel = steering_kernels(*form).steer
@@ -218,7 +219,7 @@ def _steer_rows_backward(
 ) -> tuple[Tensor, Tensor]:
     output_bar, mixed_bar = torch.empty_like(output), torch.empty_like(mixed)
     tensors = output, mixed, signs, update_bar, output_bar, mixed_bar
-    form = _steers_by_warps(mixed, len(signs))
+    form = _cuda_steering(mixed, len(signs))
     if form is not None:
         blocks = -(-output.shape[0] // (STEERED_ROWS * STEER_WARPS))
         _launch_blocks(steering_kernels(*form).pull_back_steering, blocks, STEER_WARPS, *tensors)
@@ -229,7 +230,7 @@ def _steer_rows_backward(
 
 
 class _ReadRows(torch.autograd.Function):
-    """Mixed vectors and invariants of rows."""
+    """Autograd function of `read_rows`."""
 
     @staticmethod
     def forward(
@@ -251,7 +252,7 @@ class _ReadRows(torch.autograd.Function):
 
 
 class _SteerRows(torch.autograd.Function):
-    """Autograd function of `steer_rows`: updates from gates, mixed vectors and state changes."""
+    """Autograd function of `steer_rows`."""
 
     @staticmethod
     def forward(ctx: Any, output: Tensor, mixed: Tensor, signs: Tensor, width: int) -> Tensor:
@@ -268,9 +269,9 @@ class _SteerRows(torch.autograd.Function):
 
 
 def read_rows(rows: Tensor, mixing: Tensor, form: VectorForm, width: int) -> tuple[Tensor, Tensor]:
-    """Return mixed vectors and network inputs of rows of perception [z | 1 | 0], as `invariants`.
+    """Return `invariants` of K particles by kernels: shapes [K, mixed, D] and [K, width].
 
-    They have shapes [K, mixed, D] and [K, width]; inputs are [scalars | products | 1 | 0].
+    A row is a perception vector, a one and zeros; inputs are [scalars | products | 1 | 0].
     """
     tensors = rows.contiguous(), mixing.contiguous()
     if not (torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)):
@@ -280,7 +281,7 @@ def read_rows(rows: Tensor, mixing: Tensor, form: VectorForm, width: int) -> tup
 
 
 def signed_gates(weight: Tensor, steering: Tensor) -> tuple[Tensor, Tensor]:
-    """Return output weights with gates multiplied by |steering|, and the signs of steering.
+    """Return output weights [gates and C, H] with gates times |steering|, and steering's signs.
 
     relu(g) steering = sign(steering) relu(|steering| g), so the gradient of `steering` follows from
     that of the weights, without a sum over rows. A steering of 0 is replaced by a tiny one, so that
@@ -292,7 +293,10 @@ def signed_gates(weight: Tensor, steering: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def steer_rows(output: Tensor, mixed: Tensor, signs: Tensor, width: int) -> Tensor:
-    """Return updates [δ | Δs | 0] of outputs [g | Δs | 0] by `signed_gates`, as `steered`."""
+    """Return `steered` of K particles by kernels: updates [δ | Δs | 0], shape [K, width].
+
+    `output` is [g | Δs | 0] by the weights of `signed_gates`, which also returns `signs`.
+    """
     output = output.contiguous()
     if not (torch.is_grad_enabled() and (output.requires_grad or mixed.requires_grad)):
         return _steer_rows(output, mixed, signs, width)

@@ -40,7 +40,7 @@ GROUP_WIDTHS = (4, 8, 16)
 
 
 def channel_width(state_dim: int) -> int:
-    """Return the number of channels of a group."""
+    """Return how many of a particle's `state_dim` channels one thread sums: a group."""
     return next((width for width in GROUP_WIDTHS if width >= state_dim), GROUP_WIDTHS[-1])
 
 
@@ -73,7 +73,7 @@ class _ArrayArgument:
         self._dtype: torch.dtype | None = None
 
     def set(self, tensor: Tensor | None) -> None:
-        """Write the descriptor of another tensor, or of an absent one (None)."""
+        """Write a tensor's descriptor; None stands for an absent array."""
         if tensor is None:
             # Kernels read the size of an absent array.
             if self._size is not None:
@@ -98,12 +98,12 @@ def _null(tensor: Tensor) -> int:
 
 
 def _overwrite(memory: Any, value: Any) -> None:
-    """Copy a descriptor or a struct into the memory of the arguments."""
+    """Copy the bytes of a descriptor or struct into memory."""
     ctypes.memmove(ctypes.addressof(memory), ctypes.addressof(value), ctypes.sizeof(value))
 
 
 def _description(tensor: Tensor, array_type: Any) -> Any:
-    """Return Warp's array descriptor of a tensor; one of one dimension covers the whole tensor."""
+    """Return Warp's array descriptor of a tensor, flattened where the kernel's array is 1D."""
     tensor = tensor.detach()
     if array_type.ndim == 1:
         entry = getattr(array_type.dtype, "_shape_", ())
@@ -117,7 +117,7 @@ def _description(tensor: Tensor, array_type: Any) -> Any:
 
 
 def _type_of(argument: Any) -> Any:
-    """Return the type of a kernel's argument: a `wp.array` also for `wp.array2d[...]`."""
+    """Return the Warp type of a kernel's argument; `wp.array2d[...]` becomes a `wp.array`."""
     declared = argument.type
     is_array = hasattr(declared, "ndim")
     return wp.array(dtype=declared.dtype, ndim=declared.ndim) if is_array else declared
@@ -131,7 +131,7 @@ class _StructArgument:
         self._last: Any = None
 
     def set(self, value: Any) -> None:
-        """Copy another struct, unless it is the current one."""
+        """Copy a struct's bytes, unless this object was copied last."""
         if value is not self._last:
             _overwrite(self._memory, value.__ctype__())
             self._last = value
@@ -193,7 +193,7 @@ class _Arguments:
             self._driven = DriverLaunch(self._launch, device, self._addresses)
 
     def _setter(self, name: str, declared: Any, value: Any) -> Any:
-        """Return the function that sets an argument; None for a number or vector, set directly."""
+        """Return the function that writes an array or struct; None for numbers."""
         if isinstance(declared, wp.array):
             return _ArrayArgument(getattr(self._memory, name), declared).set
         if hasattr(value, "__ctype__"):
@@ -214,7 +214,7 @@ class _Arguments:
                 setattr(self._memory, self._names[k], number)
 
     def set_address(self, index: int, tensor: Tensor) -> None:
-        """Set the address of an array argument to that of a tensor of the same form."""
+        """Point an array argument at another tensor of the same shape and dtype."""
         getattr(self._memory, self._names[index]).data = tensor.data_ptr() or _null(tensor)
 
     def _bounds_of(self, size: tuple[int, ...]) -> Any:
@@ -245,7 +245,7 @@ class _Arguments:
             self._run_on_cpu(self._memory, size)
 
     def _run_range(self, size: tuple[int, ...], indices: range) -> None:
-        """Run the part of a launch that has these indices along the first dimension."""
+        """Run the threads of a CPU launch whose first index is in `indices`."""
         memory = type(self._memory).from_buffer_copy(self._memory)
         setattr(memory, self._names[0], indices.start)
         self._run_on_cpu(memory, (len(indices), *size[1:]))
@@ -255,7 +255,7 @@ class _Arguments:
 
 
 def _first_load(kernel: Any, device: torch.device) -> contextlib.AbstractContextManager[None]:
-    """Return a lock of all processes, held while a kernel's module is compiled or loaded."""
+    """Return a lock across processes for a module's first load; afterwards a null context."""
     known = any(other.module is kernel.module and where == device for other, where in launched)
     return contextlib.nullcontext() if known else in_turn(kernel.module.name)
 
@@ -273,7 +273,7 @@ def _struct(fields: tuple[tuple[str, type], ...]) -> Any:
 
 
 class Launch(NamedTuple):
-    """One launch of a Warp kernel."""
+    """Description of one launch of a Warp kernel."""
 
     kernel: str
     """The kernel's name."""
@@ -287,7 +287,7 @@ class Launch(NamedTuple):
 
 @contextlib.contextmanager
 def noted_launches() -> Iterator[list[Launch]]:
-    """Yield a list to which all launches in the block are added, of every thread."""
+    """Yield a list that receives each launch made within the block, by any thread."""
     noted: list[Launch] = []
     _observers.append(noted)
     try:
@@ -307,7 +307,7 @@ def _described(kernel: Any, size: tuple[int, ...]) -> Launch:
 
 
 class _Ready(threading.local):
-    """A thread's cache of kernels with memory for their arguments."""
+    """A thread's kernels with memory for their arguments, and whether it records or traces."""
 
     def __init__(self) -> None:
         self.by_kernel: dict[tuple[Any, torch.device, int], _Arguments] = {}
@@ -329,9 +329,9 @@ def launch(
 ) -> None:
     """Launch a kernel with `size` threads along each dimension on torch's current stream.
 
-    Arguments are tensors of the device (None for an absent one), structs and numbers, in the
-    kernel's order, without `range_start`. The kernel's signature decides how a tensor is read: an
-    array of one dimension is all of a contiguous tensor, whatever the tensor's shape.
+    Arguments follow the kernel's signature, without its first argument if that is `range_start`:
+    tensors on the device (None: an absent array), structs and numbers. A 1D array is the whole of
+    a contiguous tensor, whatever the tensor's shape.
     """
     if _ready.traced:
         return
@@ -357,7 +357,7 @@ def launch(
 
 @contextlib.contextmanager
 def tracing() -> Iterator[None]:
-    """Launch nothing in the block, in this thread: torch only asks for the shapes of results."""
+    """Make `launch` do nothing in the block, in this thread: torch needs only results' shapes."""
     _ready.traced, before = True, _ready.traced
     try:
         yield
@@ -402,7 +402,7 @@ class Tape:
 
     @contextlib.contextmanager
     def recording(self) -> Iterator[None]:
-        """Record this thread's launches in the block, and make them."""
+        """Make and record this thread's launches in the block."""
         _ready.tape, before = self, _ready.tape
         try:
             yield
@@ -417,7 +417,7 @@ class Tape:
         block_dim: int,
         arguments: tuple[Any, ...],
     ) -> _Arguments:
-        """Add a launch to the tape, and return memory for its arguments."""
+        """Record a launch, and return its memory for arguments, which are not set yet."""
         memory = _Arguments(kernel, size, device, block_dim, arguments)
         self._launches.append((memory, size))
         self._tensors.append(list(arguments))
@@ -428,7 +428,7 @@ class Tape:
         return len(self._launches)
 
     def argument_slots(self, tensor: Tensor) -> list[tuple[_Arguments, int]]:
-        """Return the arguments that are this tensor, which the caller now has to keep alive."""
+        """Return where a tensor is an argument: launch and index. The caller keeps it alive."""
         slots, address = [], tensor.data_ptr()
         for (memory, _), arguments in zip(self._launches, self._tensors, strict=True):
             for k, value in enumerate(arguments):
@@ -438,14 +438,14 @@ class Tape:
         return slots
 
     def move(self, slots: list[tuple[_Arguments, int]], tensor: Tensor) -> None:
-        """Replace these arguments by a tensor of the same form, which the caller keeps alive."""
+        """Put a tensor of the same shape and dtype at these slots; the caller keeps it alive."""
         for memory, index in slots:
             memory.set_address(index, tensor)
 
     def replay(
         self, begin: int = 0, end: int | None = None, *, last_count: int | None = None
     ) -> None:
-        """Repeat some of the launches, the last with `last_count` threads if given."""
+        """Repeat launches begin to end - 1, the last with another size of its first dimension."""
         launches = self._launches[begin:end]
         for memory, size in launches[:-1]:
             memory.run(size)
@@ -487,9 +487,9 @@ def _pool() -> ThreadPoolExecutor:
 
 
 def _leave_threads() -> None:
-    """Drop the pool in a forked process, in which the parent's threads do not run.
+    """Use one thread in a forked process, in which the parent's threads do not run.
 
-    Torch would wait for its own threads for ever.
+    Torch would wait for its threads for ever.
     """
     global _forked
     _forked = True
@@ -502,10 +502,10 @@ if hasattr(os, "register_at_fork"):
 
 
 def thread_count() -> int:
-    """Return the number of CPU threads of kernels: torch's number.
+    """Return how many CPU threads run a kernel: torch's number.
 
     In a process started by Python's `multiprocessing` it is one, unless the number was set: such
-    processes, as of vector environments, share the cores.
+    processes, for example of vector environments, share the cores.
     """
     threads = torch.get_num_threads()
     chosen = threads != _DEFAULT_THREADS or "OMP_NUM_THREADS" in os.environ
@@ -513,7 +513,7 @@ def thread_count() -> int:
 
 
 def even_ranges(count: int, smallest: int) -> list[range]:
-    """Split [0, count) into ranges for all threads, of at least `smallest` indices each; or one."""
+    """Split [0, count) for the CPU threads into ranges of at least `smallest` indices each."""
     if count < 2 * smallest:
         return [range(count)]
     threads = thread_count()
@@ -523,7 +523,7 @@ def even_ranges(count: int, smallest: int) -> list[range]:
 
 
 def run_together(calls: Sequence[Callable[[], object]]) -> None:
-    """Run calls that release the GIL in parallel; the first error is raised after all have run."""
+    """Call functions in parallel, which must release the GIL; raise the first error at the end."""
     pending = iter(calls)
     errors: list[BaseException] = []
 

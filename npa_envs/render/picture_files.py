@@ -43,7 +43,7 @@ def encode_frame(frame: Frame, kind: Literal["PNG", "JPEG"]) -> bytes:
 
 
 def _encoded(frames: Iterable[Frame], **options: Any) -> bytes:
-    """Return the file that Pillow encodes pictures to, as bytes."""
+    """Return the bytes of a file of pictures, encoded by Pillow."""
     first, *others = map(Image.fromarray, checked_frames(frames))
     buffer = io.BytesIO()
     first.save(buffer, append_images=others, **options)
@@ -245,7 +245,7 @@ def checked_frames(frames: Iterable[Frame]) -> list[Frame]:
 
 
 def _shared_palette(pictures: list[Frame]) -> tuple[Image.Image, Frame, int]:
-    """Return a palette for all frames, the most frequent colour, and its index."""
+    """Return a palette for all frames, the most frequent colour, and its index in the palette."""
     step = max(1, math.ceil(sum(p.size // 3 for p in pictures) / _PALETTE_SAMPLE))
     sample = np.concatenate([p.reshape(-1, 3)[k % step :: step] for k, p in enumerate(pictures)])
     _, which, counts = np.unique(
@@ -290,7 +290,7 @@ def turntable_frames(
 
     Args:
         views: Returns pictures of V cameras: colours times alpha, and alpha, [1, V, H, W, 4].
-        frame_count: Pictures of one turn.
+        frame_count: Number of pictures in one turn.
         resolution: Pixels along each side.
         elevation: Angle of the cameras above the horizon [degrees].
         azimuth: Angle of the first camera around the vertical axis [degrees].

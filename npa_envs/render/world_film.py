@@ -50,7 +50,7 @@ class WorldFilm:
     """Steps from the seed by frame; frames of fresh damage are left out."""
 
     def add(self, task: Task, worlds: Particles, step: int, damage: str = "") -> None:
-        """Add a picture of one world, or of its `damage` at that step."""
+        """Append a picture of one world, and its caption; `damage` tells what just damaged it."""
         if damage:
             self.damaged.append(len(self.frames))
         else:
@@ -59,9 +59,9 @@ class WorldFilm:
         self.captions.append(f"step {step}: {damage}" if damage else f"step {step}")
 
     def strip(self, count: int = 10) -> tuple[list[Frame], list[str]]:
-        """Return frames and captions of a filmstrip: early, damaged, some between, the last.
+        """Return about `count` frames with captions: early, damaged, last, some between.
 
-        Of a film that is not longer than the early steps: damaged and evenly spaced ones.
+        A film that ends within the early steps gives damaged and evenly spaced ones.
         """
         last = len(self.frames) - 1
         if max(self.steps.values(), default=0) <= EARLY_STEPS[-1]:
@@ -104,7 +104,7 @@ def film_world(
     progress: Callable[[int], None] = lambda _: None,
     stop: Callable[[], bool] = lambda: False,
 ) -> tuple[Particles, WorldFilm]:
-    """Run one world with damage, and add a frame to `film` every `every` steps.
+    """Run one world with damage; return it and its film, a frame every `every` steps.
 
     By default there are about `FRAME_COUNT` frames. `first_step` is the world's age in steps.
     `progress` is called with the number of steps since its last call. After each frame the run ends
@@ -145,7 +145,7 @@ def write_3d_world(
     resolution: int = SCREEN,
     background: str = "white",
 ) -> list[Path]:
-    """Write a 3D world as a turntable, drawn by another task, and as point files; return them."""
+    """Write a 3D world as a turntable, drawn by a task, and as point files; return their paths."""
     names = ("turntable.gif", "points.ply", "gaussians.ply", "cloud.splat")
     paths = [folder / name for name in names]
     x, s, *_ = worlds

@@ -45,7 +45,7 @@ MAX_SPOT = 1e6
 
 
 class Splats(NamedTuple):
-    """Particles to draw, in contiguous tensors; colours are the last three states plus a shift."""
+    """Particles to draw, in contiguous tensors; colours are the last three states + `shift`."""
 
     x: Tensor
     """Positions [length units], shape [B, N, 2]."""
@@ -80,7 +80,7 @@ def splat_lanes(device: torch.device) -> int:
 
 
 def device_kernels(like: Tensor) -> Any:
-    """Return the kernels for a tensor's dtype and device."""
+    """Return the kernels of `splat` for a tensor's dtype and device."""
     return splat_kernels(SCALARS[like.dtype], splat_lanes(like.device))
 
 
@@ -93,7 +93,7 @@ def _check_size(largest: int, world_count: int, view: Any) -> None:
 
 
 def sort_splats(splats: Splats, view: Any) -> tuple[Tensor, Tensor, Tensor]:
-    """Return starts of the cells [B cells + 1], sorted footprints [B N, 8], their sources [B N]."""
+    """Return splats sorted into cells: first of each cell, footprints [B N, 8], particles [B N]."""
     x, total = splats.x, splats.total
     world_count, particle_count, _ = x.shape
     cell_total = world_count * view.cell_count
@@ -133,7 +133,7 @@ def sort_splats(splats: Splats, view: Any) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def scatter_splats(splats: Splats, view: Any) -> tuple[Tensor, Tensor, Tensor]:
-    """Return pictures [B, R, R, 4] with footprints [B N, 8] and their sources [B N]."""
+    """Return pictures [B, R, R, 4], footprints (splats in pixels) [B N, 8], particles [B N]."""
     x, total = splats.x, splats.total
     picture = x.new_zeros(x.shape[0], view.resolution, view.resolution, CHANNELS)
     footprints = x.new_empty(total, FOOTPRINT)
@@ -145,7 +145,7 @@ def scatter_splats(splats: Splats, view: Any) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _draw(splats: Splats, view: Any) -> tuple[Tensor, Tensor, Tensor]:
-    """Draw as `scatter_splats`, by the kernels for the device."""
+    """Return what `scatter_splats` returns, by the kernels for the particles' device."""
     x = splats.x
     if x.device.type != "cuda":
         return scatter_splats(splats, view)
@@ -263,7 +263,7 @@ def splat(
 
 
 def check_particles(x: Tensor, colour: Tensor, width: int | None) -> None:
-    """Check positions and colours of a given width, or states if the width is None."""
+    """Check x [B, N, 2] and colours [B, N, width]; None: states, of at least 3 channels."""
     check_world(x, colour)
     check_derivatives(x=x, colour=colour)
     fits = colour.shape[2] >= 3 if width is None else colour.shape[2] == width
@@ -279,7 +279,7 @@ def check_particles(x: Tensor, colour: Tensor, width: int | None) -> None:
 def checked_window(
     resolution: int, pixel_size: float, sigma: float, low: float, high: float
 ) -> tuple[int, float, float, float, float]:
-    """Return the checked sizes of a picture, in this order, as Python numbers."""
+    """Return the arguments of `splat` with these names as Python numbers, after checking them."""
     if checked_count("resolution", resolution) < 2:
         raise NPAError(f"resolution must be at least 2 pixels, got {resolution}")
     side = checked_side("resolution", resolution)
@@ -349,7 +349,7 @@ def periodic_splat(
 
 
 def _sum_periods(canvas: Tensor, dim: int, margin: int, period: int) -> Tensor:
-    """Sum the pixels of a canvas with a margin that are a period apart."""
+    """Return sums of pixels that are a period apart along `dim`, the first after the margin."""
     length = canvas.shape[dim]
     shape = list(canvas.shape)
     shape[dim] = period
@@ -420,7 +420,7 @@ def picture_losses(
 
     Each world's mean position is moved to `goal` and drawn as by `splat`; colours are the last
     three states plus `shift`. With d the difference from the target and e = |d| + d^2, a pixel's
-    density error is that of the densities, its colour error is the mean of e over the colours times
+    density error is e of the densities, its colour error is the mean of e over the colours times
     exp(-(density error)). The target has shape [R, R, 4], the goal [2].
 
     Returns:
