@@ -82,19 +82,14 @@ class Implementation(NamedTuple):
 
 
 @functools.lru_cache
-def is_modern(device: torch.device) -> bool:
-    """Return whether a device is a GPU of compute capability 8.0 or above."""
-    return device.type == "cuda" and torch.cuda.get_device_capability(device) >= (8, 0)
-
-
-@functools.lru_cache
 def multiprocessor_count(device: torch.device) -> int:
     """Return the number of streaming multiprocessors of a CUDA device."""
     return int(torch.cuda.get_device_properties(device).multi_processor_count)
 
 
 def _cuda(request: KernelRequest) -> bool:
-    return request.dtype == torch.float32 and is_modern(request.device)
+    fits = request.dtype == torch.float32 and request.device.type == "cuda"
+    return fits and torch.cuda.get_device_capability(request.device) >= (8, 0)
 
 
 def _block(request: KernelRequest) -> bool:
@@ -245,10 +240,6 @@ class Listing(NamedTuple):
     """Groups of threads that share a row in the perception pass."""
     tiled: bool = False
     """Whether the density pass is `tiled_density`."""
-
-    def shape(self, row_count: int) -> tuple[int, int, int]:
-        """Return the shape of the array of `row_count` neighbour lists, 32 of them interleaved."""
-        return -(-row_count // 32), self.capacity, 32
 
 
 CAPACITY, CROWDED_CAPACITY = 128, 256

@@ -160,7 +160,10 @@ class _Arguments:
             _description(value, declared) if isinstance(value, Tensor) else value
             for value, declared in zip(arguments, types, strict=True)
         ]
-        with kernel_lock, quiet_warp(), _first_load(kernel, device):
+        loaded = (kernel.module, device) in _loaded
+        # One process at a time compiles a module.
+        alone = contextlib.nullcontext() if loaded else in_turn(kernel.module.name)
+        with kernel_lock, quiet_warp(), alone:
             self._launch = wp.launch(
                 kernel,
                 size,
@@ -170,7 +173,7 @@ class _Arguments:
                 record_tape=False,
                 record_cmd=True,
             )
-            launched.add((kernel, device))
+            _loaded.add((kernel.module, device))
         self._device = device
         self._bounds = {size: self._launch.bounds}
         parameters = self._launch.params[1:]
@@ -254,14 +257,8 @@ class _Arguments:
         self._launch.hooks.forward(ctypes.byref(self._bounds_of(size)), ctypes.byref(memory))
 
 
-def _first_load(kernel: Any, device: torch.device) -> contextlib.AbstractContextManager[None]:
-    """Return a lock across processes for a module's first load; afterwards a null context."""
-    known = any(other.module is kernel.module and where == device for other, where in launched)
-    return contextlib.nullcontext() if known else in_turn(kernel.module.name)
-
-
-launched: set[tuple[Any, torch.device]] = set()
-"""Kernels that have been launched, each with its device."""
+_loaded: set[tuple[Any, torch.device]] = set()
+"""Modules of kernels that have been loaded, each with its device."""
 
 MAX_BOUNDS = 4096
 """Launch bounds that are cached for a kernel, at most."""
@@ -340,17 +337,15 @@ def launch(
         return
     for noted in _observers:
         noted.append(_described(kernel, size))
+    if _ready.tape is not None:
+        _ready.tape.add(kernel, size, device, *arguments, block_dim=block_dim).run(size)
+        return
     if kernel in MIN_RANGES:
         arguments = (0, *arguments)
-    tape = _ready.tape
-    ready: _Arguments | None
-    if tape is not None:
-        ready = tape.arguments(kernel, size, device, block_dim, arguments)
-    else:
-        key = (kernel, device, block_dim)
-        ready = _ready.by_kernel.get(key)
-        if ready is None:
-            ready = _ready.by_kernel[key] = _Arguments(kernel, size, device, block_dim, arguments)
+    key = (kernel, device, block_dim)
+    ready = _ready.by_kernel.get(key)
+    if ready is None:
+        ready = _ready.by_kernel[key] = _Arguments(kernel, size, device, block_dim, arguments)
     ready.set(arguments)
     ready.run(size)
 
@@ -394,11 +389,22 @@ class Tape:
         self._tensors: list[list[Any]] = []
         """Tensors in the arguments, kept alive: the arguments contain only their addresses."""
 
-    def add(self, kernel: Any, size: Any, device: torch.device, *arguments: Any) -> None:
-        """Record a launch without making it; arguments are those of `launch`."""
+    def add(
+        self,
+        kernel: Any,
+        size: int | tuple[int, ...],
+        device: torch.device,
+        *arguments: Any,
+        block_dim: int = CUDA_BLOCK,
+    ) -> _Arguments:
+        """Record a launch with arguments as of `launch`, and return it; it is not made yet."""
         size = (size,) if isinstance(size, int) else size
         arguments = (0, *arguments) if kernel in MIN_RANGES else arguments
-        self.arguments(kernel, size, device, CUDA_BLOCK, arguments).set(arguments)
+        recorded = _Arguments(kernel, size, device, block_dim, arguments)
+        recorded.set(arguments)
+        self._launches.append((recorded, size))
+        self._tensors.append(list(arguments))
+        return recorded
 
     @contextlib.contextmanager
     def recording(self) -> Iterator[None]:
@@ -408,20 +414,6 @@ class Tape:
             yield
         finally:
             _ready.tape = before
-
-    def arguments(
-        self,
-        kernel: Any,
-        size: tuple[int, ...],
-        device: torch.device,
-        block_dim: int,
-        arguments: tuple[Any, ...],
-    ) -> _Arguments:
-        """Record a launch, and return its memory for arguments, which are not set yet."""
-        memory = _Arguments(kernel, size, device, block_dim, arguments)
-        self._launches.append((memory, size))
-        self._tensors.append(list(arguments))
-        return memory
 
     def __len__(self) -> int:
         """Return the number of launches."""

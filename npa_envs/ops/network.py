@@ -125,7 +125,6 @@ def _run_network(
     "rectify" stores no masks; "mask" multiplies by `stored_signs` instead, for backward passes.
     """
     steps, tiles = -(-int(rows.shape[1]) // 16), -(-out_width // 8)
-    # The ReLU masks of hidden units.
     words = 4 * -(-unit_count // SIGN_UNITS) if mode == "note" else 0
     signs = rows.new_empty(rows.shape[0], words, dtype=torch.int32)
     output = rows.new_empty(rows.shape[0], out_width)

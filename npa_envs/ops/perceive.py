@@ -35,7 +35,7 @@ from npa_envs.ops.perception_passes import (
 )
 from npa_envs.ops.physics_constants import Physics, Terms, make_physics
 from npa_envs.ops.sort import plan_kernels, sort_worlds
-from npa_envs.ops.static import StaticRows, StaticWorlds, all_rows, static_worlds
+from npa_envs.ops.static import StaticRows, StaticWorlds, static_worlds
 
 
 class PerceptionFields(NamedTuple):
@@ -328,8 +328,8 @@ def perceive_rows(
     x, s, rows = x.contiguous(), s.contiguous(), static_rows
     masked = (mask if static is None else static_rows) is not None
     if static is not None:
-        x = x.detach()
-        rows = all_rows(static, x) if rows is None else rows
+        x, every = x.detach(), static.all_indices
+        rows = rows or StaticRows(every, every, static.starts, x.flatten(0, 1))
     arguments = x, s, mask, static, rows, masked, row_capacity, row_width, physics
     if torch.is_grad_enabled() and (x.requires_grad or s.requires_grad):
         perception, *maps = _PerceiveRows.apply(*arguments)  # type: ignore[no-untyped-call]

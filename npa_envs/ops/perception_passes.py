@@ -102,7 +102,8 @@ def compute_densities(
     positions = ordered.positions
     records = positions.new_empty(plan.total, 4)
     particles = positions.new_empty(plan.total if with_particles else 0, plan.space_dim + 1)
-    steps = positions.new_empty(listing.shape(plan.row_capacity), dtype=torch.int16)
+    list_shape = -(-plan.row_capacity // INTERLEAVED_LISTS), listing.capacity, INTERLEAVED_LISTS
+    steps = positions.new_empty(list_shape, dtype=torch.int16)
     lengths = positions.new_empty(plan.row_capacity, dtype=torch.int32)
     arrays = (
         ordered.starts,

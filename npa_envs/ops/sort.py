@@ -222,10 +222,13 @@ def sort_worlds(
     # Mask entries that are read if each world counts the rows of earlier worlds.
     earlier = plan.world_count * plan.total if plan.masked else 0
     capacity = 0 if earlier > MAX_MASK else block_capacity(plan.request, x, s, mask)
+    ordered = _empty_worlds(plan, x, s is not None, with_rows)
     if capacity:
-        return _sort_by_blocks(plan, capacity, x, s, mask, with_rows)
+        _sort_by_blocks(plan, capacity, x, s, mask, ordered)
+        return ordered
     if plan.runs("sort") == "world" and earlier <= MAX_THREAD_MASK:
-        return _sort_by_threads(plan, x, s, mask, with_rows)
+        _sort_by_threads(plan, x, s, mask, ordered)
+        return ordered
     assert not is_recorded(), "a tape would miss torch's operations between these launches"
     kernels = sort_kernels(plan.space_dim, plan.scalar, plan.width)
     device, total = x.device, plan.total
@@ -245,10 +248,9 @@ def sort_worlds(
         arrival,
         counts,
     )
-    starts = torch.cumsum(counts, 0, dtype=torch.int32)
-    launch(kernels.place_by_arrival, total, device, mask, cell, arrival, starts, arrived)
+    torch.cumsum(counts, 0, dtype=torch.int32, out=ordered.starts)
+    launch(kernels.place_by_arrival, total, device, mask, cell, arrival, ordered.starts, arrived)
 
-    ordered = _empty_worlds(plan, x, s is not None, with_rows, starts)
     on_cuda = plan.runs("sort", aligned=False) == "cuda"
     # Channels that a thread reads and writes at once where they are aligned.
     together = plan.width // CUDA_LANES if on_cuda else plan.width
@@ -270,16 +272,14 @@ def sort_worlds(
     return ordered
 
 
-def _empty_worlds(
-    plan: KernelPlan, x: Tensor, with_states: bool, with_rows: bool, starts: Tensor | None = None
-) -> SortedWorlds:
-    """Return uninitialised tensors for sorted worlds, with `starts` if given."""
+def _empty_worlds(plan: KernelPlan, x: Tensor, with_states: bool, with_rows: bool) -> SortedWorlds:
+    """Return uninitialised tensors for sorted worlds."""
     total = plan.total
     source, cell = torch.empty(2, total, dtype=torch.int32, device=x.device).unbind()
     row_capacity = plan.row_capacity if with_rows else 0
     row_source = source.new_empty(row_capacity)
     return SortedWorlds(
-        starts=source.new_empty(plan.start_count) if starts is None else starts,
+        starts=source.new_empty(plan.start_count),
         source=source,
         cell=cell,
         row_of=source.new_empty(total if with_rows else 0),
@@ -306,10 +306,9 @@ def slice_count(device: torch.device, world_count: int, particle_count: int) -> 
 
 
 def _sort_by_threads(
-    plan: KernelPlan, x: Tensor, s: Tensor | None, mask: Tensor | None, with_rows: bool
-) -> SortedWorlds:
-    """Sort small worlds on a CPU in one launch, one thread a world."""
-    ordered = _empty_worlds(plan, x, s is not None, with_rows)
+    plan: KernelPlan, x: Tensor, s: Tensor | None, mask: Tensor | None, ordered: SortedWorlds
+) -> None:
+    """Write small worlds on a CPU to `ordered` in one launch, one thread a world."""
     launch(
         sort_kernels(plan.space_dim, plan.scalar, plan.width).sort_worlds,
         plan.world_count,
@@ -326,7 +325,6 @@ def _sort_by_threads(
         torch.empty_like(ordered.source),
         *ordered,
     )
-    return ordered
 
 
 def _sort_by_blocks(
@@ -335,10 +333,9 @@ def _sort_by_blocks(
     x: Tensor,
     s: Tensor | None,
     mask: Tensor | None,
-    with_rows: bool,
-) -> SortedWorlds:
-    """Sort small worlds on CUDA in one launch, one block a slice of a world."""
-    ordered = _empty_worlds(plan, x, s is not None, with_rows)
+    ordered: SortedWorlds,
+) -> None:
+    """Write small worlds on CUDA to `ordered` in one launch, one block a slice of a world."""
     slices = slice_count(x.device, plan.world_count, plan.particle_count)
     block = BLOCKS[capacity]
     launch(
@@ -358,4 +355,3 @@ def _sort_by_blocks(
         *ordered,
         block_dim=block,
     )
-    return ordered

@@ -180,11 +180,6 @@ def static_rows(
     ]
 
 
-def all_rows(worlds: StaticWorlds, x: Tensor) -> StaticRows:
-    """Return the rows of a step in which all particles of static worlds are active."""
-    return StaticRows(worlds.all_indices, worlds.all_indices, worlds.starts, x.flatten(0, 1))
-
-
 def static_worlds(
     plan: KernelPlan, worlds: StaticWorlds, rows: StaticRows, x: Tensor, s: Tensor
 ) -> tuple[SortedWorlds, Densities]:

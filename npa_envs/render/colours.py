@@ -154,16 +154,13 @@ def state_colours(hidden: Tensor) -> Tensor:
 
     Each channel adds its own hue and lightness; negative values the opposite ones. Zeros are grey.
     """
-    count = hidden.shape[-1]
-    pull = []
-    for part in range(3):
-        total = hidden.new_zeros(hidden.shape[:-1])
-        # In a fixed order: that of a matrix product depends on the device and on B.
-        for channel in range(count):
-            angle = channel * GOLDEN_ANGLE
-            weight = (math.cos(1.5 * angle + 1.0), math.cos(angle), math.sin(angle))[part]
-            total = total + weight * hidden[..., channel]
-        pull.append(torch.tanh(total * (STATE_GAIN / math.sqrt(max(count, 1)))))
+    zeros = hidden.new_zeros(hidden.shape[:-1])
+    angles = [channel * GOLDEN_ANGLE for channel in range(hidden.shape[-1])]
+    weights = [(math.cos(1.5 * a + 1.0), math.cos(a), math.sin(a)) for a in angles]
+    # In a fixed order: that of a matrix product depends on the device and on B.
+    terms = [[w[k] * hidden[..., c] for c, w in enumerate(weights)] for k in range(3)]
+    gain = STATE_GAIN / math.sqrt(max(len(angles), 1))
+    pull = [torch.tanh(sum(part, zeros) * gain) for part in terms]
     middle, swing = STATE_LIGHTNESS
     lab = (middle + swing * pull[0], STATE_CHROMA * pull[1], STATE_CHROMA * pull[2])
     return srgb(torch.stack(lab, dim=-1))

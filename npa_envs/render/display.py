@@ -124,8 +124,7 @@ def _spacing(x: Tensor) -> float:
     extent = (points.amax(dim=0) - points.amin(dim=0)).clamp(min=1e-6)
     side = (float(extent.prod()) * _CELL_PARTICLES / count) ** (1.0 / space_dim)
     filled = len(torch.unique(torch.floor(points / side), dim=0))
-    spacing: float = (filled / count) ** (1.0 / space_dim) * side
-    return max(spacing, 1e-6)
+    return max(float((filled / count) ** (1.0 / space_dim) * side), 1e-6)
 
 
 # A window on the screen, which needs pygame.

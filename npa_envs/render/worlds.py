@@ -177,14 +177,11 @@ def _stack_layers(
 ) -> Tensor:
     """Return the picture of splatted layers of equal depth, composited with the nearest on top."""
     order = depth.argsort(dim=1, descending=True, stable=True)
-    points = points.gather(1, order.expand_as(points))
-    colour = colour.gather(1, order.expand_as(colour))
+    particles = torch.cat((points, colour), dim=-1)
+    particles = particles.gather(1, order.expand_as(particles))
     picture, transmittance = points.new_zeros(()), points.new_ones(())
-    layers = min(LAYERS, points.shape[1])
-    for part, tint in zip(
-        points.tensor_split(layers, 1), colour.tensor_split(layers, 1), strict=True
-    ):
-        layer = draw(part, tint)
+    for part in particles.tensor_split(min(LAYERS, points.shape[1]), 1):
+        layer = draw(part[..., :2], part[..., 2:])
         density = layer[..., 3:]
         passed = torch.exp(-OPACITY * density)
         weight = transmittance * (1.0 - passed)

@@ -54,7 +54,7 @@ class Splats(NamedTuple):
     shift: float = 0.0
     """Added to the last three states to give colours, dimensionless."""
     goal: Tensor | None = None
-    """Point to which each world's mean is moved [length units], shape [2]; None: not moved."""
+    """Point to which each world's mean is moved [length units], shape [1, 2]; None: not moved."""
 
     @property
     def total(self) -> int:
@@ -62,16 +62,12 @@ class Splats(NamedTuple):
         return self.x.shape[0] * self.x.shape[1]
 
     def contents(self) -> tuple[Any, ...]:
-        """Arguments of kernels: particles of a world, positions, states, shift."""
+        """Kernel arguments: N, positions [B N, 2], states [B N, C], shift."""
         return self.x.shape[1], self.x.view(-1, 2), self.states.view(self.total, -1), self.shift
 
-    def goal_argument(self) -> Tensor | None:
-        """Argument of kernels: the goal, or None where worlds are not moved."""
-        return None if self.goal is None else self.goal.view(1, 2)
-
     def means_and_goal(self) -> tuple[Tensor | None, Tensor | None]:
-        """Arguments of kernels for moving worlds: means and goal."""
-        return None if self.goal is None else world_mean(self.x), self.goal_argument()
+        """Kernel arguments: each world's mean position, [B, 2], and the goal; or None, None."""
+        return None if self.goal is None else world_mean(self.x), self.goal
 
 
 def splat_lanes(device: torch.device) -> int:
@@ -113,7 +109,7 @@ def sort_splats(splats: Splats, view: Any) -> tuple[Tensor, Tensor, Tensor]:
             view,
             slices,
             *splats.contents(),
-            splats.goal_argument(),
+            splats.goal,
             starts,
             footprints,
             source,
@@ -144,21 +140,6 @@ def scatter_splats(splats: Splats, view: Any) -> tuple[Tensor, Tensor, Tensor]:
     return picture, footprints, source
 
 
-def _draw(splats: Splats, view: Any) -> tuple[Tensor, Tensor, Tensor]:
-    """Return what `scatter_splats` returns, by the kernels for the particles' device."""
-    x = splats.x
-    if x.device.type != "cuda":
-        return scatter_splats(splats, view)
-    _check_size(x.shape[0] * CHANNELS * view.resolution**2, x.shape[0], view)
-    starts, footprints, source = sort_splats(splats, view)
-    picture = x.new_empty(x.shape[0], view.resolution, view.resolution, CHANNELS)
-    groups = x.shape[0] * group_count(view.resolution)
-    threads = groups * GROUP_WIDTH * GROUP_HEIGHT * TILE_LANES
-    flat = picture.view(-1, CHANNELS)
-    launch(device_kernels(x).gather_splats, threads, x.device, view, starts, footprints, flat)
-    return picture, footprints, source
-
-
 @custom_op("npa::splat")
 def _splat(
     x: Tensor,
@@ -170,7 +151,17 @@ def _splat(
     high: float,
 ) -> tuple[Tensor, Tensor, Tensor]:
     view = make_view(SCALARS[x.dtype], int(resolution), pixel_size, sigma, low, high)
-    return _draw(Splats(x, colour), view)
+    splats = Splats(x, colour)
+    if x.device.type != "cuda":
+        return scatter_splats(splats, view)
+    _check_size(x.shape[0] * CHANNELS * view.resolution**2, x.shape[0], view)
+    starts, footprints, source = sort_splats(splats, view)
+    picture = x.new_empty(x.shape[0], view.resolution, view.resolution, CHANNELS)
+    groups = x.shape[0] * group_count(view.resolution)
+    threads = groups * GROUP_WIDTH * GROUP_HEIGHT * TILE_LANES
+    flat = picture.view(-1, CHANNELS)
+    launch(device_kernels(x).gather_splats, threads, x.device, view, starts, footprints, flat)
+    return picture, footprints, source
 
 
 @custom_op("npa::splat_backward")
@@ -383,7 +374,7 @@ def _picture_losses(
 ) -> Tensor:
     world_count, device, scalar = x.shape[0], x.device, SCALARS[x.dtype]
     view = make_view(scalar, int(target.shape[0]), pixel_size, sigma, low, high)
-    splats = Splats(x, states, shift, goal)
+    splats = Splats(x, states, shift, goal.view(1, 2))
     if device.type == "cuda":
         starts, footprints, _ = sort_splats(splats, view)
         tile_total = view.tile_columns * view.tile_rows
