@@ -63,7 +63,7 @@ class KernelRequest(NamedTuple):
     hidden_dim: int = 0
     """Hidden units of the rule, H."""
     vectors: tuple[int, int, int, int, bool] | None = None
-    """The `VectorForm` of an equivariant rule."""
+    """The `VectorSizes` of an equivariant rule."""
 
 
 class Implementation(NamedTuple):
@@ -75,9 +75,9 @@ class Implementation(NamedTuple):
     """Name to which call sites compare the result of `KernelPlan.runs`."""
     where: str
     """File of the kernels."""
-    condition: str
+    condition: str = "otherwise"
     """Description of when it runs."""
-    holds: Callable[[KernelRequest], bool]
+    holds: Callable[[KernelRequest], bool] = lambda request: True
     """Returns whether it can run a call."""
 
 
@@ -122,10 +122,6 @@ def _fused(request: KernelRequest) -> bool:
     )
 
 
-def _always(request: KernelRequest) -> bool:
-    return True
-
-
 _MODERN = "CUDA from compute capability 8.0 on, float32"
 
 TABLE: tuple[Implementation, ...] = (
@@ -147,7 +143,7 @@ TABLE: tuple[Implementation, ...] = (
         f"a CPU, worlds of at most {MAX_THREAD_WORLD} particles: a thread sorts a world",
         lambda request: request.device.type == "cpu" and request.particle_count <= MAX_THREAD_WORLD,
     ),
-    Implementation("sort", "portable", "kernels/portable/sort.py", "otherwise", _always),
+    Implementation("sort", "portable", "kernels/portable/sort.py"),
     Implementation(
         "density",
         "tiles",
@@ -164,11 +160,11 @@ TABLE: tuple[Implementation, ...] = (
         f"{_MODERN}: neighbours are listed in the same pass, in 16 bits each",
         _cuda,
     ),
-    Implementation("density", "portable", "kernels/portable/density.py", "otherwise", _always),
+    Implementation("density", "portable", "kernels/portable/density.py"),
     Implementation(
         "perceive", "cuda", "kernels/cuda/perceive.py", f"{_MODERN}: from neighbour lists", _cuda
     ),
-    Implementation("perceive", "portable", "kernels/portable/perceive.py", "otherwise", _always),
+    Implementation("perceive", "portable", "kernels/portable/perceive.py"),
     Implementation(
         "adjoint",
         "cuda",
@@ -176,7 +172,7 @@ TABLE: tuple[Implementation, ...] = (
         f"{_MODERN}, positions get no gradient: tiles of eight particles on tensor cores",
         lambda request: _cuda(request) and not request.position_gradient,
     ),
-    Implementation("adjoint", "portable", "kernels/portable/adjoint.py", "otherwise", _always),
+    Implementation("adjoint", "portable", "kernels/portable/adjoint.py"),
     Implementation(
         "vectors",
         "cuda",
@@ -201,8 +197,8 @@ TABLE: tuple[Implementation, ...] = (
         f"{MAX_HIDDEN} hidden units in multiples of {WARP_UNITS}: tensor cores",
         _fused,
     ),
-    Implementation("network", "torch", "torch's products", "otherwise", _always),
-    Implementation("update", "portable", "kernels/portable/update.py", "always", _always),
+    Implementation("network", "torch", "torch's products"),
+    Implementation("update", "portable", "kernels/portable/update.py", "always"),
 )
 """All implementations. A call takes the first one of its operator whose condition is true."""
 
@@ -271,7 +267,7 @@ def rollout_listing(request: KernelRequest, mean_neighbours: float = 0.0) -> Lis
 
 
 def batch_listing(request: KernelRequest) -> Listing:
-    """Return the `Listing` of environments: fewer threads a world, as many worlds fill a GPU."""
+    """Return the `Listing` of environments: fewer threads a world, since batches fill a GPU."""
     if request.particle_count <= SMALL_WORLD:
         return Listing(SMALL_WORLD_CAPACITY, lanes=1, teams=1)
     tiled = choose("density", request).name == "tiles"

@@ -437,7 +437,7 @@ class Tape:
     def replay(
         self, begin: int = 0, end: int | None = None, *, last_count: int | None = None
     ) -> None:
-        """Repeat launches begin to end - 1, the last with another size of its first dimension."""
+        """Repeat launches [begin, end); `last_count`: size of the last one's first dimension."""
         launches = self._launches[begin:end]
         for memory, size in launches[:-1]:
             memory.run(size)

@@ -7,6 +7,7 @@ Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple, get_args
 
@@ -311,7 +312,7 @@ def perceive_rows(
     static: StaticWorlds | None = None,
     static_rows: StaticRows | None = None,
 ) -> tuple[Tensor, Rows]:
-    """Return perception vectors of active particles, a row each; x and s are not checked.
+    """Return perception vectors of active particles as rows; x and s are not checked.
 
     Args:
         mask: Which particles are active, uint8, shape [B, N], or None for all.
@@ -355,7 +356,7 @@ def updates_in_parts(
     row_capacity: int,
     row_width: int,
 ) -> tuple[Tensor, Rows]:
-    """Return updates of active particles in huge worlds, [K, A'], `ROWS_TOGETHER` at a time.
+    """Return updates of huge worlds' active particles, [K, A'], and `Rows`; computed in parts.
 
     All rows of `perceive_rows` together would take most of the memory. The network maps rows
     [any, row_width] to updates [any, A'], each row independently, so results are the same. Not
@@ -404,12 +405,12 @@ class NeighbourState:
         if out is None:
             out = self._like.new_empty(self._shape)
         rows = out.view(-1, self._shape[-1])
-        form = rows.shape, rows.dtype, rows.device, rows.is_contiguous()
+        layout = rows.shape, rows.dtype, rows.device, rows.is_contiguous()
         if self._tape is None:
-            self._tape, self._form = Tape(), form
+            self._tape, self._layout = Tape(), layout
             self._tape.add(*self._launch_of(rows))
             self._slots = self._tape.argument_slots(rows)
-        assert form == self._form, "only the address may change"
+        assert layout == self._layout, "only the address may change"
         self._tape.move(self._slots, rows)
         self._tape.replay()
         return out
@@ -418,7 +419,7 @@ class NeighbourState:
 def build_neighbours(
     x: Tensor, s: Tensor, physics: Physics, world_indices: Tensor | None = None
 ) -> NeighbourState:
-    """Return worlds sorted into cells, with densities, until x or s change; both unchecked.
+    """Return x and s, unchecked, sorted into cells with densities; valid until one changes.
 
     `world_indices`, int64, shape [B], are the worlds' indices in a larger batch, into which
     perception is written; default: the worlds are the whole batch.
@@ -444,15 +445,13 @@ def build_neighbours(
         ) * plan.particle_count
         destination = (destination.view(plan.world_count, -1) + shift.int()[:, None]).view(-1)
 
-    def launch_of(rows: Tensor) -> tuple[Any, ...]:
-        return perception_launch(
-            plan,
-            ordered,
-            densities,
-            rows,
-            states=s if in_place else None,
-            destination=destination,
-            limit=physics.limits.perception,
-        )
-
+    launch_of = functools.partial(
+        perception_launch,
+        plan,
+        ordered,
+        densities,
+        states=s if in_place else None,
+        destination=destination,
+        limit=physics.limits.perception,
+    )
     return NeighbourState(launch_of, (*x.shape[:2], physics.perception_dim), x)

@@ -30,7 +30,7 @@ INTERLEAVED_LISTS = 32
 
 
 class NeighbourLists(NamedTuple):
-    """Neighbour lists of the CUDA kernels, one an active particle (row), itself included."""
+    """Neighbour lists of active particles (rows) for the CUDA kernels; they include themselves."""
 
     listing: Listing
     """Layout of the lists."""
@@ -46,7 +46,7 @@ class NeighbourLists(NamedTuple):
 
 
 class ListedNeighbours(NamedTuple):
-    """Neighbour lists of the portable kernels, one a sorted particle, itself included."""
+    """Neighbour lists of all particles for the portable kernels; they include themselves."""
 
     neighbours: Tensor
     """Sorted indices of the neighbours of all particles, concatenated, int32, shape [E]."""
@@ -295,9 +295,9 @@ def perceive_rows_backward(
     masked: bool,
     physics: Physics,
 ) -> tuple[Tensor, Tensor]:
-    """Return the loss's gradients by states, [B N, C], and by positions, [B N, D] or empty.
+    """Return gradients with respect to states, [B N, C], and positions, [B N, D] or empty.
 
-    `perception_bar` is that by perception, [K, row_width]. `saved_tensors` are a
+    `perception_bar` is that of perception, [K, row_width]. `saved_tensors` are a
     `SavedPerception`, `listed` a `ListedNeighbours` or empty. Positions get a gradient if states
     were saved.
     """
@@ -321,7 +321,7 @@ def perceive_rows_backward(
 def _gather_by_cells(
     plan: KernelPlan, saved: SavedPerception, listed: list[Tensor], bar: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return the gradients by states and positions, with the portable kernels."""
+    """Return both gradients of `perceive_rows_backward`, with the portable kernels."""
     entries, space_dim, width = plan.row_capacity * plan.group_count, plan.space_dim, plan.width
     largest = entries * space_dim * width
     if largest >= MAX_INDEX:
@@ -402,7 +402,7 @@ def _gather_by_cells(
 
 
 def _gather_by_tiles(plan: KernelPlan, saved: SavedPerception, bar: Tensor) -> Tensor:
-    """Return the gradient by states, [B N, C], with the CUDA kernels in float32."""
+    """Return the gradient with respect to states, [B N, C], with the CUDA kernels in float32."""
     state_gradient = plan.physics.terms.state_gradient
     kernels = listed_adjoint(
         plan.space_dim, plan.width, state_gradient, plan.periodic, plan.group_count > 1

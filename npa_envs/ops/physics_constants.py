@@ -108,7 +108,7 @@ class Physics(NamedTuple):
 
     @classmethod
     def from_list(cls, numbers: list[float]) -> Physics:
-        """Return the constants in a list by `numbers`, without limits, D and C."""
+        """Return the constants in a list by `numbers`: all but limits, D and C."""
         count = len(NUMBER_FIELDS)
         state_gradient, inverse, density_gradient, moving, reflecting, *packed = numbers[count:]
         sides = tuple(packed) or None
@@ -124,7 +124,7 @@ class Physics(NamedTuple):
         )
 
     def numbers(self) -> list[float]:
-        """Return the constants as a list of numbers for torch operators, fixed in compiled code."""
+        """Return all but limits, D and C as a list of numbers, which torch operators can take."""
         state_gradient, inverse, density_gradient = self.terms
         reflecting = self.walls is not None
         flags = state_gradient, INVERSES.index(inverse), density_gradient, self.moving, reflecting
@@ -191,7 +191,7 @@ def make_physics(
     dt: float = 1.0,
     position_noise: float = 0.0,
 ) -> Physics:
-    """Return checked constants of worlds.
+    """Return the constants of worlds as a `Physics`, after checking them.
 
     `eps0` is not checked; default: `eps`. `boundary` None is "periodic" if there is a box, else
     "open". The largest displacement in a unit of time is `alpha` times `eps`.

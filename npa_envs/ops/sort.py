@@ -109,7 +109,7 @@ class KernelPlan(NamedTuple):
 
     @property
     def row_base(self) -> int:
-        """What entries of `SortedWorlds.starts` that count active particles begin with."""
+        """Value of `SortedWorlds.starts` for row 0: an entry minus this is a row."""
         return self.total if self.masked else 0
 
     @property
@@ -292,7 +292,7 @@ def _empty_worlds(plan: KernelPlan, x: Tensor, with_states: bool, with_rows: boo
 
 
 def block_capacity(request: KernelRequest, *tensors: Tensor | None) -> int:
-    """Return how many particles the CUDA block that sorts a world can hold; 0: no block sorts."""
+    """Return for how many particles the CUDA block that sorts a world is made; 0: there is none."""
     aligned = all(tensor is None or is_aligned(tensor) for tensor in tensors)
     if choose("sort", request._replace(aligned=aligned)).name != "block":
         return 0
@@ -308,7 +308,7 @@ def slice_count(device: torch.device, world_count: int, particle_count: int) -> 
 def _sort_by_threads(
     plan: KernelPlan, x: Tensor, s: Tensor | None, mask: Tensor | None, ordered: SortedWorlds
 ) -> None:
-    """Write small worlds on a CPU to `ordered` in one launch, one thread a world."""
+    """Write small worlds on a CPU to `ordered` in one launch, one thread for each world."""
     launch(
         sort_kernels(plan.space_dim, plan.scalar, plan.width).sort_worlds,
         plan.world_count,
@@ -335,7 +335,7 @@ def _sort_by_blocks(
     mask: Tensor | None,
     ordered: SortedWorlds,
 ) -> None:
-    """Write small worlds on CUDA to `ordered` in one launch, one block a slice of a world."""
+    """Write small worlds on CUDA to `ordered` in one launch, one block for each slice."""
     slices = slice_count(x.device, plan.world_count, plan.particle_count)
     block = BLOCKS[capacity]
     launch(

@@ -67,7 +67,7 @@ class StaticWorlds(NamedTuple):
 
 @custom_op("npa::prepare_static")
 def _prepare_static(x: Tensor, state_dim: int, physics: Physics) -> list[Tensor]:
-    """Return the result of `prepare_static` by `StaticWorlds.to_list`."""
+    """Return the result of `prepare_static` as a list, by `StaticWorlds.to_list`."""
     total = x.shape[0] * x.shape[1]
     plan = plan_kernels(x, x.shape, state_dim, total, False, physics)
     ordered = sort_worlds(plan, x, None, None)
@@ -108,7 +108,7 @@ def _list_neighbours(plan: KernelPlan, starts: Tensor, particles: Tensor) -> lis
 
 
 def prepare_static(x: Tensor, physics: Physics) -> StaticWorlds:
-    """Return worlds at fixed positions x, which are not checked, sorted; not differentiable."""
+    """Return `StaticWorlds` at positions x, which are not checked; not differentiable."""
     return StaticWorlds.from_list(
         _prepare_static(x.detach().contiguous(), physics.state_dim, physics)
     )

@@ -157,7 +157,7 @@ class _UpdateParticles(torch.autograd.Function):
 def _before_reflection(
     physics: Physics, update: Tensor, x: Tensor, row_of: Tensor, x_bar: Tensor, *others: Tensor
 ) -> tuple[Tensor, ...]:
-    """Return the outputs' gradients, that by positions as before walls reflected them."""
+    """Return the outputs' gradients, that of positions mirrored where walls reflected them."""
     assert physics.walls is not None
     # Positions do not depend on states and paths: any tensors of their shapes will do.
     s_bar, path_bar = (bar.contiguous() for bar in others)

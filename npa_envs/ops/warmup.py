@@ -13,7 +13,7 @@ from npa_envs.devices import check_device
 from npa_envs.errors import NPAError, shown
 from npa_envs.ops.backend import SHARED_WORLD
 from npa_envs.ops.draws import draw
-from npa_envs.ops.equivariance import MIXED_VECTORS, VectorForm, read_rows, steer_rows
+from npa_envs.ops.equivariance import MIXED_VECTORS, VectorSizes, read_rows, steer_rows
 from npa_envs.ops.network import arrange_weights, run_network
 from npa_envs.ops.perceive import build_neighbours, perceive, perceive_rows
 from npa_envs.ops.physics_constants import Limits, Physics
@@ -152,12 +152,12 @@ def _warm_invariants(x: torch.Tensor, state_dim: int) -> None:
     """Run the kernels of equivariant rules' vectors."""
     space_dim = x.shape[2]
     for chiral in (False, True)[: 4 - space_dim]:
-        form = VectorForm(space_dim, 2 * state_dim, state_dim + 1, MIXED_VECTORS, chiral)
-        rows = x.new_zeros(1, form.perception_dim + 1).requires_grad_()
-        mixing = x.new_zeros(form.perceived, form.mixed).requires_grad_()
-        mixed, inputs = read_rows(rows, mixing, form, form.input_dim + 1)
-        signs = x.new_ones(form.gate_count)
-        _pull_back(steer_rows(inputs, mixed, signs, form.input_dim))
+        sizes = VectorSizes(space_dim, 2 * state_dim, state_dim + 1, MIXED_VECTORS, chiral)
+        rows = x.new_zeros(1, sizes.perception_dim + 1).requires_grad_()
+        mixing = x.new_zeros(sizes.perceived, sizes.mixed).requires_grad_()
+        mixed, inputs = read_rows(rows, mixing, sizes, sizes.input_dim + 1)
+        signs = x.new_ones(sizes.gate_count)
+        _pull_back(steer_rows(inputs, mixed, signs, sizes.input_dim))
 
 
 def _warm_views(x: torch.Tensor) -> None:

@@ -134,7 +134,7 @@ def density_colours(density: Tensor, background: tuple[float, float, float]) -> 
 
 @functools.lru_cache(maxsize=16)
 def ramp(background: tuple[float, float, float]) -> NDArray[np.uint8]:
-    """Return the colours of densities, uint8, [RAMP_LENGTH, 3]: from the background, evenly."""
+    """Return the colour ramp of densities, uint8, [RAMP_LENGTH, 3], from the background on."""
     stops = [[int(stop[k : k + 2], 16) / 255 for k in (1, 3, 5)] for stop in RAMP_STOPS]
     first = oklab(torch.tensor([background], dtype=torch.float64))
     if first[0, 0] > LIGHT_BACKGROUND:

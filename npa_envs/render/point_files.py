@@ -86,7 +86,7 @@ def _checked(x: Tensor) -> NDArray[np.float32]:
 
 
 def _numpy(values: Tensor) -> NDArray[np.float32]:
-    """Return the values of the first of B worlds."""
+    """Return a tensor's values in the first world, in float32."""
     array: NDArray[np.float32] = values.detach()[0].float().cpu().numpy()
     return array
 

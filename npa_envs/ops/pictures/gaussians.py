@@ -170,7 +170,7 @@ def sort_pairs(
 
 
 def blend(frame: Any, footprints: Tensor, pairs: Pairs, images: int) -> tuple[Tensor, ...]:
-    """Return colours, [B V H W, K], transmittance, and one past their last pair, [B V H W]."""
+    """Return for each of B V H W pixels: colour [K], transmittance, index after its last pair."""
     device, pixels = footprints.device, images * frame.width * frame.height
     scalar = SCALARS[footprints.dtype]
     listed = (pairs.starts, pairs.owners, footprints)
@@ -276,7 +276,7 @@ def _gaussians(
 def _gaussians_backward(
     picture_bar: Tensor, passing_bar: Tensor, saved: list[Tensor], near: float, dilation: float
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Return the loss's gradients by means, scales, quaternions, opacities and colours."""
+    """Return the gradients of means, scales, quaternions, opacities and colours."""
     scene = GaussianScene(*saved[:6])
     passing, stops, footprints, counts, slots, starts, owners, pair_slots = saved[6:]
     device, scalar = footprints.device, SCALARS[footprints.dtype]
@@ -298,8 +298,8 @@ def _gaussians_backward(
     bars = [torch.empty_like(tensor) for tensor in (means, scales, quaternions)]
     bars += [means.new_empty(means.shape[:2]), torch.empty_like(colours)]
     flat = scene.flat()
-    forms = [*flat[:3], bars[3].view(-1), flat[3]]
-    bars_out = [bar.view(form.shape) for bar, form in zip(bars, forms, strict=True)]
+    flat_inputs = [*flat[:3], bars[3].view(-1), flat[3]]
+    bars_out = [bar.view(like.shape) for bar, like in zip(bars, flat_inputs, strict=True)]
     arguments = (*flat, footprints, counts, slots, pulls, *bars_out)
     kernel = gaussian_kernels(scalar).pull_back_gaussians
     launch(kernel, bars[3].numel(), device, frame, *arguments)

@@ -89,7 +89,7 @@ def _check_size(largest: int, world_count: int, view: Any) -> None:
 
 
 def sort_splats(splats: Splats, view: Any) -> tuple[Tensor, Tensor, Tensor]:
-    """Return splats sorted into cells: first of each cell, footprints [B N, 8], particles [B N]."""
+    """Return each cell's first splat, and, sorted by cell, footprints [B N, 8], particles [B N]."""
     x, total = splats.x, splats.total
     world_count, particle_count, _ = x.shape
     cell_total = world_count * view.cell_count
@@ -254,7 +254,7 @@ def splat(
 
 
 def check_particles(x: Tensor, colour: Tensor, width: int | None) -> None:
-    """Check x [B, N, 2] and colours [B, N, width]; None: states, of at least 3 channels."""
+    """Check x [B, N, 2] and colours [B, N, width], or states if the width is None."""
     check_world(x, colour)
     check_derivatives(x=x, colour=colour)
     fits = colour.shape[2] >= 3 if width is None else colour.shape[2] == width
