@@ -137,7 +137,7 @@ class _StructArgument:
             self._last = value
 
 
-class _Arguments:
+class _PreparedLaunch:
     """A kernel on a device with memory for its arguments; a launch overwrites those that changed.
 
     A launch of five arrays and two numbers takes 2.5 µs of CPU time here. `wp.launch`, which packs
@@ -303,18 +303,18 @@ def _described(kernel: Any, size: tuple[int, ...]) -> Launch:
     return Launch(kernel.func.__name__, module, " x ".join(map(str, size)), purpose)
 
 
-class _Ready(threading.local):
-    """A thread's kernels with memory for their arguments, and whether it records or traces."""
+class _ThreadState(threading.local):
+    """A thread's prepared launches, and whether it records or traces launches."""
 
     def __init__(self) -> None:
-        self.by_kernel: dict[tuple[Any, torch.device, int], _Arguments] = {}
+        self.by_kernel: dict[tuple[Any, torch.device, int], _PreparedLaunch] = {}
         self.tape: Tape | None = None
         """The tape that records this thread's launches, if any."""
         self.traced = False
         """Whether tensors have no memory, so that nothing is launched."""
 
 
-_ready = _Ready()
+_thread = _ThreadState()
 
 
 def launch(
@@ -330,44 +330,45 @@ def launch(
     tensors on the device (None: an absent array), structs and numbers. A 1D array is the whole of
     a contiguous tensor, whatever the tensor's shape.
     """
-    if _ready.traced:
+    if _thread.traced:
         return
     size = (size,) if isinstance(size, int) else size
     if 0 in size:
         return
     for noted in _observers:
         noted.append(_described(kernel, size))
-    if _ready.tape is not None:
-        _ready.tape.add(kernel, size, device, *arguments, block_dim=block_dim).run(size)
+    if _thread.tape is not None:
+        _thread.tape.add(kernel, size, device, *arguments, block_dim=block_dim).run(size)
         return
     if kernel in MIN_RANGES:
         arguments = (0, *arguments)
     key = (kernel, device, block_dim)
-    ready = _ready.by_kernel.get(key)
-    if ready is None:
-        ready = _ready.by_kernel[key] = _Arguments(kernel, size, device, block_dim, arguments)
-    ready.set(arguments)
-    ready.run(size)
+    prepared = _thread.by_kernel.get(key)
+    if prepared is None:
+        prepared = _PreparedLaunch(kernel, size, device, block_dim, arguments)
+        _thread.by_kernel[key] = prepared
+    prepared.set(arguments)
+    prepared.run(size)
 
 
 @contextlib.contextmanager
 def tracing() -> Iterator[None]:
     """Make `launch` do nothing in the block, in this thread: torch needs only results' shapes."""
-    _ready.traced, before = True, _ready.traced
+    _thread.traced, before = True, _thread.traced
     try:
         yield
     finally:
-        _ready.traced = before
+        _thread.traced = before
 
 
 def is_traced() -> bool:
     """Return whether this thread's tensors have shapes but no memory."""
-    return _ready.traced
+    return _thread.traced
 
 
 def is_aligned(tensor: Tensor, size: int = 16) -> bool:
     """Return whether a tensor begins at a multiple of `size` bytes in memory."""
-    return _ready.traced or tensor.data_ptr() % size == 0
+    return _thread.traced or tensor.data_ptr() % size == 0
 
 
 def aligned(tensor: Tensor) -> Tensor:
@@ -378,14 +379,14 @@ def aligned(tensor: Tensor) -> Tensor:
 
 def is_recorded() -> bool:
     """Return whether a tape records this thread's launches."""
-    return _ready.tape is not None
+    return _thread.tape is not None
 
 
 class Tape:
     """A recorded sequence of launches that is replayed on the same tensors in the same memory."""
 
     def __init__(self) -> None:
-        self._launches: list[tuple[_Arguments, tuple[int, ...]]] = []
+        self._launches: list[tuple[_PreparedLaunch, tuple[int, ...]]] = []
         self._tensors: list[list[Any]] = []
         """Tensors in the arguments, kept alive: the arguments contain only their addresses."""
 
@@ -396,11 +397,11 @@ class Tape:
         device: torch.device,
         *arguments: Any,
         block_dim: int = CUDA_BLOCK,
-    ) -> _Arguments:
+    ) -> _PreparedLaunch:
         """Record a launch with arguments as of `launch`, and return it; it is not made yet."""
         size = (size,) if isinstance(size, int) else size
         arguments = (0, *arguments) if kernel in MIN_RANGES else arguments
-        recorded = _Arguments(kernel, size, device, block_dim, arguments)
+        recorded = _PreparedLaunch(kernel, size, device, block_dim, arguments)
         recorded.set(arguments)
         self._launches.append((recorded, size))
         self._tensors.append(list(arguments))
@@ -409,40 +410,40 @@ class Tape:
     @contextlib.contextmanager
     def recording(self) -> Iterator[None]:
         """Make and record this thread's launches in the block."""
-        _ready.tape, before = self, _ready.tape
+        _thread.tape, before = self, _thread.tape
         try:
             yield
         finally:
-            _ready.tape = before
+            _thread.tape = before
 
     def __len__(self) -> int:
         """Return the number of launches."""
         return len(self._launches)
 
-    def argument_slots(self, tensor: Tensor) -> list[tuple[_Arguments, int]]:
+    def argument_slots(self, tensor: Tensor) -> list[tuple[_PreparedLaunch, int]]:
         """Return where a tensor is an argument: launch and index. The caller keeps it alive."""
         slots, address = [], tensor.data_ptr()
-        for (memory, _), arguments in zip(self._launches, self._tensors, strict=True):
+        for (prepared, _), arguments in zip(self._launches, self._tensors, strict=True):
             for k, value in enumerate(arguments):
                 if isinstance(value, Tensor) and value.data_ptr() == address:
                     arguments[k] = None
-                    slots.append((memory, k))
+                    slots.append((prepared, k))
         return slots
 
-    def move(self, slots: list[tuple[_Arguments, int]], tensor: Tensor) -> None:
+    def move(self, slots: list[tuple[_PreparedLaunch, int]], tensor: Tensor) -> None:
         """Put a tensor of the same shape and dtype at these slots; the caller keeps it alive."""
-        for memory, index in slots:
-            memory.set_address(index, tensor)
+        for prepared, index in slots:
+            prepared.set_address(index, tensor)
 
     def replay(
         self, begin: int = 0, end: int | None = None, *, last_count: int | None = None
     ) -> None:
         """Repeat launches [begin, end); `last_count`: size of the last one's first dimension."""
         launches = self._launches[begin:end]
-        for memory, size in launches[:-1]:
-            memory.run(size)
-        memory, size = launches[-1]
-        memory.run(size if last_count is None else (last_count, *size[1:]))
+        for prepared, size in launches[:-1]:
+            prepared.run(size)
+        prepared, size = launches[-1]
+        prepared.run(size if last_count is None else (last_count, *size[1:]))
 
 
 # CPU threads, as many as torch is set to use. Where torch ships GNU's OpenMP, they are torch's own

@@ -34,7 +34,7 @@ def warmup(
     dtypes: Iterable[torch.dtype] = (torch.float32,),
     state_dim: int = 16,
 ) -> None:
-    """Compile and load every kernel that worlds of these kinds need; cached on disk by Warp.
+    """Compile and load all kernels for these dimensions, dtypes and channels; Warp caches them.
 
     Args:
         device: Device to compile for.
@@ -85,7 +85,7 @@ def warmup(
 
 
 def _checked_choice(name: str, value: Any, known: tuple[Any, ...]) -> list[Any]:
-    """Return the values given, one or several, after checking that each is known."""
+    """Return an argument's values as a list, after checking that each is in `known`."""
     choice = entries(value)
     if not choice or not all(value in known for value in choice):
         raise NPAError(f"{name} must be some of {known}, got {shown(value)}: name one or both")

@@ -54,7 +54,7 @@ class WorldFilm:
         self.frames.append(to_uint8(task.picture(worlds.x, worlds.s)[0], self.background))
         self.captions.append(f"step {step}: {damage}" if damage else f"step {step}")
 
-    def strip(self, count: int = 10) -> tuple[list[Frame], list[str]]:
+    def filmstrip(self, count: int = 10) -> tuple[list[Frame], list[str]]:
         """Return about `count` frames with captions: early, damaged, last, some between.
 
         A film that ends within the early steps gives damaged and evenly spaced ones.
@@ -74,7 +74,7 @@ class WorldFilm:
 
     def write(self, folder: Path, name: str, *, fps: float = 25.0) -> list[Path]:
         """Write the film as GIF, MP4 and filmstrip, and return the files."""
-        strip, captions = self.strip()
+        strip, captions = self.filmstrip()
         paths = [folder / f"{name}.gif", folder / f"{name}.mp4", folder / f"{name}-filmstrip.png"]
         write_gif(paths[0], self.frames, fps)
         columns = math.ceil(len(strip) / math.ceil(len(strip) / 8))

@@ -61,7 +61,7 @@ class Splats(NamedTuple):
         """Particles of all worlds, B N."""
         return self.x.shape[0] * self.x.shape[1]
 
-    def contents(self) -> tuple[Any, ...]:
+    def arguments(self) -> tuple[Any, ...]:
         """Kernel arguments: N, positions [B N, 2], states [B N, C], shift."""
         return self.x.shape[1], self.x.view(-1, 2), self.states.view(self.total, -1), self.shift
 
@@ -108,7 +108,7 @@ def sort_splats(splats: Splats, view: Any) -> tuple[Tensor, Tensor, Tensor]:
             x.device,
             view,
             slices,
-            *splats.contents(),
+            *splats.arguments(),
             splats.goal,
             starts,
             footprints,
@@ -116,7 +116,7 @@ def sort_splats(splats: Splats, view: Any) -> tuple[Tensor, Tensor, Tensor]:
             block_dim=block,
         )
         return starts, footprints, source
-    kernels, contents, moves = device_kernels(x), splats.contents(), splats.means_and_goal()
+    kernels, contents, moves = device_kernels(x), splats.arguments(), splats.means_and_goal()
     cell, arrival, arrived = torch.empty(3, total, dtype=torch.int32, device=x.device).unbind()
     counts = torch.zeros(cell_total + 1, dtype=torch.int32, device=x.device)
     counted = (cell, arrival, counts)
@@ -135,7 +135,7 @@ def scatter_splats(splats: Splats, view: Any) -> tuple[Tensor, Tensor, Tensor]:
     footprints = x.new_empty(total, FOOTPRINT)
     source = torch.empty(total, dtype=torch.int32, device=x.device)
     scratch = x.new_empty(x.shape[0], min(2 * view.radius + 1, view.resolution))
-    drawn = (*splats.contents(), *splats.means_and_goal(), scratch, picture, footprints, source)
+    drawn = (*splats.arguments(), *splats.means_and_goal(), scratch, picture, footprints, source)
     launch(device_kernels(x).scatter_splats, x.shape[0], x.device, view, *drawn)
     return picture, footprints, source
 
