@@ -40,7 +40,7 @@ may be too small to fill a GPU."""
 
 
 class KernelRequest(NamedTuple):
-    """Properties of an operator call by which the table chooses; tensors' values are not read."""
+    """Properties of an operator call that decide which implementation in `TABLE` runs it."""
 
     device: torch.device
     dtype: torch.dtype
@@ -63,11 +63,11 @@ class KernelRequest(NamedTuple):
     hidden_dim: int = 0
     """Hidden units of the rule, H."""
     vectors: tuple[int, int, int, int, bool] | None = None
-    """The `VectorForm` of an equivariant rule."""
+    """The `VectorSizes` of an equivariant rule."""
 
 
 class Implementation(NamedTuple):
-    """A row of the table."""
+    """Kernels that implement an operator, and the calls that they can run."""
 
     operator: Operator
     """The operator that it implements."""
@@ -75,16 +75,10 @@ class Implementation(NamedTuple):
     """Name to which call sites compare the result of `KernelPlan.runs`."""
     where: str
     """File of the kernels."""
-    condition: str
+    condition: str = "otherwise"
     """Description of when it runs."""
-    holds: Callable[[KernelRequest], bool]
+    holds: Callable[[KernelRequest], bool] = lambda request: True
     """Returns whether it can run a call."""
-
-
-@functools.lru_cache
-def is_modern(device: torch.device) -> bool:
-    """Return whether a device is a GPU of compute capability 8.0 or above."""
-    return device.type == "cuda" and torch.cuda.get_device_capability(device) >= (8, 0)
 
 
 @functools.lru_cache
@@ -94,7 +88,8 @@ def multiprocessor_count(device: torch.device) -> int:
 
 
 def _cuda(request: KernelRequest) -> bool:
-    return request.dtype == torch.float32 and is_modern(request.device)
+    fits = request.dtype == torch.float32 and request.device.type == "cuda"
+    return fits and torch.cuda.get_device_capability(request.device) >= (8, 0)
 
 
 def _block(request: KernelRequest) -> bool:
@@ -127,10 +122,6 @@ def _fused(request: KernelRequest) -> bool:
     )
 
 
-def _always(request: KernelRequest) -> bool:
-    return True
-
-
 _MODERN = "CUDA from compute capability 8.0 on, float32"
 
 TABLE: tuple[Implementation, ...] = (
@@ -152,7 +143,7 @@ TABLE: tuple[Implementation, ...] = (
         f"a CPU, worlds of at most {MAX_THREAD_WORLD} particles: a thread sorts a world",
         lambda request: request.device.type == "cpu" and request.particle_count <= MAX_THREAD_WORLD,
     ),
-    Implementation("sort", "portable", "kernels/portable/sort.py", "otherwise", _always),
+    Implementation("sort", "portable", "kernels/portable/sort.py"),
     Implementation(
         "density",
         "tiles",
@@ -169,11 +160,11 @@ TABLE: tuple[Implementation, ...] = (
         f"{_MODERN}: neighbours are listed in the same pass, in 16 bits each",
         _cuda,
     ),
-    Implementation("density", "portable", "kernels/portable/density.py", "otherwise", _always),
+    Implementation("density", "portable", "kernels/portable/density.py"),
     Implementation(
         "perceive", "cuda", "kernels/cuda/perceive.py", f"{_MODERN}: from neighbour lists", _cuda
     ),
-    Implementation("perceive", "portable", "kernels/portable/perceive.py", "otherwise", _always),
+    Implementation("perceive", "portable", "kernels/portable/perceive.py"),
     Implementation(
         "adjoint",
         "cuda",
@@ -181,7 +172,7 @@ TABLE: tuple[Implementation, ...] = (
         f"{_MODERN}, positions get no gradient: tiles of eight particles on tensor cores",
         lambda request: _cuda(request) and not request.position_gradient,
     ),
-    Implementation("adjoint", "portable", "kernels/portable/adjoint.py", "otherwise", _always),
+    Implementation("adjoint", "portable", "kernels/portable/adjoint.py"),
     Implementation(
         "vectors",
         "cuda",
@@ -206,20 +197,20 @@ TABLE: tuple[Implementation, ...] = (
         f"{MAX_HIDDEN} hidden units in multiples of {WARP_UNITS}: tensor cores",
         _fused,
     ),
-    Implementation("network", "torch", "torch's products", "otherwise", _always),
-    Implementation("update", "portable", "kernels/portable/update.py", "always", _always),
+    Implementation("network", "torch", "torch's products"),
+    Implementation("update", "portable", "kernels/portable/update.py", "always"),
 )
 """All implementations. A call takes the first one of its operator whose condition is true."""
 
 
 @functools.lru_cache(maxsize=4096)
 def choose(operator: Operator, request: KernelRequest) -> Implementation:
-    """Return the implementation of an operator that a call takes."""
+    """Return the first implementation of an operator in `TABLE` that can run a call."""
     return next(row for row in TABLE if row.operator == operator and row.holds(request))
 
 
 def describe(request: KernelRequest) -> list[str]:
-    """Return a line for each operator: the chosen implementation, its file and its condition."""
+    """Return a text line for each operator: the chosen implementation, its file, when it runs."""
     chosen: dict[Operator, Implementation] = {}
     for row in TABLE:
         if row.holds(request):
@@ -231,10 +222,10 @@ def describe(request: KernelRequest) -> list[str]:
 
 
 class Listing(NamedTuple):
-    """How the CUDA backend lists neighbours, and how threads share particles.
+    """Length of neighbour lists on CUDA, and how many threads compute a particle together.
 
     It depends on the device and on one world's size and box, never on the number of worlds: it
-    decides the order of a world's sums, which are the same in every batch.
+    decides the order in which a world's sums are added, which must be the same in every batch.
     """
 
     capacity: int
@@ -245,10 +236,6 @@ class Listing(NamedTuple):
     """Groups of threads that share a row in the perception pass."""
     tiled: bool = False
     """Whether the density pass is `tiled_density`."""
-
-    def shape(self, row_count: int) -> tuple[int, int, int]:
-        """Return the shape of the array that stores the lists, in groups of 32."""
-        return -(-row_count // 32), self.capacity, 32
 
 
 CAPACITY, CROWDED_CAPACITY = 128, 256
@@ -268,7 +255,7 @@ DENSITY_LANES = 4
 
 
 def rollout_listing(request: KernelRequest, mean_neighbours: float = 0.0) -> Listing:
-    """Return how rollouts list neighbours: also a few worlds have to fill a GPU."""
+    """Return the `Listing` of rollouts: more threads a particle, so that few worlds fill a GPU."""
     if request.particle_count <= SHARED_WORLD:
         crowded = int(mean_neighbours) in CROWD
         capacity = CROWDED_CAPACITY if crowded else CAPACITY
@@ -280,7 +267,7 @@ def rollout_listing(request: KernelRequest, mean_neighbours: float = 0.0) -> Lis
 
 
 def batch_listing(request: KernelRequest) -> Listing:
-    """Return how environments list neighbours: their batches fill a GPU with less work a world."""
+    """Return the `Listing` of environments: fewer threads a world, since batches fill a GPU."""
     if request.particle_count <= SMALL_WORLD:
         return Listing(SMALL_WORLD_CAPACITY, lanes=1, teams=1)
     tiled = choose("density", request).name == "tiles"

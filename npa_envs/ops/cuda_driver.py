@@ -86,7 +86,7 @@ def new_stream(device: torch.device) -> torch.cuda.Stream:
 
 
 def _follows_kernel(stream: int) -> bool:
-    """Return whether the next launch on a captured stream follows one kernel of the same graph."""
+    """Return whether the next launch captured on a stream depends on exactly one kernel."""
     driver = _driver()
     status, identifier, graph = ctypes.c_int(), ctypes.c_uint64(), ctypes.c_void_p()
     nodes, edges = ctypes.POINTER(ctypes.c_void_p)(), ctypes.c_void_p()
@@ -124,7 +124,7 @@ class DriverLaunch:
         self._config_address = ctypes.byref(self._config)
 
     def run(self, thread_count: int, stream: int) -> bool:
-        """Launch on the current stream; return False where Warp has to launch instead."""
+        """Launch `thread_count` threads on a stream; return False where Warp has to."""
         if self._launch is None or thread_count > MAX_THREADS:
             return False
         if torch.cuda.current_device() != self._device.index:

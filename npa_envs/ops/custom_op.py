@@ -55,7 +55,7 @@ def check_derivatives(**arguments: Any) -> None:
 
 
 def _check_tangents(arguments: dict[str, Any]) -> None:
-    """Check within a `dual_level` that no tensor carries a tangent."""
+    """Check that no tensor in the arguments carries a tangent of forward-mode derivatives."""
     if torch.compiler.is_compiling():
         # Tangents are visible only to calls that a compiler does not trace.
         torch.compiler.disable(_check_tangents)(arguments)  # type: ignore[no-untyped-call]
@@ -73,7 +73,7 @@ def _check_tangents(arguments: dict[str, Any]) -> None:
 
 
 def _tensors(value: Any) -> Iterator[Tensor]:
-    """Yield the tensors in an argument; a module's weights may be plain attributes."""
+    """Yield the tensors in a tensor, list, tuple or module, also in a module's plain attributes."""
     if isinstance(value, Tensor):
         yield value
     elif isinstance(value, nn.Module):
@@ -106,13 +106,13 @@ class CustomOp(Generic[Arguments, Result]):
         self._operator.register_fake(self._taking_lists(tracing()(function)))
 
     def _taking_lists(self, function: Callable[..., Any]) -> Callable[..., Any]:
-        """Return the function with a list of numbers in place of each `Physics`."""
+        """Return the function with a list of numbers as argument in place of each `Physics`."""
         parameters = self._signature.parameters.values()
         packed = [parameter.annotation is Physics for parameter in parameters]
 
         def unpacked(*args: Any) -> Any:
             pairs = zip(args, packed, strict=True)
-            return function(*[Physics.of(value) if flag else value for value, flag in pairs])
+            return function(*[Physics.from_list(value) if flag else value for value, flag in pairs])
 
         taken = [
             parameter.replace(annotation=list[float]) if flag else parameter
@@ -122,7 +122,7 @@ class CustomOp(Generic[Arguments, Result]):
         return unpacked
 
     def __call__(self, *args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
-        """Run the function on plain tensors, and the operator on all others."""
+        """Call the plain function, or the torch operator where torch has to see one."""
         assert not kwargs, "arguments are positional"
         if forward_ad._current_level >= 0:
             _check_tangents(dict(zip(self._signature.parameters, args, strict=False)))
@@ -163,7 +163,7 @@ def without_autocast(backward: Callable[Arguments, Result]) -> Callable[Argument
 def once_differentiable(backward: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
     """Wrap the backward pass of an autograd function, so that it refuses second derivatives.
 
-    Torch's own `once_differentiable` raises no error where the cotangent requires no gradient, as
+    Torch's own `once_differentiable` raises no error where the incoming gradient requires none, as
     that of a sum: second derivatives are then silently zero. Compiled functions refuse them
     themselves, except under torch.compile's debugging backend "eager".
 

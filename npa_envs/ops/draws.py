@@ -24,10 +24,12 @@ def draw(
     dtype: torch.dtype,
     bound: int,
 ) -> Tensor:
-    """Return random numbers of each world, [B, count]; `number` is the draw's index in its step.
+    """Return random numbers of each world, [B, count], from a counter-based generator.
 
-    Distributions are "uniform" in [0, 1), with 24 or 53 random bits; standard "normal", always
-    finite; "bernoulli", ones with a probability of bound / `WORD_COUNT`; "integers" in [0, bound).
+    They depend only on the world's entries of `keys`, `episodes` and `steps`, shape [B], and on
+    `number`, the index of the draw within the step. Distributions are "uniform" in [0, 1), with 24
+    or 53 random bits; standard "normal", always finite; "bernoulli", ones with a probability of
+    bound / 2^32; "integers" in [0, bound).
     """
     values = keys.new_empty(keys.shape[0], count, dtype=dtype)
     if values.numel() == 0:

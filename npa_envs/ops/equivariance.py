@@ -38,8 +38,8 @@ MIN_STEERING = 1e-19
 """Displacement of a gate of 1 whose steering is 0, dimensionless: small, so that it can learn."""
 
 
-class VectorForm(NamedTuple):
-    """How many scalars and vectors an equivariant rule perceives, and how many it makes of them."""
+class VectorSizes(NamedTuple):
+    """Numbers of scalars and vectors that an equivariant rule perceives, and of mixed vectors."""
 
     space_dim: int
     """Space dimension D."""
@@ -48,13 +48,13 @@ class VectorForm(NamedTuple):
     perceived: int
     """Perceived vectors, D numbers each."""
     mixed: int
-    """Mixed vectors."""
+    """Mixed vectors: linear combinations of the perceived ones."""
     chiral: bool
     """Whether the rule distinguishes left from right."""
 
     @classmethod
-    def of(cls, numbers: list[int]) -> VectorForm:
-        """Return the form whose fields are these numbers, as in a torch operator."""
+    def from_list(cls, numbers: list[int]) -> VectorSizes:
+        """Return the sizes from the list of integers that torch operators take."""
         space_dim, scalars, perceived, mixed, chiral = numbers
         return cls(space_dim, scalars, perceived, mixed, bool(chiral))
 
@@ -65,51 +65,52 @@ class VectorForm(NamedTuple):
 
     @property
     def product_count(self) -> int:
-        """Products u_a · u_b of pairs a <= b, and, where chiral, u_a × u_b of pairs a < b."""
+        """Number of products u_a · u_b with a <= b and, where chiral, u_a × u_b with a < b."""
         pairs = self.mixed * (self.mixed + 1) // 2
         return pairs + self.chiral * (pairs - self.mixed)
 
     @property
     def input_dim(self) -> int:
-        """Scalars and products."""
+        """Length of the network's input: perceived scalars, then products of mixed vectors."""
         return self.scalars + self.product_count
 
     @property
     def gate_count(self) -> int:
-        """Gates: one for each mixed vector, and, where chiral, for each turned by 90 degrees."""
+        """Number of gates: one for each mixed vector and, where chiral, for each turned by 90°."""
         return self.mixed * (1 + self.chiral)
 
 
-def invariants(perception: Tensor, mixing: Tensor, form: VectorForm) -> tuple[Tensor, Tensor]:
-    """Return mixed vectors u, [..., mixed, D], and rotation-invariant inputs, [..., input_dim].
+def invariants(perception: Tensor, mixing: Tensor, sizes: VectorSizes) -> tuple[Tensor, Tensor]:
+    """Return mixed vectors u, [..., mixed, D], and the network's inputs, [..., input_dim].
 
-    The inputs are scalars and products of mixed vectors. `mixing` has shape [perceived, mixed].
+    u = mixing^T v, where v are the perceived vectors and `mixing` has shape [perceived, mixed].
+    Inputs do not change with rotations: they are the scalars and the products of mixed vectors.
     """
-    shape = (*perception.shape[:-1], form.perceived, form.space_dim)
-    vectors = perception[..., form.scalars :].reshape(shape)
+    shape = (*perception.shape[:-1], sizes.perceived, sizes.space_dim)
+    vectors = perception[..., sizes.scalars :].reshape(shape)
     mixed = mixing.T @ vectors
-    a, b = torch.triu_indices(form.mixed, form.mixed, device=mixed.device)
+    a, b = torch.triu_indices(sizes.mixed, sizes.mixed, device=mixed.device)
     products = [(mixed[..., a, :] * mixed[..., b, :]).sum(dim=-1)]
-    if form.chiral:
-        a, b = torch.triu_indices(form.mixed, form.mixed, 1, device=mixed.device)
+    if sizes.chiral:
+        a, b = torch.triu_indices(sizes.mixed, sizes.mixed, 1, device=mixed.device)
         products.append((_turned(mixed)[..., a, :] * mixed[..., b, :]).sum(dim=-1))
-    return mixed, torch.cat((perception[..., : form.scalars], *products), dim=-1)
+    return mixed, torch.cat((perception[..., : sizes.scalars], *products), dim=-1)
 
 
-def steered(output: Tensor, mixed: Tensor, steering: Tensor, form: VectorForm) -> Tensor:
-    """Return raw updates [δ (D) ; Δs] from gates and state changes: δ = Σ relu(g_a) steering_a u_a.
+def steered(output: Tensor, mixed: Tensor, steering: Tensor, sizes: VectorSizes) -> Tensor:
+    """Return updates [δ (D) ; Δs (C)] from a network's gates g and state changes Δs.
 
-    `output` has gates and then state changes, shape [..., gate_count + C]; `steering` is the
-    displacement of a gate of 1 along its vector, in units of the vector, shape [gate_count].
+    δ = Σ_a relu(g_a) steering_a u_a, over mixed vectors u_a and, where chiral, those turned by 90
+    degrees. `output` is [g ; Δs], shape [..., gate_count + C]; `steering` has shape [gate_count].
     """
-    gates = torch.relu(output[..., : form.gate_count]) * steering
-    along = torch.cat((mixed, _turned(mixed)), dim=-2) if form.chiral else mixed
+    gates = torch.relu(output[..., : sizes.gate_count]) * steering
+    along = torch.cat((mixed, _turned(mixed)), dim=-2) if sizes.chiral else mixed
     direction = (along * gates[..., None]).sum(dim=-2)
-    return torch.cat((direction, output[..., form.gate_count :]), dim=-1)
+    return torch.cat((direction, output[..., sizes.gate_count :]), dim=-1)
 
 
 def _turned(vectors: Tensor) -> Tensor:
-    """Return vectors [..., 2] rotated by 90 degrees."""
+    """Return 2D vectors [..., 2] rotated counterclockwise by 90 degrees."""
     x, y = vectors.unbind(dim=-1)
     return torch.stack((-y, x), dim=-1)
 
@@ -118,9 +119,9 @@ def _kernels(like: Tensor, space_dim: int) -> Any:
     return equivariance_kernels(space_dim, SCALARS[like.dtype])
 
 
-def _is_for_warps(like: Tensor, form: VectorForm) -> bool:
-    """Return whether the CUDA kernels support a form, for such a tensor."""
-    return choose("vectors", KernelRequest(like.device, like.dtype, vectors=form)).name == "cuda"
+def _cuda_runs(like: Tensor, sizes: VectorSizes) -> bool:
+    """Return whether CUDA kernels run these `sizes` on the device and dtype of `like`."""
+    return choose("vectors", KernelRequest(like.device, like.dtype, vectors=sizes)).name == "cuda"
 
 
 BLOCKS_PER_PROCESSOR = 5
@@ -128,27 +129,27 @@ BLOCKS_PER_PROCESSOR = 5
 
 
 def _launch_blocks(kernel: Any, blocks: int, warps: int, *tensors: Tensor) -> None:
-    """Launch a CUDA kernel in `blocks` blocks of `warps` warps each."""
+    """Launch a kernel on CUDA in `blocks` blocks of `warps` warps each."""
     block = warps * WARP
     launch(kernel, blocks * block, tensors[0].device, *tensors, block_dim=block)
 
 
 @custom_op("npa::read_rows")
 def _read_rows(
-    rows: Tensor, mixing: Tensor, width: int, form_numbers: list[int]
+    rows: Tensor, mixing: Tensor, width: int, size_list: list[int]
 ) -> tuple[Tensor, Tensor]:
-    form = VectorForm.of(form_numbers)
-    mixed = rows.new_empty(rows.shape[0], form.mixed, form.space_dim)
+    sizes = VectorSizes.from_list(size_list)
+    mixed = rows.new_empty(rows.shape[0], sizes.mixed, sizes.space_dim)
     inputs = rows.new_empty(rows.shape[0], width)
-    if _is_for_warps(rows, form):
-        blocks = -(-rows.shape[0] // (rows_of_warp(form.mixed) * READ_WARPS))
-        kernel = row_kernels(*form).read_rows
+    if _cuda_runs(rows, sizes):
+        blocks = -(-rows.shape[0] // (rows_of_warp(sizes.mixed) * READ_WARPS))
+        kernel = row_kernels(*sizes).read_rows
         _launch_blocks(kernel, blocks, READ_WARPS, rows, mixing, mixed, inputs)
         return mixed, inputs
-    kernels, threads = _kernels(rows, form.space_dim), rows.shape[0] * form.mixed
-    launch(kernels.mix_vectors, threads, rows.device, form.scalars, rows, mixing, mixed)
-    sizes = form.scalars, form.perception_dim, int(form.chiral)
-    launch(kernels.write_inputs, threads, rows.device, *sizes, rows, mixed, inputs)
+    kernels, threads = _kernels(rows, sizes.space_dim), rows.shape[0] * sizes.mixed
+    launch(kernels.mix_vectors, threads, rows.device, sizes.scalars, rows, mixing, mixed)
+    numbers = sizes.scalars, sizes.perception_dim, int(sizes.chiral)
+    launch(kernels.write_inputs, threads, rows.device, *numbers, rows, mixed, inputs)
     return mixed, inputs
 
 
@@ -159,17 +160,17 @@ def _read_rows_backward(
     mixed: Tensor,
     mixed_bar: Tensor,
     inputs_bar: Tensor,
-    form_numbers: list[int],
+    size_list: list[int],
     with_mixing: bool,
 ) -> tuple[Tensor, Tensor]:
-    form, row_count, device = VectorForm.of(form_numbers), mixed.shape[0], rows.device
-    space_dim, scalars, perceived, count, chiral = form
+    sizes, row_count, device = VectorSizes.from_list(size_list), mixed.shape[0], rows.device
+    space_dim, scalars, perceived, count, chiral = sizes
     rows_bar = torch.empty_like(rows)
-    if _is_for_warps(rows, form):
+    if _cuda_runs(rows, sizes):
         blocks = -(-row_count // (rows_of_warp(count) * PULL_WARPS))
         blocks = min(blocks, BLOCKS_PER_PROCESSOR * multiprocessor_count(device))
         partial_sums, mixing_bar = rows.new_empty(blocks, mixing.numel()), torch.empty_like(mixing)
-        kernel = row_kernels(*form).pull_back_rows
+        kernel = row_kernels(*sizes).pull_back_rows
         tensors = rows, mixing, mixed, mixed_bar, inputs_bar, rows_bar, partial_sums
         _launch_blocks(kernel, blocks, PULL_WARPS, *tensors)
         if with_mixing:
@@ -184,27 +185,27 @@ def _read_rows_backward(
     if not with_mixing:
         return rows_bar, torch.empty_like(mixing)
     # One matrix product gives all pairs of axes; only the pairs of an axis with itself are summed.
-    vectors = rows[:, scalars : form.perception_dim]
+    vectors = rows[:, scalars : sizes.perception_dim]
     pairs = (vectors.T @ total.flatten(1)).view(perceived, space_dim, count, space_dim)
     return rows_bar, pairs.diagonal(dim1=1, dim2=3).sum(dim=-1)
 
 
-def _steers_by_warps(mixed: Tensor, gate_count: int) -> tuple[int, int, bool] | None:
-    """Return D, mixed vectors and chirality if CUDA kernels steer these rows, else None."""
+def _cuda_steering(mixed: Tensor, gate_count: int) -> tuple[int, int, bool] | None:
+    """Return D, number of mixed vectors and chirality if CUDA runs `steer_rows`, else None."""
     count, space_dim = map(int, mixed.shape[1:])
     chiral = gate_count > count
     # Steering needs no shared memory, so it runs wherever the smallest rows fit.
-    least = VectorForm(space_dim, 0, 1, count, chiral)
-    return (space_dim, count, chiral) if _is_for_warps(mixed, least) else None
+    least = VectorSizes(space_dim, 0, 1, count, chiral)
+    return (space_dim, count, chiral) if _cuda_runs(mixed, least) else None
 
 
 @custom_op("npa::steer_rows")
 def _steer_rows(output: Tensor, mixed: Tensor, signs: Tensor, width: int) -> Tensor:
     update = output.new_empty(output.shape[0], width)
-    form = _steers_by_warps(mixed, len(signs))
-    if form is not None:
+    sizes = _cuda_steering(mixed, len(signs))
+    if sizes is not None:
         blocks = -(-output.shape[0] // (STEERED_ROWS * STEER_WARPS))
-        kernel = steering_kernels(*form).steer
+        kernel = steering_kernels(*sizes).steer
         _launch_blocks(kernel, blocks, STEER_WARPS, output, mixed, signs, update)
         return update
     kernel = _kernels(output, int(mixed.shape[2])).steer
@@ -218,10 +219,10 @@ def _steer_rows_backward(
 ) -> tuple[Tensor, Tensor]:
     output_bar, mixed_bar = torch.empty_like(output), torch.empty_like(mixed)
     tensors = output, mixed, signs, update_bar, output_bar, mixed_bar
-    form = _steers_by_warps(mixed, len(signs))
-    if form is not None:
+    sizes = _cuda_steering(mixed, len(signs))
+    if sizes is not None:
         blocks = -(-output.shape[0] // (STEERED_ROWS * STEER_WARPS))
-        _launch_blocks(steering_kernels(*form).pull_back_steering, blocks, STEER_WARPS, *tensors)
+        _launch_blocks(steering_kernels(*sizes).pull_back_steering, blocks, STEER_WARPS, *tensors)
         return output_bar, mixed_bar
     kernel = _kernels(output, int(mixed.shape[2])).pull_back_steering
     launch(kernel, output.numel(), output.device, len(signs), *tensors)
@@ -229,14 +230,14 @@ def _steer_rows_backward(
 
 
 class _ReadRows(torch.autograd.Function):
-    """Mixed vectors and invariants of rows."""
+    """Autograd function of `read_rows`."""
 
     @staticmethod
     def forward(
-        ctx: Any, rows: Tensor, mixing: Tensor, width: int, form: VectorForm
+        ctx: Any, rows: Tensor, mixing: Tensor, width: int, sizes: VectorSizes
     ) -> tuple[Tensor, Tensor]:
-        ctx.form_numbers = [*map(int, form)]
-        outputs: tuple[Tensor, Tensor] = _read_rows(rows, mixing, width, ctx.form_numbers)
+        ctx.size_list = [*map(int, sizes)]
+        outputs: tuple[Tensor, Tensor] = _read_rows(rows, mixing, width, ctx.size_list)
         ctx.save_for_backward(rows, mixing, outputs[0])
         return outputs
 
@@ -245,13 +246,13 @@ class _ReadRows(torch.autograd.Function):
     def backward(ctx: Any, mixed_bar: Tensor, inputs_bar: Tensor) -> tuple[Tensor | None, ...]:
         rows, mixing, mixed = ctx.saved_tensors
         bars = mixed_bar.contiguous(), inputs_bar.contiguous()
-        options = ctx.form_numbers, ctx.needs_input_grad[1]
+        options = ctx.size_list, ctx.needs_input_grad[1]
         rows_bar, mixing_bar = _read_rows_backward(rows, mixing, mixed, *bars, *options)
         return rows_bar, mixing_bar if ctx.needs_input_grad[1] else None, None, None
 
 
 class _SteerRows(torch.autograd.Function):
-    """Autograd function of `steer_rows`: updates from gates, mixed vectors and state changes."""
+    """Autograd function of `steer_rows`."""
 
     @staticmethod
     def forward(ctx: Any, output: Tensor, mixed: Tensor, signs: Tensor, width: int) -> Tensor:
@@ -267,20 +268,22 @@ class _SteerRows(torch.autograd.Function):
         return output_bar, mixed_bar, None, None
 
 
-def read_rows(rows: Tensor, mixing: Tensor, form: VectorForm, width: int) -> tuple[Tensor, Tensor]:
-    """Return mixed vectors and network inputs of rows of perception [z | 1 | 0], as `invariants`.
+def read_rows(
+    rows: Tensor, mixing: Tensor, sizes: VectorSizes, width: int
+) -> tuple[Tensor, Tensor]:
+    """Return `invariants` of K particles by kernels: shapes [K, mixed, D] and [K, width].
 
-    They have shapes [K, mixed, D] and [K, width]; inputs are [scalars | products | 1 | 0].
+    A row is a perception vector, a one and zeros; inputs are [scalars | products | 1 | 0].
     """
     tensors = rows.contiguous(), mixing.contiguous()
     if not (torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)):
-        return _read_rows(*tensors, width, [*map(int, form)])
-    outputs: tuple[Tensor, Tensor] = _ReadRows.apply(*tensors, width, form)  # type: ignore[no-untyped-call]
+        return _read_rows(*tensors, width, [*map(int, sizes)])
+    outputs: tuple[Tensor, Tensor] = _ReadRows.apply(*tensors, width, sizes)  # type: ignore[no-untyped-call]
     return outputs
 
 
 def signed_gates(weight: Tensor, steering: Tensor) -> tuple[Tensor, Tensor]:
-    """Return output weights with gates multiplied by |steering|, and the signs of steering.
+    """Return output weights [gate_count + C, H], gates times |steering|, and signs of steering.
 
     relu(g) steering = sign(steering) relu(|steering| g), so the gradient of `steering` follows from
     that of the weights, without a sum over rows. A steering of 0 is replaced by a tiny one, so that
@@ -292,7 +295,10 @@ def signed_gates(weight: Tensor, steering: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def steer_rows(output: Tensor, mixed: Tensor, signs: Tensor, width: int) -> Tensor:
-    """Return updates [δ | Δs | 0] of outputs [g | Δs | 0] by `signed_gates`, as `steered`."""
+    """Return `steered` of K particles by kernels: updates [δ | Δs | 0], shape [K, width].
+
+    `output` is [g | Δs | 0] by the weights of `signed_gates`, which also returns `signs`.
+    """
     output = output.contiguous()
     if not (torch.is_grad_enabled() and (output.requires_grad or mixed.requires_grad)):
         return _steer_rows(output, mixed, signs, width)

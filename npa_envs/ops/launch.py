@@ -40,7 +40,7 @@ GROUP_WIDTHS = (4, 8, 16)
 
 
 def channel_width(state_dim: int) -> int:
-    """Return the number of channels of a group."""
+    """Return how many of a particle's `state_dim` channels one thread sums: a group."""
     return next((width for width in GROUP_WIDTHS if width >= state_dim), GROUP_WIDTHS[-1])
 
 
@@ -73,7 +73,7 @@ class _ArrayArgument:
         self._dtype: torch.dtype | None = None
 
     def set(self, tensor: Tensor | None) -> None:
-        """Write the descriptor of another tensor, or of an absent one (None)."""
+        """Write a tensor's descriptor; None stands for an absent array."""
         if tensor is None:
             # Kernels read the size of an absent array.
             if self._size is not None:
@@ -98,12 +98,12 @@ def _null(tensor: Tensor) -> int:
 
 
 def _overwrite(memory: Any, value: Any) -> None:
-    """Copy a descriptor or a struct into the memory of the arguments."""
+    """Copy the bytes of a descriptor or struct into memory."""
     ctypes.memmove(ctypes.addressof(memory), ctypes.addressof(value), ctypes.sizeof(value))
 
 
 def _description(tensor: Tensor, array_type: Any) -> Any:
-    """Return Warp's array descriptor of a tensor; one of one dimension covers the whole tensor."""
+    """Return Warp's array descriptor of a tensor, flattened where the kernel's array is 1D."""
     tensor = tensor.detach()
     if array_type.ndim == 1:
         entry = getattr(array_type.dtype, "_shape_", ())
@@ -117,7 +117,7 @@ def _description(tensor: Tensor, array_type: Any) -> Any:
 
 
 def _type_of(argument: Any) -> Any:
-    """Return the type of a kernel's argument: a `wp.array` also for `wp.array2d[...]`."""
+    """Return the Warp type of a kernel's argument; `wp.array2d[...]` becomes a `wp.array`."""
     declared = argument.type
     is_array = hasattr(declared, "ndim")
     return wp.array(dtype=declared.dtype, ndim=declared.ndim) if is_array else declared
@@ -131,13 +131,13 @@ class _StructArgument:
         self._last: Any = None
 
     def set(self, value: Any) -> None:
-        """Copy another struct, unless it is the current one."""
+        """Copy a struct's bytes, unless this object was copied last."""
         if value is not self._last:
             _overwrite(self._memory, value.__ctype__())
             self._last = value
 
 
-class _Arguments:
+class _PreparedLaunch:
     """A kernel on a device with memory for its arguments; a launch overwrites those that changed.
 
     A launch of five arrays and two numbers takes 2.5 µs of CPU time here. `wp.launch`, which packs
@@ -160,7 +160,10 @@ class _Arguments:
             _description(value, declared) if isinstance(value, Tensor) else value
             for value, declared in zip(arguments, types, strict=True)
         ]
-        with kernel_lock, quiet_warp(), _first_load(kernel, device):
+        loaded = (kernel.module, device) in _loaded
+        # One process at a time compiles a module.
+        alone = contextlib.nullcontext() if loaded else in_turn(kernel.module.name)
+        with kernel_lock, quiet_warp(), alone:
             self._launch = wp.launch(
                 kernel,
                 size,
@@ -170,7 +173,7 @@ class _Arguments:
                 record_tape=False,
                 record_cmd=True,
             )
-            launched.add((kernel, device))
+            _loaded.add((kernel.module, device))
         self._device = device
         self._bounds = {size: self._launch.bounds}
         parameters = self._launch.params[1:]
@@ -193,7 +196,7 @@ class _Arguments:
             self._driven = DriverLaunch(self._launch, device, self._addresses)
 
     def _setter(self, name: str, declared: Any, value: Any) -> Any:
-        """Return the function that sets an argument; None for a number or vector, set directly."""
+        """Return the function that writes an array or struct; None for numbers."""
         if isinstance(declared, wp.array):
             return _ArrayArgument(getattr(self._memory, name), declared).set
         if hasattr(value, "__ctype__"):
@@ -214,7 +217,7 @@ class _Arguments:
                 setattr(self._memory, self._names[k], number)
 
     def set_address(self, index: int, tensor: Tensor) -> None:
-        """Set the address of an array argument to that of a tensor of the same form."""
+        """Point an array argument at another tensor of the same shape and dtype."""
         getattr(self._memory, self._names[index]).data = tensor.data_ptr() or _null(tensor)
 
     def _bounds_of(self, size: tuple[int, ...]) -> Any:
@@ -245,7 +248,7 @@ class _Arguments:
             self._run_on_cpu(self._memory, size)
 
     def _run_range(self, size: tuple[int, ...], indices: range) -> None:
-        """Run the part of a launch that has these indices along the first dimension."""
+        """Run the threads of a CPU launch whose first index is in `indices`."""
         memory = type(self._memory).from_buffer_copy(self._memory)
         setattr(memory, self._names[0], indices.start)
         self._run_on_cpu(memory, (len(indices), *size[1:]))
@@ -254,14 +257,8 @@ class _Arguments:
         self._launch.hooks.forward(ctypes.byref(self._bounds_of(size)), ctypes.byref(memory))
 
 
-def _first_load(kernel: Any, device: torch.device) -> contextlib.AbstractContextManager[None]:
-    """Return a lock of all processes, held while a kernel's module is compiled or loaded."""
-    known = any(other.module is kernel.module and where == device for other, where in launched)
-    return contextlib.nullcontext() if known else in_turn(kernel.module.name)
-
-
-launched: set[tuple[Any, torch.device]] = set()
-"""Kernels that have been launched, each with its device."""
+_loaded: set[tuple[Any, torch.device]] = set()
+"""Modules of kernels that have been loaded, each with its device."""
 
 MAX_BOUNDS = 4096
 """Launch bounds that are cached for a kernel, at most."""
@@ -273,7 +270,7 @@ def _struct(fields: tuple[tuple[str, type], ...]) -> Any:
 
 
 class Launch(NamedTuple):
-    """One launch of a Warp kernel."""
+    """Description of one launch of a Warp kernel."""
 
     kernel: str
     """The kernel's name."""
@@ -287,7 +284,7 @@ class Launch(NamedTuple):
 
 @contextlib.contextmanager
 def noted_launches() -> Iterator[list[Launch]]:
-    """Yield a list to which all launches in the block are added, of every thread."""
+    """Yield a list that receives each launch made within the block, by any thread."""
     noted: list[Launch] = []
     _observers.append(noted)
     try:
@@ -306,18 +303,18 @@ def _described(kernel: Any, size: tuple[int, ...]) -> Launch:
     return Launch(kernel.func.__name__, module, " x ".join(map(str, size)), purpose)
 
 
-class _Ready(threading.local):
-    """A thread's cache of kernels with memory for their arguments."""
+class _ThreadState(threading.local):
+    """A thread's prepared launches, and whether it records or traces launches."""
 
     def __init__(self) -> None:
-        self.by_kernel: dict[tuple[Any, torch.device, int], _Arguments] = {}
+        self.by_kernel: dict[tuple[Any, torch.device, int], _PreparedLaunch] = {}
         self.tape: Tape | None = None
         """The tape that records this thread's launches, if any."""
         self.traced = False
         """Whether tensors have no memory, so that nothing is launched."""
 
 
-_ready = _Ready()
+_thread = _ThreadState()
 
 
 def launch(
@@ -329,50 +326,49 @@ def launch(
 ) -> None:
     """Launch a kernel with `size` threads along each dimension on torch's current stream.
 
-    Arguments are tensors of the device (None for an absent one), structs and numbers, in the
-    kernel's order, without `range_start`. The kernel's signature decides how a tensor is read: an
-    array of one dimension is all of a contiguous tensor, whatever the tensor's shape.
+    Arguments follow the kernel's signature, without its first argument if that is `range_start`:
+    tensors on the device (None: an absent array), structs and numbers. A 1D array is the whole of
+    a contiguous tensor, whatever the tensor's shape.
     """
-    if _ready.traced:
+    if _thread.traced:
         return
     size = (size,) if isinstance(size, int) else size
     if 0 in size:
         return
     for noted in _observers:
         noted.append(_described(kernel, size))
+    if _thread.tape is not None:
+        _thread.tape.add(kernel, size, device, *arguments, block_dim=block_dim).run(size)
+        return
     if kernel in MIN_RANGES:
         arguments = (0, *arguments)
-    tape = _ready.tape
-    ready: _Arguments | None
-    if tape is not None:
-        ready = tape.arguments(kernel, size, device, block_dim, arguments)
-    else:
-        key = (kernel, device, block_dim)
-        ready = _ready.by_kernel.get(key)
-        if ready is None:
-            ready = _ready.by_kernel[key] = _Arguments(kernel, size, device, block_dim, arguments)
-    ready.set(arguments)
-    ready.run(size)
+    key = (kernel, device, block_dim)
+    prepared = _thread.by_kernel.get(key)
+    if prepared is None:
+        prepared = _PreparedLaunch(kernel, size, device, block_dim, arguments)
+        _thread.by_kernel[key] = prepared
+    prepared.set(arguments)
+    prepared.run(size)
 
 
 @contextlib.contextmanager
 def tracing() -> Iterator[None]:
-    """Launch nothing in the block, in this thread: torch only asks for the shapes of results."""
-    _ready.traced, before = True, _ready.traced
+    """Make `launch` do nothing in the block, in this thread: torch needs only results' shapes."""
+    _thread.traced, before = True, _thread.traced
     try:
         yield
     finally:
-        _ready.traced = before
+        _thread.traced = before
 
 
 def is_traced() -> bool:
     """Return whether this thread's tensors have shapes but no memory."""
-    return _ready.traced
+    return _thread.traced
 
 
 def is_aligned(tensor: Tensor, size: int = 16) -> bool:
     """Return whether a tensor begins at a multiple of `size` bytes in memory."""
-    return _ready.traced or tensor.data_ptr() % size == 0
+    return _thread.traced or tensor.data_ptr() % size == 0
 
 
 def aligned(tensor: Tensor) -> Tensor:
@@ -383,74 +379,71 @@ def aligned(tensor: Tensor) -> Tensor:
 
 def is_recorded() -> bool:
     """Return whether a tape records this thread's launches."""
-    return _ready.tape is not None
+    return _thread.tape is not None
 
 
 class Tape:
     """A recorded sequence of launches that is replayed on the same tensors in the same memory."""
 
     def __init__(self) -> None:
-        self._launches: list[tuple[_Arguments, tuple[int, ...]]] = []
+        self._launches: list[tuple[_PreparedLaunch, tuple[int, ...]]] = []
         self._tensors: list[list[Any]] = []
         """Tensors in the arguments, kept alive: the arguments contain only their addresses."""
 
-    def add(self, kernel: Any, size: Any, device: torch.device, *arguments: Any) -> None:
-        """Record a launch without making it; arguments are those of `launch`."""
+    def add(
+        self,
+        kernel: Any,
+        size: int | tuple[int, ...],
+        device: torch.device,
+        *arguments: Any,
+        block_dim: int = CUDA_BLOCK,
+    ) -> _PreparedLaunch:
+        """Record a launch with arguments as of `launch`, and return it; it is not made yet."""
         size = (size,) if isinstance(size, int) else size
         arguments = (0, *arguments) if kernel in MIN_RANGES else arguments
-        self.arguments(kernel, size, device, CUDA_BLOCK, arguments).set(arguments)
+        recorded = _PreparedLaunch(kernel, size, device, block_dim, arguments)
+        recorded.set(arguments)
+        self._launches.append((recorded, size))
+        self._tensors.append(list(arguments))
+        return recorded
 
     @contextlib.contextmanager
     def recording(self) -> Iterator[None]:
-        """Record this thread's launches in the block, and make them."""
-        _ready.tape, before = self, _ready.tape
+        """Make and record this thread's launches in the block."""
+        _thread.tape, before = self, _thread.tape
         try:
             yield
         finally:
-            _ready.tape = before
-
-    def arguments(
-        self,
-        kernel: Any,
-        size: tuple[int, ...],
-        device: torch.device,
-        block_dim: int,
-        arguments: tuple[Any, ...],
-    ) -> _Arguments:
-        """Add a launch to the tape, and return memory for its arguments."""
-        memory = _Arguments(kernel, size, device, block_dim, arguments)
-        self._launches.append((memory, size))
-        self._tensors.append(list(arguments))
-        return memory
+            _thread.tape = before
 
     def __len__(self) -> int:
         """Return the number of launches."""
         return len(self._launches)
 
-    def argument_slots(self, tensor: Tensor) -> list[tuple[_Arguments, int]]:
-        """Return the arguments that are this tensor, which the caller now has to keep alive."""
+    def argument_slots(self, tensor: Tensor) -> list[tuple[_PreparedLaunch, int]]:
+        """Return where a tensor is an argument: launch and index. The caller keeps it alive."""
         slots, address = [], tensor.data_ptr()
-        for (memory, _), arguments in zip(self._launches, self._tensors, strict=True):
+        for (prepared, _), arguments in zip(self._launches, self._tensors, strict=True):
             for k, value in enumerate(arguments):
                 if isinstance(value, Tensor) and value.data_ptr() == address:
                     arguments[k] = None
-                    slots.append((memory, k))
+                    slots.append((prepared, k))
         return slots
 
-    def move(self, slots: list[tuple[_Arguments, int]], tensor: Tensor) -> None:
-        """Replace these arguments by a tensor of the same form, which the caller keeps alive."""
-        for memory, index in slots:
-            memory.set_address(index, tensor)
+    def move(self, slots: list[tuple[_PreparedLaunch, int]], tensor: Tensor) -> None:
+        """Put a tensor of the same shape and dtype at these slots; the caller keeps it alive."""
+        for prepared, index in slots:
+            prepared.set_address(index, tensor)
 
     def replay(
         self, begin: int = 0, end: int | None = None, *, last_count: int | None = None
     ) -> None:
-        """Repeat some of the launches, the last with `last_count` threads if given."""
+        """Repeat launches [begin, end); `last_count`: size of the last one's first dimension."""
         launches = self._launches[begin:end]
-        for memory, size in launches[:-1]:
-            memory.run(size)
-        memory, size = launches[-1]
-        memory.run(size if last_count is None else (last_count, *size[1:]))
+        for prepared, size in launches[:-1]:
+            prepared.run(size)
+        prepared, size = launches[-1]
+        prepared.run(size if last_count is None else (last_count, *size[1:]))
 
 
 # CPU threads, as many as torch is set to use. Where torch ships GNU's OpenMP, they are torch's own
@@ -487,9 +480,9 @@ def _pool() -> ThreadPoolExecutor:
 
 
 def _leave_threads() -> None:
-    """Drop the pool in a forked process, in which the parent's threads do not run.
+    """Use one thread in a forked process, in which the parent's threads do not run.
 
-    Torch would wait for its own threads for ever.
+    Torch would wait for its threads for ever.
     """
     global _forked
     _forked = True
@@ -502,10 +495,10 @@ if hasattr(os, "register_at_fork"):
 
 
 def thread_count() -> int:
-    """Return the number of CPU threads of kernels: torch's number.
+    """Return how many CPU threads run a kernel: torch's number.
 
     In a process started by Python's `multiprocessing` it is one, unless the number was set: such
-    processes, as of vector environments, share the cores.
+    processes, for example of vector environments, share the cores.
     """
     threads = torch.get_num_threads()
     chosen = threads != _DEFAULT_THREADS or "OMP_NUM_THREADS" in os.environ
@@ -513,7 +506,7 @@ def thread_count() -> int:
 
 
 def even_ranges(count: int, smallest: int) -> list[range]:
-    """Split [0, count) into ranges for all threads, of at least `smallest` indices each; or one."""
+    """Split [0, count) for the CPU threads into ranges of at least `smallest` indices each."""
     if count < 2 * smallest:
         return [range(count)]
     threads = thread_count()
@@ -523,7 +516,7 @@ def even_ranges(count: int, smallest: int) -> list[range]:
 
 
 def run_together(calls: Sequence[Callable[[], object]]) -> None:
-    """Run calls that release the GIL in parallel; the first error is raised after all have run."""
+    """Call functions in parallel, which must release the GIL; raise the first error at the end."""
     pending = iter(calls)
     errors: list[BaseException] = []
 

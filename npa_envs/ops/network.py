@@ -26,7 +26,7 @@ from npa_envs.ops.launch import aligned, launch
 
 
 class ArrangedWeights(NamedTuple):
-    """A rule's weights in the memory layout of the fused kernels."""
+    """Weights W1 and W2 of a rule's network in the memory layout of the CUDA kernels."""
 
     forward: list[Tensor]
     """Fragments (tiles of tensor cores) of W1 and W2, float16, and scales of updates, float32."""
@@ -35,7 +35,7 @@ class ArrangedWeights(NamedTuple):
 
 
 def _arrange_layers(first: Tensor, second: Tensor) -> list[Tensor]:
-    """Return fragments and output scales of two layers' weights, [H, width] and [width', H]."""
+    """Return weights [H, width] and [outputs, H] in tensor-core tiles, and scales of outputs."""
     hidden, width = first.shape
     steps, tiles = -(-width // 16), -(-second.shape[0] // 8)
     half = functools.partial(torch.empty, dtype=torch.float16, device=first.device)
@@ -69,7 +69,7 @@ def _arrange_weights(
 def arrange(
     hidden_weight: Tensor, output_weight: Tensor, *, with_backward: bool
 ) -> ArrangedWeights:
-    """Return weights in the order the kernels read; `with_backward`: also for backward passes."""
+    """Return weights in the layout of the CUDA kernels, of the backward pass too if asked for."""
     arranged = _arrange_weights(
         hidden_weight.detach().contiguous(), output_weight.detach().contiguous(), with_backward
     )
@@ -77,10 +77,10 @@ def arrange(
 
 
 def arrange_weights(hidden_weight: Tensor, output_weight: Tensor) -> ArrangedWeights | None:
-    """Lay out a rule's weights for `run_network`; None where it does not support them.
+    """Return a rule's weights in the layout of `run_network`; None if no kernel supports them.
 
     Where gradients are enabled they are also laid out for the backward pass, even if the weights
-    require no gradient: once, instead of in every step whose rows require one.
+    require no gradient: once, instead of in every step whose perception requires one.
     """
     hidden, width = hidden_weight.shape
     request = KernelRequest(
@@ -120,9 +120,11 @@ def _run_network(
     mode: str,
     stored_signs: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
-    """Run `two_layer_kernel` on rows [K, width]; mode "note" also returns the ReLU masks."""
+    """Return outputs [K, out_width] of rows [K, width], and in mode "note" the ReLU masks.
+
+    "rectify" stores no masks; "mask" multiplies by `stored_signs` instead, for backward passes.
+    """
     steps, tiles = -(-int(rows.shape[1]) // 16), -(-out_width // 8)
-    # The ReLU masks of hidden units.
     words = 4 * -(-unit_count // SIGN_UNITS) if mode == "note" else 0
     signs = rows.new_empty(rows.shape[0], words, dtype=torch.int32)
     output = rows.new_empty(rows.shape[0], out_width)
@@ -183,7 +185,7 @@ def _weight_gradients(
 
 
 class _Network(torch.autograd.Function):
-    """Raw updates of rows of perception."""
+    """Autograd function of `run_network`."""
 
     @staticmethod
     def forward(
@@ -216,14 +218,16 @@ class _Network(torch.autograd.Function):
 def run_network(
     rows: Tensor, weights: Tensor, output_shape: tuple[int, ...], arranged: ArrangedWeights
 ) -> Tensor:
-    """Map rows to relu(rows W1ᵀ) W2ᵀ, as accurate as matrix products in float32.
+    """Return relu(rows W1ᵀ) W2ᵀ, [K, A'], as accurate as matrix products in float32.
 
     A row's result depends only on that row and the weights, not on the other rows.
 
     Args:
+        rows: Perception vectors, padded, shape [K, row_width].
         weights: W1 [H, row_width] and W2 [A', H], concatenated, shape [H (row_width + A')].
-        arranged: The same weights, as `arrange_weights` laid them out; they are laid out again
-            where that was without gradients and gradients are enabled now.
+        output_shape: A' and H.
+        arranged: The same weights by `arrange_weights`; arranged again if gradients are needed
+            that were disabled then.
     """
     out_width, unit_count = output_shape
     needs_gradient = torch.is_grad_enabled() and (rows.requires_grad or weights.requires_grad)

@@ -7,6 +7,7 @@ Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple, get_args
 
@@ -35,7 +36,7 @@ from npa_envs.ops.perception_passes import (
 )
 from npa_envs.ops.physics_constants import Physics, Terms, make_physics
 from npa_envs.ops.sort import plan_kernels, sort_worlds
-from npa_envs.ops.static import StaticRows, StaticWorlds, all_rows, static_worlds
+from npa_envs.ops.static import StaticRows, StaticWorlds, static_worlds
 
 
 class PerceptionFields(NamedTuple):
@@ -72,8 +73,8 @@ def perceive(
 
     c = eps / eps0, L(v) = log(1 + |v|) v / |v|. Differentiable in s, and in x where
     `detach_positions` is False; the moment correction of ∇s is a stopped gradient, as in the paper
-    (arXiv 2601.16096, section 3). Bit-identical from run to run; world k of B equals that world
-    alone.
+    (arXiv 2601.16096, section 3). Bit-identical from run to run, and for a world alone or in any
+    batch.
 
     Args:
         x: Particle positions [length units], shape [B, N, D], D = 2 or 3, anywhere in open space.
@@ -91,7 +92,7 @@ def perceive(
             (det M adj M + τ² I) / (det² M + τ²), τ = 1e-2, which nears both and never jumps.
 
     Returns:
-        Perception vectors z, dimensionless, shape [B, N, P], P = C(2+D)+D with every group.
+        Perception vectors z, dimensionless, shape [B, N, P], P = C(2+D)+D with both gradients.
 
     Raises:
         NPAError: Shapes, dtypes or devices do not fit, a position is not finite, eps or eps0 is
@@ -184,7 +185,7 @@ def perception_fields(
 
 
 class Rows(NamedTuple):
-    """Maps between particles and rows of perception; only active particles have rows."""
+    """Which row of a matrix has which particle's perception; only active particles have rows."""
 
     row_of: Tensor
     """Row of each particle, -1 for none, int32, shape [B N]."""
@@ -207,13 +208,13 @@ def _perceive_rows(
     physics: Physics,
     for_adjoint: bool,
 ) -> list[Tensor]:
-    """Return the tensors of a `SavedPerception`, and then `row_source`.
+    """Return the tensors of a `SavedPerception`, and then the particle of each row, [K].
 
-    With `static`, the tensors that it already has are left out.
+    For static worlds only the first two, as the others are in `static`.
     """
     plan = plan_kernels(x, x.shape, s.shape[2], row_capacity, masked, physics)
     if static:
-        rows, worlds = StaticRows(*static[:4]), StaticWorlds.of(static[4:])
+        rows, worlds = StaticRows(*static[:4]), StaticWorlds.from_list(static[4:])
         ordered, densities = static_worlds(plan, worlds, rows, x, s)
     else:
         ordered = sort_worlds(plan, x, s, mask)
@@ -238,7 +239,7 @@ def _perceive_rows(
 
 
 class _PerceiveRows(torch.autograd.Function):
-    """Rows of perception of the active particles; the backward pass gathers over neighbours."""
+    """Autograd function of `perceive_rows`; the backward pass sums over neighbours."""
 
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
@@ -280,14 +281,14 @@ def _perceived(
     rows: StaticRows | None,
     *options: Any,
 ) -> tuple[SavedPerception, Tensor]:
-    """Return perception with the tensors of its adjoint, and the particles of its rows.
+    """Return the result of `_perceive_rows`: `SavedPerception`, and the particle of each row, [K].
 
-    Options are those of `_perceive_rows`, from `masked` on.
+    `options` are its arguments from `masked` on.
     """
     if static is None or rows is None:
         *saved_tensors, row_source = _perceive_rows(x, s, mask, [], *options)
         return SavedPerception(*saved_tensors), row_source
-    perception, kernel_sum = _perceive_rows(x, s, None, [*rows, *static.flat()], *options)
+    perception, kernel_sum = _perceive_rows(x, s, None, [*rows, *static.to_list()], *options)
     saved = SavedPerception(
         perception,
         kernel_sum,
@@ -311,25 +312,25 @@ def perceive_rows(
     static: StaticWorlds | None = None,
     static_rows: StaticRows | None = None,
 ) -> tuple[Tensor, Rows]:
-    """Perceive the active particles of checked worlds.
+    """Return perception vectors of active particles as rows; x and s are not checked.
 
     Args:
         mask: Which particles are active, uint8, shape [B, N], or None for all.
-        row_capacity: Rows K of the result; active particles beyond it are left out.
+        row_capacity: Number K of rows; active particles beyond it are left out.
         row_width: Columns of a row, at least P: the perception vector, a one, then zeros.
         static: Result of `prepare_static` for worlds whose particles do not move. Then x and s are
             in its sorted order, no gradient flows into x, and the mask is not read.
         static_rows: Rows of the active particles of static worlds, or None for all.
 
     Returns:
-        Rows of perception, shape [K, row_width], zero beyond the last active row, and the map
+        The rows, shape [K, row_width], zero beyond the last active particle's, and the indices
         between rows and particles.
     """
     x, s, rows = x.contiguous(), s.contiguous(), static_rows
     masked = (mask if static is None else static_rows) is not None
     if static is not None:
-        x = x.detach()
-        rows = all_rows(static, x) if rows is None else rows
+        x, every = x.detach(), static.all_indices
+        rows = rows or StaticRows(every, every, static.starts, x.flatten(0, 1))
     arguments = x, s, mask, static, rows, masked, row_capacity, row_width, physics
     if torch.is_grad_enabled() and (x.requires_grad or s.requires_grad):
         perception, *maps = _PerceiveRows.apply(*arguments)  # type: ignore[no-untyped-call]
@@ -355,11 +356,11 @@ def updates_in_parts(
     row_capacity: int,
     row_width: int,
 ) -> tuple[Tensor, Rows]:
-    """Perceive huge worlds and map rows to updates, `ROWS_TOGETHER` rows at a time.
+    """Return updates of huge worlds' active particles, [K, A'], and `Rows`; computed in parts.
 
-    All rows of perception together would take most of the memory. The network maps rows
-    [K, row_width] to updates [K, A'], each row independently, so results equal those of
-    `perceive_rows`. Not differentiable.
+    All rows of `perceive_rows` together would take most of the memory. The network maps rows
+    [any, row_width] to updates [any, A'], each row independently, so results are the same. Not
+    differentiable.
     """
     x, s = x.detach().contiguous(), s.detach().contiguous()
     plan = plan_kernels(x, x.shape, s.shape[2], row_capacity, mask is not None, physics)
@@ -385,7 +386,7 @@ def updates_in_parts(
 
 
 class NeighbourState:
-    """Sorted worlds with densities, ready for perception; `build_neighbours` makes them."""
+    """Worlds sorted into cells, with densities, for `perceive`; made by `build_neighbours`."""
 
     def __init__(
         self, launch_of: Callable[[Tensor], tuple[Any, ...]], shape: tuple[int, ...], like: Tensor
@@ -396,7 +397,7 @@ class NeighbourState:
         self._tape: Tape | None = None
 
     def perceive(self, out: Tensor | None = None) -> Tensor:
-        """Return clipped perception of every particle, in the caller's order, shape [B, N, P].
+        """Return every particle's perception, clipped to `Limits.perception`, shape [B, N, P].
 
         Later calls read the current values of the same tensors and cost less CPU time. For worlds
         with `world_indices` in a larger batch, `out` must be given, of that batch's shape.
@@ -404,12 +405,12 @@ class NeighbourState:
         if out is None:
             out = self._like.new_empty(self._shape)
         rows = out.view(-1, self._shape[-1])
-        form = rows.shape, rows.dtype, rows.device, rows.is_contiguous()
+        layout = rows.shape, rows.dtype, rows.device, rows.is_contiguous()
         if self._tape is None:
-            self._tape, self._form = Tape(), form
+            self._tape, self._layout = Tape(), layout
             self._tape.add(*self._launch_of(rows))
             self._slots = self._tape.argument_slots(rows)
-        assert form == self._form, "only the address may change"
+        assert layout == self._layout, "only the address may change"
         self._tape.move(self._slots, rows)
         self._tape.replay()
         return out
@@ -418,10 +419,10 @@ class NeighbourState:
 def build_neighbours(
     x: Tensor, s: Tensor, physics: Physics, world_indices: Tensor | None = None
 ) -> NeighbourState:
-    """Sort checked worlds into cells and compute densities; valid until x or s change.
+    """Return x and s, unchecked, sorted into cells with densities; valid until one changes.
 
-    `world_indices` are indices in a larger batch, to which perception is written, int64,
-    shape [B]; default: the worlds are the whole batch.
+    `world_indices`, int64, shape [B], are the worlds' indices in a larger batch, into which
+    perception is written; default: the worlds are the whole batch.
     """
     x, s = x.contiguous(), s.contiguous()
     plan = plan_kernels(x, x.shape, s.shape[2], x.shape[0] * x.shape[1], False, physics)
@@ -444,15 +445,13 @@ def build_neighbours(
         ) * plan.particle_count
         destination = (destination.view(plan.world_count, -1) + shift.int()[:, None]).view(-1)
 
-    def launch_of(rows: Tensor) -> tuple[Any, ...]:
-        return perception_launch(
-            plan,
-            ordered,
-            densities,
-            rows,
-            states=s if in_place else None,
-            destination=destination,
-            limit=physics.limits.perception,
-        )
-
+    launch_of = functools.partial(
+        perception_launch,
+        plan,
+        ordered,
+        densities,
+        states=s if in_place else None,
+        destination=destination,
+        limit=physics.limits.perception,
+    )
     return NeighbourState(launch_of, (*x.shape[:2], physics.perception_dim), x)

@@ -30,7 +30,7 @@ INTERLEAVED_LISTS = 32
 
 
 class NeighbourLists(NamedTuple):
-    """The neighbours of each row's particle, itself included."""
+    """Neighbour lists of active particles (rows) for the CUDA kernels; they include themselves."""
 
     listing: Listing
     """Layout of the lists."""
@@ -46,7 +46,7 @@ class NeighbourLists(NamedTuple):
 
 
 class ListedNeighbours(NamedTuple):
-    """The neighbours of each sorted particle, itself included, for the portable kernels."""
+    """Neighbour lists of all particles for the portable kernels; they include themselves."""
 
     neighbours: Tensor
     """Sorted indices of the neighbours of all particles, concatenated, int32, shape [E]."""
@@ -55,7 +55,7 @@ class ListedNeighbours(NamedTuple):
 
 
 class Densities(NamedTuple):
-    """Results of the density pass, read by perception."""
+    """Results of the density pass, which the perception pass reads."""
 
     particles: Tensor
     """Sorted positions with volumes 1 / rho, shape [B N, D + 1]; empty if not asked for."""
@@ -69,7 +69,7 @@ class Densities(NamedTuple):
 
 
 def portable_kernels(plan: KernelPlan, listed: bool = False) -> Any:
-    """Return the portable perception kernels of a plan."""
+    """Return the portable perception kernels for a plan; `listed`: that read neighbour lists."""
     terms = plan.physics.terms
     return perception_kernels(
         plan.space_dim,
@@ -90,11 +90,11 @@ def compute_densities(
     state_index: Tensor | None = None,
     with_particles: bool = True,
 ) -> Densities:
-    """Compute densities, and neighbour lists or the rows' density gradients for perception.
+    """Return densities, with neighbour lists (CUDA) or density gradients (elsewhere).
 
-    Neighbours are listed where `plan.lists_neighbours`, by default as in rollouts. `state_index`
-    has the index of each sorted particle's state, by default in order. `with_particles`: also
-    return `particles`, which the adjoint reads.
+    `listing` is the layout of the lists, by default that of rollouts. `state_index` has the index
+    of each sorted particle's state, by default in order. `with_particles`: also return `particles`,
+    which the adjoint reads.
     """
     if not plan.lists_neighbours:
         return compute_density_gradients(plan, ordered)
@@ -102,7 +102,8 @@ def compute_densities(
     positions = ordered.positions
     records = positions.new_empty(plan.total, 4)
     particles = positions.new_empty(plan.total if with_particles else 0, plan.space_dim + 1)
-    steps = positions.new_empty(listing.shape(plan.row_capacity), dtype=torch.int16)
+    list_shape = -(-plan.row_capacity // INTERLEAVED_LISTS), listing.capacity, INTERLEAVED_LISTS
+    steps = positions.new_empty(list_shape, dtype=torch.int16)
     lengths = positions.new_empty(plan.row_capacity, dtype=torch.int32)
     arrays = (
         ordered.starts,
@@ -142,7 +143,7 @@ def compute_densities(
 
 
 def compute_density_gradients(plan: KernelPlan, ordered: SortedWorlds) -> Densities:
-    """Compute densities, and density gradients of the particles that have rows."""
+    """Return densities of all particles, and density gradients of active ones, without lists."""
     positions = ordered.positions
     particles = positions.new_empty(plan.total, plan.space_dim + 1)
     density_gradient = positions.new_empty(plan.total, plan.space_dim, dtype=torch.float64)
@@ -176,14 +177,15 @@ def perception_launch(
     first_row: int = 0,
     row_count: int | None = None,
 ) -> tuple[Any, ...]:
-    """Return the arguments of a `launch` that writes the perception of all or some rows to `out`.
+    """Return the arguments of a `launch` that writes active particles' perception to `out`.
 
     Args:
         states: States in the caller's order, where `ordered` has none.
-        destination: Row of `out` for each row, int32, shape [K]; default: the same row.
+        destination: Row of `out` for each active particle, int32, shape [K]; default: its own.
         limit: Entries are clipped to plus and minus this; 0: not clipped.
-        row_kernel_sum: Output of the rows' sums of v K, shape [K, D], for the adjoint.
-        first_row: Row that is written to the first row of `out`, a multiple of `INTERLEAVED_LISTS`.
+        row_kernel_sum: Output: sums over neighbours of volume times kernel gradient, shape [K, D].
+        first_row: First active particle to write, a multiple of `INTERLEAVED_LISTS`.
+        row_count: Number of active particles to write, without gaps; None: all.
     """
     has_part = row_count is not None
     row_count = plan.row_capacity if row_count is None else row_count
@@ -267,7 +269,8 @@ class SavedPerception(NamedTuple):
     perception: Tensor
     """Rows of perception, dimensionless, shape [K, row_width]."""
     row_kernel_sum: Tensor
-    """Each row's sum of v K [1 / length units], shape [K, D]; undefined beyond active rows."""
+    """Sums over neighbours of volume times kernel gradient [1 / length units], shape [K, D];
+    undefined beyond the last active row."""
     row_of: Tensor
     """Row of each particle, -1 for none, int32, shape [B N]."""
     starts: Tensor
@@ -292,10 +295,11 @@ def perceive_rows_backward(
     masked: bool,
     physics: Physics,
 ) -> tuple[Tensor, Tensor]:
-    """Return the cotangents of states, [B N, C], and of positions, [B N, D] or empty.
+    """Return gradients with respect to states, [B N, C], and positions, [B N, D] or empty.
 
-    The tensors are those of a `SavedPerception`, and of `ListedNeighbours` if there are any.
-    Positions get a cotangent if states were saved.
+    `perception_bar` is that of perception, [K, row_width]. `saved_tensors` are a
+    `SavedPerception`, `listed` a `ListedNeighbours` or empty. Positions get a gradient if states
+    were saved.
     """
     saved = SavedPerception(*saved_tensors)
     total, space_dim = saved.particles.shape[0], saved.particles.shape[1] - 1
@@ -317,7 +321,7 @@ def perceive_rows_backward(
 def _gather_by_cells(
     plan: KernelPlan, saved: SavedPerception, listed: list[Tensor], bar: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Compute the cotangents with the portable kernels, particle by particle."""
+    """Return both gradients of `perceive_rows_backward`, with the portable kernels."""
     entries, space_dim, width = plan.row_capacity * plan.group_count, plan.space_dim, plan.width
     largest = entries * space_dim * width
     if largest >= MAX_INDEX:
@@ -398,7 +402,7 @@ def _gather_by_cells(
 
 
 def _gather_by_tiles(plan: KernelPlan, saved: SavedPerception, bar: Tensor) -> Tensor:
-    """Compute the cotangent of states, [B N, C], with the kernels for CUDA in float32."""
+    """Return the gradient with respect to states, [B N, C], with the CUDA kernels in float32."""
     state_gradient = plan.physics.terms.state_gradient
     kernels = listed_adjoint(
         plan.space_dim, plan.width, state_gradient, plan.periodic, plan.group_count > 1

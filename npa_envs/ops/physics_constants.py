@@ -27,7 +27,7 @@ Boundary = Literal["open", "periodic", "reflecting"]
 
 
 class Terms(NamedTuple):
-    """Which groups of entries a perception vector has; others are not computed."""
+    """Which gradients a perception vector has besides states and smoothed states."""
 
     state_gradient: bool = True
     moment_inverse: str | None = "threshold"
@@ -39,7 +39,7 @@ class Terms(NamedTuple):
         return self.moment_inverse if self.state_gradient else None
 
     def perception_dim(self, space_dim: int, state_dim: int) -> int:
-        """Length P of a perception vector with these groups."""
+        """Length P of a perception vector, for D space dimensions and C channels."""
         gradients = state_dim * space_dim * self.state_gradient
         return 2 * state_dim + gradients + space_dim * self.density_gradient
 
@@ -51,7 +51,7 @@ INVERSES = (None, "threshold", "smooth")
 
 
 class Limits(NamedTuple):
-    """Bounds on the worlds of environments; rollouts have no bounds."""
+    """Scale of actions and largest values in environments; rollouts have no limits."""
 
     state_scale: float = 1.0
     """State step of an action of 1, dimensionless."""
@@ -67,7 +67,7 @@ NO_LIMITS = Limits()
 
 
 class Physics(NamedTuple):
-    """The constants of worlds; `make_physics` makes and checks them."""
+    """Constants of worlds, such as radius, box and time step; `make_physics` makes them."""
 
     space_dim: int
     """Space dimension D."""
@@ -107,8 +107,8 @@ class Physics(NamedTuple):
         return self.state_dim + (self.space_dim if self.moving else 0)
 
     @classmethod
-    def of(cls, numbers: list[float]) -> Physics:
-        """Return what `numbers` packed: everything but limits and the sizes of tensors."""
+    def from_list(cls, numbers: list[float]) -> Physics:
+        """Return the constants in a list by `numbers`: all but limits, D and C."""
         count = len(NUMBER_FIELDS)
         state_gradient, inverse, density_gradient, moving, reflecting, *packed = numbers[count:]
         sides = tuple(packed) or None
@@ -124,7 +124,7 @@ class Physics(NamedTuple):
         )
 
     def numbers(self) -> list[float]:
-        """Pack this into a list for torch operators: numbers that compilers take for constants."""
+        """Return all but limits, D and C as a list of numbers, which torch operators can take."""
         state_gradient, inverse, density_gradient = self.terms
         reflecting = self.walls is not None
         flags = state_gradient, INVERSES.index(inverse), density_gradient, self.moving, reflecting
@@ -133,11 +133,11 @@ class Physics(NamedTuple):
         return [constant(number) for number in (*scalars, *map(float, flags), *sides)]
 
     def scale(self) -> float:
-        """Return c = eps / eps0."""
+        """Return c = eps / eps0, the factor on perceived gradients."""
         return constant(self.eps / self.eps0)
 
     def constants(self) -> Physics:
-        """Return the same with numbers that a compiler takes for constants."""
+        """Return a copy whose numbers torch.compile takes for constants."""
         if not torch.compiler.is_compiling():
             return self
         # Compilers lose fields that `_replace` or a default would fill in.
@@ -149,7 +149,7 @@ NUMBER_FIELDS = ("eps", "eps0", "max_displacement", "update_prob", "dt", "positi
 
 
 def _constants(value: Any) -> Any:
-    """Return the value of a field, with constants in place of numbers."""
+    """Return a field's value, in which torch.compile takes floats for constants."""
     if type(value) is tuple:
         return tuple([constant(side) for side in value])
     return constant(value) if type(value) is float else value
@@ -162,7 +162,7 @@ Arguments = ParamSpec("Arguments")
 
 
 def _cached(make: Callable[Arguments, Physics]) -> Callable[Arguments, Physics]:
-    """Return a function that remembers results of immutable arguments, except for compilers."""
+    """Cache a function's results by its arguments, unless one is mutable or torch compiles."""
     remembered = cast("Callable[Arguments, Physics]", functools.lru_cache(256, typed=True)(make))
 
     @functools.wraps(make)
@@ -191,10 +191,10 @@ def make_physics(
     dt: float = 1.0,
     position_noise: float = 0.0,
 ) -> Physics:
-    """Check the constants of worlds, and return them.
+    """Return the constants of worlds as a `Physics`, after checking them.
 
-    `eps0` is already checked, default: `eps`. `boundary` None is "periodic" if there is a box, else
-    "open". The largest displacement is α ε.
+    `eps0` is not checked; default: `eps`. `boundary` None is "periodic" if there is a box, else
+    "open". The largest displacement in a unit of time is `alpha` times `eps`.
     """
     if boundary is None:
         boundary = "open" if box is None else "periodic"

@@ -25,7 +25,7 @@ ON_DIVERGENCE = {"ignore": CONTINUE, "terminate": END, "reset": LIMIT_LOSS, "rai
 
 
 class EpisodeRules(NamedTuple):
-    """Settings of rewards and endings, the same in every step."""
+    """How losses become rewards, and when episodes end."""
 
     last_step: int | None
     """Step at which an episode is truncated, or None for never."""
@@ -38,19 +38,19 @@ class EpisodeRules(NamedTuple):
 
 
 class EpisodeUpdate:
-    """Computes rewards and endings of the same B worlds in each step, from their new losses.
+    """Computes rewards and endings of B worlds after each step, from their new losses.
 
     Args:
-        rules: Settings of rewards and endings.
         enabled: Whether a step was made, uint8, shape [1]; 0: nothing changes.
         diverged: Which worlds diverged in the step, uint8, shape [B].
         first_loss: Loss at the start of each episode, shape [B].
         success_loss: Loss at which each episode ends in success, shape [B].
         elapsed: Steps of each episode, int32, shape [B]; increased by 1.
-        numbers: Reward; loss; its K parts; their improvements; float32, shape [2 + 2 K, B]. Losses
-            and parts are those of the step before; all become those of this step.
+        numbers: Reward; loss; its K terms; their decreases; float32, shape [2 + 2 K, B]. Losses
+            and terms of the step before are read; all become those of this step.
         flags: Terminated; truncated; success; diverged; bool, shape [4, B]; written.
-        endings: Bits of each world, then `enabled`, uint8, shape [B + 1]; written.
+        endings: Bits of each world, such as `SUCCESS`, then `enabled`, uint8, shape [B + 1];
+            written.
     """
 
     def __init__(
@@ -75,8 +75,8 @@ class EpisodeUpdate:
         """Compute this step's rewards and endings.
 
         Args:
-            parts: Parts of each world's loss, whose sum it is, float32, contiguous, shape [K, B].
-            broken: Worlds with another loss that is not finite, uint8, shape [B]; read with
+            parts: Terms whose sum is each world's loss, float32, contiguous, shape [K, B].
+            broken: Whether another loss of a world is not finite, uint8, shape [B]; read with
                 `on_divergence="ignore"` only.
         """
         elapsed, numbers, flags, endings = self._written

@@ -40,7 +40,7 @@ MIN_SLICE = 128
 
 
 class KernelPlan(NamedTuple):
-    """Variant, sizes and domain of an operator call; none depends on values of tensors."""
+    """Sizes, constants and cell grid of an operator call; none depends on values of tensors."""
 
     scalar: Any
     width: int
@@ -61,7 +61,7 @@ class KernelPlan(NamedTuple):
     def runs(
         self, operator: Operator, *, aligned: bool = True, position_gradient: bool = False
     ) -> str:
-        """Return the name of the implementation that runs an operator."""
+        """Return the name of the implementation in the backend table that runs an operator."""
         request = self.request
         if not aligned or position_gradient:
             request = request._replace(aligned=aligned, position_gradient=position_gradient)
@@ -84,37 +84,37 @@ class KernelPlan(NamedTuple):
 
     @property
     def total(self) -> int:
-        """Particles of all worlds, B N."""
+        """Number of particles of all worlds, B N."""
         return self.world_count * self.particle_count
 
     @property
     def group_count(self) -> int:
-        """Channel groups of a particle."""
+        """Number of groups of `width` channels that a particle's states are split into."""
         return -(-self.state_dim // self.width)
 
     @property
     def cell_total(self) -> int:
-        """Cells of all worlds."""
+        """Number of cells of all worlds."""
         return self.world_count * int(self.domain.cell_count)
 
     @property
     def active_offset(self) -> int:
-        """Index in `starts` at which the starts of active rows begin."""
+        """Index in `SortedWorlds.starts` of the first entry that counts active particles."""
         return self.cell_total if self.masked else 0
 
     @property
     def start_count(self) -> int:
-        """Length of `starts`: an entry a cell, with a mask another for its rows, and the end."""
+        """Length of `SortedWorlds.starts`: one or, with a mask, two entries a cell, and the end."""
         return self.cell_total + self.active_offset + 1
 
     @property
     def row_base(self) -> int:
-        """Offset of the entries for active rows in `starts`: entry minus offset is a row."""
+        """Value of `SortedWorlds.starts` for row 0: an entry minus this is a row."""
         return self.total if self.masked else 0
 
     @property
     def row_numbers(self) -> tuple[int, int, int]:
-        """What kernels need to give active particles rows: offset, base and capacity."""
+        """`active_offset`, `row_base` and `row_capacity`, in the order of kernels' arguments."""
         return self.active_offset, self.row_base, self.row_capacity
 
     @property
@@ -124,7 +124,7 @@ class KernelPlan(NamedTuple):
 
 
 class SortedWorlds(NamedTuple):
-    """Particles in the order world, cell, index; the active ones have rows in the same order."""
+    """Particles sorted by world, cell and index; active ones have rows 0 to K - 1 in this order."""
 
     starts: Tensor
     """First sorted index of every cell, then first row of every cell (plus `row_base`), int32."""
@@ -154,9 +154,10 @@ def plan_kernels(
     masked: bool,
     physics: Physics,
 ) -> KernelPlan:
-    """Return the plan of a call on positions of shape [B, N, D] and `state_dim` channels.
+    """Return the `KernelPlan` of a call on positions of shape [B, N, D] and `state_dim` channels.
 
-    `like` is any tensor with the worlds' dtype and device.
+    `like` has the worlds' dtype and device; `row_capacity` is the largest number of active
+    particles in all worlds together.
     """
     # As integers: symbolic sizes of torch.compile become constants, and other sizes recompile.
     world_count, particle_count, space_dim = (int(size) for size in shape)
@@ -206,24 +207,28 @@ def mean_neighbours(particle_count: int, eps: float, box: Sequence[float] | None
 
 
 def sorts_at_once(world_count: int, particle_count: int) -> bool:
-    """Return whether a CPU sorts small worlds in one launch with any mask."""
+    """Return whether one launch on a CPU sorts small worlds, whether there is a mask or not."""
     return world_count * world_count * particle_count <= MAX_THREAD_MASK
 
 
 def sort_worlds(
     plan: KernelPlan, x: Tensor, s: Tensor | None, mask: Tensor | None, *, with_rows: bool = True
 ) -> SortedWorlds:
-    """Sort contiguous worlds into cells; particles in `mask` (uint8, [B, N]) get rows.
+    """Return worlds sorted into cells; active particles (`mask`, uint8, [B, N]) get rows.
 
-    States are empty without `s`, all tensors of rows without `with_rows`.
+    Inputs are contiguous. Without `s` the sorted states are empty, without `with_rows` all tensors
+    of rows.
     """
     # Mask entries that are read if each world counts the rows of earlier worlds.
     earlier = plan.world_count * plan.total if plan.masked else 0
     capacity = 0 if earlier > MAX_MASK else block_capacity(plan.request, x, s, mask)
+    ordered = _empty_worlds(plan, x, s is not None, with_rows)
     if capacity:
-        return _sort_by_blocks(plan, capacity, x, s, mask, with_rows)
+        _sort_by_blocks(plan, capacity, x, s, mask, ordered)
+        return ordered
     if plan.runs("sort") == "world" and earlier <= MAX_THREAD_MASK:
-        return _sort_by_threads(plan, x, s, mask, with_rows)
+        _sort_by_threads(plan, x, s, mask, ordered)
+        return ordered
     assert not is_recorded(), "a tape would miss torch's operations between these launches"
     kernels = sort_kernels(plan.space_dim, plan.scalar, plan.width)
     device, total = x.device, plan.total
@@ -243,10 +248,9 @@ def sort_worlds(
         arrival,
         counts,
     )
-    starts = torch.cumsum(counts, 0, dtype=torch.int32)
-    launch(kernels.place_by_arrival, total, device, mask, cell, arrival, starts, arrived)
+    torch.cumsum(counts, 0, dtype=torch.int32, out=ordered.starts)
+    launch(kernels.place_by_arrival, total, device, mask, cell, arrival, ordered.starts, arrived)
 
-    ordered = _empty_worlds(plan, x, s is not None, with_rows, starts)
     on_cuda = plan.runs("sort", aligned=False) == "cuda"
     # Channels that a thread reads and writes at once where they are aligned.
     together = plan.width // CUDA_LANES if on_cuda else plan.width
@@ -268,16 +272,14 @@ def sort_worlds(
     return ordered
 
 
-def _empty_worlds(
-    plan: KernelPlan, x: Tensor, with_states: bool, with_rows: bool, starts: Tensor | None = None
-) -> SortedWorlds:
-    """Return tensors for sorted worlds, not written yet, except for `starts` if given."""
+def _empty_worlds(plan: KernelPlan, x: Tensor, with_states: bool, with_rows: bool) -> SortedWorlds:
+    """Return uninitialised tensors for sorted worlds."""
     total = plan.total
     source, cell = torch.empty(2, total, dtype=torch.int32, device=x.device).unbind()
     row_capacity = plan.row_capacity if with_rows else 0
     row_source = source.new_empty(row_capacity)
     return SortedWorlds(
-        starts=source.new_empty(plan.start_count) if starts is None else starts,
+        starts=source.new_empty(plan.start_count),
         source=source,
         cell=cell,
         row_of=source.new_empty(total if with_rows else 0),
@@ -290,7 +292,7 @@ def _empty_worlds(
 
 
 def block_capacity(request: KernelRequest, *tensors: Tensor | None) -> int:
-    """Return the capacity in particles of the CUDA block that sorts such worlds; 0 for none."""
+    """Return for how many particles the CUDA block that sorts a world is made; 0: there is none."""
     aligned = all(tensor is None or is_aligned(tensor) for tensor in tensors)
     if choose("sort", request._replace(aligned=aligned)).name != "block":
         return 0
@@ -298,16 +300,15 @@ def block_capacity(request: KernelRequest, *tensors: Tensor | None) -> int:
 
 
 def slice_count(device: torch.device, world_count: int, particle_count: int) -> int:
-    """Return into how many slices to split each world: 1 unless worlds are too few for the GPU."""
+    """Return into how many slices to split each world, so that few worlds fill a GPU too."""
     idle = multiprocessor_count(device) // world_count
     return max(min(idle, particle_count // MIN_SLICE), 1)
 
 
 def _sort_by_threads(
-    plan: KernelPlan, x: Tensor, s: Tensor | None, mask: Tensor | None, with_rows: bool
-) -> SortedWorlds:
-    """Sort small worlds on a CPU in one launch, a thread each."""
-    ordered = _empty_worlds(plan, x, s is not None, with_rows)
+    plan: KernelPlan, x: Tensor, s: Tensor | None, mask: Tensor | None, ordered: SortedWorlds
+) -> None:
+    """Write small worlds on a CPU to `ordered` in one launch, one thread for each world."""
     launch(
         sort_kernels(plan.space_dim, plan.scalar, plan.width).sort_worlds,
         plan.world_count,
@@ -324,7 +325,6 @@ def _sort_by_threads(
         torch.empty_like(ordered.source),
         *ordered,
     )
-    return ordered
 
 
 def _sort_by_blocks(
@@ -333,10 +333,9 @@ def _sort_by_blocks(
     x: Tensor,
     s: Tensor | None,
     mask: Tensor | None,
-    with_rows: bool,
-) -> SortedWorlds:
-    """Sort small worlds on CUDA in one launch, a block each."""
-    ordered = _empty_worlds(plan, x, s is not None, with_rows)
+    ordered: SortedWorlds,
+) -> None:
+    """Write small worlds on CUDA to `ordered` in one launch, one block for each slice."""
     slices = slice_count(x.device, plan.world_count, plan.particle_count)
     block = BLOCKS[capacity]
     launch(
@@ -356,4 +355,3 @@ def _sort_by_blocks(
         *ordered,
         block_dim=block,
     )
-    return ordered

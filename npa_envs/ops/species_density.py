@@ -30,7 +30,7 @@ MAX_SPECIES = 64
 
 
 class SpeciesFields(NamedTuple):
-    """The unscaled fields of each species at every particle."""
+    """The unscaled density of each species and its gradient at every particle."""
 
     rho: Tensor
     """Density of each species [1 / length^D], shape [B, N, K]; they sum to the density."""
@@ -65,7 +65,7 @@ def checked_counts(counts: Sequence[int], particle_count: int) -> tuple[int, ...
 def _gather_species(
     x: Tensor, counts: list[int], physics: Physics, scaled: bool
 ) -> tuple[Tensor, Tensor]:
-    """Return densities and density gradients of species; `scaled`: as rules perceive them."""
+    """Return densities [B, N, K] and their gradients [B, N, K, D]; `scaled`: as in perception."""
     world_count, particle_count, space_dim = map(int, x.shape)
     plan = plan_kernels(x, x.shape, 1, world_count * particle_count, False, physics)
     ordered = sort_worlds(plan, x, None, None, with_rows=False)
@@ -116,8 +116,8 @@ def species_fields(
 
     Args:
         x: Particle positions [length units], shape [B, N, D], species after species.
-        counts: Particles of each species, K numbers that sum to N: species k owns `counts[k]`
-            consecutive ones.
+        counts: Particles of each species, K numbers that sum to N: species k is the next
+            `counts[k]` particles.
         eps: Perception radius [length units].
         box: Sides of a periodic box centred on the origin [length units], or None for open space.
 

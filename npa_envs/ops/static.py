@@ -29,7 +29,7 @@ MAX_LISTS = 2**31
 
 
 class StaticWorlds(NamedTuple):
-    """Sorted worlds with fixed positions, ready for perception; `prepare_static` makes them."""
+    """Sorted worlds whose particles do not move, with densities; made by `prepare_static`."""
 
     source: Tensor
     """Caller's index of each sorted particle, int32, shape [B N]."""
@@ -49,25 +49,25 @@ class StaticWorlds(NamedTuple):
     """For the CUDA backend steps, lengths and records of `NeighbourLists`; on a CPU the tensors of
     `ListedNeighbours`; empty elsewhere."""
 
-    def flat(self) -> list[Tensor]:
+    def to_list(self) -> list[Tensor]:
         """Return all tensors in one list, for torch operators."""
         return [*self[:-1], *self.lists]
 
     @property
     def listed(self) -> ListedNeighbours | None:
-        """The neighbours for the portable kernels, or None if they were not listed."""
+        """Neighbour lists for the portable kernels; None if there are none."""
         return ListedNeighbours(*self.lists) if len(self.lists) == 2 else None
 
     @classmethod
-    def of(cls, tensors: list[Tensor]) -> StaticWorlds:
-        """Return the worlds of a list by `flat`."""
+    def from_list(cls, tensors: list[Tensor]) -> StaticWorlds:
+        """Return the worlds from a list by `to_list`."""
         count = len(cls._fields) - 1
         return cls._make([*tensors[:count], tensors[count:]])
 
 
 @custom_op("npa::prepare_static")
 def _prepare_static(x: Tensor, state_dim: int, physics: Physics) -> list[Tensor]:
-    """Return the tensors of a `StaticWorlds`, as `flat`."""
+    """Return the result of `prepare_static` as a list, by `StaticWorlds.to_list`."""
     total = x.shape[0] * x.shape[1]
     plan = plan_kernels(x, x.shape, state_dim, total, False, physics)
     ordered = sort_worlds(plan, x, None, None)
@@ -87,11 +87,11 @@ def _prepare_static(x: Tensor, state_dim: int, physics: Physics) -> list[Tensor]
         particles=densities.particles,
         density_gradient=densities.density_gradient,
         lists=lists,
-    ).flat()
+    ).to_list()
 
 
 def _list_neighbours(plan: KernelPlan, starts: Tensor, particles: Tensor) -> list[Tensor]:
-    """List the neighbours of each particle on a CPU, where reading their number does not wait."""
+    """Return the tensors of `ListedNeighbours`, on a CPU; empty if they take too much memory."""
     kernels = density_kernels(plan.space_dim, plan.scalar, plan.on_cpu)
     common = plan.total, particles.device, plan.domain, plan.particle_count, starts, particles
     counts = starts.new_empty(plan.total)
@@ -108,12 +108,14 @@ def _list_neighbours(plan: KernelPlan, starts: Tensor, particles: Tensor) -> lis
 
 
 def prepare_static(x: Tensor, physics: Physics) -> StaticWorlds:
-    """Return checked worlds, whose particles do not move, sorted by cell; not differentiable."""
-    return StaticWorlds.of(_prepare_static(x.detach().contiguous(), physics.state_dim, physics))
+    """Return `StaticWorlds` at positions x, which are not checked; not differentiable."""
+    return StaticWorlds.from_list(
+        _prepare_static(x.detach().contiguous(), physics.state_dim, physics)
+    )
 
 
 class StaticRows(NamedTuple):
-    """Maps between sorted particles and the rows of one step."""
+    """Which particles of static worlds are active in one step, and their rows of perception."""
 
     row_of: Tensor
     """Row of each sorted particle, -1 for none, int32, shape [B N]."""
@@ -129,7 +131,7 @@ class StaticRows(NamedTuple):
 def _static_rows(
     x: Tensor, masks: Tensor, source: Tensor, cell_starts: Tensor, row_capacity: int
 ) -> list[Tensor]:
-    """Return the tensors of `StaticRows` for all steps, and the active particles of each step."""
+    """Return `StaticRows` of all steps, stacked, and the number of active particles of each."""
     step_count, total, space_dim = masks.shape[0], source.shape[0], int(x.shape[2])
     active = masks.view(step_count, total).index_select(1, source)
     # One sum over all steps: torch is fastest on one long row.
@@ -157,10 +159,10 @@ def _static_rows(
 def static_rows(
     worlds: StaticWorlds, x: Tensor, masks: list[Tensor], row_capacity: int
 ) -> list[StaticRows]:
-    """Assign rows to the active particles of several steps, all steps at once.
+    """Return for each of several steps the rows of its active particles.
 
-    Masks are in the caller's order. On CUDA a step has `row_capacity` rows, and active particles
-    beyond them get none; on a CPU it has a row for each active particle, at least one.
+    Masks, [B, N], are in the caller's order. On CUDA a step has `row_capacity` rows, and further
+    active particles get none; on a CPU it has a row for each active particle, at least one.
     """
     if not x.is_cuda:
         row_capacity = x.shape[0] * x.shape[1]
@@ -178,15 +180,10 @@ def static_rows(
     ]
 
 
-def all_rows(worlds: StaticWorlds, x: Tensor) -> StaticRows:
-    """Return the rows of a step in which all particles of worlds at x are active."""
-    return StaticRows(worlds.all_indices, worlds.all_indices, worlds.starts, x.flatten(0, 1))
-
-
 def static_worlds(
     plan: KernelPlan, worlds: StaticWorlds, rows: StaticRows, x: Tensor, s: Tensor
 ) -> tuple[SortedWorlds, Densities]:
-    """Return the sorted worlds and densities that a step's perception pass reads."""
+    """Return what the perception pass of a step reads: sorted worlds and densities."""
     lists = None
     if plan.lists_neighbours:
         steps, lengths, records = worlds.lists

@@ -31,7 +31,7 @@ from npa_envs.ops.sort import MAX_INDEX
 
 
 def _threads_for(count: int) -> int:
-    """Return the number of threads that share `count` channels."""
+    """Return how many threads update `count` channels of a particle."""
     return -(-count // THREAD_CHANNELS)
 
 
@@ -127,7 +127,7 @@ def _update_particles_backward(
 
 
 class _UpdateParticles(torch.autograd.Function):
-    """Positions, states and path lengths after one update of the active particles."""
+    """Autograd function of `update_particles`."""
 
     @staticmethod
     def forward(
@@ -157,7 +157,7 @@ class _UpdateParticles(torch.autograd.Function):
 def _before_reflection(
     physics: Physics, update: Tensor, x: Tensor, row_of: Tensor, x_bar: Tensor, *others: Tensor
 ) -> tuple[Tensor, ...]:
-    """Return cotangents of the update's results before its positions are reflected by walls."""
+    """Return the outputs' gradients, that of positions mirrored where walls reflected them."""
     assert physics.walls is not None
     # Positions do not depend on states and paths: any tensors of their shapes will do.
     s_bar, path_bar = (bar.contiguous() for bar in others)
@@ -170,7 +170,7 @@ def update_particles(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return positions, states and path lengths after a rule's updates of the active particles.
 
-    `update` is [δ (D) ; Δs (C)] for each row, shape [K, A]; further columns are not read.
+    `update` has a row [δ (D) ; Δs (C)] for each, shape [K, A]; further columns are not read.
     """
     x, s = x.contiguous(), s.contiguous()
     tensors = (update, x, s, path_length)
@@ -181,7 +181,7 @@ def update_particles(
 
 
 def _images(x: Tensor, sides: tuple[float, ...]) -> Tensor:
-    """Return the integer index of the image of the box in which each coordinate lies."""
+    """Return in which periodic image of the box each coordinate lies; 0 is the box itself."""
     images = [torch.floor(x.detach()[..., d] / side + 0.5) for d, side in enumerate(sides)]
     return torch.stack(images, dim=-1)
 
@@ -206,7 +206,7 @@ def bounded(x: Tensor, physics: Physics) -> Tensor:
 
 
 class ActedWorlds(NamedTuple):
-    """Worlds that actions change in place, and the other tensors of a step."""
+    """Worlds that actions change in place, and the other tensors of `apply_actions`."""
 
     x: Tensor
     """Positions [length units], shape [B, N, D]."""
@@ -222,7 +222,7 @@ class ActedWorlds(NamedTuple):
     """Set to 1 for worlds that diverged, uint8, shape [B]."""
 
     def check(self, action: Tensor, physics: Physics) -> None:
-        """Check shapes, dtypes, devices and strides."""
+        """Check shapes, dtypes, devices and strides of the worlds and of actions."""
         x, s = self.x, self.s
         check_world(x, s)
         check_derivatives(action=action, x=x, s=s, noise=self.noise)
@@ -257,7 +257,10 @@ class ActedWorlds(NamedTuple):
             )
 
     def launch_of(self, action: Tensor, physics: Physics, aligned: bool) -> tuple[Any, ...]:
-        """Return the arguments of `launch`; `aligned`: states and actions are, to 16 bytes."""
+        """Return the arguments of the `launch` that applies actions.
+
+        `aligned`: states and actions begin at multiples of 16 bytes in memory.
+        """
         x, s, mask, noise, enabled, diverged = self
         world_count, particle_count, space_dim = x.shape
         state_dim = s.shape[2]
@@ -345,7 +348,7 @@ class PreparedActions:
             self.apply_loaded()
 
     def load(self, action: Tensor) -> None:
-        """Copy actions, as for `__call__`, into the buffer that `apply_loaded` reads."""
+        """Copy actions of any dtype and device into the buffer that `apply_loaded` reads."""
         buffer = self._buffer
         if action.shape != buffer.shape:
             raise NPAError(

@@ -13,7 +13,7 @@ from npa_envs.devices import check_device
 from npa_envs.errors import NPAError, shown
 from npa_envs.ops.backend import SHARED_WORLD
 from npa_envs.ops.draws import draw
-from npa_envs.ops.equivariance import MIXED_VECTORS, VectorForm, read_rows, steer_rows
+from npa_envs.ops.equivariance import MIXED_VECTORS, VectorSizes, read_rows, steer_rows
 from npa_envs.ops.network import arrange_weights, run_network
 from npa_envs.ops.perceive import build_neighbours, perceive, perceive_rows
 from npa_envs.ops.physics_constants import Limits, Physics
@@ -34,7 +34,7 @@ def warmup(
     dtypes: Iterable[torch.dtype] = (torch.float32,),
     state_dim: int = 16,
 ) -> None:
-    """Compile and load every kernel that worlds of these kinds need; cached on disk by Warp.
+    """Compile and load all kernels for these dimensions, dtypes and channels; Warp caches them.
 
     Args:
         device: Device to compile for.
@@ -109,7 +109,7 @@ def _warm_rewards(elapsed: torch.Tensor) -> None:
 
 
 def _warm_steps(x: torch.Tensor, s: torch.Tensor, physics: Physics) -> None:
-    """Run perception and update as in rollouts, of all particles and of those in a mask."""
+    """Run perception and update of rollouts, with and without a mask and gradients."""
     count, width = x.shape[1], physics.perception_dim + 1
     all_active = torch.ones(x.shape[:2], dtype=torch.uint8, device=x.device)
     for mask, gradients in itertools.product((None, all_active), (False, True)):
@@ -123,7 +123,7 @@ def _warm_steps(x: torch.Tensor, s: torch.Tensor, physics: Physics) -> None:
 
 
 def _warm_static(x: torch.Tensor, s: torch.Tensor, physics: Physics) -> None:
-    """Run perception of static worlds, of all particles and of those in a mask."""
+    """Run perception of static worlds, with and without a mask."""
     static = prepare_static(x, physics)
     mask = torch.ones(x.shape[:2], dtype=torch.uint8, device=x.device)
     size = {"row_capacity": x.shape[1], "row_width": physics.perception_dim + 1}
@@ -133,7 +133,7 @@ def _warm_static(x: torch.Tensor, s: torch.Tensor, physics: Physics) -> None:
 
 
 def _warm_network(x: torch.Tensor, physics: Physics) -> None:
-    """Run the fused network where it supports the sizes, with and without displacements."""
+    """Run the network's kernels if there are any, with and without displacements."""
     width = physics.perception_dim + 1
     for out in (physics.action_dim, physics.state_dim):
         shapes = (1, width + -width % 4), (128, width + -width % 4), (out + -out % 4, 128)
@@ -149,19 +149,19 @@ def _warm_network(x: torch.Tensor, physics: Physics) -> None:
 
 
 def _warm_invariants(x: torch.Tensor, state_dim: int) -> None:
-    """Run the vector kernels of equivariant rules."""
+    """Run the kernels of equivariant rules' vectors."""
     space_dim = x.shape[2]
     for chiral in (False, True)[: 4 - space_dim]:
-        form = VectorForm(space_dim, 2 * state_dim, state_dim + 1, MIXED_VECTORS, chiral)
-        rows = x.new_zeros(1, form.perception_dim + 1).requires_grad_()
-        mixing = x.new_zeros(form.perceived, form.mixed).requires_grad_()
-        mixed, inputs = read_rows(rows, mixing, form, form.input_dim + 1)
-        signs = x.new_ones(form.gate_count)
-        _pull_back(steer_rows(inputs, mixed, signs, form.input_dim))
+        sizes = VectorSizes(space_dim, 2 * state_dim, state_dim + 1, MIXED_VECTORS, chiral)
+        rows = x.new_zeros(1, sizes.perception_dim + 1).requires_grad_()
+        mixing = x.new_zeros(sizes.perceived, sizes.mixed).requires_grad_()
+        mixed, inputs = read_rows(rows, mixing, sizes, sizes.input_dim + 1)
+        signs = x.new_ones(sizes.gate_count)
+        _pull_back(steer_rows(inputs, mixed, signs, sizes.input_dim))
 
 
 def _warm_views(x: torch.Tensor) -> None:
-    """Draw worlds, and meshes as targets, by cameras."""
+    """Run the kernels that draw 3D worlds and meshes."""
     cameras = orbit(1, width=16, height=16)
     scales, colours = x.new_ones(x.shape), x.new_zeros(*x.shape[:2], 4, 3)
     quaternions = x.new_ones(*x.shape[:2], 4)

@@ -18,7 +18,7 @@ from npa_envs.ops.launch import SCALARS, launch
 
 
 def average_sums(partial_sums: Tensor, value_count: int, like: Tensor) -> Tensor:
-    """Return means [B, K] from partial sums [B, L, K]; the order of summation depends only on L."""
+    """Return means [B, K] of `value_count` values from L partial sums each, [B, L, K]."""
     world_count, _, width = partial_sums.shape
     lanes = _lanes(like.device)
     kernels = mean_kernels(SCALARS[like.dtype], lanes)

@@ -122,9 +122,9 @@ _RGB_FROM_LMS = (
 
 
 def density_colours(density: Tensor, background: tuple[float, float, float]) -> NDArray[np.uint8]:
-    """Return the ramp's colours, [..., 3], of finite densities [...] of 0 or more (dimensionless).
+    """Return colours, uint8, [..., 3], of finite densities [...] of 0 or more (dimensionless).
 
-    Density 0 is the background, 1 the middle of the ramp; larger densities tend to its end.
+    Density 0 is the background, 1 the middle of `ramp`; larger densities tend to its end.
     """
     position = 1.0 - torch.exp2(-density.clamp(min=0.0))
     entry = (position * (RAMP_LENGTH - 1)).round().to(torch.int32).cpu().numpy()
@@ -134,7 +134,7 @@ def density_colours(density: Tensor, background: tuple[float, float, float]) -> 
 
 @functools.lru_cache(maxsize=16)
 def ramp(background: tuple[float, float, float]) -> NDArray[np.uint8]:
-    """Return `RAMP_LENGTH` colours in even steps, from the background to the last stop."""
+    """Return the colour ramp of densities, uint8, [RAMP_LENGTH, 3], from the background on."""
     stops = [[int(stop[k : k + 2], 16) / 255 for k in (1, 3, 5)] for stop in RAMP_STOPS]
     first = oklab(torch.tensor([background], dtype=torch.float64))
     if first[0, 0] > LIGHT_BACKGROUND:
@@ -154,29 +154,26 @@ def state_colours(hidden: Tensor) -> Tensor:
 
     Each channel adds its own hue and lightness; negative values the opposite ones. Zeros are grey.
     """
-    count = hidden.shape[-1]
-    pull = []
-    for part in range(3):
-        total = hidden.new_zeros(hidden.shape[:-1])
-        # In a fixed order: that of a matrix product depends on the device and on B.
-        for channel in range(count):
-            angle = channel * GOLDEN_ANGLE
-            weight = (math.cos(1.5 * angle + 1.0), math.cos(angle), math.sin(angle))[part]
-            total = total + weight * hidden[..., channel]
-        pull.append(torch.tanh(total * (STATE_GAIN / math.sqrt(max(count, 1)))))
+    zeros = hidden.new_zeros(hidden.shape[:-1])
+    angles = [channel * GOLDEN_ANGLE for channel in range(hidden.shape[-1])]
+    weights = [(math.cos(1.5 * a + 1.0), math.cos(a), math.sin(a)) for a in angles]
+    # In a fixed order: that of a matrix product depends on the device and on B.
+    terms = [[w[k] * hidden[..., c] for c, w in enumerate(weights)] for k in range(3)]
+    gain = STATE_GAIN / math.sqrt(max(len(angles), 1))
+    pull = [torch.tanh(sum(part, zeros) * gain) for part in terms]
     middle, swing = STATE_LIGHTNESS
     lab = (middle + swing * pull[0], STATE_CHROMA * pull[1], STATE_CHROMA * pull[2])
     return srgb(torch.stack(lab, dim=-1))
 
 
 def oklab(rgb: Tensor) -> Tensor:
-    """Return OKLab lightness, a and b of sRGB colours in [0, 1], shape [..., 3]."""
+    """Return OKLab coordinates (L, a, b), [..., 3], of sRGB colours in [0, 1]."""
     linear = torch.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
     return _mix(_mix(linear, _LMS_FROM_RGB).pow(1.0 / 3.0), _LAB_FROM_ROOTS)
 
 
 def srgb(lab: Tensor) -> Tensor:
-    """Return sRGB colours, clipped to [0, 1], of OKLab lightness, a and b, shape [..., 3]."""
+    """Return sRGB colours, clipped to [0, 1], [..., 3], of OKLab coordinates (L, a, b)."""
     linear = _mix(_mix(lab, _ROOTS_FROM_LAB).pow(3.0), _RGB_FROM_LMS).clamp(0.0, 1.0)
     curved = 1.055 * linear.clamp(min=0.0031308).pow(1.0 / 2.4) - 0.055
     return torch.where(linear <= 0.0031308, 12.92 * linear, curved)

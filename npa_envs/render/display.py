@@ -53,7 +53,7 @@ class Shown:
         return f"{what} of {width} × {height} pixels"
 
     def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> dict[str, Any]:
-        """Return a JPEG, which is smaller than a PNG, or a WebP film in HTML."""
+        """Return what notebooks display: a JPEG (smaller than a PNG), or a WebP film in HTML."""
         bundle: dict[str, Any] = {"text/plain": repr(self)}
         if len(self.frames) == 1:
             picture = encode_frame(self.frames[0], "JPEG")
@@ -115,7 +115,7 @@ def side_by_side(pictures: NDArray[np.uint8]) -> Frame:
 
 
 def _spacing(x: Tensor) -> float:
-    """Return an estimate of the distance between particles, by the area of the first world."""
+    """Return an estimate of the distance between particles, from the area they cover."""
     points = x[0].detach().double()
     points = points[points.isfinite().all(dim=-1)]
     if not len(points):
@@ -124,8 +124,7 @@ def _spacing(x: Tensor) -> float:
     extent = (points.amax(dim=0) - points.amin(dim=0)).clamp(min=1e-6)
     side = (float(extent.prod()) * _CELL_PARTICLES / count) ** (1.0 / space_dim)
     filled = len(torch.unique(torch.floor(points / side), dim=0))
-    spacing: float = (filled / count) ** (1.0 / space_dim) * side
-    return max(spacing, 1e-6)
+    return max(float((filled / count) ** (1.0 / space_dim) * side), 1e-6)
 
 
 # A window on the screen, which needs pygame.

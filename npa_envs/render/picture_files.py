@@ -43,7 +43,7 @@ def encode_frame(frame: Frame, kind: Literal["PNG", "JPEG"]) -> bytes:
 
 
 def _encoded(frames: Iterable[Frame], **options: Any) -> bytes:
-    """Return the file that Pillow encodes pictures to, as bytes."""
+    """Return the bytes of a file of pictures, encoded by Pillow."""
     first, *others = map(Image.fromarray, checked_frames(frames))
     buffer = io.BytesIO()
     first.save(buffer, append_images=others, **options)
@@ -107,13 +107,12 @@ def write_webp(
 
 def encode_webp(frames: Iterable[Frame], fps: float = 25, *, quality: int = 50) -> bytes:
     """Return the file that `write_webp` writes, as bytes."""
-    pictures = checked_frames(frames)
     check_rate(fps)
     if not (is_real(quality) and 0 <= quality <= 100):
         raise NPAError(f"quality must be in [0, 100], got {shown(quality)}: try 50")
     duration = round(1000 / fps)
     return _encoded(
-        pictures, format="WebP", save_all=True, duration=duration, loop=0, quality=quality, method=4
+        frames, format="WebP", save_all=True, duration=duration, loop=0, quality=quality, method=4
     )
 
 
@@ -184,7 +183,10 @@ def write_filmstrip(
     check_count("columns", across, ": try 4")
     across = min(across, count)
     height, width, _ = pictures[0].shape
-    font = _caption_font(texts, width)
+    # The largest font with which no caption is wider than a frame.
+    fonts = map(ImageFont.load_default, range(max(12, min(28, width // 12)), 10, -1))
+    fitting = (font for font in fonts if all(font.getlength(text) <= width for text in texts))
+    font = next(fitting, None) or ImageFont.load_default(10)
     _, top, _, bottom = font.getbbox("Ågjy")
     text_height = math.ceil(bottom - top) + _MARGIN if texts else 0
     cell = max([width, *(math.ceil(font.getlength(text)) for text in texts)])
@@ -227,7 +229,6 @@ def checked_frames(frames: Iterable[Frame]) -> list[Frame]:
         raise NPAError(
             "frames must hold at least one picture, got none: give uint8 [H, W, 3] arrays"
         )
-    first = pictures[0].shape
     for k, picture in enumerate(pictures):
         is_picture = picture.ndim == 3 and picture.shape[-1] == 3 and picture.size > 0
         if picture.dtype != np.uint8 or not is_picture:
@@ -236,16 +237,16 @@ def checked_frames(frames: Iterable[Frame]) -> list[Frame]:
                 f"{name} must be uint8 of shape [H, W, 3] and a size that is not zero, got "
                 f"{picture.dtype} {picture.shape}: make frames with npa_envs.render.to_uint8"
             )
-        if picture.shape != first:
+        if picture.shape != pictures[0].shape:
             raise NPAError(
-                f"frames must all have one size, got {first} and frame {k} of {picture.shape}: "
-                "render them at one resolution"
+                f"frames must all have one size, got {pictures[0].shape} and frame {k} of "
+                f"{picture.shape}: render them at one resolution"
             )
     return pictures
 
 
 def _shared_palette(pictures: list[Frame]) -> tuple[Image.Image, Frame, int]:
-    """Return a palette for all frames, the most frequent colour, and its index."""
+    """Return a palette for all frames, the most frequent colour, and its index in the palette."""
     step = max(1, math.ceil(sum(p.size // 3 for p in pictures) / _PALETTE_SAMPLE))
     sample = np.concatenate([p.reshape(-1, 3)[k % step :: step] for k, p in enumerate(pictures)])
     _, which, counts = np.unique(
@@ -266,16 +267,6 @@ def _shared_palette(pictures: list[Frame]) -> tuple[Image.Image, Frame, int]:
     return palette, background, entry
 
 
-def _caption_font(
-    captions: Sequence[str], width: int
-) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
-    for size in range(max(12, min(28, width // 12)), 10, -1):
-        font = ImageFont.load_default(size)
-        if all(font.getlength(caption) <= width for caption in captions):
-            return font
-    return ImageFont.load_default(10)
-
-
 def turntable_frames(
     views: Callable[[Cameras], Tensor],
     *,
@@ -290,7 +281,7 @@ def turntable_frames(
 
     Args:
         views: Returns pictures of V cameras: colours times alpha, and alpha, [1, V, H, W, 4].
-        frame_count: Pictures of one turn.
+        frame_count: Number of pictures in one turn.
         resolution: Pixels along each side.
         elevation: Angle of the cameras above the horizon [degrees].
         azimuth: Angle of the first camera around the vertical axis [degrees].

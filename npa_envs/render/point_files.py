@@ -70,7 +70,7 @@ def write_splat(path: str | Path, x: Tensor, gaussians: Gaussians) -> None:
 
 
 def _ply_header(count: int, **properties: Sequence[str]) -> bytes:
-    """Return the header of a binary PLY file: the names of its properties by their type."""
+    """Return the header of a binary PLY file, from names of columns by type."""
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
     lines += [f"property {kind} {name}" for kind, names in properties.items() for name in names]
     return "\n".join((*lines, "end_header\n")).encode()
@@ -86,7 +86,7 @@ def _checked(x: Tensor) -> NDArray[np.float32]:
 
 
 def _numpy(values: Tensor) -> NDArray[np.float32]:
-    """Return the values of the first world."""
+    """Return a tensor's values in the first world, in float32."""
     array: NDArray[np.float32] = values.detach()[0].float().cpu().numpy()
     return array
 

@@ -44,33 +44,29 @@ class WorldFilm:
     """The colour behind the particles: a name or "#rrggbb"."""
     frames: list[Frame] = field(default_factory=list)
     captions: list[str] = field(default_factory=list)
-    damaged: list[int] = field(default_factory=list)
-    """Frames that show fresh damage, which are in every filmstrip."""
     steps: dict[int, int] = field(default_factory=dict)
-    """Steps from the seed by frame; frames of fresh damage are left out."""
+    """Steps from the seed by index of frame, without frames that show fresh damage."""
 
     def add(self, task: Task, worlds: Particles, step: int, damage: str = "") -> None:
-        """Add a picture of one world, or of its `damage` at that step."""
-        if damage:
-            self.damaged.append(len(self.frames))
-        else:
+        """Append a picture of one world, and its caption; `damage` tells what just damaged it."""
+        if not damage:
             self.steps[len(self.frames)] = step
         self.frames.append(to_uint8(task.picture(worlds.x, worlds.s)[0], self.background))
         self.captions.append(f"step {step}: {damage}" if damage else f"step {step}")
 
-    def strip(self, count: int = 10) -> tuple[list[Frame], list[str]]:
-        """Return frames and captions of a filmstrip: early, damaged, some between, the last.
+    def filmstrip(self, count: int = 10) -> tuple[list[Frame], list[str]]:
+        """Return about `count` frames with captions: early, damaged, last, some between.
 
-        Of a film that is not longer than the early steps: damaged and evenly spaced ones.
+        A film that ends within the early steps gives damaged and evenly spaced ones.
         """
-        last = len(self.frames) - 1
+        damaged, last = {*range(len(self.frames))} - self.steps.keys(), len(self.frames) - 1
         if max(self.steps.values(), default=0) <= EARLY_STEPS[-1]:
-            others = max(count - 2 - len(self.damaged), 2)
+            others = max(count - 2 - len(damaged), 2)
             even = np.linspace(0, last, min(others, len(self.frames)))
-            chosen = sorted({*self.damaged, *(round(float(k)) for k in even)})
+            chosen = sorted({*damaged, *(round(float(k)) for k in even)})
         else:
             early = {min(self.steps, key=lambda k: abs(self.steps[k] - n)) for n in EARLY_STEPS}
-            chosen = sorted({*early, *self.damaged, last})
+            chosen = sorted({*early, *damaged, last})
             while len(chosen) < min(count, len(self.frames)):
                 start, end = max(pairwise(chosen), key=lambda pair: pair[1] - pair[0])
                 chosen = sorted([*chosen, (start + end) // 2])
@@ -78,11 +74,10 @@ class WorldFilm:
 
     def write(self, folder: Path, name: str, *, fps: float = 25.0) -> list[Path]:
         """Write the film as GIF, MP4 and filmstrip, and return the files."""
-        strip, captions = self.strip()
+        strip, captions = self.filmstrip()
         paths = [folder / f"{name}.gif", folder / f"{name}.mp4", folder / f"{name}-filmstrip.png"]
         write_gif(paths[0], self.frames, fps)
-        rows = math.ceil(len(strip) / 8)
-        columns = math.ceil(len(strip) / rows)
+        columns = math.ceil(len(strip) / math.ceil(len(strip) / 8))
         write_filmstrip(paths[2], strip, captions, columns=columns, background=self.background)
         # Written last, as it needs ffmpeg and the others do not.
         write_mp4(paths[1], self.frames, fps)
@@ -104,7 +99,7 @@ def film_world(
     progress: Callable[[int], None] = lambda _: None,
     stop: Callable[[], bool] = lambda: False,
 ) -> tuple[Particles, WorldFilm]:
-    """Run one world with damage, and add a frame to `film` every `every` steps.
+    """Run one world with damage; return it and its film, a frame every `every` steps.
 
     By default there are about `FRAME_COUNT` frames. `first_step` is the world's age in steps.
     `progress` is called with the number of steps since its last call. After each frame the run ends
@@ -145,7 +140,7 @@ def write_3d_world(
     resolution: int = SCREEN,
     background: str = "white",
 ) -> list[Path]:
-    """Write a 3D world as a turntable, drawn by another task, and as point files; return them."""
+    """Write a 3D world as a turntable, drawn by a task, and as point files; return their paths."""
     names = ("turntable.gif", "points.ply", "gaussians.ply", "cloud.splat")
     paths = [folder / name for name in names]
     x, s, *_ = worlds

@@ -162,7 +162,7 @@ def _colours(s: Tensor, style: str) -> Tensor:
 
 
 def _projected(x: Tensor, azimuth: float, elevation: float) -> tuple[Tensor, Tensor]:
-    """Return positions in the picture, [B, N, 2], and towards the viewer, [B, N, 1]."""
+    """Return positions on the picture plane, [B, N, 2], and towards the viewer, [B, N, 1]."""
     turn, tilt = (math.radians(angle % 360.0) for angle in (azimuth, elevation))
     right, height, outward = x.unbind(-1)
     across = math.cos(turn) * right - math.sin(turn) * outward
@@ -175,16 +175,13 @@ def _projected(x: Tensor, azimuth: float, elevation: float) -> tuple[Tensor, Ten
 def _stack_layers(
     draw: Callable[[Tensor, Tensor], Tensor], points: Tensor, depth: Tensor, colour: Tensor
 ) -> Tensor:
-    """Return the picture of splatted layers of equal depth, composited with the nearest on top."""
+    """Return pictures [B, R, R, 4] of splats in layers by depth, the nearest layer on top."""
     order = depth.argsort(dim=1, descending=True, stable=True)
-    points = points.gather(1, order.expand_as(points))
-    colour = colour.gather(1, order.expand_as(colour))
+    particles = torch.cat((points, colour), dim=-1)
+    particles = particles.gather(1, order.expand_as(particles))
     picture, transmittance = points.new_zeros(()), points.new_ones(())
-    layers = min(LAYERS, points.shape[1])
-    for part, tint in zip(
-        points.tensor_split(layers, 1), colour.tensor_split(layers, 1), strict=True
-    ):
-        layer = draw(part, tint)
+    for part in particles.tensor_split(min(LAYERS, points.shape[1]), 1):
+        layer = draw(part[..., :2], part[..., 2:])
         density = layer[..., 3:]
         passed = torch.exp(-OPACITY * density)
         weight = transmittance * (1.0 - passed)

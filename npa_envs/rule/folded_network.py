@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.ops.custom_op import without_autocast
-from npa_envs.ops.equivariance import VectorForm, read_rows, steer_rows
+from npa_envs.ops.equivariance import VectorSizes, read_rows, steer_rows
 from npa_envs.ops.network import ArrangedWeights, arrange_weights, run_network
 
 FOLD = 4
@@ -105,7 +105,7 @@ class FoldedInvariants(NamedTuple):
     """Weights that mix vectors."""
     signs: Tensor
     """Signs of the steering weights: along or against the vector."""
-    form: VectorForm
+    form: VectorSizes
     """Positions of vectors in a row."""
     row_width: int
     """As in `FoldedRule`."""

@@ -21,7 +21,7 @@ from npa_envs.checks import (
     is_whole,
 )
 from npa_envs.errors import NPAError, shown
-from npa_envs.ops.equivariance import MIXED_VECTORS, VectorForm, invariants, signed_gates, steered
+from npa_envs.ops.equivariance import MIXED_VECTORS, VectorSizes, invariants, signed_gates, steered
 from npa_envs.ops.physics_constants import Terms
 from npa_envs.rule.folded_network import (
     FOLD,
@@ -260,10 +260,10 @@ class NPARule(nn.Module):
         return Terms(self.state_gradient, inverse, self.density_gradient)
 
     @property
-    def vector_form(self) -> VectorForm:
+    def vector_form(self) -> VectorSizes:
         """How many scalars and vectors an equivariant rule perceives, and how many it mixes."""
         vectors = self.state_dim * self.state_gradient + self.density_gradient
-        return VectorForm(
+        return VectorSizes(
             self.space_dim, 2 * self.state_dim, vectors, self.mixed_vectors, self.chiral
         )
 

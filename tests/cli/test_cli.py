@@ -447,7 +447,7 @@ def test_filmstrip_shows_growth_damage_and_the_end(steps, every, damages, shown)
         film.add(task, worlds, step)
         if step in damages:
             film.add(task, worlds, step, "!")
-    frames, captions = film.strip()
+    frames, captions = film.filmstrip()
     assert captions == [f"step {caption.replace('!', ': !')}" for caption in shown]
     assert len(frames) == len(shown)
 

@@ -12,7 +12,7 @@ from worlds import relative_error
 
 from npa_envs.kernels import native_functions as native
 from npa_envs.kernels.cuda import equivariance as cuda
-from npa_envs.ops.equivariance import VectorForm, read_rows, steer_rows
+from npa_envs.ops.equivariance import VectorSizes, read_rows, steer_rows
 
 HERE = Path(__file__).parent
 KERNELS = Path(native.__file__).parent
@@ -70,9 +70,9 @@ def fourfold(number):
 @pytest.mark.parametrize(
     ("form", "count"),
     [
-        (VectorForm(2, 32, 17, 8, chiral=True), 37),
-        (VectorForm(3, 10, 6, 5, chiral=False), 23),
-        (VectorForm(2, 6, 3, 33, chiral=True), 9),
+        (VectorSizes(2, 32, 17, 8, chiral=True), 37),
+        (VectorSizes(3, 10, 6, 5, chiral=False), 23),
+        (VectorSizes(2, 6, 3, 33, chiral=True), 9),
     ],
 )
 def test_vectors_of_rows_are_what_the_portable_kernels_make_of_them(form, count, tmp_path):

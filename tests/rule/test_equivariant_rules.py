@@ -8,7 +8,7 @@ from worlds import assert_near, lively_rule, random_world, relative_error
 
 import npa_envs
 from npa_envs.kernels.cuda.equivariance import fits_block, rows_of_warp
-from npa_envs.ops.equivariance import VectorForm, read_rows
+from npa_envs.ops.equivariance import VectorSizes, read_rows
 from npa_envs.rule.rule import NPARule
 
 RULES = {
@@ -117,7 +117,7 @@ def test_forms_that_a_block_of_cuda_has_room_for():
 
 @pytest.mark.parametrize("count", [0, 5])
 def test_gradients_are_taken_of_what_needs_them(count, device):
-    form = VectorForm(2, 10, 6, 8, chiral=True)
+    form = VectorSizes(2, 10, 6, 8, chiral=True)
     rows, mixing = torch.randn(count, 24, device=device), torch.randn(6, 8, device=device)
     results = []
     for wanted in ("rows", "mixing", "both"):
@@ -133,7 +133,7 @@ def test_gradients_are_taken_of_what_needs_them(count, device):
 
 
 def test_rows_in_plenty_are_all_read(device):
-    form = VectorForm(2, 10, 6, 8, chiral=True)
+    form = VectorSizes(2, 10, 6, 8, chiral=True)
     generator = torch.Generator().manual_seed(4)
     rows, mixing = (
         torch.randn(*shape, generator=generator, dtype=torch.float64).to(device)

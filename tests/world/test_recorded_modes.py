@@ -115,7 +115,7 @@ def test_launches_keep_none_of_their_tensors():
     torch.cuda.synchronize()
     before = torch.cuda.memory_allocated()
     # As in a process that launches these kernels for the first time.
-    launch._ready.by_kernel.clear()
+    launch._thread.by_kernel.clear()
     with torch.no_grad():
         npa_envs.rollout(rule, x, s, 3, eps=0.01, cuda_graph=False)
     torch.cuda.synchronize()

@@ -72,12 +72,12 @@ class Cameras:
 
     @property
     def count(self) -> int:
-        """Cameras of a world, V."""
+        """Number of cameras of a world, V."""
         return self.world_to_camera.shape[-3]
 
     @property
     def world_count(self) -> int | None:
-        """Worlds with separate cameras, B; None if all worlds share the cameras."""
+        """Number of worlds with separate cameras, B; None if all worlds share the cameras."""
         return self.world_to_camera.shape[0] if self.world_to_camera.ndim == 4 else None
 
     def to(self, like: Tensor | torch.device | torch.dtype | str) -> Cameras:

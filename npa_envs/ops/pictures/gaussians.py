@@ -134,9 +134,10 @@ class Pairs(NamedTuple):
 def sort_pairs(
     frame: Any, footprints: Tensor, depths: Tensor, counts: Tensor, pairs_per_particle: int
 ) -> Pairs:
-    """Sort the pairs of all pictures; depths and numbers of tiles have shape [B V, N].
+    """Return the pairs of all pictures, sorted by tile and depth.
 
-    Both sorts are stable: Gaussians of equal depth stay in the order of their indices.
+    `counts` are the numbers of tiles that Gaussians cover; both they and `depths` have shape
+    [B V, N]. Gaussians of equal depth stay in the order of their indices.
     """
     device, images = depths.device, depths.shape[0]
     tile_end = images * frame.tile_count
@@ -169,7 +170,7 @@ def sort_pairs(
 
 
 def blend(frame: Any, footprints: Tensor, pairs: Pairs, images: int) -> tuple[Tensor, ...]:
-    """Return colours [B V H W, K], final transmittance and each pixel's end of pairs, [B V H W]."""
+    """Return for each of B V H W pixels: colour [K], transmittance, index after its last pair."""
     device, pixels = footprints.device, images * frame.width * frame.height
     scalar = SCALARS[footprints.dtype]
     listed = (pairs.starts, pairs.owners, footprints)
@@ -198,7 +199,7 @@ DILATION = 0.3
 
 
 class GaussianPictures(NamedTuple):
-    """Pictures of worlds by cameras."""
+    """Pictures that `render_gaussians` draws of worlds."""
 
     image: Tensor
     """Colours, dimensionless, shape [B, V, H, W, K]; the first row is the upper one."""
@@ -221,14 +222,14 @@ class GaussianScene(NamedTuple):
     intrinsics: Tensor
 
     def frame(self, width: int, height: int, near: float, dilation: float) -> Any:
-        """Return the struct of sizes that all pictures share, for kernels."""
+        """Return the struct of sizes and constants that kernels read, the same for all pictures."""
         # As integers: symbolic sizes of torch.compile become constants, and others recompile.
         sizes = self.means.shape[1], self.motions.shape[-3], self.colours.shape[-1]
         shape = int(sizes[0]), int(sizes[1]), int(sizes[2])
         return make_frame(SCALARS[self.means.dtype], shape, (width, height), near, dilation)
 
     def flat(self) -> list[Tensor]:
-        """Return the tensors for kernels, with worlds and views flattened to one dimension."""
+        """Return the tensors as kernels read them, with B N particles, or B V cameras, first."""
         means, scales, quaternions, colours, motions, intrinsics = self
         total = means.shape[0] * means.shape[1]
         shapes = means.view(total, 3), scales.view(total, 3), quaternions.view(total, 4)
@@ -245,7 +246,7 @@ def _gaussians(
     dilation: float,
     pairs_per_particle: int,
 ) -> list[Tensor]:
-    """Return pictures, whether pairs overflowed, and the tensors of the adjoint."""
+    """Return pictures, whether each had too few pairs, and tensors for the backward pass."""
     scene = GaussianScene(*tensors)
     means, frame = scene.means, scene.frame(int(width), int(height), near, dilation)
     worlds, views = means.shape[0], frame.view_count
@@ -275,7 +276,7 @@ def _gaussians(
 def _gaussians_backward(
     picture_bar: Tensor, passing_bar: Tensor, saved: list[Tensor], near: float, dilation: float
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Return the cotangents of means, scales, quaternions, opacities and colours."""
+    """Return the gradients of means, scales, quaternions, opacities and colours."""
     scene = GaussianScene(*saved[:6])
     passing, stops, footprints, counts, slots, starts, owners, pair_slots = saved[6:]
     device, scalar = footprints.device, SCALARS[footprints.dtype]
@@ -297,8 +298,8 @@ def _gaussians_backward(
     bars = [torch.empty_like(tensor) for tensor in (means, scales, quaternions)]
     bars += [means.new_empty(means.shape[:2]), torch.empty_like(colours)]
     flat = scene.flat()
-    forms = [*flat[:3], bars[3].view(-1), flat[3]]
-    bars_out = [bar.view(form.shape) for bar, form in zip(bars, forms, strict=True)]
+    flat_inputs = [*flat[:3], bars[3].view(-1), flat[3]]
+    bars_out = [bar.view(like.shape) for bar, like in zip(bars, flat_inputs, strict=True)]
     arguments = (*flat, footprints, counts, slots, pulls, *bars_out)
     kernel = gaussian_kernels(scalar).pull_back_gaussians
     launch(kernel, bars[3].numel(), device, frame, *arguments)

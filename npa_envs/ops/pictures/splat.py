@@ -45,7 +45,7 @@ MAX_SPOT = 1e6
 
 
 class Splats(NamedTuple):
-    """Particles to draw, in contiguous tensors; colours are the last three states plus a shift."""
+    """Particles to draw, in contiguous tensors; colours are the last three states + `shift`."""
 
     x: Tensor
     """Positions [length units], shape [B, N, 2]."""
@@ -54,24 +54,20 @@ class Splats(NamedTuple):
     shift: float = 0.0
     """Added to the last three states to give colours, dimensionless."""
     goal: Tensor | None = None
-    """Point to which each world's mean is moved [length units], shape [2]; None: not moved."""
+    """Point to which each world's mean is moved [length units], shape [1, 2]; None: not moved."""
 
     @property
     def total(self) -> int:
         """Particles of all worlds, B N."""
         return self.x.shape[0] * self.x.shape[1]
 
-    def contents(self) -> tuple[Any, ...]:
-        """Arguments of kernels: particles of a world, positions, states, shift."""
+    def arguments(self) -> tuple[Any, ...]:
+        """Kernel arguments: N, positions [B N, 2], states [B N, C], shift."""
         return self.x.shape[1], self.x.view(-1, 2), self.states.view(self.total, -1), self.shift
 
-    def goal_argument(self) -> Tensor | None:
-        """Argument of kernels: the goal, or None where worlds are not moved."""
-        return None if self.goal is None else self.goal.view(1, 2)
-
     def means_and_goal(self) -> tuple[Tensor | None, Tensor | None]:
-        """Arguments of kernels for moving worlds: means and goal."""
-        return None if self.goal is None else world_mean(self.x), self.goal_argument()
+        """Kernel arguments: each world's mean position, [B, 2], and the goal; or None, None."""
+        return None if self.goal is None else world_mean(self.x), self.goal
 
 
 def splat_lanes(device: torch.device) -> int:
@@ -80,7 +76,7 @@ def splat_lanes(device: torch.device) -> int:
 
 
 def device_kernels(like: Tensor) -> Any:
-    """Return the kernels for a tensor's dtype and device."""
+    """Return the kernels of `splat` for a tensor's dtype and device."""
     return splat_kernels(SCALARS[like.dtype], splat_lanes(like.device))
 
 
@@ -93,7 +89,7 @@ def _check_size(largest: int, world_count: int, view: Any) -> None:
 
 
 def sort_splats(splats: Splats, view: Any) -> tuple[Tensor, Tensor, Tensor]:
-    """Return starts of the cells [B cells + 1], sorted footprints [B N, 8], their sources [B N]."""
+    """Return each cell's first splat, and, sorted by cell, footprints [B N, 8], particles [B N]."""
     x, total = splats.x, splats.total
     world_count, particle_count, _ = x.shape
     cell_total = world_count * view.cell_count
@@ -112,15 +108,15 @@ def sort_splats(splats: Splats, view: Any) -> tuple[Tensor, Tensor, Tensor]:
             x.device,
             view,
             slices,
-            *splats.contents(),
-            splats.goal_argument(),
+            *splats.arguments(),
+            splats.goal,
             starts,
             footprints,
             source,
             block_dim=block,
         )
         return starts, footprints, source
-    kernels, contents, moves = device_kernels(x), splats.contents(), splats.means_and_goal()
+    kernels, contents, moves = device_kernels(x), splats.arguments(), splats.means_and_goal()
     cell, arrival, arrived = torch.empty(3, total, dtype=torch.int32, device=x.device).unbind()
     counts = torch.zeros(cell_total + 1, dtype=torch.int32, device=x.device)
     counted = (cell, arrival, counts)
@@ -133,29 +129,14 @@ def sort_splats(splats: Splats, view: Any) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def scatter_splats(splats: Splats, view: Any) -> tuple[Tensor, Tensor, Tensor]:
-    """Return pictures [B, R, R, 4] with footprints [B N, 8] and their sources [B N]."""
+    """Return pictures [B, R, R, 4], footprints (splats in pixels) [B N, 8], particles [B N]."""
     x, total = splats.x, splats.total
     picture = x.new_zeros(x.shape[0], view.resolution, view.resolution, CHANNELS)
     footprints = x.new_empty(total, FOOTPRINT)
     source = torch.empty(total, dtype=torch.int32, device=x.device)
     scratch = x.new_empty(x.shape[0], min(2 * view.radius + 1, view.resolution))
-    drawn = (*splats.contents(), *splats.means_and_goal(), scratch, picture, footprints, source)
+    drawn = (*splats.arguments(), *splats.means_and_goal(), scratch, picture, footprints, source)
     launch(device_kernels(x).scatter_splats, x.shape[0], x.device, view, *drawn)
-    return picture, footprints, source
-
-
-def _draw(splats: Splats, view: Any) -> tuple[Tensor, Tensor, Tensor]:
-    """Draw as `scatter_splats`, by the kernels for the device."""
-    x = splats.x
-    if x.device.type != "cuda":
-        return scatter_splats(splats, view)
-    _check_size(x.shape[0] * CHANNELS * view.resolution**2, x.shape[0], view)
-    starts, footprints, source = sort_splats(splats, view)
-    picture = x.new_empty(x.shape[0], view.resolution, view.resolution, CHANNELS)
-    groups = x.shape[0] * group_count(view.resolution)
-    threads = groups * GROUP_WIDTH * GROUP_HEIGHT * TILE_LANES
-    flat = picture.view(-1, CHANNELS)
-    launch(device_kernels(x).gather_splats, threads, x.device, view, starts, footprints, flat)
     return picture, footprints, source
 
 
@@ -170,7 +151,17 @@ def _splat(
     high: float,
 ) -> tuple[Tensor, Tensor, Tensor]:
     view = make_view(SCALARS[x.dtype], int(resolution), pixel_size, sigma, low, high)
-    return _draw(Splats(x, colour), view)
+    splats = Splats(x, colour)
+    if x.device.type != "cuda":
+        return scatter_splats(splats, view)
+    _check_size(x.shape[0] * CHANNELS * view.resolution**2, x.shape[0], view)
+    starts, footprints, source = sort_splats(splats, view)
+    picture = x.new_empty(x.shape[0], view.resolution, view.resolution, CHANNELS)
+    groups = x.shape[0] * group_count(view.resolution)
+    threads = groups * GROUP_WIDTH * GROUP_HEIGHT * TILE_LANES
+    flat = picture.view(-1, CHANNELS)
+    launch(device_kernels(x).gather_splats, threads, x.device, view, starts, footprints, flat)
+    return picture, footprints, source
 
 
 @custom_op("npa::splat_backward")
@@ -263,7 +254,7 @@ def splat(
 
 
 def check_particles(x: Tensor, colour: Tensor, width: int | None) -> None:
-    """Check positions and colours of a given width, or states if the width is None."""
+    """Check x [B, N, 2] and colours [B, N, width], or states if the width is None."""
     check_world(x, colour)
     check_derivatives(x=x, colour=colour)
     fits = colour.shape[2] >= 3 if width is None else colour.shape[2] == width
@@ -279,7 +270,7 @@ def check_particles(x: Tensor, colour: Tensor, width: int | None) -> None:
 def checked_window(
     resolution: int, pixel_size: float, sigma: float, low: float, high: float
 ) -> tuple[int, float, float, float, float]:
-    """Return the checked sizes of a picture, in this order, as Python numbers."""
+    """Return the arguments of `splat` with these names as Python numbers, after checking them."""
     if checked_count("resolution", resolution) < 2:
         raise NPAError(f"resolution must be at least 2 pixels, got {resolution}")
     side = checked_side("resolution", resolution)
@@ -349,7 +340,7 @@ def periodic_splat(
 
 
 def _sum_periods(canvas: Tensor, dim: int, margin: int, period: int) -> Tensor:
-    """Sum the pixels of a canvas with a margin that are a period apart."""
+    """Return sums of pixels that are a period apart along `dim`, the first after the margin."""
     length = canvas.shape[dim]
     shape = list(canvas.shape)
     shape[dim] = period
@@ -383,7 +374,7 @@ def _picture_losses(
 ) -> Tensor:
     world_count, device, scalar = x.shape[0], x.device, SCALARS[x.dtype]
     view = make_view(scalar, int(target.shape[0]), pixel_size, sigma, low, high)
-    splats = Splats(x, states, shift, goal)
+    splats = Splats(x, states, shift, goal.view(1, 2))
     if device.type == "cuda":
         starts, footprints, _ = sort_splats(splats, view)
         tile_total = view.tile_columns * view.tile_rows
@@ -420,7 +411,7 @@ def picture_losses(
 
     Each world's mean position is moved to `goal` and drawn as by `splat`; colours are the last
     three states plus `shift`. With d the difference from the target and e = |d| + d^2, a pixel's
-    density error is that of the densities, its colour error is the mean of e over the colours times
+    density error is e of the densities, its colour error is the mean of e over the colours times
     exp(-(density error)). The target has shape [R, R, 4], the goal [2].
 
     Returns:

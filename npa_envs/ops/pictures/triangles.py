@@ -19,7 +19,7 @@ def nearest_triangles(
     width: int,
     height: int,
 ) -> Tensor:
-    """Return red, green and blue of the nearest triangle at each pixel, and 1; elsewhere 0.
+    """Return pictures [V, H, W, 4]: colour of the nearest triangle at a pixel, and 1; else 0.
 
     Everything is on the CPU, in float64. A triangle covers a pixel if it covers the centre.
 
