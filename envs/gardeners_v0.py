@@ -23,7 +23,7 @@ AGENTS = ("keeper_0", "raider_0")
 
 
 class _BothSpaces(BrushSpaces):
-    """Spaces of one gardener, and conversion of both gardeners' actions to rows of brushes."""
+    """Spaces of one gardener, and conversion of both gardeners' actions."""
 
     def action(self, action: Any, world_count: int | None) -> Tensor:
         """Return the rows of both gardeners' brushes, shape [B, 2 K, W]."""

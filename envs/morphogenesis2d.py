@@ -59,7 +59,7 @@ class PictureEnvTask(TargetEnvTask[Config]):
     pixel_bytes = 16
 
     def losses(self, x: Tensor, s: Tensor) -> Mapping[str, Tensor]:
-        """Return the density error and the weighted colour error of each world."""
+        """Return density error and weighted colour error of each world, by name, [B] each."""
         density, colour = self.task.splat_losses(x, s)
         return {"density": density, "colour": self.config.colour_weight * colour}
 

@@ -75,7 +75,7 @@ class Regeneration2DEnvConfig(GrownConfig):
 
 
 class RegenerationTask(GrownTask[Regeneration2DEnvConfig]):
-    """A grown picture with damage."""
+    """A grown picture that has been damaged and has to heal."""
 
     config_type = Regeneration2DEnvConfig
 

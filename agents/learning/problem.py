@@ -152,7 +152,7 @@ class Problem:
         """Particles of each species that is an agent; one number without species."""
         config = self.config
         if isinstance(config, SpeciesConfig):
-            return config.played_counts
+            return config.agent_particle_counts
         return (config.particle_count,)
 
     @property

@@ -40,12 +40,12 @@ def total(terms: Tensor) -> Tensor:
 
 
 def named_terms(prefix: str, names: tuple[str, ...], rows: Any) -> dict[str, Any]:
-    """Return the terms of a loss, or their decreases, by their names in infos."""
+    """Return rows, one for each term of a loss, by their names in infos: `prefix_name`."""
     return {f"{prefix}_{name}": row for name, row in zip(names, rows, strict=True)}
 
 
 def reason(ending: int) -> str | None:
-    """Return `info["reason"]` of an ending, or None of an episode that goes on."""
+    """Return `info["reason"]` for the flags of an ending; None if the episode goes on."""
     names = {DIVERGED: "diverged", SUCCESS: "success", TIME_LIMIT: "time limit"}
     return next((name for bit, name in names.items() if ending & bit), None)
 
@@ -119,15 +119,15 @@ class ParticleRewards:
         self._before = particles if by_loss else particles.map(torch.clone)
 
     def place(self, worlds: Tensor, task: EnvTask[Any], particles: Particles) -> None:
-        """Begin with new particles in some worlds, int64, [M], which have no reward."""
+        """Store the new particles of the worlds of indices `worlds`, int64 [M]; rewards are 0."""
         self.reward.index_fill_(0, worlds, 0.0)
         if self.loss is None:
             self._before.put_(worlds, particles)
         else:
             self.loss[worlds] = self._losses(task, particles)
 
-    def gains(self, task: EnvTask[Any], particles: Particles) -> Tensor:
-        """Return each particle's reward of a step, [B, N]; the next step counts from now."""
+    def step_rewards(self, task: EnvTask[Any], particles: Particles) -> Tensor:
+        """Return each particle's reward of a step, [B, N]; store these particles for the next."""
         if self.loss is None:
             gains = task.particle_gains(self._before[:2], particles[:2])
             gains = checked_tensor(task, "particle_gains", "gains", gains, self.reward.shape)
@@ -215,7 +215,7 @@ class RewardedWorlds(WorldState):
         return bool(self.task.config.reward == "sparse")
 
     def begin(self, worlds: Tensor, start: Start, *, check: bool) -> None:
-        """Begin episodes in some worlds, int64, [M].
+        """Begin episodes with `start` in the worlds of indices `worlds`, int64 [M].
 
         `check` raises an error unless all losses are finite, which synchronises with the device.
         """
@@ -232,7 +232,7 @@ class RewardedWorlds(WorldState):
     @torch.no_grad()
     @makes_plain_tensors
     def place(self, worlds: Tensor, placed: Particles) -> None:
-        """Replace the particles of some worlds, int64, shape [M], without a reward.
+        """Replace the particles of the worlds of indices `worlds`, int64 [M], without a reward.
 
         Worlds keep their goals if `placed` has none.
         """
@@ -266,7 +266,7 @@ class RewardedWorlds(WorldState):
         if particle_rewards is None:
             self._evaluation(terms)
         else:
-            gains = particle_rewards.gains(task, self.particles)
+            gains = particle_rewards.step_rewards(task, self.particles)
             self._evaluation(terms, (~torch.isfinite(gains).all(dim=1)).byte())
             reward = self.report.reward
             if task.config.reward == "marginal":
@@ -289,7 +289,7 @@ class RewardedWorlds(WorldState):
         self.enabled.fill_(1)
 
     def task_rewards(self) -> Tensor | None:
-        """Return the rewards of a step, [B], where they are no decrease of the loss, else None."""
+        """Return the task's own rewards of a step, [B]; None: they are the loss's decrease."""
         return None
 
     def _make_evaluation(self) -> EpisodeUpdate:
@@ -308,7 +308,7 @@ class RewardedWorlds(WorldState):
         )
 
     def check_losses(self, worlds: Tensor) -> None:
-        """Check that the losses of some worlds, int64, shape [M], are finite."""
+        """Check that the losses of the worlds of indices `worlds`, int64 [M], are finite."""
         terms = zip(self.term_names, self.report.terms[:, worlds], strict=True)
         check_finite(self.task, "losses", {f"term {shown(name)}": term for name, term in terms})
         if self.particle_rewards is not None and self.particle_rewards.loss is not None:
@@ -321,5 +321,5 @@ class RewardedWorlds(WorldState):
         return self.report.loss
 
     def extra_info(self) -> dict[str, Tensor]:
-        """Return further entries of infos, of resets and steps, shape [B, ...] each."""
+        """Return what the task adds to infos of resets and steps, by name, [B, ...] each."""
         return self.goal_task.extra_info(self.s)

@@ -131,7 +131,7 @@ class WorldState:
         return random
 
     def checked_particles(self, x: Any, s: Any, world_count: int, particle_count: int) -> Particles:
-        """Return particles of M worlds, checked, as float32 on the device."""
+        """Return positions and states of `world_count` worlds, checked, float32 on the device."""
         checked, physics = [], self.physics
         for name, value, width, limit, limit_name in (
             ("x", x, physics.space_dim, physics.limits.position, "position_limit"),

@@ -22,7 +22,7 @@ from npa_envs.envs.core.task import (
     check_finite,
     check_no_draws,
     check_start,
-    global_draws,
+    global_rng_states,
     start_method,
 )
 from npa_envs.envs.core.world_state import check_default_dtype, not_finite
@@ -51,9 +51,9 @@ FEW_PARTICLES = 8192
 class BatchedWorlds(RewardedWorlds):
     """B worlds of one task, stepped together.
 
-    Each particle moves and changes its state by its row of an action, and observes what it
-    perceives, then the task's `target_rows` for the world's goal. All tensors keep their memory
-    between steps, as CUDA graphs need.
+    Each particle moves and changes its state by its row of an action. Its row of the observation is
+    what it perceives, then the columns of the task's `target_rows` for the world's goal. All
+    tensors keep their memory between steps, as CUDA graphs need.
     """
 
     @makes_plain_tensors
@@ -93,18 +93,19 @@ class BatchedWorlds(RewardedWorlds):
 
     @property
     def target_dim(self) -> int:
-        """Columns of the target after those of perception in an observation's row, T."""
+        """Number T of target columns at the end of an observation's row."""
         return 0 if self._target is None else int(self._target.shape[1])
 
     @torch.no_grad()
     @makes_plain_tensors
     def start(self, worlds: Tensor, keys: Tensor | None = None) -> Start:
-        """Start episodes of worlds, int64 indices [M]; return starts; keys as in `next_streams`."""
+        """Start and return episodes of the worlds of int64 indices [M]; keys: of `next_streams`."""
         random = self.next_streams(worlds, keys)
         check_default_dtype()
         # The first start is not recorded as a graph, so that it can synchronise for checks.
         task, first = self.task, not self.term_names
-        draws, check = global_draws(self.device) if first else {}, first or not self.x.is_cuda
+        draws = global_rng_states(self.device) if first else {}
+        check = first or not self.x.is_cuda
         start: Start = task.start(random)
         check_start(task, start, len(worlds), (self.x.shape, self.s.shape))
         if first:
@@ -122,7 +123,7 @@ class BatchedWorlds(RewardedWorlds):
         return build_neighbours(start.x, start.s, self.physics, world_indices=worlds)
 
     def restart(self, worlds: NDArray[np.int64], observation: Tensor) -> None:
-        """Start the next episodes of some worlds, [M], and write their rows of the observation."""
+        """Start the next episodes of worlds, indices [M]; write their rows of `observation`."""
         if self._target is None:
             self._resets(worlds, observation)
             return
@@ -152,7 +153,7 @@ class BatchedWorlds(RewardedWorlds):
     @torch.no_grad()
     @makes_plain_tensors
     def reseed(self, worlds: NDArray[np.int64], observation: Tensor) -> None:
-        """Restart the particles of some worlds, [M], within their episodes.
+        """Restart the particles of worlds, indices [M], within their episodes.
 
         Rewards, flags and step counts stay. The worlds' rows of the observation, [B, ...], are
         overwritten.
@@ -250,7 +251,7 @@ class BatchedWorlds(RewardedWorlds):
 
     @contextlib.contextmanager
     def _evaluating_on_side(self) -> Iterator[None]:
-        """Evaluate the worlds, on CUDA overlapped with what the block launches."""
+        """Evaluate the worlds, on CUDA at the same time as what the `with` block launches."""
         with contextlib.nullcontext() if self._side_stream is None else self._side_stream.overlap():
             self.evaluate()
         yield
@@ -258,7 +259,7 @@ class BatchedWorlds(RewardedWorlds):
             self._side_stream.join()
 
     def step_info(self) -> dict[str, Tensor]:
-        """Return further entries of infos, of steps alone, shape [B, N] each."""
+        """Return entries of infos of steps: particles' rewards, which were updated, [B, N]."""
         info: dict[str, Tensor] = {}
         if self.particle_rewards is not None:
             info["particle_reward"] = self.particle_rewards.reward
@@ -267,18 +268,18 @@ class BatchedWorlds(RewardedWorlds):
         return info
 
     def host_observation(self, observation: Tensor) -> Tensor:
-        """Return a single world's observation, from the host's copy if that is current."""
+        """Return a single world's observation, from pinned memory if it has been copied there."""
         if not self._host_is_current or self._host_perceived is None:
             return observation
         # The next step overwrites it. NumPy copies in this thread; torch would wake others, which
         # can take milliseconds.
         return torch.from_numpy(self._host_perceived.numpy().copy())
 
-    def guarded(self, endings: NDArray[np.uint8], observation: Tensor) -> NDArray[np.uint8]:
+    def handle_diverged(self, endings: NDArray[np.uint8], observation: Tensor) -> NDArray[np.uint8]:
         """Apply `on_divergence` to worlds that diverged; costs nothing if none did.
 
         Returns:
-            Endings, shape [B], without the flag of divergences that end no episode.
+            Flags of endings, [B], without DIVERGED where a divergence ends no episode.
         """
         on_divergence = self.task.config.on_divergence
         diverged = endings & DIVERGED != 0
@@ -355,7 +356,7 @@ class GraphedResets:
 
     @makes_plain_tensors
     def __call__(self, worlds: NDArray[np.int64], observation: Tensor) -> None:
-        """Start the next episodes of some worlds, [M], and write what they perceive, [B, N, P]."""
+        """Start the next episodes of worlds, indices [M]; write what they perceive, [B, N, P]."""
         if not self._recorded:
             self._start()(to_device_async(worlds, self._device)).perceive(observation)
             return

@@ -34,7 +34,8 @@ def sampled(env, count, seed=0):
 
 def brush(config, **numbers):
     """The row of one brush at the middle, for a world."""
-    row, columns = torch.zeros(1, 1, BrushLayout.of(config).width), BrushLayout.of(config)
+    columns = BrushLayout.for_config(config)
+    row = torch.zeros(1, 1, columns.width)
     for tool, values in numbers.items():
         row[..., getattr(columns, tool)] = torch.tensor(values)
     return row
@@ -164,7 +165,7 @@ def test_the_whole_world_is_differentiable_by_every_number_of_a_brush():
     weights = torch.rand((1, 96, 18), generator=generator, dtype=torch.float64)
     given = action.clone().requires_grad_()
     (slope,) = torch.autograd.grad(worth(given), given)
-    columns = BrushLayout.of(env.config)
+    columns = BrushLayout.for_config(env.config)
     for column in range(columns.width):
         assert float(slope[0, :, column].abs().sum()) > 0.0, column
     way = torch.rand(shape, generator=generator, dtype=torch.float64) - 0.5
