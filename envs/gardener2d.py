@@ -20,7 +20,7 @@ from npa_envs.world.randomness import StreamId, WorldRandom
 
 @dataclass(frozen=True, kw_only=True)
 class Gardener2DEnvConfig(GardenConfig):
-    """Adds the disturbances: gusts, which move particles, and blights, which wipe states."""
+    """`GardenConfig` with gusts, which move particles, and blights, which wipe states."""
 
     position_noise: float = 0.002
     """Standard deviation of the noise added to every position in a step of the rule

@@ -164,7 +164,7 @@ def _for_both(observation: Any) -> dict[str, Any]:
 
 
 def parallel_env(max_cycles: int = 32, **config: Any) -> GardenersEnv:
-    """Return the environment in which both act at once; arguments are those of `GardenersEnv`."""
+    """Return the environment in which both agents act at once; arguments: of `GardenersEnv`."""
     return GardenersEnv(max_cycles, **config)
 
 

@@ -30,7 +30,7 @@ FIRST_TEST_SEED = 1_000_000
 
 @dataclass(frozen=True, kw_only=True)
 class GrownConfig(Morphogenesis2DEnvConfig):
-    """Adds the rule that grows the worlds, and the pool of grown worlds."""
+    """`Morphogenesis2DEnvConfig` with the rule that grows worlds, and the pool of worlds."""
 
     words = EnvConfig.words | {"split": get_args(Split)}
 
@@ -151,7 +151,7 @@ def check_matches_rule(rule: NPARule, config: EnvConfig, *names: str) -> None:
 
 
 def load_readout_rule(field: str, name: str, state_dim: int, device: torch.device) -> NPARule:
-    """Load a rule by name or file; check that it has a read-out. `field` is for the error."""
+    """Return the rule of this name or file, which must have a read-out; `field`: its keyword."""
     rule = load_rule(name, device=device).float().requires_grad_(False)
     if rule.readout is None or rule.state_dim != state_dim:
         raise NPAError(

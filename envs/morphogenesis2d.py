@@ -19,7 +19,7 @@ from npa_envs.tasks.targets.images import MAX_POINT_COUNT
 
 @dataclass(frozen=True, kw_only=True)
 class PictureConfig(EnvConfig):
-    """Adds the seed and the loss of `Morphogenesis2DConfig`, which documents the fields."""
+    """`EnvConfig` with seed and loss of `Morphogenesis2DConfig`, which documents the fields."""
 
     task_config_type = Morphogenesis2DConfig
 
@@ -42,7 +42,7 @@ class PictureConfig(EnvConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class Morphogenesis2DEnvConfig(PictureConfig):
-    """Adds the target."""
+    """`PictureConfig` with the target picture."""
 
     target: str = Morphogenesis2DConfig.target
 

@@ -30,7 +30,7 @@ PARTICLE_BYTES = 700
 
 @dataclass(frozen=True, kw_only=True)
 class Morphogenesis3DEnvConfig(EnvConfig):
-    """Adds target, seed and views of `Morphogenesis3DConfig`, which documents most fields."""
+    """`EnvConfig` with fields of `Morphogenesis3DConfig`, which documents most of them."""
 
     task_config_type = Morphogenesis3DConfig
 

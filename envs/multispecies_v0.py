@@ -209,7 +209,7 @@ raw_env, env = in_turns(parallel_env)
 
 
 def settings(task: str, species_count: int | None, config: dict[str, Any]) -> dict[str, Any]:
-    """Return all keywords of an environment for a task's name or an id; `config` comes first."""
+    """Return all keywords for a task's name or an id; those in `config` replace the id's own."""
     name, keywords = task_settings(task)
     if species_count is not None:
         keywords["species_count"] = species_count

@@ -28,7 +28,7 @@ CHANNELS = 4
 
 @dataclass(frozen=True, kw_only=True)
 class Pictures2DEnvConfig(PictureConfig):
-    """Adds the targets, and whether observations show them."""
+    """`PictureConfig` with several targets, and whether observations show them."""
 
     words = EnvConfig.words | {"split": get_args(Split)}
 

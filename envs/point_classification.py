@@ -34,7 +34,7 @@ Score = Literal["error", "cross_entropy", "accuracy"]
 
 @dataclass(frozen=True, kw_only=True)
 class PointClassificationEnvConfig(EnvConfig):
-    """Adds the clouds and the loss of `PointClassificationConfig`, which documents the fields."""
+    """`EnvConfig` with fields of `PointClassificationConfig`, which documents them."""
 
     task_config_type = PointClassificationConfig
 

@@ -41,7 +41,7 @@ CodeActions = Literal["code", "choice"]
 
 @dataclass(frozen=True, kw_only=True)
 class Shapeshifter2DEnvConfig(PictureConfig):
-    """Adds the rule of many pictures and how its goals change."""
+    """`PictureConfig` with the rule of many pictures, and how its goals change."""
 
     words = EnvConfig.words | {"reward": get_args(GardenReward), "actions": get_args(CodeActions)}
 

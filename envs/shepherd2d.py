@@ -29,7 +29,7 @@ Aim = Literal["move", "turn", "reshape"]
 
 @dataclass(frozen=True, kw_only=True)
 class Shepherd2DEnvConfig(GardenConfig):
-    """Adds the goals."""
+    """`GardenConfig` with the goals."""
 
     words = GardenConfig.words | {"aim": get_args(Aim)}
 

@@ -100,9 +100,9 @@ def _batch_shape(
 def action_tensor(
     name: str, action: Any, expected: tuple[int, ...], space: str, letters: str = ""
 ) -> Tensor:
-    """Return an action of shape `expected` as a float32 tensor on the device that it is on.
+    """Return an action of shape `expected`, checked, as a float32 tensor, on its old device.
 
-    `name` and `space` say in the error message what is wrong and where its shape is described.
+    The error message calls the action `name`, and refers to the space called `space`.
     """
     actual = ""
     if not isinstance(action, Tensor):
@@ -194,7 +194,7 @@ class WorldsEnv(ShownEnv):
     spec: Any
 
     def _make_worlds(self, keywords: dict[str, Any], world_count: int, steps: int | None) -> None:
-        """Set `config`, `worlds`, `task` and `spaces`; episodes have at most `steps` steps."""
+        """Set `config`, `worlds`, `task` and `spaces`; `steps`: the longest episode, if limited."""
         self.config = self.task_type.config_type.from_keywords(keywords)
         self.render_mode = self.config.render_mode
         worlds_type = self.task_type.worlds_type or BatchedWorlds

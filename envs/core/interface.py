@@ -26,7 +26,7 @@ class Interface(NamedTuple):
 
     @property
     def shared_dim(self) -> int:
-        """Length of a perception without the density and its gradient of each species."""
+        """Length of a perception without each species' own density and density gradient."""
         return self.state_dim * (2 + self.space_dim) + self.space_dim
 
     @property

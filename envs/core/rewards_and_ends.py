@@ -64,7 +64,7 @@ class StepReport(NamedTuple):
 
     @classmethod
     def empty(cls, world_count: int, term_count: int, device: torch.device) -> StepReport:
-        """Return a report of zeros, of B worlds whose loss has K terms."""
+        """Return a `StepReport` of zeros, for B worlds whose loss has K terms."""
         rows = 4 * (2 + 2 * term_count) + FLAG_ROWS
         buffer = torch.zeros(rows * world_count, dtype=torch.uint8, device=device)
         report = cls.from_buffer(buffer, world_count)
@@ -73,7 +73,7 @@ class StepReport(NamedTuple):
 
     @classmethod
     def from_buffer(cls, buffer: Tensor, world_count: int) -> StepReport:
-        """Return a report whose tensors are views of a buffer."""
+        """Return a `StepReport` whose tensors are views of `buffer`, uint8."""
         numbers, flags = buffer.view(-1, world_count).tensor_split((-FLAG_ROWS,))
         numbers = numbers.flatten().view(torch.float32).view(-1, world_count)
         flags = flags.view(torch.bool)
@@ -84,7 +84,7 @@ class StepReport(NamedTuple):
         return StepReport.from_buffer, (self.buffer, len(self.all_worlds))
 
     def copy(self) -> StepReport:
-        """Return a copy that later steps do not overwrite."""
+        """Return a copy of the report, which later steps do not overwrite."""
         return self.from_buffer(self.buffer.clone(), len(self.all_worlds))
 
     @property

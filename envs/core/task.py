@@ -79,7 +79,7 @@ class WorldTask(Generic[AnyConfig]):
 
     @property
     def open_half_width(self) -> float:
-        """Half of a picture's side in open space [length units]; at least 1 is used."""
+        """Half of a picture's side in open space [length units], raised to 1 if it is less."""
         return 1.0
 
     @property
@@ -279,7 +279,7 @@ class EnvTask(WorldTask[Config]):
 
     @property
     def pixel_size(self) -> float:
-        """Size of a particle in pictures: the spacing of N in the unit disk or ball."""
+        """Size of a particle in pictures: the spacing of N particles in the unit disk or ball."""
         volume = np.pi if self.space_dim == 2 else 4.0 * np.pi / 3.0
         return float((volume / self.config.particle_count) ** (1.0 / self.space_dim))
 
@@ -336,7 +336,7 @@ class TargetEnvTask(EnvTask[Config]):
 
 
 def start_method(task: EnvTask[Any]) -> str:
-    """Return which method, start, fresh or seed, the task has to make worlds; for errors."""
+    """Return the name of the method that makes a task's worlds: start, fresh or seed."""
     names = ("start", "fresh")
     return next((n for n in names if getattr(type(task), n) != getattr(EnvTask, n)), "seed")
 

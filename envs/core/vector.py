@@ -219,7 +219,7 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
     def _report(
         self, stepped: NDArray[np.bool_] | None, *, copy: bool
     ) -> tuple[list[Any], list[Any], dict[str, Any]]:
-        """Return rows of numbers, flags, and infos; `stepped`: which worlds acted, None: all."""
+        """Return the report's numbers, its flags, and infos; `stepped`: worlds that acted."""
         worlds = self.worlds
         report = worlds.report.copy() if copy else worlds.report
         rows, flags = self._report_rows(report), list(self._out(report.endings))
@@ -244,7 +244,7 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
 
 
 def with_masks(values: dict[str, Any], which: Any) -> dict[str, Any]:
-    """Return infos: each value by its name, and `which`, the worlds that have it, by `_name`."""
+    """Return infos: each value by its name, and by `_name` the mask of worlds that have it."""
     infos = {}
     for name, value in values.items():
         infos[name], infos[f"_{name}"] = value, which

@@ -99,7 +99,7 @@ class BatchedWorlds(RewardedWorlds):
     @torch.no_grad()
     @makes_plain_tensors
     def start(self, worlds: Tensor, keys: Tensor | None = None) -> Start:
-        """Start and return episodes of the worlds of int64 indices [M]; keys: of `next_streams`."""
+        """Start episodes of worlds, int64 indices [M]; return `Start`; keys: see `next_streams`."""
         random = self.next_streams(worlds, keys)
         check_default_dtype()
         # The first start is not recorded as a graph, so that it can synchronise for checks.
@@ -259,7 +259,7 @@ class BatchedWorlds(RewardedWorlds):
             self._side_stream.join()
 
     def step_info(self) -> dict[str, Tensor]:
-        """Return entries of infos of steps: particles' rewards, which were updated, [B, N]."""
+        """Return `particle_reward` and `updated` of infos, as far as asked for, [B, N] each."""
         info: dict[str, Tensor] = {}
         if self.particle_rewards is not None:
             info["particle_reward"] = self.particle_rewards.reward
@@ -268,7 +268,7 @@ class BatchedWorlds(RewardedWorlds):
         return info
 
     def host_observation(self, observation: Tensor) -> Tensor:
-        """Return a single world's observation, from pinned memory if it has been copied there."""
+        """Return a single world's observation, on the host if it has been copied there."""
         if not self._host_is_current or self._host_perceived is None:
             return observation
         # The next step overwrites it. NumPy copies in this thread; torch would wake others, which

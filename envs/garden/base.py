@@ -180,7 +180,7 @@ class RuleDriven:
         raise NotImplementedError
 
     def reward(self, particles: Particles, loss: Tensor, context: Any) -> Tensor:
-        """Return the rewards of a step, [B], from the particles and losses, [B], after it."""
+        """Return the rewards of a step, [B]; particles and losses, [B], are those after it."""
         raise NotImplementedError
 
     def next_goals(self, elapsed: Tensor, context: Any, goal: Tensor) -> None:

@@ -35,7 +35,7 @@ TOOLS = ("push", "wipe", "inject", "rate")
 
 @dataclass(frozen=True, kw_only=True)
 class GardenConfig(GrownConfig):
-    """Adds the brushes and the form of observations."""
+    """`GrownConfig` with the brushes and the form of observations."""
 
     words = GrownConfig.words | {
         "reward": get_args(GardenReward),

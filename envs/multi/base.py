@@ -239,7 +239,7 @@ class SpeciesTask(WorldTask[Any]):
         raise NotImplementedError
 
     def with_opponent(self, action: Tensor, population: Population, random: WorldRandom) -> Tensor:
-        """Return `action`, [B, N, A], with the rows of species that the environment plays."""
+        """Return `action`, [B, N, A], where the environment may replace rows of an opponent."""
         return action
 
     def final_rewards(self, rewards: Tensor, live: Tensor, species: Tensor) -> Tensor:

@@ -86,7 +86,7 @@ USUAL = ("gecko", "heart", "butterfly", "flower", "octopus", "ring")
 
 @dataclass(frozen=True, kw_only=True)
 class PictureLossConfig(SpeciesConfig):
-    """Adds the loss of `Morphogenesis2DConfig`, which documents the fields."""
+    """`SpeciesConfig` with the loss of `Morphogenesis2DConfig`, which documents the fields."""
 
     task_config_type = Morphogenesis2DConfig
 
@@ -113,7 +113,7 @@ class PictureLossConfig(SpeciesConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class OnePictureConfig(PictureLossConfig):
-    """Adds the target of tasks with one picture."""
+    """`PictureLossConfig` with one target picture."""
 
     target: str = Morphogenesis2DConfig.target
 
@@ -152,7 +152,7 @@ class PictureLossTask(SpeciesTask):
 
 @dataclass(frozen=True, kw_only=True)
 class CoMorphogenesisConfig(PictureLossConfig):
-    """Adds a target for each species, and the distance between their seeds."""
+    """`PictureLossConfig` with a target for each species, and the distance of their seeds."""
 
     targets: tuple[str, ...] = ()
     """Target of each species: built-in names (`npa-envs list`), emoji, or paths of pictures; empty:
@@ -204,7 +204,7 @@ class CoMorphogenesisTask(PictureLossTask):
 
 @dataclass(frozen=True, kw_only=True)
 class InvasionConfig(OnePictureConfig):
-    """Adds who plays the invaders; refuses rewards of a team."""
+    """`OnePictureConfig` with the player of the invaders; refuses reward="team"."""
 
     words = OnePictureConfig.words | {"opponent": (None, "random")}
 
@@ -233,7 +233,7 @@ class InvasionTask(PictureLossTask):
         super().__init__(config, device, (config.target, config.counts[0]))
 
     def losses(self, population: Population) -> Mapping[str, Tensor]:
-        """Return terms, [B, K]: of species 0's splat loss, minus that in equal parts for others."""
+        """Return the terms of the losses by name, [B, K]; invaders share minus species 0's loss."""
         invaders = population.counts[1:]
         present = max(sum(count > 0 for count in invaders), 1)
         return {
@@ -242,7 +242,7 @@ class InvasionTask(PictureLossTask):
         }
 
     def particle_losses(self, population: Population) -> Mapping[str, Tensor]:
-        """Return losses, [B, N]; an invader's is minus species 0's sum over the invader count."""
+        """Return losses by name, [B, N]; all invaders have the same, in sum minus species 0's."""
         losses = self.task.particle_contributions(*population.of(0))
         count, invader_count = losses.shape[1], sum(population.counts[1:])
         part = world_mean(losses[..., None])[:, 0] * (-count / max(invader_count, 1))
@@ -275,7 +275,7 @@ class SymbiosisConfig(OnePictureConfig):
 
 
 class SymbiosisTask(PictureLossTask):
-    """Splat loss of the picture of all particles."""
+    """All species grow one picture; the loss of each is the splat loss of all particles."""
 
     config_type = SymbiosisConfig
     least_species = 1
