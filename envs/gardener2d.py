@@ -65,7 +65,7 @@ class GardenerTask(GardenTask[Gardener2DEnvConfig]):
         centre = random_particle(x, draws)
         happens = (chance[:, :1] < config.gust_chance).to(x.dtype)
         move = config.gust_length * happens * torch.cat((angle.cos(), angle.sin()), dim=1)
-        box = config.periodic_sides
+        box = self.periodic_sides
         x = push(x, centre=centre, move=move, radius=config.gust_radius, box=box)
         # A negative radius wipes nothing.
         centre = random_particle(x, draws)

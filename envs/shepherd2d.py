@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, assert_never, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 import torch
@@ -158,16 +158,11 @@ class ShepherdTask(GardenTask[Shepherd2DEnvConfig]):
         """Return the rewards, shape [...], for achieved and desired goals, [..., 3]."""
         distance = (achieved[..., :2] - desired[..., :2]).square().sum(dim=-1).sqrt()
         excess = achieved[..., 2] - desired[..., 2]
-        match self.config.reward:
-            case "sparse":
-                return ((distance <= self.config.tolerance) & (excess <= 0.0)) * 1.0 - 1.0
-            case "dense":
-                # No division: CUDA replaces it by a product with the inverse, which rounds
-                # differently.
-                nearness = -distance * (1.0 / self.config.goal_reach)
-                return nearness - self.config.reward_weight * excess.clamp(min=0.0)
-            case unknown:
-                assert_never(unknown)
+        if self.config.reward == "sparse":
+            return ((distance <= self.config.tolerance) & (excess <= 0.0)) * 1.0 - 1.0
+        # No division: CUDA replaces it by a product with the inverse, which rounds differently.
+        nearness = -distance * (1.0 / self.config.goal_reach)
+        return nearness - self.config.reward_weight * excess.clamp(min=0.0)
 
     def reward(self, particles: Particles, loss: Tensor, context: ShepherdContext) -> Tensor:
         """Return rewards [B] of a step, from the particles after it and the goals in `context`."""

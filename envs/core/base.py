@@ -173,7 +173,8 @@ class ShownEnv:
             self._window = Window(title, across * size, fps=self.metadata["render_fps"])
         self._window.show(frame.reshape(across * size, across * size, 3))
 
-    def _close_window(self) -> None:
+    def close(self) -> None:
+        """Close the window, if there is one."""
         if self._window is not None:
             self._window.close()
             self._window = None

@@ -196,10 +196,6 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
         pictures = self._pictures()
         return None if pictures is None else pictures[0]
 
-    def close(self) -> None:
-        """Close the window, if there is one."""
-        self._close_window()
-
     def particles(self) -> tuple[Tensor, Tensor]:
         """Return copies of positions [length units], [N, D], and states, [N, C], on the device."""
         return self.worlds.x[0].clone(), self.worlds.s[0].clone()

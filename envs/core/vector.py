@@ -193,9 +193,11 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
         pictures = self._pictures()
         return None if pictures is None else tuple(pictures)
 
+    close = VectorEnv.close
+
     def close_extras(self, **kwargs: Any) -> None:
         """Close the window, if there is one."""
-        self._close_window()
+        WorldsEnv.close(self)
 
     def particles(self) -> tuple[Tensor, Tensor]:
         """Return copies of positions [length units], [B, N, D], and states, [B, N, C]."""

@@ -152,11 +152,6 @@ class BatchedWorlds(WorldState):
         """Whether only the last step of an episode is rewarded."""
         return bool(self.task.config.reward == "sparse")
 
-    @property
-    def target_dim(self) -> int:
-        """Number T of target columns at the end of an observation's row."""
-        return 0 if self._target is None else int(self._target.shape[1])
-
     @torch.no_grad()
     @makes_plain_tensors
     def start(self, worlds: Tensor, keys: Tensor | None = None) -> Start:

@@ -239,7 +239,7 @@ class GardenTask(RuleDriven, GrownTask[Config]):
         particles, rate = apply_brushes(particles, action, middle, config)
         if rate is None:
             return run(particles, config.rule_steps)
-        box = config.periodic_sides
+        box = self.periodic_sides
         for _ in range(config.rule_steps):
             (x, s, *_), stepped = particles, run(particles, 1)
             x = x + rate * nearest_image(stepped.x - x, box)

@@ -118,11 +118,6 @@ class GardenConfig(GrownConfig):
         rule, hint = f"lie in [{-count}, {count - 1}]", f"there are {count} channels"
         check_field(self, "inject_channels", exist, rule, hint)
 
-    @property
-    def periodic_sides(self) -> tuple[float, float] | None:
-        """Sides of the box [length units] if it is periodic, else None."""
-        return None if self.periodic_box is None else (self.periodic_box, self.periodic_box)
-
 
 DIRECTIONS = ((1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1))
 """Directions of pushes of the "discrete" form."""
@@ -161,8 +156,8 @@ def grid_places(config: GardenConfig, device: torch.device | None = None) -> Ten
 def offsets(x: Tensor, places: Tensor, config: GardenConfig) -> Tensor:
     """Return the vector from each place to each particle [length units], shape [B, K, N, 2]."""
     spread = x[:, None].expand(-1, places.shape[1], -1, -1)
-    flat = spread.flatten(0, 1), places.flatten(0, 1)
-    return offsets_from(*flat, config.periodic_sides).view(spread.shape)
+    box = None if config.periodic_box is None else (config.periodic_box, config.periodic_box)
+    return offsets_from(spread.flatten(0, 1), places.flatten(0, 1), box).view(spread.shape)
 
 
 def brush_weights(away: Tensor, config: GardenConfig) -> Tensor:

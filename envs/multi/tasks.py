@@ -317,9 +317,6 @@ TASKS: dict[str, type[SpeciesTask]] = {
 }
 """Tasks by the names that environments take."""
 
-ENVIRONMENTS = SPECIES
-"""Tasks by the ids that `pettingzoo.make` takes."""
-
 SETTINGS: dict[str, tuple[str, Mapping[str, Any]]] = {
     **{name: (task, {}) for name, task in SPECIES.items()},
     **{size.id: (size.task, size.keywords) for size in SPECIES_SIZES},

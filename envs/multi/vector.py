@@ -74,10 +74,6 @@ class AgentsEnv(ShownEnv):
         self._state_space = Box(upper * np.array([-1.0] * len(high) + [0.0], np.float32), upper)
         self.np_random: np.random.Generator | None = None
 
-    def close(self) -> None:
-        """Close the window, if there is one."""
-        self._close_window()
-
     def _start(self, worlds: NDArray[np.int64], seed: Any, key_seed: Any) -> Tensor:
         """Start episodes in worlds, indices [M]; return all worlds' perception, [B, N, P].
 
