@@ -93,13 +93,6 @@ class GardenersEnv(KnownAgents):
     ## Version history
 
     - v0: first version.
-
-    Args:
-        max_cycles: Steps of an episode.
-        config: Fields of the configuration of `npa/Gardener2D-v0`.
-
-    Raises:
-        NPAError: A name is unknown, or a value wrong.
     """
 
     metadata: ClassVar[dict[str, Any]] = {

@@ -158,13 +158,6 @@ class MultiSpeciesEnv(CrowdEnv):
     ## Version history
 
     - v0: first version.
-
-    Args:
-        task: A name from `npa_envs.envs.multi.TASKS`.
-        config: Fields of the task's configuration.
-
-    Raises:
-        NPAError: A name is unknown, or a value wrong.
     """
 
     def __init__(self, task: str = "mixing", **config: Any) -> None:

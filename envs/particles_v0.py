@@ -93,13 +93,6 @@ class ParticlesEnv(CrowdEnv):
     ## Version history
 
     - v0: first version.
-
-    Args:
-        task: A name from `npa_envs.envs.multi.TASKS`.
-        config: Fields of the task's configuration.
-
-    Raises:
-        NPAError: A name is unknown, a value wrong, or there are more than 512 particles.
     """
 
     metadata: Any = CrowdEnv.metadata | {"name": "npa_particles_v0"}

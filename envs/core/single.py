@@ -157,7 +157,8 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
             keys = rng_keys(None, 1, self.np_random)
         observation = self._change_worlds(self.worlds.start, self._world, keys)
         info = self.losses_of(self.worlds.report.numbers[:, 0].tolist())
-        return self.spaces.observation_output(observation[0]), info | self._extra_info()
+        info |= self._of_world(self.worlds.extra_info())
+        return self.spaces.observation_output(observation[0]), info
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Apply an action, shape [N, A], in [-1, 1].
@@ -185,7 +186,7 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
         info |= {"success": bool(ending & SUCCESS), "diverged": diverged}
         if terminated or truncated:
             info["reason"] = reason(ending)
-        info |= self._extra_info() | self._of_world(worlds.step_info())
+        info |= self._of_world(worlds.extra_info() | worlds.step_info())
         self._is_unrewarded = worlds.rewards_last_step_only and not (terminated or truncated)
         self._show()
         returned = self.spaces.observation_output(worlds.host_observation(observation)[0])
@@ -214,10 +215,6 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
         placed = self.worlds.checked_particles(x, s, 1, self.config.particle_count)
         observation = self._change_worlds(self.worlds.place, self._world, placed)
         return self.spaces.observation_output(observation[0])
-
-    def _extra_info(self) -> dict[str, Any]:
-        """Return the entries of infos that the task adds in every call."""
-        return self._of_world(self.worlds.extra_info())
 
     def _of_world(self, values: dict[str, Tensor]) -> dict[str, Any]:
         return {
