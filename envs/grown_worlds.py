@@ -93,7 +93,7 @@ class GrownTask(PictureEnvTask[Config]):
 
     @property
     def first_pool_seed(self) -> int:
-        """Seed of world 0 of the pool: 0 to train, `FIRST_TEST_SEED` for the split "test"."""
+        """Seed of world 0 of the pool: 0 for split="train", `FIRST_TEST_SEED` for "test"."""
         return 0 if self.config.split == "train" else FIRST_TEST_SEED
 
     def seed(self, random: WorldRandom) -> tuple[Tensor, Tensor]:

@@ -99,7 +99,7 @@ def load_coded_rule(config: Shapeshifter2DEnvConfig, device: torch.device) -> tu
 
 
 class CodeSpaces(ParticleSpaces):
-    """Spaces: observe a coarse picture and the goal's; act by a code or by the index of one."""
+    """Spaces: coarse pictures of world and goal as observations; codes or indices as actions."""
 
     def __init__(self, physics: Physics, config: Shapeshifter2DEnvConfig) -> None:
         _, codes = load_coded_rule(config, torch.device("cpu"))

@@ -16,7 +16,7 @@ from npa_envs import world_mean
 from npa_envs.checks import check_field, check_non_negative, check_positive
 from npa_envs.envs.core.base import to_output
 from npa_envs.envs.core.task import Start
-from npa_envs.envs.core.vector import NPAVectorEnv
+from npa_envs.envs.core.vector import vector_class
 from npa_envs.envs.garden.base import GardenEnv, GardenTask
 from npa_envs.envs.garden.brushes import OBSERVATION_LIMIT, BrushSpaces, GardenConfig, GardenReward
 from npa_envs.tasks.seeds import uniform_ball
@@ -315,7 +315,4 @@ class Shepherd2DEnv(_GoalReward, GardenEnv):
     task_type = ShepherdTask
 
 
-class Shepherd2DVectorEnv(_GoalReward, NPAVectorEnv):
-    """Worlds of `Shepherd2DEnv`, batched on one device; its docstring describes both."""
-
-    task_type = ShepherdTask
+Shepherd2DVectorEnv = vector_class(Shepherd2DEnv, _GoalReward)

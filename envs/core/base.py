@@ -100,7 +100,7 @@ def _batch_shape(
 def action_tensor(
     name: str, action: Any, expected: tuple[int, ...], space: str, letters: str = ""
 ) -> Tensor:
-    """Return an action of shape `expected`, checked, as a float32 tensor, on its old device.
+    """Return an action of shape `expected`, checked, as float32; a tensor keeps its device.
 
     The error message calls the action `name`, and refers to the space called `space`.
     """

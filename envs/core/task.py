@@ -311,7 +311,7 @@ class TargetEnvTask(EnvTask[Config]):
 
     @property
     def pixel_size(self) -> float:
-        """Size of a particle in pictures: that of the training task."""
+        """Size of a particle in pictures [length units], from the training task."""
         size: float = self.task.pixel_size
         return size
 

@@ -36,12 +36,12 @@ class BatchedSpaces(VectorEnv[Any, Any, Any]):
 
     @cached_property
     def observation_space(self) -> Space[Any]:  # type: ignore[override]
-        """Space of all observations, [B, ...]."""
+        """Space of the observations of all B worlds, [B, ...]."""
         return batch_space(self.single_observation_space, self.num_envs)
 
     @cached_property
     def action_space(self) -> Space[Any]:  # type: ignore[override]
-        """Space of all actions, [B, ...]."""
+        """Space of the actions of all B worlds, [B, ...]."""
         return batch_space(self.single_action_space, self.num_envs)
 
 
@@ -253,15 +253,15 @@ def with_masks(values: dict[str, Any], which: Any) -> dict[str, Any]:
     return infos
 
 
-def vector_class(env_type: type[WorldsEnv]) -> type[NPAVectorEnv]:
-    """Return the vector environment's class for the class of a single environment."""
+def vector_class(env_type: type[WorldsEnv], *mixins: type[Any]) -> type[NPAVectorEnv]:
+    """Return the vector environment's class for the class of a single one, with mixins."""
     name = env_type.__name__
     attributes = {
         "__doc__": f"Worlds of `{name}`, batched on one device; its docstring describes both.",
         "__module__": env_type.__module__,
         "task_type": env_type.task_type,
     }
-    return type(name.replace("Env", "VectorEnv"), (NPAVectorEnv,), attributes)
+    return type(name.replace("Env", "VectorEnv"), (*mixins, NPAVectorEnv), attributes)
 
 
 # Checks of arguments that are no fields of a configuration.
@@ -275,7 +275,7 @@ def checked_count(name: str, value: Any) -> int:
 
 
 def checked_mode(mode: str | AutoresetMode) -> AutoresetMode:
-    """Return Gymnasium's mode for a name or a mode."""
+    """Return Gymnasium's `AutoresetMode` for its name or for itself."""
     if isinstance(mode, AutoresetMode):
         return mode
     by_name = AUTORESET_MODES | {known.value: known for known in AutoresetMode}

@@ -83,7 +83,7 @@ def check_memory(
 
 
 def check_default_dtype() -> None:
-    """Check that torch's default dtype is float32, the worlds' own."""
+    """Check that torch's default dtype is float32, which the worlds' tensors have."""
     dtype = torch.get_default_dtype()
     if dtype != torch.float32:
         raise NPAError(

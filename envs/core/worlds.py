@@ -134,9 +134,9 @@ class BatchedWorlds(WorldState):
 
     def __getstate__(self) -> dict[str, Any]:
         # The next step makes these again.
-        names = ("_evaluation", "host_endings", "host_numbers")
-        names += ("_neighbours", "_perceived", "_host_perceived")
-        return self.__dict__ | dict.fromkeys(names) | {"_host_is_current": False}
+        none = dict.fromkeys(("_neighbours", "_evaluation", "host_endings", "host_numbers"))
+        none |= dict.fromkeys(("_perceived", "_host_perceived"))
+        return self.__dict__ | none | {"_host_is_current": False}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
@@ -425,7 +425,7 @@ class BatchedWorlds(WorldState):
         return self.goal_task.extra_info(self.s)
 
     def step_info(self) -> dict[str, Tensor]:
-        """Return `particle_reward` and `updated` of infos, as far as asked for, [B, N] each."""
+        """Return `particle_reward` and `updated` for infos, if configured, [B, N] each."""
         info: dict[str, Tensor] = {}
         if self.particle_rewards is not None:
             info["particle_reward"] = self.particle_rewards.reward
@@ -499,7 +499,7 @@ class GraphedResets:
     """Starts of next episodes, on CUDA as one graph launch instead of some hundred launches.
 
     A graph serves a fixed number of worlds. If fewer restart, the last index is repeated, and that
-    world is started in the same way several times. `start`, a bound method, is referred to weakly.
+    world is started in the same way several times. Only a weak reference to `start` is kept.
     """
 
     def __init__(
@@ -538,7 +538,7 @@ class GraphedResets:
 
 
 class _GraphedReset:
-    """The graph of a start of a fixed number of worlds."""
+    """A CUDA graph that starts episodes in a fixed number of worlds."""
 
     neighbours: NeighbourState
 

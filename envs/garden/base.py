@@ -184,7 +184,7 @@ class RuleDriven:
         raise NotImplementedError
 
     def next_goals(self, elapsed: Tensor, context: Any, goal: Tensor) -> None:
-        """Change `goal`, [B], in place after a step; `elapsed`: steps since the start, [B]."""
+        """Change `goal`, [B], in place after a step, by default not; `elapsed`: steps, [B]."""
 
     def context_info(self, particles: Particles, context: Any) -> dict[str, Tensor]:
         """Return what the task adds to infos, by name, [B, ...] each; by default nothing."""

@@ -183,7 +183,7 @@ class Population(NamedTuple):
 
     @property
     def spans(self) -> list[slice]:
-        """Slice of each species' particles."""
+        """Slice of each species' particles in x and s."""
         ends = list(accumulate(self.counts))
         return [slice(end - count, end) for end, count in zip(ends, self.counts, strict=True)]
 
@@ -239,11 +239,11 @@ class SpeciesTask(WorldTask[Any]):
         raise NotImplementedError
 
     def with_opponent(self, action: Tensor, population: Population, random: WorldRandom) -> Tensor:
-        """Return `action`, [B, N, A], where the environment may replace rows of an opponent."""
+        """Return `action`, [B, N, A]; a task with an opponent replaces its particles' rows."""
         return action
 
     def final_rewards(self, rewards: Tensor, live: Tensor, species: Tensor) -> Tensor:
-        """Return the agents' rewards, [B, A], with what the task changes; by default nothing."""
+        """Return `rewards`, [B, A], which a task may change; by default unchanged."""
         return rewards
 
     def is_over(self, counts: tuple[int, ...]) -> bool:

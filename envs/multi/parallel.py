@@ -120,7 +120,7 @@ class CrowdEnv(AgentsEnv, KnownAgents):
         return None if pictures is None else pictures[0]
 
     def particles(self) -> tuple[Tensor, Tensor]:
-        """Return copies of positions [length units], [N', 2], and states, [N', C], of N' left."""
+        """Return copies of positions [length units], [N', 2], and states, [N', C]; N' are left."""
         population = self.worlds.population(0)
         return population.x[0], population.s[0]
 
@@ -142,7 +142,7 @@ class CrowdEnv(AgentsEnv, KnownAgents):
         self.agents = [self.possible_agents[k] for k in self._live]
 
     def _with_zeros(self, action: Tensor) -> Tensor:
-        """Return the live agents' actions, [N', A], and zeros for other particles, [1, N, A]."""
+        """Return all particles' actions, [1, N, A]: the live agents', [N', A], else zeros."""
         count = self.worlds.particle_count
         if len(action) == count:
             return action[None]

@@ -461,7 +461,7 @@ class Cohort:
         return self.__dict__ | {"_neighbours": None}
 
     def act(self, action: Tensor) -> None:
-        """Apply finite actions, [M, N', A]; measure losses and find neighbours; no sync."""
+        """Apply finite actions, [M, N', A]; compute losses and neighbours, without waiting."""
         action = self._task.with_opponent(action, self.population, self.random)
         self._draw()
         self._actions.apply(action)

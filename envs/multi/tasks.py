@@ -204,7 +204,7 @@ class CoMorphogenesisTask(PictureLossTask):
 
 @dataclass(frozen=True, kw_only=True)
 class InvasionConfig(OnePictureConfig):
-    """`OnePictureConfig` with the player of the invaders; refuses reward="team"."""
+    """`OnePictureConfig` with `opponent`, who plays the invaders; refuses reward="team"."""
 
     words = OnePictureConfig.words | {"opponent": (None, "random")}
 

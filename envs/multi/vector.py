@@ -37,7 +37,7 @@ BatchOutcome = tuple[ByAgent, ByAgent, ByAgent, ByAgent, Infos]
 
 
 class AgentsEnv(ShownEnv):
-    """Base class of environments of agents, of one world or many: names, spaces, start, state."""
+    """Base class of environments with several agents, of one world or many."""
 
     metadata: Any = {  # noqa: RUF012 (nobody writes to it)
         "name": "npa_multispecies_v0",
