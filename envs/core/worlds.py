@@ -109,7 +109,6 @@ class BatchedWorlds(WorldState):
         """What a step returns apart from the observation."""
         # Each world's ending, then whether the actions were finite.
         self._endings = torch.zeros(world_count + 1, dtype=torch.uint8, device=self.device)
-        self._evaluation: EpisodeUpdate | None = None
         self._target: Tensor | None = self.task.target_rows
         self._perceived: Tensor | None = None
         """Perception, shape [B, N, P], that the graph of a step writes; None without one."""
@@ -125,7 +124,7 @@ class BatchedWorlds(WorldState):
             self._start_and_sort, world_count, self.device, recorded=self.task.start_is_short
         )
         self._side_stream = SideStream(self.device) if self.device.type == "cuda" else None
-        self._make_host_copies()
+        self._prepare_report()
 
     def _prepare_actions(self) -> None:
         flags = {"enabled": self.enabled, "diverged": self.diverged}
@@ -140,12 +139,26 @@ class BatchedWorlds(WorldState):
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
-        self._make_host_copies()
+        self._prepare_report()
 
-    def _make_host_copies(self) -> None:
-        """Make the tensors that the host reads: on CUDA pinned memory that the device fills."""
+    @makes_plain_tensors
+    def _prepare_report(self) -> None:
+        """Make what computes the report, and what the host reads of it: on CUDA pinned memory."""
         read = (self._endings, self.report.numbers)
         self.host_endings, self.host_numbers = map(pinned_like, read) if self.x.is_cuda else read
+        config = self.task.config
+        rewarded_step = self.episode_steps if self.rewards_last_step_only else None
+        self._evaluation = EpisodeUpdate(
+            EpisodeRules(self.episode_steps, rewarded_step, config.on_divergence),
+            enabled=self.enabled,
+            diverged=self.diverged,
+            first_loss=self._start_loss,
+            success_loss=self._success_loss,
+            elapsed=self.elapsed,
+            numbers=self.report.numbers,
+            flags=self.report.endings,
+            endings=self._endings,
+        )
 
     @property
     def rewards_last_step_only(self) -> bool:
@@ -207,7 +220,7 @@ class BatchedWorlds(WorldState):
         if not self.term_names:
             self.term_names = tuple(terms)
             self.report = StepReport.empty(self.world_count, len(terms), self.device)
-            self._make_host_copies()
+            self._prepare_report()
         self.particles.put_(worlds, placed)
         zeros = torch.zeros_like(values)
         numbers = torch.cat((zeros[:1], total(values)[None], values, zeros))
@@ -361,8 +374,6 @@ class BatchedWorlds(WorldState):
         task, particle_rewards = self.goal_task, self.particle_rewards
         losses = task.losses(self.x, self.s)
         terms = torch.stack(checked_losses(task, losses, len(self.x), self.term_names))
-        if self._evaluation is None:
-            self._evaluation = self._make_evaluation()
         if particle_rewards is None:
             self._evaluation(terms)
         else:
@@ -391,21 +402,6 @@ class BatchedWorlds(WorldState):
     def task_rewards(self) -> Tensor | None:
         """Return the task's own rewards of a step, [B]; None: they are the loss's decrease."""
         return None
-
-    def _make_evaluation(self) -> EpisodeUpdate:
-        config = self.task.config
-        rewarded_step = self.episode_steps if self.rewards_last_step_only else None
-        return EpisodeUpdate(
-            EpisodeRules(self.episode_steps, rewarded_step, config.on_divergence),
-            enabled=self.enabled,
-            diverged=self.diverged,
-            first_loss=self._start_loss,
-            success_loss=self._success_loss,
-            elapsed=self.elapsed,
-            numbers=self.report.numbers,
-            flags=self.report.endings,
-            endings=self._endings,
-        )
 
     def check_losses(self, worlds: Tensor) -> None:
         """Check that the losses of the worlds of indices `worlds`, int64 [M], are finite."""
