@@ -340,7 +340,7 @@ def rng_keys(
 ) -> Tensor:
     """Return the key of each world's random stream, int64, shape [B].
 
-    World k has the key of seed + k, or of the k-th seed of a sequence; None: of `np_random`.
+    World k gets that of seed + k, or of the k-th seed given; None: drawn from `np_random`.
     """
     if seed is None:
         keys = np_random.integers(2**64, size=world_count, dtype=np.uint64)

@@ -120,7 +120,7 @@ class WorldState:
         """One random stream for each world."""
 
     def next_streams(self, worlds: Tensor, keys: Tensor | None) -> WorldRandom:
-        """Return the random streams for the next episodes of some worlds, [M].
+        """Return the random streams for the next episodes of worlds, by their indices, [M].
 
         Keys, int64, shape [M], start new sequences of episodes; None: each world's next episode.
         """

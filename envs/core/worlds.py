@@ -143,7 +143,7 @@ class BatchedWorlds(WorldState):
 
     @makes_plain_tensors
     def _prepare_report(self) -> None:
-        """Make what computes the report, and what the host reads of it: on CUDA pinned memory."""
+        """Make what writes the report, and the tensors that the host reads, on CUDA pinned."""
         read = (self._endings, self.report.numbers)
         self.host_endings, self.host_numbers = map(pinned_like, read) if self.x.is_cuda else read
         config = self.task.config
@@ -492,7 +492,7 @@ GROWTH = 4
 
 
 class GraphedResets:
-    """Starts of next episodes, on CUDA as one graph launch instead of some hundred launches.
+    """Starts the next episodes of worlds, on CUDA by one graph launch instead of some hundred.
 
     A graph serves a fixed number of worlds. If fewer restart, the last index is repeated, and that
     world is started in the same way several times. Only a weak reference to `start` is kept.
