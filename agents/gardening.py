@@ -33,7 +33,7 @@ class BrushPolicy:
                 f"{type(self.task).__name__}: make it with gymnasium.make('npa/Gardener2D-v0')"
             )
         self.config = self.task.config
-        self.columns = BrushLayout.of(self.config)
+        self.columns = BrushLayout.for_config(self.config)
         self.shape = inner.spaces.rows_shape
         """Shape of a world's actions, (K, W)."""
 

@@ -20,7 +20,7 @@ from npa_envs.world.randomness import StreamId, WorldRandom
 
 @dataclass(frozen=True, kw_only=True)
 class Gardener2DEnvConfig(GardenConfig):
-    """Adds the disturbances: gusts, which move particles, and blights, which wipe states."""
+    """`GardenConfig` with gusts, which move particles, and blights, which wipe states."""
 
     position_noise: float = 0.002
     """Standard deviation of the noise added to every position in a step of the rule
@@ -53,19 +53,19 @@ class Gardener2DEnvConfig(GardenConfig):
 
 
 class GardenerTask(GardenTask[Gardener2DEnvConfig]):
-    """A picture with gusts and blights."""
+    """A picture that gusts and blights disturb."""
 
     config_type = Gardener2DEnvConfig
 
     def disturb(self, particles: Particles, random: WorldRandom) -> Particles:
-        """Return worlds after a gust and a blight; their random stream is not the rule's."""
+        """Return worlds after a gust and a blight, drawn from a random stream of their own."""
         x, s, *_ = particles
         config, draws = self.config, random.substream(StreamId.DAMAGE)
         chance, angle = draws.uniform(2), 2.0 * math.pi * draws.uniform(1)
         centre = random_particle(x, draws)
         happens = (chance[:, :1] < config.gust_chance).to(x.dtype)
         move = config.gust_length * happens * torch.cat((angle.cos(), angle.sin()), dim=1)
-        box = config.periodic_sides
+        box = self.periodic_sides
         x = push(x, centre=centre, move=move, radius=config.gust_radius, box=box)
         # A negative radius wipes nothing.
         centre = random_particle(x, draws)
@@ -75,7 +75,7 @@ class GardenerTask(GardenTask[Gardener2DEnvConfig]):
         return particles._replace(x=x, s=s)
 
     def reward(self, particles: Particles, loss: Tensor, context: GardenContext) -> Tensor:
-        """Return 1 for worlds as at their start, 0 for worlds as bad as grey, shape [B]."""
+        """Return rewards, [B]: 1 for a picture as at its start, 0 for one as bad as grey."""
         return (1.0 - self.lost_fraction(loss, context)).clamp_min(-1.0)
 
 

@@ -23,7 +23,7 @@ AGENTS = ("keeper_0", "raider_0")
 
 
 class _BothSpaces(BrushSpaces):
-    """Spaces of one gardener, and conversion of both gardeners' actions to rows of brushes."""
+    """Spaces of one gardener, and conversion of both gardeners' actions."""
 
     def action(self, action: Any, world_count: int | None) -> Tensor:
         """Return the rows of both gardeners' brushes, shape [B, 2 K, W]."""
@@ -93,13 +93,6 @@ class GardenersEnv(KnownAgents):
     ## Version history
 
     - v0: first version.
-
-    Args:
-        max_cycles: Steps of an episode.
-        config: Fields of the configuration of `npa/Gardener2D-v0`.
-
-    Raises:
-        NPAError: A name is unknown, or a value wrong.
     """
 
     metadata: ClassVar[dict[str, Any]] = {
@@ -164,7 +157,7 @@ def _for_both(observation: Any) -> dict[str, Any]:
 
 
 def parallel_env(max_cycles: int = 32, **config: Any) -> GardenersEnv:
-    """Return the environment in which both act at once; arguments are those of `GardenersEnv`."""
+    """Return the environment in which both agents act at once; arguments: of `GardenersEnv`."""
     return GardenersEnv(max_cycles, **config)
 
 

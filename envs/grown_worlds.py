@@ -30,7 +30,7 @@ FIRST_TEST_SEED = 1_000_000
 
 @dataclass(frozen=True, kw_only=True)
 class GrownConfig(Morphogenesis2DEnvConfig):
-    """Adds the rule that grows the worlds, and the pool of grown worlds."""
+    """`Morphogenesis2DEnvConfig` with the rule that grows worlds, and the pool of worlds."""
 
     words = EnvConfig.words | {"split": get_args(Split)}
 
@@ -66,14 +66,14 @@ Config = TypeVar("Config", bound=GrownConfig)
 
 
 class GrownTask(PictureEnvTask[Config]):
-    """Pictures that a rule has grown."""
+    """A task whose worlds begin with pictures that a rule has grown."""
 
     config_type: ClassVar[type[GrownConfig]] = GrownConfig
     grows = True
 
     @cached_property
     def rule(self) -> NPARule:
-        """The rule that grows them."""
+        """The trained rule that grows the worlds."""
         config, known = self.config, shipped_rules("morphogenesis2d")
         if config.rule is None and config.target not in known:
             raise NPAError(
@@ -93,11 +93,11 @@ class GrownTask(PictureEnvTask[Config]):
 
     @property
     def first_pool_seed(self) -> int:
-        """Seed of the first world of the pool, far from the other split's."""
+        """Seed of world 0 of the pool: 0 for split="train", `FIRST_TEST_SEED` for "test"."""
         return 0 if self.config.split == "train" else FIRST_TEST_SEED
 
     def seed(self, random: WorldRandom) -> tuple[Tensor, Tensor]:
-        """Return seeds that `rule` has grown `grow_steps` steps: x [B, N, D] and s [B, N, C]."""
+        """Return worlds that `rule` has grown from seeds: x [B, N, D] and s [B, N, C]."""
         seeds = Particles(*super().seed(random))
         x, s, *_ = grow(self.rule, self.config, seeds, random, dt=1.0, position_noise=0.0)
         return x, s
@@ -111,7 +111,7 @@ def run_rule(
     random: WorldRandom,
     **changes: Any,
 ) -> Particles:
-    """Return worlds after steps of a rule with an environment's constants.
+    """Return worlds after `steps` steps of a rule with the constants of an environment.
 
     `changes` replace arguments of `rollout`.
     """
@@ -124,9 +124,9 @@ def run_rule(
 def grow(
     rule: NPARule, config: Any, seeds: Particles, random: WorldRandom, **changes: Any
 ) -> Particles:
-    """Return worlds after `grow_steps` steps of a rule; arguments are those of `run_rule`.
+    """Return seeds after `grow_steps` steps of a rule; other arguments as in `run_rule`.
 
-    One after the other: a rule's matrix products depend in the last bit on the number of worlds.
+    Worlds are grown one by one: matrix products depend in the last bit on the number of worlds.
     """
     worlds = []
     for one in torch.split(torch.arange(len(seeds.x), device=seeds.x.device), 1):
@@ -136,22 +136,22 @@ def grow(
 
 
 def check_rule_driven(config: Any) -> None:
-    """Check the fields that configurations of rule-driven worlds share."""
+    """Check `picture_size` and `tell_updated` of worlds that a rule steps."""
     check_picture_size(config)
     if config.tell_updated:
         raise NPAError("tell_updated must be False, as actions do not belong to particles")
 
 
-def check_runs(rule: NPARule, config: EnvConfig, *names: str) -> None:
-    """Check that these fields are those of the rule that steps the worlds."""
+def check_matches_rule(rule: NPARule, config: EnvConfig, *names: str) -> None:
+    """Check that fields of these names have the values of the rule that steps the worlds."""
     for name in names:
         value = getattr(rule, name)
         is_same, hint = getattr(config, name) == value, f"give {name}={value!r}, or another rule"
         check_field(config, name, is_same, f"be the rule's, {value!r}", hint)
 
 
-def load_read_out(field: str, name: str, state_dim: int, device: torch.device) -> NPARule:
-    """Return the rule with a read-out that a field of a configuration names, checked."""
+def load_readout_rule(field: str, name: str, state_dim: int, device: torch.device) -> NPARule:
+    """Return the rule of this name or file, which must have a read-out; `field`: its keyword."""
     rule = load_rule(name, device=device).float().requires_grad_(False)
     if rule.readout is None or rule.state_dim != state_dim:
         raise NPAError(

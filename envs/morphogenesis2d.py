@@ -19,7 +19,7 @@ from npa_envs.tasks.targets.images import MAX_POINT_COUNT
 
 @dataclass(frozen=True, kw_only=True)
 class PictureConfig(EnvConfig):
-    """Adds the seed and the loss of `Morphogenesis2DConfig`, which documents the fields."""
+    """`EnvConfig` with seed and loss of `Morphogenesis2DConfig`, which documents the fields."""
 
     task_config_type = Morphogenesis2DConfig
 
@@ -42,7 +42,7 @@ class PictureConfig(EnvConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class Morphogenesis2DEnvConfig(PictureConfig):
-    """Adds the target."""
+    """`PictureConfig` with the target picture."""
 
     target: str = Morphogenesis2DConfig.target
 
@@ -59,7 +59,7 @@ class PictureEnvTask(TargetEnvTask[Config]):
     pixel_bytes = 16
 
     def losses(self, x: Tensor, s: Tensor) -> Mapping[str, Tensor]:
-        """Return the density error and the weighted colour error of each world."""
+        """Return density error and weighted colour error of each world, by name, [B] each."""
         density, colour = self.task.splat_losses(x, s)
         return {"density": density, "colour": self.config.colour_weight * colour}
 

@@ -16,7 +16,7 @@ from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import EnvTask, TargetEnvTask
 from npa_envs.envs.core.vector import vector_class
-from npa_envs.envs.grown_worlds import load_read_out
+from npa_envs.envs.grown_worlds import load_readout_rule
 from npa_envs.render import turntable_frames
 from npa_envs.tasks.morphogenesis3d import Morphogenesis3D, Morphogenesis3DConfig
 from npa_envs.world.particles import Particles
@@ -30,7 +30,7 @@ PARTICLE_BYTES = 700
 
 @dataclass(frozen=True, kw_only=True)
 class Morphogenesis3DEnvConfig(EnvConfig):
-    """Adds target, seed and views of `Morphogenesis3DConfig`, which documents most fields."""
+    """`EnvConfig` with fields of `Morphogenesis3DConfig`, which documents most of them."""
 
     task_config_type = Morphogenesis3DConfig
 
@@ -61,7 +61,7 @@ class Morphogenesis3DEnvConfig(EnvConfig):
 
     @property
     def task_config(self) -> Morphogenesis3DConfig:
-        """Configuration of the training task; the compared views are the held-out ones."""
+        """Configuration of the training task, whose held-out views the loss compares."""
         return self.as_config(
             Morphogenesis3DConfig,
             training_views=1,
@@ -71,7 +71,7 @@ class Morphogenesis3DEnvConfig(EnvConfig):
 
 
 class SolidTask(TargetEnvTask[Morphogenesis3DEnvConfig]):
-    """An object to grow, compared view by view by `npa_envs.tasks.morphogenesis3d`."""
+    """A 3D object to grow; the loss, of `npa_envs.tasks.morphogenesis3d`, compares views."""
 
     config_type = Morphogenesis3DEnvConfig
     training_task = Morphogenesis3D
@@ -83,22 +83,24 @@ class SolidTask(TargetEnvTask[Morphogenesis3DEnvConfig]):
         if not self.config.readout:
             return task
         state_dim = self.config.state_dim
-        return task.for_rule(load_read_out("readout", self.config.readout, state_dim, self.device))
+        return task.for_rule(
+            load_readout_rule("readout", self.config.readout, state_dim, self.device)
+        )
 
     @classmethod
     def bytes_per_world(cls, config: Any) -> int:
-        """Return about how much memory a world's views take [bytes]."""
+        """Return about how much memory the views of one world take [bytes]."""
         view = PIXEL_BYTES * config.resolution**2 + PARTICLE_BYTES * config.particle_count
         return int(view * config.view_count * (2 if config.per_particle_reward else 1))
 
     def losses(self, x: Tensor, s: Tensor) -> Mapping[str, Tensor]:
-        """Return the mean absolute difference of each world's views."""
+        """Return each world's mean absolute difference from the target's views, [B], by name."""
         return {"views": self.task.metric(x, s)}
 
     def draw_particles(
         self, particles: Particles, style: str, azimuth: float = 0.0
     ) -> NDArray[np.uint8]:
-        """Return a picture of a world; with a read-out, of its Gaussians."""
+        """Return pictures as the base class; with a read-out, of the particles' Gaussians."""
         if not self.config.readout or style != "particles":
             return super().draw_particles(particles, style, azimuth)
         frames = turntable_frames(

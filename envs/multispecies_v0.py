@@ -8,9 +8,12 @@ from __future__ import annotations
 from typing import Any
 
 from npa_envs.envs.multi.parallel import CrowdEnv, in_turns, register
-from npa_envs.envs.multi.tasks import ENVIRONMENTS as ENVIRONMENTS
 from npa_envs.envs.multi.tasks import SETTINGS, task_settings
 from npa_envs.envs.multi.vector import MultiSpeciesVectorEnv
+from npa_envs.registration import SPECIES
+
+ENVIRONMENTS = SPECIES
+"""Tasks by the ids that `pettingzoo.make` takes."""
 
 
 class MultiSpeciesEnv(CrowdEnv):
@@ -155,13 +158,6 @@ class MultiSpeciesEnv(CrowdEnv):
     ## Version history
 
     - v0: first version.
-
-    Args:
-        task: A name from `npa_envs.envs.multi.TASKS`.
-        config: Fields of the task's configuration.
-
-    Raises:
-        NPAError: A name is unknown, or a value wrong.
     """
 
     def __init__(self, task: str = "mixing", **config: Any) -> None:
@@ -209,7 +205,7 @@ raw_env, env = in_turns(parallel_env)
 
 
 def settings(task: str, species_count: int | None, config: dict[str, Any]) -> dict[str, Any]:
-    """Return all keywords for a task's name or an id, whose own keywords `config` replaces."""
+    """Return all keywords for a task's name or an id; those in `config` replace the id's own."""
     name, keywords = task_settings(task)
     if species_count is not None:
         keywords["species_count"] = species_count

@@ -10,11 +10,11 @@ from typing import Any
 
 from npa_envs.envs.core.config import plain
 from npa_envs.envs.multi.parallel import CrowdEnv, in_turns, register
-from npa_envs.envs.multi.tasks import ENVIRONMENTS as OF_SPECIES
 from npa_envs.envs.multi.tasks import task_type
 from npa_envs.errors import NPAError
+from npa_envs.registration import SPECIES
 
-ENVIRONMENTS = {name.replace("-v0", "Particles-v0"): task for name, task in OF_SPECIES.items()}
+ENVIRONMENTS = {name.replace("-v0", "Particles-v0"): task for name, task in SPECIES.items()}
 """Tasks by the ids that `pettingzoo.make` takes."""
 
 PARTICLE_COUNT = 64
@@ -93,13 +93,6 @@ class ParticlesEnv(CrowdEnv):
     ## Version history
 
     - v0: first version.
-
-    Args:
-        task: A name from `npa_envs.envs.multi.TASKS`.
-        config: Fields of the task's configuration.
-
-    Raises:
-        NPAError: A name is unknown, a value wrong, or there are more than 512 particles.
     """
 
     metadata: Any = CrowdEnv.metadata | {"name": "npa_particles_v0"}

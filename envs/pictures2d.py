@@ -28,7 +28,7 @@ CHANNELS = 4
 
 @dataclass(frozen=True, kw_only=True)
 class Pictures2DEnvConfig(PictureConfig):
-    """Adds the targets, and whether observations show them."""
+    """`PictureConfig` with several targets, and whether observations show them."""
 
     words = EnvConfig.words | {"split": get_args(Split)}
 
@@ -68,12 +68,12 @@ class Pictures2DEnvConfig(PictureConfig):
 
     @property
     def task_config(self) -> Morphogenesis2DConfig:
-        """Configuration of the training task."""
+        """Configuration of the training task, with the targets of the split."""
         return self._config_of(self.targets if self.split == "train" else self.test_targets)
 
     @property
     def target_dim(self) -> int:
-        """Columns of the target after those of perception in an observation's row, T."""
+        """Number T of target columns at the end of an observation's row."""
         return CHANNELS * self.picture_size**2 if self.observe_target else 0
 
     def _config_of(self, targets: tuple[str, ...]) -> Morphogenesis2DConfig:
@@ -101,7 +101,7 @@ class PicturesTask(PictureEnvTask[Pictures2DEnvConfig]):
 
     @classmethod
     def bytes_per_world(cls, config: Any) -> int:
-        """Return about how much memory a world's picture and columns of its target take [bytes]."""
+        """Return about how much memory the loss and target columns of one world take [bytes]."""
         numbers = OBSERVATION_COPIES * config.particle_count * config.target_dim
         return super().bytes_per_world(config) + 4 * int(numbers)
 

@@ -17,7 +17,7 @@ from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import Start, TargetEnvTask
 from npa_envs.envs.core.vector import vector_class
-from npa_envs.envs.grown_worlds import load_read_out
+from npa_envs.envs.grown_worlds import load_readout_rule
 from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
 from npa_envs.tasks.point_classification import (
     PICTURE_MARGIN,
@@ -34,7 +34,7 @@ Score = Literal["error", "cross_entropy", "accuracy"]
 
 @dataclass(frozen=True, kw_only=True)
 class PointClassificationEnvConfig(EnvConfig):
-    """Adds the clouds and the loss of `PointClassificationConfig`, which documents the fields."""
+    """`EnvConfig` with fields of `PointClassificationConfig`, which documents them."""
 
     task_config_type = PointClassificationConfig
 
@@ -74,14 +74,14 @@ class PointClassificationEnvConfig(EnvConfig):
 
 
 class _WorldByWorld(NPARule):
-    """A rule whose read-out does not depend on the batch in its last bits."""
+    """A rule whose read-out of a world is the same, bit for bit, in every batch."""
 
     def read_out(self, states: Tensor) -> Tensor:
         return torch.stack([super(_WorldByWorld, self).read_out(world) for world in states])
 
 
 class PointClassificationTask(TargetEnvTask[PointClassificationEnvConfig]):
-    """Clouds of digits, and the error of their particles' outputs."""
+    """Particles in the shape of a digit, with the error of their outputs as the loss."""
 
     config_type = PointClassificationEnvConfig
     task: PointClassification
@@ -94,7 +94,7 @@ class PointClassificationTask(TargetEnvTask[PointClassificationEnvConfig]):
         _ = task.clouds.coverage
         if not config.rule:
             return task
-        loaded = load_read_out("rule", config.rule, config.state_dim, device)
+        loaded = load_readout_rule("rule", config.rule, config.state_dim, device)
         rule = _WorldByWorld(**loaded.hyper_parameters()).to(device)
         rule.load_state_dict(loaded.state_dict())
         return task.for_rule(rule.requires_grad_(False))
@@ -105,26 +105,26 @@ class PointClassificationTask(TargetEnvTask[PointClassificationEnvConfig]):
         return Start(x, s, goal=label)
 
     def losses(self, x: Tensor, s: Tensor) -> Mapping[str, Tensor]:
-        """Return each world's loss of its outputs, and its weighted overflow."""
+        """Return each world's mean score and weighted overflow of states, by name, [B] each."""
         overflow = self.config.overflow_weight * world_mean(self.task.overflows(s)[..., None])[:, 0]
         score = world_mean(self._scores(s)[..., None])[:, 0]
         return {self.config.score: score, "overflow": overflow}
 
     def particle_losses(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return each particle's own loss and overflow."""
+        """Return each particle's score plus weighted overflow of states, shape [B, N]."""
         return self._scores(s) + self.config.overflow_weight * self.task.overflows(s)
 
     def particle_gains(self, before: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor]) -> Tensor:
-        """Return the decrease of each particle's loss, which no other particle's action changes."""
+        """Return the decrease of each particle's loss, which depends on its own action only."""
         return self.particle_losses(*before) - self.particle_losses(*after)
 
     def extra_info(self, s: Tensor) -> dict[str, Tensor]:
-        """Return each world's class, int64, and the fraction of right particles, [B] each."""
+        """Return each world's class, int64, and its fraction of correct particles, [B] each."""
         wrong = world_mean(self.task.mistakes(s)[..., None])[:, 0]
         return {"label": self.task.goal.clone(), "accuracy": 1.0 - wrong}
 
     def _scores(self, s: Tensor) -> Tensor:
-        """Return the loss of each particle's outputs, [B, N]."""
+        """Return the loss of each particle's outputs that `score` names, shape [B, N]."""
         if self.config.score == "cross_entropy":
             return self.task.cross_entropies(s, self.config.sharpness)
         return self.task.mistakes(s) if self.config.score == "accuracy" else self.task.errors(s)

@@ -38,7 +38,7 @@ PICTURE = "picture"
 
 @dataclass(frozen=True, kw_only=True)
 class Regeneration2DEnvConfig(GrownConfig):
-    """Adds the damage."""
+    """`GrownConfig` with the damage."""
 
     words = GrownConfig.words | {"damage": (*SIZES, RANDOM_DAMAGE)}
 
@@ -75,7 +75,7 @@ class Regeneration2DEnvConfig(GrownConfig):
 
 
 class RegenerationTask(GrownTask[Regeneration2DEnvConfig]):
-    """A grown picture with damage."""
+    """A grown picture that has been damaged and has to heal."""
 
     config_type = Regeneration2DEnvConfig
 
@@ -86,7 +86,7 @@ class RegenerationTask(GrownTask[Regeneration2DEnvConfig]):
             _ = self.rule
 
     def seed(self, random: WorldRandom) -> tuple[Tensor, Tensor]:
-        """Return grown worlds without damage, or the target's points."""
+        """Return grown worlds without damage; if `rule` is "picture", the target's points."""
         if not self._drawn:
             return super().seed(random)
         x, s = PictureEnvTask.seed(self, random)

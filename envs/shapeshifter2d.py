@@ -20,7 +20,7 @@ from npa_envs.envs.core.task import Start
 from npa_envs.envs.core.vector import vector_class
 from npa_envs.envs.garden.base import RuleDriven
 from npa_envs.envs.garden.brushes import OBSERVATION_LIMIT, GardenReward
-from npa_envs.envs.grown_worlds import check_rule_driven, check_runs, grow, run_rule
+from npa_envs.envs.grown_worlds import check_matches_rule, check_rule_driven, grow, run_rule
 from npa_envs.envs.morphogenesis2d import PictureConfig, PictureEnvTask
 from npa_envs.errors import NPAError
 from npa_envs.rule.files import load_rule
@@ -41,7 +41,7 @@ CodeActions = Literal["code", "choice"]
 
 @dataclass(frozen=True, kw_only=True)
 class Shapeshifter2DEnvConfig(PictureConfig):
-    """Adds the rule of many pictures and how its goals change."""
+    """`PictureConfig` with the rule of many pictures, and how its goals change."""
 
     words = EnvConfig.words | {"reward": get_args(GardenReward), "actions": get_args(CodeActions)}
 
@@ -86,23 +86,23 @@ class Shapeshifter2DEnvConfig(PictureConfig):
         check_rule_driven(self)
 
 
-def rule_of(config: Shapeshifter2DEnvConfig, device: torch.device) -> tuple[NPARule, Codes]:
-    """Return the rule of a configuration, with its codes."""
+def load_coded_rule(config: Shapeshifter2DEnvConfig, device: torch.device) -> tuple[NPARule, Codes]:
+    """Return the rule of many pictures that a configuration names, and its codes."""
     rule = load_rule(config.rule, device=device).float().requires_grad_(False)
     if rule.codes is None or len(rule.codes) < 2:
         raise NPAError(
             f"rule must be one of two pictures or more, got {config.rule!r}: train one with "
             "npa-envs train morphogenesis2d --targets gecko heart"
         )
-    check_runs(rule, config, "state_dim", "alpha", "eps0", "moment_inverse")
+    check_matches_rule(rule, config, "state_dim", "alpha", "eps0", "moment_inverse")
     return rule, rule.codes
 
 
 class CodeSpaces(ParticleSpaces):
-    """Spaces: observe a coarse picture and the goal's; act by a code or by the index of one."""
+    """Spaces: coarse pictures of world and goal as observations; codes or indices as actions."""
 
     def __init__(self, physics: Physics, config: Shapeshifter2DEnvConfig) -> None:
-        _, codes = rule_of(config, torch.device("cpu"))
+        _, codes = load_coded_rule(config, torch.device("cpu"))
         self._table = codes.table
         self._limit = max(1.0, float(self._table.abs().max()))
         self._chosen = config.actions == "choice"
@@ -126,7 +126,7 @@ class CodeSpaces(ParticleSpaces):
         return self._table.to(chosen.device)[chosen[:, None]]
 
     def actions_of_codes(self) -> Tensor:
-        """Return the action of the form "code" for each of the rule's codes, [T, K]."""
+        """Return the action that gives each of the rule's codes with actions="code", [T, K]."""
         return self._table / self._limit
 
 
@@ -152,7 +152,7 @@ class ShapeshifterTask(RuleDriven, PictureEnvTask[Shapeshifter2DEnvConfig]):
 
     def _make_task(self) -> ManyPictures:
         config = self.config
-        self.rule, self.codes = rule_of(config, self.device)
+        self.rule, self.codes = load_coded_rule(config, self.device)
         sources = sources_of_codes(config.rule, self.codes)
         task_config = config.as_config(
             Morphogenesis2DConfig,
@@ -189,7 +189,7 @@ class ShapeshifterTask(RuleDriven, PictureEnvTask[Shapeshifter2DEnvConfig]):
         return (goal + 1 + random.integers(count - 1, 1)[:, 0]) % count
 
     def episode_context(self, start: Start, loss: Tensor, random: WorldRandom) -> PictureGoals:
-        """Return the episodes' first goals, and random ones that follow them."""
+        """Return the episodes' first goals, and all their goals, drawn at random, in order."""
         assert start.goal is not None, "made with goals"
         goals = [start.goal]
         while len(goals) < GOAL_COUNT:
@@ -207,12 +207,12 @@ class ShapeshifterTask(RuleDriven, PictureEnvTask[Shapeshifter2DEnvConfig]):
         return x, s
 
     def reward(self, particles: Particles, loss: Tensor, context: PictureGoals) -> Tensor:
-        """Return 1 at the goal, 0 for a loss as of an empty picture, shape [B]."""
+        """Return rewards, [B]: 1 for a loss of 0, 0 for the loss of an empty picture."""
         blank = self.blank_losses.index_select(0, context.goal)
         return (1.0 - loss / blank).clamp_min(-1.0)
 
     def next_goals(self, elapsed: Tensor, context: PictureGoals, goal: Tensor) -> None:
-        """Change the worlds' goals in place every `hold_steps` steps."""
+        """Write each world's goal, which changes every `hold_steps` steps, into `goal`."""
         turn = (elapsed.long() // self.config.hold_steps) % GOAL_COUNT
         context.goal.copy_(context.in_turn.gather(1, turn[:, None])[:, 0])
         goal.copy_(context.goal)

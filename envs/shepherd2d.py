@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, assert_never, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 import torch
@@ -16,7 +16,7 @@ from npa_envs import world_mean
 from npa_envs.checks import check_field, check_non_negative, check_positive
 from npa_envs.envs.core.base import to_output
 from npa_envs.envs.core.task import Start
-from npa_envs.envs.core.vector import NPAVectorEnv
+from npa_envs.envs.core.vector import vector_class
 from npa_envs.envs.garden.base import GardenEnv, GardenTask
 from npa_envs.envs.garden.brushes import OBSERVATION_LIMIT, BrushSpaces, GardenConfig, GardenReward
 from npa_envs.tasks.seeds import uniform_ball
@@ -29,7 +29,7 @@ Aim = Literal["move", "turn", "reshape"]
 
 @dataclass(frozen=True, kw_only=True)
 class Shepherd2DEnvConfig(GardenConfig):
-    """Adds the goals."""
+    """`GardenConfig` with the goals."""
 
     words = GardenConfig.words | {"aim": get_args(Aim)}
 
@@ -80,7 +80,7 @@ class GoalBrushes(BrushSpaces):
             {"observation": box, "achieved_goal": goal, "desired_goal": goal}
         )
 
-    def returned(self, observation: Tensor) -> Any:
+    def observation_output(self, observation: Tensor) -> Any:
         """Split flat observations, [..., O + 6], into a goal dictionary in the user's type."""
         parts = torch.split(observation, [self._count, 3, 3], dim=-1)
         names = ("observation", "achieved_goal", "desired_goal")
@@ -89,9 +89,9 @@ class GoalBrushes(BrushSpaces):
             for name, part in zip(names, parts, strict=True)
         }
 
-    def returned_final(self, observation: Tensor, ended: NDArray[np.bool_]) -> Any:
+    def final_observation_output(self, observation: Tensor, ended: NDArray[np.bool_]) -> Any:
         """Return `final_obs`: for NumPy an array with a dictionary or None for each world."""
-        batched = self.returned(observation)
+        batched = self.observation_output(observation)
         if self._output == "torch":
             return batched
         last = np.full(len(ended), None, dtype=object)
@@ -101,7 +101,7 @@ class GoalBrushes(BrushSpaces):
 
 
 class ShepherdContext(NamedTuple):
-    """The creature at the start of B episodes, and its goal."""
+    """Losses and moments of the creature at the start of B episodes, and its goal."""
 
     intact_loss: Tensor
     rise: Tensor
@@ -121,20 +121,20 @@ class ShepherdTask(GardenTask[Shepherd2DEnvConfig]):
     rewards_each_step = True
 
     def episode_context(self, start: Start, loss: Tensor, random: WorldRandom) -> ShepherdContext:
-        """Return the intact loss and its rise, a drawn goal, and the creature's moments."""
+        """Return losses and moments of the creatures at the start, and a random goal of each."""
         moments, reach = moments_of(start.x), self.config.goal_reach
         drawn = uniform_ball(len(loss), 1, 2, reach, generator=random, device=self.device)[:, 0]
         if self.config.aim == "move":
             goal = moments[:, :2] + drawn
         elif self.config.aim == "turn":
-            goal = direction(drawn[:, :1])
+            goal = double_angle(drawn[:, :1])
         else:
             goal = 1.0 + drawn
         intact = super().episode_context(start, loss, random)
         return ShepherdContext(intact.intact_loss, intact.rise, goal, moments)
 
     def achieved(self, particles: Particles, context: ShepherdContext) -> Tensor:
-        """Return the achieved goal: its two values and the lost fraction, shape [B, 3]."""
+        """Return the achieved goals, [B, 3]: two values that `aim` names, and lost fractions."""
         x, s, *_ = particles
         first, now = context.moments, moments_of(x)
         if self.config.aim == "move":
@@ -150,7 +150,7 @@ class ShepherdTask(GardenTask[Shepherd2DEnvConfig]):
         return torch.cat((values, self.lost_fraction(loss, context)[:, None]), dim=1)
 
     def desired(self, context: ShepherdContext) -> Tensor:
-        """Return the desired goal: its two values and `lost_limit`, shape [B, 3]."""
+        """Return the desired goals, [B, 3]: two values that `aim` names, and `lost_limit`."""
         limit = torch.full_like(context.goal[:, :1], self.config.lost_limit)
         return torch.cat((context.goal, limit), dim=1)
 
@@ -158,16 +158,11 @@ class ShepherdTask(GardenTask[Shepherd2DEnvConfig]):
         """Return the rewards, shape [...], for achieved and desired goals, [..., 3]."""
         distance = (achieved[..., :2] - desired[..., :2]).square().sum(dim=-1).sqrt()
         excess = achieved[..., 2] - desired[..., 2]
-        match self.config.reward:
-            case "sparse":
-                return ((distance <= self.config.tolerance) & (excess <= 0.0)) * 1.0 - 1.0
-            case "dense":
-                # No division: CUDA replaces it by a product with the inverse, which rounds
-                # differently.
-                nearness = -distance * (1.0 / self.config.goal_reach)
-                return nearness - self.config.reward_weight * excess.clamp(min=0.0)
-            case unknown:
-                assert_never(unknown)
+        if self.config.reward == "sparse":
+            return ((distance <= self.config.tolerance) & (excess <= 0.0)) * 1.0 - 1.0
+        # No division: CUDA replaces it by a product with the inverse, which rounds differently.
+        nearness = -distance * (1.0 / self.config.goal_reach)
+        return nearness - self.config.reward_weight * excess.clamp(min=0.0)
 
     def reward(self, particles: Particles, loss: Tensor, context: ShepherdContext) -> Tensor:
         """Return rewards [B] of a step, from the particles after it and the goals in `context`."""
@@ -196,15 +191,15 @@ def moments_of(x: Tensor) -> Tensor:
     return torch.cat((mean, world_mean(seconds)), dim=1)
 
 
-def direction(angle: Tensor) -> Tensor:
-    """Return cosine and sine, [B, 2], of twice the angle whose tangent is `angle`, [B, 1]."""
+def double_angle(tangent: Tensor) -> Tensor:
+    """Return (cos 2φ, sin 2φ), [B, 2], of the angles φ with these tangents, [B, 1]."""
     # Without library functions, whose last bit changes with the number of worlds.
-    square = angle * angle
-    return torch.cat((1.0 - square, 2.0 * angle), dim=1) / (1.0 + square)
+    square = tangent * tangent
+    return torch.cat((1.0 - square, 2.0 * tangent), dim=1) / (1.0 + square)
 
 
 def axis_turn(first: Tensor, now: Tensor) -> Tensor:
-    """Return cosine and sine of twice the angle by which the longer axis has turned, [B, 2]."""
+    """Return (cos 2φ, sin 2φ), [B, 2]; the longer axis turned by φ between two `moments_of`."""
 
     def axis(moments: Tensor) -> tuple[Tensor, Tensor]:
         across, slant = moments[:, 2] - moments[:, 4], 2.0 * moments[:, 3]
@@ -216,7 +211,7 @@ def axis_turn(first: Tensor, now: Tensor) -> Tensor:
 
 
 def turned_back(x: Tensor, middle: Tensor, turn: Tensor) -> Tensor:
-    """Return positions rotated about a middle by minus half of the angle of `turn`, [B, N, 2]."""
+    """Return positions rotated about `middle` by −φ, [B, N, 2]; `turn`: (cos 2φ, sin 2φ)."""
     cosine = (0.5 * (1.0 + turn[:, 0])).clamp_min(0.0).sqrt()[:, None]
     sine = (0.5 * (1.0 - turn[:, 0])).clamp_min(0.0).sqrt()[:, None]
     sine = torch.where(turn[:, 1:] < 0.0, -sine, sine)
@@ -226,7 +221,7 @@ def turned_back(x: Tensor, middle: Tensor, turn: Tensor) -> Tensor:
 
 
 class _GoalReward:
-    """Mixin with the method that Hindsight Experience Replay calls."""
+    """Mixin with `compute_reward`, which Hindsight Experience Replay calls."""
 
     task: Any
 
@@ -320,7 +315,4 @@ class Shepherd2DEnv(_GoalReward, GardenEnv):
     task_type = ShepherdTask
 
 
-class Shepherd2DVectorEnv(_GoalReward, NPAVectorEnv):
-    """Worlds of `Shepherd2DEnv`, batched on one device; its docstring describes both."""
-
-    task_type = ShepherdTask
+Shepherd2DVectorEnv = vector_class(Shepherd2DEnv, _GoalReward)

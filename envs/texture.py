@@ -18,7 +18,7 @@ from npa_envs.world.environment_steps import Boundary
 
 @dataclass(frozen=True, kw_only=True)
 class TextureEnvConfig(EnvConfig):
-    """Adds the target and the loss of `TextureConfig`, which explains them."""
+    """`EnvConfig` with target and loss of `TextureConfig`, which documents the fields."""
 
     task_config_type = TextureConfig
 
@@ -50,7 +50,7 @@ class TextureTask(TargetEnvTask[TextureEnvConfig]):
     pixel_bytes = 4000
 
     def losses(self, x: Tensor, s: Tensor) -> Mapping[str, Tensor]:
-        """Return the weighted losses of each world's colour image and of its density image."""
+        """Return the weighted losses of colour image and density image, by name, [B] each."""
         colour, density = self.task.texture_losses(x, s)
         colour_weight, density_weight = self.task.weights()
         return {"colour": colour_weight * colour, "density": density_weight * density}

@@ -131,7 +131,7 @@ class DamageEvents(_DamagesWorlds, AnyWrapper):
         observation = self._base.place_particles(x[0], s[0])
         losses = self._base.losses_of(worlds.report.numbers[:, 0].tolist())
         losses["loss_damage"] = info.get("loss_damage", 0.0) + losses["loss"] - before
-        return observation, info | losses | self._base._extra_info()
+        return observation, info | losses | self._base._of_world(worlds.extra_info())
 
 
 class VectorDamageEvents(_DamagesWorlds, EpisodeWrapper):

@@ -36,7 +36,7 @@ class ConcatenatedSpeciesEnv(MultiSpeciesVectorEnv):
         self.num_envs, self.episode_steps = self.world_count, self.max_cycles
         self.task, physics = self.worlds.task, self.worlds.physics
         self.metadata = self.metadata | {"autoreset_mode": AutoresetMode.SAME_STEP}
-        counts, interface = self.config.played_counts, self.config.interface(physics)
+        counts, interface = self.config.agent_particle_counts, self.config.interface(physics)
         self.spans = dict(zip(self.agents, spans_of(counts), strict=True))
         limit, observed = physics.limits.perception, (sum(counts), interface.perception_dim)
         self.single_observation_space = Box(-limit, limit, observed, np.float32)

@@ -22,11 +22,11 @@ from npa_envs.envs.core.interface import Interface
 from npa_envs.envs.core.task import Controls, EnvTask
 from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.envs.multi.base import SpeciesConfig, SpeciesTask
-from npa_envs.envs.multi.tasks import ENVIRONMENTS as SPECIES_TASKS
 from npa_envs.envs.multi.tasks import task_settings
 from npa_envs.envs.multi.tasks import task_type as species_task_type
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.registration import ALL, SPECIES_SIZES
+from npa_envs.registration import SPECIES as SPECIES_TASKS
 from npa_envs.world.environment_steps import Physics
 
 WORLDS_PER_SEED = 10_000
@@ -152,7 +152,7 @@ class Problem:
         """Particles of each species that is an agent; one number without species."""
         config = self.config
         if isinstance(config, SpeciesConfig):
-            return config.played_counts
+            return config.agent_particle_counts
         return (config.particle_count,)
 
     @property

@@ -44,7 +44,6 @@ print(rewards)  # they sum to zero
 def page() -> str:
     """Return the page, Markdown."""
     text = sections(gardeners_v0.GardenersEnv)
-    text["Version history"] = text["Version history"].partition("\n\nArgs:")[0]
     env = gardeners_v0.parallel_env()
     first = env.possible_agents[0]
     facts = table(

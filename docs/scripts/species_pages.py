@@ -102,7 +102,6 @@ def page(name: str) -> str:
         heading: own.get(heading) or link.format(heading.lower().replace(" ", "-"))
         for heading in first
     }
-    text["Version history"] = text["Version history"].partition("\n\nArgs:")[0]
     if name == "MultiSpecies":
         text["Arguments"] += "\n\n" + argument_tables()
     env = module.parallel_env()

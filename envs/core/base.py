@@ -45,27 +45,30 @@ class ParticleSpaces:
         self._output = config.output
 
     def action(self, action: Any, world_count: int | None) -> Tensor:
-        """Return checked actions, float32, shape [B, N, A]; `world_count` is None for one world."""
+        """Return checked actions, float32, [B, N, A]; `world_count` None: of one world, [N, A]."""
         return batch_tensor(action, world_count, self._shape, "N, A")
 
-    def returned(self, observation: Tensor) -> Any:
-        """Return observations of worlds, or of one, in the type that the user chose."""
+    def observation_output(self, observation: Tensor) -> Any:
+        """Return an observation, [B, N, P] or [N, P], as array or tensor, as `output` says."""
         return to_output(observation, self._output)
 
-    def returned_final(self, observation: Tensor, ended: NDArray[np.bool_]) -> Any:
-        """Return `final_obs`, shape [B, ...], after a step in which some worlds, [B], ended."""
-        return self.returned(observation)
+    def final_observation_output(self, observation: Tensor, ended: NDArray[np.bool_]) -> Any:
+        """Return `final_obs`, [B, ...], as array or tensor; `ended`: which episodes ended, [B]."""
+        return self.observation_output(observation)
 
 
 def to_output(tensor: Tensor, output: str) -> Any:
-    """Return a tensor itself for the output "torch", as an array for "numpy"."""
+    """Return a tensor as it is if `output` is "torch", as a NumPy array if it is "numpy"."""
     return tensor if output == "torch" else tensor.cpu().numpy()
 
 
 def batch_tensor(
     action: Any, world_count: int | None, shape: tuple[int, ...], letters: str
 ) -> Tensor:
-    """Return checked actions of B worlds, or of one (None), float32, shape [B, *shape]."""
+    """Return checked actions, float32, [B, *shape]; `world_count` None: of one world, [*shape].
+
+    `letters` names the dimensions of `shape` in the error message, such as "N, A".
+    """
     expected, letters = _batch_shape(world_count, shape, letters)
     checked = action_tensor("action", action, expected, "env.action_space", letters)
     return checked[None] if world_count is None else checked
@@ -74,7 +77,7 @@ def batch_tensor(
 def batch_choices(
     action: Any, world_count: int | None, shape: tuple[int, ...], letters: str
 ) -> Tensor:
-    """Return checked whole numbers of B worlds, or of one (None), int64, shape [B, *shape]."""
+    """Return the checked whole numbers of discrete actions, int64; else as `batch_tensor`."""
     expected, letters = _batch_shape(world_count, shape, letters)
     choices = number_tensor("action", action)
     if tuple(choices.shape) != expected or choices.is_floating_point():
@@ -88,7 +91,7 @@ def batch_choices(
 def _batch_shape(
     world_count: int | None, shape: tuple[int, ...], letters: str
 ) -> tuple[tuple[int, ...], str]:
-    """Return the shape of actions of B worlds, or of one (None), and its letters for errors."""
+    """Return the shape that actions must have, and its dimensions' names for errors."""
     if world_count is None:
         return shape, f"[{letters}] = "
     return (world_count, *shape), f"[{', '.join(filter(None, ('B', letters)))}] = "
@@ -97,7 +100,10 @@ def _batch_shape(
 def action_tensor(
     name: str, action: Any, expected: tuple[int, ...], space: str, letters: str = ""
 ) -> Tensor:
-    """Return a checked action as a float32 tensor on its own device."""
+    """Return an action of shape `expected`, checked, as float32; a tensor keeps its device.
+
+    The error message calls the action `name`, and refers to the space called `space`.
+    """
     actual = ""
     if not isinstance(action, Tensor):
         try:
@@ -122,7 +128,7 @@ def action_tensor(
 
 
 class ShownEnv:
-    """Base class of all environments: rendering, and the type of returned arrays."""
+    """Base class of all environments: pictures, the window, and arrays or tensors as output."""
 
     config: Any
     """The environment's configuration."""
@@ -133,7 +139,7 @@ class ShownEnv:
     _window: Window | None = None
 
     def _pictures(self) -> NDArray[np.uint8] | None:
-        """Return a picture of each world, uint8, shape [B, R, R, 3]; None unless "rgb_array"."""
+        """Return a picture of each world, uint8, [B, R, R, 3], if `render_mode` is "rgb_array"."""
         if self.config.render_mode is None:
             gymnasium.logger.warn(
                 "render() draws nothing without a render_mode: make the environment with "
@@ -146,7 +152,7 @@ class ShownEnv:
         return pictures
 
     def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> dict[str, Any]:
-        """Return what Jupyter displays: pictures of the first worlds, once there was a reset."""
+        """Return what Jupyter displays: text, and after a reset pictures of the first worlds."""
         text = {"text/plain": str(self)}
         if not self._started:
             return text
@@ -154,7 +160,7 @@ class ShownEnv:
         return show(side_by_side(self.worlds.pictures(count)))._repr_mimebundle_() | text
 
     def _show_in_window(self, title: str) -> None:
-        """Show the first worlds in the window, with the render mode "human"."""
+        """Show the first worlds in a window if `render_mode` is "human"."""
         if self.config.render_mode != "human":
             return
         count, size = self.worlds.world_count, self.config.render_size
@@ -167,19 +173,17 @@ class ShownEnv:
             self._window = Window(title, across * size, fps=self.metadata["render_fps"])
         self._window.show(frame.reshape(across * size, across * size, 3))
 
-    def _close_window(self) -> None:
+    def close(self) -> None:
+        """Close the window, if there is one."""
         if self._window is not None:
             self._window.close()
             self._window = None
 
-    def _out(self, tensor: Tensor) -> Any:
-        return to_output(tensor, self.config.output)
-
-    def _sent(self, values: NDArray[Any]) -> Any:
-        """Return an array of the host in the type that the user chose."""
-        if self.config.output == "numpy":
-            return values
-        return to_device_async(values, self.config.torch_device)
+    def _out(self, values: Tensor | NDArray[Any]) -> Any:
+        """Return values as an array, or as a tensor on the device if `output` is "torch"."""
+        if isinstance(values, np.ndarray) and self.config.output == "torch":
+            return to_device_async(values, self.config.torch_device)
+        return to_output(values, self.config.output) if isinstance(values, Tensor) else values
 
 
 class WorldsEnv(ShownEnv):
@@ -191,7 +195,7 @@ class WorldsEnv(ShownEnv):
     spec: Any
 
     def _make_worlds(self, keywords: dict[str, Any], world_count: int, steps: int | None) -> None:
-        """Make the configuration, the worlds and the spaces."""
+        """Set `config`, `worlds`, `task` and `spaces`; `steps`: the longest episode, if limited."""
         self.config = self.task_type.config_type.from_keywords(keywords)
         self.render_mode = self.config.render_mode
         worlds_type = self.task_type.worlds_type or BatchedWorlds
@@ -203,7 +207,7 @@ class WorldsEnv(ShownEnv):
     def _change_worlds(
         self, change: Callable[..., Any], worlds: Tensor, values: Any, buffer: Tensor | None = None
     ) -> Tensor:
-        """Call `start` or `place` of the worlds for M of them, by their indices, int64, [M].
+        """Call `change(worlds, values)`, which starts or replaces M worlds, of int64 indices [M].
 
         Returns:
             New observations of all B worlds, written to `buffer` if it is given, shape [B, ...].
@@ -216,7 +220,7 @@ class WorldsEnv(ShownEnv):
         return observation
 
     def losses_of(self, numbers: Any) -> dict[str, Any]:
-        """Return the loss and its terms by their names in infos, from the rows of a report."""
+        """Return the loss and its terms by their names in infos, from `StepReport.numbers`."""
         names = self.worlds.term_names
         return {"loss": numbers[1]} | named_terms("loss", names, numbers[2 : 2 + len(names)])
 

@@ -165,7 +165,7 @@ class WorldConfig:
         return self.box_size if self.boundary == "periodic" else None
 
     def physics(self, space_dim: int, *, static: bool) -> Physics:
-        """Return the constants of motion and perception."""
+        """Return the constants of motion and perception; `static`: particles never move."""
         sides = None if self.box is None else (self.box,) * space_dim
         periodic = self.boundary == "periodic"
         return Physics(
@@ -201,7 +201,7 @@ class WorldConfig:
 
     @classmethod
     def from_keywords(cls, keywords: dict[str, Any]) -> Self:
-        """Return the configuration with these fields; NumPy numbers and lists are converted."""
+        """Return the configuration with these keywords as its fields; NumPy types are converted."""
         known = [field.name for field in fields(cls)]
         for name in keywords:
             if name not in known:
@@ -210,7 +210,7 @@ class WorldConfig:
         return cls(**{name: plain(value) for name, value in keywords.items()})
 
     def as_config(self, config_type: type[TaskConfig], **changes: Any) -> TaskConfig:
-        """Return a training task's configuration, which takes and checks the shared fields."""
+        """Return a training task's configuration: the fields that both have, and `changes`."""
         names = [field.name for field in fields(config_type)]  # type: ignore[arg-type]
         shared = {name: getattr(self, name) for name in names if hasattr(self, name)}
         return config_type(**(shared | changes))
@@ -284,11 +284,11 @@ class EnvConfig(WorldConfig):
 
     @property
     def target_dim(self) -> int:
-        """Columns of the target after those of perception in an observation's row, T."""
+        """Number T of target columns at the end of an observation's row; by default 0."""
         return 0
 
     def interface(self, physics: Physics) -> Interface:
-        """As `WorldConfig.interface`, with the columns of the target."""
+        """Return the meaning of the columns, those of the target included."""
         return super().interface(physics)._replace(target_dim=self.target_dim)
 
     @property
@@ -298,13 +298,13 @@ class EnvConfig(WorldConfig):
 
 
 def check_picture_size(config: Any) -> None:
-    """Check that pixels of the observed picture are squares of those of the compared picture."""
+    """Check that `picture_size`, of the observed picture, divides `resolution`, of the loss."""
     rule, hint = f"divide resolution = {config.resolution}", f"try {config.resolution // 2}"
     check_field(config, "picture_size", config.resolution % config.picture_size == 0, rule, hint)
 
 
 def plain(value: Any) -> Any:
-    """Return a field's value with NumPy numbers as Python's, lists and arrays as tuples."""
+    """Return a keyword's value with NumPy numbers as Python's, lists and arrays as tuples."""
     if isinstance(value, np.generic | np.ndarray | Tensor):
         value = value.tolist()
     if isinstance(value, Sequence) and not isinstance(value, str):

@@ -26,7 +26,7 @@ class Interface(NamedTuple):
 
     @property
     def shared_dim(self) -> int:
-        """Columns of an observation before those of single species."""
+        """Length of a perception without each species' own density and density gradient."""
         return self.state_dim * (2 + self.space_dim) + self.space_dim
 
     @property
@@ -48,7 +48,7 @@ class Interface(NamedTuple):
         return observation[..., self.state_dim : 2 * self.state_dim]
 
     def density_gradient(self, observation: Tensor) -> Tensor:
-        """Return c^{1+D} ∇ρ / N on a linear scale, shape [..., D]."""
+        """Return the density gradient, (ε / ε0)^{1+D} ∇ρ / N, on a linear scale, shape [..., D]."""
         scaled = observation[..., self.shared_dim - self.space_dim : self.shared_dim]
         size = scaled.norm(dim=-1, keepdim=True)
         return scaled * torch.where(size > 0.0, torch.expm1(size) / size, 1.0)

@@ -157,7 +157,8 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
             keys = rng_keys(None, 1, self.np_random)
         observation = self._change_worlds(self.worlds.start, self._world, keys)
         info = self.losses_of(self.worlds.report.numbers[:, 0].tolist())
-        return self.spaces.returned(observation[0]), info | self._extra_info()
+        info |= self._of_world(self.worlds.extra_info())
+        return self.spaces.observation_output(observation[0]), info
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Apply an action, shape [N, A], in [-1, 1].
@@ -178,27 +179,23 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
         with worlds.device_context():
             endings, observation = worlds.step(checked)
             diverged = bool(endings[0] & DIVERGED)
-            ending = int(worlds.guarded(endings, observation)[0])
+            ending = int(worlds.handle_diverged(endings, observation)[0])
         terminated, truncated = ending & (SUCCESS | DIVERGED) != 0, ending & TIME_LIMIT != 0
         numbers = worlds.host_numbers.numpy()[:, 0].tolist()
         info = self.losses_of(numbers) | self._improvements(numbers)
         info |= {"success": bool(ending & SUCCESS), "diverged": diverged}
         if terminated or truncated:
             info["reason"] = reason(ending)
-        info |= self._extra_info() | self._of_world(worlds.step_info())
+        info |= self._of_world(worlds.extra_info() | worlds.step_info())
         self._is_unrewarded = worlds.rewards_last_step_only and not (terminated or truncated)
         self._show()
-        returned = self.spaces.returned(worlds.host_observation(observation)[0])
+        returned = self.spaces.observation_output(worlds.host_observation(observation)[0])
         return returned, numbers[0], terminated, truncated, info
 
     def render(self) -> NDArray[np.uint8] | None:
         """Return the world's picture, shape [R, R, 3], with the render mode "rgb_array"."""
         pictures = self._pictures()
         return None if pictures is None else pictures[0]
-
-    def close(self) -> None:
-        """Close the window, if there is one."""
-        self._close_window()
 
     def particles(self) -> tuple[Tensor, Tensor]:
         """Return copies of positions [length units], [N, D], and states, [N, C], on the device."""
@@ -217,11 +214,7 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
         x, s = number_tensor("x", x)[None], number_tensor("s", s)[None]
         placed = self.worlds.checked_particles(x, s, 1, self.config.particle_count)
         observation = self._change_worlds(self.worlds.place, self._world, placed)
-        return self.spaces.returned(observation[0])
-
-    def _extra_info(self) -> dict[str, Any]:
-        """Return the entries of infos that the task adds in every call."""
-        return self._of_world(self.worlds.extra_info())
+        return self.spaces.observation_output(observation[0])
 
     def _of_world(self, values: dict[str, Tensor]) -> dict[str, Any]:
         return {

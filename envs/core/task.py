@@ -54,7 +54,7 @@ class Start(NamedTuple):
 
 
 class WorldTask(Generic[AnyConfig]):
-    """Base class of tasks of one species and of several: constants and pictures."""
+    """Base class of all tasks: constants of the class, and pictures of worlds."""
 
     config_type: ClassVar[type[WorldConfig]] = WorldConfig
     """The configuration's class: its fields are the environment's keywords."""
@@ -79,7 +79,7 @@ class WorldTask(Generic[AnyConfig]):
 
     @property
     def open_half_width(self) -> float:
-        """Half of a picture's side in open space [length units]; values below 1 count as 1."""
+        """Half of a picture's side in open space [length units], raised to 1 if it is less."""
         return 1.0
 
     @property
@@ -138,13 +138,13 @@ class EnvTask(WorldTask[Config]):
 
     @classmethod
     def extra_bytes(cls, config: Any, world_count: int) -> int:
-        """Return about how much memory the task needs beyond that of B worlds [bytes]."""
+        """Return about how much memory the pool and the losses of B worlds take [bytes]."""
         numbers = config.particle_count * (cls.space_dim + config.state_dim)
         return int(4 * config.seed_pool * numbers) + world_count * cls.bytes_per_world(config)
 
     @classmethod
     def bytes_per_world(cls, config: Any) -> int:
-        """Return about how much extra memory the task needs per world [bytes]; by default 0."""
+        """Return about how much memory the loss of one world takes [bytes]; by default 0."""
         return 0
 
     def seed(self, random: WorldRandom) -> tuple[Tensor, Tensor]:
@@ -159,7 +159,7 @@ class EnvTask(WorldTask[Config]):
         return self._as_start("seed", self.seed(random))
 
     def _as_start(self, method: str, result: Any) -> Start:
-        """Return the tuple that a method of the task returned as a `Start`."""
+        """Return `result`, the tuple that `method` of the task returned, as a `Start`."""
         if not isinstance(result, tuple | list) or not 2 <= len(result) <= len(Start._fields):
             raise NPAError(
                 f"{type(self).__name__}.{method} must return positions and states, got a "
@@ -179,7 +179,7 @@ class EnvTask(WorldTask[Config]):
         raise NotImplementedError
 
     def extra_info(self, s: Tensor) -> dict[str, Tensor]:
-        """Return further entries of infos, shape [B, ...] each; by default none."""
+        """Return what the task adds to infos, by name, [B, ...] each; by default nothing."""
         return {}
 
     def particle_losses(self, x: Tensor, s: Tensor) -> Tensor:
@@ -279,7 +279,7 @@ class EnvTask(WorldTask[Config]):
 
     @property
     def pixel_size(self) -> float:
-        """Size of a particle in pictures: the spacing of N that fill the unit disk or ball."""
+        """Size of a particle in pictures: the spacing of N particles in the unit disk or ball."""
         volume = np.pi if self.space_dim == 2 else 4.0 * np.pi / 3.0
         return float((volume / self.config.particle_count) ** (1.0 / self.space_dim))
 
@@ -311,7 +311,7 @@ class TargetEnvTask(EnvTask[Config]):
 
     @property
     def pixel_size(self) -> float:
-        """Size of a particle in pictures: that of the training task."""
+        """Size of a particle in pictures [length units], from the training task."""
         size: float = self.task.pixel_size
         return size
 
@@ -327,7 +327,7 @@ class TargetEnvTask(EnvTask[Config]):
         return goal_task
 
     def particle_losses(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return the training task's loss of each particle."""
+        """Return the training task's loss of each particle, shape [B, N]."""
         losses: Tensor = self.task.particle_contributions(x, s)
         return losses
 
@@ -336,13 +336,13 @@ class TargetEnvTask(EnvTask[Config]):
 
 
 def start_method(task: EnvTask[Any]) -> str:
-    """Return the name of the method by which a task defines where worlds start, for errors."""
+    """Return the name of the method that makes a task's worlds: start, fresh or seed."""
     names = ("start", "fresh")
     return next((n for n in names if getattr(type(task), n) != getattr(EnvTask, n)), "seed")
 
 
 def check_start(task: EnvTask[Any], start: Start, world_count: int, shapes: Any) -> None:
-    """Check M starts without synchronising; `shapes` are those of x and s of all worlds."""
+    """Check starts of M worlds without synchronising; `shapes`: [B, N, D] and [B, N, C]."""
     name = start_method(task)
     if not isinstance(start, Start):
         raise NPAError(
@@ -362,7 +362,7 @@ def check_start(task: EnvTask[Any], start: Start, world_count: int, shapes: Any)
 def checked_losses(
     task: EnvTask[Any], losses: Any, world_count: int, names: tuple[str, ...]
 ) -> list[Tensor]:
-    """Return the checked terms of worlds' losses, shape [B] each, without synchronising."""
+    """Return the checked terms of `losses`, shape [B] each; `names`: those of earlier calls."""
     name = f"{type(task).__name__}.losses"
     if not isinstance(losses, Mapping) or not losses or not all(type(n) is str for n in losses):
         actual = list(losses) if isinstance(losses, Mapping) else type(losses).__name__
@@ -389,7 +389,7 @@ def checked_tensor(
     shape: tuple[int, ...],
     dtype: torch.dtype = torch.float32,
 ) -> Tensor:
-    """Return a tensor that a method of a task returned, if it has this shape and type."""
+    """Return `value`, which `method` returned as `field`, if it has this shape and type."""
     device = task.device
     if not isinstance(value, Tensor):
         actual = f"a {type(value).__name__}"
@@ -416,7 +416,7 @@ def check_finite(task: EnvTask[Any], method: str, values: Mapping[str, Tensor]) 
             )
 
 
-def global_draws(device: torch.device) -> dict[str, Any]:
+def global_rng_states(device: torch.device) -> dict[str, Any]:
     """Return the states of the global random generators, from which a task must not draw."""
     _, key, *rest = np.random.get_state()
     states: dict[str, Any] = {
@@ -432,8 +432,8 @@ def global_draws(device: torch.device) -> dict[str, Any]:
 
 
 def check_no_draws(task: EnvTask[Any], method: str, before: dict[str, Any]) -> None:
-    """Check that a method of a task has left the global random generators in these states."""
-    now = global_draws(task.device)
+    """Check that `method` has left the global random generators in the states `before`."""
+    now = global_rng_states(task.device)
     moved = [name for name, state in before.items() if state != now[name]]
     if moved:
         raise NPAError(

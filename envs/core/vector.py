@@ -36,12 +36,12 @@ class BatchedSpaces(VectorEnv[Any, Any, Any]):
 
     @cached_property
     def observation_space(self) -> Space[Any]:  # type: ignore[override]
-        """Space of all observations, [B, ...]."""
+        """Space of the observations of all B worlds, [B, ...]."""
         return batch_space(self.single_observation_space, self.num_envs)
 
     @cached_property
     def action_space(self) -> Space[Any]:  # type: ignore[override]
-        """Space of all actions, [B, ...]."""
+        """Space of the actions of all B worlds, [B, ...]."""
         return batch_space(self.single_action_space, self.num_envs)
 
 
@@ -126,8 +126,8 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
         which[chosen] = True
         losses = self.losses_of(self._report_rows(self.worlds.report.copy()))
         extra = self._returned_values(self.worlds.extra_info())
-        infos = masked(losses, self._mask(which)) | masked(extra, self._mask(which))
-        return self.spaces.returned(observation), infos
+        infos = with_masks(losses, self._mask(which)) | with_masks(extra, self._mask(which))
+        return self.spaces.observation_output(observation), infos
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Apply actions, shape [B, N, A], in [-1, 1]; errors are those of `NPAEnv.step`.
@@ -156,7 +156,7 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
         stepped = None
         if restarting:
             stepped, endings = ~over, np.where(over, 0, endings)
-        endings = self.worlds.guarded(endings, observation)
+        endings = self.worlds.handle_diverged(endings, observation)
         if restarting:
             self.worlds.restart(np.flatnonzero(over), observation)
         ended = endings != 0
@@ -175,7 +175,7 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
             self.worlds.restart(np.flatnonzero(ended), observation)
             _, _, infos = self._report(~ended, copy=self.copies)
             infos |= {
-                "final_obs": self.spaces.returned_final(final_observation, ended),
+                "final_obs": self.spaces.final_observation_output(final_observation, ended),
                 "_final_obs": which,
             }
             infos |= {"final_info": final_infos, "_final_info": self._mask(ended)}
@@ -184,7 +184,7 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
             if ended.any():
                 infos |= {"reason": REASONS[endings], "_reason": self._mask(ended)}
         self._show()
-        return self.spaces.returned(observation), rows[0], flags[0], flags[1], infos
+        return self.spaces.observation_output(observation), rows[0], flags[0], flags[1], infos
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Return a picture of each world, shape [R, R, 3], with the render mode "rgb_array"."""
@@ -193,9 +193,11 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
         pictures = self._pictures()
         return None if pictures is None else tuple(pictures)
 
+    close = VectorEnv.close
+
     def close_extras(self, **kwargs: Any) -> None:
         """Close the window, if there is one."""
-        self._close_window()
+        WorldsEnv.close(self)
 
     def particles(self) -> tuple[Tensor, Tensor]:
         """Return copies of positions [length units], [B, N, D], and states, [B, N, C]."""
@@ -214,12 +216,12 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
         placed = self.worlds.checked_particles(x, s, len(chosen), self.config.particle_count)
         index = chosen.to(self.task.device)
         observation = self._change_worlds(self.worlds.place, index, placed, self._buffer)
-        return self.spaces.returned(observation)
+        return self.spaces.observation_output(observation)
 
     def _report(
         self, stepped: NDArray[np.bool_] | None, *, copy: bool
     ) -> tuple[list[Any], list[Any], dict[str, Any]]:
-        """Return the current report's rows and flags, and infos; `stepped`: worlds that acted."""
+        """Return the report's numbers, its flags, and infos; `stepped`: worlds that acted."""
         worlds = self.worlds
         report = worlds.report.copy() if copy else worlds.report
         rows, flags = self._report_rows(report), list(self._out(report.endings))
@@ -228,38 +230,38 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
         of_all = self.losses_of(rows) | self._returned_values(worlds.extra_info(), copy=copy)
         of_step = self._improvements(rows) | dict(zip(FLAGS, flags[2:], strict=True))
         of_step |= self._returned_values(worlds.step_info(), copy=copy)
-        return rows, flags, masked(of_all, all_worlds) | masked(of_step, which)
+        return rows, flags, with_masks(of_all, all_worlds) | with_masks(of_step, which)
 
     def _returned_values(self, values: dict[str, Tensor], *, copy: bool = True) -> dict[str, Any]:
         return {n: self._out(v.clone() if copy else v) for n, v in values.items()}
 
     def _report_rows(self, report: StepReport) -> list[Any]:
-        """Return the rows of a report's numbers: tensors, or arrays of float64 as Gymnasium's."""
+        """Return the rows of `report.numbers`: tensors, or arrays of float64 as Gymnasium's."""
         rows = self._out(report.numbers)
         return list(rows if isinstance(rows, Tensor) else rows.astype(np.float64))
 
     def _mask(self, mask: NDArray[np.bool_]) -> Any:
-        """Return a copy of a mask of worlds in the type that the user chose."""
-        return self._sent(mask.copy())
+        """Return a copy of a mask of worlds as array or tensor, as `output` says."""
+        return self._out(mask.copy())
 
 
-def masked(values: dict[str, Any], which: Any) -> dict[str, Any]:
-    """Return values by name, and as `_name` the mask of the worlds that have them."""
+def with_masks(values: dict[str, Any], which: Any) -> dict[str, Any]:
+    """Return infos: each value by its name, and by `_name` the mask of worlds that have it."""
     infos = {}
     for name, value in values.items():
         infos[name], infos[f"_{name}"] = value, which
     return infos
 
 
-def vector_class(env_type: type[WorldsEnv]) -> type[NPAVectorEnv]:
-    """Return the vector environment's class for the class of a single environment."""
+def vector_class(env_type: type[WorldsEnv], *mixins: type[Any]) -> type[NPAVectorEnv]:
+    """Return the vector environment's class for the class of a single one, with mixins."""
     name = env_type.__name__
     attributes = {
         "__doc__": f"Worlds of `{name}`, batched on one device; its docstring describes both.",
         "__module__": env_type.__module__,
         "task_type": env_type.task_type,
     }
-    return type(name.replace("Env", "VectorEnv"), (NPAVectorEnv,), attributes)
+    return type(name.replace("Env", "VectorEnv"), (*mixins, NPAVectorEnv), attributes)
 
 
 # Checks of arguments that are no fields of a configuration.
@@ -273,7 +275,7 @@ def checked_count(name: str, value: Any) -> int:
 
 
 def checked_mode(mode: str | AutoresetMode) -> AutoresetMode:
-    """Return Gymnasium's mode for a name or a mode."""
+    """Return Gymnasium's `AutoresetMode` for its name or for itself."""
     if isinstance(mode, AutoresetMode):
         return mode
     by_name = AUTORESET_MODES | {known.value: known for known in AutoresetMode}
@@ -301,7 +303,7 @@ def check_options(options: Any, known: tuple[str, ...]) -> None:
 def worlds_to_reset(
     options: dict[str, Any] | None, world_count: int, *, started: bool = True
 ) -> NDArray[np.int64]:
-    """Return the indices of the worlds that `reset_mask` chooses, all without a mask."""
+    """Return the indices of the worlds that `options["reset_mask"]` chooses, else of all."""
     check_options(options, ("reset_mask",))
     mask = (options or {}).get("reset_mask")
     if mask is None:
@@ -338,7 +340,7 @@ def rng_keys(
 ) -> Tensor:
     """Return the key of each world's random stream, int64, shape [B].
 
-    World k has the key of seed + k, or of the k-th seed of a sequence; None: keys are drawn.
+    World k gets that of seed + k, or of the k-th seed given; None: drawn from `np_random`.
     """
     if seed is None:
         keys = np_random.integers(2**64, size=world_count, dtype=np.uint64)

@@ -83,7 +83,7 @@ def check_memory(
 
 
 def check_default_dtype() -> None:
-    """Check that torch's default dtype is float32, the worlds' own."""
+    """Check that torch's default dtype is float32, which the worlds' tensors have."""
     dtype = torch.get_default_dtype()
     if dtype != torch.float32:
         raise NPAError(
@@ -120,7 +120,7 @@ class WorldState:
         """One random stream for each world."""
 
     def next_streams(self, worlds: Tensor, keys: Tensor | None) -> WorldRandom:
-        """Return the random streams for the next episodes of some worlds, [M].
+        """Return the random streams for the next episodes of worlds, by their indices, [M].
 
         Keys, int64, shape [M], start new sequences of episodes; None: each world's next episode.
         """
@@ -131,7 +131,7 @@ class WorldState:
         return random
 
     def checked_particles(self, x: Any, s: Any, world_count: int, particle_count: int) -> Particles:
-        """Return particles of M worlds, checked, as float32 on the device."""
+        """Return positions and states of `world_count` worlds, checked, float32 on the device."""
         checked, physics = [], self.physics
         for name, value, width, limit, limit_name in (
             ("x", x, physics.space_dim, physics.limits.position, "position_limit"),

@@ -1,4 +1,4 @@
-"""The batch of worlds of an environment: actions, observations, restarts.
+"""The batch of worlds of an environment: actions, observations, rewards, restarts.
 
 A single environment is a batch of one. World k of a batch is the same as alone, bit for bit.
 """
@@ -15,18 +15,19 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.envs.core.config import EnvConfig
-from npa_envs.envs.core.rewards_and_ends import RewardedWorlds
+from npa_envs.envs.core.rewards_and_ends import ParticleRewards, StepReport, total
 from npa_envs.envs.core.task import (
     EnvTask,
     Start,
     check_finite,
     check_no_draws,
     check_start,
-    global_draws,
+    checked_losses,
+    global_rng_states,
     start_method,
 )
-from npa_envs.envs.core.world_state import check_default_dtype, not_finite
-from npa_envs.errors import DivergedError, NPAError
+from npa_envs.envs.core.world_state import WorldState, check_default_dtype, not_finite
+from npa_envs.errors import DivergedError, NPAError, shown
 from npa_envs.world.cuda_graph import (
     GraphedCallable,
     SideStream,
@@ -40,20 +41,24 @@ from npa_envs.world.environment_steps import (
     DIVERGED,
     NOT_FINITE,
     Actions,
+    EpisodeRules,
+    EpisodeUpdate,
     NeighbourState,
     build_neighbours,
+    with_mean_reward,
 )
+from npa_envs.world.particles import Particles
 
 FEW_PARTICLES = 8192
 """Particles of all worlds up to which a step on CUDA is one graph; larger steps hide launches."""
 
 
-class BatchedWorlds(RewardedWorlds):
-    """B worlds of one task, stepped together.
+class BatchedWorlds(WorldState):
+    """B worlds of one task, stepped together, with their losses, rewards and episode ends.
 
-    Each particle moves and changes its state by its row of an action, and observes what it
-    perceives, then the task's `target_rows` for the world's goal. All tensors keep their memory
-    between steps, as CUDA graphs need.
+    Each particle moves and changes its state by its row of an action. Its row of the observation is
+    what it perceives, then the columns of the task's `target_rows` for the world's goal. All
+    tensors keep their memory between steps, as CUDA graphs need.
     """
 
     @makes_plain_tensors
@@ -64,7 +69,46 @@ class BatchedWorlds(RewardedWorlds):
         world_count: int,
         episode_steps: int | None = None,
     ) -> None:
-        super().__init__(task_type, config, world_count, episode_steps)
+        # Memory is checked before the task is made, which may make a target of as many points.
+        extra, count = task_type.extra_bytes(config, world_count), config.particle_count
+        super().__init__(config, task_type, world_count, count, extra)
+        self.task: Any = task_type(config, self.device)
+        limits = [steps for steps in (episode_steps, config.episode_steps) if steps is not None]
+        self.episode_steps = min(limits, default=None)
+        """Steps after which an episode is truncated; None: never."""
+        if self.rewards_last_step_only and self.episode_steps is None:
+            raise NPAError(
+                "episode_steps must be given where reward='sparse' comes in the last step, got "
+                "None: for example episode_steps=64, and the same number as max_episode_steps of "
+                "gymnasium.make"
+            )
+
+        def zeros(dtype: torch.dtype = torch.float32) -> Tensor:
+            return torch.zeros(world_count, dtype=dtype, device=self.device)
+
+        self.elapsed = zeros(torch.int32)
+        """Steps since the start of each episode, shape [B]."""
+        self.particle_rewards: ParticleRewards | None = None
+        """Rewards of single particles, where they have any."""
+        if config.per_particle_reward:
+            by_loss = config.reward == "particle"
+            self.particle_rewards = ParticleRewards(self.particles, by_loss=by_loss)
+        self.goal = zeros(torch.int64)
+        """Index of each world's goal, shape [B]; zeros where the task has one goal."""
+        self.goal_task: EnvTask[Any] = self.task.with_goal(self.goal)
+        """The task with losses for the worlds' goals."""
+        self._start_loss = zeros()
+        self._success_loss = zeros()
+        self.diverged = zeros(torch.uint8)
+        """1 where a position or state of the world left its bounds in the last step, shape [B]."""
+        self.enabled = torch.ones(1, dtype=torch.uint8, device=self.device)
+        """0 if the last actions were not finite and so not applied, shape [1]."""
+        self.term_names: tuple[str, ...] = ()
+        """Names of the terms of the loss, known once worlds have been placed."""
+        self.report = StepReport.empty(world_count, 0, self.device)
+        """What a step returns apart from the observation."""
+        # Each world's ending, then whether the actions were finite.
+        self._endings = torch.zeros(world_count + 1, dtype=torch.uint8, device=self.device)
         self._target: Tensor | None = self.task.target_rows
         self._perceived: Tensor | None = None
         """Perception, shape [B, N, P], that the graph of a step writes; None without one."""
@@ -80,6 +124,7 @@ class BatchedWorlds(RewardedWorlds):
             self._start_and_sort, world_count, self.device, recorded=self.task.start_is_short
         )
         self._side_stream = SideStream(self.device) if self.device.type == "cuda" else None
+        self._prepare_report()
 
     def _prepare_actions(self) -> None:
         flags = {"enabled": self.enabled, "diverged": self.diverged}
@@ -88,23 +133,48 @@ class BatchedWorlds(RewardedWorlds):
 
     def __getstate__(self) -> dict[str, Any]:
         # The next step makes these again.
-        none = dict.fromkeys(("_neighbours", "_perceived", "_host_perceived"))
-        return super().__getstate__() | none | {"_host_is_current": False}
+        none = dict.fromkeys(("_neighbours", "_evaluation", "host_endings", "host_numbers"))
+        none |= dict.fromkeys(("_perceived", "_host_perceived"))
+        return self.__dict__ | none | {"_host_is_current": False}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._prepare_report()
+
+    @makes_plain_tensors
+    def _prepare_report(self) -> None:
+        """Make what writes the report, and the tensors that the host reads, on CUDA pinned."""
+        read = (self._endings, self.report.numbers)
+        self.host_endings, self.host_numbers = map(pinned_like, read) if self.x.is_cuda else read
+        config = self.task.config
+        rewarded_step = self.episode_steps if self.rewards_last_step_only else None
+        self._evaluation = EpisodeUpdate(
+            EpisodeRules(self.episode_steps, rewarded_step, config.on_divergence),
+            enabled=self.enabled,
+            diverged=self.diverged,
+            first_loss=self._start_loss,
+            success_loss=self._success_loss,
+            elapsed=self.elapsed,
+            numbers=self.report.numbers,
+            flags=self.report.endings,
+            endings=self._endings,
+        )
 
     @property
-    def target_dim(self) -> int:
-        """Columns of the target after those of perception in an observation's row, T."""
-        return 0 if self._target is None else int(self._target.shape[1])
+    def rewards_last_step_only(self) -> bool:
+        """Whether only the last step of an episode is rewarded."""
+        return bool(self.task.config.reward == "sparse")
 
     @torch.no_grad()
     @makes_plain_tensors
     def start(self, worlds: Tensor, keys: Tensor | None = None) -> Start:
-        """Start episodes of worlds, int64 indices [M]; return starts; keys as in `next_streams`."""
+        """Start episodes of worlds, int64 indices [M]; return `Start`; keys: see `next_streams`."""
         random = self.next_streams(worlds, keys)
         check_default_dtype()
         # The first start is not recorded as a graph, so that it can synchronise for checks.
         task, first = self.task, not self.term_names
-        draws, check = global_draws(self.device) if first else {}, first or not self.x.is_cuda
+        draws = global_rng_states(self.device) if first else {}
+        check = first or not self.x.is_cuda
         start: Start = task.start(random)
         check_start(task, start, len(worlds), (self.x.shape, self.s.shape))
         if first:
@@ -117,12 +187,54 @@ class BatchedWorlds(RewardedWorlds):
             check_no_draws(task, "losses", draws)
         return start
 
+    def begin(self, worlds: Tensor, start: Start, *, check: bool) -> None:
+        """Begin episodes with `start` in the worlds of indices `worlds`, int64 [M].
+
+        `check` raises an error unless all losses are finite, which synchronises with the device.
+        """
+        self.elapsed.index_fill_(0, worlds, 0)
+        self.place(worlds, Particles(start.x, start.s, goal=start.goal))
+        if check:
+            self.check_losses(worlds)
+        self._start_loss[worlds] = self.loss[worlds]
+        if start.success_loss is None:
+            self._success_loss.index_fill_(0, worlds, -torch.inf)
+        else:
+            self._success_loss[worlds] = start.success_loss
+
+    @torch.no_grad()
+    @makes_plain_tensors
+    def place(self, worlds: Tensor, placed: Particles) -> None:
+        """Replace the particles of the worlds of indices `worlds`, int64 [M], without a reward.
+
+        Worlds keep their goals if `placed` has none.
+        """
+        task, goal = self.task, placed.goal
+        placed = placed._replace(goal=None).map(Tensor.contiguous)
+        if self.goal_task is not task:
+            goal = self.goal[worlds] if goal is None else goal
+            self.goal.index_copy_(0, worlds, goal)
+            task = task.with_goal(goal)
+        terms = task.losses(placed.x, placed.s)
+        values = torch.stack(checked_losses(task, terms, len(placed.x), self.term_names))
+        if not self.term_names:
+            self.term_names = tuple(terms)
+            self.report = StepReport.empty(self.world_count, len(terms), self.device)
+            self._prepare_report()
+        self.particles.put_(worlds, placed)
+        zeros = torch.zeros_like(values)
+        numbers = torch.cat((zeros[:1], total(values)[None], values, zeros))
+        self.report.numbers.index_copy_(1, worlds, numbers)
+        if self.particle_rewards is not None:
+            self.particle_rewards.place(worlds, task, placed)
+        self.report.endings.index_fill_(1, worlds, False)
+
     def _start_and_sort(self, worlds: Tensor) -> NeighbourState:
         start = self.start(worlds)
         return build_neighbours(start.x, start.s, self.physics, world_indices=worlds)
 
     def restart(self, worlds: NDArray[np.int64], observation: Tensor) -> None:
-        """Start the next episodes of some worlds, [M], and write their rows of the observation."""
+        """Start the next episodes of worlds, indices [M]; write their rows of `observation`."""
         if self._target is None:
             self._resets(worlds, observation)
             return
@@ -152,7 +264,7 @@ class BatchedWorlds(RewardedWorlds):
     @torch.no_grad()
     @makes_plain_tensors
     def reseed(self, worlds: NDArray[np.int64], observation: Tensor) -> None:
-        """Restart the particles of some worlds, [M], within their episodes.
+        """Restart the particles of worlds, indices [M], within their episodes.
 
         Rewards, flags and step counts stay. The worlds' rows of the observation, [B, ...], are
         overwritten.
@@ -250,15 +362,66 @@ class BatchedWorlds(RewardedWorlds):
 
     @contextlib.contextmanager
     def _evaluating_on_side(self) -> Iterator[None]:
-        """Evaluate the worlds, on CUDA overlapped with what the block launches."""
+        """Evaluate the worlds, on CUDA at the same time as what the `with` block launches."""
         with contextlib.nullcontext() if self._side_stream is None else self._side_stream.overlap():
             self.evaluate()
         yield
         if self._side_stream is not None:
             self._side_stream.join()
 
+    def evaluate(self) -> None:
+        """Write rewards, losses and endings for the current particles into `report`."""
+        task, particle_rewards = self.goal_task, self.particle_rewards
+        losses = task.losses(self.x, self.s)
+        terms = torch.stack(checked_losses(task, losses, len(self.x), self.term_names))
+        if particle_rewards is None:
+            self._evaluation(terms)
+        else:
+            gains = particle_rewards.step_rewards(task, self.particles)
+            self._evaluation(terms, (~torch.isfinite(gains).all(dim=1)).byte())
+            reward = self.report.reward
+            if task.config.reward == "marginal":
+                gains = with_mean_reward(gains, reward)
+            # In worlds that left their bounds each particle gets the world's reward.
+            by_world = self.diverged.bool() & (task.config.on_divergence != "ignore")
+            gains = torch.where(by_world[:, None], reward[:, None], gains)
+            gains = torch.where(self.enabled.bool(), gains, particle_rewards.reward)
+            particle_rewards.reward.copy_(gains)
+        rewards = self.task_rewards()
+        if rewards is not None:
+            if self.rewards_last_step_only:
+                terminated, truncated = self.report.endings[:2]
+                rewards = torch.where(terminated | truncated, rewards, 0.0)
+            self.report.reward.copy_(rewards)
+        if self.x.is_cuda:
+            self.host_endings.copy_(self._endings, non_blocking=True)
+            if self.world_count == 1:
+                self.host_numbers.copy_(self.report.numbers, non_blocking=True)
+        self.enabled.fill_(1)
+
+    def task_rewards(self) -> Tensor | None:
+        """Return the task's own rewards of a step, [B]; None: they are the loss's decrease."""
+        return None
+
+    def check_losses(self, worlds: Tensor) -> None:
+        """Check that the losses of the worlds of indices `worlds`, int64 [M], are finite."""
+        terms = zip(self.term_names, self.report.terms[:, worlds], strict=True)
+        check_finite(self.task, "losses", {f"term {shown(name)}": term for name, term in terms})
+        if self.particle_rewards is not None and self.particle_rewards.loss is not None:
+            losses = self.particle_rewards.loss[worlds]
+            check_finite(self.task, "particle_losses", {"losses": losses})
+
+    @property
+    def loss(self) -> Tensor:
+        """Each world's current loss, shape [B]."""
+        return self.report.loss
+
+    def extra_info(self) -> dict[str, Tensor]:
+        """Return what the task adds to infos of resets and steps, by name, [B, ...] each."""
+        return self.goal_task.extra_info(self.s)
+
     def step_info(self) -> dict[str, Tensor]:
-        """Return further entries of infos, of steps alone, shape [B, N] each."""
+        """Return `particle_reward` and `updated` for infos, if configured, [B, N] each."""
         info: dict[str, Tensor] = {}
         if self.particle_rewards is not None:
             info["particle_reward"] = self.particle_rewards.reward
@@ -267,18 +430,18 @@ class BatchedWorlds(RewardedWorlds):
         return info
 
     def host_observation(self, observation: Tensor) -> Tensor:
-        """Return a single world's observation, from the host's copy if that is current."""
+        """Return a single world's observation, on the host if it has been copied there."""
         if not self._host_is_current or self._host_perceived is None:
             return observation
         # The next step overwrites it. NumPy copies in this thread; torch would wake others, which
         # can take milliseconds.
         return torch.from_numpy(self._host_perceived.numpy().copy())
 
-    def guarded(self, endings: NDArray[np.uint8], observation: Tensor) -> NDArray[np.uint8]:
+    def handle_diverged(self, endings: NDArray[np.uint8], observation: Tensor) -> NDArray[np.uint8]:
         """Apply `on_divergence` to worlds that diverged; costs nothing if none did.
 
         Returns:
-            Endings, shape [B], without the flag of divergences that end no episode.
+            Flags of endings, [B], without DIVERGED where a divergence ends no episode.
         """
         on_divergence = self.task.config.on_divergence
         diverged = endings & DIVERGED != 0
@@ -329,10 +492,10 @@ GROWTH = 4
 
 
 class GraphedResets:
-    """Starts of next episodes, on CUDA as one graph launch instead of some hundred launches.
+    """Starts the next episodes of worlds, on CUDA by one graph launch instead of some hundred.
 
     A graph serves a fixed number of worlds. If fewer restart, the last index is repeated, and that
-    world is started in the same way several times. `start`, a bound method, is referred to weakly.
+    world is started in the same way several times. Only a weak reference to `start` is kept.
     """
 
     def __init__(
@@ -355,7 +518,7 @@ class GraphedResets:
 
     @makes_plain_tensors
     def __call__(self, worlds: NDArray[np.int64], observation: Tensor) -> None:
-        """Start the next episodes of some worlds, [M], and write what they perceive, [B, N, P]."""
+        """Start the next episodes of worlds, indices [M]; write what they perceive, [B, N, P]."""
         if not self._recorded:
             self._start()(to_device_async(worlds, self._device)).perceive(observation)
             return
@@ -371,7 +534,7 @@ class GraphedResets:
 
 
 class _GraphedReset:
-    """The graph of a start of a fixed number of worlds."""
+    """A CUDA graph that starts episodes in a fixed number of worlds."""
 
     neighbours: NeighbourState
 

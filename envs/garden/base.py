@@ -26,7 +26,7 @@ from npa_envs.envs.garden.brushes import (
     grid_places,
     offsets,
 )
-from npa_envs.envs.grown_worlds import GrownTask, check_runs, run_rule
+from npa_envs.envs.grown_worlds import GrownTask, check_matches_rule, run_rule
 from npa_envs.rule.rule import COLOUR_OFFSET
 from npa_envs.tasks.targets.picture_points import PointTarget
 from npa_envs.world.brushes import nearest_image
@@ -97,7 +97,7 @@ class RuleDrivenWorlds(BatchedWorlds):
         return observed if out is None else out.copy_(observed)
 
     def restart(self, worlds: NDArray[np.int64], observation: Tensor) -> None:
-        """Start the next episodes of some worlds, [M], and write their rows of the observation."""
+        """Start the next episodes of worlds, indices [M]; write their rows of `observation`."""
         index = to_device_async(worlds, self.device)
         self.start(index)
         observation[index] = self.perceive()[index]
@@ -108,7 +108,7 @@ class RuleDrivenWorlds(BatchedWorlds):
         return super().rewards_last_step_only and not self.task.rewards_each_step
 
     def begin(self, worlds: Tensor, start: Start, *, check: bool) -> None:
-        """Begin episodes in some worlds, and store the task's context of their starts."""
+        """Begin episodes in some worlds; store what the task's `episode_context` returns."""
         super().begin(worlds, start, check=check)
         draws = self.random.take(worlds).substream(StreamId.GOAL)
         context = self.task.episode_context(start, self.loss[worlds], draws)
@@ -119,19 +119,19 @@ class RuleDrivenWorlds(BatchedWorlds):
             stored[worlds] = value
 
     def task_rewards(self) -> Tensor:
-        """Return the task's rewards of a step, [B], then change goals that are due."""
+        """Return the task's rewards of a step, [B]; then let the task change the goals."""
         rewards: Tensor = self.task.reward(self.particles, self.loss, self.context)
         self.task.next_goals(self.elapsed, self.context, self.goal)
         return rewards
 
     def extra_info(self) -> dict[str, Tensor]:
-        """Return further entries of infos, shape [B, ...] each."""
+        """Return what the task's `context_info` adds to infos, by name, [B, ...] each."""
         infos: dict[str, Tensor] = self.task.context_info(self.particles, self.context)
         return infos
 
 
 class TargetDeficit:
-    """Difference between a target and worlds at some places, weighted as by brushes there."""
+    """Sums over a target's particles minus sums over a world's, weighted by brushes at places."""
 
     def __init__(self, places: Tensor, target: PointTarget, config: GardenConfig) -> None:
         self.places, self._config = places, config
@@ -145,11 +145,11 @@ class TargetDeficit:
         self._target_sums = self._scale * target_sums
 
     def __call__(self, particles: Particles, middle: Tensor) -> Tensor:
-        """Return the target's weighted sums at each place minus the worlds' own, [B, P, 6].
+        """Return the target's sums minus the worlds' own, for brushes at K places, [B, K, 6].
 
         Sums are over particles, dimensionless: of 1, of x and y from the place in brush radii, and
-        of red, green and blue. They are multiples of the mean sum of 1 over the target's places,
-        times `DEFICIT_SCALES`.
+        of red, green and blue. They are multiples of the target's mean sum of 1 over all places,
+        times `DEFICIT_SCALES`. `middle`, [B, 2], is the origin of the places.
         """
         return self._target_sums - self._weighted(particles, middle)
 
@@ -173,26 +173,26 @@ class RuleDriven:
     """Whether `reward="sparse"` also rewards each step."""
 
     def episode_context(self, start: Start, loss: Tensor, random: WorldRandom) -> Any:
-        """Return what observations and rewards need of the starts of B episodes.
+        """Return what later observations and rewards need to know of B episodes' starts.
 
         It is a named tuple of tensors, [B, ...]; `loss` are the losses at the starts, [B].
         """
         raise NotImplementedError
 
     def reward(self, particles: Particles, loss: Tensor, context: Any) -> Tensor:
-        """Return the rewards of a step, [B], from the particles and losses, [B], after it."""
+        """Return the rewards of a step, [B]; particles and losses, [B], are those after it."""
         raise NotImplementedError
 
     def next_goals(self, elapsed: Tensor, context: Any, goal: Tensor) -> None:
-        """Change goals in place after the rewards of a step, by the steps since the start, [B]."""
+        """Change `goal`, [B], in place after a step, by default not; `elapsed`: steps, [B]."""
 
     def context_info(self, particles: Particles, context: Any) -> dict[str, Tensor]:
-        """Return further entries of infos, shape [B, ...] each."""
+        """Return what the task adds to infos, by name, [B, ...] each; by default nothing."""
         return {}
 
 
 class GardenContext(NamedTuple):
-    """The picture at the start of B episodes."""
+    """Losses of the picture at the start of B episodes."""
 
     intact_loss: Tensor
     """Loss of the intact picture, shape [B]."""
@@ -202,7 +202,7 @@ class GardenContext(NamedTuple):
 
 
 class GardenTask(RuleDriven, GrownTask[Config]):
-    """A grown picture that its rule keeps stepping; differentiable in the brushes."""
+    """A grown picture that its rule keeps stepping; `step` is differentiable in the action."""
 
     config_type: ClassVar[type[GardenConfig]] = GardenConfig
     spaces_type: ClassVar[Any] = BrushSpaces
@@ -210,21 +210,21 @@ class GardenTask(RuleDriven, GrownTask[Config]):
 
     def __init__(self, config: Config, device: torch.device) -> None:
         super().__init__(config, device)
-        check_runs(self.rule, config, "alpha", "eps0", "moment_inverse")
+        check_matches_rule(self.rule, config, "alpha", "eps0", "moment_inverse")
         self.rule.requires_grad_(False)
         self.deficit = TargetDeficit(grid_places(config, device), self.task.target, config)
         """Difference between the target and worlds at the places of the grid."""
 
     @classmethod
     def bytes_per_world(cls, config: Any) -> int:
-        """Return about how much memory a world's picture and brushes take [bytes]."""
+        """Return about how much memory the loss and the brushes of one world take [bytes]."""
         values = VALUES_PER_PLACE * config.place_count**2 * config.particle_count
         return super().bytes_per_world(config) + 3 * 4 * int(values)
 
     def step(
         self, x: Tensor, s: Tensor, action: Tensor, random: WorldRandom
     ) -> tuple[Tensor, Tensor]:
-        """Return worlds after a step of the environment; differentiable."""
+        """Return positions and states after a step: brushes, rule, `disturb`; differentiable."""
         rolled = self.brush_and_roll(Particles(x, s), action, random)
         x, s, *_ = self.disturb(rolled, random)
         return x, s
@@ -239,7 +239,7 @@ class GardenTask(RuleDriven, GrownTask[Config]):
         particles, rate = apply_brushes(particles, action, middle, config)
         if rate is None:
             return run(particles, config.rule_steps)
-        box = config.periodic_sides
+        box = self.periodic_sides
         for _ in range(config.rule_steps):
             (x, s, *_), stepped = particles, run(particles, 1)
             x = x + rate * nearest_image(stepped.x - x, box)
@@ -252,19 +252,19 @@ class GardenTask(RuleDriven, GrownTask[Config]):
         return particles
 
     def episode_context(self, start: Start, loss: Tensor, random: WorldRandom) -> Any:
-        """Return the loss of intact pictures, and its rise if they turn grey."""
+        """Return the losses of the grown pictures, and their rise if the pictures turn grey."""
         blank = torch.zeros_like(start.s)
         grey = sum(self.losses(start.x, blank).values(), torch.zeros_like(loss))
         # The loss of a picture that did not grow may not rise at all.
         return GardenContext(loss, (grey - loss).maximum(MIN_RISE * loss))
 
     def lost_fraction(self, loss: Tensor, context: Any) -> Tensor:
-        """Return the fraction of pictures that is lost: 0 if intact, 1 if grey, shape [B]."""
+        """Return the lost fraction of each picture, [B]: 0 as at its start, 1 as bad as grey."""
         fraction: Tensor = (loss - context.intact_loss) / context.rise
         return fraction
 
     def middle(self, x: Tensor) -> Tensor:
-        """Return the origin of brushes' places: the mean position minus the target's, [B, 2]."""
+        """Return the origin of the brushes: the mean position minus the target's, [B, 2]."""
         return world_mean(x) - self.task.target.points.mean(dim=0)
 
     def observe(self, particles: Particles, loss: Tensor, context: Any) -> Tensor:

@@ -35,7 +35,7 @@ TOOLS = ("push", "wipe", "inject", "rate")
 
 @dataclass(frozen=True, kw_only=True)
 class GardenConfig(GrownConfig):
-    """Adds the brushes and the form of observations."""
+    """`GrownConfig` with the brushes and the form of observations."""
 
     words = GrownConfig.words | {
         "reward": get_args(GardenReward),
@@ -118,11 +118,6 @@ class GardenConfig(GrownConfig):
         rule, hint = f"lie in [{-count}, {count - 1}]", f"there are {count} channels"
         check_field(self, "inject_channels", exist, rule, hint)
 
-    @property
-    def periodic_sides(self) -> tuple[float, float] | None:
-        """Sides of the box [length units] if it is periodic, else None."""
-        return None if self.periodic_box is None else (self.periodic_box, self.periodic_box)
-
 
 DIRECTIONS = ((1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1))
 """Directions of pushes of the "discrete" form."""
@@ -139,8 +134,8 @@ class BrushLayout(NamedTuple):
     width: int
 
     @classmethod
-    def of(cls, config: GardenConfig) -> BrushLayout:
-        """Return the layout for a configuration; only brushes off the grid have place columns."""
+    def for_config(cls, config: GardenConfig) -> BrushLayout:
+        """Return the columns for a configuration; brushes of a grid have none for their place."""
         widths = {"place": 0 if config.actions == "grid" else 2}
         widths |= {"push": 2, "wipe": 1, "inject": len(config.inject_channels), "rate": 1}
         first, columns = 0, {}
@@ -151,7 +146,7 @@ class BrushLayout(NamedTuple):
 
 
 def grid_places(config: GardenConfig, device: torch.device | None = None) -> Tensor:
-    """Return the places of the grid [length units], row by row from the bottom up, shape [P, 2]."""
+    """Return the P² places of the grid [length units], from the bottom row up, shape [P², 2]."""
     fraction = torch.arange(config.place_count, device=device) / (config.place_count - 1)
     steps = config.place_reach * (2.0 * fraction - 1.0)
     up, across = torch.meshgrid(steps, steps, indexing="ij")
@@ -161,12 +156,12 @@ def grid_places(config: GardenConfig, device: torch.device | None = None) -> Ten
 def offsets(x: Tensor, places: Tensor, config: GardenConfig) -> Tensor:
     """Return the vector from each place to each particle [length units], shape [B, K, N, 2]."""
     spread = x[:, None].expand(-1, places.shape[1], -1, -1)
-    flat = spread.flatten(0, 1), places.flatten(0, 1)
-    return offsets_from(*flat, config.periodic_sides).view(spread.shape)
+    box = None if config.periodic_box is None else (config.periodic_box, config.periodic_box)
+    return offsets_from(spread.flatten(0, 1), places.flatten(0, 1), box).view(spread.shape)
 
 
 def brush_weights(away: Tensor, config: GardenConfig) -> Tensor:
-    """Return each brush's weight in [0, 1] at offsets of particles, shape [B, K, N]."""
+    """Return each brush's weight in [0, 1] at particles `away` from it, shape [B, K, N]."""
     origin = away.new_zeros(away.shape[0] * away.shape[1], 2)
     weights = softness(away.flatten(0, 1), centre=origin, radius=config.brush_radius)
     return weights.view(away.shape[:3])
@@ -178,11 +173,11 @@ def apply_brushes(
     """Apply all brushes at once, adding up their effects; differentiable.
 
     Returns:
-        Worlds, and each particle's rate, the factor of its rule's steps, dimensionless, shape
-        [B, N, 1]; None without the tool "rate".
+        Particles, and by how much to multiply each one's change in a step of the rule,
+        dimensionless, shape [B, N, 1]; None without the tool "rate".
     """
     x, s, *_ = particles
-    columns, action = BrushLayout.of(config), action.clamp(-1.0, 1.0)
+    columns, action = BrushLayout.for_config(config), action.clamp(-1.0, 1.0)
     places = action[..., columns.place]
     if config.actions == "grid":
         places = grid_places(config, x.device).to(x)
@@ -205,11 +200,11 @@ def apply_brushes(
 
 
 def tool_table(config: GardenConfig) -> Tensor:
-    """Return the M choices of a "discrete" brush at full strength, as rows of tools, [M, W - 2].
+    """Return the actions of M choices of a "discrete" brush at full strength, [M, W - 2].
 
-    Nothing; pushes in eight directions; wipe; each channel up and down; rates of 0 and of 2.
+    Choices: nothing; pushes in eight directions; wipe; each channel up, down; rates 0 and 2.
     """
-    columns, choices = BrushLayout.of(config), list[tuple[slice, Tensor]]()
+    columns, choices = BrushLayout.for_config(config), list[tuple[slice, Tensor]]()
     if "push" in config.tools:
         directions = torch.tensor(DIRECTIONS).float()
         lengths = directions.square().sum(dim=1, keepdim=True).sqrt()
@@ -228,7 +223,7 @@ def tool_table(config: GardenConfig) -> Tensor:
 
 
 class BrushSpaces(ParticleSpaces):
-    """Spaces and conversions of observations of a whole world and of actions of brushes."""
+    """Spaces for observations of a whole world and actions of brushes, with conversions."""
 
     def __init__(self, physics: Physics, config: GardenConfig) -> None:
         self._config = config
@@ -242,7 +237,7 @@ class BrushSpaces(ParticleSpaces):
         self.observation_space: Space[Any] = Box(-limit, limit, shape, np.float32)
         on_grid = config.actions == "grid"
         count = config.place_count**2 if on_grid else config.brush_count
-        self.rows_shape = (count, BrushLayout.of(config).width)
+        self.rows_shape = (count, BrushLayout.for_config(config).width)
         """Shape (K, W) of a world's rows of brushes."""
         self._tools = tool_table(config)
         self._choices = [config.place_count] * 2 + [len(self._tools), config.strength_count]

@@ -105,7 +105,7 @@ class SpeciesConfig(WorldConfig):
             )
 
     def interface(self, physics: Physics) -> Interface:
-        """As `WorldConfig.interface`, with the columns of single species."""
+        """Return the meaning of the columns, those of each species' density included."""
         count = self.species_count if self.perception == "per_species" else 0
         return super().interface(physics)._replace(species_count=count)
 
@@ -118,8 +118,8 @@ class SpeciesConfig(WorldConfig):
         return tuple(even + int(k < rest) for k in range(self.species_count))
 
     @property
-    def played_counts(self) -> tuple[int, ...]:
-        """Particles of each species that is an agent; the environment plays the other species."""
+    def agent_particle_counts(self) -> tuple[int, ...]:
+        """Particles of each species that agents control; the environment plays the others."""
         return self.counts
 
     @property
@@ -129,7 +129,7 @@ class SpeciesConfig(WorldConfig):
 
     @classmethod
     def from_keywords(cls, keywords: dict[str, Any]) -> Self:
-        """As `WorldConfig.from_keywords`; only one of the two counts of particles may be given."""
+        """As `WorldConfig.from_keywords`; refuse `particle_count` next to `particle_counts`."""
         if "particle_count" in keywords and plain(keywords.get("particle_counts")):
             raise NPAError(
                 "particle_count and particle_counts exclude each other: "
@@ -167,7 +167,7 @@ class SpeciesConfig(WorldConfig):
 
 
 class Population(NamedTuple):
-    """The N remaining particles, sorted by species, of worlds that all have the same ones left."""
+    """Particles of B worlds, sorted by species; the same N of them remain in every world."""
 
     x: Tensor
     """Positions [length units], shape [B, N, 2]."""
@@ -183,7 +183,7 @@ class Population(NamedTuple):
 
     @property
     def spans(self) -> list[slice]:
-        """Slice of each species' particles."""
+        """Slice of each species' particles in x and s."""
         ends = list(accumulate(self.counts))
         return [slice(end - count, end) for end, count in zip(ends, self.counts, strict=True)]
 
@@ -238,26 +238,26 @@ class SpeciesTask(WorldTask[Any]):
         """Return the terms of each particle's loss by name, [B, N] each; their sum is its loss."""
         raise NotImplementedError
 
-    def played(self, action: Tensor, population: Population, random: WorldRandom) -> Tensor:
-        """Return the actions of all particles, those of the environment's opponent included."""
+    def with_opponent(self, action: Tensor, population: Population, random: WorldRandom) -> Tensor:
+        """Return `action`, [B, N, A]; a task with an opponent replaces its particles' rows."""
         return action
 
     def final_rewards(self, rewards: Tensor, live: Tensor, species: Tensor) -> Tensor:
-        """Return the agents' final rewards, [B, A]; by default unchanged."""
+        """Return `rewards`, [B, A], which a task may change; by default unchanged."""
         return rewards
 
     def is_over(self, counts: tuple[int, ...]) -> bool:
-        """Return whether the episode ends for all at these counts of each species' live agents."""
+        """Return whether the episode ends for all; `counts`: live agents of each species."""
         return False
 
     @property
     def pixel_size(self) -> float:
-        """Size of a particle in pictures: the spacing of all that fill the unit disk."""
+        """Size of a particle in pictures: the spacing of all of them in the unit disk."""
         return math.sqrt(math.pi / sum(self.config.counts))
 
     @property
     def open_half_width(self) -> float:
-        """Half of a picture's side in open space [length units]; values below 1 count as 1."""
+        """Half of a picture's side in open space [length units]; at least 1 is used."""
         return 1.25 * float(self.config.seed_span)
 
     def draw(self, population: Population) -> NDArray[np.uint8]:

@@ -50,7 +50,7 @@ class KnownAgents(pettingzoo.ParallelEnv):  # type: ignore[misc]
 
 
 class CrowdEnv(AgentsEnv, KnownAgents):
-    """One world whose agents are species, or particles with `by_particle`."""
+    """One world as a PettingZoo environment; agents are species, or particles."""
 
     def __init__(self, task: str, keywords: dict[str, Any], *, by_particle: bool) -> None:
         super().__init__(task, keywords, 1, by_particle=by_particle)
@@ -70,7 +70,7 @@ class CrowdEnv(AgentsEnv, KnownAgents):
         """
         observation = self._start(np.arange(1), seed, seed)
         self._update_agents()
-        infos = self._infos(self.worlds.agent_returns.numbers())
+        infos = self._infos(self.worlds.agent_returns.loss_infos())
         return self._by_agent(observation), infos
 
     def step(self, actions: Mapping[str, Any]) -> Outcome:
@@ -120,14 +120,14 @@ class CrowdEnv(AgentsEnv, KnownAgents):
         return None if pictures is None else pictures[0]
 
     def particles(self) -> tuple[Tensor, Tensor]:
-        """Return copies of positions [length units], [N now, 2], and states, [N now, C]."""
+        """Return copies of positions [length units], [N', 2], and states, [N', C]; N' are left."""
         population = self.worlds.population(0)
         return population.x[0], population.s[0]
 
     def place_particles(self, x: Any, s: Any) -> dict[str, Any]:
         """Replace the particles of all live agents, without a reward; return the observations.
 
-        Positions have shape [N now, 2], states [N now, C].
+        Positions have shape [N', 2], states [N', C], as those that `particles` returns.
         """
         if not self.agents:
             raise NPAError("particles need live agents: call reset first")
@@ -137,12 +137,12 @@ class CrowdEnv(AgentsEnv, KnownAgents):
         return self._by_agent(observation)
 
     def _update_agents(self) -> None:
-        """Set `agents` to those that act next."""
+        """Set `agents` to the names of those that act in the next step."""
         self._live = np.flatnonzero(self.worlds.live[0, : len(self.possible_agents)]).tolist()
         self.agents = [self.possible_agents[k] for k in self._live]
 
     def _with_zeros(self, action: Tensor) -> Tensor:
-        """Return actions of live agents, [N now, A], with zeros for all others, [1, N, A]."""
+        """Return all particles' actions, [1, N, A]: the live agents', [N', A], else zeros."""
         count = self.worlds.particle_count
         if len(action) == count:
             return action[None]
@@ -152,7 +152,7 @@ class CrowdEnv(AgentsEnv, KnownAgents):
         return all_rows
 
     def _infos(self, numbers: dict[str, Tensor]) -> Infos:
-        """Return the infos of live agents: species and losses."""
+        """Return the infos of live agents, with their species and `numbers`, [1, A] each."""
         rows = torch.stack(list(numbers.values()))[:, 0].tolist()
         columns = dict(zip(numbers, rows, strict=True))
         species = self.worlds.agent_species
@@ -162,7 +162,7 @@ class CrowdEnv(AgentsEnv, KnownAgents):
         }
 
     def _by_agent(self, observation: Tensor) -> dict[str, Any]:
-        """Return the observation of each of `agents`, from all particles' perception, [1, N, P]."""
+        """Split the perception of all particles, [1, N, P], into the `agents`' observations."""
         rows, spans = self._out(observation[0]), self.worlds.spans
         return {
             agent: rows[spans[k].start] if self.worlds.by_particle else rows[spans[k]]
@@ -173,7 +173,7 @@ class CrowdEnv(AgentsEnv, KnownAgents):
 def in_turns(
     parallel_env: Callable[Arguments, KnownAgents],
 ) -> tuple[Callable[Arguments, Any], Callable[Arguments, Any]]:
-    """Return the functions `raw_env` and `env` for a module's `parallel_env`."""
+    """Return functions `raw_env` and `env`, whose agents act in turn, for a `parallel_env`."""
 
     def raw_env(*args: Arguments.args, **config: Arguments.kwargs) -> Any:
         """Return `parallel_env` with agents that act in turn; a step runs after the last one."""
@@ -189,7 +189,7 @@ def in_turns(
 
 
 def register(name: str, module: str, keywords: dict[str, Any]) -> None:
-    """Register both kinds of an environment with PettingZoo, unless they are registered."""
+    """Register an id with PettingZoo as parallel and as AEC environment, unless it is known."""
     for api, function in (("parallel", "parallel_env"), ("aec", "env")):
         # PettingZoo before 1.27 has no registries.
         if name not in getattr(pettingzoo, f"{api}_registry", {name}):

@@ -89,7 +89,7 @@ class AgentReturns:
         self._at_start = self._carried = zeros
 
     def begin(self, terms: LossTerms, worlds: Tensor) -> None:
-        """Begin episodes in some worlds, int64, [M], by terms of all agents there, [M, A] each."""
+        """Begin episodes in worlds of int64 indices [M]; `terms`: of the first losses, [M, A]."""
         first = _stacked(terms)
         if not self.term_names:
             self.term_names = tuple(terms)
@@ -102,14 +102,14 @@ class AgentReturns:
         self._carried = self._carried.index_fill(0, worlds, 0.0)
 
     def replace(self, terms: LossTerms) -> None:
-        """Replace the losses without a reward; those of agents that ended are not used again."""
+        """Replace the losses without a reward, after particles were removed or placed."""
         self._terms = self._before = _stacked(terms)
         loss = total(self._terms)
         self._carried = self._carried + (loss - self.loss)
         self.loss = loss
 
     def step_rewards(self, terms: LossTerms, live: Tensor, diverged: Tensor) -> Tensor:
-        """Store the losses after a step; return rewards, 0 if not live, float64, [B, A]."""
+        """Store the losses after a step; return rewards, float64, [B, A], 0 for ended agents."""
         now = _stacked(terms)
         loss = total(now)
         # Leaving the world must not be rewarded, even if an empty picture is better than the start;
@@ -124,8 +124,8 @@ class AgentReturns:
         self._terms, self._before, self.loss = now, self._terms, loss
         return self._task.final_rewards(rewards, live, self._species)
 
-    def numbers(self, *, stepped: bool = False) -> dict[str, Tensor]:
-        """Return the entries of `info` about losses, after a step or a reset, float64, [B, A]."""
+    def loss_infos(self, *, stepped: bool = False) -> dict[str, Tensor]:
+        """Return losses and terms, and after a step their decrease, as in `info`, [B, A]."""
         numbers = {"loss": self.loss} | named_terms("loss", self.term_names, self._terms)
         if stepped:
             numbers |= named_terms("reward", self.term_names, self._before - self._terms)
@@ -208,7 +208,7 @@ class SpeciesWorlds(WorldState):
     @torch.no_grad()
     @makes_plain_tensors
     def start(self, worlds: NDArray[np.int64], keys: Tensor | None = None) -> Tensor:
-        """Start episodes in some worlds, [M]; return their perception, [M, N, P].
+        """Start episodes in the worlds of indices [M]; return their perception, [M, N, P].
 
         Keys are those of `next_streams`.
         """
@@ -222,8 +222,8 @@ class SpeciesWorlds(WorldState):
         self.live[worlds] = self.present[worlds] = self.running[worlds] = True
         self.elapsed[worlds] = 0
         population = self._whole.population._replace(x=x.contiguous(), s=s)
-        self.agent_returns.begin(self._whole.measured(population), index)
-        return self._whole.perceived(population)
+        self.agent_returns.begin(self._whole.loss_terms(population), index)
+        return self._whole.perception(population)
 
     @torch.no_grad()
     @makes_plain_tensors
@@ -248,10 +248,10 @@ class SpeciesWorlds(WorldState):
         self._host_diverged.copy_(diverged, non_blocking=True)
         if self._side_stream is not None:
             self._side_stream.mark()
-        live, terms = to_device_async(acted, self.device), self.measured(stepped=True)
+        live, terms = to_device_async(acted, self.device), self.loss_terms(stepped=True)
         rewards = self.agent_returns.step_rewards(terms, live, diverged & live)
-        numbers = self.agent_returns.numbers(stepped=True)
-        observation = self.perceived(stepped=True)
+        numbers = self.agent_returns.loss_infos(stepped=True)
+        observation = self.perception(stepped=True)
         # The device continues while the host reads who diverged.
         if self._side_stream is not None:
             self._side_stream.wait()
@@ -269,23 +269,23 @@ class SpeciesWorlds(WorldState):
 
     @torch.no_grad()
     @makes_plain_tensors
-    def perceived(self, *, stepped: bool = False) -> Tensor:
+    def perception(self, *, stepped: bool = False) -> Tensor:
         """Return what particles perceive, shape [B, N, P]; zeros where they or their world ended.
 
-        `stepped`: the particles are as after the last step, so that its neighbours are used.
+        `stepped`: particles are as the last step left them, so its neighbour search is reused.
         """
         if self.cohorts == [self._whole]:
-            return self._whole.perceived(stepped=stepped)
+            return self._whole.perception(stepped=stepped)
         perceived = self.x.new_zeros(self.world_count, self.particle_count, self.perception_dim)
         for cohort in self.cohorts:
-            perceived[cohort.indices] = cohort.perceived(stepped=stepped)
+            perceived[cohort.indices] = cohort.perception(stepped=stepped)
         return perceived
 
-    def measured(self, *, stepped: bool = False) -> LossTerms:
-        """Return the terms of every agent's loss, float32, [B, A] each; 0 for agents that ended."""
+    def loss_terms(self, *, stepped: bool = False) -> LossTerms:
+        """Return the terms of every agent's loss, float32, [B, A] each; 0 for ended agents."""
         terms: LossTerms = {}
         for cohort in self.cohorts:
-            for name, term in (cohort.terms if stepped else cohort.measured()).items():
+            for name, term in (cohort.terms if stepped else cohort.loss_terms()).items():
                 if name not in terms:
                     terms[name] = term.new_zeros(self.live.shape)
                 terms[name].index_copy_(0, cohort.worlds, term)
@@ -301,16 +301,16 @@ class SpeciesWorlds(WorldState):
         placed = self.checked_particles(x, s, 1, population.x.shape[1])
         population.x.copy_(placed.x)
         population.s.copy_(placed.s)
-        return self._measured_again()
+        return self._measure_unrewarded()
 
-    def _measured_again(self) -> Tensor:
-        """Measure the losses again without a reward, and return what particles perceive."""
-        self.agent_returns.replace(self.measured())
-        perceived: Tensor = self.perceived()
+    def _measure_unrewarded(self) -> Tensor:
+        """Measure the losses anew, without a reward; return what particles perceive."""
+        self.agent_returns.replace(self.loss_terms())
+        perceived: Tensor = self.perception()
         return perceived
 
     def population(self, world: int) -> Population:
-        """Return the particles that are in a world."""
+        """Return the remaining particles of the world of this index."""
         self._collect()
         columns = np.flatnonzero(self.present[world][self.owner])
         index = to_device_async(columns, self.device)
@@ -331,7 +331,7 @@ class SpeciesWorlds(WorldState):
         return np.concatenate([self.task.draw(self.population(k)) for k in range(count)])
 
     def _close_deserted(self) -> None:
-        """Stop stepping worlds without live agents until they start again."""
+        """Stop stepping worlds that have no live agent, until their next episodes start."""
         deserted = self.running & ~self.live.any(axis=1)
         if deserted.any():
             self._disband()
@@ -372,7 +372,7 @@ class SpeciesWorlds(WorldState):
         if not self.running.any():
             return observation
         # A death changes the losses of others; this is not rewarded.
-        perceived = self._measured_again()
+        perceived = self._measure_unrewarded()
         stays = (endings == 0) & self.running[:, None]
         where = to_device_async(stays, self.device)[:, self._owner, None]
         return torch.where(where, perceived, observation)
@@ -404,12 +404,12 @@ class SpeciesWorlds(WorldState):
         return cohorts
 
     def _disband(self) -> None:
-        """Copy the cohorts' particles to the batch; the next use groups the worlds again."""
+        """Copy the cohorts' particles to the batch; group the worlds anew at the next use."""
         self._collect()
         self._cohorts = None
 
     def _collect(self) -> None:
-        """Copy the cohorts' particles to the batch."""
+        """Copy the cohorts' particles and random streams to the batch."""
         for cohort in self._cohorts or ():
             if cohort is not self._whole:
                 self.x[cohort.indices] = cohort.population.x
@@ -461,13 +461,13 @@ class Cohort:
         return self.__dict__ | {"_neighbours": None}
 
     def act(self, action: Tensor) -> None:
-        """Apply finite actions, shape [M, N now, A], and evaluate, without synchronising."""
-        action = self._task.played(action, self.population, self.random)
+        """Apply finite actions, [M, N', A]; compute losses and neighbours, without waiting."""
+        action = self._task.with_opponent(action, self.population, self.random)
         self._draw()
         self._actions.apply(action)
         self._evaluate_graph()
 
-    def measured(self, population: Population | None = None) -> LossTerms:
+    def loss_terms(self, population: Population | None = None) -> LossTerms:
         """Return the terms of every agent's loss, float32, [M, A] each; 0 for removed agents.
 
         `population`: other positions and states of the same particles; None: the current ones.
@@ -482,10 +482,10 @@ class Cohort:
             for name, loss in losses.items()
         }
 
-    def perceived(self, population: Population | None = None, *, stepped: bool = False) -> Tensor:
-        """Return what particles perceive, shape [M, N now, P].
+    def perception(self, population: Population | None = None, *, stepped: bool = False) -> Tensor:
+        """Return what the N' particles of each world perceive, shape [M, N', P].
 
-        `stepped`: the neighbours of the last step are still right, and used again.
+        `stepped`: particles are as the last step left them, so its neighbour search is reused.
         """
         x, s, counts, _ = population or self.population
         neighbours = self._neighbours if stepped else None
@@ -503,14 +503,14 @@ class Cohort:
         # Sums of ones are exact in any order.
         count = torch.zeros(len(inside), self._agent_count, device=inside.device)
         self.diverged = count.index_add_(1, self._owners, inside.float()) == 0.0
-        self.terms = self.measured()
+        self.terms = self.loss_terms()
         self._neighbours = build_neighbours(x, s, physics)
 
 
 def population_of(
     particles: Particles, species: NDArray[np.int64], species_count: int
 ) -> Population:
-    """Return particles of these species, [N], as a population."""
+    """Return particles as a `Population`; `species` has the species of each, int64 [N]."""
     counts = tuple(np.bincount(species, minlength=species_count).tolist())
     index = to_device_async(species, particles.x.device)
     return Population(particles.x, particles.s, counts, index)

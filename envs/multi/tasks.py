@@ -23,7 +23,7 @@ class MixingTask(SpeciesTask):
     """Mix the species: a particle's loss is 1 minus the entropy of species around it."""
 
     def losses(self, population: Population) -> Mapping[str, Tensor]:
-        """Return the mean of the particle losses of each species."""
+        """Return each species' mean of its particles' losses, by name, shape [B, K]."""
         spans = [population.spans[k] for k in _present(population)]
         return {
             name: by_species([world_mean(loss[:, span, None])[:, 0] for span in spans], population)
@@ -31,7 +31,7 @@ class MixingTask(SpeciesTask):
         }
 
     def particle_losses(self, population: Population) -> Mapping[str, Tensor]:
-        """Return 1 minus the entropy of species around each particle."""
+        """Return 1 minus the entropy of species around each particle, by name, [B, N]."""
         return {"separation": 1.0 - self._entropy(population)}
 
     def _entropy(self, population: Population) -> Tensor:
@@ -76,7 +76,7 @@ class SegregationTask(MixingTask):
     config_type = SegregationConfig
 
     def particle_losses(self, population: Population) -> Mapping[str, Tensor]:
-        """Return the entropy of species around each particle."""
+        """Return the entropy of species around each particle, by name, [B, N]."""
         return {"mixture": self._entropy(population)}
 
 
@@ -86,7 +86,7 @@ USUAL = ("gecko", "heart", "butterfly", "flower", "octopus", "ring")
 
 @dataclass(frozen=True, kw_only=True)
 class PictureLossConfig(SpeciesConfig):
-    """Adds the loss of `Morphogenesis2DConfig`, which documents the fields."""
+    """`SpeciesConfig` with the loss of `Morphogenesis2DConfig`, which documents the fields."""
 
     task_config_type = Morphogenesis2DConfig
 
@@ -113,7 +113,7 @@ class PictureLossConfig(SpeciesConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class OnePictureConfig(PictureLossConfig):
-    """Adds the target of tasks with one picture."""
+    """`PictureLossConfig` with one target picture."""
 
     target: str = Morphogenesis2DConfig.target
 
@@ -146,13 +146,13 @@ class PictureLossTask(SpeciesTask):
 
     @property
     def open_half_width(self) -> float:
-        """Half of a picture's side in open space [length units]; each seed's target fits in."""
+        """Half of a picture's side in open space [length units]: a target fits at each seed."""
         return float(1.0 + 0.5 * (self.config.species_count - 1) * self.config.seed_distance)
 
 
 @dataclass(frozen=True, kw_only=True)
 class CoMorphogenesisConfig(PictureLossConfig):
-    """Adds a target for each species, and the distance between them."""
+    """`PictureLossConfig` with a target for each species, and the distance of their seeds."""
 
     targets: tuple[str, ...] = ()
     """Target of each species: built-in names (`npa-envs list`), emoji, or paths of pictures; empty:
@@ -171,8 +171,8 @@ class CoMorphogenesisConfig(PictureLossConfig):
         check_field(self, "targets", fits, rule, f"for example targets={self._usual}")
 
     @property
-    def grown(self) -> tuple[str, ...]:
-        """Target of each species."""
+    def target_names(self) -> tuple[str, ...]:
+        """Target of each species: `targets`, or the usual ones if that is empty."""
         return self.targets or self._usual
 
     @property
@@ -187,15 +187,15 @@ class CoMorphogenesisTask(PictureLossTask):
     least_species = 1
 
     def __init__(self, config: CoMorphogenesisConfig, device: torch.device) -> None:
-        super().__init__(config, device, *zip(config.grown, config.counts, strict=True))
+        super().__init__(config, device, *zip(config.target_names, config.counts, strict=True))
 
     def losses(self, population: Population) -> Mapping[str, Tensor]:
-        """Return the density error and the weighted colour error of each species' picture."""
+        """Return density error and weighted colour error of each species, by name, [B, K]."""
         terms = [self.picture_terms(k, *population.of(k)) for k in _present(population)]
         return {name: by_species([term[name] for term in terms], population) for name in terms[0]}
 
     def particle_losses(self, population: Population) -> Mapping[str, Tensor]:
-        """Return each particle's share of its species' splat loss, shape [B, N]."""
+        """Return what each particle adds to its species' splat loss, times N_k, [B, N]."""
         losses = [
             self.tasks[k].particle_contributions(*population.of(k)) for k in _present(population)
         ]
@@ -204,7 +204,7 @@ class CoMorphogenesisTask(PictureLossTask):
 
 @dataclass(frozen=True, kw_only=True)
 class InvasionConfig(OnePictureConfig):
-    """Adds the opponent; rewards cannot be those of a team."""
+    """`OnePictureConfig` with `opponent`, who plays the invaders; refuses reward="team"."""
 
     words = OnePictureConfig.words | {"opponent": (None, "random")}
 
@@ -213,8 +213,8 @@ class InvasionConfig(OnePictureConfig):
     [-1, 1] for each particle and step."""
 
     @property
-    def played_counts(self) -> tuple[int, ...]:
-        """Particles of each species that is an agent."""
+    def agent_particle_counts(self) -> tuple[int, ...]:
+        """Particles of each species that agents control."""
         return self.counts if self.opponent is None else self.counts[:1]
 
     def __post_init__(self) -> None:
@@ -225,7 +225,7 @@ class InvasionConfig(OnePictureConfig):
 
 
 class InvasionTask(PictureLossTask):
-    """Splat loss of species 0; the rewards of the other species are minus its own, in sum."""
+    """Species 0 has the splat loss of its picture; the others get minus its reward, in sum."""
 
     config_type = InvasionConfig
 
@@ -233,7 +233,7 @@ class InvasionTask(PictureLossTask):
         super().__init__(config, device, (config.target, config.counts[0]))
 
     def losses(self, population: Population) -> Mapping[str, Tensor]:
-        """Return the terms of species 0's splat loss, and minus an equal share for each other."""
+        """Return the terms of the losses by name, [B, K]; invaders share minus species 0's loss."""
         invaders = population.counts[1:]
         present = max(sum(count > 0 for count in invaders), 1)
         return {
@@ -242,28 +242,28 @@ class InvasionTask(PictureLossTask):
         }
 
     def particle_losses(self, population: Population) -> Mapping[str, Tensor]:
-        """Return each particle's loss; an invader's is −(sum of species 0) / (invader count)."""
+        """Return losses by name, [B, N]; all invaders have the same, in sum minus species 0's."""
         losses = self.task.particle_contributions(*population.of(0))
         count, invader_count = losses.shape[1], sum(population.counts[1:])
         part = world_mean(losses[..., None])[:, 0] * (-count / max(invader_count, 1))
         return {"picture": torch.cat((losses, part[:, None].expand(-1, invader_count)), dim=1)}
 
-    def played(self, action: Tensor, population: Population, random: WorldRandom) -> Tensor:
-        """Return the actions of all particles, random ones for an opponent's."""
+    def with_opponent(self, action: Tensor, population: Population, random: WorldRandom) -> Tensor:
+        """Return `action`, [B, N, A], with random rows for invaders if opponent="random"."""
         if self.config.opponent is None:
             return action
         drawn = 2.0 * random.substream(StreamId.OPPONENT).uniform(*action.shape[1:]) - 1.0
         return torch.where((population.species > 0)[:, None], drawn, action)
 
     def final_rewards(self, rewards: Tensor, live: Tensor, species: Tensor) -> Tensor:
-        """Return rewards that sum to zero: invaders lose what species 0 gains, in equal parts."""
+        """Return rewards, [B, A]: live invaders lose in equal parts what species 0 gains."""
         invading = species > 0
         gained = torch.where(invading, 0.0, rewards).sum(dim=1, keepdim=True)
         payers = live & invading
         return torch.where(payers, -gained / payers.sum(dim=1, keepdim=True).clamp_min(1), rewards)
 
     def is_over(self, counts: tuple[int, ...]) -> bool:
-        """Return whether species 0 or all others are gone."""
+        """Return whether species 0, or every other species, has no live agent."""
         return counts[0] == 0 or sum(counts[1:]) == 0
 
 
@@ -275,7 +275,7 @@ class SymbiosisConfig(OnePictureConfig):
 
 
 class SymbiosisTask(PictureLossTask):
-    """Splat loss of the picture of all particles."""
+    """All species grow one picture; the loss of each is the splat loss of all particles."""
 
     config_type = SymbiosisConfig
     least_species = 1
@@ -284,13 +284,13 @@ class SymbiosisTask(PictureLossTask):
         super().__init__(config, device, (config.target, sum(config.counts)))
 
     def losses(self, population: Population) -> Mapping[str, Tensor]:
-        """Return the density error and the weighted colour error, the same for every species."""
+        """Return density error and weighted colour error, by name, equal for all, [B, K]."""
         terms = self.picture_terms(0, population.x, population.s)
         count = len(population.counts)
         return {name: loss[:, None].expand(-1, count) for name, loss in terms.items()}
 
     def particle_losses(self, population: Population) -> Mapping[str, Tensor]:
-        """Return each particle's share of the splat loss, shape [B, N]."""
+        """Return what each particle adds to the splat loss, times N, [B, N]."""
         return {"picture": self.task.particle_contributions(population.x, population.s)}
 
     # There is one picture, in the middle.
@@ -298,7 +298,7 @@ class SymbiosisTask(PictureLossTask):
 
 
 def _present(population: Population) -> list[int]:
-    """Return the species that have particles."""
+    """Return the indices of the species that have particles left."""
     return [k for k, count in enumerate(population.counts) if count]
 
 
@@ -317,9 +317,6 @@ TASKS: dict[str, type[SpeciesTask]] = {
 }
 """Tasks by the names that environments take."""
 
-ENVIRONMENTS = SPECIES
-"""Tasks by the ids that `pettingzoo.make` takes."""
-
 SETTINGS: dict[str, tuple[str, Mapping[str, Any]]] = {
     **{name: (task, {}) for name, task in SPECIES.items()},
     **{size.id: (size.task, size.keywords) for size in SPECIES_SIZES},
@@ -328,13 +325,13 @@ SETTINGS: dict[str, tuple[str, Mapping[str, Any]]] = {
 
 
 def task_settings(name: str) -> tuple[str, dict[str, Any]]:
-    """Return the task's name and the keywords of an id; names of tasks are returned unchanged."""
+    """Return the task and the keywords that an id stands for; a task's name has no keywords."""
     task, keywords = SETTINGS.get(name, (name, {})) if isinstance(name, str) else (name, {})
     return task, dict(keywords)
 
 
 def task_type(name: str) -> type[SpeciesTask]:
-    """Return a task's class."""
+    """Return the class of the task of this name."""
     if not isinstance(name, str) or name not in TASKS:
         known = [*TASKS, *SETTINGS]
         raise NPAError(f"task must be a known word, got {shown(name)}: {suggest(name, known)}")

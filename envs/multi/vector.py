@@ -37,7 +37,7 @@ BatchOutcome = tuple[ByAgent, ByAgent, ByAgent, ByAgent, Infos]
 
 
 class AgentsEnv(ShownEnv):
-    """Base class of environments of agents, of one world or many: names, spaces, start, state."""
+    """Base class of environments with several agents, of one world or many."""
 
     metadata: Any = {  # noqa: RUF012 (nobody writes to it)
         "name": "npa_multispecies_v0",
@@ -56,7 +56,7 @@ class AgentsEnv(ShownEnv):
         self.render_mode = self.config.render_mode
         self.max_cycles = self.config.max_cycles
         """Steps after which an episode is truncated for all agents."""
-        played = self.config.played_counts
+        played = self.config.agent_particle_counts
         word, count = ("particle", sum(played)) if by_particle else ("species", len(played))
         self.possible_agents = [f"{word}_{k}" for k in range(count)]
         """Names of the agents."""
@@ -74,24 +74,20 @@ class AgentsEnv(ShownEnv):
         self._state_space = Box(upper * np.array([-1.0] * len(high) + [0.0], np.float32), upper)
         self.np_random: np.random.Generator | None = None
 
-    def close(self) -> None:
-        """Close the window, if there is one."""
-        self._close_window()
+    def _start(self, worlds: NDArray[np.int64], seed: Any, key_seed: Any) -> Tensor:
+        """Start episodes in worlds, indices [M]; return all worlds' perception, [B, N, P].
 
-    def _start(self, worlds: NDArray[np.int64], seed: Any, first: Any) -> Tensor:
-        """Start episodes in some worlds, [M]; return all worlds' perception, [B, N, P].
-
-        `seed` is that of `reset`; `first` seeds the generator of later keys.
+        `seed` is that of `reset`; `key_seed` seeds `np_random`, which draws keys without a seed.
         """
         keys, batch = None, self.worlds
         # The first reset may have failed, so that there are no sequences of episodes yet.
         if seed is not None or not self._started:
-            self.np_random, _ = seeding.np_random(plain(first))
+            self.np_random, _ = seeding.np_random(plain(key_seed))
             keys = rng_keys(seed, batch.world_count, self.np_random)[worlds]
         with batch.device_context():
             observation: Tensor = batch.start(worlds, keys)
             if len(worlds) < batch.world_count:
-                observation = batch.perceived()
+                observation = batch.perception()
         self._started = True
         self._show()
         return observation
@@ -192,7 +188,7 @@ class MultiSpeciesVectorEnv(AgentsEnv):
         chosen = worlds_to_reset(options, self.world_count, started=self._started)
         first = int(seed) if isinstance(seed, int | np.integer) else None
         observation, worlds = self._start(chosen, seed, first), self.worlds
-        return self._rows(observation), self._infos(worlds.agent_returns.numbers(), worlds.live)
+        return self._rows(observation), self._infos(worlds.agent_returns.loss_infos(), worlds.live)
 
     def step(self, actions: Mapping[str, Any]) -> BatchOutcome:
         """Apply every species' actions, shape [B, N_k, A], in [-1, 1], in all worlds.
@@ -244,7 +240,7 @@ class MultiSpeciesVectorEnv(AgentsEnv):
         return None if pictures is None else tuple(pictures)
 
     def _infos(self, numbers: dict[str, Tensor], acted: NDArray[np.bool_]) -> Infos:
-        """Return infos of all species, with zeros in worlds where they did not act."""
+        """Return the infos of all species: `numbers`, [B, A] each, 0 where not `acted`, [B, A]."""
         mask = to_device_async(acted, self.worlds.device)
         all_numbers = torch.stack(list(numbers.values())).float()
         rows = self._out(torch.where(mask, all_numbers, 0.0).movedim(2, 0).contiguous())
@@ -267,7 +263,7 @@ class MultiSpeciesVectorEnv(AgentsEnv):
         if final is not None:
             which = np.zeros(self.world_count, dtype=bool)
             which[final[1]] = True
-            restarted = self._sent(which)
+            restarted = self._out(which)
             for agent, rows in final[0].items():
                 infos[agent] |= {"final_obs": rows, "_final_obs": restarted}
         return infos
@@ -278,16 +274,16 @@ class MultiSpeciesVectorEnv(AgentsEnv):
         return {agent: rows[:, spans[k]] for k, agent in enumerate(self.possible_agents)}
 
     def _columns(self, values: Any) -> ByAgent:
-        """Split values, [B, K], by agent, shape [B] each."""
-        on_device = isinstance(values, Tensor)
-        columns = self._out(values.T.contiguous()) if on_device else self._sent(values.T.copy())
+        """Split values, [B, A], by agent, shape [B] each."""
+        rows = values.T.contiguous() if isinstance(values, Tensor) else values.T.copy()
+        columns = self._out(rows)
         return {agent: columns[k] for k, agent in enumerate(self.possible_agents)}
 
 
 def joined_actions(
     actions: Any, agents: Sequence[str], shapes: Sequence[tuple[int, ...]], device: torch.device
 ) -> Tensor:
-    """Return the checked actions of all live agents as rows, float32, [N, A] or [B, N, A]."""
+    """Return the checked actions of `agents`, joined by rows, float32, [N, A] or [B, N, A]."""
     if not isinstance(actions, Mapping):
         raise NPAError(
             f"actions must be a dict with an action for each live agent, got "

@@ -16,9 +16,8 @@ class ListOptions:
 def main(arguments: Sequence[str]) -> int:
     """Print the names of tasks, environments, targets, losses and rules; return 0."""
     common.parse_options(ListOptions, "list", arguments)
-    from npa_envs.envs.multi.tasks import ENVIRONMENTS as OF_SPECIES
     from npa_envs.measure.quality import score_line, scores
-    from npa_envs.registration import ALL, SPECIES_SIZES
+    from npa_envs.registration import ALL, SPECIES, SPECIES_SIZES
     from npa_envs.rule.files import load_rule, shipped_rules
     from npa_envs.tasks.losses.texture import TEXTURE_LOSSES
     from npa_envs.tasks.targets.digit_clouds import BUILT_IN
@@ -38,7 +37,7 @@ def main(arguments: Sequence[str]) -> int:
     for environment in ALL:
         print(f"  {environment.id}: episodes of {environment.max_episode_steps} steps")
     print("several species (npa_envs.envs.multispecies_v0.parallel_env(NAME); needs PettingZoo)")
-    print(f"  {', '.join((*OF_SPECIES, *(size.id for size in SPECIES_SIZES)))}")
+    print(f"  {', '.join((*SPECIES, *(size.id for size in SPECIES_SIZES)))}")
     print("targets (--target NAME, or the path of a picture; for morphogenesis also one emoji)")
     for name, entry in TASKS.items():
         if entry.targets():

@@ -9,7 +9,7 @@ import pytest
 import torch
 from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test
 from refusals import refused
-from small_envs import assert_same, begun, make, make_vec, small
+from small_envs import begun, make, make_vec, small
 
 import npa_envs
 from npa_envs.agents.gardening import ScriptedGardener
@@ -18,7 +18,6 @@ from npa_envs.envs import gardeners_v0
 from npa_envs.envs.garden.base import GardenContext
 from npa_envs.envs.garden.brushes import BrushLayout, apply_brushes, grid_places
 from npa_envs.envs.gardener2d import Gardener2DEnv
-from npa_envs.envs.shapeshifter2d import PictureGoals
 from npa_envs.registration import GARDENS
 from npa_envs.world.particles import Particles
 
@@ -34,7 +33,8 @@ def sampled(env, count, seed=0):
 
 def brush(config, **numbers):
     """The row of one brush at the middle, for a world."""
-    row, columns = torch.zeros(1, 1, BrushLayout.of(config).width), BrushLayout.of(config)
+    columns = BrushLayout.for_config(config)
+    row = torch.zeros(1, 1, columns.width)
     for tool, values in numbers.items():
         row[..., getattr(columns, tool)] = torch.tensor(values)
     return row
@@ -164,7 +164,7 @@ def test_the_whole_world_is_differentiable_by_every_number_of_a_brush():
     weights = torch.rand((1, 96, 18), generator=generator, dtype=torch.float64)
     given = action.clone().requires_grad_()
     (slope,) = torch.autograd.grad(worth(given), given)
-    columns = BrushLayout.of(env.config)
+    columns = BrushLayout.for_config(env.config)
     for column in range(columns.width):
         assert float(slope[0, :, column].abs().sum()) > 0.0, column
     way = torch.rand(shape, generator=generator, dtype=torch.float64) - 0.5
@@ -173,35 +173,25 @@ def test_the_whole_world_is_differentiable_by_every_number_of_a_brush():
     assert float((slope * way).sum()) == pytest.approx(float(difference), rel=1e-4)
 
 
-def goals(env, **moved):
-    """What a shepherd sees of the creature, after its particles were placed elsewhere."""
-    x, s = env.unwrapped.particles()
-    middle = x.mean(dim=0)
-    away = x - middle
-    if "by" in moved:
-        away = away + torch.tensor(moved["by"])
-    if "turn" in moved:
-        c, s_ = np.cos(moved["turn"]), np.sin(moved["turn"])
-        away = away @ torch.tensor([[c, s_], [-s_, c]], dtype=torch.float32)
-    if "stretch" in moved:
-        away = away * torch.tensor(moved["stretch"])
-    return env.unwrapped.place_particles(middle + away, s)
+COSINE, SINE = np.cos(0.5), np.sin(0.5)
 
 
 @pytest.mark.parametrize(
-    ("aim", "moved", "difference"),
+    ("aim", "matrix", "shift", "difference"),
     [
-        ("move", {"by": (0.3, -0.2)}, (0.3, -0.2)),
-        ("turn", {"turn": 0.5}, (np.cos(1.0) - 1.0, np.sin(1.0))),
-        ("reshape", {"stretch": (1.25, 0.8)}, (0.25, -0.2)),
+        ("move", np.eye(2), (0.3, -0.2), (0.3, -0.2)),
+        ("turn", [[COSINE, SINE], [-SINE, COSINE]], 0.0, (np.cos(1.0) - 1.0, np.sin(1.0))),
+        ("reshape", np.diag((1.25, 0.8)), 0.0, (0.25, -0.2)),
     ],
 )
-def test_a_shepherd_sees_what_became_of_a_creature_that_stays_whole(aim, moved, difference):
+def test_a_shepherd_sees_what_became_of_a_creature_that_stays_whole(aim, matrix, shift, difference):
     env = make(SHEPHERD, aim=aim, target="gecko", resolution=32, particle_count=256, eps=0.1)
     seen, _ = env.reset(seed=0)
     assert abs(seen["achieved_goal"][2]) < 1e-3
     assert env.unwrapped.compute_reward(seen["achieved_goal"], seen["desired_goal"], {}) < 0
-    after = goals(env, **moved)
+    x, s = env.unwrapped.particles()
+    away = (x - x.mean(dim=0)).numpy() @ np.float32(matrix) + np.float32(shift)
+    after = env.unwrapped.place_particles(x.mean(dim=0) + torch.from_numpy(away), s)
     assert after["achieved_goal"][:2] - seen["achieved_goal"][:2] == pytest.approx(
         difference, abs=1e-3
     )
@@ -346,17 +336,6 @@ def test_brushes_of_both_add_up_and_without_a_raider_it_is_the_gardeners_world()
 SHAPESHIFTER = "npa/Shapeshifter2D-v0"
 
 
-def test_a_choice_is_the_code_of_that_number(coded):
-    by_number, by_code = begun(
-        make(SHAPESHIFTER, **coded, actions="choice"), make(SHAPESHIFTER, **coded), seed=1
-    )
-    codes = by_code.unwrapped.task.codes.table
-    left, right = by_number.step(2), by_code.step(codes[2].numpy())
-    assert_same(left[:4], right[:4])
-    _, s = by_code.unwrapped.particles()
-    assert torch.equal(s[:, :3], codes[2].expand(61, 3))
-
-
 def test_goals_change_after_they_were_held_and_are_never_the_same_twice_on_end(coded):
     env = make(SHAPESHIFTER, **coded)
     _, info = env.reset(seed=3)
@@ -382,16 +361,11 @@ def test_a_step_is_paid_by_the_goal_that_was_seen_before_it(coded):
         assert reward == pytest.approx(max(-1.0, 1.0 - float(loss) / blank), rel=1e-5)
 
 
-def test_a_goal_itself_earns_one_and_an_empty_picture_nothing(coded):
+def test_an_empty_picture_has_the_loss_of_the_goals_density(coded):
     task = make(SHAPESHIFTER, **coded, resolution=32).unwrapped.task
-    single = task.task.with_goal(torch.tensor([1]))
-    context = PictureGoals(torch.tensor([1]), torch.tensor([[1]]))
-    no_loss, blank = torch.zeros(1), task.blank_losses[1:2]
-    nothing = Particles(torch.zeros(1, 1, 2), torch.zeros(1, 1, 1))
-    assert task.reward(nothing, no_loss, context).tolist() == [1.0]
-    assert task.reward(nothing, blank, context).tolist() == [0.0]
-    density = single.target_picture[..., 3]
-    assert float(blank) == pytest.approx(float((density + density * density).mean()), rel=1e-6)
+    density = task.task.with_goal(torch.tensor([1])).target_picture[..., 3]
+    loss = float((density + density * density).mean())
+    assert float(task.blank_losses[1]) == pytest.approx(loss, rel=1e-6)
 
 
 def test_the_goals_picture_is_seen_beside_the_worlds(coded):
@@ -414,7 +388,7 @@ def test_a_script_recognises_goals_and_says_their_codes(coded, actions):
         seen, _, _, _, info = env.step(policy(seen))
         _, s = env.unwrapped.particles()
         codes = env.unwrapped.task.codes.table
-        assert s[0, :3].numpy() == pytest.approx(codes[goal].numpy(), abs=1e-6)
+        assert s[:, :3].numpy() == pytest.approx(codes[goal].expand(61, 3).numpy(), abs=1e-6)
     batch = make_vec(SHAPESHIFTER, 3, **coded, actions=actions)
     seen, _ = batch.reset(seed=0)
     assert RecognisingShapeshifter(batch)(seen).shape[0] == 3

@@ -57,13 +57,11 @@ def drawing(draw):
 
 FIRST = {
     "no pair": ("seed", lambda a: a[0], "MyTask.seed must return positions and states, got a Tens"),
-    "nothing": ("seed", lambda a: None, "MyTask.seed must return positions and states, got a None"),
     "one dimension more": (
         "seed",
         lambda a: (torch.cat((a[0], a[0][..., :1]), 2), a[1]),
         r"positions of MyTask\.seed must be a torch\.float32 .* shape \(\d, 9, 2\).*\(\d, 9, 3\)",
     ),
-    "few particles": ("seed", lambda a: (a[0][:, 1:], a[1]), r"positions of MyTask\.seed must"),
     "double states": ("seed", lambda a: (a[0], a[1].double()), r"states of .*got torch\.float64"),
     "arrays": ("seed", lambda a: (a[0].cpu().numpy(), a[1]), "positions of .*got a ndarray"),
     "NaN positions": ("seed", lambda a: (a[0] / 0, a[1]), r"positions of MyTask\.seed .* finite"),
@@ -78,9 +76,6 @@ FIRST = {
     "no term": ("losses", lambda a: {}, r"MyTask\.losses .* at least one, got \[\]"),
     "no name": ("losses", lambda a: {1: a["away"]}, r"MyTask\.losses .* by name"),
     "one loss for all": ("losses", away(torch.mean), r"term 'away' of MyTask\.losses must .*\(\)"),
-    "a column": ("losses", away(lambda a: a[:, None]), r"term 'away' of .*got .* shape \(\d, 1\)"),
-    "a double loss": ("losses", away(torch.Tensor.double), "term 'away' of .*got torch.float64"),
-    "a float": ("losses", away(lambda a: 1.0), "term 'away' of .* got a float"),
     "NaN": ("losses", away(lambda a: (a - 9.0).sqrt()), r"term 'away' of MyTask\.losses .* finite"),
     "torch draws": (
         "seed",

@@ -348,7 +348,7 @@ class Crowd(Played):
             assert abs(sum(rewards.values())) <= 1e-6 * (1 + max(map(abs, rewards.values())))
 
     def expect_place(self) -> None:
-        losses = sum(part[0].double() for part in self.env.worlds.measured().values())
+        losses = sum(part[0].double() for part in self.env.worlds.loss_terms().values())
         # An opponent that the environment plays comes last.
         now = dict(zip(self.env.possible_agents, losses.tolist(), strict=False))
         self.loss = {agent: now[agent] for agent in self.env.agents}

@@ -117,4 +117,4 @@ def test_a_first_reset_that_is_refused_leaves_the_next_one_random():
         envs.reset()
         states += list(envs.state())
     # Neither two worlds nor two environments are alike.
-    assert len({world_state.tobytes() for world_state in states}) == 6
+    assert len({state.tobytes() for state in states}) == 6
