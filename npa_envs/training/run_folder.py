@@ -333,9 +333,14 @@ class JsonlLog:
         self.path = path
 
     def append(self, record: dict[str, Any]) -> None:
-        """Write a line without a buffer, so that a kill right after it does not lose it."""
+        """Write a record as a line, in place of an incomplete last line.
+
+        The file has no buffer, so that a kill right after the call does not lose the line.
+        """
         line = (json.dumps(record, allow_nan=False) + "\n").encode()
         try:
+            if self._is_cut_short():
+                self.truncate()
             with self.path.open("ab", buffering=0) as file:
                 while line:
                     line = line[file.write(line) :]
@@ -345,8 +350,17 @@ class JsonlLog:
                 "space or change the permissions, then resume the run"
             ) from error
 
-    def truncate(self, iteration: int) -> None:
-        """Drop the lines after an iteration, and an incomplete last line."""
+    def _is_cut_short(self) -> bool:
+        """Return whether the last line has no newline, after a kill or on a full disk."""
+        if not os.path.exists(self.path):
+            return False
+        with self.path.open("rb") as file:
+            size = file.seek(0, os.SEEK_END)
+            file.seek(max(size - 1, 0))
+            return file.read() not in (b"", b"\n")
+
+    def truncate(self, iteration: int | None = None) -> None:
+        """Drop an incomplete last line, and the lines after an iteration, if given."""
         write_text(self.path, "".join(json.dumps(r) + "\n" for r in self.records(iteration)))
 
     def records(self, iteration: int | None = None) -> list[dict[str, Any]]:
