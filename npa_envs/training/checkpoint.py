@@ -145,7 +145,7 @@ def unusable_checkpoint(path: Path, reason: str) -> NPAError:
 
 
 def _wrong(name: str, value: Any, like: Any) -> Iterator[str]:
-    """Yield a message for each difference of a value of a checkpoint from the expected `like`."""
+    """Yield what is wrong with a checkpoint's value `name`, compared with the expected `like`."""
     if isinstance(like, type):
         if not isinstance(value, like):
             yield f"{name} must be a {like.__name__}"

@@ -252,7 +252,7 @@ class TrainingCycle:
 
     @torch.no_grad()
     def _draw_worlds(self) -> None:
-        """Fill the batch from the pool, and draw seeds."""
+        """Copy worlds from the pool to the batch, some damaged or replaced by fresh seeds."""
         config, worlds = self._config, self.random.worlds
         restart(worlds, self.random.masks)
         self._index.copy_(self.pool.sample(len(self._index), worlds))
@@ -285,7 +285,7 @@ class TrainingCycle:
 
     @torch.no_grad()
     def _record_iteration(self) -> None:
-        """Add the losses of all processes to the statistics, and prepare the gradients."""
+        """Add the iteration's losses to the statistics, and normalise the gradients."""
         self.statistics.add(self._replaced)
         self._replaced.zero_()
         self.optimiser.prepare_gradients()

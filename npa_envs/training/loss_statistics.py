@@ -46,14 +46,14 @@ class LossStatistics:
         self._arrival = torch.cuda.Event() if on_cuda else None  # type: ignore[no-untyped-call]
 
     def begin(self, number: int, steps: int) -> None:
-        """Set the number and the steps of the iteration that is added next."""
+        """Set number and steps of the iteration that `add` adds next."""
         self._now[0].fill_(number)
         self._now[1].fill_(steps)
         self._count += 1
         self._step_sum += steps
 
     def add(self, replaced: Tensor) -> None:
-        """Add an iteration, before the optimiser changes the parameters."""
+        """Add the iteration's loss terms and replaced worlds, before its optimiser step."""
         terms = self._iteration.terms
         self._sums += terms
         self._replaced += replaced.sum()

@@ -50,7 +50,7 @@ def layer_weights(rules: nn.Module) -> list[Tensor]:
 
 
 class RuleOptimiser:
-    """AdamW, or Muon for weight matrices and AdamW for all else; moments are reset at each repeat.
+    """AdamW, or Muon for weight matrices and AdamW for all else; each repeat resets the moments.
 
     Muon's steps are orthogonalised momentum, computed in bfloat16 and scaled to the length of
     AdamW's steps (Jordan et al. 2024; Liu et al., arXiv 2502.16982).

@@ -103,13 +103,13 @@ class Run:
         self._content: dict[str, Any] | None = processes.broadcast(content)
 
     def take_content(self) -> dict[str, Any] | None:
-        """Return the checkpoint of a resumed run once; its memory is then the caller's to free."""
+        """Return a resumed run's checkpoint, and forget it, so that the caller can free it."""
         content, self._content = self._content, None
         return content
 
     @contextlib.contextmanager
     def locked(self, *, begin: bool = False) -> Iterator[None]:
-        """Lock the folder inside; with `begin`, remove unfinished and overwritten files."""
+        """Lock the folder in the block; with `begin`, remove unfinished and overwritten files."""
         folder = self.folder if self._processes.first else None
         with contextlib.nullcontext() if folder is None else folder.locked():
             if begin and folder is not None:
@@ -122,19 +122,19 @@ class Run:
         self,
         step: Callable[[], None],
         *,
-        over: Callable[[], bool],
+        is_over: Callable[[], bool],
         end: Callable[[bool], None],
         begin: Callable[[], None] = lambda: None,
-        late: Callable[[], bool] = lambda: False,
+        time_is_up: Callable[[], bool] = lambda: False,
     ) -> bool:
         """Repeat `step` until the run is over, or until SIGTERM, Ctrl-C or a time limit stops it.
 
         Args:
             step: One iteration; it increments `iteration`.
-            over: Whether the run is over, the same on all processes.
+            is_over: Returns whether the run is over, the same on all processes.
             end: Called at the end, with whether the run was stopped; signals are still caught.
             begin: Called before the first step, when signals are caught.
-            late: Whether the time limit has passed, on this process.
+            time_is_up: Returns whether the time limit has passed, on this process.
 
         Returns:
             Whether a signal came.
@@ -146,8 +146,8 @@ class Run:
         with requests as stop:
             begin()
             stopped = False
-            while not stopped and not over():
-                stopped = self._processes.agree_to_stop(stop.is_set() or late())
+            while not stopped and not is_over():
+                stopped = self._processes.agree_to_stop(stop.is_set() or time_is_up())
                 if not stopped:
                     step()
             end(stopped)
@@ -230,7 +230,7 @@ class RunFolder:
         self._known: tuple[int, int] | None = None
 
     def prepare(self, byte_count: int, *, pictures: bool = True) -> None:
-        """Create the folder, and check that the disk has room for two checkpoints of this size."""
+        """Create the folder; check that the disk has room for two checkpoints of `byte_count`."""
         # The old checkpoint exists until the new one is complete.
         needed = 2 * byte_count
         try:
@@ -289,7 +289,7 @@ class RunFolder:
             yield
 
     def note_checkpoint(self) -> None:
-        """Remember the present checkpoint file, or none, which `locked` compares later."""
+        """Remember which checkpoint file there is, so that `locked` notices another trainer's."""
         self._known = _identity(self.checkpoint)
 
     def tidy(self) -> None:

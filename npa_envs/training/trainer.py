@@ -213,8 +213,8 @@ class Trainer:
             try:
                 interrupted = self._run.repeat(
                     step,
-                    over=lambda: self.iteration >= total,
-                    late=lambda: time.perf_counter() - start >= seconds,
+                    is_over=lambda: self.iteration >= total,
+                    time_is_up=lambda: time.perf_counter() - start >= seconds,
                     end=lambda _: self.save(),
                 )
             finally:
@@ -300,7 +300,7 @@ class Trainer:
             self._finish_record()
 
     def _finish_record(self) -> None:
-        """Write the record that was begun, if any."""
+        """Write the record that `_begin_record` has begun, if any."""
         sent, self._sent_record = self._sent_record, None
         if sent is None:
             return
@@ -439,7 +439,7 @@ def take_options(rule: NPARule, config: TrainConfig[Any]) -> None:
 
 
 def initial_rule(config: TrainConfig[Any], untrained: NPARule) -> NPARule:
-    """Return the rule that a run starts from, in the form of the task's untrained one.
+    """Return the rule that a run starts from, with the shapes of the task's untrained one.
 
     A rule without division or codes may initialise one with them. An equivariant rule has no dead
     zone, and starts from random weights where the configuration names one of `preset_rules`, which
@@ -478,7 +478,7 @@ def _species_rules(
     saved: dict[str, Any] | None,
     rules: Sequence[NPARule] | None,
 ) -> list[NPARule]:
-    """Return a rule for each species, in the form of the `untrained` ones."""
+    """Return a rule for each species, with the shapes of the `untrained` ones."""
     if config.initial_rule:
         raise NPAError(
             f"initial_rule is for one rule, got {shown(config.initial_rule)}: give one for each "

@@ -120,7 +120,7 @@ def test_a_record_comes_back_as_it_was_written(tmp_path: Path):
     assert check_runner.StressRecord(FACTS, path).read().rows == []
     figures = {"a": 1.5, "b": math.inf, "c": math.nan}
     record = check_runner.StressRecord(FACTS, path)
-    record.put(CheckResult(figures, {"a": 1.0}, note="n", name="x/y", expected="s"))
+    record.store(CheckResult(figures, {"a": 1.0}, note="n", name="x/y", expected="s"))
     stored = json.loads(path.read_text(encoding="utf-8"))
     assert stored["counts"] == {"pass": 0, "range": 0, "fail": 1, "skipped": 0}
     assert stored["checks"][0]["figures"] == {"a": 1.5, "b": "inf", "c": "nan"}
