@@ -92,7 +92,7 @@ def check_task(content: Mapping[str, Any], task_name: str, path: Path) -> None:
 
 
 def check_same_run(
-    content: dict[str, Any], task_name: str, config: TrainConfig[Any], path: Path
+    content: dict[str, Any], path: Path, task_name: str, config: TrainConfig[Any]
 ) -> None:
     """Check that a checkpoint belongs to the run that is to be resumed."""
     check_content(content, READ_FIRST, path)

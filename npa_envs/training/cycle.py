@@ -20,7 +20,7 @@ from npa_envs.tasks.base import Task
 from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.iteration import EagerIteration, GraphedIteration, Rollout
 from npa_envs.training.loss_statistics import LossStatistics
-from npa_envs.training.optimiser import RuleOptimiser
+from npa_envs.training.optimiser import RuleOptimiser, normalise_gradients
 from npa_envs.training.process_group import (
     ALONE,
     ProcessGroup,
@@ -41,7 +41,6 @@ class WorldPool:
 
     Args:
         worlds: The W worlds of this process.
-        largest_value: A world with a larger |x| or |s|, or one that is not finite, is replaced.
         max_age_range: Lifetimes of the first and the last world [steps]; those between are spaced
             geometrically. None: worlds have no lifetime.
         indices: Indices of these worlds among the `total` of all processes, int64, shape [W].
@@ -51,7 +50,6 @@ class WorldPool:
         self,
         worlds: Particles,
         *,
-        largest_value: float,
         max_age_range: tuple[int, int] | None = None,
         indices: Tensor | slice = slice(None),
         total: int | None = None,
@@ -68,7 +66,6 @@ class WorldPool:
             lo, hi = map(math.log, max_age_range)
             logarithms = torch.linspace(lo, hi, total or len(x), dtype=torch.float64)
             self.lifetime = logarithms[indices].exp().round().to(x.device, torch.int64)
-        self._largest_value = largest_value
 
     def tensors(self) -> dict[str, Tensor]:
         """Return the tensors of a checkpoint by name."""
@@ -107,7 +104,7 @@ class WorldPool:
         """
         largest = torch.maximum(_largest(worlds.x), _largest(worlds.s))
         # A comparison with NaN is false, so worlds that are not finite are replaced too.
-        keep = largest <= self._largest_value
+        keep = largest <= LARGEST_VALUE
         self.worlds.put_(index, worlds.where(keep, fresh))
         if self.age is not None and age is not None:
             self.age.index_copy_(0, index, age.masked_fill(~keep, 0))
@@ -159,7 +156,6 @@ class TrainingCycle:
         seeds = self._seeds(len(pool_indices), self.random.pool)
         self.pool = WorldPool(
             seeds,
-            largest_value=LARGEST_VALUE,
             max_age_range=config.max_age_range if config.ages else None,
             indices=pool_indices,
             total=config.pool_size,
@@ -288,7 +284,7 @@ class TrainingCycle:
         """Add the iteration's losses to the statistics, and normalise the gradients."""
         self.statistics.add(self._replaced)
         self._replaced.zero_()
-        self.optimiser.prepare_gradients()
+        normalise_gradients(self.batch.gradients)
 
     def _seeds(self, world_count: int, random: Randomness) -> Particles:
         dtype = self._config.torch_dtype

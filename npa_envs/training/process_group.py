@@ -185,23 +185,18 @@ class RunRandomness:
         *,
         per_world_streams: bool,
     ) -> None:
-        self.schedule = schedule
-        self.worlds: Randomness
-        self.masks: Randomness
-        self.pool: Randomness
-        if not per_world_streams:
-            self.worlds = self.pool = torch.Generator(device).manual_seed(config.seed + 1)
-            self.masks = torch.Generator(device).manual_seed(config.seed + 2)
-            return
         batch, pool = config.world_count, config.pool_size
 
-        def streams(purpose: int, total: int, section: int = 1) -> WorldRandom:
+        def streams(purpose: int, total: int, section: int = 1) -> Randomness:
+            if not per_world_streams:
+                return torch.Generator(device).manual_seed(config.seed + purpose)
             indices = processes.indices(total, section)
             return world_streams((config.seed, purpose), total, indices, device)
 
-        self.pool = streams(0, pool, section=pool // batch)
+        self.schedule = schedule
         self.worlds = streams(1, batch)
         self.masks = streams(2, batch)
+        self.pool = streams(0, pool, pool // batch) if per_world_streams else self.worlds
 
     def _sources(self) -> dict[str, Randomness]:
         return {"schedule": self.schedule, "worlds": self.worlds, "masks": self.masks}

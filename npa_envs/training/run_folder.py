@@ -331,6 +331,8 @@ class JsonlLog:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self._is_complete = False
+        """Whether the last line is known to be complete: a kill or a full disk cuts it short."""
 
     def append(self, record: dict[str, Any]) -> None:
         """Write a record as a line, in place of an incomplete last line.
@@ -339,25 +341,18 @@ class JsonlLog:
         """
         line = (json.dumps(record, allow_nan=False) + "\n").encode()
         try:
-            if self._is_cut_short():
+            if not self._is_complete:
                 self.truncate()
+            self._is_complete = False
             with self.path.open("ab", buffering=0) as file:
                 while line:
                     line = line[file.write(line) :]
+            self._is_complete = True
         except OSError as error:
             raise NPAError(
                 f"cannot write the log {str(self.path)!r} ({error.strerror or error}): free disk "
                 "space or change the permissions, then resume the run"
             ) from error
-
-    def _is_cut_short(self) -> bool:
-        """Return whether the last line has no newline, after a kill or on a full disk."""
-        if not os.path.exists(self.path):
-            return False
-        with self.path.open("rb") as file:
-            size = file.seek(0, os.SEEK_END)
-            file.seek(max(size - 1, 0))
-            return file.read() not in (b"", b"\n")
 
     def truncate(self, iteration: int | None = None) -> None:
         """Drop an incomplete last line, and the lines after an iteration, if given."""
@@ -407,12 +402,12 @@ PICTURE_GAP = 8
 """Pixels between the worlds of a picture."""
 
 
-class RunLog:
+class RunLog(JsonlLog):
     """The log lines and pictures of a run: in its folder, and for TensorBoard while opened."""
 
     def __init__(self, folder: RunFolder) -> None:
+        super().__init__(folder.log)
         self._folder = folder
-        self.lines = JsonlLog(folder.log)
         self._board: Any = None
 
     @contextlib.contextmanager
@@ -435,9 +430,9 @@ class RunLog:
                 self._board.close()
                 self._board = None
 
-    def add(self, record: dict[str, Any]) -> None:
-        """Add a line of numbers, with its `iteration`."""
-        self.lines.append(record)
+    def append(self, record: dict[str, Any]) -> None:
+        """Write a line of numbers, one of them the `iteration`, also to TensorBoard."""
+        super().append(record)
         if self._board is not None:
             for name, value in record.items():
                 if name != "iteration":

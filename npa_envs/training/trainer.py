@@ -117,10 +117,7 @@ class Trainer:
         device = check_device(config.device)
         self._defer_records = device.type == "cuda"
         self._processes = ProcessGroup.current() if processes is None else processes
-
-        def check(content: dict[str, Any], path: Path) -> None:
-            check_same_run(content, task_name, config, path)
-
+        check = functools.partial(check_same_run, task_name=task_name, config=config)
         self._run = Run(self.folder, self._processes, check, resume=resume, overwrite=overwrite)
         content = self._run.take_content()
         schedule = torch.Generator().manual_seed(config.seed)
@@ -149,7 +146,7 @@ class Trainer:
         with self._run.locked(begin=True):
             if content is not None:
                 self._restore(content)
-            elif self._processes.first and self._log.lines.records():
+            elif self._processes.first and self._log.records():
                 raise NPAError(
                     f"out must be a folder without a run, but {shown(str(self.folder.path))} "
                     "holds a log without its checkpoint: choose another folder (--out), or "
@@ -209,7 +206,7 @@ class Trainer:
             self._started = start
             seconds = math.inf if max_seconds is None else max_seconds
             if first:
-                self._record = next(iter(self._log.lines.records()[-1:]), {})
+                self._record = next(iter(self._log.records()[-1:]), {})
             try:
                 interrupted = self._run.repeat(
                     step,
@@ -314,7 +311,7 @@ class Trainer:
             "seconds": round(self._seconds(), 3),
         }
         if self._processes.first:
-            self._log.add(self._record)
+            self._log.append(self._record)
 
     def _write_picture(self) -> None:
         self._finish_record()
@@ -357,7 +354,7 @@ class Trainer:
             reason = f"it cannot be used ({shown(error)})"
             raise unusable_checkpoint(self.folder.checkpoint, reason) from error
         if self._processes.first:
-            self._log.lines.truncate(self.iteration)
+            self._log.truncate(self.iteration)
 
 
 def check_seconds(max_seconds: object) -> None:
@@ -399,11 +396,11 @@ def first_rule(
     what the configuration names, or untrained; then its weights are drawn from `generator`.
     """
     if hasattr(task, "make_rules"):
-        untrained = task.make_rules(generator)
+        joint = JointRules(_species_rules(config, task.make_rules(generator), saved, rules))
         # The trainer uses its rule only as a module with hyper-parameters.
-        return cast(NPARule, JointRules(_species_rules(config, untrained, saved, rules)))
-    untrained_one = task.make_rule(generator)
-    return initial_rule(config, untrained_one) if saved is None else rule_like(saved)
+        return cast(NPARule, joint)
+    untrained = task.make_rule(generator)
+    return initial_rule(config, untrained) if saved is None else rule_like(saved)
 
 
 def write_rules(
