@@ -21,13 +21,7 @@ from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.iteration import EagerIteration, GraphedIteration, Rollout
 from npa_envs.training.loss_statistics import LossStatistics
 from npa_envs.training.optimiser import RuleOptimiser, normalise_gradients
-from npa_envs.training.process_group import (
-    ALONE,
-    ProcessGroup,
-    RunRandomness,
-    registered,
-    restart,
-)
+from npa_envs.training.process_group import ALONE, ProcessGroup, RunRandomness, registered, restart
 from npa_envs.world.cuda_graph import GraphedCallable
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness, WorldRandom, uniform_draws

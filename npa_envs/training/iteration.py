@@ -23,7 +23,6 @@ from npa_envs.world.randomness import Randomness, WorldRandom
 WARM_UP_STEPS = 2
 """Steps of the eager rollout that loads every kernel before the first capture."""
 
-
 Rollout = Callable[..., tuple[Tensor, ...]]
 """Type of `npa_envs.rollout` in training: returns positions, states and path lengths."""
 

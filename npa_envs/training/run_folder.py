@@ -174,7 +174,6 @@ def stop_flag(*, patient: bool = False) -> Iterator[threading.Event]:
     if threading.current_thread() is not threading.main_thread():
         yield requested
         return
-    previous: dict[signal.Signals, Any] = {}
     first = 0.0
 
     def restore() -> None:
@@ -192,8 +191,7 @@ def stop_flag(*, patient: bool = False) -> Iterator[threading.Event]:
             restore()
             signal.raise_signal(number)
 
-    for number in (signal.SIGINT, signal.SIGTERM):
-        previous[number] = signal.signal(number, stop)
+    previous = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield requested
     finally:
@@ -311,10 +309,6 @@ class RunFolder:
     def rule_of(self, species: int | str) -> Path:
         """Return the path of a species' rule in a run of several rules."""
         return self.path / f"rule-{species}.safetensors"
-
-    def picture(self, iteration: int) -> Path:
-        """Return the path of the picture of an iteration."""
-        return self.pictures / f"{iteration:06d}.png"
 
 
 def _identity(path: Path) -> tuple[int, int] | None:
@@ -444,7 +438,8 @@ class RunLog(JsonlLog):
         frames = to_uint8(picture).repeat(repeats, axis=1).repeat(repeats, axis=2)
         frames = np.pad(frames, ((0, 0), (0, 0), (0, PICTURE_GAP), (0, 0)), constant_values=255)
         frame = np.concatenate(list(frames), axis=1)[:, :-PICTURE_GAP]
-        write_bytes(self._folder.picture(iteration), encode_frame(frame, "PNG"))
+        path = self._folder.pictures / f"{iteration:06d}.png"
+        write_bytes(path, encode_frame(frame, "PNG"))
         if self._board is None:
             return
         # Imported here: only runs with TensorBoard need it.

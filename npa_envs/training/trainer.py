@@ -10,7 +10,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import torch
 from torch import nn
@@ -122,10 +122,16 @@ class Trainer:
         content = self._run.take_content()
         schedule = torch.Generator().manual_seed(config.seed)
         saved = None if content is None else content["rule_hyper_parameters"]
-        self.rule = first_rule(task, config, schedule, saved, rules).to(device, config.torch_dtype)
-        if isinstance(self.rule, JointRules):
+        rule: Any
+        if hasattr(task, "make_rules"):
+            rule = JointRules(_species_rules(config, task.make_rules(schedule), saved, rules))
             counts = config.task.counts
             rollout = functools.partial(rollout_species, counts=counts, density_counts=counts)
+        else:
+            rule = task.make_rule(schedule)
+            rule = initial_rule(config, rule) if saved is None else rule_like(saved)
+        # A `JointRules` is used only as a module with hyper-parameters.
+        self.rule: NPARule = rule.to(device, config.torch_dtype)
         self._cycle = TrainingCycle(
             task,
             self.rule,
@@ -381,26 +387,6 @@ class JointRules(nn.Module):
     def hyper_parameters(self) -> dict[str, Any]:
         """Return the hyper-parameters of all rules, for checkpoints."""
         return {"rules": [dict(rule.hyper_parameters()) for rule in self]}
-
-
-def first_rule(
-    task: Task,
-    config: TrainConfig[Any],
-    generator: torch.Generator,
-    saved: dict[str, Any] | None,
-    rules: Sequence[NPARule] | None,
-) -> NPARule:
-    """Return the rule that a run starts from, for a task of several species a `JointRules`.
-
-    It has the hyper-parameters `saved` in a checkpoint, if any. Without, and without `rules`, it is
-    what the configuration names, or untrained; then its weights are drawn from `generator`.
-    """
-    if hasattr(task, "make_rules"):
-        joint = JointRules(_species_rules(config, task.make_rules(generator), saved, rules))
-        # The trainer uses its rule only as a module with hyper-parameters.
-        return cast(NPARule, joint)
-    untrained = task.make_rule(generator)
-    return initial_rule(config, untrained) if saved is None else rule_like(saved)
 
 
 def write_rules(

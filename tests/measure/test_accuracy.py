@@ -15,13 +15,7 @@ from npa_envs.errors import NPAError
 from npa_envs.measure import accuracy
 from npa_envs.measure.accuracy import all_checks, check_runner, hard_cases, trained_rule_checks
 from npa_envs.measure.accuracy import scenes as places
-from npa_envs.measure.accuracy.check_runner import (
-    GROUPS,
-    Check,
-    CheckResult,
-    CheckSession,
-    Skipped,
-)
+from npa_envs.measure.accuracy.check_runner import GROUPS, Check, CheckResult, CheckSession, Skipped
 from npa_envs.measure.accuracy.scenes import scenes
 from npa_envs.measure.accuracy.trained_rule_checks import rule_worlds
 from npa_envs.rule.files import load_rule, rule_digest, rule_file, rule_metadata, save_rule
