@@ -59,7 +59,7 @@ class CheckResult:
     """Hash of the weights of the check's rule (`rule_digest`)."""
 
     def __post_init__(self) -> None:
-        """Set the default verdict."""
+        """Set the verdict from the limits, unless it is given."""
         # Comparisons with NaN are false.
         within = all(self.figures.get(key, math.nan) <= limit for key, limit in self.limits.items())
         default = "range" if self.holds else "pass"

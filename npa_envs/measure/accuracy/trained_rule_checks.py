@@ -134,7 +134,7 @@ def measured(runner: RuleRunner, worlds: Particles) -> dict[str, float]:
 
 
 @check("time", registry=RULE_CHECKS)
-def _run(name: str, session: CheckSession) -> CheckResult:
+def _run_long(name: str, session: CheckSession) -> CheckResult:
     """No number becomes infinite or NaN; the extent at most doubles, updates have at most four
     times the energy of the settled world's, states stay within 8 and on average within 1.1, the
     centroid moves by an extent at most."""

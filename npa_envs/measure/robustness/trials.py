@@ -98,10 +98,10 @@ CONDITIONS = {
 
 def trained_value(condition: str, update_prob: float) -> float | str:
     """Return the trained value of a condition; `update_prob` is that of the task."""
-    absolute: dict[str, float | str] = {"update_prob": update_prob, "noise": 0.0}
-    absolute["shape"] = "trained"
+    trained: dict[str, float | str]
+    trained = {"update_prob": update_prob, "noise": 0.0, "shape": "trained"}
     # All other conditions are factors on what was trained.
-    return absolute.get(condition, 1.0)
+    return trained.get(condition, 1.0)
 
 
 @dataclass(frozen=True, kw_only=True)
