@@ -253,7 +253,7 @@ def accuracies(
     check_steps("checkpoints", checkpoints)
     runner = _copied_runner(rule, task, task.clouds.x.device, seed, progress)
 
-    def figures(index: Tensor) -> Iterator[tuple[Tensor, ...]]:
+    def measured(index: Tensor) -> Iterator[tuple[Tensor, ...]]:
         label, clouds = task.clouds.label[index], _blank_clouds(runner, index)
         labelled = runner.task.with_goal(label)
         for _, (x, s, *_) in runner.at(checkpoints, clouds):
@@ -267,7 +267,7 @@ def accuracies(
                 _overflow(s).mean((1, 2)),
             )
 
-    means = _cloud_means(task, figures)
+    means = _cloud_means(task, measured)
     return [AccuracyRow(step, *row) for step, row in zip(checkpoints, means, strict=True)]
 
 
@@ -292,7 +292,7 @@ def changes_of_mind(
     runner = _copied_runner(rule, task, task.clouds.x.device, seed, progress)
     classes, partner = task.clouds.label, _partners(task.clouds.label)
 
-    def figures(index: Tensor) -> Iterator[tuple[Tensor, ...]]:
+    def measured(index: Tensor) -> Iterator[tuple[Tensor, ...]]:
         label, other_label = classes[index], classes[partner[index]]
         x, s, *_ = runner.run(_blank_clouds(runner, index), settle_steps)
         other_x = _blank_clouds(runner, partner[index]).x
@@ -310,7 +310,8 @@ def changes_of_mind(
     names = (f"{CUT_FRACTION:.0%} cut off", "upper half mutated", "all mutated")
     cases = itertools.product(names, steps)
     return [
-        ChangeRow(*case, *row) for case, row in zip(cases, _cloud_means(task, figures), strict=True)
+        ChangeRow(*case, *row)
+        for case, row in zip(cases, _cloud_means(task, measured), strict=True)
     ]
 
 
@@ -321,13 +322,13 @@ def _blank_clouds(runner: RuleRunner, index: Tensor) -> Particles:
 
 
 def _cloud_means(
-    task: PointClassification, figures: Callable[[Tensor], Iterable[Sequence[Tensor]]]
+    task: PointClassification, measured: Callable[[Tensor], Iterable[Sequence[Tensor]]]
 ) -> list[list[float]]:
-    """Return means over all clouds of the rows of tensors [B] that `figures` yields for a batch."""
+    """Return means over all clouds of the rows of tensors [B] that `measured` yields a batch."""
     count = len(task.clouds.label)
     sums = torch.zeros((), dtype=torch.float64)
     for index in torch.split(torch.arange(count, device=task.clouds.x.device), BATCH):
-        rows = [[figure.double().sum() for figure in row] for row in figures(index)]
+        rows = [[values.double().sum() for values in row] for row in measured(index)]
         sums = sums + torch.stack([torch.stack(row) for row in rows]).cpu()
     means: list[list[float]] = (sums / count).tolist()
     return means

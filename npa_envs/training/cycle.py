@@ -114,7 +114,7 @@ def _largest(worlds: Tensor) -> Tensor:
 class TrainingCycle:
     """One iteration of training, and all of its state but the rule.
 
-    `per_world_streams`: as of `RunRandomness`. Each world of the batch then comes from its own
+    `per_world_streams`: see `RunRandomness`. Each world of the batch then comes from its own
     section of the pool.
     """
 
@@ -179,10 +179,10 @@ class TrainingCycle:
         self._keep = graph(self._keep_worlds)
         self._record = graph(self._record_iteration)
 
-    def run(self, iteration: int, share: float = 0.0) -> int:
+    def run(self, iteration: int, least_progress: float = 0.0) -> int:
         """Train for one iteration, and return the number of steps of its rollout.
 
-        share: Lower bound on the schedule's progress, in [0, 1].
+        least_progress: Lower bound on the progress of the learning rate's schedule, in [0, 1].
         """
         batch = self.batch
         lo, hi = self._config.steps
@@ -199,7 +199,7 @@ class TrainingCycle:
         # Not inside a graph: torch watches NCCL only there for processes that do not answer.
         self._processes.reduce([*batch.gradients, batch.terms], self._replaced)
         self._record()
-        self.optimiser.step(iteration, share)
+        self.optimiser.step(iteration, least_progress)
         return steps
 
     def _seeded_worlds(self, iteration: int) -> Tensor | None:

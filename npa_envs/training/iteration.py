@@ -116,7 +116,7 @@ class EagerIteration:
         return mean
 
     def _loss(self, end: Particles) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the task's loss plus the stillness loss of grown worlds, and named parts."""
+        """Return the task's loss plus the stillness loss of grown worlds, and its terms by name."""
         total, parts = self._task.loss(end)
         if self._config.stillness_weight > 0.0:
             x, s, path = end.per_particle()

@@ -69,14 +69,14 @@ class RuleOptimiser:
         self._orthogonal = [muon and id(p) in matrices for p in self._parameters]
         self._optimisers = self._fresh_optimisers()
 
-    def step(self, iteration: int, share: float = 0.0) -> None:
+    def step(self, iteration: int, least_progress: float = 0.0) -> None:
         """Take a step along the prepared gradients; a new repeat begins with zero moments.
 
-        share: Lower bound on the schedule's progress, in [0, 1].
+        least_progress: Lower bound on the progress of the learning rate's schedule, in [0, 1].
         """
         if iteration > 0 and iteration % self._config.iterations == 0:
             self._optimisers = self._fresh_optimisers()
-        rate = self._config.learning_rate_at(iteration, share)
+        rate = self._config.learning_rate_at(iteration, least_progress)
         for optimiser in self._optimisers:
             for group in optimiser.param_groups:
                 group["lr"] = rate * group.get("rate_factor", 1.0)

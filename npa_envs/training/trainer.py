@@ -71,7 +71,7 @@ class Trainer:
 
     The constructor creates the folder `config.out` and writes the configuration and a first
     checkpoint there, or with `resume` reads the checkpoint. The processes of torch's default group,
-    if there is one, train together: each has a part of the pool and of the batch, and rank 0 reads
+    if there is one, train together: each has some worlds of pool and batch, and rank 0 reads
     and writes the files.
 
     Args:

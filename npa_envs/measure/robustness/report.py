@@ -131,7 +131,7 @@ def measure_rule(
     *,
     enough: Callable[[], bool] = lambda: False,
 ) -> None:
-    """Measure what a rule's record lacks; save it after the damage curves and after each value.
+    """Measure what is missing in a rule's record; save it after each value of a condition.
 
     Values of conditions that need more than `most_particles` particles are left out. Once `enough`
     returns True, no further value is measured, and the record stays unfinished.
@@ -162,7 +162,7 @@ def measure_rule(
 def grow(
     trial: RuleTrial, condition: str = "", value: float | str = 1.0
 ) -> tuple[Particles, Response]:
-    """Grow seeds as in training, or with `condition` at `value`; return worlds and losses."""
+    """Grow worlds as in training, or with `condition` at `value`; return them and their losses."""
     initial = trial.initial_worlds(
         fraction=float(value) if condition == "particles" else 1.0,
         shape=str(value) if condition == "shape" else "trained",
