@@ -226,7 +226,7 @@ class Progress:
             if content is not None:
                 assert learner is not None, "methods whose runs are kept are learners"
                 self._restore(learner, content)
-            self._run.repeat(step, begin=begin, over=lambda: self.over, end=end)
+            self._run.repeat(step, begin=begin, is_over=lambda: self.over, end=end)
         return rules
 
     def start(self, policy: RuleSet | Callable[[Any], Any]) -> None:

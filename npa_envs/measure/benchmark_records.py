@@ -33,7 +33,7 @@ Row = TypeVar("Row")
 
 
 class Record(Generic[Row]):
-    """Rows of a measurement and the facts that they depend on; with `path` in a JSON file."""
+    """Rows of a measurement and the settings (`facts`) they depend on; with `path`, a JSON file."""
 
     command: str
     """The command that writes such records, for errors."""
@@ -46,11 +46,11 @@ class Record(Generic[Row]):
         self.facts, self.path, self.rows = facts, path, list(rows)
 
     def content(self) -> Mapping[str, Any]:
-        """Return the file's fields except the facts: settings and versions of the measurement."""
+        """Return the fields of the file, except the facts."""
         return {"rows": as_objects(self.rows)}
 
     def parse(self, content: dict[str, Any]) -> list[Row]:
-        """Return the rows of the file's JSON object."""
+        """Return the rows from the JSON object of a file."""
         raise NotImplementedError
 
     def read(self) -> Self:
@@ -111,7 +111,7 @@ def read_record(
 
 
 def number(value: float | None) -> float:
-    """Return a number of a record; NaN for null."""
+    """Return a number read from a JSON record; NaN for null."""
     return math.nan if value is None else float(value)
 
 
@@ -125,7 +125,7 @@ def time_limit(max_seconds: float | None) -> Callable[[], bool]:
 
 
 def measured_facts(device: torch.device, commit: str | None, **settings: Any) -> dict[str, Any]:
-    """Return the facts of a measurement; `commit` defaults to the checkout's."""
+    """Return a record's facts: device, settings, commit (default: the checkout's) and versions."""
     return {
         "device": device.type,
         "machine": machine(device),
@@ -136,7 +136,7 @@ def measured_facts(device: torch.device, commit: str | None, **settings: Any) ->
 
 
 def command_text(name: str, arguments: Sequence[str], *options: str) -> str:
-    """Return a command line as text, with OUT in place of the path after "--out" of `options`.
+    """Return a command line as text; after each of `options` OUT replaces a value: "--out OUT".
 
     Records do not name folders of the machine that they were written on.
     """
@@ -209,7 +209,7 @@ def table_text(rows: Sequence[Any], *, missing: str = "never") -> str:
 
 
 def aligned(lines: Sequence[Sequence[str]], *, left: bool = False) -> list[str]:
-    """Return lines of cells as text in columns, aligned right or left."""
+    """Return a table's lines of cells as text, with columns aligned right or left."""
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     align = str.ljust if left else str.rjust
     return ["  ".join(map(align, line, widths)).rstrip() for line in lines]
@@ -222,7 +222,7 @@ def table_markdown(rows: Sequence[Any], *, missing: str = "never") -> str:
 
 
 def _cells(rows: Sequence[Any], missing: str) -> list[list[str]]:
-    """Return headings, and the cells of each row."""
+    """Return the headings, followed by the cells of each row, as text."""
     names = [field.name for field in dataclasses.fields(rows[0])]
     if missing == UNMEASURED:
         names = [name for name in names if any(getattr(row, name) is not None for row in rows)]

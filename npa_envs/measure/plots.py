@@ -58,7 +58,7 @@ def png(figure: Any, dpi: int = 90) -> bytes:
 
 
 def legend_of(figure: Any, panel: Any, place: str = "lower center", **options: Any) -> None:
-    """Show the legend of one panel outside of all panels of a figure."""
+    """Show the legend of one panel at `place` outside of the figure's panels."""
     handles, labels = panel.get_legend_handles_labels()
     figure.legend(handles, labels, loc=f"outside {place}", **options)
 
@@ -71,7 +71,7 @@ def draw_band(
     label: str,
     **options: Any,
 ) -> None:
-    """Draw a curve with a band; `lines` are the band's lower end, the curve, the upper end."""
+    """Draw a curve with a band over `across`; `lines`: lower end, curve, upper end."""
     low, middle, high = lines
     panel.plot(across, middle, color=colour, label=label, **options)
     panel.fill_between(across, low, high, color=colour, alpha=0.2, lw=0)

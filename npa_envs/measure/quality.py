@@ -42,7 +42,7 @@ HEALED = 1.2
 
 @dataclass(frozen=True)
 class EvaluationRow:
-    """Several worlds `step` steps after the seed: means over worlds, and `..._worst` of the worst.
+    """Means over worlds `step` steps after the seed; fields `..._worst` are of the worst world.
 
     `loss` is the task's metric. `psnr` compares the picture with the target's, four channels in
     [0, 1], in 3D held-out views [dB]; None for tasks whose worlds need not match their target pixel
@@ -67,7 +67,7 @@ class EvaluationRow:
 
 @dataclass(frozen=True)
 class HealingRow:
-    """Several worlds, grown and damaged: mean loss `before` and right `after` damage, and at `end`.
+    """Mean loss of grown worlds `before` and right `after` a damage, and at the `end`.
 
     `steps_to_heal`: steps until the mean loss is at most `HEALED` times `before`, None if never.
     `worlds_healed`: worlds that once heal by their own loss, and at the end have not diverged.
@@ -109,7 +109,7 @@ def evaluate(
 
 
 def measure(task: Task, x: Tensor, s: Tensor, step: int) -> EvaluationRow:
-    """Measure worlds that are `step` steps after their seed."""
+    """Return the measurements of worlds that are `step` steps after their seed."""
     loss, ratio = task.metric(x, s), None
     if task.has_views:
         ratio = task.view_psnr(x, s)
@@ -207,7 +207,7 @@ BATCH = 256
 
 @dataclass(frozen=True)
 class AccuracyRow:
-    """All clouds `step` steps after blank states; fractions in [0, 1].
+    """Fractions in [0, 1] of all clouds, or of particles, `step` steps after zero states.
 
     `majority`: clouds whose majority vote is right; `particle`: particles whose vote is right;
     `agreement`: particles that vote as their cloud's majority. `loss` is the mean squared error to
@@ -224,7 +224,7 @@ class AccuracyRow:
 
 @dataclass(frozen=True)
 class ChangeRow:
-    """All clouds `steps` steps after a change of positions, which kept the particles' states.
+    """Votes of all clouds `steps` steps after their positions, but not their states, were changed.
 
     `majority` and `particle` are fractions that vote for the class after the change,
     `majority_before` the fraction of clouds whose majority votes for the class before it.
@@ -253,7 +253,7 @@ def accuracies(
     check_steps("checkpoints", checkpoints)
     runner = _copied_runner(rule, task, task.clouds.x.device, seed, progress)
 
-    def figures(index: Tensor) -> Iterator[tuple[Tensor, ...]]:
+    def measured(index: Tensor) -> Iterator[tuple[Tensor, ...]]:
         label, clouds = task.clouds.label[index], _blank_clouds(runner, index)
         labelled = runner.task.with_goal(label)
         for _, (x, s, *_) in runner.at(checkpoints, clouds):
@@ -267,7 +267,7 @@ def accuracies(
                 _overflow(s).mean((1, 2)),
             )
 
-    means = _cloud_means(task, figures)
+    means = _cloud_means(task, measured)
     return [AccuracyRow(step, *row) for step, row in zip(checkpoints, means, strict=True)]
 
 
@@ -292,7 +292,7 @@ def changes_of_mind(
     runner = _copied_runner(rule, task, task.clouds.x.device, seed, progress)
     classes, partner = task.clouds.label, _partners(task.clouds.label)
 
-    def figures(index: Tensor) -> Iterator[tuple[Tensor, ...]]:
+    def measured(index: Tensor) -> Iterator[tuple[Tensor, ...]]:
         label, other_label = classes[index], classes[partner[index]]
         x, s, *_ = runner.run(_blank_clouds(runner, index), settle_steps)
         other_x = _blank_clouds(runner, partner[index]).x
@@ -310,24 +310,25 @@ def changes_of_mind(
     names = (f"{CUT_FRACTION:.0%} cut off", "upper half mutated", "all mutated")
     cases = itertools.product(names, steps)
     return [
-        ChangeRow(*case, *row) for case, row in zip(cases, _cloud_means(task, figures), strict=True)
+        ChangeRow(*case, *row)
+        for case, row in zip(cases, _cloud_means(task, measured), strict=True)
     ]
 
 
 def _blank_clouds(runner: RuleRunner, index: Tensor) -> Particles:
-    """Return clouds with zero states, by their indices."""
+    """Return the clouds of these indices, with zero states."""
     x = runner.task.clouds.x[index].to(next(runner.rule.parameters()).dtype)
     return Particles(x, x.new_zeros(*x.shape[:2], runner.task.config.state_dim))
 
 
 def _cloud_means(
-    task: PointClassification, figures: Callable[[Tensor], Iterable[Sequence[Tensor]]]
+    task: PointClassification, measured: Callable[[Tensor], Iterable[Sequence[Tensor]]]
 ) -> list[list[float]]:
-    """Return means over all clouds; `figures` yields rows of figures [B] of a batch of indices."""
+    """Return means over all clouds of the rows of tensors [B] that `measured` yields a batch."""
     count = len(task.clouds.label)
     sums = torch.zeros((), dtype=torch.float64)
     for index in torch.split(torch.arange(count, device=task.clouds.x.device), BATCH):
-        rows = [[figure.double().sum() for figure in row] for row in figures(index)]
+        rows = [[values.double().sum() for values in row] for row in measured(index)]
         sums = sums + torch.stack([torch.stack(row) for row in rows]).cpu()
     means: list[list[float]] = (sums / count).tolist()
     return means
@@ -403,7 +404,7 @@ def tables_of(
 
 
 class RuleRunner:
-    """Runs worlds by a rule, with the options of a task, except those in `changed`.
+    """Runs worlds by a rule, with the task's rollout options, some replaced by `changed`.
 
     `progress` is called with the steps done since its last call.
     """
@@ -435,7 +436,7 @@ class RuleRunner:
         return worlds._replace(x=x, s=s)
 
     def at(self, steps: Sequence[int], worlds: Particles) -> Iterator[tuple[int, Particles]]:
-        """Yield the step and the worlds at each of increasing `steps`."""
+        """Run worlds; yield each of the increasing `steps`, with the worlds then."""
         for step, before in zip(steps, (0, *steps), strict=False):
             worlds = self.run(worlds, step - before)
             yield step, worlds
@@ -448,7 +449,7 @@ def _copied_runner(
     seed: int,
     progress: Callable[[int], None] | None,
 ) -> RuleRunner:
-    """Return a runner on a device with a copy of the rule, as the caller's rule must stay."""
+    """Return a runner on a device with a copy of the rule, so that the caller's does not move."""
     rule = copy.deepcopy(rule).to(device)
     return RuleRunner(
         rule, task.for_rule(rule), torch.Generator(device).manual_seed(seed), progress

@@ -110,9 +110,10 @@ class InteractionRow:
 
 
 def verdict(change: float, mixing: float, margin: float = MARGIN) -> str:
-    """Return "cooperates" below 1 - margin, "disrupted" above 1 + margin or of NaN, "undisturbed".
+    """Return "cooperates" for a change below 1 - margin, "undisturbed" for one up to 1 + margin.
 
-    ", mixes" follows where the mixing index is at least `MIXED`.
+    A larger change, or NaN, is "disrupted". ", mixes" follows if the mixing index is at least
+    `MIXED`.
     """
     word = "disrupted"
     if change < 1.0 - margin:
@@ -142,8 +143,8 @@ def ratio_interval(numerators: Tensor, denominators: Tensor) -> tuple[float, flo
 def mixing_index(x: Tensor, counts: Sequence[int], *, eps: float) -> Tensor:
     """Return how much the K species of each world are mixed, in [0, 1], shape [B].
 
-    It is the mean over particles of the entropy of the species' fractions of the density, over
-    log K. 0: no particle perceives another species; 1: all species are perceived equally.
+    It is the entropy of the species' fractions of a particle's density, divided by log K: the mean
+    over particles. 0: no particle perceives another species; 1: all species are perceived equally.
     """
     rho = species_fields(x, counts, eps=eps).rho
     if rho.shape[2] < 2:
@@ -255,7 +256,7 @@ class Encounters:
     def _measured(
         rule: RuleUnderTest, count: int, x: Tensor, s: Tensor, diverged: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Return metric [B], infinite if diverged, and centroids of the first `count` particles."""
+        """Return metric (inf if diverged) and centroid, [B, 2], of the first `count` particles."""
         x = x[:, :count]
         losses = _resized(rule, count).metric(x, s[:, :count])
         return losses.masked_fill(diverged, math.inf), x.mean(dim=1)
@@ -328,9 +329,9 @@ class InteractionRecord(Record[InteractionRow]):
 
 
 def heat_map(rows: Sequence[InteractionRow]) -> bytes:
-    """Return a PNG of two matrices over all rules and those beside them, for each setting.
+    """Return a PNG of two matrices for each setting, of rules (rows) and those beside (columns).
 
-    They are the change of the loss and the mixing index. Needs matplotlib.
+    They hold the change of the loss and the mixing index. Needs matplotlib.
     """
     from matplotlib.colors import LogNorm, Normalize
 

@@ -37,7 +37,7 @@ DRAWINGS = 4
 
 @dataclass(frozen=True)
 class JudgeRow:
-    """Distances from the target over those of drawings of the target, averaged over worlds.
+    """Pictures' distances from the target, divided by those of drawings of it; means over worlds.
 
     `patches` are sliced Wasserstein distances of patches, `spectra` distances of oriented power
     spectra, `colours` those of co-occurring colours; `ratio` is the mean of the three.
@@ -109,7 +109,7 @@ class TextureJudge:
         return self._distances(images) / self._units
 
     def row(self, x: Tensor, s: Tensor, step: int) -> JudgeRow:
-        """Measure worlds that are `step` steps after their seed."""
+        """Return the row of worlds that are `step` steps after their seed."""
         ratios = self(self._task.picture(x, s))
         each = ratios.mean(1)
         patches, spectra, colours = ratios.mean(0).tolist()
@@ -142,7 +142,7 @@ class TextureJudge:
         return sums.sqrt()
 
     def _counts(self, image: Tensor, wrap: bool) -> Tensor:
-        """Return how often two codes lie at each distance and direction, fractions, [D, K, K]."""
+        """Return the fractions of pairs of pixels with each two of K colours, [pairs, K, K]."""
         away = (image[0].movedim(0, -1)[..., None, :] - self._codes).square().sum(-1)
         near = torch.exp(-0.5 * away / 0.15**2)
         # One more code for colours that are near no other.
@@ -165,7 +165,7 @@ class TextureJudge:
 
 
 def _images(pictures: Tensor) -> Tensor:
-    """Return the colours and densities to compare, float64, shape [B, 4, R, R]."""
+    """Return colours and density of pictures [B, R, R, 4], float64, shape [B, 4, R, R]."""
     channels = pictures.double().movedim(-1, 1)
     # The plain density, no power of it, as the faintest parts of edges should count little.
     return torch.cat((colour_image(channels), channels[:, 3:]), dim=1)
@@ -187,7 +187,7 @@ def _wave_bins(resolution: int) -> Tensor:
 
 
 def _codes(colours: Tensor, count: int) -> Tensor:
-    """Return k-means centres of colours, [K, F], that start from the farthest colours."""
+    """Return K = `count` k-means centres [K, F] of colours [M, F], from far apart initial ones."""
     centres = colours.mean(0, keepdim=True)
     for _ in range(count - 1):
         away = torch.cdist(colours, centres).amin(1)

@@ -78,7 +78,7 @@ def train(
         progress: Show a progress bar.
         max_seconds: Stop after this time [s]; the run can be resumed.
         begun: Called once after all checks, before the first iteration.
-        rules: As of `train_together`, for a joint task.
+        rules: For a joint task: see `train_together`.
 
     Raises:
         NPAError: The task is unknown, its target cannot be loaded, or as for `Trainer`.
@@ -117,7 +117,7 @@ def train_together(
             `TrainConfig(task=CoMorphogenesis2DConfig())`.
         rules: Initial rules, one for each species; copied. None: the configuration's
             `initial_rules`, or untrained ones.
-        options: As of `train`; to resume, give the same `rules` again.
+        options: Those of `train`; to resume, give the same `rules` again.
 
     Returns:
         The result; its `rule` is a `JointRules`, in the order of the species. Their files

@@ -92,7 +92,7 @@ def check_task(content: Mapping[str, Any], task_name: str, path: Path) -> None:
 
 
 def check_same_run(
-    content: dict[str, Any], task_name: str, config: TrainConfig[Any], path: Path
+    content: dict[str, Any], path: Path, task_name: str, config: TrainConfig[Any]
 ) -> None:
     """Check that a checkpoint belongs to the run that is to be resumed."""
     check_content(content, READ_FIRST, path)
@@ -145,7 +145,7 @@ def unusable_checkpoint(path: Path, reason: str) -> NPAError:
 
 
 def _wrong(name: str, value: Any, like: Any) -> Iterator[str]:
-    """Yield a message for each difference of a value of a checkpoint from the expected `like`."""
+    """Yield what is wrong with a checkpoint's value `name`, compared with the expected `like`."""
     if isinstance(like, type):
         if not isinstance(value, like):
             yield f"{name} must be a {like.__name__}"

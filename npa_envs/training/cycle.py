@@ -20,14 +20,8 @@ from npa_envs.tasks.base import Task
 from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.iteration import EagerIteration, GraphedIteration, Rollout
 from npa_envs.training.loss_statistics import LossStatistics
-from npa_envs.training.optimiser import RuleOptimiser
-from npa_envs.training.process_group import (
-    ALONE,
-    ProcessGroup,
-    RunRandomness,
-    registered,
-    restart,
-)
+from npa_envs.training.optimiser import RuleOptimiser, normalise_gradients
+from npa_envs.training.process_group import ALONE, ProcessGroup, RunRandomness, registered, restart
 from npa_envs.world.cuda_graph import GraphedCallable
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness, WorldRandom, uniform_draws
@@ -41,7 +35,6 @@ class WorldPool:
 
     Args:
         worlds: The W worlds of this process.
-        largest_value: A world with a larger |x| or |s|, or one that is not finite, is replaced.
         max_age_range: Lifetimes of the first and the last world [steps]; those between are spaced
             geometrically. None: worlds have no lifetime.
         indices: Indices of these worlds among the `total` of all processes, int64, shape [W].
@@ -51,7 +44,6 @@ class WorldPool:
         self,
         worlds: Particles,
         *,
-        largest_value: float,
         max_age_range: tuple[int, int] | None = None,
         indices: Tensor | slice = slice(None),
         total: int | None = None,
@@ -68,7 +60,6 @@ class WorldPool:
             lo, hi = map(math.log, max_age_range)
             logarithms = torch.linspace(lo, hi, total or len(x), dtype=torch.float64)
             self.lifetime = logarithms[indices].exp().round().to(x.device, torch.int64)
-        self._largest_value = largest_value
 
     def tensors(self) -> dict[str, Tensor]:
         """Return the tensors of a checkpoint by name."""
@@ -107,7 +98,7 @@ class WorldPool:
         """
         largest = torch.maximum(_largest(worlds.x), _largest(worlds.s))
         # A comparison with NaN is false, so worlds that are not finite are replaced too.
-        keep = largest <= self._largest_value
+        keep = largest <= LARGEST_VALUE
         self.worlds.put_(index, worlds.where(keep, fresh))
         if self.age is not None and age is not None:
             self.age.index_copy_(0, index, age.masked_fill(~keep, 0))
@@ -123,7 +114,7 @@ def _largest(worlds: Tensor) -> Tensor:
 class TrainingCycle:
     """One iteration of training, and all of its state but the rule.
 
-    `per_world_streams`: as of `RunRandomness`. Each world of the batch then comes from its own
+    `per_world_streams`: see `RunRandomness`. Each world of the batch then comes from its own
     section of the pool.
     """
 
@@ -159,7 +150,6 @@ class TrainingCycle:
         seeds = self._seeds(len(pool_indices), self.random.pool)
         self.pool = WorldPool(
             seeds,
-            largest_value=LARGEST_VALUE,
             max_age_range=config.max_age_range if config.ages else None,
             indices=pool_indices,
             total=config.pool_size,
@@ -189,10 +179,10 @@ class TrainingCycle:
         self._keep = graph(self._keep_worlds)
         self._record = graph(self._record_iteration)
 
-    def run(self, iteration: int, share: float = 0.0) -> int:
+    def run(self, iteration: int, least_progress: float = 0.0) -> int:
         """Train for one iteration, and return the number of steps of its rollout.
 
-        share: Lower bound on the schedule's progress, in [0, 1].
+        least_progress: Lower bound on the progress of the learning rate's schedule, in [0, 1].
         """
         batch = self.batch
         lo, hi = self._config.steps
@@ -209,7 +199,7 @@ class TrainingCycle:
         # Not inside a graph: torch watches NCCL only there for processes that do not answer.
         self._processes.reduce([*batch.gradients, batch.terms], self._replaced)
         self._record()
-        self.optimiser.step(iteration, share)
+        self.optimiser.step(iteration, least_progress)
         return steps
 
     def _seeded_worlds(self, iteration: int) -> Tensor | None:
@@ -252,7 +242,7 @@ class TrainingCycle:
 
     @torch.no_grad()
     def _draw_worlds(self) -> None:
-        """Fill the batch from the pool, and draw seeds."""
+        """Copy worlds from the pool to the batch, some damaged or replaced by fresh seeds."""
         config, worlds = self._config, self.random.worlds
         restart(worlds, self.random.masks)
         self._index.copy_(self.pool.sample(len(self._index), worlds))
@@ -285,10 +275,10 @@ class TrainingCycle:
 
     @torch.no_grad()
     def _record_iteration(self) -> None:
-        """Add the losses of all processes to the statistics, and prepare the gradients."""
+        """Add the iteration's losses to the statistics, and normalise the gradients."""
         self.statistics.add(self._replaced)
         self._replaced.zero_()
-        self.optimiser.prepare_gradients()
+        normalise_gradients(self.batch.gradients)
 
     def _seeds(self, world_count: int, random: Randomness) -> Particles:
         dtype = self._config.torch_dtype

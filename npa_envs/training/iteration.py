@@ -23,7 +23,6 @@ from npa_envs.world.randomness import Randomness, WorldRandom
 WARM_UP_STEPS = 2
 """Steps of the eager rollout that loads every kernel before the first capture."""
 
-
 Rollout = Callable[..., tuple[Tensor, ...]]
 """Type of `npa_envs.rollout` in training: returns positions, states and path lengths."""
 
@@ -60,8 +59,7 @@ class EagerIteration:
         task = task.with_goal(self.start.goal)
         self.grown = torch.zeros_like(worlds.x[:, 0, 0], dtype=torch.bool)
         """Worlds to which the stillness loss applies, bool, shape [B]."""
-        self._stillness_weight = config.stillness_weight
-        self._stillness_power = config.stillness_power
+        self._config = config
         self._take_means = take_means
         self._divides = bool(fate_parameters(rule))
         self._task = task
@@ -76,7 +74,6 @@ class EagerIteration:
         for parameter, buffer in zip(self.parameters, self.gradients, strict=True):
             parameter.grad = buffer
         self._rule = rule
-        self._memory = config.memory
         self._generator = generator
         self._rollout = rollout
 
@@ -91,7 +88,7 @@ class EagerIteration:
             self.start.x,
             first_states,
             steps,
-            memory=self._memory,
+            memory=self._config.memory,
             generator=self._generator,
             return_path_length=True,
             **self._task.rollout_options,
@@ -119,20 +116,22 @@ class EagerIteration:
         return mean
 
     def _loss(self, end: Particles) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the task's loss plus the stillness loss of grown worlds, and named parts."""
+        """Return the task's loss plus the stillness loss of grown worlds, and its terms by name."""
         total, parts = self._task.loss(end)
-        if self._stillness_weight > 0.0:
+        if self._config.stillness_weight > 0.0:
             x, s, path = end.per_particle()
             change = s - self.start.s
             if self._divides:
                 # Births and deaths do not count.
                 stayed = (living(s) & living(self.start.s))[..., None]
                 change = torch.where(stayed, change, 0.0)[..., LIFE + 1 :]
-            moved, changed = (power_mean(each, self._stillness_power) for each in (path, change))
+            moved, changed = (
+                power_mean(each, self._config.stillness_power) for each in (path, change)
+            )
             change_of_world = moved / self._task.eps + changed
             # The log's name of the stillness loss.
             parts["rest"] = (self.grown.to(x.dtype) * change_of_world).mean()
-            total = total + self._stillness_weight * parts["rest"]
+            total = total + self._config.stillness_weight * parts["rest"]
         return total, parts
 
 

@@ -46,14 +46,14 @@ class LossStatistics:
         self._arrival = torch.cuda.Event() if on_cuda else None  # type: ignore[no-untyped-call]
 
     def begin(self, number: int, steps: int) -> None:
-        """Set the number and the steps of the iteration that is added next."""
+        """Set number and steps of the iteration that `add` adds next."""
         self._now[0].fill_(number)
         self._now[1].fill_(steps)
         self._count += 1
         self._step_sum += steps
 
     def add(self, replaced: Tensor) -> None:
-        """Add an iteration, before the optimiser changes the parameters."""
+        """Add the iteration's loss terms and replaced worlds, before its optimiser step."""
         terms = self._iteration.terms
         self._sums += terms
         self._replaced += replaced.sum()
@@ -152,6 +152,7 @@ def divergence_error(
     )
 
 
+@torch.no_grad()
 def diverged_worlds(task: Task, rule: NPARule, snapshot: dict[str, Any]) -> list[int]:
     """Return the indices of the batch's worlds whose own loss is not finite."""
     rule = copy.deepcopy(rule).cpu()
@@ -159,16 +160,13 @@ def diverged_worlds(task: Task, rule: NPARule, snapshot: dict[str, Any]) -> list
     nn.utils.vector_to_parameters(snapshot["parameters"], trained)
     task = task.for_rule(rule)
     worlds = Particles(snapshot["x"], snapshot["s"], goal=snapshot.get("goal"))
-    return [
-        index
-        for index in range(len(worlds.x))
-        if not _has_finite_loss(task, worlds.take(torch.tensor([index])))
-    ]
-
-
-def _has_finite_loss(task: Task, world: Particles) -> bool:
-    if not all(bool(torch.isfinite(value).all()) for value in world.tensors()):
-        return False
-    with torch.no_grad():
-        total, parts = task.with_goal(world.goal).loss(world.with_zero_paths())
-    return all(bool(torch.isfinite(value).all()) for value in (total, *parts.values()))
+    diverged = []
+    for index in range(len(worlds.x)):
+        world = worlds.take(torch.tensor([index]))
+        values = list(world.tensors())
+        if all(bool(value.isfinite().all()) for value in values):
+            total, parts = task.with_goal(world.goal).loss(world.with_zero_paths())
+            values = [total, *parts.values()]
+        if not all(bool(value.isfinite().all()) for value in values):
+            diverged.append(index)
+    return diverged

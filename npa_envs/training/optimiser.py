@@ -50,7 +50,7 @@ def layer_weights(rules: nn.Module) -> list[Tensor]:
 
 
 class RuleOptimiser:
-    """AdamW, or Muon for weight matrices and AdamW for all else; moments are reset at each repeat.
+    """AdamW, or Muon for weight matrices and AdamW for all else; each repeat resets the moments.
 
     Muon's steps are orthogonalised momentum, computed in bfloat16 and scaled to the length of
     AdamW's steps (Jordan et al. 2024; Liu et al., arXiv 2502.16982).
@@ -60,25 +60,23 @@ class RuleOptimiser:
         self, parameters: Sequence[nn.Parameter], config: TrainConfig[Any], rules: nn.Module
     ) -> None:
         self._parameters = list(parameters)
+        self._indices = {id(parameter): index for index, parameter in enumerate(parameters)}
+        """Index of each parameter by its `id`."""
         self._config = config
         fates, matrices = (set(map(id, of(rules))) for of in (fate_parameters, layer_weights))
         self._rate_factors = [FATE_RATE if id(p) in fates else 1.0 for p in self._parameters]
         muon = config.optimiser == "muon"
         self._orthogonal = [muon and id(p) in matrices for p in self._parameters]
-        self._optimisers = self._fresh(self._parameters)
+        self._optimisers = self._fresh_optimisers()
 
-    def prepare_gradients(self) -> None:
-        """Normalise the gradients; one that is not finite becomes 0."""
-        normalise_gradients([p.grad for p in self._parameters if p.grad is not None])
-
-    def step(self, iteration: int, share: float = 0.0) -> None:
+    def step(self, iteration: int, least_progress: float = 0.0) -> None:
         """Take a step along the prepared gradients; a new repeat begins with zero moments.
 
-        share: Lower bound on the schedule's progress, in [0, 1].
+        least_progress: Lower bound on the progress of the learning rate's schedule, in [0, 1].
         """
         if iteration > 0 and iteration % self._config.iterations == 0:
-            self._optimisers = self._fresh(self._parameters)
-        rate = self._config.learning_rate_at(iteration, share)
+            self._optimisers = self._fresh_optimisers()
+        rate = self._config.learning_rate_at(iteration, least_progress)
         for optimiser in self._optimisers:
             for group in optimiser.param_groups:
                 group["lr"] = rate * group.get("rate_factor", 1.0)
@@ -86,24 +84,19 @@ class RuleOptimiser:
 
     def state_dict(self) -> dict[str, Any]:
         """Return moments and step counts by the index of a parameter, for a checkpoint."""
-        indices = self._indices()
         states = [item for optimiser in self._optimisers for item in optimiser.state.items()]
-        return {"state": {indices[id(parameter)]: state for parameter, state in states}}
+        return {"state": {self._indices[id(parameter)]: state for parameter, state in states}}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore what `state_dict` returned."""
-        moments, indices = state["state"], self._indices()
+        moments, indices = state["state"], self._indices
         for optimiser in self._optimisers:
             order = [indices[id(p)] for group in optimiser.param_groups for p in group["params"]]
             load_moments(optimiser, {k: moments[i] for k, i in enumerate(order) if i in moments})
 
-    def _indices(self) -> dict[int, int]:
-        """Return the index of each parameter by its `id`."""
-        return {id(parameter): index for index, parameter in enumerate(self._parameters)}
-
-    def _fresh(self, parameters: list[nn.Parameter]) -> list[Optimizer]:
+    def _fresh_optimisers(self) -> list[Optimizer]:
         """Return new optimisers, whose moments are zero."""
-        decay = self._config.weight_decay
+        parameters, decay = self._parameters, self._config.weight_decay
         optimisers: list[Optimizer] = []
         orthogonal = list(itertools.compress(parameters, self._orthogonal))
         if orthogonal:

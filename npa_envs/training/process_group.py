@@ -65,11 +65,11 @@ class ProcessGroup:
             )
 
     def indices(self, total: int, section: int = 1) -> Tensor:
-        """Return the indices of this process's worlds, on the CPU, int64, shape [total / count]."""
+        """Return the indices of this process's worlds, cut as by `local`, int64, on the CPU."""
         return self.local(torch.arange(total), section)
 
     def local(self, worlds: Tensor, section: int) -> Tensor:
-        """Return this process's worlds out of all, which come in sections of `section` worlds."""
+        """Return this process's worlds out of all, cut into sections of `section` worlds."""
         sections = worlds.view(-1, self.count, section, *worlds.shape[1:])
         return sections[:, self.rank].flatten(0, 1)
 
@@ -185,23 +185,18 @@ class RunRandomness:
         *,
         per_world_streams: bool,
     ) -> None:
-        self.schedule = schedule
-        self.worlds: Randomness
-        self.masks: Randomness
-        self.pool: Randomness
-        if not per_world_streams:
-            self.worlds = self.pool = torch.Generator(device).manual_seed(config.seed + 1)
-            self.masks = torch.Generator(device).manual_seed(config.seed + 2)
-            return
         batch, pool = config.world_count, config.pool_size
 
-        def streams(purpose: int, total: int, section: int = 1) -> WorldRandom:
+        def streams(purpose: int, total: int, section: int = 1) -> Randomness:
+            if not per_world_streams:
+                return torch.Generator(device).manual_seed(config.seed + purpose)
             indices = processes.indices(total, section)
             return world_streams((config.seed, purpose), total, indices, device)
 
-        self.pool = streams(0, pool, section=pool // batch)
+        self.schedule = schedule
         self.worlds = streams(1, batch)
         self.masks = streams(2, batch)
+        self.pool = streams(0, pool, pool // batch) if per_world_streams else self.worlds
 
     def _sources(self) -> dict[str, Randomness]:
         return {"schedule": self.schedule, "worlds": self.worlds, "masks": self.masks}
@@ -223,7 +218,7 @@ class RunRandomness:
 def world_streams(
     seed: Sequence[int], total: int, indices: Tensor, device: torch.device
 ) -> WorldRandom:
-    """Return the streams of the worlds at `indices` among `total`, whatever the others are."""
+    """Return random streams of the worlds at `indices`; each depends on its index only."""
     keys = np.random.default_rng(seed).integers(2**64, size=total, dtype=np.uint64)
     return WorldRandom.from_keys(torch.from_numpy(keys.view(np.int64))[indices].to(device))
 

@@ -133,7 +133,7 @@ def joined_processes() -> Iterator[ProcessGroup]:
 
     Each process sees one CUDA device, by its local rank; call this before anything uses CUDA.
     Within the block, a process that is lost ends all others (see `Heartbeat`), so the process that
-    hosts the store must leave last. Without torchrun there is a single process.
+    hosts their store must leave last. Without torchrun there is a single process.
     """
     if not dist.is_available() or not dist.is_torchelastic_launched():
         yield ProcessGroup()

@@ -103,13 +103,13 @@ class Run:
         self._content: dict[str, Any] | None = processes.broadcast(content)
 
     def take_content(self) -> dict[str, Any] | None:
-        """Return the checkpoint of a resumed run once; its memory is then the caller's to free."""
+        """Return a resumed run's checkpoint, and forget it, so that the caller can free it."""
         content, self._content = self._content, None
         return content
 
     @contextlib.contextmanager
     def locked(self, *, begin: bool = False) -> Iterator[None]:
-        """Lock the folder inside; with `begin`, remove unfinished and overwritten files."""
+        """Lock the folder in the block; with `begin`, remove unfinished and overwritten files."""
         folder = self.folder if self._processes.first else None
         with contextlib.nullcontext() if folder is None else folder.locked():
             if begin and folder is not None:
@@ -122,19 +122,19 @@ class Run:
         self,
         step: Callable[[], None],
         *,
-        over: Callable[[], bool],
+        is_over: Callable[[], bool],
         end: Callable[[bool], None],
         begin: Callable[[], None] = lambda: None,
-        late: Callable[[], bool] = lambda: False,
+        time_is_up: Callable[[], bool] = lambda: False,
     ) -> bool:
         """Repeat `step` until the run is over, or until SIGTERM, Ctrl-C or a time limit stops it.
 
         Args:
             step: One iteration; it increments `iteration`.
-            over: Whether the run is over, the same on all processes.
+            is_over: Returns whether the run is over, the same on all processes.
             end: Called at the end, with whether the run was stopped; signals are still caught.
             begin: Called before the first step, when signals are caught.
-            late: Whether the time limit has passed, on this process.
+            time_is_up: Returns whether the time limit has passed, on this process.
 
         Returns:
             Whether a signal came.
@@ -146,8 +146,8 @@ class Run:
         with requests as stop:
             begin()
             stopped = False
-            while not stopped and not over():
-                stopped = self._processes.agree_to_stop(stop.is_set() or late())
+            while not stopped and not is_over():
+                stopped = self._processes.agree_to_stop(stop.is_set() or time_is_up())
                 if not stopped:
                     step()
             end(stopped)
@@ -174,7 +174,6 @@ def stop_flag(*, patient: bool = False) -> Iterator[threading.Event]:
     if threading.current_thread() is not threading.main_thread():
         yield requested
         return
-    previous: dict[signal.Signals, Any] = {}
     first = 0.0
 
     def restore() -> None:
@@ -192,8 +191,7 @@ def stop_flag(*, patient: bool = False) -> Iterator[threading.Event]:
             restore()
             signal.raise_signal(number)
 
-    for number in (signal.SIGINT, signal.SIGTERM):
-        previous[number] = signal.signal(number, stop)
+    previous = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield requested
     finally:
@@ -230,7 +228,7 @@ class RunFolder:
         self._known: tuple[int, int] | None = None
 
     def prepare(self, byte_count: int, *, pictures: bool = True) -> None:
-        """Create the folder, and check that the disk has room for two checkpoints of this size."""
+        """Create the folder; check that the disk has room for two checkpoints of `byte_count`."""
         # The old checkpoint exists until the new one is complete.
         needed = 2 * byte_count
         try:
@@ -289,7 +287,7 @@ class RunFolder:
             yield
 
     def note_checkpoint(self) -> None:
-        """Remember the present checkpoint file, or none, which `locked` compares later."""
+        """Remember which checkpoint file there is, so that `locked` notices another trainer's."""
         self._known = _identity(self.checkpoint)
 
     def tidy(self) -> None:
@@ -312,10 +310,6 @@ class RunFolder:
         """Return the path of a species' rule in a run of several rules."""
         return self.path / f"rule-{species}.safetensors"
 
-    def picture(self, iteration: int) -> Path:
-        """Return the path of the picture of an iteration."""
-        return self.pictures / f"{iteration:06d}.png"
-
 
 def _identity(path: Path) -> tuple[int, int] | None:
     """Return inode and time of a file, which change when it is replaced, or None if missing."""
@@ -331,22 +325,31 @@ class JsonlLog:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self._is_complete = False
+        """Whether the last line is known to be complete: a kill or a full disk cuts it short."""
 
     def append(self, record: dict[str, Any]) -> None:
-        """Write a line without a buffer, so that a kill right after it does not lose it."""
+        """Write a record as a line, in place of an incomplete last line.
+
+        The file has no buffer, so that a kill right after the call does not lose the line.
+        """
         line = (json.dumps(record, allow_nan=False) + "\n").encode()
         try:
+            if not self._is_complete:
+                self.truncate()
+            self._is_complete = False
             with self.path.open("ab", buffering=0) as file:
                 while line:
                     line = line[file.write(line) :]
+            self._is_complete = True
         except OSError as error:
             raise NPAError(
                 f"cannot write the log {str(self.path)!r} ({error.strerror or error}): free disk "
                 "space or change the permissions, then resume the run"
             ) from error
 
-    def truncate(self, iteration: int) -> None:
-        """Drop the lines after an iteration, and an incomplete last line."""
+    def truncate(self, iteration: int | None = None) -> None:
+        """Drop an incomplete last line, and the lines after an iteration, if given."""
         write_text(self.path, "".join(json.dumps(r) + "\n" for r in self.records(iteration)))
 
     def records(self, iteration: int | None = None) -> list[dict[str, Any]]:
@@ -393,12 +396,12 @@ PICTURE_GAP = 8
 """Pixels between the worlds of a picture."""
 
 
-class RunLog:
+class RunLog(JsonlLog):
     """The log lines and pictures of a run: in its folder, and for TensorBoard while opened."""
 
     def __init__(self, folder: RunFolder) -> None:
+        super().__init__(folder.log)
         self._folder = folder
-        self.lines = JsonlLog(folder.log)
         self._board: Any = None
 
     @contextlib.contextmanager
@@ -421,9 +424,9 @@ class RunLog:
                 self._board.close()
                 self._board = None
 
-    def add(self, record: dict[str, Any]) -> None:
-        """Add a line of numbers, with its `iteration`."""
-        self.lines.append(record)
+    def append(self, record: dict[str, Any]) -> None:
+        """Write a line of numbers, one of them the `iteration`, also to TensorBoard."""
+        super().append(record)
         if self._board is not None:
             for name, value in record.items():
                 if name != "iteration":
@@ -435,7 +438,8 @@ class RunLog:
         frames = to_uint8(picture).repeat(repeats, axis=1).repeat(repeats, axis=2)
         frames = np.pad(frames, ((0, 0), (0, 0), (0, PICTURE_GAP), (0, 0)), constant_values=255)
         frame = np.concatenate(list(frames), axis=1)[:, :-PICTURE_GAP]
-        write_bytes(self._folder.picture(iteration), encode_frame(frame, "PNG"))
+        path = self._folder.pictures / f"{iteration:06d}.png"
+        write_bytes(path, encode_frame(frame, "PNG"))
         if self._board is None:
             return
         # Imported here: only runs with TensorBoard need it.

@@ -44,7 +44,7 @@ def task_of_rule(
 
     A rule whose file names no task, as those of the paper's authors, is run in the paper's world of
     2D morphogenesis with the rule's own sizes; a file of `npa-envs search` names the world that it
-    was found in. Of a rule of many pictures it is the task of the code that `target` names, else of
+    was found in. A rule with codes for many pictures has the task of the picture `target`, else of
     the first one. Where the target is unknown or its picture is missing, a built-in target replaces
     it, so that worlds can still be run and drawn.
 

@@ -119,14 +119,7 @@ TASKS: Mapping[str, TaskEntry] = {
 
 
 def task_entry(task_name: str) -> TaskEntry:
-    """Return the entry of a task.
-
-    Args:
-        task_name: For example `morphogenesis2d`.
-
-    Raises:
-        NPAError: There is no such task.
-    """
+    """Return the entry of a task in `TASKS`; raises NPAError if there is no such task."""
     if not isinstance(task_name, str) or task_name not in TASKS:
         raise NPAError(f"unknown task {shown(task_name)}: {suggest(task_name, TASKS)}")
     return TASKS[task_name]

@@ -10,7 +10,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import torch
 from torch import nn
@@ -71,7 +71,7 @@ class Trainer:
 
     The constructor creates the folder `config.out` and writes the configuration and a first
     checkpoint there, or with `resume` reads the checkpoint. The processes of torch's default group,
-    if there is one, train together: each has a part of the pool and of the batch, and rank 0 reads
+    if there is one, train together: each has some worlds of pool and batch, and rank 0 reads
     and writes the files.
 
     Args:
@@ -117,18 +117,21 @@ class Trainer:
         device = check_device(config.device)
         self._defer_records = device.type == "cuda"
         self._processes = ProcessGroup.current() if processes is None else processes
-
-        def check(content: dict[str, Any], path: Path) -> None:
-            check_same_run(content, task_name, config, path)
-
+        check = functools.partial(check_same_run, task_name=task_name, config=config)
         self._run = Run(self.folder, self._processes, check, resume=resume, overwrite=overwrite)
         content = self._run.take_content()
         schedule = torch.Generator().manual_seed(config.seed)
         saved = None if content is None else content["rule_hyper_parameters"]
-        self.rule = first_rule(task, config, schedule, saved, rules).to(device, config.torch_dtype)
-        if isinstance(self.rule, JointRules):
+        rule: Any
+        if hasattr(task, "make_rules"):
+            rule = JointRules(_species_rules(config, task.make_rules(schedule), saved, rules))
             counts = config.task.counts
             rollout = functools.partial(rollout_species, counts=counts, density_counts=counts)
+        else:
+            rule = task.make_rule(schedule)
+            rule = initial_rule(config, rule) if saved is None else rule_like(saved)
+        # A `JointRules` is used only as a module with hyper-parameters.
+        self.rule: NPARule = rule.to(device, config.torch_dtype)
         self._cycle = TrainingCycle(
             task,
             self.rule,
@@ -149,7 +152,7 @@ class Trainer:
         with self._run.locked(begin=True):
             if content is not None:
                 self._restore(content)
-            elif self._processes.first and self._log.lines.records():
+            elif self._processes.first and self._log.records():
                 raise NPAError(
                     f"out must be a folder without a run, but {shown(str(self.folder.path))} "
                     "holds a log without its checkpoint: choose another folder (--out), or "
@@ -209,12 +212,12 @@ class Trainer:
             self._started = start
             seconds = math.inf if max_seconds is None else max_seconds
             if first:
-                self._record = next(iter(self._log.lines.records()[-1:]), {})
+                self._record = next(iter(self._log.records()[-1:]), {})
             try:
                 interrupted = self._run.repeat(
                     step,
-                    over=lambda: self.iteration >= total,
-                    late=lambda: time.perf_counter() - start >= seconds,
+                    is_over=lambda: self.iteration >= total,
+                    time_is_up=lambda: time.perf_counter() - start >= seconds,
                     end=lambda _: self.save(),
                 )
             finally:
@@ -300,7 +303,7 @@ class Trainer:
             self._finish_record()
 
     def _finish_record(self) -> None:
-        """Write the record that was begun, if any."""
+        """Write the record that `_begin_record` has begun, if any."""
         sent, self._sent_record = self._sent_record, None
         if sent is None:
             return
@@ -314,7 +317,7 @@ class Trainer:
             "seconds": round(self._seconds(), 3),
         }
         if self._processes.first:
-            self._log.add(self._record)
+            self._log.append(self._record)
 
     def _write_picture(self) -> None:
         self._finish_record()
@@ -357,7 +360,7 @@ class Trainer:
             reason = f"it cannot be used ({shown(error)})"
             raise unusable_checkpoint(self.folder.checkpoint, reason) from error
         if self._processes.first:
-            self._log.lines.truncate(self.iteration)
+            self._log.truncate(self.iteration)
 
 
 def check_seconds(max_seconds: object) -> None:
@@ -384,26 +387,6 @@ class JointRules(nn.Module):
     def hyper_parameters(self) -> dict[str, Any]:
         """Return the hyper-parameters of all rules, for checkpoints."""
         return {"rules": [dict(rule.hyper_parameters()) for rule in self]}
-
-
-def first_rule(
-    task: Task,
-    config: TrainConfig[Any],
-    generator: torch.Generator,
-    saved: dict[str, Any] | None,
-    rules: Sequence[NPARule] | None,
-) -> NPARule:
-    """Return the rule that a run starts from, for a task of several species a `JointRules`.
-
-    It has the hyper-parameters `saved` in a checkpoint, if any. Without, and without `rules`, it is
-    what the configuration names, or untrained; then its weights are drawn from `generator`.
-    """
-    if hasattr(task, "make_rules"):
-        untrained = task.make_rules(generator)
-        # The trainer uses its rule only as a module with hyper-parameters.
-        return cast(NPARule, JointRules(_species_rules(config, untrained, saved, rules)))
-    untrained_one = task.make_rule(generator)
-    return initial_rule(config, untrained_one) if saved is None else rule_like(saved)
 
 
 def write_rules(
@@ -439,7 +422,7 @@ def take_options(rule: NPARule, config: TrainConfig[Any]) -> None:
 
 
 def initial_rule(config: TrainConfig[Any], untrained: NPARule) -> NPARule:
-    """Return the rule that a run starts from, in the form of the task's untrained one.
+    """Return the rule that a run starts from, with the shapes of the task's untrained one.
 
     A rule without division or codes may initialise one with them. An equivariant rule has no dead
     zone, and starts from random weights where the configuration names one of `preset_rules`, which
@@ -478,7 +461,7 @@ def _species_rules(
     saved: dict[str, Any] | None,
     rules: Sequence[NPARule] | None,
 ) -> list[NPARule]:
-    """Return a rule for each species, in the form of the `untrained` ones."""
+    """Return a rule for each species, with the shapes of the `untrained` ones."""
     if config.initial_rule:
         raise NPAError(
             f"initial_rule is for one rule, got {shown(config.initial_rule)}: give one for each "

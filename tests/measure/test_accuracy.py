@@ -15,13 +15,7 @@ from npa_envs.errors import NPAError
 from npa_envs.measure import accuracy
 from npa_envs.measure.accuracy import all_checks, check_runner, hard_cases, trained_rule_checks
 from npa_envs.measure.accuracy import scenes as places
-from npa_envs.measure.accuracy.check_runner import (
-    GROUPS,
-    Check,
-    CheckResult,
-    CheckSession,
-    Skipped,
-)
+from npa_envs.measure.accuracy.check_runner import GROUPS, Check, CheckResult, CheckSession, Skipped
 from npa_envs.measure.accuracy.scenes import scenes
 from npa_envs.measure.accuracy.trained_rule_checks import rule_worlds
 from npa_envs.rule.files import load_rule, rule_digest, rule_file, rule_metadata, save_rule
@@ -120,7 +114,7 @@ def test_a_record_comes_back_as_it_was_written(tmp_path: Path):
     assert check_runner.StressRecord(FACTS, path).read().rows == []
     figures = {"a": 1.5, "b": math.inf, "c": math.nan}
     record = check_runner.StressRecord(FACTS, path)
-    record.put(CheckResult(figures, {"a": 1.0}, note="n", name="x/y", expected="s"))
+    record.store(CheckResult(figures, {"a": 1.0}, note="n", name="x/y", expected="s"))
     stored = json.loads(path.read_text(encoding="utf-8"))
     assert stored["counts"] == {"pass": 0, "range": 0, "fail": 1, "skipped": 0}
     assert stored["checks"][0]["figures"] == {"a": 1.5, "b": "inf", "c": "nan"}

@@ -213,8 +213,11 @@ def test_a_damaged_line_of_the_log_is_named_and_the_log_left_alone(tmp_path, lin
 
 
 def test_the_last_line_of_a_log_may_be_cut_short_or_lack_its_end(tmp_path):
-    log = JsonlLog(tmp_path / "log.jsonl")
     whole = [json.dumps({"iteration": k, "loss": 0.5}) for k in (1, 2)]
     for text, count in (("\n".join(whole), 2), (whole[0] + "\n" + whole[1][:-3], 1), ("", 0)):
+        log = JsonlLog(tmp_path / "log.jsonl")
         log.path.write_text(text, encoding="utf-8")
-        assert len(log.records()) == count
+        before = log.records()
+        assert len(before) == count
+        log.append({"iteration": 3})
+        assert log.records() == [*before, {"iteration": 3}]

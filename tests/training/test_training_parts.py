@@ -20,10 +20,9 @@ from npa_envs.training.process_group import ALONE, RunRandomness
 from npa_envs.world.particles import Particles
 
 
-def make_pool(pool_size=6, particle_count=4, limit=10.0, device="cpu"):
-    x = torch.arange(pool_size, dtype=torch.float32, device=device)
-    x = x[:, None, None].repeat(1, particle_count, 2)
-    return WorldPool(Particles(x, x[..., :1].repeat(1, 1, 3)), largest_value=limit)
+def make_pool(device="cpu"):
+    x = torch.arange(6.0, device=device)[:, None, None].repeat(1, 4, 2)
+    return WorldPool(Particles(x, x[..., :1].repeat(1, 1, 3)))
 
 
 def test_pool_draws_different_worlds_and_all_of_them_in_the_long_run():
@@ -46,7 +45,7 @@ def test_pool_draws_different_worlds_and_all_of_them_in_the_long_run():
 
 def test_a_pool_with_lifetimes_draws_one_world_of_each_section():
     x = torch.zeros(12, 2, 2)
-    pool = WorldPool(Particles(x, x.clone()), largest_value=1.0, max_age_range=(10, 1000))
+    pool = WorldPool(Particles(x, x.clone()), max_age_range=(10, 1000))
     lifetimes = pool.lifetime.tolist()
     assert (lifetimes[0], lifetimes[-1]) == (10, 1000)
     ratios = [b / a for a, b in itertools.pairwise(lifetimes)]
@@ -59,9 +58,9 @@ def test_a_pool_with_lifetimes_draws_one_world_of_each_section():
 
 def test_worlds_age_and_are_new_when_they_run_away():
     x = torch.zeros(4, 2, 2)
-    pool = WorldPool(Particles(x, x.clone()), largest_value=1.0, max_age_range=(5, 40))
+    pool = WorldPool(Particles(x, x.clone()), max_age_range=(5, 40))
     index = torch.tensor([0, 2, 3])
-    after = torch.tensor([0.0, 0.0, 3.0])[:, None, None].expand(3, 2, 2)
+    after = torch.tensor([0.0, 0.0, 30.0])[:, None, None].expand(3, 2, 2)
     pool.write(index, Particles(after, after), Particles(x[:3], x[:3]), age=torch.tensor([7, 8, 9]))
     assert pool.age.tolist() == [7, 0, 8, 0]
     age, over = pool.ages_of(index)
@@ -101,7 +100,7 @@ def test_first_step_of_each_repeat_has_the_full_learning_rate_and_fresh_moments(
     optimiser = RuleOptimiser([parameter], config, nn.Identity())
     for iteration, value in enumerate((1.0, 1.0, 1.0, -1.0)):
         parameter.grad = torch.tensor([value])
-        optimiser.prepare_gradients()
+        normalise_gradients([parameter.grad])
         optimiser.step(iteration)
         path.append(parameter.item())
     # With fresh moments AdamW's first step is the learning rate, against the gradient's sign.
@@ -130,7 +129,7 @@ def test_muon_makes_steps_of_matrices_orthogonal_and_leaves_all_else_to_adamw(tm
     for p in parameters:
         p.grad = torch.randn_like(p)
     optimiser = RuleOptimiser(parameters, config, rule)
-    optimiser.prepare_gradients()
+    normalise_gradients([p.grad for p in parameters])
     optimiser.step(0)
     fates = set(map(id, fate_parameters(rule)))
     for parameter, old in zip(parameters, before, strict=True):

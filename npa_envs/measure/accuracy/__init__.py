@@ -15,9 +15,10 @@ from npa_envs.rule.files import shipped_rules
 def all_checks(
     *, quick: bool = False, seed: int = 0, rules: Mapping[str, str] | None = None
 ) -> list[Check]:
-    """Return every check in order; with `rules`, name -> source, only the checks of these rules.
+    """Return all checks, sorted by `GROUPS`; with `rules`, only the checks of these rules.
 
-    `quick` checks fewer shipped rules. The seed is that of random positions.
+    `rules` maps names to shipped rules or files. `quick` checks fewer shipped rules. `seed` is for
+    random positions.
     """
     # Gradients are checked for one rule of each task.
     few = ("gecko", "dots") if quick else ("gecko", "dots", "digits", "duck")

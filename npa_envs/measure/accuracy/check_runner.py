@@ -39,7 +39,7 @@ class Skipped(Exception):
 
 @dataclass(frozen=True)
 class CheckResult:
-    """Measured errors and other numbers of a check by name (`figures`), and limits of some."""
+    """Result of a check: measured numbers by name (`figures`), and upper limits of some of them."""
 
     figures: Mapping[str, float] = field(default_factory=dict)
     limits: Mapping[str, float] = field(default_factory=dict)
@@ -56,10 +56,10 @@ class CheckResult:
     seconds: float = 0.0
     """Duration [s]."""
     weights: str = ""
-    """The `rule_digest` of a check's rule."""
+    """Hash of the weights of the check's rule (`rule_digest`)."""
 
     def __post_init__(self) -> None:
-        """Set the default verdict."""
+        """Set the verdict from the limits, unless it is given."""
         # Comparisons with NaN are false.
         within = all(self.figures.get(key, math.nan) <= limit for key, limit in self.limits.items())
         default = "range" if self.holds else "pass"
@@ -87,7 +87,7 @@ class CheckResult:
 
 @dataclass
 class CheckSession:
-    """One run of the command; `quick`: small worlds and few steps."""
+    """Options of one run of `npa-envs stress`; `quick`: small worlds and few steps."""
 
     device: torch.device
     quick: bool = False
@@ -101,7 +101,7 @@ class CheckSession:
         return self.device.type == "cuda"
 
     def generator(self, number: int = 0) -> torch.Generator:
-        """Return a random generator on the device, a different one for each number."""
+        """Return a random generator on the device, seeded by the session's seed and a number."""
         return torch.Generator(self.device).manual_seed(1000 * self.seed + number)
 
 
@@ -121,12 +121,12 @@ class Check:
 
     @property
     def group(self) -> str:
-        """One of `GROUPS`."""
+        """The name up to the slash, one of `GROUPS`."""
         return self.name.partition("/")[0]
 
     @property
     def weights(self) -> str:
-        """The `rule_digest` of its rule, "" without one."""
+        """Hash of the rule's weights (`rule_digest`), "" without a rule."""
         return rule_digest(load_rule(self.rule)) if self.rule else ""
 
 
@@ -146,8 +146,8 @@ def check(
 ) -> Callable[[Run], Run]:
     """Return a decorator that registers a check, or one for each case: NAME/2d, NAME/2d/open.
 
-    A case is a space dimension, or that and whether the box is periodic. The decorated function's
-    docstring is the expectation.
+    A case is a space dimension, or a pair of it and whether the box is periodic. The decorated
+    function's docstring is the check's expected result.
     """
 
     def add(run: Run) -> Run:
@@ -177,7 +177,7 @@ def chosen_checks(checks: Sequence[Check], names: Sequence[str]) -> list[Check]:
 
 
 class StressRecord(Record[CheckResult]):
-    """Check results of a run, in the order of `names`."""
+    """Results of a run's checks, sorted as the names of the checks in `names`."""
 
     command = "stress"
 
@@ -188,7 +188,7 @@ class StressRecord(Record[CheckResult]):
         self._order = {name: k for k, name in enumerate(names)}
 
     def content(self) -> dict[str, Any]:
-        """Return counts and check results; numbers that are not finite become text: "nan"."""
+        """Return the record file's check results and their counts by verdict; NaN becomes "nan"."""
         return {"counts": self.counts(), "checks": _json_values(as_objects(self.rows))}
 
     def parse(self, content: dict[str, Any]) -> list[CheckResult]:
@@ -198,14 +198,14 @@ class StressRecord(Record[CheckResult]):
                 fields[name] = {key: float(value) for key, value in fields[name].items()}
         return [CheckResult(**fields) for fields in content["checks"]]
 
-    def put(self, result: CheckResult) -> None:
-        """Add a check's result, or replace the earlier one of its name, and write the file."""
+    def store(self, result: CheckResult) -> None:
+        """Add a result, or replace the one of the same check, and write the file."""
         self.rows = [row for row in self.rows if row.name != result.name] + [result]
         self.rows.sort(key=lambda row: self._order.get(row.name, len(self._order)))
         self.write()
 
     def result_of(self, check: Check) -> CheckResult | None:
-        """Return a check's stored result, or None if it has none for the rule's present weights."""
+        """Return a check's stored result, or None if there is none for the rule's weights."""
         rows = (row for row in self.rows if row.name == check.name and row.weights == check.weights)
         return next(rows, None)
 
@@ -224,14 +224,14 @@ class StressRecord(Record[CheckResult]):
         return [result for result in self.rows if result.verdict == "fail"]
 
     def by_group(self) -> dict[str, list[CheckResult]]:
-        """Return the results of each group."""
+        """Return results by the group of their check."""
         groups: dict[str, list[CheckResult]] = {}
         for result in self.rows:
             groups.setdefault(result.name.partition("/")[0], []).append(result)
         return groups
 
     def text(self) -> str:
-        """Return a table of each group, and the expectations of the checks that failed."""
+        """Return a table for each group, and the expected results of the checks that failed."""
         parts = []
         for results in self.by_group().values():
             texts = [result.holds or result.worst() or result.note for result in results]
@@ -267,24 +267,24 @@ def run_checks(
     max_seconds: float | None = None,
     progress: Callable[[int], None] = lambda done: None,
 ) -> None:
-    """Run checks that are not done, and put their results into the record.
+    """Run the checks that have not passed before, and store their results in the record.
 
-    No check starts after `max_seconds`; those without a result are then skipped. After each check
-    `progress` is called with 1.
+    No check starts after `max_seconds`: those without a result are stored as skipped. After each
+    check `progress` is called with 1.
     """
     time_is_up = time_limit(max_seconds)
     for check in checks:
         if not record.is_done(check):
             if not time_is_up():
-                record.put(run_check(check, session))
+                record.store(run_check(check, session))
             elif record.result_of(check) is None:
                 skipped = CheckResult(verdict="skipped", note="no time was left for it")
-                record.put(replace(skipped, name=check.name, expected=check.expected))
+                record.store(replace(skipped, name=check.name, expected=check.expected))
         progress(1)
 
 
 def run_check(check: Check, session: CheckSession) -> CheckResult:
-    """Run a check and return its result; an error is a failure, lack of memory skips it."""
+    """Run a check and return its result: "fail" on an error, "skipped" if memory runs out."""
     weights, begin = check.weights, time.perf_counter()
     try:
         result = check.run(session)
@@ -303,7 +303,7 @@ def run_check(check: Check, session: CheckSession) -> CheckResult:
 
 
 def heat_maps(record: StressRecord) -> dict[str, bytes]:
-    """Return a heat map as PNG for each group of checks: each figure divided by its limit."""
+    """Return a PNG heat map for each group of checks: measured numbers divided by their limits."""
     from matplotlib.colors import LogNorm
 
     drawn = {}

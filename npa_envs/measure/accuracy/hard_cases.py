@@ -126,8 +126,8 @@ def _largest_jump(z: Tensor) -> float:
 
 @check("geometry/crowd", 2, 3)
 def _run_crowd(space_dim: int, session: CheckSession) -> CheckResult:
-    """Very many particles in one cell: densities as float64 has them, all is finite, and the
-    smoothing's adjoint conserves what it spreads."""
+    """With very many particles in one cell, densities match float64, all numbers are finite, and
+    the gradient of the smoothed states' sum by each state is 1."""
     count, sampled = 2_000 if session.quick else 1_000_000 if session.cuda else 20_000, 32
     generator = torch.Generator().manual_seed(session.seed)
     x = 0.01 + (torch.rand(1, count, space_dim, generator=generator) - 0.5) * (EPS / 4.0)
@@ -157,8 +157,8 @@ def _run_crowd(space_dim: int, session: CheckSession) -> CheckResult:
 
 @check("geometry/nearest", 2, 3)
 def _run_nearest(space_dim: int, session: CheckSession) -> CheckResult:
-    """A pair is perceived as such from 1e-19 length units on (float32), below it counts as
-    coincident; all is finite down to denormal distances."""
+    """Two particles at least 1e-19 length units apart (float32) are perceived as two, closer ones
+    as coincident; all numbers are finite down to denormal distances."""
     figures: dict[str, float] = {}
     broken, holds = 0.0, 0
     s = states_at(torch.empty(1, 2, space_dim))
@@ -180,8 +180,8 @@ def _run_nearest(space_dim: int, session: CheckSession) -> CheckResult:
 
 @check("geometry/outside", 2, 3)
 def _run_outside(space_dim: int, session: CheckSession) -> CheckResult:
-    """Particles outside of a periodic box are perceived as their images: in float32 with the
-    rounding of their coordinates; all is finite."""
+    """Particles outside of a periodic box are perceived as their images inside, up to the rounding
+    of their float32 coordinates; all numbers are finite."""
     generator = torch.Generator().manual_seed(session.seed)
     inside = (torch.rand(1, 60, space_dim, generator=generator) - 0.5) * SIDE
     s = torch.randn(1, 60, STATE_DIM, generator=generator)
@@ -218,7 +218,7 @@ WORLD_COUNT, PARTICLE_COUNT, STEPS = 3, 150, 8
 
 
 def _worlds(session: CheckSession, space_dim: int, state_dim: int) -> tuple[Tensor, Tensor]:
-    """Return worlds with about 20 neighbours a particle, in two halves that are far apart."""
+    """Return x and s of worlds in two halves far apart; particles have about 20 neighbours."""
     generator = torch.Generator().manual_seed(session.seed)
     shape = (WORLD_COUNT, PARTICLE_COUNT)
     side = EPS * (3.0 if space_dim == 2 else 2.4)
@@ -230,8 +230,8 @@ def _worlds(session: CheckSession, space_dim: int, state_dim: int) -> tuple[Tens
 
 @check("values/scale", 2, 3)
 def _run_scale(space_dim: int, session: CheckSession) -> CheckResult:
-    """States of 1e-30 to 1e30 are perceived as the float64 reference has them, forwards and
-    backwards; beyond, the largest scale is reported."""
+    """Perception and gradients of states of 1e-30 to 1e30 match the float64 reference; the largest
+    scale up to which they do is reported."""
     x, s = (tensor[:1] for tensor in _worlds(session, space_dim, STATE_DIM))
     figures = {}
     right = []
@@ -383,8 +383,9 @@ def _run_differences(space_dim: int, periodic: bool, session: CheckSession) -> C
 def _difference(scene: Scene, session: CheckSession, what: str) -> float:
     """Return the relative error of a directional derivative against a finite difference.
 
-    Positions move along a smooth periodic field that is 0 at the origin, so that coincident
-    particles stay together. There is no moment correction, through which no gradient flows.
+    `what` is varied: "states" or "positions". Positions move along a smooth periodic field that is
+    0 at the origin, so that coincident particles stay together. There is no moment correction,
+    through which no gradient flows.
     """
     x, s = scene.x.to(session.device), scene.s.to(session.device)
     weights = functional_weights(x, s)

@@ -41,7 +41,7 @@ class Scene:
 
 
 def states_at(x: Tensor) -> Tensor:
-    """Return normally distributed states, float64 numbers that float32 represents exactly."""
+    """Return normally distributed states for positions x, float64, exact in float32 too."""
     shape = (*x.shape[:2], STATE_DIM)
     return torch.randn(shape, generator=torch.Generator().manual_seed(5)).double()
 
@@ -74,7 +74,7 @@ def _direction(space_dim: int) -> Tensor:
 
 
 def _touching(space_dim: int, generator: torch.Generator) -> Tensor:
-    """A pair in each world."""
+    """Return worlds of one pair each, from 1e-12 length units to ε/2 apart."""
     distances = torch.tensor([1e-12, 1e-9, 1e-6, 1e-3, 0.5], dtype=torch.float64)
     distances[3:] *= EPS
     apart = distances[:, None] * _direction(space_dim)
@@ -82,7 +82,7 @@ def _touching(space_dim: int, generator: torch.Generator) -> Tensor:
 
 
 def _at_eps(space_dim: int, generator: torch.Generator) -> Tensor:
-    """Four pairs along the first axis: well within ε, at it, and next to it on either side."""
+    """Return one world with four pairs, ε/2 and ε apart, and slightly less and more than ε."""
     step = 2.0**-20
     first = torch.full((4, space_dim), -0.375, dtype=torch.float64)
     first[:, 1] += torch.arange(4) * 2.0 * EPS
@@ -121,7 +121,7 @@ def _tight_box(space_dim: int, generator: torch.Generator) -> Tensor:
 
 
 def _far(space_dim: int, generator: torch.Generator) -> Tensor:
-    """A crowd at the origin and at each far offset; the square of the farthest overflows."""
+    """Return one world with crowds at the origin and far away; squares of the farthest overflow."""
     x = _uniform(space_dim, generator, 80)
     for k, offset in enumerate((1e3, 1e6, -1e30, 3e38)):
         x[:, 20 * k : 20 * k + 10, 0] += offset
@@ -209,7 +209,7 @@ class PerceptionOutcome(NamedTuple):
 
 
 def relative_error(value: Tensor, expected: Tensor) -> float:
-    """Return the largest error of the worlds [B, ...], relative to its norm, if not 0."""
+    """Return the largest error of B worlds [B, ...], relative to the norm of each, if not 0."""
     exact = expected.detach().cpu().double().flatten(1)
     away = (value.detach().cpu().double().flatten(1) - exact).norm(dim=1)
     size = exact.norm(dim=1)
@@ -221,7 +221,7 @@ def relative_error(value: Tensor, expected: Tensor) -> float:
 def perception_errors(
     outcome: PerceptionOutcome, expected: PerceptionOutcome, precision: str = "float32"
 ) -> dict[str, float]:
-    """Return the relative errors of a perception, by the names of `LIMITS`."""
+    """Return the relative errors of a perception and its gradients, with the keys of `LIMITS`."""
     pairs = zip(PerceptionOutcome._fields, outcome, expected, strict=True)
     return {f"{what}_{precision}": relative_error(a, b) for what, a, b in pairs}
 
@@ -246,7 +246,7 @@ def differing(value: Tensor, expected: Tensor) -> float:
 
 
 def functional_weights(x: Tensor, s: Tensor) -> Tensor:
-    """Return weights of a random linear functional of the perception of worlds, [B, N, P]."""
+    """Return random weights [B, N, P], for a linear functional of the perception of worlds."""
     width = s.shape[2] * (2 + x.shape[2]) + x.shape[2]
     draws = torch.Generator().manual_seed(3)
     return torch.randn(*x.shape[:2], width, generator=draws).to(x)
@@ -261,9 +261,10 @@ def perceived(
     weights: Tensor | None = None,
     changed: Callable[[Tensor], Tensor] = torch.clone,
 ) -> PerceptionOutcome:
-    """Return z and its gradients, by the library or the reference.
+    """Return the perception z of worlds and its gradients, by the library or the reference.
 
-    `weights` are by default `functional_weights`; `changed` is applied to all inputs first.
+    Gradients are of Σ z `weights`, by default `functional_weights`. `changed` is applied to x, s
+    and the weights first.
     """
     x, s = changed(x.detach()).requires_grad_(), changed(s.detach()).requires_grad_()
     operator = reference.perceive if by_reference else perceive
@@ -274,7 +275,7 @@ def perceived(
 
 
 def error_limits(x: Tensor, s: Tensor, box: Box, expected: PerceptionOutcome) -> dict[str, float]:
-    """Return the relative errors allowed for a scene, by the names of `LIMITS`.
+    """Return the relative errors allowed for a scene, with the keys of `LIMITS`.
 
     An error may be as large as the effect of rounding every input four times, which is large where
     sums cancel or results grow with 1 / distance. Coincident particles are moved together. Far away

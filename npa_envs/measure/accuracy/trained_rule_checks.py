@@ -39,7 +39,7 @@ MIN_VIEWS: dict[str, Any] = {"resolution": 16, "training_views": 1, "held_out_vi
 
 
 class RuleWorlds(NamedTuple):
-    """A float32 rule, its task, and worlds of it with their goals, if any."""
+    """A float32 rule, its task, and worlds of the task with their goals, if any."""
 
     rule: NPARule
     task: Task
@@ -62,7 +62,7 @@ def rule_worlds(
 ) -> RuleWorlds:
     """Return a rule, shipped or of a file, with fresh worlds of its task.
 
-    `particles` is a factor on the trained number, in a quick run on at most `QUICK_PARTICLES`.
+    `particles` is a factor on the trained number of particles, which a quick run limits.
     """
     if (name, particles) not in session.cache:
         rule = load_rule(name, device=session.device).float().requires_grad_(False)
@@ -111,7 +111,7 @@ particles in open space.
 
 
 def measured(runner: RuleRunner, worlds: Particles) -> dict[str, float]:
-    """Return the absolute figures of worlds; the energy runs `ENERGY_STEPS` more steps."""
+    """Return measurements of worlds, named as in `BOUNDS`; energy takes `ENERGY_STEPS` steps."""
     with torch.no_grad():
         x, s, *_ = worlds
         not_finite = (~x.isfinite()).sum() + (~s.isfinite()).sum()
@@ -134,7 +134,7 @@ def measured(runner: RuleRunner, worlds: Particles) -> dict[str, float]:
 
 
 @check("time", registry=RULE_CHECKS)
-def _run(name: str, session: CheckSession) -> CheckResult:
+def _run_long(name: str, session: CheckSession) -> CheckResult:
     """No number becomes infinite or NaN; the extent at most doubles, updates have at most four
     times the energy of the settled world's, states stay within 8 and on average within 1.1, the
     centroid moves by an extent at most."""
@@ -200,7 +200,7 @@ def powers_of_two(most: int) -> list[int]:
 def outcome(
     start: RuleWorlds, session: CheckSession, steps: int, dtype: torch.dtype
 ) -> RolloutOutcome:
-    """Run a rollout and return worlds and gradients; masks do not depend on the dtype."""
+    """Return worlds and gradients after a rollout in a dtype, on which masks do not depend."""
     rule = NPARule(**start.rule.hyper_parameters()).to(start.worlds.x.device)
     rule.load_state_dict(start.rule.state_dict())
     rule.to(dtype)
@@ -232,8 +232,8 @@ def _gradient_worlds(session: CheckSession, name: str) -> RuleWorlds:
 
 @check("gradients/norm", registry=RULE_CHECKS)
 def _run_norm(name: str, session: CheckSession) -> CheckResult:
-    """Gradients of a functional by weights and by states at the start are finite whatever the
-    number of steps; their norms are reported."""
+    """Gradients of a rollout by weights and by initial states are finite whatever the number of
+    steps; their norms are reported."""
     start = _gradient_worlds(session, name)
     figures: dict[str, float] = {}
     not_finite = 0.0
@@ -271,7 +271,7 @@ def _run_float32(name: str, session: CheckSession) -> CheckResult:
 @check("precision/graph")
 @torch.no_grad()
 def _run_graph(session: CheckSession) -> CheckResult:
-    """A rollout of 16 steps recorded in a CUDA graph has the bits of one that is not."""
+    """A rollout of 16 steps recorded in a CUDA graph equals an eager one bit for bit."""
     if not session.cuda:
         raise Skipped("graphs are CUDA's: run it with --device cuda")
     start = rule_worlds(session, "gecko", world_count=3)

@@ -62,7 +62,7 @@ class Response:
 
 
 class RuleRecord(Record[Response]):
-    """Measurements of one rule: loss curves after damage, and responses to conditions."""
+    """Measurements of one rule: loss curves after damage, and losses under other conditions."""
 
     command = "robustness"
 
@@ -93,7 +93,7 @@ class RuleRecord(Record[Response]):
         return bool(self.about["done"])
 
     def content(self) -> dict[str, Any]:
-        """Return the file's fields except the facts: settings and versions of the measurement."""
+        """Return the fields of the file, except the facts."""
         curves = [asdict(curve) for curve in self.curves]
         for fields, curve in zip(curves, self.curves, strict=True):
             fields["twins"] = fields.pop("undamaged")
@@ -101,7 +101,7 @@ class RuleRecord(Record[Response]):
         return {**self.about, "courses": curves, "responses": as_objects(self.rows)}
 
     def parse(self, content: dict[str, Any]) -> list[Response]:
-        """Read all fields of a file but its responses, and return these."""
+        """Set curves and other fields from a file's JSON object; return its responses."""
 
         def numbers(values: list[float | None]) -> tuple[float, ...]:
             return tuple(map(number, values))
@@ -115,13 +115,13 @@ class RuleRecord(Record[Response]):
         self.about = content
         return [Response(**row | {"losses": numbers(row["losses"])}) for row in rows]
 
-    def of(self, condition: str) -> list[Response]:
+    def responses_to(self, condition: str) -> list[Response]:
         """Return the responses to a condition."""
         return [response for response in self.rows if response.condition == condition]
 
     def trained(self) -> Response:
-        """Return the response with all conditions as in training."""
-        return next(response for response in self.of("eps") if response.value == 1.0)
+        """Return the response under the conditions of training."""
+        return next(response for response in self.responses_to("eps") if response.value == 1.0)
 
 
 def measure_rule(
@@ -131,7 +131,7 @@ def measure_rule(
     *,
     enough: Callable[[], bool] = lambda: False,
 ) -> None:
-    """Measure what a rule's record lacks; save it after the damage curves and after each value.
+    """Measure what is missing in a rule's record; save it after each value of a condition.
 
     Values of conditions that need more than `most_particles` particles are left out. Once `enough`
     returns True, no further value is measured, and the record stays unfinished.
@@ -162,7 +162,7 @@ def measure_rule(
 def grow(
     trial: RuleTrial, condition: str = "", value: float | str = 1.0
 ) -> tuple[Particles, Response]:
-    """Grow seeds as in training, or with `condition` at `value`; return worlds and losses."""
+    """Grow worlds as in training, or with `condition` at `value`; return them and their losses."""
     initial = trial.initial_worlds(
         fraction=float(value) if condition == "particles" else 1.0,
         shape=str(value) if condition == "shape" else "trained",
@@ -212,7 +212,7 @@ def where_it_works(record: RuleRecord, condition: str) -> str:
 
     It works if all seeds are finite and the mean loss is at most `WORKS` times the trained one.
     """
-    measured = record.of(condition)
+    measured = record.responses_to(condition)
     if not measured:
         return ""
     # The ratio of a value that was left out is NaN, so a range ends before it.
@@ -260,7 +260,7 @@ DAMAGE_GROUPS = {
 def recovered_counts(
     records: Iterable[RuleRecord], damages: Collection[str]
 ) -> tuple[int, int, int]:
-    """Return the seeds of all rules that recovered, that are recovered at the end, and all."""
+    """Return how many seeds recovered at any step, how many at the last one, and their number."""
     curves = [c for record in records for c in record.curves if c.damage in damages]
     recovered = sum(curve.recovered() for curve in curves)
     at_end = sum(curve.recovered_at_end() for curve in curves)
@@ -319,11 +319,15 @@ def _by_damage(records: Sequence[RuleRecord], cell: Callable[[LossCurve], str]) 
 
 
 def _by_value(records: Sequence[RuleRecord], condition: str) -> str:
-    """Return a table of mean losses over the trained ones, which are in the second column."""
-    values = list(dict.fromkeys(r.value for record in records for r in record.of(condition)))
+    """Return a Markdown table of each rule's loss as trained, and its multiple at each value."""
+    values = list(
+        dict.fromkeys(r.value for record in records for r in record.responses_to(condition))
+    )
     rows = []
     for record in records:
-        responses_by_value = {response.value: response for response in record.of(condition)}
+        responses_by_value = {
+            response.value: response for response in record.responses_to(condition)
+        }
         if responses_by_value:
             cells = [_change(record, responses_by_value.get(value)) for value in values]
             rows.append([record.rule, short(record.trained().mean()), *cells])
@@ -368,7 +372,7 @@ def _draw(records: Sequence[RuleRecord]) -> bytes:
             panel.set(xscale="log", xlabel=label, ylabel="loss")
             trained = sorted(record.trained().losses)
             panel.axhline(trained[len(trained) // 2], color="black", lw=0.7, ls=":")
-            measured = [response for response in record.of(condition) if response.losses]
+            measured = [response for response in record.responses_to(condition) if response.losses]
             values = [float(response.value) for response in measured]
             losses = [response.losses for response in measured]
             _draw_seeds(panel, values, losses, "C0", CONDITIONS[condition])
@@ -380,7 +384,7 @@ def _draw(records: Sequence[RuleRecord]) -> bytes:
 def _draw_seeds(
     panel: Any, across: Sequence[float], columns: Sequence[Sequence[float]], colour: str, name: str
 ) -> None:
-    """Draw the median of the seeds and a band from least to most; NaN makes gaps."""
+    """Plot the seeds' median and range in each of `columns` over `across`; NaN makes gaps."""
     diverged = [any(map(math.isnan, column)) for column in columns]
     # The upper median of an even number.
     low, middle, high = (

@@ -43,13 +43,13 @@ Shape = Callable[[int, int, float, WorldRandom], Tensor]
 
 
 def disk(particle_count: int, space_dim: int, radius: float, random: WorldRandom) -> Tensor:
-    """Return a disk, a ball in 3D, of radius R."""
+    """Return positions in a disk, in 3D a ball, [B, N, D]."""
     sizes = (random.world_count, particle_count, space_dim, radius)
     return uniform_ball(*sizes, generator=random, device=random.device)
 
 
 def ring(particle_count: int, space_dim: int, radius: float, random: WorldRandom) -> Tensor:
-    """Return a ring around a disk of radius R with the disk's area, in 3D a spherical shell."""
+    """Return positions in a ring around a disk, of its area; in 3D in a spherical shell."""
     x = disk(particle_count, space_dim, radius, random)
     distance: Tensor = torch.linalg.vector_norm(x, dim=-1, keepdim=True).clamp_min(1e-12)
     # Moves each particle so that the ring inside of it has the area that the disk had.
@@ -58,14 +58,14 @@ def ring(particle_count: int, space_dim: int, radius: float, random: WorldRandom
 
 
 def square(particle_count: int, space_dim: int, radius: float, random: WorldRandom) -> Tensor:
-    """Return a square of the disk's area, in 3D a cube of its volume."""
+    """Return positions in a square of a disk's area, in 3D in a cube of a ball's volume."""
     side = radius * (math.sqrt(math.pi) if space_dim == 2 else (4.0 * math.pi / 3.0) ** (1.0 / 3.0))
     sizes = (random.world_count, particle_count, (side,) * space_dim)
     return uniform_box(*sizes, generator=random, device=random.device)
 
 
 def two_blobs(particle_count: int, space_dim: int, radius: float, random: WorldRandom) -> Tensor:
-    """Return two disks side by side, in 3D balls, with the total size of one of radius R."""
+    """Return positions in two disks side by side, in 3D balls, of one disk's total area."""
     small = radius * 0.5 ** (1.0 / space_dim)
     x = disk(particle_count, space_dim, small, random)
     side = torch.arange(particle_count, device=x.device) % 2 * 2 - 1
@@ -98,10 +98,10 @@ CONDITIONS = {
 
 def trained_value(condition: str, update_prob: float) -> float | str:
     """Return the trained value of a condition; `update_prob` is that of the task."""
-    absolute: dict[str, float | str] = {"update_prob": update_prob, "noise": 0.0}
-    absolute["shape"] = "trained"
+    trained: dict[str, float | str]
+    trained = {"update_prob": update_prob, "noise": 0.0, "shape": "trained"}
     # All other conditions are factors on what was trained.
-    return absolute.get(condition, 1.0)
+    return trained.get(condition, 1.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -217,7 +217,7 @@ class RuleTrial:
         """Index of each world's task, [B]."""
 
     def random(self, purpose: int) -> WorldRandom:
-        """Return the streams of all worlds for a `StreamId`, at their start."""
+        """Return new random streams of all worlds, for a purpose, a `StreamId`."""
         return WorldRandom(self._world_seeds, device=self._device).substream(purpose)
 
     def particles(self, fraction: float) -> int:
@@ -234,14 +234,14 @@ class RuleTrial:
         return self._tasks[particle_count]
 
     def _by_task(self, x: Tensor) -> Iterator[tuple[Any, Tensor]]:
-        """Yield each task and its worlds' indices in x, which holds all worlds once or more."""
+        """Yield each task and its worlds' indices in x: all worlds, once or several times."""
         pictures = self._pictures.repeat(len(x) // self.world_count)
         tasks = self.tasks_of(x.shape[1])
         for k in sorted(set(pictures.tolist())):
             yield tasks[k], (pictures == k).nonzero()[:, 0]
 
     def with_codes_restored(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return states whose first channels have their world's target code again, if any."""
+        """Return states with their picture's code in the first channels, if the rule has codes."""
         s = s.clone()
         for task, index in self._by_task(x):
             s[index] = task.with_target_code(s[index])
@@ -283,7 +283,7 @@ class RuleTrial:
         return worlds, torch.stack(losses)
 
     def losses(self, worlds: Particles, eps: float) -> Tensor:
-        """Return the task's metric of worlds that were run with a radius, [B].
+        """Return the task's metric [B] of worlds that were run with perception radius `eps`.
 
         In open space the dynamics do not change if positions and ε are scaled by one factor, so
         positions are measured at the scale of training. Those in boxes and of static particles are
@@ -316,7 +316,7 @@ Change = Callable[[Tensor, Tensor, WorldRandom, Box], tuple[Tensor, Tensor]]
 
 
 class Damage(NamedTuple):
-    """A kind of damage."""
+    """A kind of damage, and the rules that it suits."""
 
     apply: Change
     static: bool
@@ -350,7 +350,7 @@ def pull_together(x: Tensor, s: Tensor, random: WorldRandom, box: Box) -> tuple[
 def _around(
     x: Tensor, s: Tensor, centre: Tensor, box: Box, change: Callable[..., tuple[Tensor, Tensor]]
 ) -> tuple[Tensor, Tensor]:
-    """Apply a change relative to a centre in each world, in a box to the nearest images."""
+    """Apply `change` to positions relative to each world's centre, in a box of nearest images."""
     away, s = change(offsets_from(x, centre, box), s, centre=torch.zeros_like(centre))
     return nearest_image(away + centre[:, None], box), s
 
@@ -432,7 +432,7 @@ class LossCurve:
         return median(steps) if steps else None
 
     def ratios(self, index: int) -> list[float]:
-        """Return for each seed its loss over that of its undamaged copy, at an index of `steps`."""
+        """Return each seed's loss divided by its undamaged copy's, at `steps[index]`."""
         pairs = zip(self.losses, self.undamaged, strict=True)
         return [ratio(losses[index], undamaged[index]) for losses, undamaged in pairs]
 
@@ -442,7 +442,7 @@ class LossCurve:
 
 
 def ratio(loss: float, reference: float) -> float:
-    """Return a loss over a reference loss; 1 if both are 0."""
+    """Return a loss divided by a reference loss; 1 if both are 0."""
     if reference == 0.0:
         return 1.0 if loss == 0.0 else math.nan if math.isnan(loss) else math.inf
     return loss / reference

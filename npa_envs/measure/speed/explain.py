@@ -36,7 +36,7 @@ class KernelRow:
 
 
 def kernel_rows(session: TimingSession, workloads: Sequence[Workload]) -> list[KernelRow]:
-    """Return the kernels of inference and of training; none on a CPU."""
+    """Return a row for each kernel of inference and of training; none on a CPU."""
     if not session.cuda:
         session.leave_out("kernels", "CUDA only")
         return []

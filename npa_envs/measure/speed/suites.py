@@ -160,7 +160,7 @@ class ScalingRow:
 
 
 def scaling_rows(session: TimingSession) -> list[ScalingRow]:
-    """Return the rows of all axes, increasing along each."""
+    """Return a row for each value of each of `AXES`, in increasing order."""
     return session.rows(
         (f"{value} {axis}", partial(_scaling_row, session, axis, value))
         for axis, values in _axis_values(session).items()
@@ -228,7 +228,7 @@ Skip = tuple[str, str, dict[str, Any], dict[str, Any]]
 
 
 def skips(workload: Workload) -> list[Skip]:
-    """Return all computations that rollouts leave out."""
+    """Return all computations that rollouts can leave out."""
     side = 2.0 * workload.half_width
     training: dict[str, Any] = {"train": True}
     # Cells and densities are computed in each step if positions may have a gradient.
@@ -275,7 +275,7 @@ def skips(workload: Workload) -> list[Skip]:
 
 
 def skip_rows(session: TimingSession) -> list[SkipRow]:
-    """Return what each omission saves, from times with and without it."""
+    """Return the time of a step with and without each computation that `skips` lists."""
     workload = SKIPPED[session.size]
     x, s = workload.worlds(session.device)
 
@@ -307,8 +307,8 @@ SPECIES = {
 class OneSpeciesRow:
     """Times of one step [µs] of `rollout`, and of `rollout_species` with one species.
 
-    `calls` is "graph" for replays of a CUDA graph, else "eager". `ratio` is the median over pairs
-    of readings in turn.
+    `calls` is "graph" for replays of a CUDA graph, else "eager". `ratio` is the median of the
+    second time / the first.
     """
 
     workload: str
@@ -362,7 +362,7 @@ def _species_row(
 
 
 def paper(session: TimingSession) -> Tables:
-    """Return the tables `throughput`, as in the paper, and on CUDA `public`."""
+    """Return the tables `throughput` and, on CUDA, `public`: rows of the suite `paper`."""
     workloads = SMALL if session.small else PAPER if session.cuda else CPU
     tables: Tables = {"throughput": throughput_rows(session, workloads)}
     if session.cuda:
@@ -385,7 +385,7 @@ SUITES: dict[str, Callable[[TimingSession], Tables]] = {
 
 @dataclass(frozen=True)
 class BenchReport:
-    """One run of one suite."""
+    """Result of one run of a suite."""
 
     suite: str
     command: str
@@ -437,7 +437,7 @@ def pictures(tables: Tables) -> dict[str, bytes]:
 
 
 def _draw_scaling(table: Sequence[ScalingRow], unit: str, name: str) -> bytes:
-    """Return a PNG of the columns of inference and training of a unit, over each axis."""
+    """Return a PNG of the columns `infer_UNIT` and `train_UNIT`, called `name`, over each axis."""
     figure, grid = new_figure(2, 2, (9.2, 7.6))
     for axis, panel in zip(AXES, grid.flat, strict=True):
         rows = [row for row in table if row.axis == axis]

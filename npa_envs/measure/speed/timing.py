@@ -234,7 +234,7 @@ NO_TIME = "no time was left"
 
 @dataclass
 class TimingSession:
-    """One run of the benchmark."""
+    """Options of one run of `npa-envs bench`, and what it left out."""
 
     device: torch.device
     repeats: int = 7
@@ -264,7 +264,7 @@ class TimingSession:
         graph: bool = True,
         generator: torch.Generator | None = None,
     ) -> Cost:
-        """Return time and memory of a call after a first one; on CUDA `graph` times replays."""
+        """Return time and memory of a call after a first one; `graph`: of replays on CUDA."""
         device = self.device
         run()
         synchronize(device)
@@ -279,7 +279,7 @@ class TimingSession:
         return Cost(timing, (torch.cuda.max_memory_allocated(device) - before) / 2**20)
 
     def attempt(self, what: str, make: Callable[[], Row]) -> list[Row]:
-        """Return the row of a call in a list, which is empty without memory or time for it."""
+        """Return a list of the row that `make` returns, empty if memory or time is short."""
         if self.enough():
             self.leave_out(what, NO_TIME)
             return []
@@ -292,11 +292,11 @@ class TimingSession:
         return []
 
     def rows(self, calls: Iterable[tuple[str, Callable[[], Row]]]) -> list[Row]:
-        """Return the rows of several named calls, as `attempt`."""
+        """Return the rows of calls with their names, each made by `attempt`."""
         return [row for what, make in calls for row in self.attempt(what, make)]
 
     def leave_out(self, what: str, why: str) -> None:
-        """Record that something is not measured."""
+        """Add to `left_out` that something is not measured, and why."""
         entry = LeftOut(what, why)
         if entry not in self.left_out:
             self.left_out.append(entry)
