@@ -91,7 +91,7 @@ def drawn_indices(
 
 
 def drawn_worlds(x: Tensor, generator: Randomness, probability: float) -> Tensor:
-    """Return a random bool for each world, True with a probability, shape [B]."""
+    """Return a random bool for each world, True with `probability`, shape [B]."""
     single = x.new_empty(0, dtype=torch.float32)
     return uniform_draws(generator, (len(x), 1), single)[:, 0] < probability
 
@@ -109,7 +109,7 @@ def _check_points(number_count: int, dtype: torch.dtype) -> None:
 def _unit_ball_by_world(
     generator: WorldRandom, particle_count: int, space_dim: int, dtype: torch.dtype
 ) -> Tensor:
-    """Return points uniform in the unit ball, the same bits on every device and in every batch."""
+    """Return points uniform in the unit ball, [B, N, D], same bits on every device and batch."""
     direction = generator.normal(particle_count, space_dim, dtype=dtype)
     squares = direction * direction
     length = sum(squares.unbind(dim=-1), torch.zeros_like(squares[..., 0])).sqrt()
