@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -105,7 +105,7 @@ class CoMorphogenesis2D(ParticleTask[Any]):
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
     ) -> Particles:
         """Return fresh worlds: each species uniform in a disk of its own, all states zero."""
-        return _together(
+        return together(
             [
                 _shifted(task.seed(world_count, generator=generator, device=device), centre)
                 for task, centre in zip(self.tasks, self.config.centres, strict=True)
@@ -115,7 +115,7 @@ class CoMorphogenesis2D(ParticleTask[Any]):
     def damage(self, worlds: Particles, generator: Randomness) -> Particles:
         """Return worlds after random damage of each species, independently."""
         species = zip(self.tasks, worlds.split(self.config.counts), strict=True)
-        return _together([task.damage(each, generator) for task, each in species])
+        return together([task.damage(each, generator) for task, each in species])
 
     def loss(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the sum of the species' training losses, and terms of species k as "k.term"."""
@@ -143,8 +143,8 @@ class CoMorphogenesis2D(ParticleTask[Any]):
             # States of pictures are colours alone.
             target = Particles(task.target.points[None], task.target.colours[None] - COLOUR_OFFSET)
             targets.append(_shifted(target, centre))
-        together = _together(targets)
-        return self.picture(together.x, together.s)[0]
+        x, s, *_ = together(targets)
+        return self.picture(x, s)[0]
 
     def metrics(self, x: Tensor, s: Tensor) -> Tensor:
         """Return the splat loss of each of K species in each world, shape [B, K]."""
@@ -162,7 +162,7 @@ def _shifted(worlds: Particles, distance: float) -> Particles:
     return worlds._replace(x=torch.stack((x + distance, y), dim=-1))
 
 
-def _together(species: list[Particles]) -> Particles:
+def together(species: Sequence[Particles]) -> Particles:
     """Return worlds with the particles of all species, one species after the other."""
     return combined(lambda fields: torch.cat(fields, 1), species)
 

@@ -487,7 +487,7 @@ MORPHOGENESIS2D_PRESETS = presets_of(
     # A few particles that see far; of two worlds one is young, one grown and at rest:
     # docs/recipes.md.
     fast=fast_run(
-        Morphogenesis2DConfig(
+        task=Morphogenesis2DConfig(
             target_point_count=512,
             particle_count=512,
             eps=0.2,
@@ -509,7 +509,7 @@ MORPHOGENESIS2D_PRESETS = presets_of(
         picture_interval=200,
     ),
     tiny=tiny_run(
-        Morphogenesis2DConfig(
+        task=Morphogenesis2DConfig(
             target="ring",
             target_point_count=128,
             particle_count=128,

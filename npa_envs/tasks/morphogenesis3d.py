@@ -379,7 +379,7 @@ MORPHOGENESIS3D_PRESETS = presets_of(
     # Of two worlds one is young, one grown and at rest, so that what has grown stays:
     # docs/morphogenesis3d.md.
     fast=fast_run(
-        Morphogenesis3DConfig(
+        task=Morphogenesis3DConfig(
             particle_count=768,
             hidden_dim=64,
             readout_hidden_dim=32,
@@ -410,7 +410,7 @@ MORPHOGENESIS3D_PRESETS = presets_of(
         picture_interval=100,
     ),
     tiny=tiny_run(
-        Morphogenesis3DConfig(
+        task=Morphogenesis3DConfig(
             target="doughnut",
             particle_count=200,
             hidden_dim=32,

@@ -333,7 +333,7 @@ POINT_CLASSIFICATION_PRESETS = presets_of(
     ),
     # Of clouds never seen 91 % are classified rightly, after some four minutes on one core.
     fast=fast_run(
-        PointClassificationConfig(
+        task=PointClassificationConfig(
             stretch=0.1,
             mutated_share=0.25,
             particle_count=128,
@@ -353,7 +353,7 @@ POINT_CLASSIFICATION_PRESETS = presets_of(
         checkpoint_interval=300,
     ),
     tiny=tiny_run(
-        PointClassificationConfig(
+        task=PointClassificationConfig(
             particle_count=64,
             hidden_dim=32,
             readout_hidden_dim=32,

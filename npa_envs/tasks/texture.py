@@ -381,7 +381,9 @@ TEXTURE_PRESETS = presets_of(
         tensorboard=False,
     ),
     tiny=tiny_run(
-        TextureConfig(target="dots", particle_count=256, hidden_dim=32, eps=0.3, resolution=24),
+        task=TextureConfig(
+            target="dots", particle_count=256, hidden_dim=32, eps=0.3, resolution=24
+        ),
         steps=(8, 16),
         seed_interval=4,
     ),

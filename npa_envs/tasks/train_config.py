@@ -309,27 +309,22 @@ def _is_pair(value: object, kind: Callable[[object], bool]) -> bool:
 
 
 SMALL: Mapping[str, Any] = {"repeats": 1, "world_count": 2, "tensorboard": False}
-FAST = {**SMALL, "learning_rate": 2e-3, "checkpoint_interval": 200}
-TINY = {
+
+fast_run = partial(TrainConfig, **SMALL, learning_rate=2e-3, checkpoint_interval=200)
+"""Makes the settings of a run of a few minutes on one core, from its task and other fields."""
+
+tiny_run = partial(
+    TrainConfig,
     **SMALL,
-    "iterations": 60,
-    "pool_size": 8,
-    "learning_rate": 5e-3,
-    "milestones": (45,),
-    "log_interval": 1,
-    "picture_interval": 20,
-    "checkpoint_interval": 20,
-}
-
-
-def fast_run(task: TaskConfigT, **fields: Any) -> TrainConfig[TaskConfigT]:
-    """Return the settings of a run of a few minutes on one core."""
-    return TrainConfig(task=task, **{**FAST, **fields})
-
-
-def tiny_run(task: TaskConfigT, **fields: Any) -> TrainConfig[TaskConfigT]:
-    """Return the settings of a run of a few seconds, for tests."""
-    return TrainConfig(task=task, **{**TINY, **fields})
+    iterations=60,
+    pool_size=8,
+    learning_rate=5e-3,
+    milestones=(45,),
+    log_interval=1,
+    picture_interval=20,
+    checkpoint_interval=20,
+)
+"""Makes the settings of a run of a few seconds, for tests, from its task and other fields."""
 
 
 def presets_of(

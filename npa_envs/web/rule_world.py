@@ -16,7 +16,7 @@ from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.rule.files import load_rule, rule_file, rule_metadata, shipped_rules
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Task
-from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2DConfig
+from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2DConfig, together
 from npa_envs.tasks.damage import DAMAGE_SIZES, damage_worlds
 from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.tasks.train_config import TrainConfig
@@ -26,7 +26,7 @@ from npa_envs.training.task_table import load_config, preset
 from npa_envs.web.live_world import ColouredWorld, Colouring, LiveWorld, Range, Touch, shows_of
 from npa_envs.world.brushes import inside_ball, wipe_state
 from npa_envs.world.division import living
-from npa_envs.world.particles import Particles, combined
+from npa_envs.world.particles import Particles
 from npa_envs.world.rollout import at_rest, rollout
 from npa_envs.world.species import AGREEMENTS, rollout_species
 
@@ -349,7 +349,7 @@ class RuleWorld(LiveWorld):
         # A new species divides densities by its own number of particles, as in a world alone.
         index = self._species_index(live_rule, float(count))
         species = torch.nn.functional.pad(self._species(), (0, count), value=index)
-        self._arrange(_joined([self.particles, fresh]), species)
+        self._arrange(together([self.particles, fresh]), species)
 
     def _all_coded(self, s: Tensor) -> Tensor:
         """Return states [1, N, C] of all particles with the target codes of their rules."""
@@ -403,11 +403,6 @@ class RuleWorld(LiveWorld):
 def _taken(particles: Particles, indices: Tensor) -> Particles:
     """Return the particles that indices or a mask [N] select."""
     return particles.map(lambda value: value[:, indices])
-
-
-def _joined(worlds: Sequence[Particles]) -> Particles:
-    """Return the particles of several worlds as one world."""
-    return combined(functools.partial(torch.cat, dim=1), worlds)
 
 
 def name_of(source: str) -> str:
@@ -466,7 +461,7 @@ class RunWorld(RuleWorld):
             worlds.append(world._replace(goal=None))
             # As in training, each species divides densities by its own number of particles.
             live_rule.count = live_rule.divisor = world.x.shape[1]
-        self.particles = _joined(worlds)
+        self.particles = together(worlds)
         self.count = sum(self.counts)
 
     def describe(self) -> dict[str, Any]:

@@ -1,6 +1,8 @@
 // Colours of particles by state, density, species, speed or update mask. This file follows `Colouring` of
 // npa_envs/web/live_world.py.
 
+import { inner } from "./brushes.js";
+
 // Of npa_envs/render/colours.py and npa_envs/web/live_world.py.
 const COLOUR_OFFSET = 0.5;
 const GOLDEN_ANGLE = Math.PI * (3 - Math.sqrt(5));
@@ -27,7 +29,7 @@ export class Colouring {
     const { world } = live;
     const bytes = new Uint8ClampedArray(3 * world.count);
     if (show === "colours") {
-      live.looks.forEach((look, number) => look.colour(world, number, bytes));
+      live.ruleColours.forEach((colours, number) => colours.write(world, number, bytes));
     } else if (show === "density") {
       this.densities(live, bytes);
     } else if (show === "components") {
@@ -83,7 +85,7 @@ export class Colouring {
     const components = eigenvectors(this.covariance, channels).slice(0, 3);
     components.forEach(({ vector }, k) => {
       // An eigenvector's sign is arbitrary: colours must not flip between frames.
-      if (this.basis?.[k] && product(vector, this.basis[k]) < 0) vector.forEach((part, c) => (vector[c] = -part));
+      if (this.basis?.[k] && inner(vector, this.basis[k]) < 0) vector.forEach((part, c) => (vector[c] = -part));
     });
     this.basis = components.map(({ vector }) => vector);
     const tint = [0.5, 0.5, 0.5];
@@ -97,6 +99,7 @@ export class Colouring {
     }
   }
 
+  // Red, green and blue at a fraction of the ramp.
   onRamp(fraction) {
     const last = this.ramp.length / 3 - 1;
     const entry = 3 * Math.round(last * Math.min(1, Math.max(0, fraction)));
@@ -104,9 +107,9 @@ export class Colouring {
   }
 }
 
-// Colours of one rule's particles: their last three outputs, or the colour of their class, greyer the
-// smaller its output.
-export class Look {
+// Colours of one rule's particles by the outputs of its read-out, or their states: the last three, or the
+// colour of the class with the largest output, greyer the smaller it is.
+export class RuleColours {
   // rule: of LiveWorld; its `classes` are {palette, undecided}, or null.
   constructor(rule, kernels) {
     this.classes = rule.classes;
@@ -126,8 +129,8 @@ export class Look {
     this.read = kernels.floats(ROWS_TOGETHER * this.second.width);
   }
 
-  // Colours the particles of species `number`.
-  colour({ s, species, count }, number, bytes) {
+  // Writes red, green and blue of the particles of species `number` to `bytes`.
+  write({ s, species, count }, number, bytes) {
     const { channels } = this;
     if (this.first === undefined) {
       for (let i = 0; i < count; i++) if (species[i] === number) put(bytes, i, this.tint(s, i * channels));
@@ -147,6 +150,7 @@ export class Look {
     flush();
   }
 
+  // Red, green and blue of a particle whose outputs begin at index `at` of `values`.
   tint(values, at) {
     if (this.classes === null) {
       const last = at + this.outputs;
@@ -194,10 +198,6 @@ function srgb(lightness, a, b) {
     const clipped = Math.min(1, Math.max(0, linear));
     return clipped <= 0.0031308 ? 12.92 * clipped : 1.055 * clipped ** (1 / 2.4) - 0.055;
   });
-}
-
-function product(a, b) {
-  return a.reduce((sum, part, k) => sum + part * b[k], 0);
 }
 
 // Eigenvalues and eigenvectors of a symmetric matrix, the largest first, by Jacobi's rotations.
