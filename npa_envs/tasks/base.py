@@ -211,8 +211,9 @@ class ParticleTask(Generic[ConfigT]):
     def with_goal(self, goal: Tensor | None) -> Self:
         """Return a copy of the task whose loss and metric compare worlds with these goals.
 
-        A goal is the index of a world's target or class: int64, shape [B], read at each call. Tasks
-        without goals return themselves. On CUDA the range is not checked: it would synchronise.
+        A goal is the index of a world's target or class: int64, shape [B], read at each call. It is
+        the task itself for None, or without goals. On CUDA the range is not checked: that would
+        synchronise.
         """
         count = self.goal_count
         if goal is None or count == 0:

@@ -73,11 +73,8 @@ def uniform_box(
     sides = [checked_finite("a side of box", side, " [length units]") for side in values]
     _check_points(world_count * particle_count * len(sides), dtype)
     check_generator(generator, device, world_count)
-    if isinstance(generator, WorldRandom):
-        fraction = generator.uniform(particle_count, len(sides), dtype=dtype)
-    else:
-        shape = (world_count, particle_count, len(sides))
-        fraction = torch.rand(shape, generator=generator, device=device, dtype=dtype)
+    like = torch.empty(0, device=device, dtype=dtype)
+    fraction = uniform_draws(generator, (world_count, particle_count, len(sides)), like)
     return torch.stack([side * (fraction[..., d] - 0.5) for d, side in enumerate(sides)], dim=-1)
 
 

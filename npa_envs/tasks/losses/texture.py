@@ -321,7 +321,7 @@ def relaxed_transport(first: Tensor, second: Tensor) -> Tensor:
     """Return the relaxed earth mover's distance of two sets of feature vectors, shape [B].
 
     Every vector (a row) moves to the one of the other set with the least cosine distance. The
-    larger of both directions' mean costs is returned; each is a lower bound of the transport's.
+    larger mean cost of both directions is returned; each is a lower bound of transport's cost.
     """
     costs = 1.0 - _directions(first) @ _directions(second).transpose(1, 2)
     there, back = costs.amin(dim=2).mean(dim=1), costs.amin(dim=1).mean(dim=1)

@@ -36,14 +36,14 @@ export class Colouring {
       this.components(world.s, live.channels, bytes);
     } else if (show === "species") {
       const tints = live.species.map((_, k) => speciesColour(k));
-      each(bytes, (i) => tints[world.species[i]]);
+      writeColours(bytes, (i) => tints[world.species[i]]);
     } else if (show === "speed") {
-      each(bytes, (i) => this.onRamp(Math.sqrt(live.travelled[i] || 0)));
+      writeColours(bytes, (i) => this.onRamp(Math.sqrt(live.travelled[i] || 0)));
     } else if (show === "mask") {
-      each(bytes, (i) => (live.updated[i] ? UPDATED : RESTING));
+      writeColours(bytes, (i) => (live.updated[i] ? UPDATED : RESTING));
     } else {
       const channel = Number(show.slice("state ".length));
-      each(bytes, (i) => signedColour(world.s[i * live.channels + channel]));
+      writeColours(bytes, (i) => signedColour(world.s[i * live.channels + channel]));
     }
     return new Uint8Array(bytes.buffer);
   }
@@ -55,7 +55,7 @@ export class Colouring {
     const volume = box === null ? 2 ** dimension : box.reduce((product, side) => product * side, 1);
     const usual = (full / volume) * (box === null ? 4 : 1);
     for (let k = 0; k < world.count; k++) {
-      put(bytes, physics.order[k], this.onRamp(1 - 2 ** (-physics.density[k] / usual)));
+      writeColour(bytes, physics.order[k], this.onRamp(1 - 2 ** (-physics.density[k] / usual)));
     }
   }
 
@@ -95,7 +95,7 @@ export class Colouring {
         for (let c = 0; c < channels; c++) sum += (s[i * channels + c] - mean[c]) * vector[c];
         tint[k] = 0.5 + (0.22 * sum) / Math.sqrt(Math.max(value, 1e-12));
       });
-      put(bytes, i, tint);
+      writeColour(bytes, i, tint);
     }
   }
 
@@ -126,22 +126,22 @@ export class RuleColours {
     );
     this.rows = kernels.floats(ROWS_TOGETHER * this.channels);
     this.hidden = kernels.floats(ROWS_TOGETHER * this.first.width);
-    this.read = kernels.floats(ROWS_TOGETHER * this.second.width);
+    this.results = kernels.floats(ROWS_TOGETHER * this.second.width);
   }
 
   // Writes red, green and blue of the particles of species `number` to `bytes`.
   write({ s, species, count }, number, bytes) {
     const { channels } = this;
     if (this.first === undefined) {
-      for (let i = 0; i < count; i++) if (species[i] === number) put(bytes, i, this.tint(s, i * channels));
+      for (let i = 0; i < count; i++) if (species[i] === number) writeColour(bytes, i, this.tint(s, i * channels));
       return;
     }
     const block = [];
     const flush = () => {
       block.forEach((i, row) => this.rows.set(s.subarray(i * channels, (i + 1) * channels), row * channels));
       this.kernels.product(this.first, block.length, this.rows, channels, this.hidden, true);
-      this.kernels.product(this.second, block.length, this.hidden, this.first.width, this.read, false);
-      block.forEach((i, row) => put(bytes, i, this.tint(this.read, row * this.second.width)));
+      this.kernels.product(this.second, block.length, this.hidden, this.first.width, this.results, false);
+      block.forEach((i, row) => writeColour(bytes, i, this.tint(this.results, row * this.second.width)));
       block.length = 0;
     };
     for (let i = 0; i < count; i++) {
@@ -164,11 +164,11 @@ export class RuleColours {
   }
 }
 
-function each(bytes, tintOf) {
-  for (let i = 0; 3 * i < bytes.length; i++) put(bytes, i, tintOf(i));
+function writeColours(bytes, tintOf) {
+  for (let i = 0; 3 * i < bytes.length; i++) writeColour(bytes, i, tintOf(i));
 }
 
-function put(bytes, i, tint) {
+function writeColour(bytes, i, tint) {
   bytes[3 * i] = 255 * tint[0];
   bytes[3 * i + 1] = 255 * tint[1];
   bytes[3 * i + 2] = 255 * tint[2];

@@ -257,7 +257,7 @@ class GlPainter {
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
     const program = soft ? this.programs.soft : this.programs.ball;
     gl.useProgram(program.program);
-    this.look(program, scene, width, height);
+    this.setCamera(program, scene, width, height);
     attribute(gl, 0, this.positions, positions, dimension);
     attribute(gl, 1, this.tints, colours, 3);
     if (soft) {
@@ -290,7 +290,7 @@ class GlPainter {
     if (scene.trails) this.drawTrails(scene, width, height);
   }
 
-  look(program, { camera }, width, height) {
+  setCamera(program, { camera }, width, height) {
     const gl = this.gl, unit = camera.unit(width, height);
     const [right, up, toward] = camera.axes;
     gl.uniform3fv(program.right, right);
@@ -307,7 +307,7 @@ class GlPainter {
   drawTrails(scene, width, height) {
     const gl = this.gl, program = this.programs.trail;
     gl.useProgram(program.program);
-    this.look(program, scene, width, height);
+    this.setCamera(program, scene, width, height);
     gl.disable(gl.DEPTH_TEST);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);

@@ -385,7 +385,7 @@ export function serve(scope) {
   };
 
   // One message, or one frame where there is none, never two at a time.
-  const go = async () => {
+  const handleNext = async () => {
     if (busy) return;
     busy = true;
     const message = messages.shift();
@@ -401,10 +401,10 @@ export function serve(scope) {
     if (messages.length > 0 || live?.pending) clock.port2.postMessage(null);
   };
 
-  clock.port1.onmessage = go;
+  clock.port1.onmessage = handleNext;
   scope.onmessage = ({ data }) => {
     messages.push(data);
-    go();
+    handleNext();
   };
 }
 
