@@ -36,7 +36,7 @@ from npa_envs.rule.files import load_rule, save_rule
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.morphogenesis3d import Morphogenesis3D
 from npa_envs.tasks.targets.meshes import FloatArray, Mesh, load_mesh
-from npa_envs.tasks.targets.views import Views, over, some_views, views_of_mesh
+from npa_envs.tasks.targets.views import Views, composited, some_views, views_of_mesh
 from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training import Trainer, override, preset
 from npa_envs.training.task_table import config_to_dict
@@ -268,7 +268,7 @@ def sheet(task: Morphogenesis3D, worlds: list[tuple[Tensor, Tensor]]) -> Image.I
     shown = some_views(held_out, chosen)
     rows = [shown.pictures, *(task.views(x[:1], s[:1], shown.cameras)[0] for x, s in worlds)]
     white = shown.pictures.new_ones(3)
-    pictures = [over(views, white).clamp(0.0, 1.0).cpu() for views in rows]
+    pictures = [composited(views, white).clamp(0.0, 1.0).cpu() for views in rows]
     flat = torch.cat([torch.cat(list(views), dim=1) for views in pictures])
     return Image.fromarray((255.0 * flat).round().byte().numpy())
 

@@ -19,7 +19,7 @@ from torch import Tensor
 import npa_envs
 from npa_envs.render import to_uint8, write_filmstrip
 from npa_envs.rule.files import shipped_rules
-from npa_envs.tasks.targets.views import over
+from npa_envs.tasks.targets.views import composited
 from npa_envs.training.task_of_rule import task_of_rule
 
 IMAGES = Path(__file__).resolve().parents[1] / "images"
@@ -80,7 +80,7 @@ def things() -> Shots:
             (name, held_out.pictures),
             ("step 128", task.views(x, s, held_out.cameras)[0]),
         ):
-            white = over(views, torch.ones(3)).clamp(0.0, 1.0)
+            white = composited(views, torch.ones(3)).clamp(0.0, 1.0)
             shots += [(what, (255.0 * view).byte().numpy()) for view in white[1:11:2]]
     return shots
 

@@ -24,7 +24,7 @@ from npa_envs.world.randomness import Randomness
 
 
 class Frame(NamedTuple):
-    """The region that viewers show."""
+    """The square or cube of space that viewers show."""
 
     centre: tuple[float, ...]
     """Its centre [length units]."""
@@ -35,7 +35,7 @@ class Frame(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class TaskConfig:
-    """World and rule of a task; the tasks' configurations add their own fields."""
+    """Settings that all tasks share: sizes of world, rule and picture. Subclasses add their own."""
 
     particle_count: int = 4096
     """Particles in a world, N."""
@@ -79,7 +79,7 @@ ConfigT = TypeVar("ConfigT", bound=TaskConfig)
 
 
 class ParticleTask(Generic[ConfigT]):
-    """A task: its world, untrained rule, seeds, loss, metric and pictures.
+    """A task: its worlds, untrained rule, loss, metric and pictures.
 
     A subclass defines where particles start (`places`), the loss (`compare`), a metric and a
     picture; all else has defaults. In all methods x are positions [length units], shape [B, N, D],
@@ -156,7 +156,9 @@ class ParticleTask(Generic[ConfigT]):
 
     @property
     def target_picture(self) -> Tensor:
-        """The picture to match: rgb sums and density, dimensionless, shape [R, R, 4].
+        """The picture to match, dimensionless, shape [R, R, 4].
+
+        Channels are red, green and blue, each summed over splats, and the density.
 
         Raises:
             AttributeError: The task has none.
@@ -167,7 +169,7 @@ class ParticleTask(Generic[ConfigT]):
 
     @property
     def rule_shape(self) -> dict[str, Any]:
-        """Further arguments of `NPARule`: all but channels, hidden width and ε0."""
+        """Arguments of `NPARule` in addition to state_dim, hidden_dim and eps0."""
         raise NotImplementedError
 
     def make_rule(self, generator: torch.Generator) -> NPARule:
@@ -177,7 +179,7 @@ class ParticleTask(Generic[ConfigT]):
         return untrained_rule(generator, **(sizes | {"eps0": config.eps} | self.rule_shape))
 
     def places(self, world_count: int, generator: Randomness, device: torch.device) -> Tensor:
-        """Return the particles' positions in fresh worlds, shape [B, N, D]."""
+        """Return start positions of particles in fresh worlds [length units], shape [B, N, D]."""
         raise NotImplementedError
 
     def seed(
@@ -188,29 +190,30 @@ class ParticleTask(Generic[ConfigT]):
         return Particles(x, x.new_zeros(*x.shape[:2], self.config.state_dim))
 
     def damage(self, worlds: Particles, generator: Randomness) -> Particles:
-        """Return worlds of the pool, damaged; their goals may change."""
+        """Return worlds of the training pool after random damage; their goals may change."""
         return worlds
 
     def begin(self, iteration: int) -> None:
-        """Prepare the loss of an iteration, without synchronising with the device.
+        """Set what the loss uses in an iteration only, such as camera views.
 
-        Values depend on the iteration alone, so that a resumed run equals an uninterrupted one.
-        They are written to the same tensors in each iteration, because CUDA graphs read these.
+        It depends on the iteration alone, so that a resumed run equals an uninterrupted one. It is
+        written to the same tensors in each iteration, because CUDA graphs read these.
         """
 
     def for_rule(self, rule: NPARule) -> Self:
-        """Return the task for worlds that a rule runs; by default the task itself.
+        """Return the task whose loss and pictures use a rule's codes or read-out, or itself.
 
-        Losses read the rule's parameters at each call and are differentiable in them. The task
-        itself is not changed.
+        They read the rule's parameters at each call and are differentiable in them. The original
+        task is not changed.
         """
         return self
 
     def with_goal(self, goal: Tensor | None) -> Self:
-        """Return the task with loss and metric for worlds with these goals, int64, shape [B].
+        """Return a copy of the task whose loss and metric compare worlds with these goals.
 
-        By default worlds have none. The tensor is read at each call. The task is not changed. On
-        CUDA the goals' range is not checked, which would synchronise.
+        A goal is the index of a world's target or class: int64, shape [B], read at each call. It is
+        the task itself for None, or without goals. On CUDA the range is not checked: that would
+        synchronise.
         """
         count = self.goal_count
         if goal is None or count == 0:
@@ -231,15 +234,16 @@ class ParticleTask(Generic[ConfigT]):
 
     @property
     def goal(self) -> Tensor:
-        """Goals of the worlds, int64, shape [B]."""
+        """Index of each world's target or class, int64, shape [B]."""
         if self._goal is None:
             raise NPAError("the worlds' goals must be given first: task.with_goal(goal), int64 [B]")
         return self._goal
 
     def with_target_code(self, s: Tensor) -> Tensor:
-        """Return states with each world's target code restored, which damage may have erased.
+        """Return states [B, N, C] whose first channels hold the code of the world's target again.
 
-        Without codes they are unchanged. They are differentiable in codes that are learned.
+        Damage may have erased it. They are differentiable in codes that are learned; states of
+        tasks without codes are unchanged.
         """
         return s
 
@@ -256,9 +260,9 @@ class ParticleTask(Generic[ConfigT]):
         return task
 
     def compare(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the batch's weighted distance from the target, and its named terms, unweighted.
+        """Return the batch's weighted distance from the target, shape [].
 
-        All have shape [].
+        The second result has its terms by name, without weights, each of shape [].
         """
         raise NotImplementedError
 
@@ -271,9 +275,9 @@ class ParticleTask(Generic[ConfigT]):
         return {"overflow": (self.config.overflow_weight, outside)}
 
     def loss(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the training loss of worlds after a rollout, and its named terms, unweighted.
+        """Return the training loss of worlds after a rollout, shape [].
 
-        All have shape [].
+        The second result has its terms by name, without weights, each of shape [].
 
         Raises:
             NPAError: The worlds lack path lengths, or these have another shape than [B, N].
@@ -289,7 +293,7 @@ class ParticleTask(Generic[ConfigT]):
         return total, terms
 
     def picture(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return the picture of each world: rgb sums and density, shape [B, R, R, 4]."""
+        """Return each world's picture, as `target_picture` but of shape [B, R, R, 4]."""
         raise NotImplementedError
 
     def metric(self, x: Tensor, s: Tensor) -> Tensor:
@@ -302,7 +306,7 @@ class ParticleTask(Generic[ConfigT]):
         return self.metric_name
 
     def trial_metric(self, worlds: Particles) -> Tensor:
-        """Return the metric under damage or changed conditions, shape [B]; by default `metric`."""
+        """Return the metric that robustness trials measure, shape [B]; by default `metric`."""
         return self.metric(worlds.x, worlds.s)
 
     def colours(self, s: Tensor) -> Tensor:
@@ -310,15 +314,15 @@ class ParticleTask(Generic[ConfigT]):
         return s[..., -3:] + COLOUR_OFFSET
 
     def views(self, x: Tensor, s: Tensor, cameras: Cameras) -> Tensor:
-        """Return pictures of V cameras: colours times alpha, and alpha, shape [B, V, H, W, 4]."""
+        """Return pictures by V cameras: colours times alpha, and alpha, shape [B, V, H, W, 4]."""
         raise NotImplementedError
 
     def view_psnr(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return each world's mean PSNR over the views that it is measured by [dB], shape [B]."""
+        """Return each world's mean PSNR over the held-out views [dB], shape [B]."""
         raise NotImplementedError
 
     def gaussians(self, s: Tensor) -> Gaussians:
-        """Return the Gaussians that particles with states s are drawn as."""
+        """Return the 3D Gaussian that draws each particle, from states s."""
         raise NotImplementedError
 
     def _with(self, **fields: object) -> Self:
@@ -377,7 +381,7 @@ class GrowthTask(ParticleTask[GrowthConfigT]):
 
     @property
     def rule_shape(self) -> dict[str, Any]:
-        """Further arguments of `NPARule`: all but channels, hidden width and ε0."""
+        """Arguments of `NPARule` in addition to state_dim, hidden_dim and eps0."""
         return {"space_dim": self.space_dim, "alpha": self.config.alpha}
 
     def places(self, world_count: int, generator: Randomness, device: torch.device) -> Tensor:
@@ -388,11 +392,11 @@ class GrowthTask(ParticleTask[GrowthConfigT]):
         )
 
     def damage(self, worlds: Particles, generator: Randomness) -> Particles:
-        """Return the worlds, damaged as the configuration says, each at its own random position."""
+        """Return worlds after the damage that the configuration sets, at random positions."""
         return damage_pool(worlds, self.config, generator=generator)
 
     def penalties(self, worlds: Particles) -> dict[str, tuple[float, Tensor]]:
-        """Return terms for motion, states outside of [-1, 1], positions there, and motion there."""
+        """Return penalties of motion, and of states, positions and motion outside of [-1, 1]."""
         config, bounded = self.config, self.bounded(worlds.x)
         terms = {"motion": (config.motion_weight, distances_moved(worlds).mean())}
         terms |= super().penalties(worlds)
@@ -407,20 +411,20 @@ class GrowthTask(ParticleTask[GrowthConfigT]):
 
 
 def distances_moved(worlds: Particles) -> Tensor:
-    """Return the path lengths of worlds that a loss compares [length units], shape [B, N]."""
+    """Return the particles' path lengths [length units], shape [B, N]; worlds must have them."""
     assert worlds.path_length is not None, "worlds are the end of a rollout"
     return worlds.path_length
 
 
-def contributions_to_loss(loss: Tensor, amounts: Tensor) -> Tensor:
+def contributions_to_loss(loss: Tensor, effects: Tensor) -> Tensor:
     """Return each particle's contribution to its world's loss, times N; shape [B, N].
 
-    It is the loss [B] plus N times the difference between the particle's amount and its world's
-    mean amount, so that the mean contribution is the loss, up to rounding. `amounts` [B, N] are the
-    first-order changes of the loss by what each particle adds to the world.
+    It is loss + N (effect - mean effect of the world), so that its mean over particles is the loss
+    [B], up to rounding. `effects` [B, N] are the derivatives of the loss by a factor on each
+    particle's splat or opacity.
     """
-    excess = amounts - world_mean(amounts[..., None])
-    return loss[:, None] + amounts.shape[1] * excess
+    excess = effects - world_mean(effects[..., None])
+    return loss[:, None] + effects.shape[1] * excess
 
 
 def untrained_rule(generator: torch.Generator, **hyper_parameters: Any) -> NPARule:
@@ -431,6 +435,6 @@ def untrained_rule(generator: torch.Generator, **hyper_parameters: Any) -> NPARu
 
 
 def differing_fields(rule: NPARule, task_rule: NPARule) -> list[str]:
-    """Return the names of the hyper-parameters in which a rule differs from one of a task."""
+    """Return the names of the hyper-parameters in which a rule differs from a task's."""
     actual, expected = rule.hyper_parameters(), task_rule.hyper_parameters()
     return [name for name in expected if actual[name] != expected[name]]

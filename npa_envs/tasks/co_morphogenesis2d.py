@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -59,15 +59,15 @@ class CoMorphogenesis2DConfig:
 
     @property
     def centres(self) -> tuple[float, ...]:
-        """First coordinate of each seed's centre [length units]; their mean is 0."""
+        """x coordinate of the centre of each species' start disk [length units]; mean 0."""
         middle = 0.5 * (len(self.species) - 1)
         return tuple(self.distance * (k - middle) for k in range(len(self.species)))
 
 
 class CoMorphogenesis2D(ParticleTask[Any]):
-    """`Morphogenesis2D` of every species, each on its own particles.
+    """Several pictures that grow in one world; each species is the particles of one picture.
 
-    Worlds contain the particles of all species, one species after the other.
+    Particles of a species have consecutive indices. Each species has its own rule.
     """
 
     def __init__(
@@ -104,8 +104,8 @@ class CoMorphogenesis2D(ParticleTask[Any]):
     def seed(
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
     ) -> Particles:
-        """Return fresh worlds: each species uniform in its own disk, all states zero."""
-        return _together(
+        """Return fresh worlds: each species uniform in a disk of its own, all states zero."""
+        return together(
             [
                 _shifted(task.seed(world_count, generator=generator, device=device), centre)
                 for task, centre in zip(self.tasks, self.config.centres, strict=True)
@@ -113,12 +113,12 @@ class CoMorphogenesis2D(ParticleTask[Any]):
         )
 
     def damage(self, worlds: Particles, generator: Randomness) -> Particles:
-        """Return the worlds with each species damaged independently."""
+        """Return worlds after random damage of each species, independently."""
         species = zip(self.tasks, worlds.split(self.config.counts), strict=True)
-        return _together([task.damage(each, generator) for task, each in species])
+        return together([task.damage(each, generator) for task, each in species])
 
     def loss(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the sum of the species' training losses and its terms, named "k.term"."""
+        """Return the sum of the species' training losses, and terms of species k as "k.term"."""
         total = worlds.x.new_zeros(())
         terms: dict[str, Tensor] = {}
         for k, species in enumerate(worlds.split(self.config.counts)):
@@ -137,17 +137,17 @@ class CoMorphogenesis2D(ParticleTask[Any]):
 
     @property
     def target_picture(self) -> Tensor:
-        """The picture of all targets, each around its species' seed; shape [R, R, 4]."""
+        """The picture of all targets, each around its species' start disk; shape [R, R, 4]."""
         targets = []
         for task, centre in zip(self.tasks, self.config.centres, strict=True):
             # States of pictures are colours alone.
             target = Particles(task.target.points[None], task.target.colours[None] - COLOUR_OFFSET)
             targets.append(_shifted(target, centre))
-        together = _together(targets)
-        return self.picture(together.x, together.s)[0]
+        x, s, *_ = together(targets)
+        return self.picture(x, s)[0]
 
     def metrics(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return each species' splat loss in each world, shape [B, K]."""
+        """Return the splat loss of each of K species in each world, shape [B, K]."""
         species = zip(self.tasks, Particles(x, s).split(self.config.counts), strict=True)
         return torch.stack([task.metric(each.x, each.s) for task, each in species], dim=1)
 
@@ -162,8 +162,8 @@ def _shifted(worlds: Particles, distance: float) -> Particles:
     return worlds._replace(x=torch.stack((x + distance, y), dim=-1))
 
 
-def _together(species: list[Particles]) -> Particles:
-    """Return worlds of several species, one species after the other."""
+def together(species: Sequence[Particles]) -> Particles:
+    """Return worlds with the particles of all species, one species after the other."""
     return combined(lambda fields: torch.cat(fields, 1), species)
 
 
@@ -195,7 +195,7 @@ _SPECIES: Mapping[str, Mapping[str, Any]] = {
 
 
 def _joint_preset(name: str) -> JointTrainConfig[CoMorphogenesis2DConfig]:
-    """Return a preset of 2D morphogenesis, with a heart next to its target."""
+    """Return the preset of 2D morphogenesis of this name, with a heart as second species."""
     alone = MORPHOGENESIS2D_PRESETS[name]
     first = replace(alone.task, **_SPECIES.get(name, {}))
     species = (first, replace(first, target="heart"))

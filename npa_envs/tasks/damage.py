@@ -35,14 +35,14 @@ CLUMP_FACTOR = 0.9
 
 
 def check_damage(kind: object, where: str = "") -> None:
-    """Check that there is such a kind of damage; `where` adds to the error message."""
+    """Raise NPAError unless `kind` is in `DAMAGE_SIZES`; `where` is added to its message."""
     if not isinstance(kind, str) or kind not in DAMAGE_SIZES:
         raise NPAError(f"unknown damage {shown(kind)}{where}: {suggest(kind, DAMAGE_SIZES)}")
 
 
 @dataclass(frozen=True)
 class DamageEvent:
-    """One damage of a world, after a number of steps."""
+    """Damage of a world after a number of steps."""
 
     step: int
     """Steps since the seed."""
@@ -61,7 +61,7 @@ class DamageEvent:
 
     @property
     def extent(self) -> float:
-        """The size [length units], given or usual."""
+        """The size [length units]; if it is None, the usual one of the kind."""
         return DAMAGE_SIZES[self.kind] if self.size is None else self.size
 
     @property
@@ -75,7 +75,7 @@ class DamageEvent:
 
 
 def parse_damage(text: str) -> DamageEvent:
-    """Read "STEP:KIND" or "STEP:KIND:SIZE", for example "300:cut" or "500:wipe:0.3"."""
+    """Return the event of "STEP:KIND" or "STEP:KIND:SIZE", such as "500:wipe:0.3"."""
     if not isinstance(text, str):
         raise NPAError(f"damage must be text, got {shown(text)}: for example '300:cut'")
     step, _, damage = text.partition(":")
@@ -151,17 +151,17 @@ NEAREST, FARTHEST = 2.0, 4.0
 
 
 def displace(x: Tensor, *, probability: float, generator: Randomness) -> Tensor:
-    """Return positions with some particles, each with a probability, displaced far out."""
+    """Return positions [B, N, D]; each particle is thrown out of the world with `probability`."""
     drawn = uniform_draws(generator, (*x.shape[:2], 1), x)
     return torch.where(drawn < probability, _outside(x, x.shape[1], generator), x)
 
 
 def tear_off(x: Tensor, *, radius: float, probability: float, generator: Randomness) -> Tensor:
-    """Return positions where some worlds lose a flake, which is displaced far out in one piece.
+    """Return positions [B, N, D]; worlds lose a flake with `probability`.
 
-    Its particles perceive each other, and may drift on where a lone particle has learned to rest.
-    A flake is a ball around a random particle, of a random radius up to `radius` [length units]; a
-    world loses one with a probability.
+    A flake is a ball around a random particle, of a random radius up to `radius` [length units]. It
+    is thrown out of the world in one piece. Its particles perceive each other, and may drift on
+    where a lone particle has learned to rest.
     """
     centre = random_particle(x, generator)
     draws = uniform_draws(generator, (len(x), 2), x)
@@ -171,7 +171,7 @@ def tear_off(x: Tensor, *, radius: float, probability: float, generator: Randomn
 
 
 def _outside(x: Tensor, count: int, generator: Randomness) -> Tensor:
-    """Return random points for each world, from `NEAREST` to `FARTHEST`, [B, count, D]."""
+    """Return points at random distances, `NEAREST` to `FARTHEST`, from 0; [B, count, D]."""
     ball = uniform_ball(
         len(x), count, x.shape[2], 1.0, generator=generator, device=x.device, dtype=x.dtype
     )
@@ -185,7 +185,10 @@ _counting: ContextVar[Callable[[Tensor], Tensor] | None] = ContextVar("counting"
 
 @contextmanager
 def counted_together(mean: Callable[[Tensor], Tensor]) -> Iterator[None]:
-    """Let `escape_motion` in the block count particles of all processes, averaged by `mean`."""
+    """Within the block `escape_motion` divides by the count of particles that `mean` returns.
+
+    `mean` averages a count over all processes.
+    """
     before = _counting.set(mean)
     try:
         yield
@@ -194,10 +197,10 @@ def counted_together(mean: Callable[[Tensor], Tensor]) -> Iterator[None]:
 
 
 def escape_motion(x: Tensor, distances: Tensor) -> Tensor:
-    """Return the mean of the distances that particles outside of [-1, 1]^D have moved, shape [].
+    """Return the mean path length of the particles outside of [-1, 1]^D, shape [].
 
-    It is 0 where there are none. Within `counted_together` the mean of all processes' results is
-    the mean over the particles of all processes.
+    `distances` [B, N] are the path lengths. The mean of no particles is 0. Within
+    `counted_together` the mean of all processes' results is the mean over all their particles.
     """
     outside = (x.detach().abs().amax(dim=-1) > 1.0).to(x.dtype)
     count, mean = outside.sum(), _counting.get()
@@ -212,7 +215,7 @@ CHANCE = 0.25
 
 @dataclass(frozen=True, kw_only=True)
 class PoolDamage:
-    """Damage of worlds from the pool; a radius, gap or probability of 0: none of that kind."""
+    """Settings of damage in the training pool; a radius, gap or probability of 0 means none."""
 
     damage_radius: float = 0.0
     """Radius of the ball whose state is wiped in worlds from the pool [length units]; 0: none."""
@@ -242,11 +245,11 @@ class PoolDamage:
 
 
 def damage_pool(worlds: Particles, damage: PoolDamage, *, generator: Randomness) -> Particles:
-    """Return the worlds, damaged at random positions."""
+    """Return worlds after each kind of damage that the settings enable, at random positions."""
     x, s, *_ = worlds
 
     def chosen_worlds(probability: float) -> Tensor:
-        """Return 1 for worlds that are damaged, else 0, shape [B]."""
+        """Return for each world 1 with this probability, else 0, shape [B]."""
         return (uniform_draws(generator, (len(x), 1), x)[:, 0] < probability).to(x.dtype)
 
     if damage.damage_radius > 0.0:

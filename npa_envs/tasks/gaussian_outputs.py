@@ -35,15 +35,15 @@ class Gaussians(NamedTuple):
 
 
 def appearance(outputs: Tensor, sigma: float, anisotropy: float, opacity: float) -> Gaussians:
-    """Return the Gaussians of particles with outputs [B, N, K].
+    """Return the Gaussian that draws each particle, from K outputs of its rule.
 
-    20 outputs are those of a read-out: four are added to the quaternion (1, 0, 0, 0), three stretch
+    Of a read-out's 20 outputs four are added to the quaternion (1, 0, 0, 0), three stretch
     the axes, one changes the opacity, nine are coefficients of view-dependent colour, and the last
     three, plus 0.5, are the colour. With any other number of outputs particles are round, and the
     last three outputs, plus 0.5, are the colour.
 
     Args:
-        outputs: Outputs of the rule's read-out, or states (dimensionless).
+        outputs: Outputs of the read-out, or states (dimensionless), shape [B, N, K].
         sigma: Standard deviation of a round particle [length units].
         anisotropy: Largest |log(scale / sigma)| (dimensionless).
         opacity: Opacity of a particle whose output is 0, in (0, 1).

@@ -25,7 +25,7 @@ PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
 
 
 def named_targets(targets: Sequence[str]) -> dict[str, str]:
-    """Return name -> source for `load_target` of all targets; folders stand for their files."""
+    """Return the sources of all targets, for `load_target`, by name; folders give their files."""
     named: dict[str, str] = {}
     for target in targets:
         for source in _pictures_of(target):
@@ -54,9 +54,10 @@ def _pictures_of(target: str) -> list[str]:
 
 
 class ManyPictures(Morphogenesis2D):
-    """Morphogenesis of several targets by one rule; each world has a goal and a code.
+    """Morphogenesis of several targets by one rule; each world has one of the targets.
 
-    A world's goal is the index of its target in `names`. Particles are drawn equally large for all
+    A world's goal is the index of its target in `names`. The target's code, a learned vector, is in
+    the first state channels of its particles. Particles are drawn equally large for all
     targets, and pictures are scaled so that each target's density is about 1.
     """
 
@@ -90,7 +91,7 @@ class ManyPictures(Morphogenesis2D):
 
     @property
     def rule_shape(self) -> dict[str, Any]:
-        """Further arguments of `NPARule`: all but hidden width and ε0."""
+        """Arguments of `NPARule` in addition to hidden_dim and eps0."""
         config = self.config
         return super().rule_shape | {
             "state_dim": config.code_dim + config.state_dim,
@@ -102,7 +103,7 @@ class ManyPictures(Morphogenesis2D):
     def for_rule(self, rule: NPARule) -> Self:
         """Return the task whose worlds have the codes of a rule.
 
-        With an encoder they are computed now and at each call of `coded`.
+        With an encoder they are computed now and at each call of `with_target_code`.
         """
         if rule.codes is not None:
             with torch.no_grad():
@@ -112,7 +113,7 @@ class ManyPictures(Morphogenesis2D):
     def seed(
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
     ) -> Particles:
-        """Return fresh worlds with random goals and their codes."""
+        """Return fresh worlds with random goals; particles have the targets' codes."""
         x, s, *_ = super().seed(world_count, generator=generator, device=device)
         goal = drawn_indices(len(self.names), world_count, generator, torch.device(device))
         blank = s.new_zeros(*s.shape[:2], self.config.code_dim)
@@ -122,7 +123,7 @@ class ManyPictures(Morphogenesis2D):
         return Particles(x, s, goal=goal)
 
     def damage(self, worlds: Particles, generator: Randomness) -> Particles:
-        """Return the worlds, damaged, some with another goal."""
+        """Return worlds after random damage; some get another goal."""
         worlds = super().damage(worlds, generator)
         x, goal = worlds.x, worlds.goal
         if goal is None or self.config.switch_share == 0.0:
@@ -138,7 +139,7 @@ class ManyPictures(Morphogenesis2D):
         return replace_code(s, self._read_codes(self._codes).index_select(0, self.goal)[:, None])
 
     def _read_codes(self, codes: Codes) -> Tensor:
-        """Return the targets' codes, shape [T, K]; an encoder also writes them to the table."""
+        """Return the codes of T targets, shape [T, K]; an encoder also updates `codes.table`."""
         if codes.encoder is None:
             return codes.table
         read = codes.encode(self._target_pictures)
@@ -148,11 +149,11 @@ class ManyPictures(Morphogenesis2D):
 
     @property
     def target_picture(self) -> Tensor:
-        """Pictures of the worlds' targets: rgb sums and density, shape [B, R, R, 4]."""
+        """Picture of each world's target: sums of colours over splats, density; [B, R, R, 4]."""
         return self._target_pictures.index_select(0, self.goal)
 
     def picture(self, x: Tensor, s: Tensor, *, centred: bool = True) -> Tensor:
-        """Return each world's picture: colour sums and density, dimensionless, [B, R, R, 4].
+        """Return each world's picture: sums of colours over splats, density; [B, R, R, 4].
 
         Without goals, densities are scaled for a target of the mean size.
         """

@@ -165,7 +165,7 @@ UNOWNED = 0.05
 class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
     """The task of arXiv 2601.16096, section 4.1, with its loss.
 
-    `for_rule` binds the code that a rule of many pictures has for this target.
+    `for_rule` returns the task with the code of this target that a rule of many pictures has.
     """
 
     metric_name = "splat loss"
@@ -195,9 +195,9 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         self._target_picture = self._splat(points, colours)[0]
 
     def for_rule(self, rule: NPARule) -> Self:
-        """Return the task whose fresh worlds have the rule's code in front of the other states.
+        """Return the task whose worlds have the rule's code of the target in the first channels.
 
-        It is the code of the target's name, or else the encoder's code of its picture.
+        It is the stored code of the target's name, or else the encoder's code of its picture.
         """
         codes = rule.codes
         if codes is None:
@@ -211,8 +211,10 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
     def seed(
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
     ) -> Particles:
-        """Return fresh worlds; with `division` one particle lives, at the origin, and with
-        `equivariant` the first states have an axis."""
+        """Return fresh worlds; with `division` one particle lives, at the origin.
+
+        With `equivariant` the first states rise along an axis (`seed_axis`, `seed_across`).
+        """
         x, s, *_ = super().seed(world_count, generator=generator, device=device)
         config = self.config
         if config.division:
@@ -233,11 +235,11 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         return Particles(x, s)
 
     def with_target_code(self, s: Tensor) -> Tensor:
-        """Return states with the task's code, or unchanged where it has none."""
+        """Return states whose first channels hold the target's code, if the task has one."""
         return s if self._code is None else replace_code(s, self._code)
 
     def damage(self, worlds: Particles, generator: Randomness) -> Particles:
-        """Return the worlds, damaged; where particles divide, some die, but never all."""
+        """Return worlds after random damage; with `division` some particles die, never all."""
         if not (self.config.division and self.config.damage_radius > 0.0):
             return super().damage(worlds, generator)
         # Survivors are grown particles, among which newly divided ones must find their role.
@@ -249,15 +251,15 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         return damage_pool(worlds._replace(s=survivors), others, generator=generator)
 
     def picture(self, x: Tensor, s: Tensor, *, centred: bool = True) -> Tensor:
-        """Return each world's picture: colour sums and density, dimensionless, shape [B, R, R, 4].
+        """Return each world's picture: sums of colours over splats, density; [B, R, R, 4].
 
         Args:
-            centred: Move each world's mean to the target's, and turn worlds of an equivariant rule,
-                as the loss does.
+            centred: Move each world's mean to the target's, and rotate worlds of an equivariant
+                rule, as the loss does.
         """
         colour = s[..., -3:] + COLOUR_OFFSET
         if centred:
-            x = self._placed(x, s)
+            x = self._aligned(x, s)
         if not self.config.division:
             return self._splat(x, colour)
         x, life = torch.where(living(s)[..., None], x, FAR_AWAY), s[..., LIFE : LIFE + 1]
@@ -283,14 +285,14 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
     def splat_losses(self, x: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return each world's density loss and colour loss, dimensionless, shape [B] each.
 
-        They are the means of `splat_errors` over the pixels. Where neither gradients nor pictures
-        of several targets are needed, no picture is stored.
+        They are the means of `splat_errors` over the pixels. With one target and without
+        gradients no picture is stored.
         """
         with_gradient = torch.is_grad_enabled() and (x.requires_grad or s.requires_grad)
         if with_gradient or self.config.division or self.goal_count > 0:
             density, colour = self.splat_errors(x, s)
             return _pixel_mean(density), _pixel_mean(colour)
-        return self._picture_losses(turned(x, self.best_turn(x, s)) if self._turns else x, s)
+        return self._picture_losses(turned(x, self.best_turn(x, s)) if self._tries_angles else x, s)
 
     def metric(self, x: Tensor, s: Tensor) -> Tensor:
         """Return each world's splat loss: density + colour_weight x colour, shape [B]."""
@@ -305,7 +307,7 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
 
     @property
     def rule_shape(self) -> dict[str, Any]:
-        """Further arguments of `NPARule`: all but channels, hidden width and ε0."""
+        """Arguments of `NPARule` in addition to state_dim, hidden_dim and eps0."""
         config = self.config
         known: dict[str, Any] = {"divides": True} if config.division else {}
         if config.equivariant:
@@ -313,16 +315,17 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         return super().rule_shape | known
 
     def bounded(self, x: Tensor) -> Tensor:
-        """Return positions, or where worlds are turned, distances from the origin.
+        """Return the coordinates that the loss keeps in [-1, 1]: by default x itself.
 
-        The latter are relative to the circle that contains the target at every angle.
+        For worlds that are compared at their best angle they are the distances from the origin,
+        over the radius of the circle that contains the target at every angle.
         """
-        if not self._turns:
+        if not self._tries_angles:
             return x
         return x.square().sum(dim=-1, keepdim=True).add(1e-12).sqrt() / self._radius
 
     def penalties(self, worlds: Particles) -> dict[str, tuple[float, Tensor]]:
-        """Return terms of `GrowthTask`, and for the drift of centroids from the origin."""
+        """Return the penalties of `GrowthTask`, and of centroids' distances from the origin."""
         terms = super().penalties(worlds)
         if self.config.drift_weight > 0.0:
             drift = world_mean(worlds.x).square().sum(dim=-1).add(1e-12).sqrt().mean()
@@ -341,7 +344,7 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
             errors = density + self.config.colour_weight * colour
         blank = x.new_zeros(*x.shape[:2], 3).requires_grad_()
         with torch.enable_grad():
-            picture = self._splat(self._placed(x.detach(), s), blank)
+            picture = self._splat(self._aligned(x.detach(), s), blank)
             owned = errors / (picture[..., 3].detach() + UNOWNED)
             # The picture is linear in the colours: its gradient sums over a particle's splat.
             (pulled,) = torch.autograd.grad(picture[..., 0], blank, owned)
@@ -381,7 +384,7 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         return turns(angle, hand)[:, 0]
 
     def _picture_losses(self, x: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the density and colour losses of worlds without rotation, shape [B] each."""
+        """Return each world's density loss and colour loss at its present angle, shape [B] each."""
         return picture_losses(
             x,
             s,
@@ -393,13 +396,13 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         )
 
     @property
-    def _turns(self) -> bool:
-        """Whether worlds are compared at their best angles."""
+    def _tries_angles(self) -> bool:
+        """Whether worlds are compared with the target at their best angles."""
         return self.config.equivariant and self.config.angles > 0
 
-    def _placed(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return positions centred on the target, and rotated where worlds are."""
-        if self._turns:
+    def _aligned(self, x: Tensor, s: Tensor) -> Tensor:
+        """Return positions moved to the target's mean, and rotated if angles are tried."""
+        if self._tries_angles:
             x = turned(x, self.best_turn(x, s))
         return x - world_mean(x)[:, None] + self._target_mean.to(x)
 
@@ -414,7 +417,7 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
 
 
 def turns(angle: Tensor, hand: Tensor) -> Tensor:
-    """Return rotations by angles [rad], mirrored where `hand` is -1; shape [..., 2, 2]."""
+    """Return matrices of rotations by angles [rad], after a mirroring where `hand` is -1."""
     cos, sin = angle.cos(), angle.sin()
     return torch.stack((cos, -sin * hand, sin, cos * hand), dim=-1).view(*angle.shape, 2, 2)
 
@@ -484,7 +487,7 @@ MORPHOGENESIS2D_PRESETS = presets_of(
     # A few particles that see far; of two worlds one is young, one grown and at rest:
     # docs/recipes.md.
     fast=fast_run(
-        Morphogenesis2DConfig(
+        task=Morphogenesis2DConfig(
             target_point_count=512,
             particle_count=512,
             eps=0.2,
@@ -506,7 +509,7 @@ MORPHOGENESIS2D_PRESETS = presets_of(
         picture_interval=200,
     ),
     tiny=tiny_run(
-        Morphogenesis2DConfig(
+        task=Morphogenesis2DConfig(
             target="ring",
             target_point_count=128,
             particle_count=128,

@@ -28,9 +28,9 @@ from npa_envs.tasks.losses.image_distances import MultiScaleSimilarity
 from npa_envs.tasks.targets.views import (
     Views,
     ViewTarget,
+    composited,
     load_views,
     nearest_camera,
-    over,
     some_views,
 )
 from npa_envs.tasks.train_config import TrainConfig, fast_run, presets_of, tiny_run
@@ -132,8 +132,8 @@ GREY = 0.5
 class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
     """The task of arXiv 2601.16096 with its loss.
 
-    Without a rule, particles are round and the last three channels of their states are the colour;
-    `for_rule` returns the task that draws the outputs of the rule's read-out.
+    Particles are round, and the last three channels of their states are the colour. `for_rule`
+    returns the task that draws particles by the rule's read-out instead.
     """
 
     space_dim = 3
@@ -176,7 +176,7 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
         self._rule: NPARule | None = None
 
     def for_rule(self, rule: NPARule) -> Self:
-        """Return the task that draws the outputs of a rule's read-out; all else is shared."""
+        """Return the task that draws particles by a rule's read-out; the target is shared."""
         if rule.readout_dim not in (0, OUTPUTS):
             raise NPAError(
                 f"the rule must have a read-out of {OUTPUTS} outputs, or none, got readout_dim="
@@ -186,7 +186,7 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
 
     @property
     def rule_shape(self) -> dict[str, Any]:
-        """Further arguments of `NPARule`: all but channels, hidden width and ε0."""
+        """Arguments of `NPARule` in addition to state_dim, hidden_dim and eps0."""
         readout = {"readout_dim": OUTPUTS, "readout_hidden_dim": self.config.readout_hidden_dim}
         return super().rule_shape | readout
 
@@ -195,13 +195,13 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
         self.schedule.begin(iteration)
 
     def gaussians(self, s: Tensor) -> Gaussians:
-        """Return the Gaussians that particles are drawn as."""
+        """Return the 3D Gaussian that draws each particle, from states s."""
         outputs = s[..., -3:] if self._rule is None else self._rule.read_out(s)
         config = self.config
         return appearance(outputs, config.sigma, config.anisotropy, config.opacity)
 
     def views(self, x: Tensor, s: Tensor, cameras: Cameras) -> Tensor:
-        """Return pictures of V cameras: colours times alpha, and alpha, shape [B, V, H, W, 4]."""
+        """Return pictures by V cameras: colours times alpha, and alpha, shape [B, V, H, W, 4]."""
         return self._draw(x, self.gaussians(s), cameras)
 
     def picture(self, x: Tensor, s: Tensor) -> Tensor:
@@ -216,13 +216,13 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
         """Return each world's mean PSNR [dB] of held-out views on a white background, [B]."""
         held_out, white = self.target.held_out, x.new_ones(3)
         views, targets = self.views(x, s, held_out.cameras), held_out.pictures.to(x)
-        error = over(views, white).clamp(0.0, 1.0) - over(targets, white)
+        error = composited(views, white).clamp(0.0, 1.0) - composited(targets, white)
         return (-10.0 * error.square().mean(dim=(2, 3, 4)).log10()).mean(dim=1)
 
     def particle_contributions(self, x: Tensor, s: Tensor) -> Tensor:
         """Return each particle's contribution to its world's view loss, times N; [B, N].
 
-        See `contributions_to_loss`; amounts are the slope of the loss times the particle's opacity.
+        See `contributions_to_loss`; effects are derivatives by a factor on a particle's opacity.
         """
         with torch.enable_grad():
             gaussians = self.gaussians(s.detach())
@@ -232,7 +232,7 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
         return contributions_to_loss(loss.detach(), opacities.detach() * slope)
 
     def compare(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the batch's weighted loss of this iteration's views, and its terms; shape []."""
+        """Return the batch's weighted loss of the iteration's views, and terms by name, [] each."""
         config, schedule, x = self.config, self.schedule, worlds.x
         gaussians = self.gaussians(worlds.s)
         target = some_views(self.target.training, schedule.index)
@@ -257,7 +257,7 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
     ) -> dict[str, Tensor]:
         """Return each world's mean |difference| of colours and alpha, and 1 − MS-SSIM, [B] each."""
         drawn, pictures = (
-            torch.cat((over(views, background), views[..., 3:]), dim=-1)
+            torch.cat((composited(views, background), views[..., 3:]), dim=-1)
             for views in (self._draw(x, gaussians, target.cameras), target.pictures.to(x))
         )
         size = (drawn - pictures).abs()
@@ -274,7 +274,7 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
 
 
 class ViewSchedule:
-    """Views, backgrounds and blur of an iteration, on the device.
+    """Camera views, backgrounds and blur of the loss in an iteration, on the device.
 
     They depend on the seed and the iteration alone, and are always written to the same tensors.
     """
@@ -307,16 +307,16 @@ class ViewSchedule:
 def blurred(pictures: Tensor, sigma: Tensor) -> Tensor:
     """Return pictures [V, H, W, K] blurred by a Gaussian; outside of their edges they are 0.
 
-    `sigma` [pixels], shape [], is read on the device alone; 0 leaves pictures unchanged, bit for
-    bit.
+    `sigma` is the standard deviation [pixels], shape [], which stays on the device. With 0 pictures
+    are unchanged, bit for bit.
     """
-    rows, columns = (_weights(size, sigma, pictures) for size in pictures.shape[1:3])
+    rows, columns = (_blur_matrix(size, sigma, pictures) for size in pictures.shape[1:3])
     across = torch.einsum("xw,vhwk->vhxk", columns, pictures)
     return torch.einsum("yh,vhxk->vyxk", rows, across)
 
 
-def _weights(size: int, sigma: Tensor, like: Tensor) -> Tensor:
-    """Return the matrix of a blur along one side, [size, size]."""
+def _blur_matrix(size: int, sigma: Tensor, like: Tensor) -> Tensor:
+    """Return the matrix that blurs the pixels along one side, [size, size]."""
     far = torch.arange(-size, size + 1, device=like.device, dtype=like.dtype)
     pixel = far[size : 2 * size]
     variance = sigma.to(like).square().clamp_min(1e-6)
@@ -379,7 +379,7 @@ MORPHOGENESIS3D_PRESETS = presets_of(
     # Of two worlds one is young, one grown and at rest, so that what has grown stays:
     # docs/morphogenesis3d.md.
     fast=fast_run(
-        Morphogenesis3DConfig(
+        task=Morphogenesis3DConfig(
             particle_count=768,
             hidden_dim=64,
             readout_hidden_dim=32,
@@ -410,7 +410,7 @@ MORPHOGENESIS3D_PRESETS = presets_of(
         picture_interval=100,
     ),
     tiny=tiny_run(
-        Morphogenesis3DConfig(
+        task=Morphogenesis3DConfig(
             target="doughnut",
             particle_count=200,
             hidden_dim=32,

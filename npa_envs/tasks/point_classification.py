@@ -16,7 +16,7 @@ from npa_envs.ops import splat, world_mean
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Frame, ParticleTask, TaskConfig
 from npa_envs.tasks.seeds import drawn_indices, drawn_worlds
-from npa_envs.tasks.targets.digit_clouds import PointClouds, Split, load_clouds, varied
+from npa_envs.tasks.targets.digit_clouds import PointClouds, Split, augmented, load_clouds
 from npa_envs.tasks.train_config import TrainConfig, fast_run, presets_of, tiny_run
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness
@@ -151,7 +151,7 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
 
     @property
     def rule_shape(self) -> dict[str, Any]:
-        """Further arguments of `NPARule`: all but channels, hidden width and ε0."""
+        """Arguments of `NPARule` in addition to state_dim, hidden_dim and eps0."""
         sizes = {"readout_dim": self.config.class_count}
         sizes["readout_hidden_dim"] = self.config.readout_hidden_dim
         return {"alpha": 1.0, "static": True, **sizes}
@@ -178,11 +178,11 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         chosen = chosen.to(clouds.label.device)
         x, goal = clouds.x[chosen].to(device), clouds.label[chosen].to(device)
         if self.split == "train":
-            x = varied(x, config.rotation, config.stretch, config.jitter, generator)
+            x = augmented(x, config.rotation, config.stretch, config.jitter, generator)
         return Particles(x, x.new_zeros(*x.shape[:2], config.state_dim), goal=goal)
 
     def damage(self, worlds: Particles, generator: Randomness) -> Particles:
-        """Return the worlds, some with the positions and class of another cloud; states stay."""
+        """Return worlds, of which some get the positions and class of another cloud."""
         x, probability = worlds.x, self.config.mutated_share
         if worlds.goal is None or probability == 0.0:
             return worlds
@@ -201,24 +201,24 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         return outputs[..., -self.config.class_count :]
 
     def errors(self, s: Tensor) -> Tensor:
-        """Return each particle's mean squared error to the one-hot of its world's class, [B, N]."""
+        """Return each particle's mean of (class scores - one-hot of the world's class)², [B, N]."""
         outputs = self.outputs(s)
         classes = torch.arange(self.config.class_count, device=s.device)
         one_hot = (self.goal[:, None] == classes).to(outputs.dtype)
         return channel_mean((outputs - one_hot[:, None]).square())
 
     def mistakes(self, s: Tensor) -> Tensor:
-        """Return 1 for particles whose largest class score is of a wrong class, else 0, [B, N]."""
+        """Return 1 for particles that score a wrong class highest, else 0, shape [B, N]."""
         return (self.outputs(s).argmax(dim=-1) != self.goal[:, None]).to(s.dtype)
 
     def cross_entropies(self, s: Tensor, sharpness: float) -> Tensor:
-        """Return each particle's cross-entropy of softmax(sharpness × outputs), [B, N]."""
+        """Return each particle's cross-entropy of softmax(sharpness × scores), [B, N]."""
         log_probabilities = torch.log_softmax(sharpness * self.outputs(s), dim=-1)
         label = self.goal[:, None, None].expand(*s.shape[:2], 1)
         return -log_probabilities.gather(-1, label).squeeze(-1)
 
     def metric(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return each world's mean squared error of class scores to the one-hot class, [B]."""
+        """Return each world's mean of (class scores - one-hot of its class)², shape [B]."""
         return world_mean(self.errors(s)[..., None])[:, 0]
 
     def trial_metric(self, worlds: Particles) -> Tensor:
@@ -226,21 +226,21 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         return self.mistakes(worlds.s).mean(1)
 
     def colours(self, s: Tensor) -> Tensor:
-        """Return each particle's colour, by its class; [B, N, 3]."""
+        """Return the colour of each particle's best class, shape [B, N, 3]."""
         return class_colours(self.outputs(s))
 
     def overflows(self, s: Tensor) -> Tensor:
-        """Return each particle's mean |s − clip(s, −1, 1)|, [B, N]."""
+        """Return each particle's mean |s − clip(s, −1, 1)| over channels, shape [B, N]."""
         return channel_mean((s - s.clamp(-1.0, 1.0)).abs())
 
     def compare(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the batch's mean squared error, and the terms "error" and "accuracy"; shape []."""
+        """Return the batch's mean squared error, and by name "error" and "accuracy", [] each."""
         error = self.errors(worlds.s).mean()
         accuracy = 1.0 - self.mistakes(worlds.s.detach()).mean()
         return error, {"error": error, "accuracy": accuracy}
 
     def picture(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return each world's picture, coloured by class: colour sums, density, [B, R, R, 4]."""
+        """Return pictures coloured by class: sums of colours over splats, density, [B, R, R, 4]."""
         return splat(
             x,
             self.colours(s),
@@ -278,9 +278,10 @@ UNDECIDED = (0.6, 0.6, 0.6)
 
 
 def majority(outputs: Tensor) -> Tensor:
-    """Return the majority class of each world's particles, int64, shape [B].
+    """Return the class that most particles of a world score highest, int64, shape [B].
 
-    Of several with equally many votes it is the one with the largest sum of scores.
+    `outputs` are scores [B, N, K]. Of classes with as many particles it is the one with the
+    largest sum of scores.
     """
     particle_count, class_count = outputs.shape[1:]
     classes = torch.arange(class_count, device=outputs.device)
@@ -292,7 +293,7 @@ def majority(outputs: Tensor) -> Tensor:
 
 
 def class_colours(outputs: Tensor) -> Tensor:
-    """Return each particle's colour, by its class, greyer the lower the score; [B, N, 3]."""
+    """Return the colour of each particle's best class, greyer the lower its score; [B, N, 3]."""
     rows = [PALETTE[k % len(PALETTE)] for k in range(outputs.shape[-1])]
     sure, chosen = outputs.max(-1, keepdim=True)
     sure = sure.clamp(0.0, 1.0)
@@ -307,7 +308,7 @@ def class_colours(outputs: Tensor) -> Tensor:
 
 
 def channel_mean(values: Tensor) -> Tensor:
-    """Return the mean over the last dimension, the same bits in every batch, [...]."""
+    """Return the mean over the last dimension, bit for bit the same in every batch."""
     # One by one: the rounding of torch's mean may depend on the batch.
     total, *rest = values.unbind(-1)
     for term in rest:
@@ -332,7 +333,7 @@ POINT_CLASSIFICATION_PRESETS = presets_of(
     ),
     # Of clouds never seen 91 % are classified rightly, after some four minutes on one core.
     fast=fast_run(
-        PointClassificationConfig(
+        task=PointClassificationConfig(
             stretch=0.1,
             mutated_share=0.25,
             particle_count=128,
@@ -352,7 +353,7 @@ POINT_CLASSIFICATION_PRESETS = presets_of(
         checkpoint_interval=300,
     ),
     tiny=tiny_run(
-        PointClassificationConfig(
+        task=PointClassificationConfig(
             particle_count=64,
             hidden_dim=32,
             readout_hidden_dim=32,

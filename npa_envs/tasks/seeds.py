@@ -73,11 +73,8 @@ def uniform_box(
     sides = [checked_finite("a side of box", side, " [length units]") for side in values]
     _check_points(world_count * particle_count * len(sides), dtype)
     check_generator(generator, device, world_count)
-    if isinstance(generator, WorldRandom):
-        fraction = generator.uniform(particle_count, len(sides), dtype=dtype)
-    else:
-        shape = (world_count, particle_count, len(sides))
-        fraction = torch.rand(shape, generator=generator, device=device, dtype=dtype)
+    like = torch.empty(0, device=device, dtype=dtype)
+    fraction = uniform_draws(generator, (world_count, particle_count, len(sides)), like)
     return torch.stack([side * (fraction[..., d] - 0.5) for d, side in enumerate(sides)], dim=-1)
 
 
@@ -91,7 +88,7 @@ def drawn_indices(
 
 
 def drawn_worlds(x: Tensor, generator: Randomness, probability: float) -> Tensor:
-    """Return a random bool for each world, True with a probability, shape [B]."""
+    """Return a random bool for each world, True with `probability`, shape [B]."""
     single = x.new_empty(0, dtype=torch.float32)
     return uniform_draws(generator, (len(x), 1), single)[:, 0] < probability
 
@@ -109,7 +106,7 @@ def _check_points(number_count: int, dtype: torch.dtype) -> None:
 def _unit_ball_by_world(
     generator: WorldRandom, particle_count: int, space_dim: int, dtype: torch.dtype
 ) -> Tensor:
-    """Return points uniform in the unit ball, the same bits on every device and in every batch."""
+    """Return points uniform in the unit ball, [B, N, D], same bits on every device and batch."""
     direction = generator.normal(particle_count, space_dim, dtype=dtype)
     squares = direction * direction
     length = sum(squares.unbind(dim=-1), torch.zeros_like(squares[..., 0])).sqrt()

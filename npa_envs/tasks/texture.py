@@ -66,8 +66,8 @@ class TextureConfig(TaskConfig):
     """Perception radius ε [length units]; the rule is trained at it, so it is also its ε0."""
 
     see_across: bool = False
-    """Raise ε to twice the median gap between neighbouring things of the target, at most to 0.3, so
-    that particles of one thing perceive the next."""
+    """Raise ε to twice the median gap between neighbouring objects of the target, at most to 0.3,
+    so that particles of one object perceive the next."""
 
     alpha: float = 0.5
     """Largest displacement in one step, as a fraction of ε (dimensionless)."""
@@ -173,7 +173,7 @@ class Texture(ParticleTask[TextureConfig]):
 
     @property
     def rule_shape(self) -> dict[str, Any]:
-        """Further arguments of `NPARule`: all but channels, hidden width and ε0."""
+        """Arguments of `NPARule` in addition to state_dim, hidden_dim and eps0."""
         return {"alpha": self.config.alpha}
 
     def places(self, world_count: int, generator: Randomness, device: torch.device) -> Tensor:
@@ -182,7 +182,7 @@ class Texture(ParticleTask[TextureConfig]):
         return uniform_box(world_count, count, self.box, generator=generator, device=device)
 
     def damage(self, worlds: Particles, generator: Randomness) -> Particles:
-        """Return the worlds with the states in a disk around one random particle set to zero."""
+        """Return worlds whose states in a disk around one random particle are set to zero."""
         if self.config.damage_radius == 0.0:
             return worlds
         x, s, *_ = worlds
@@ -190,11 +190,11 @@ class Texture(ParticleTask[TextureConfig]):
         return worlds._replace(s=wipe_state(x, s, centre=centre, radius=radius, box=self.box))
 
     def picture(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return the picture of each world: colour sums and density, shape [B, R, R, 4]."""
+        """Return each world's picture: sums of colours over splats, density; [B, R, R, 4]."""
         return self.splat(x, s[..., -3:] + COLOUR_OFFSET)
 
     def drawing(self, number: int, *, shifted: bool = True) -> Tensor:
-        """Return the target drawn by particles on a jittered lattice, shape [1, R, R, 4].
+        """Return a picture of the target by splats on a jittered lattice, shape [1, R, R, 4].
 
         `number` seeds the jitter. `shifted` also translates it at random across the periodic box.
         """
@@ -215,7 +215,7 @@ class Texture(ParticleTask[TextureConfig]):
 
     @cached_property
     def drawable(self) -> Tensor:
-        """The target as sharp as particles can draw it: a mean of drawings, [R, R, 4]."""
+        """The target as sharp as splats can draw it: a mean of `drawing`s, shape [R, R, 4]."""
         drawn = [self.drawing(number, shifted=False) for number in range(DRAWINGS)]
         return torch.cat(drawn).mean(0)
 
@@ -229,19 +229,19 @@ class Texture(ParticleTask[TextureConfig]):
         return self.compare_pictures(self.picture(x - x[:, :1].detach(), s))
 
     def weights(self) -> tuple[float, float]:
-        """Return weights of the two `texture_losses`; 1 for a joint loss, which includes them."""
+        """Return the weights of `texture_losses`; 1 for a joint loss, which contains them."""
         if is_joint(self.config.loss):
             return 1.0, 1.0
         return self.config.colour_weight, self.config.density_weight
 
     def metric(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return each world's texture loss, colour and density weighted, shape [B]."""
+        """Return each world's weighted sum of `texture_losses`, shape [B]."""
         return self.weighted(*self.texture_losses(x, s))
 
     def particle_contributions(self, x: Tensor, s: Tensor) -> Tensor:
         """Return each particle's contribution to its world's texture loss, times N; [B, N].
 
-        See `contributions_to_loss`; amounts are the slope of the loss times the particle's splat.
+        See `contributions_to_loss`; effects are derivatives by a factor on a particle's splat.
         """
         x, s = x.detach(), s.detach()
         x = x - x[:, :1]
@@ -257,17 +257,16 @@ class Texture(ParticleTask[TextureConfig]):
             by_density[..., 0] = slope[..., 3]
             (density,) = torch.autograd.grad(drawn, blank, by_density)
         red, green, blue = ((s[..., -3:] + COLOUR_OFFSET) * pulled).unbind(dim=-1)
-        amounts = red + green + blue + density[..., 0]
-        return contributions_to_loss(loss.detach(), amounts)
+        return contributions_to_loss(loss.detach(), red + green + blue + density[..., 0])
 
     def compare(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the batch's weighted texture loss, and its terms, each of shape []."""
+        """Return the batch's weighted texture loss, and its terms by name, [] each."""
         losses = self.texture_losses(worlds.x, worlds.s)
         colour, density = (term.mean() for term in losses)
         return self.weighted(colour, density), {"colour": colour, "density": density}
 
     def penalties(self, worlds: Particles) -> dict[str, tuple[float, Tensor]]:
-        """Return terms for motion and for states outside of [-1, 1]."""
+        """Return penalties of motion and of states outside of [-1, 1]."""
         motion = self.config.motion_weight, distances_moved(worlds).mean()
         return {"motion": motion, **super().penalties(worlds)}
 
@@ -285,7 +284,7 @@ class Texture(ParticleTask[TextureConfig]):
         )
 
     def compare_pictures(self, picture: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the losses of pictures' colours and densities, [B] each."""
+        """Return the losses of pictures' [B, R, R, 4] colours and densities, [B] each."""
         compare_colours, compare_densities = self._losses
         channels = picture.movedim(-1, 1)
         if compare_densities is None:
@@ -296,7 +295,10 @@ class Texture(ParticleTask[TextureConfig]):
         return compare_colours(colour_image(channels)), compare_densities(density)
 
     def joint_image(self, channels: Tensor) -> Tensor:
-        """Return colours and powers of densities, times roots of weights, [..., 4, R, R]."""
+        """Return the image that joint losses compare, [..., 4, R, R], from sums and density.
+
+        It has colours and density^0.5, each times the square root of its weight.
+        """
         density = (channels[..., 3:, :, :] + DENSITY_FLOOR) ** JOINT_POWER
         colour_scale = self.config.colour_weight**0.5
         density_scale = self.config.density_weight**0.5
@@ -323,7 +325,7 @@ class Texture(ParticleTask[TextureConfig]):
 
 
 def colour_image(channels: Tensor) -> Tensor:
-    """Return the colours that losses compare, [..., 3, R, R]: means where particles overlap."""
+    """Return the colours that losses compare, [..., 3, R, R]: means where splats overlap."""
     sums, density = channels[..., :3, :, :], channels[..., 3:, :, :]
     return sums / density.clamp_min(1.0)
 
@@ -379,7 +381,9 @@ TEXTURE_PRESETS = presets_of(
         tensorboard=False,
     ),
     tiny=tiny_run(
-        TextureConfig(target="dots", particle_count=256, hidden_dim=32, eps=0.3, resolution=24),
+        task=TextureConfig(
+            target="dots", particle_count=256, hidden_dim=32, eps=0.3, resolution=24
+        ),
         steps=(8, 16),
         seed_interval=4,
     ),

@@ -52,7 +52,7 @@ class TrainConfig(Generic[TaskConfigT]):
     """A training run: the schedule, the pool, the optimiser, the machine, what is written.
 
     The defaults are the paper's for 2D morphogenesis (arXiv 2601.16096). Fields of the task lie
-    in `task`; `npa_envs.training.override` and configuration files take both kinds by plain name.
+    in `task`; `npa_envs.training.override` and configuration files accept both by name.
     """
 
     task: TaskConfigT
@@ -236,7 +236,7 @@ class TrainConfig(Generic[TaskConfigT]):
 
     @property
     def ages(self) -> bool:
-        """Whether worlds of the pool have lifetimes."""
+        """Whether worlds of the pool have lifetimes (`max_age_range`)."""
         return self.max_age_range[1] > 0
 
     @property
@@ -246,7 +246,7 @@ class TrainConfig(Generic[TaskConfigT]):
 
     @property
     def fresh_count(self) -> int:
-        """Fresh seeds in a batch that has any."""
+        """Number of fresh worlds in a batch that gets some (`seed_interval`)."""
         return max(1, round(self.fresh_share * self.world_count))
 
     @property
@@ -256,15 +256,15 @@ class TrainConfig(Generic[TaskConfigT]):
 
     @property
     def torch_dtype(self) -> torch.dtype:
-        """`dtype` as torch's own."""
+        """The torch.dtype of the name `dtype`."""
         return torch.float64 if self.dtype == "float64" else torch.float32
 
     def learning_rate_at(self, iteration: int, elapsed: float = 0.0) -> float:
         """Return the learning rate of an iteration, counted from 0 over all repeats.
 
         A resumed run needs no scheduler state. Each repeat restarts it: steps at the milestones, or
-        a short linear rise and a cosine (Loshchilov and Hutter, arXiv 1608.03983). The cosine is at
-        least at the fraction `elapsed` of its way, also in earlier iterations.
+        a short linear rise and a cosine (Loshchilov and Hutter, arXiv 1608.03983). `elapsed` is
+        the least progress along the cosine, from 0 to 1, also in earlier iterations.
         """
         within = iteration % self.iterations
         if self.schedule == "milestones":
@@ -309,31 +309,26 @@ def _is_pair(value: object, kind: Callable[[object], bool]) -> bool:
 
 
 SMALL: Mapping[str, Any] = {"repeats": 1, "world_count": 2, "tensorboard": False}
-FAST = {**SMALL, "learning_rate": 2e-3, "checkpoint_interval": 200}
-TINY = {
+
+fast_run = partial(TrainConfig, **SMALL, learning_rate=2e-3, checkpoint_interval=200)
+"""Makes the settings of a run of a few minutes on one core, from its task and other fields."""
+
+tiny_run = partial(
+    TrainConfig,
     **SMALL,
-    "iterations": 60,
-    "pool_size": 8,
-    "learning_rate": 5e-3,
-    "milestones": (45,),
-    "log_interval": 1,
-    "picture_interval": 20,
-    "checkpoint_interval": 20,
-}
-
-
-def fast_run(task: TaskConfigT, **fields: Any) -> TrainConfig[TaskConfigT]:
-    """Return a run of a few minutes on one core."""
-    return TrainConfig(task=task, **{**FAST, **fields})
-
-
-def tiny_run(task: TaskConfigT, **fields: Any) -> TrainConfig[TaskConfigT]:
-    """Return a run of a few seconds, for tests."""
-    return TrainConfig(task=task, **{**TINY, **fields})
+    iterations=60,
+    pool_size=8,
+    learning_rate=5e-3,
+    milestones=(45,),
+    log_interval=1,
+    picture_interval=20,
+    checkpoint_interval=20,
+)
+"""Makes the settings of a run of a few seconds, for tests, from its task and other fields."""
 
 
 def presets_of(
     task_name: str, **runs: TrainConfig[TaskConfigT]
 ) -> Mapping[str, TrainConfig[TaskConfigT]]:
-    """Return the presets of a task, each with the task's folder of runs."""
+    """Return the presets of a task, each of which writes to runs/<task_name>."""
     return {name: replace(run, out=Path("runs") / task_name) for name, run in runs.items()}

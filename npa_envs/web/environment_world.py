@@ -24,7 +24,7 @@ from npa_envs.world.particles import Particles
 def make_environment(
     id: str, policy: str = "zero", *, device: str = "cpu", **keywords: Any
 ) -> tuple[Any, Callable[[Any], Any]]:
-    """Return an environment of this package, and a policy for it.
+    """Return an environment of this package, and a function from its observations to actions.
 
     `policy` is "zero", "random", or the source of a rule. Keywords that are None keep their
     defaults.
@@ -67,7 +67,7 @@ class EnvironmentWorld(LiveWorld):
         self.reset(self.seed)
 
     def _begin(self, seed: int | None) -> None:
-        """Start an episode."""
+        """Start an episode; `seed` as for `reset` of the environment."""
         super()._begin(seed)
         self._observation, info = self._env.reset(seed=seed)
         self._episode += 1
@@ -81,7 +81,7 @@ class EnvironmentWorld(LiveWorld):
         return box
 
     def describe(self) -> dict[str, Any]:
-        """Return the event "world"."""
+        """Return the event "world", which describes the environment's world to the page."""
         task = self._inner.task
         return super().describe() | {
             "title": self._env.spec.id if self._env.spec is not None else type(self._env).__name__,
@@ -123,7 +123,7 @@ class EnvironmentWorld(LiveWorld):
 
     @property
     def particles(self) -> Particles:
-        """The environment's particles, as a batch of one; settable."""
+        """The environment's particles, as a batch of one world; settable."""
         x, s = self._inner.particles()
         return Particles(x[None], s[None])
 

@@ -63,10 +63,10 @@ EXPORT = re.compile(r"^export (?=(?:async )?(?:function|class|const) (\w+))", re
 
 
 def joined_modules(name: str) -> str:
-    """Return a module of the page and all that it imports as one script without imports.
+    """Return one script with a module of the page and all that it imports.
 
     Each module becomes a function that runs once, after those that it imports, so that its names
-    stay its own. `modules` of the script has their exports by file name.
+    stay local. The script's constant `modules` has their exports by file name.
     """
     functions: dict[str, str] = {}
 
@@ -143,7 +143,7 @@ def export_web(
 
 
 def distinct_names(sources: Sequence[str], what: str) -> list[str]:
-    """Return rules' names; raise NPAError if two are equal. `what` is the output in its message."""
+    """Return the names of rules; raise NPAError if two are equal. `what` begins its message."""
     names = [name_of(source) for source in sources]
     if not names or len(set(names)) < len(names):
         raise NPAError(
@@ -154,7 +154,7 @@ def distinct_names(sources: Sequence[str], what: str) -> list[str]:
 
 
 def page_rule(source: str, *, particle_count: int | None = None) -> dict[str, Any]:
-    """Return a rule and its world for page_world.js, as JSON; arrays are float32 in base64."""
+    """Return a rule and its world as JSON for page_world.js, with arrays as float32 in base64."""
     check_browser_rule(load_rule(source), name_of(source))
     live = RuleWorld(source, device=torch.device("cpu"), particle_count=particle_count, choices={})
     rule, task = live.main.rule, live.task
@@ -189,7 +189,7 @@ def page_rule(source: str, *, particle_count: int | None = None) -> dict[str, An
 
 
 def check_browser_rule(rule: NPARule, name: str) -> None:
-    """Raise an `NPAError` if the JavaScript of the page cannot run a rule."""
+    """Raise NPAError if the page's JavaScript cannot run a rule."""
     check_rule(rule)
     view = "watch it with npa-envs view"
     cls, species, size = type(rule).__name__, rule.species_count, rule.weight_count
@@ -234,7 +234,10 @@ def page_text(
     seed: int = 0,
     previews: Mapping[str, str] | None = None,
 ) -> str:
-    """Return the HTML of a page of rules, each as `page_rule` returns it; `previews` by name."""
+    """Return the HTML of a page that runs rules, each as `page_rule` returns it.
+
+    `previews` are data URLs of pictures to choose from, by the names of the rules.
+    """
     settings = {
         "seed": seed,
         "ramp": base64.b64encode(colour_ramp().tobytes()).decode(),
@@ -271,7 +274,7 @@ def page_text(
 
 
 def _gallery(title: str, previews: Mapping[str, str]) -> str:
-    """Return the HTML of pictures to choose from."""
+    """Return the HTML of the pictures from which a rule is chosen."""
     links = "\n".join(
         f'<li><a href="#{quote(name, safe="")}"><img src="{picture}" alt="">'
         f"<span>{html.escape(name)}</span></a></li>"

@@ -56,7 +56,7 @@ TOOLS = {
 
 
 class WorldView(NamedTuple):
-    """A frame of a world."""
+    """What a page shows of a world at one step."""
 
     step: int
     """Steps from the seed."""
@@ -71,7 +71,7 @@ class WorldView(NamedTuple):
 
 
 class Range(NamedTuple):
-    """The range of a setting."""
+    """The allowed values of a setting, and the scale of its slider."""
 
     low: float
     high: float
@@ -106,7 +106,7 @@ class LiveWorld(ABC):
         self._events: list[dict[str, Any]] = []
 
     def describe(self) -> dict[str, Any]:
-        """Return the event "world"."""
+        """Return the event "world", which describes the world to the page."""
         return {
             "type": "world",
             "tools": [tool for tool, need in TOOLS.items() if need in self._allowed()],
@@ -122,7 +122,7 @@ class LiveWorld(ABC):
         }
 
     def handle(self, message: Mapping[str, Any]) -> bool:
-        """Apply a message, and return whether `describe` has changed; raises NPAError."""
+        """Apply a message of the page; return whether `describe` returns something else now."""
         action = message.get("type") if isinstance(message, Mapping) else None
         match action:
             case "play":
@@ -152,7 +152,7 @@ class LiveWorld(ABC):
 
     @torch.no_grad()
     def frame(self) -> WorldView:
-        """Return the present frame."""
+        """Return what the page shows now."""
         world = self._coloured()
         colours = self._colouring(self.show, world)
         loss = self._loss() if self._loss_wanted else None
@@ -160,7 +160,7 @@ class LiveWorld(ABC):
         return WorldView(self.step, positions, colours, self._milliseconds, loss)
 
     def take_events(self) -> list[dict[str, Any]]:
-        """Return the other events since the last call: curves, errors, changed descriptions."""
+        """Return the events since the last call: curves, errors, changed descriptions."""
         events, self._events = self._events, []
         return events
 
@@ -168,12 +168,12 @@ class LiveWorld(ABC):
         """Release the world's resources."""
 
     def reset(self, seed: int | None) -> None:
-        """Start a fresh world; `None`: of the next seed."""
+        """Start a fresh world from a seed; None: from the next one."""
         self.seed = self.seed + 1 if seed is None else seed
         self._begin(self.seed)
 
     def _begin(self, seed: int | None) -> None:
-        """Start a fresh world; `None`: of any seed."""
+        """Start a fresh world from a seed; None: from any one."""
         self.step, self._milliseconds = 0, 0.0
         self._travelled: Tensor | None = None
         self._updated: Tensor | None = None
@@ -194,7 +194,7 @@ class LiveWorld(ABC):
 
     @abstractmethod
     def _allowed(self) -> set[str]:
-        """Return what brushes may do in this world: some of the values of `TOOLS`."""
+        """Return what brushes may change in this world: some of the values of `TOOLS`."""
 
     @abstractmethod
     def _shows(self) -> list[str]: ...
@@ -204,7 +204,7 @@ class LiveWorld(ABC):
         self.particles = self.particles._replace(x=x, s=s)
 
     def _brush(self, touch: Touch) -> bool:
-        """Apply a brush, and return whether `describe` has changed."""
+        """Apply a brush; return whether `describe` returns something else now."""
         self.particles = brushed(self.particles, touch, self.box)
         return False
 
@@ -224,7 +224,7 @@ class LiveWorld(ABC):
         return bool(name != "loss")
 
     def _ranges(self) -> dict[str, Range]:
-        """Return the ranges of the settings, by the name of the attribute."""
+        """Return the allowed values of the settings, by name; attributes have the same names."""
         return {"speed": Range(1, MAX_STEPS, "log", whole=True)}
 
     def _run_timed(self, steps: int) -> None:
@@ -236,7 +236,7 @@ class LiveWorld(ABC):
 
 
 class Touch(NamedTuple):
-    """The brush of a message."""
+    """One use of a brush, from a message of the page."""
 
     tool: str
     at: Tensor
@@ -252,11 +252,11 @@ class Touch(NamedTuple):
     view: Tensor | None
     """In 3D the unit vector towards the viewer, shape [1, D], or None."""
     rule: Any
-    """What the message says as the name of another rule."""
+    """Name of another rule in the message, unchecked."""
 
     @classmethod
     def read(cls, message: Mapping[str, Any], x: Tensor) -> Touch:
-        """Parse the brush of a message for a world with positions x [1, N, D]."""
+        """Return the brush of a message to a world with positions x [1, N, D]."""
         name = message.get("tool")
         if not isinstance(name, str) or name not in TOOLS:
             raise NPAError(f"unknown tool {shown(name)}: {suggest(name, TOOLS)}")
@@ -274,7 +274,7 @@ class Touch(NamedTuple):
 
 
 def brushed(particles: Particles, touch: Touch, box: tuple[float, ...] | None) -> Particles:
-    """Return particles after pull, clump, cut or inject, which keep their number."""
+    """Return particles after the brush pull, clump, cut or inject."""
     x, s, *_ = particles
     disk: dict[str, Any] = {"radius": touch.radius, "box": box}
     match touch.tool:
@@ -301,7 +301,7 @@ def brushed(particles: Particles, touch: Touch, box: tuple[float, ...] | None) -
 
 
 def _normal(touch: Touch) -> Tensor:
-    """Return the normal of a cut along the movement [1, D]; in 3D the cut contains `view`."""
+    """Return the normal [1, D] of a cut along `touch.move` and, in 3D, along `touch.view`."""
     move, view = touch.move, touch.view
     if move.shape[1] == 2:
         return torch.stack((-move[:, 1], move[:, 0]), dim=1)
@@ -347,7 +347,7 @@ BALANCE = 0.9
 
 
 class ColouredWorld(NamedTuple):
-    """A world whose particles are coloured."""
+    """What `Colouring` needs of a world."""
 
     x: Tensor
     s: Tensor
@@ -366,14 +366,14 @@ class ColouredWorld(NamedTuple):
 
 
 class Colouring:
-    """Computes the particles' colours of one world, frame by frame."""
+    """Computes the colours of one world's particles, frame by frame."""
 
     def __init__(self) -> None:
         self._covariance: Tensor | None = None
         self._basis: Tensor | None = None
 
     def __call__(self, show: str, world: ColouredWorld) -> NDArray[np.uint8]:
-        """Return red, green and blue of each particle, uint8, [N, 3]; `show`: one of `shows_of`."""
+        """Return particles' colours, uint8, shape [N, 3]; `show` is one of `shows_of`."""
         if world.x.shape[1] == 0:
             return np.zeros((0, 3), dtype=np.uint8)
         match show.split():
@@ -427,7 +427,7 @@ class Colouring:
 
 
 def shows_of(state_dim: int, *, species: bool = True) -> list[str]:
-    """Return the choices of `Colouring` for particles with `state_dim` state channels."""
+    """Return all values of `show` for particles with `state_dim` state channels."""
     shows = SHOWS if species else ("colours", "density", "components", "speed")
     return [*shows, *(f"state {k}" for k in range(state_dim))]
 
@@ -447,14 +447,14 @@ def species_colours(count: int) -> NDArray[np.uint8]:
 
 
 def _or_zeros(values: Tensor | None, world: ColouredWorld) -> Tensor:
-    """Return `values` of the last step [N], or zeros if there are none."""
+    """Return a value of each particle from the last step [N]; zeros if there are none."""
     if values is None or values.shape[1] != world.x.shape[1]:
         return torch.zeros(world.x.shape[1], device=world.x.device)
     return values[0]
 
 
 def colour_ramp() -> NDArray[np.uint8]:
-    """Return the colours of densities and speeds from low to high, uint8, shape [entries, 3]."""
+    """Return the colours of densities and speeds from low to high, uint8, shape [K, 3]."""
     table = ramp(DARK)
     # The darkest colours are invisible on a dark background.
     return table[len(table) // 6 :]

@@ -16,7 +16,7 @@ from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.rule.files import load_rule, rule_file, rule_metadata, shipped_rules
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Task
-from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2DConfig
+from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2DConfig, together
 from npa_envs.tasks.damage import DAMAGE_SIZES, damage_worlds
 from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.tasks.train_config import TrainConfig
@@ -26,7 +26,7 @@ from npa_envs.training.task_table import load_config, preset
 from npa_envs.web.live_world import ColouredWorld, Colouring, LiveWorld, Range, Touch, shows_of
 from npa_envs.world.brushes import inside_ball, wipe_state
 from npa_envs.world.division import living
-from npa_envs.world.particles import Particles, combined
+from npa_envs.world.particles import Particles
 from npa_envs.world.rollout import at_rest, rollout
 from npa_envs.world.species import AGREEMENTS, rollout_species
 
@@ -55,11 +55,13 @@ POLL_SECONDS = 1.0
 
 @dataclass
 class LiveRule:
-    """A float32 rule in the world, with the number of its particles."""
+    """A rule that runs some of the world's particles."""
 
     name: str
     rule: NPARule
+    """The rule in float32."""
     count: int = 0
+    """Number of its particles."""
     divisor: float = 0.0
     """Number by which its densities are divided."""
 
@@ -104,7 +106,7 @@ class RuleWorld(LiveWorld):
         )
 
     def _plant(self, name: Any, particle_count: int | None = None) -> None:
-        """Start a fresh world of a rule with the task that it was trained on."""
+        """Choose a rule with the task that it was trained on, and start a fresh world."""
         main = self._live_rule(name)
         self.trained = self._trained(main.name, particle_count)
         self.main = main
@@ -116,7 +118,7 @@ class RuleWorld(LiveWorld):
 
     @torch.no_grad()
     def _begin(self, seed: int | None) -> None:
-        """Start a fresh world in which all particles follow the chosen rule."""
+        """Start a fresh world whose particles all follow the chosen rule."""
         super()._begin(seed)
         self._generator = torch.Generator(self._device).manual_seed(self.seed)
         seed_world = self.task.seed(1, generator=self._generator, device=self._device)
@@ -136,7 +138,7 @@ class RuleWorld(LiveWorld):
 
     @property
     def counts(self) -> list[int]:
-        """Particles of each rule, rule after rule."""
+        """Number of particles of each rule, in the order of `live_rules`."""
         return [live_rule.count for live_rule in self.live_rules]
 
     @property
@@ -145,7 +147,7 @@ class RuleWorld(LiveWorld):
         return self.task.box
 
     def describe(self) -> dict[str, Any]:
-        """Return the event "world"."""
+        """Return the event "world", which describes the world to the page."""
         frame = self.task.frame
         return super().describe() | {
             "title": self.main.name,
@@ -162,7 +164,7 @@ class RuleWorld(LiveWorld):
         }
 
     def handle(self, message: Mapping[str, Any]) -> bool:
-        """Apply a message, and return whether `describe` has changed; raises NPAError."""
+        """Apply a message of the page; return whether `describe` returns something else now."""
         self._resting = False
         return super().handle(message)
 
@@ -175,7 +177,7 @@ class RuleWorld(LiveWorld):
         return allowed
 
     def _may_join(self, name: str) -> bool:
-        """Return whether particles of another rule can be put into this world."""
+        """Return whether particles of this rule can be put into the world."""
         main = self.main.rule
         try:
             other = self._live_rule(name).rule
@@ -252,7 +254,7 @@ class RuleWorld(LiveWorld):
         return species == [(self.count, self.count)]
 
     def _rollout(self, steps: int, options: Mapping[str, Any]) -> Tensor:
-        """Run steps and return the path length of each particle."""
+        """Run steps and return particles' path lengths [length units], shape [1, N]."""
         rules = [live_rule.rule for live_rule in self.live_rules]
         x, s, *_ = self.particles
         if self._is_unchanged():
@@ -289,7 +291,7 @@ class RuleWorld(LiveWorld):
         return torch.cat([live_rule.rule.colour(states) for live_rule, states in groups], dim=1)
 
     def _loss(self) -> float | None:
-        """Return the metric, or None where it has no meaning, or too early (`LOSS_FRACTION`)."""
+        """Return the task's metric; None if it does not fit the world, or is not due yet."""
         start = time.perf_counter()
         comparable = self.trained.doubt is None and len(self.live_rules) == 1
         if not comparable or not self.counts[0] or start < self._loss_due:
@@ -347,15 +349,15 @@ class RuleWorld(LiveWorld):
         # A new species divides densities by its own number of particles, as in a world alone.
         index = self._species_index(live_rule, float(count))
         species = torch.nn.functional.pad(self._species(), (0, count), value=index)
-        self._arrange(_joined([self.particles, fresh]), species)
+        self._arrange(together([self.particles, fresh]), species)
 
     def _all_coded(self, s: Tensor) -> Tensor:
-        """Return states of all particles, each with the code of its species."""
+        """Return states [1, N, C] of all particles with the target codes of their rules."""
         groups = zip(self.live_rules, s.split_with_sizes(self.counts, dim=1), strict=True)
         return torch.cat([self._coded(live_rule, states) for live_rule, states in groups], dim=1)
 
     def _coded(self, live_rule: LiveRule, s: Tensor) -> Tensor:
-        """Return states of a species with its rule's code, if it has one."""
+        """Return states of particles with the target code of their rule, if it has codes."""
         if live_rule.rule.codes is None:
             return s
         is_main = live_rule.name == self.main.name
@@ -372,7 +374,7 @@ class RuleWorld(LiveWorld):
         return live_rule
 
     def _species_index(self, live_rule: LiveRule, divisor: float) -> int:
-        """Return the index of a rule's species; a rule that is new in the world is appended."""
+        """Return a rule's index in `live_rules`; a new rule is appended, with this divisor."""
         names = [present.name for present in self.live_rules]
         if live_rule.name not in names:
             names.append(live_rule.name)
@@ -380,12 +382,12 @@ class RuleWorld(LiveWorld):
         return names.index(live_rule.name)
 
     def _species(self) -> Tensor:
-        """Return the species index of each particle, int64, shape [N]."""
+        """Return the index of each particle's rule in `live_rules`, int64, shape [N]."""
         indices = torch.arange(len(self.counts))
         return indices.repeat_interleave(torch.tensor(self.counts)).to(self._device)
 
     def _arrange(self, particles: Particles, species: Tensor) -> None:
-        """Set the world's particles, sorted by species."""
+        """Replace the world's particles, sorted by the index of their rule."""
         order = species.argsort(stable=True)
         if not torch.equal(order, torch.arange(self.particles.x.shape[1], device=order.device)):
             # The page's tracers follow particles by their index.
@@ -399,17 +401,12 @@ class RuleWorld(LiveWorld):
 
 
 def _taken(particles: Particles, indices: Tensor) -> Particles:
-    """Return some particles of every world, by indices or a mask, shape [N]."""
+    """Return the particles that indices or a mask [N] select."""
     return particles.map(lambda value: value[:, indices])
 
 
-def _joined(worlds: Sequence[Particles]) -> Particles:
-    """Return the particles of several worlds as one world."""
-    return combined(functools.partial(torch.cat, dim=1), worlds)
-
-
 def name_of(source: str) -> str:
-    """Return the name of a rule: that of its file, or of the run's folder for rule.safetensors."""
+    """Return a rule's name: of its file, or of the run's folder for rule.safetensors."""
     if "#" in source:
         return source.rpartition("#")[2]
     path = rule_file(source)
@@ -417,7 +414,7 @@ def name_of(source: str) -> str:
 
 
 class RunWorld(RuleWorld):
-    """A world of the rules of a run, which are replaced by those of each new checkpoint."""
+    """A world of the rules of a training run, which are replaced at each new checkpoint."""
 
     def __init__(
         self,
@@ -464,7 +461,7 @@ class RunWorld(RuleWorld):
             worlds.append(world._replace(goal=None))
             # As in training, each species divides densities by its own number of particles.
             live_rule.count = live_rule.divisor = world.x.shape[1]
-        self.particles = _joined(worlds)
+        self.particles = together(worlds)
         self.count = sum(self.counts)
 
     def describe(self) -> dict[str, Any]:
@@ -483,7 +480,7 @@ class RunWorld(RuleWorld):
         return ranges
 
     def take_events(self) -> list[dict[str, Any]]:
-        """Return the other events since the last call, also the run's new losses and rules."""
+        """Return the events since the last call, also of the run's new losses and rules."""
         if time.monotonic() >= self._poll_due:
             self._poll_due = time.monotonic() + POLL_SECONDS
             try:
@@ -550,7 +547,7 @@ class RunWorld(RuleWorld):
         self._goals = goals
 
     def _goal_choices(self) -> list[Any]:
-        """Return each file's task name and configuration, to notice that a run's task changed."""
+        """Return the task's name and configuration of each rule's file; they tell another run."""
         goals: list[Any] = []
         for path in self._files.values():
             metadata = rule_metadata(path)
@@ -560,7 +557,7 @@ class RunWorld(RuleWorld):
 
 
 def _version(path: Path) -> tuple[int, ...] | None:
-    """Return what changes whenever a file is written, or None where there is none."""
+    """Return numbers that change when a file is written, or None if there is no file."""
     try:
         status = path.stat()
     except FileNotFoundError:
@@ -569,7 +566,7 @@ def _version(path: Path) -> tuple[int, ...] | None:
 
 
 def rules_of_run(folder: RunFolder) -> list[Path]:
-    """Return the file of a run's rule, or the files of all rules that it trains together."""
+    """Return the files of all rules that a run trains."""
     path = str(folder.path)
     if not folder.path.is_dir():
         raise NPAError(f"a run must be a folder, got {shown(path)}: name the one given as --out")

@@ -92,7 +92,7 @@ SECURITY = {
 
 
 class Site:
-    """Worlds, address and token of a server.
+    """What a server serves: its worlds, address and token.
 
     Args:
         make_world: Makes the world of a page, in the thread that runs it.
@@ -159,12 +159,12 @@ def make_app(site: Site) -> Starlette:
         return FileResponse(PAGE / "index.html")
 
     async def page_file(request: Request) -> Response:
-        return _file(PAGE, request, {".js": "text/javascript", ".css": "text/css"})
+        return _file_response(PAGE, request, {".js": "text/javascript", ".css": "text/css"})
 
     async def film(request: Request) -> Response:
         if not site.allows_token(request.query_params.get("token")):
             return _refused("films need the token of the page")
-        return _file(site.films, request, {".gif": "image/gif", ".mp4": "video/mp4"})
+        return _file_response(site.films, request, {".gif": "image/gif", ".mp4": "video/mp4"})
 
     async def connect(page: WebSocket) -> None:
         host, origin = page.headers.get("host", ""), page.headers.get("origin")
@@ -199,8 +199,8 @@ def make_app(site: Site) -> Starlette:
     return Starlette(routes=routes, middleware=[Middleware(BaseHTTPMiddleware, dispatch=guard)])
 
 
-def _file(folder: Path, request: Request, media_types: Mapping[str, str]) -> Response:
-    """Return the response with a file directly in a folder, or 404."""
+def _file_response(folder: Path, request: Request, media_types: Mapping[str, str]) -> Response:
+    """Return the response with the requested file of a folder, or 404."""
     path = folder / request.path_params["name"]
     with contextlib.suppress(OSError, ValueError):  # Invalid file names.
         if path.parent == folder and path.suffix in media_types and path.is_file():
@@ -213,7 +213,7 @@ def _refused(reason: str) -> Response:
 
 
 def frame_bytes(frame: WorldView) -> bytes:
-    """Return the bytes of a frame: header, positions, colours."""
+    """Return a frame as bytes: header, positions, colours."""
     count, dimension = frame.positions.shape
     loss = float("nan") if frame.loss is None else frame.loss
     header = HEADER.pack(frame.step, count, dimension, frame.milliseconds, loss)
@@ -222,7 +222,7 @@ def frame_bytes(frame: WorldView) -> bytes:
 
 
 class ViewerSession:
-    """One page's socket, and a thread with its world.
+    """The connection with one page, and a thread that runs its world.
 
     The world waits for a slow or hidden page: at most `FRAMES_AHEAD` frames are not drawn yet.
     """
@@ -351,7 +351,7 @@ class ViewerSession:
             changed = False
 
     def _apply_messages(self, world: LiveWorld, *, wait: bool) -> bool:
-        """Apply messages; return whether there were any."""
+        """Apply the page's messages; return whether there were any. `wait`: for the first one."""
         taken = False
         while not self._stopped.is_set():
             try:
@@ -418,7 +418,7 @@ def picture_of(data: bytes) -> NDArray[np.uint8]:
 
 
 def write_film(pictures: Sequence[bytes], folder: Path) -> Iterator[Path]:
-    """Write JPEG pictures as GIF and as MP4; yield each file once it is written."""
+    """Write JPEG pictures as a GIF and as an MP4; yield each file when it is written."""
     if not pictures:
         raise NPAError("the film has no pictures: let the world move while it records")
     # Random, as several films may end within the same second.
@@ -465,7 +465,7 @@ def open_port(host: str, port: int | None) -> socket.socket:
 
 
 def address_of(site: Site, listener: socket.socket) -> str:
-    """Return the link to the page."""
+    """Return the URL of the page."""
     port = listener.getsockname()[1]
     # For a server on all addresses, the link names this computer.
     name = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(site.host, site.host)

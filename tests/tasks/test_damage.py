@@ -185,7 +185,9 @@ def test_damage_is_as_its_formula_says_and_continues_across_the_edges_of_a_box(
 def wiped_in_the_viewer():
     world = RuleWorld("dots", device=torch.device("cpu"), particle_count=300)
     world.particles.s.fill_(1.0)
-    world.particles.x[:] = nearest_image(0.3 * torch.rand(1, 300, 2, generator=seeded(1)) + 0.85, (2.0, 2.0))
+    world.particles.x[:] = nearest_image(
+        0.3 * torch.rand(1, 300, 2, generator=seeded(1)) + 0.85, (2.0, 2.0)
+    )
     world.handle({"type": "damage", "name": "wipe"})
     return world.particles.x, world.particles.s, 0.2
 

@@ -8,11 +8,11 @@ from small_digits import COUNTS, idx, pictures, write_idx
 from npa_envs.errors import NPAError
 from npa_envs.tasks.targets.digit_clouds import (
     _farthest_points,
+    augmented,
     load_clouds,
     load_pictures,
     read_idx,
     sample_ink,
-    varied,
 )
 
 
@@ -138,7 +138,7 @@ def test_a_cloud_does_not_depend_on_the_others_nor_on_the_device(device, monkeyp
 
 def test_turned_clouds_keep_their_distances_and_their_middle():
     x = torch.rand(40, 9, 2, dtype=torch.float64)
-    turned = varied(x, 30.0, 0.0, 0.0, torch.Generator().manual_seed(1))
+    turned = augmented(x, 30.0, 0.0, 0.0, torch.Generator().manual_seed(1))
     torch.testing.assert_close(torch.cdist(turned, turned), torch.cdist(x, x))
     torch.testing.assert_close((turned - 0.5).norm(dim=-1), (x - 0.5).norm(dim=-1))
     angles = [torch.atan2(*(cloud - 0.5)[:, 0].T.flip(0)) for cloud in (turned, x)]
@@ -150,7 +150,7 @@ def test_turned_clouds_keep_their_distances_and_their_middle():
 def test_stretched_clouds_are_linear_and_shaken_ones_are_off_by_a_little():
     x = torch.rand(200, 3, 2, dtype=torch.float64)
     generator = torch.Generator().manual_seed(1)
-    stretched = varied(x, rotation=0.0, stretch=0.2, jitter=0.0, generator=generator) - 0.5
+    stretched = augmented(x, rotation=0.0, stretch=0.2, jitter=0.0, generator=generator) - 0.5
     maps = torch.linalg.lstsq(x - 0.5, stretched).solution.mT
     torch.testing.assert_close(torch.einsum("bij,bnj->bni", maps, x - 0.5), stretched)
     off = maps - torch.eye(2)
@@ -158,6 +158,6 @@ def test_stretched_clouds_are_linear_and_shaken_ones_are_off_by_a_little():
     assert off[:, 1, 0].abs().max() < 1e-9
     for i, j in ((0, 0), (1, 1), (0, 1)):
         assert off[:, i, j].abs().max() > 0.18
-    shaken = varied(x, rotation=0.0, stretch=0.0, jitter=0.01, generator=generator) - x
+    shaken = augmented(x, rotation=0.0, stretch=0.0, jitter=0.01, generator=generator) - x
     # 1200 numbers: the standard deviation is within 10 % but for one case in a million.
     assert shaken.std() == pytest.approx(0.01, rel=0.1)

@@ -15,7 +15,7 @@ from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.gaussian_outputs import FLAT, OUTPUTS, appearance
 from npa_envs.tasks.morphogenesis3d import Morphogenesis3D, Morphogenesis3DConfig
 from npa_envs.tasks.targets.meshes import AMBIENT, LIGHT, load_mesh
-from npa_envs.tasks.targets.views import ANGLE, DISTANCE, load_views, over, some_views
+from npa_envs.tasks.targets.views import ANGLE, DISTANCE, composited, load_views, some_views
 from npa_envs.world.particles import Particles
 
 WORLD = {"target": "doughnut", "particle_count": 150, "eps": 0.3, "sigma": 0.1, "opacity": 0.5}
@@ -159,7 +159,7 @@ def test_loss_sees_the_views_of_its_iteration_before_their_backgrounds(task):
     error = 0.0
     for view in range(2):
         back = schedule.backgrounds[view]
-        colours = over(drawn[:, view], back) - over(chosen.pictures[view], back)
+        colours = composited(drawn[:, view], back) - composited(chosen.pictures[view], back)
         alpha = drawn[:, view, ..., 3:] - chosen.pictures[view, ..., 3:]
         error += float(torch.cat((colours, alpha), dim=-1).abs().mean()) / 2
     assert float(parts["views"]) == pytest.approx(error, rel=1e-5)

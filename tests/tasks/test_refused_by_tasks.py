@@ -99,7 +99,10 @@ def many(*targets, **fields):
         (lambda: random_particle(X.long()), r"x must be float32 or float64, got torch\.int64"),
         (lambda: wipe_state(X, S[:, :3], **AT), "x and s must agree in worlds and particles"),
         (lambda: wipe_state(X, S, centre=PLACE[0], radius=0.1), r"= \(2, 2\), got \(2,\)"),
-        (lambda: wipe_state(X, S, centre=PLACE.double(), radius=0.1), r"centre and x must share dtype"),
+        (
+            lambda: wipe_state(X, S, centre=PLACE.double(), radius=0.1),
+            r"centre and x must share dtype",
+        ),
         (lambda: wipe_state(X, S, centre=PLACE, radius=PLACE[0, :1]), r"or a tensor of .* \[B\]"),
         (lambda: cut(X, S, centre=PLACE, normal=torch.zeros(2, 3), gap=0.1), "normal must have"),
         *(

@@ -26,7 +26,7 @@ def pair(**fields):
 def run_config(out, **fields):
     usual = {"iterations": 4, "pool_size": 6, "steps": (4, 8), "milestones": (), "out": out}
     usual |= {"seed_interval": 2, "picture_interval": 2, "checkpoint_interval": 2}
-    return tiny_run(pair(), **usual | fields)
+    return tiny_run(task=pair(), **usual | fields)
 
 
 @pytest.fixture(scope="module")

@@ -123,7 +123,8 @@ def test_solid_and_still_worlds_live_in_a_page(exported, name):
         pytest.importorskip("sklearn")
     page = exported(name, particle_count=None, previews=True, query=f"#{name}", steps=3)
     count = {"duck": 8192, "digits": 512}[name]
-    text = page.run("document.getElementById('step').textContent")
+    # It is written four times a second.
+    text = page.wait("document.getElementById('step').textContent")
     assert re.fullmatch(rf"step \d+ · {count} particles", text)
 
 

@@ -38,7 +38,7 @@ class LossOptions:
 
 
 class TextureDistance:
-    """Base class of distances between images and a target, shape [K, R, R]."""
+    """Base class of distances between images and a target of K channels, shape [K, R, R]."""
 
     same_in_every_batch: bool = False
     """Whether `compare` returns the same for an image, bit for bit, in every batch."""
@@ -52,9 +52,9 @@ class TextureDistance:
         self._shape = tuple(target.shape)
 
     def __call__(self, images: Tensor) -> Tensor:
-        """Return the distance of each image [B, K, R, R] (dimensionless), [B]; differentiable.
+        """Return the distance of images [B, K, R, R] from the target (dimensionless), [B].
 
-        Without gradient no result depends on the batch.
+        It is differentiable. Without gradient it is the same, bit for bit, in every batch.
         """
         if images.ndim != 4 or tuple(images.shape[1:]) != self._shape:
             raise NPAError(
@@ -67,12 +67,12 @@ class TextureDistance:
         return torch.cat([self.compare(image[None]) for image in images])
 
     def compare(self, images: Tensor) -> Tensor:
-        """Return the distance of each of some checked images, [B]."""
+        """Return the distance of images [B, K, R, R] from the target, [B]."""
         raise NotImplementedError
 
 
 def level_count(resolution: int) -> int:
-    """Return the number of image sizes to compare at a resolution."""
+    """Return at how many sizes images of a resolution [pixels] are compared."""
     count = 1
     while count < LEVELS and resolution % 2 == 0 and resolution // 2 >= MIN_SIDE:
         resolution //= 2
@@ -92,12 +92,15 @@ def pyramid(images: Tensor, count: int) -> list[Tensor]:
 
 
 def stride_of(level: Tensor, thinned: bool) -> int:
-    """Return the stride in pixels between compared positions; 1 unless `thinned`."""
+    """Return the distance [pixels] between an image's compared positions; 1 unless `thinned`."""
     return max(1, level.shape[-1] // POSITIONS) if thinned else 1
 
 
 def patches(images: Tensor, size: int, *, stride: int, wrap: bool) -> Tensor:
-    """Return square patches of images as rows, [B, M, K size²]; `wrap`: also across edges."""
+    """Return the M square patches of each image as rows, [B, M, K size²].
+
+    `wrap`: opposite edges of an image are connected.
+    """
     if wrap:
         half = size // 2
         images = torch.cat((images[:, :, -half:], images, images[:, :, :half]), dim=2)
@@ -107,10 +110,10 @@ def patches(images: Tensor, size: int, *, stride: int, wrap: bool) -> Tensor:
 
 
 def products(rows: Tensor, weights: Tensor) -> Tensor:
-    """Return the rows of each image times weights, shape [B, M, F].
+    """Return the matrix product of rows [B, M, E] and weights [E, F], shape [B, M, F].
 
-    Image by image and aligned in memory: otherwise rounding may depend on the batch. Rows [B, M, E]
-    are contiguous.
+    It is computed image by image, from aligned memory: otherwise rounding may depend on the batch.
+    Rows must be contiguous.
     """
     weights = weights.to(rows)
     tables = [one if one.data_ptr() % ALIGNMENT == 0 else one.clone() for one in rows]
@@ -125,7 +128,7 @@ def orthogonal(size: int, count: int, generator: torch.Generator) -> Tensor:
 
 
 def quantiles(values: Tensor, count: int) -> Tensor:
-    """Return `count` evenly spaced quantiles of each row of values [F, M], in rising order."""
+    """Return evenly spaced quantiles of each row of values [F, M], rising, shape [F, count]."""
     ordered = values.sort(dim=1).values
     total = ordered.shape[1]
     if total == count:
@@ -172,7 +175,7 @@ class PatchTransport(TextureDistance):
             self._scales.append(1.0 / (spread + EVEN))
 
     def compare(self, images: Tensor) -> Tensor:
-        """Return the distance of each of some checked images, [B]."""
+        """Return the distance of images [B, K, R, R] from the target, [B]."""
         total = images.new_zeros(len(images))
         levels = pyramid(images, len(self._expected))
         for level, expected, scale in zip(levels, self._expected, self._scales, strict=True):
@@ -183,7 +186,7 @@ class PatchTransport(TextureDistance):
 
 
 def _matched(rows: Tensor, expected: Tensor) -> Tensor:
-    """Return the larger mean squared distance to nearest patches, of both directions; shape [B]."""
+    """Return the mean squared distance to the nearest patch, the larger of both directions, [B]."""
     with torch.no_grad():
         squares = rows.square().sum(2)[:, :, None] + expected.square().sum(1)
         costs = squares - 2.0 * (rows @ expected.T)
@@ -223,9 +226,9 @@ FLOOR = 1e-4
 class MultiScaleSimilarity:
     """MS-SSIM of pictures in [0, 1].
 
-    Windows and halving are matrix products from both sides, which is fast for tens of pictures.
-    Similarities are multiplied by their logarithms: the derivative of torch's product synchronises,
-    and is not finite where a similarity is 0.
+    Windowed means and smaller sizes are computed by matrix products, which are fast for tens of
+    pictures. Logarithms of similarities are added up: the derivative of torch's product
+    synchronises, and is not finite where a similarity is 0.
     """
 
     def __init__(self, resolution: int, *, device: str | torch.device = "cpu") -> None:
@@ -257,7 +260,7 @@ class MultiScaleSimilarity:
 
 
 def _similarity(pictures: Tensor, target: Tensor, window: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the SSIM of pictures at one size, and its factor of contrast and structure."""
+    """Return the SSIM at one size, and its factor of contrast and structure, [...] each."""
     mean, square, product = _from_both_sides(
         torch.stack((pictures, pictures.square(), pictures * target)), window
     )
@@ -271,12 +274,12 @@ def _similarity(pictures: Tensor, target: Tensor, window: Tensor) -> tuple[Tenso
 
 
 def _from_both_sides(pictures: Tensor, matrix: Tensor) -> Tensor:
-    """Return the transpose of matrixᵀ picture matrix for each picture."""
+    """Return (matrixᵀ picture matrix)ᵀ for each picture."""
     return (pictures @ matrix).mT @ matrix
 
 
 def _window(size: int) -> Tensor:
-    """Return the window's weights at each position along a side, [size, positions]."""
+    """Return the weights of pixels in the window at each position along a side, in columns."""
     width = min(WINDOW, size - 1 + size % 2)
     offset = torch.arange(width, dtype=torch.float64) - width // 2
     weights = torch.exp(-0.5 * (offset * (WINDOW / (SPREAD * width))) ** 2)

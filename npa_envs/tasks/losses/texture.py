@@ -45,7 +45,7 @@ same, bit for bit, in every batch (of `vgg_ot`: without gradient)."""
 
 @dataclass(frozen=True)
 class LossEntry:
-    """A row of `TEXTURE_LOSSES`."""
+    """A texture loss of the table `TEXTURE_LOSSES`."""
 
     summary: str
     """One line for lists."""
@@ -58,7 +58,7 @@ class LossEntry:
 
 
 def check_loss_name(name: str) -> None:
-    """Check that a name, or every name joined by "+", is of a texture loss."""
+    """Raise NPAError unless `name` is a texture loss, or joint ones with "+" between them."""
     names = name.split("+") if isinstance(name, str) else [name]
     for one in names:
         if not isinstance(one, str) or one not in TEXTURE_LOSSES:
@@ -77,9 +77,10 @@ def is_joint(name: str) -> bool:
 def make_texture_loss(
     name: str, target: Tensor, options: LossOptions = DEFAULT_OPTIONS
 ) -> TextureLoss:
-    """Return the loss against a target [K, R, R]: colours (K = 3), density (1) or both (4).
+    """Return a function from images to their texture loss against a target [K, R, R].
 
-    Names of joint losses that are joined by "+" give their sum.
+    The target has colours (K = 3), a density (1) or both (4). Names of joint losses with "+"
+    between them give their sum.
     """
     check_loss_name(name)
     if not isinstance(target, Tensor):
@@ -123,9 +124,9 @@ class SlicedWasserstein(TextureDistance):
     between their distributions, divided by the target's variance; sizes are summed.
 
     Args:
-        describe: Class of a descriptor, which returns the features at each position of images,
-            [B, M, F] for each size. With `wrap` opposite edges meet, else positions near them are
-            left out; `thinned`: at most `POSITIONS` along each side.
+        describe: Class of a descriptor. This maps images to F features at M positions, [B, M, F]
+            for each size. With `wrap` opposite edges are connected, else positions near them are
+            left out. With `thinned` there are at most `POSITIONS` along each side.
     """
 
     same_in_every_batch = True
@@ -147,7 +148,7 @@ class SlicedWasserstein(TextureDistance):
             self._scales = [1.0 / (each[0].var(0).mean() + FLOOR) for each in described]
 
     def compare(self, images: Tensor) -> Tensor:
-        """Return the distance of each of some checked images, [B]."""
+        """Return the distance of images [B, K, R, R] from the target, [B]."""
         described = self.descriptor(images, wrap=True, thinned=True)
         total = images.new_zeros(len(images))
         for features, expected, scale in zip(described, self._quantiles, self._scales, strict=True):
@@ -159,7 +160,7 @@ class SlicedWasserstein(TextureDistance):
 
 
 class PatchDescriptor:
-    """Square patches of all channels, projected on random directions.
+    """Features of images: square patches of all channels, projected on random directions.
 
     The directions are an orthonormal basis of the space of patches.
     """
@@ -182,7 +183,7 @@ class PatchDescriptor:
 
 
 class FilterDescriptor:
-    """Two layers of random filters with rectifiers between them.
+    """Features of images: two layers of random filters with rectifiers between them.
 
     Filters of the first layer sum to zero, but for one mean filter for each channel; those of the
     second layer are random projections of patches of the first layer's features.
@@ -308,7 +309,7 @@ class VGGTransport(TextureDistance):
         return features
 
     def compare(self, images: Tensor) -> Tensor:
-        """Return the distance of each of some checked images, [B]."""
+        """Return the distance of images [B, K, R, R] from the target, [B]."""
         total = images.new_zeros(len(images))
         for actual, target in zip(self.features(images, wrap=True), self._expected, strict=True):
             expected = target.to(actual)
@@ -317,10 +318,10 @@ class VGGTransport(TextureDistance):
 
 
 def relaxed_transport(first: Tensor, second: Tensor) -> Tensor:
-    """Return the relaxed earth mover's distance of rows under the cosine distance, shape [B].
+    """Return the relaxed earth mover's distance of two sets of feature vectors, shape [B].
 
-    Every row moves to the nearest row of the other side. The larger of both directions' mean costs
-    is returned; each is a lower bound of the cost of transport.
+    Every vector (a row) moves to the one of the other set with the least cosine distance. The
+    larger mean cost of both directions is returned; each is a lower bound of transport's cost.
     """
     costs = 1.0 - _directions(first) @ _directions(second).transpose(1, 2)
     there, back = costs.amin(dim=2).mean(dim=1), costs.amin(dim=1).mean(dim=1)
@@ -328,7 +329,7 @@ def relaxed_transport(first: Tensor, second: Tensor) -> Tensor:
 
 
 def moment_distance(first: Tensor, second: Tensor) -> Tensor:
-    """Return the mean absolute differences of means and of covariances, added, shape [B]."""
+    """Return the mean absolute difference of features' means, plus that of covariances, [B]."""
     (mean, covariance), (other_mean, other_covariance) = _moments(first), _moments(second)
     difference = (mean - other_mean).abs().mean(dim=(1, 2))
     return difference + (covariance - other_covariance).abs().mean(dim=(1, 2))

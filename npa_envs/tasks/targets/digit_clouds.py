@@ -72,7 +72,7 @@ def load_clouds(
     sample_seed: int = 0,
     device: torch.device,
 ) -> PointClouds:
-    """Return all clouds of a data set, from a cache."""
+    """Return a cloud of `particle_count` points for each picture of a data set; cached."""
     pictures = load_pictures(data, split, folder=folder)
     x, area = sample_ink(pictures.ink, particle_count, sample_seed=sample_seed, device=device)
     height, width = pictures.ink.shape[1:]
@@ -87,11 +87,12 @@ def sample_ink(
     sample_seed: int = 0,
     device: str | torch.device = "cpu",
 ) -> tuple[Tensor, float]:
-    """Return farthest-point samples of the ink of pictures, and the mean fraction that has ink.
+    """Return farthest-point samples [M, N, 2] of the ink of M pictures [M, H, W].
 
-    Candidates are one random position in each cell of a grid, where the picture, enlarged
-    bilinearly, has ink; the grid is refined until there are enough. Positions, [M, N, 2], lie in
-    [0, 1]² [length units], where the longer side is 1; they are the same on every device.
+    The second result is the fraction of pixels with ink, averaged over the pictures. Candidates are
+    one random position in each cell of a grid, where the picture, enlarged bilinearly, has ink; the
+    grid is refined until there are enough. Positions lie in [0, 1]² [length units], where the
+    longer side is 1; they are the same on every device.
     """
     darkest = ink.max((1, 2))
     if (darkest <= 0).any():
@@ -132,7 +133,7 @@ def sample_ink(
 def _grid_points(
     side: int, shape: tuple[int, ...], random: torch.Generator
 ) -> tuple[Tensor, Tensor]:
-    """Return the cells of a grid in random order, and a random point in each."""
+    """Return the indices of a grid's cells in random order, and a random point in each."""
     height, width = shape
     longer = max(height, width)
     order = torch.randperm(side * side, generator=random)
@@ -144,7 +145,7 @@ def _grid_points(
 
 
 def _first(has_ink: Tensor, most: int) -> Tensor:
-    """Return the indices of the first `most` True entries of each row, [M, most], padded with 0."""
+    """Return the indices of the first `most` True values of each row, [M, most], padded with 0."""
     # Entries are in random order, so the first ones are a fair choice.
     slot = (has_ink.cumsum(1) - 1).where(has_ink, most).clamp(max=most)
     index = torch.arange(has_ink.shape[1]).expand_as(slot)
@@ -152,7 +153,7 @@ def _first(has_ink: Tensor, most: int) -> Tensor:
 
 
 def _farthest_points(candidates: Tensor, counts: Tensor, particle_count: int) -> Tensor:
-    """Return points chosen one by one, each the farthest from those before, [M, N, 2]."""
+    """Return N of the first `counts` candidates, each farthest from those before, [M, N, 2]."""
     across, up = candidates.unbind(-1)
     valid = torch.arange(across.shape[1], device=across.device) < counts[:, None]
     # Invalid candidates are never the farthest, even after all valid ones are chosen.
@@ -169,10 +170,10 @@ def _farthest_points(candidates: Tensor, counts: Tensor, particle_count: int) ->
     return candidates.gather(1, index)
 
 
-def varied(
+def augmented(
     x: Tensor, rotation: float, stretch: float, jitter: float, generator: Randomness
 ) -> Tensor:
-    """Return clouds with random rotation, stretch, shear (around (0.5, 0.5)) and noise."""
+    """Return clouds [B, N, 2] after random rotation, stretch, shear around (0.5, 0.5), noise."""
     world_count, particle_count = x.shape[:2]
     if rotation > 0.0 or stretch > 0.0:
         draws = 2.0 * uniform_draws(generator, (world_count, 4), x) - 1.0
@@ -251,7 +252,7 @@ def load_pictures(data: str, split: Split = "train", *, folder: str = "data") ->
 
 
 def read_idx(path: Path) -> NDArray[np.uint8]:
-    """Return the bytes of a file in MNIST's IDX format, gzipped or not, in their shape."""
+    """Return the array in a file of MNIST's IDX format, gzipped or not."""
     name = f"the IDX file {shown(str(path))}"
     with open_regular(path, limit=MAX_IDX, what="the IDX file") as file:
         try:

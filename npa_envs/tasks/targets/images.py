@@ -113,7 +113,7 @@ def _too_large(name: str, got: str) -> str:
 
 
 def looks_like_path(source: str) -> bool:
-    """Return whether text has a folder or suffix in it, or is the path of an existing file."""
+    """Return whether text has a folder or a suffix, or is the path of an existing file."""
     if "/" in source or "\\" in source or Path(source).suffix:
         return True
     return os.path.exists(source)
@@ -228,7 +228,7 @@ def resample(image: Image.Image, point_count: int, *, label: str = "picture") ->
 
 
 def _margin(image: Image.Image, pitch: float) -> int:
-    """Return the width of the border that sampling needs: two pixels of the grid."""
+    """Return the width [pixels] of the transparent border that resampling needs."""
     return 2 + math.ceil(min(0.5 * max(image.size) + 4 * pitch, 2.0 * max(image.size) + 2.0))
 
 

@@ -70,7 +70,7 @@ def builtin_meshes() -> tuple[str, ...]:
 
 
 def load_mesh(source: str | Path) -> Mesh:
-    """Return a built-in mesh or that of a file, scaled into a ball of radius 0.85."""
+    """Return a built-in mesh or the mesh in a file, scaled into a ball of radius 0.85."""
     if isinstance(source, str) and source in MESHES:
         with np.load(MESHES[source]) as file:
             return Mesh(file["vertices"], file["faces"].astype(np.int64), file["colours"]).fitted()

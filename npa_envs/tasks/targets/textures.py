@@ -55,18 +55,18 @@ class TextureTarget:
 
     @property
     def gap(self) -> float:
-        """Median distance from a thing to the nearest other one, as a fraction of the side.
+        """Median distance from an object to the nearest other one, as a fraction of the side.
 
-        Things are connected components of covered pixels; opposite edges are connected. 0 with
-        fewer than two things.
+        Objects are connected components of covered pixels; opposite edges are connected. 0 with
+        fewer than two objects.
         """
         covered = self.picture[..., 3] > COVERED
         side = len(covered)
-        edge = covered & (_around(~covered) > 0.0)
-        owner, position = _things(covered)[edge], edge.nonzero().double()
+        edge = covered & (_neighbour_maximum(~covered) > 0.0)
+        owner, position = _component_numbers(covered)[edge], edge.nonzero().double()
         gaps = []
-        for thing in sorted(set(owner.tolist())):
-            apart = position[owner == thing][:, None] - position[owner != thing]
+        for number in sorted(set(owner.tolist())):
+            apart = position[owner == number][:, None] - position[owner != number]
             if apart.numel() == 0:
                 return 0.0
             apart -= side * (apart / side).round()
@@ -82,23 +82,23 @@ class TextureTarget:
 
 
 COVERED = 0.5
-"""Density above which a pixel belongs to a thing."""
+"""Density above which a pixel belongs to an object."""
 
 
-def _things(covered: Tensor) -> Tensor:
-    """Return the label of each pixel's connected component, 0 where not covered; [R, R]."""
+def _component_numbers(covered: Tensor) -> Tensor:
+    """Return the number of each pixel's connected component, 0 where not covered; [R, R]."""
     numbers = torch.arange(1, covered.numel() + 1, dtype=torch.float64, device=covered.device)
     number = numbers.view_as(covered) * covered
     while True:
         # The largest number in a component spreads over all of it.
-        spread = _around(number) * covered
+        spread = _neighbour_maximum(number) * covered
         if torch.equal(spread, number):
             return number
         number = spread
 
 
-def _around(values: Tensor) -> Tensor:
-    """Return the maximum of each pixel and its eight neighbours, across edges too, [R, R]."""
+def _neighbour_maximum(values: Tensor) -> Tensor:
+    """Return the maximum of each pixel and its eight neighbours in the periodic picture."""
     wrapped = pad(values.double()[None, None], (1, 1, 1, 1), mode="circular")
     return max_pool2d(wrapped, kernel_size=3, stride=1)[0, 0]
 

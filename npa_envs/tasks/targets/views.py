@@ -141,13 +141,13 @@ def surrounding_cameras(count: int, resolution: int, *, turn: float = 0.0) -> Ca
     )
 
 
-def over(views: Tensor, background: Tensor) -> Tensor:
+def composited(views: Tensor, background: Tensor) -> Tensor:
     """Return views [..., 4] composited over a background [..., 3], shape [..., 3]."""
     return views[..., :3] + (1.0 - views[..., 3:]) * background
 
 
 def some_views(views: Views, index: Tensor) -> Views:
-    """Return the views of these indices."""
+    """Return the pictures and cameras with these indices."""
     cameras = views.cameras
     intrinsics = cameras.intrinsics
     chosen = replace(
@@ -182,7 +182,7 @@ UPRIGHT = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
 def read_nerf(
     folder: Path, resolution: int, training_count: int, held_out_count: int
 ) -> ViewTarget:
-    """Return the views of a NeRF-synthetic folder, as `load_views` describes."""
+    """Return the target in a NeRF-synthetic folder, as `load_views` describes."""
     held_out = next((folder / name for name in HELD_OUT if (folder / name).is_file()), None)
     if held_out is None or not (folder / TRAINING).is_file():
         raise NPAError(
@@ -190,8 +190,8 @@ def read_nerf(
             f"{shown(str(folder))} does not: views to measure by must be others than those trained "
             "with"
         )
-    training = _views(folder / TRAINING, resolution, training_count)
-    measured = _views(held_out, resolution, held_out_count)
+    training = _read_views(folder / TRAINING, resolution, training_count)
+    measured = _read_views(held_out, resolution, held_out_count)
     radius = max(scene_radius(training), scene_radius(measured))
     if radius == 0.0:
         raise NPAError(
@@ -204,11 +204,11 @@ def read_nerf(
 
 
 def scene_radius(views: Views) -> float:
-    """Return a lower bound on the scene's radius: the largest distance of a visible ray [length
-    units].
+    """Return a lower bound on the scene's radius [length units].
 
-    A point of the scene is at least as far from the origin as the camera rays on which it is
-    visible; with many views, one of these rays nearly touches the farthest point.
+    It is the largest distance from the origin of a camera ray on which something is visible. A
+    point is at least as far from the origin as the rays on which it is visible; with many views,
+    one of these rays nearly touches the farthest point.
     """
     cameras, radius = views.cameras, 0.0
     lenses = cameras.intrinsics.double().expand(cameras.count, 4)
@@ -227,8 +227,8 @@ def scene_radius(views: Views) -> float:
     return radius
 
 
-def _views(path: Path, resolution: int, count: int) -> Views:
-    """Return evenly chosen views of a `transforms_*.json`, turned so that y is up."""
+def _read_views(path: Path, resolution: int, count: int) -> Views:
+    """Return `count` evenly spaced views of a `transforms_*.json`, rotated so that y is up."""
     file = shown(str(path))
     try:
         content = read_json(path)

@@ -29,12 +29,13 @@ export function insideBall(world, centre, radius) {
   return indices;
 }
 
+// Sets the states of particles in a ball to 0.
 export function wipeState(world, centre, radius) {
   const { s, channels } = world;
   for (const i of insideBall(world, centre, radius)) s.fill(0, i * channels, (i + 1) * channels);
 }
 
-// Moves particles by a fraction of `move`, in the centre `strength`, less towards the rim.
+// Moves particles by a fraction of `move`: `strength` at the centre, less towards the rim.
 export function push(world, centre, move, radius, strength) {
   const { x, dimension } = world;
   forEach(world, centre, (i, _, square) => {
@@ -43,7 +44,7 @@ export function push(world, centre, move, radius, strength) {
   });
 }
 
-// Returns the mean state under a soft brush, or null if there is no particle.
+// Returns the weighted mean state of particles in a ball, heavier towards the centre; null without any.
 export function stateAround(world, centre, radius) {
   const { s, channels } = world, mean = new Float64Array(channels);
   let total = 0;
@@ -55,7 +56,7 @@ export function stateAround(world, centre, radius) {
   return total > 0 ? mean.map((sum) => sum / total) : null;
 }
 
-// Mixes a state into those of particles, in the centre by the fraction `strength`.
+// Mixes a state into those of particles, by the fraction `strength` at the centre, less towards the rim.
 export function inject(world, centre, radius, state, strength) {
   const { s, channels } = world;
   forEach(world, centre, (i, _, square) => {
@@ -64,7 +65,7 @@ export function inject(world, centre, radius, state, strength) {
   });
 }
 
-// Returns the weight of a soft brush at a squared distance.
+// Returns a brush's weight at a squared distance from its centre: 1 there, 0 from the rim on.
 function softness(square, radius) {
   return radius > 0 ? Math.max(0, 1 - square / (radius * radius)) ** 2 : 0;
 }
@@ -93,7 +94,8 @@ export function cut(world, centre, normal, gap, along = null) {
   });
 }
 
-function inner(a, b) {
+// Returns the scalar product.
+export function inner(a, b) {
   let sum = 0;
   for (let d = 0; d < b.length; d++) sum += a[d] * b[d];
   return sum;

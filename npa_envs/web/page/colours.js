@@ -1,6 +1,8 @@
 // Colours of particles by state, density, species, speed or update mask. This file follows `Colouring` of
 // npa_envs/web/live_world.py.
 
+import { inner } from "./brushes.js";
+
 // Of npa_envs/render/colours.py and npa_envs/web/live_world.py.
 const COLOUR_OFFSET = 0.5;
 const GOLDEN_ANGLE = Math.PI * (3 - Math.sqrt(5));
@@ -27,21 +29,21 @@ export class Colouring {
     const { world } = live;
     const bytes = new Uint8ClampedArray(3 * world.count);
     if (show === "colours") {
-      live.looks.forEach((look, number) => look.colour(world, number, bytes));
+      live.ruleColours.forEach((colours, number) => colours.write(world, number, bytes));
     } else if (show === "density") {
       this.densities(live, bytes);
     } else if (show === "components") {
       this.components(world.s, live.channels, bytes);
     } else if (show === "species") {
       const tints = live.species.map((_, k) => speciesColour(k));
-      each(bytes, (i) => tints[world.species[i]]);
+      writeColours(bytes, (i) => tints[world.species[i]]);
     } else if (show === "speed") {
-      each(bytes, (i) => this.onRamp(Math.sqrt(live.travelled[i] || 0)));
+      writeColours(bytes, (i) => this.onRamp(Math.sqrt(live.travelled[i] || 0)));
     } else if (show === "mask") {
-      each(bytes, (i) => (live.updated[i] ? UPDATED : RESTING));
+      writeColours(bytes, (i) => (live.updated[i] ? UPDATED : RESTING));
     } else {
       const channel = Number(show.slice("state ".length));
-      each(bytes, (i) => signedColour(world.s[i * live.channels + channel]));
+      writeColours(bytes, (i) => signedColour(world.s[i * live.channels + channel]));
     }
     return new Uint8Array(bytes.buffer);
   }
@@ -53,7 +55,7 @@ export class Colouring {
     const volume = box === null ? 2 ** dimension : box.reduce((product, side) => product * side, 1);
     const usual = (full / volume) * (box === null ? 4 : 1);
     for (let k = 0; k < world.count; k++) {
-      put(bytes, physics.order[k], this.onRamp(1 - 2 ** (-physics.density[k] / usual)));
+      writeColour(bytes, physics.order[k], this.onRamp(1 - 2 ** (-physics.density[k] / usual)));
     }
   }
 
@@ -83,7 +85,7 @@ export class Colouring {
     const components = eigenvectors(this.covariance, channels).slice(0, 3);
     components.forEach(({ vector }, k) => {
       // An eigenvector's sign is arbitrary: colours must not flip between frames.
-      if (this.basis?.[k] && product(vector, this.basis[k]) < 0) vector.forEach((part, c) => (vector[c] = -part));
+      if (this.basis?.[k] && inner(vector, this.basis[k]) < 0) vector.forEach((part, c) => (vector[c] = -part));
     });
     this.basis = components.map(({ vector }) => vector);
     const tint = [0.5, 0.5, 0.5];
@@ -93,10 +95,11 @@ export class Colouring {
         for (let c = 0; c < channels; c++) sum += (s[i * channels + c] - mean[c]) * vector[c];
         tint[k] = 0.5 + (0.22 * sum) / Math.sqrt(Math.max(value, 1e-12));
       });
-      put(bytes, i, tint);
+      writeColour(bytes, i, tint);
     }
   }
 
+  // Red, green and blue at a fraction of the ramp.
   onRamp(fraction) {
     const last = this.ramp.length / 3 - 1;
     const entry = 3 * Math.round(last * Math.min(1, Math.max(0, fraction)));
@@ -104,9 +107,9 @@ export class Colouring {
   }
 }
 
-// Colours of one rule's particles: their last three outputs, or the colour of their class, greyer the
-// smaller its output.
-export class Look {
+// Colours of one rule's particles by the outputs of its read-out, or their states: the last three, or the
+// colour of the class with the largest output, greyer the smaller it is.
+export class RuleColours {
   // rule: of LiveWorld; its `classes` are {palette, undecided}, or null.
   constructor(rule, kernels) {
     this.classes = rule.classes;
@@ -123,22 +126,22 @@ export class Look {
     );
     this.rows = kernels.floats(ROWS_TOGETHER * this.channels);
     this.hidden = kernels.floats(ROWS_TOGETHER * this.first.width);
-    this.read = kernels.floats(ROWS_TOGETHER * this.second.width);
+    this.results = kernels.floats(ROWS_TOGETHER * this.second.width);
   }
 
-  // Colours the particles of species `number`.
-  colour({ s, species, count }, number, bytes) {
+  // Writes red, green and blue of the particles of species `number` to `bytes`.
+  write({ s, species, count }, number, bytes) {
     const { channels } = this;
     if (this.first === undefined) {
-      for (let i = 0; i < count; i++) if (species[i] === number) put(bytes, i, this.tint(s, i * channels));
+      for (let i = 0; i < count; i++) if (species[i] === number) writeColour(bytes, i, this.tint(s, i * channels));
       return;
     }
     const block = [];
     const flush = () => {
       block.forEach((i, row) => this.rows.set(s.subarray(i * channels, (i + 1) * channels), row * channels));
       this.kernels.product(this.first, block.length, this.rows, channels, this.hidden, true);
-      this.kernels.product(this.second, block.length, this.hidden, this.first.width, this.read, false);
-      block.forEach((i, row) => put(bytes, i, this.tint(this.read, row * this.second.width)));
+      this.kernels.product(this.second, block.length, this.hidden, this.first.width, this.results, false);
+      block.forEach((i, row) => writeColour(bytes, i, this.tint(this.results, row * this.second.width)));
       block.length = 0;
     };
     for (let i = 0; i < count; i++) {
@@ -147,6 +150,7 @@ export class Look {
     flush();
   }
 
+  // Red, green and blue of a particle whose outputs begin at index `at` of `values`.
   tint(values, at) {
     if (this.classes === null) {
       const last = at + this.outputs;
@@ -160,11 +164,11 @@ export class Look {
   }
 }
 
-function each(bytes, tintOf) {
-  for (let i = 0; 3 * i < bytes.length; i++) put(bytes, i, tintOf(i));
+function writeColours(bytes, tintOf) {
+  for (let i = 0; 3 * i < bytes.length; i++) writeColour(bytes, i, tintOf(i));
 }
 
-function put(bytes, i, tint) {
+function writeColour(bytes, i, tint) {
   bytes[3 * i] = 255 * tint[0];
   bytes[3 * i + 1] = 255 * tint[1];
   bytes[3 * i + 2] = 255 * tint[2];
@@ -194,10 +198,6 @@ function srgb(lightness, a, b) {
     const clipped = Math.min(1, Math.max(0, linear));
     return clipped <= 0.0031308 ? 12.92 * clipped : 1.055 * clipped ** (1 / 2.4) - 0.055;
   });
-}
-
-function product(a, b) {
-  return a.reduce((sum, part, k) => sum + part * b[k], 0);
 }
 
 // Eigenvalues and eigenvectors of a symmetric matrix, the largest first, by Jacobi's rotations.

@@ -49,12 +49,13 @@ export class Camera {
     return [width / 2 + (across * scale) / unit, this.open(height) / 2 - (up * scale) / unit, near, scale];
   }
 
-  // The position under a place on the canvas, at a nearness; and how far a movement leads there.
+  // The position under a pixel of the canvas, at a nearness: the distance from the centre towards the viewer.
   position(column, row, width, height, near = 0) {
     const move = this.movement(column - width / 2, row - this.open(height) / 2, width, height, near);
     return this.centre.map((middle, k) => middle + move[k] + near * this.axes[2][k]);
   }
 
+  // The movement in space [length units] of a movement on the canvas [pixels], at a nearness.
   movement(columns, rows, width, height, near = 0) {
     const unit = this.unit(width, height);
     const fraction = this.distance ? 1 - near / this.distance : 1;
@@ -132,13 +133,13 @@ function tiles(scene, width, height) {
   return range(width, box[0], camera.centre[0]).flatMap((x) => rows.map((y) => [x, y, 0]));
 }
 
-const PLACE = `
+const PROJECT = `
 uniform vec3 right, up, toward, centre, offset;
 uniform vec2 unit;        // device units a length unit
 uniform float distance_;  // of the camera; 0: no perspective
 uniform float nearest;    // nearness that counts as the front
 uniform float covered;    // fraction of the height that controls cover
-vec4 place(vec3 position, out float scale, out float near) {
+vec4 project(vec3 position, out float scale, out float near) {
   vec3 p = position + offset - centre;
   near = dot(p, toward);
   scale = distance_ > 0.0 ? distance_ / max(distance_ - near, 1e-3) : 1.0;
@@ -150,16 +151,16 @@ layout(location=0) in vec3 position;
 layout(location=1) in vec3 colour;
 uniform float size;       // pixels at the depth of the centre
 out vec3 tint; out float light;
-${PLACE}
+${PROJECT}
 void main() {
   float scale, near;
-  gl_Position = place(position, scale, near);
+  gl_Position = project(position, scale, near);
   gl_PointSize = size * scale;
   tint = colour;
   light = distance_ > 0.0 ? clamp(0.95 + 0.5 * near / nearest, 0.45, 1.15) : 1.0;
 }`;
 
-// Sums of colours and of densities: soft spots, which the second pass shows over the background.
+// Soft spots: sums of colours and of densities, which the second pass shows over the background.
 const SOFT_FRAGMENT = `#version 300 es
 precision mediump float;
 in vec3 tint; in float light; out vec4 sum;
@@ -207,10 +208,10 @@ const TRAIL_VERTEX = `#version 300 es
 layout(location=0) in vec3 position;
 layout(location=1) in float fade;
 out float cover;
-${PLACE}
+${PROJECT}
 void main() {
   float scale, near;
-  gl_Position = place(position, scale, near);
+  gl_Position = project(position, scale, near);
   cover = fade;
 }`;
 
@@ -234,7 +235,7 @@ class GlPainter {
       show: linked(gl, SHOW_VERTEX, SHOW_FRAGMENT),
       trail: linked(gl, TRAIL_VERTEX, TRAIL_FRAGMENT),
     };
-    this.places = gl.createBuffer();
+    this.positions = gl.createBuffer();
     this.tints = gl.createBuffer();
     this.lines = gl.createBuffer();
     this.fades = gl.createBuffer();
@@ -256,8 +257,8 @@ class GlPainter {
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
     const program = soft ? this.programs.soft : this.programs.ball;
     gl.useProgram(program.program);
-    this.look(program, scene, width, height);
-    attribute(gl, 0, this.places, positions, dimension);
+    this.setCamera(program, scene, width, height);
+    attribute(gl, 0, this.positions, positions, dimension);
     attribute(gl, 1, this.tints, colours, 3);
     if (soft) {
       gl.blendFunc(gl.ONE, gl.ONE);
@@ -289,7 +290,7 @@ class GlPainter {
     if (scene.trails) this.drawTrails(scene, width, height);
   }
 
-  look(program, { camera }, width, height) {
+  setCamera(program, { camera }, width, height) {
     const gl = this.gl, unit = camera.unit(width, height);
     const [right, up, toward] = camera.axes;
     gl.uniform3fv(program.right, right);
@@ -306,7 +307,7 @@ class GlPainter {
   drawTrails(scene, width, height) {
     const gl = this.gl, program = this.programs.trail;
     gl.useProgram(program.program);
-    this.look(program, scene, width, height);
+    this.setCamera(program, scene, width, height);
     gl.disable(gl.DEPTH_TEST);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
@@ -387,9 +388,9 @@ class PlainPainter {
     const soft = scene.dimension === 2 && scene.look === "soft";
     const spot = scene.spot / scene.camera.unit(across, down);
     for (const offset of tiles(scene, across, down)) {
-      const places = projected(scene, offset, across, down);
-      if (soft) addSpots(this.sums, across, down, places, scene.colours, Math.max(spot, 0.6));
-      else addBalls(this.sums, across, down, places, scene, Math.max(spot, 0.5));
+      const spots = projected(scene, offset, across, down);
+      if (soft) addSpots(this.sums, across, down, spots, scene.colours, Math.max(spot, 0.6));
+      else addBalls(this.sums, across, down, spots, scene, Math.max(spot, 0.5));
     }
     show(this.picture.data, this.sums, scene.background, soft);
     small.getContext("2d").putImageData(this.picture, 0, 0);
@@ -421,7 +422,7 @@ class PlainPainter {
 
 // Column, row, nearness and scale of all particles, as by `Camera.project`.
 function projected({ positions, dimension, camera }, offset, width, height) {
-  const count = positions.length / dimension, places = new Float32Array(4 * count);
+  const count = positions.length / dimension, spots = new Float32Array(4 * count);
   const [right, up, toward] = camera.axes, unit = camera.unit(width, height), { distance, centre } = camera;
   const middle = camera.open(height) / 2;
   for (let k = 0; k < count; k++) {
@@ -430,20 +431,20 @@ function projected({ positions, dimension, camera }, offset, width, height) {
     const z = (dimension === 3 ? positions[3 * k + 2] : 0) + offset[2] - centre[2];
     const near = x * toward[0] + y * toward[1] + z * toward[2];
     const scale = distance ? distance / Math.max(distance - near, 1e-3) : 1;
-    places[4 * k] = width / 2 + ((x * right[0] + y * right[1] + z * right[2]) * scale) / unit;
-    places[4 * k + 1] = middle - ((x * up[0] + y * up[1] + z * up[2]) * scale) / unit;
-    places[4 * k + 2] = near / unit;
-    places[4 * k + 3] = scale;
+    spots[4 * k] = width / 2 + ((x * right[0] + y * right[1] + z * right[2]) * scale) / unit;
+    spots[4 * k + 1] = middle - ((x * up[0] + y * up[1] + z * up[2]) * scale) / unit;
+    spots[4 * k + 2] = near / unit;
+    spots[4 * k + 3] = scale;
   }
-  return places;
+  return spots;
 }
 
 // Adds soft spots: sums of colours and of weights. They end round, where they are faint.
-function addSpots(sums, width, height, places, colours, spot) {
+function addSpots(sums, width, height, spots, colours, spot) {
   const extent = 2.4 * spot, fall = -0.5 / (spot * spot), faint = Math.exp(-0.5 * 2.4 ** 2);
   const weights = new Float32Array(2 * Math.ceil(extent) + 2);
-  for (let k = 0; k < places.length / 4; k++) {
-    const column = places[4 * k], row = places[4 * k + 1];
+  for (let k = 0; k < spots.length / 4; k++) {
+    const column = spots[4 * k], row = spots[4 * k + 1];
     const left = Math.max(0, Math.ceil(column - extent)), last = Math.min(width - 1, Math.floor(column + extent));
     const top = Math.max(0, Math.ceil(row - extent)), end = Math.min(height - 1, Math.floor(row + extent));
     for (let x = left; x <= last; x++) weights[x - left] = Math.exp(fall * (x - column) ** 2);
@@ -463,11 +464,11 @@ function addSpots(sums, width, height, places, colours, spot) {
 }
 
 // Writes opaque balls or flat discs; the fourth sum is their nearness.
-function addBalls(sums, width, height, places, { colours, dimension, camera }, spot) {
+function addBalls(sums, width, height, spots, { colours, dimension, camera }, spot) {
   const solid = dimension === 3, span = 2 * camera.halfWidth;
-  for (let k = 0; k < places.length / 4; k++) {
-    const column = places[4 * k], row = places[4 * k + 1], near = places[4 * k + 2];
-    const radius = (solid ? 1.6 : 0.7) * spot * places[4 * k + 3];
+  for (let k = 0; k < spots.length / 4; k++) {
+    const column = spots[4 * k], row = spots[4 * k + 1], near = spots[4 * k + 2];
+    const radius = (solid ? 1.6 : 0.7) * spot * spots[4 * k + 3];
     const depth = near * camera.unit(width, height);
     const light = solid ? Math.min(1.15, Math.max(0.45, 0.95 + (0.5 * depth) / span)) : 1;
     const left = Math.max(0, Math.ceil(column - radius)), last = Math.min(width - 1, column + radius);
@@ -519,27 +520,27 @@ export class Tracers {
     const count = positions.length / dimension;
     if (count !== this.count) this.clear();
     this.count = count;
-    const traced = Math.min(TRACED, count), places = new Float32Array(3 * traced);
+    const traced = Math.min(TRACED, count), points = new Float32Array(3 * traced);
     for (let k = 0; k < traced; k++) {
       const particle = Math.floor(((k + 0.5) * count) / traced);
-      for (let d = 0; d < dimension; d++) places[3 * k + d] = positions[dimension * particle + d];
+      for (let d = 0; d < dimension; d++) points[3 * k + d] = positions[dimension * particle + d];
     }
-    this.frames.push(places);
+    this.frames.push(points);
     if (this.frames.length > TRAIL_LENGTH) this.frames.shift();
   }
 
   // Lines from frame to frame, older ones fainter; none across a box's edge.
   lines(box) {
-    const places = [], fades = [], longest = box ? Math.min(...box) / 2 : Infinity;
+    const points = [], fades = [], longest = box ? Math.min(...box) / 2 : Infinity;
     for (let f = 1; f < this.frames.length; f++) {
       const from = this.frames[f - 1], to = this.frames[f];
       const fade = 0.75 * (f / this.frames.length) ** 1.5;
       for (let k = 0; k < to.length; k += 3) {
         if (Math.hypot(to[k] - from[k], to[k + 1] - from[k + 1]) > longest) continue;
-        places.push(from[k], from[k + 1], from[k + 2], to[k], to[k + 1], to[k + 2]);
+        points.push(from[k], from[k + 1], from[k + 2], to[k], to[k + 1], to[k + 2]);
         fades.push(fade, fade);
       }
     }
-    return { positions: new Float32Array(places), fades: new Float32Array(fades) };
+    return { positions: new Float32Array(points), fades: new Float32Array(fades) };
   }
 }

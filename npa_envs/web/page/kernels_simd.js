@@ -67,9 +67,9 @@ function loopBelow(local, limit, body) {
   return [0x02, 0x40, 0x03, 0x40, ...below(get(local), limit), 0x45, 0x0d, 1, ...body, 0x0c, 0, 0x0b, 0x0b];
 }
 
-// gather(states, own, listBytes, place, a, kx, ky, kz, sums): as in plainKernels, addresses in bytes.
+// gather(states, own, listBytes, stateAt, a, kx, ky, kz, sums): as in plainKernels, addresses in bytes.
 function gatherCode(width, dimension) {
-  const [states, own, listBytes, place, a, kx, ky, kz, sums] = [0, 1, 2, 3, 4, 5, 6, 7, 8];
+  const [states, own, listBytes, stateAt, a, kx, ky, kz, sums] = [0, 1, 2, 3, 4, 5, 6, 7, 8];
   const [done, at, other, offset] = [9, 10, 11, 12];
   const slopes = [kx, ky, kz].slice(0, dimension);
   const spread = [13, 14, 15, 16];
@@ -85,7 +85,7 @@ function gatherCode(width, dimension) {
       for (let axis = 0; axis <= dimension; axis++) code.push(...set(sum(axis, part), zeros));
     }
     code.push(...set(done, number(0)));
-    const body = [...set(at, add(get(states), multiply(loadInteger(add(get(place), get(done))), number(4))))];
+    const body = [...set(at, add(get(states), multiply(loadInteger(add(get(stateAt), get(done))), number(4))))];
     [a, ...slopes].forEach((list, axis) => body.push(...set(spread[axis], loadSplat(add(get(list), get(done))))));
     for (const part of parts) {
       body.push(...set(other, load(get(at), byte(part))));
@@ -110,12 +110,12 @@ function gatherCode(width, dimension) {
 // Numbers that `pairs` reads, each of them a word in memory.
 const PROBE = ["x", "y", "z", "eps", "square", "weight", "slope", "sideX", "sideY", "sideZ", "perX", "perY", "perZ"];
 
-// pairs(probe, order, x, y, z, volume, ranges, rangesEnd, width, place, a, kx, ky, kz, out): as in
+// pairs(probe, order, x, y, z, volume, ranges, rangesEnd, width, stateAt, a, kx, ky, kz, out): as in
 // plainKernels. `order` holds, for each set of lanes, the bytes that bring them to the front; `out` gets
 // the number of neighbours, and from its 16th byte on six vectors, the lanes of the moment matrix.
 function pairsCode(dimension) {
   const names = [
-    "probe", "order", "x", "y", "z", "volume", "ranges", "rangesEnd", "width", "place", "a", "kx", "ky", "kz", "out",
+    "probe", "order", "x", "y", "z", "volume", "ranges", "rangesEnd", "width", "stateAt", "a", "kx", "ky", "kz", "out",
     // Local integers.
     "byte", "end", "count", "hits", "at",
     // Vectors.
@@ -148,7 +148,7 @@ function pairsCode(dimension) {
       put(axis + other, plus(value(axis + other), times(value(`s${axis}`), value(`d${other}`)))))),
     ...put("front", load(add(value("order"), multiply(value("hits"), number(16))))),
     ...put("at", multiply(value("count"), number(4))),
-    ...append("place", timesIntegers(value("lanes"), spreadInteger(value("width")))),
+    ...append("stateAt", timesIntegers(value("lanes"), spreadInteger(value("width")))),
     ...append("a", times(
       times(probed("weight"), times(value("rest"), times(value("rest"), value("rest")))),
       load(add(value("volume"), value("byte"))),
@@ -198,28 +198,28 @@ function lanesToFront() {
 function productCode() {
   const [rows, rowBytes, rowEnd, weights, bias, outputs, outputBytes, inputBytes, limit, tiles] = [0, 1, 2, 3, 4, 5, 6, 7, 8, 9];
   const [row, input, weight, out, tile, at0, at1, at2, at3] = [10, 11, 12, 13, 14, 15, 16, 17, 18];
-  const places = [at0, at1, at2, at3];
+  const addresses = [at0, at1, at2, at3];
   const [left, right, spread, other] = [19, 20, 21, 22];
   const sum = (k, half) => 23 + 2 * k + half;
   const inner = [
     ...set(left, load(get(weight))),
     ...set(right, load(get(weight), 16)),
   ];
-  places.forEach((place, k) => {
-    inner.push(...set(spread, loadSplat(add(get(place), get(input)))));
+  addresses.forEach((address, k) => {
+    inner.push(...set(spread, loadSplat(add(get(address), get(input)))));
     inner.push(...set(sum(k, 0), plus(get(sum(k, 0)), times(get(spread), get(left)))));
     inner.push(...set(sum(k, 1), plus(get(sum(k, 1)), times(get(spread), get(right)))));
   });
   inner.push(...set(weight, add(get(weight), number(4 * TILE_OUTPUTS))));
   inner.push(...set(input, add(get(input), number(4))));
   const perRows = [];
-  places.forEach((place, k) => {
-    perRows.push(...set(place, add(get(row), multiply(get(rowBytes), number(k)))));
+  addresses.forEach((address, k) => {
+    perRows.push(...set(address, add(get(row), multiply(get(rowBytes), number(k)))));
     perRows.push(...set(sum(k, 0), load(get(bias))), ...set(sum(k, 1), load(get(bias), 16)));
   });
   perRows.push(...set(weight, get(weights)), ...set(input, number(0)));
   perRows.push(...loopBelow(input, get(inputBytes), inner));
-  places.forEach((_, k) => {
+  addresses.forEach((_, k) => {
     for (const half of [0, 1]) {
       perRows.push(...set(other, get(sum(k, half))));
       perRows.push(...store(get(out), select(larger(get(other), zeros), get(other), get(limit)), 16 * half));
@@ -291,10 +291,10 @@ export function simdKernels(width, dimension) {
   };
   const floats = (length) => reserve(Float32Array, length);
 
-  function gather(states, stateWidth, space, own, { count, place, a, slopes }, sums) {
+  function gather(states, stateWidth, space, own, { count, stateAt, a, slopes }, sums) {
     const at = states.byteOffset;
     gatherAt(
-      at, at + 4 * own, 4 * count, place.byteOffset, a.byteOffset,
+      at, at + 4 * own, 4 * count, stateAt.byteOffset, a.byteOffset,
       slopes[0].byteOffset, slopes[1].byteOffset, slopes[2].byteOffset, sums.byteOffset,
     );
   }
@@ -314,10 +314,10 @@ export function simdKernels(width, dimension) {
       probe[scalars.length + 3 + d] = perSide[d];
     }
     const at = ranges.byteOffset;
-    const { place, a, slopes } = list;
+    const { stateAt, a, slopes } = list;
     pairsAt(
       probe.byteOffset, order.byteOffset, x.byteOffset, y.byteOffset, z.byteOffset, volume.byteOffset,
-      at, at + 4 * used, stride, place.byteOffset, a.byteOffset,
+      at, at + 4 * used, stride, stateAt.byteOffset, a.byteOffset,
       slopes[0].byteOffset, slopes[1].byteOffset, slopes[2].byteOffset, out.byteOffset,
     );
     list.count = neighbourCount[0];

@@ -18,7 +18,7 @@
 //                                      its half-width; strength in [0, 1]; source (inject): where the
 //                                      state comes from; rule (graft, add): a name of `rules`;
 //                                      view (3D): the unit vector towards the viewer
-//   {type: "damage", name}             one of the world's `damages`, at a random place
+//   {type: "damage", name}             one of the world's `damages`, at a random position
 //   {type: "drawn"}                    the page has drawn a frame. An engine sends at most two frames
 //                                      that are not drawn yet: it waits for a slow or hidden page.
 //   {type: "film", action}             "start" or "stop", if capabilities contain "film"; between them
@@ -60,7 +60,7 @@ const BLANK = {
 
 // The tools; "look" is the page's own, and a world offers some of the others. Icons are SVG paths on a square of
 // side 24. sends: when a stroke sends messages: "frame", in each frame; "motion", in frames in which the pointer
-// moves; "place", at each new place; "once", at its start; "line", at its end. takes: further content of its messages.
+// moves; "position", at each new position; "once", at its start; "line", at its end. takes: a further field of its messages.
 const TOOLS = {
   look: {
     label: "Look: drag to move, wheel or pinch to zoom, double click to see all",
@@ -80,7 +80,7 @@ const TOOLS = {
     icon: "M4 20l3-1 8-8-2-2-8 8zM12 8l4 4M14 10l3-4a1.8 1.8 0 0 1 3 0 1.8 1.8 0 0 1-1 3l-4 2",
   },
   graft: {
-    label: "Graft: particles take another rule", sends: "place", takes: "rule",
+    label: "Graft: particles take another rule", sends: "position", takes: "rule",
     icon: "M12 21v-9M12 12c0-5 3-7 8-7 0 5-3 7-8 7zM12 15c0-4-3-6-8-6 0 4 3 6 8 6z",
   },
   add: { label: "Add a seed of another rule", sends: "once", takes: "rule", icon: "M12 4a8 8 0 1 0 .1 0M12 8v8M8 12h8" },
@@ -357,7 +357,7 @@ class Page {
     act();
   }
 
-  // Pointers: one uses the tool, two move the camera.
+  // One pointer uses the tool, two move the camera.
 
   watchPointers() {
     const { canvas } = this;
@@ -381,45 +381,46 @@ class Page {
     this.dirty = true;
   }
 
-  place(event) {
+  // The position of the pointer on the canvas [pixels].
+  position(event) {
     const { left, top } = this.canvas.getBoundingClientRect();
     return [event.clientX - left, event.clientY - top];
   }
 
   press(event) {
     this.canvas.setPointerCapture(event.pointerId);
-    const place = this.place(event);
-    this.pointers.set(event.pointerId, place);
+    const position = this.position(event);
+    this.pointers.set(event.pointerId, position);
     this.looking = this.tool === "look" || event.button === 2 || event.shiftKey || this.pointers.size > 1;
     if (this.looking) {
       this.stroke = null;
       return;
     }
-    const near = this.nearness(place);
-    this.stroke = { near, from: place, at: place, sent: place };
-    if (this.sends !== "line") this.brush(place, [0, 0]);
-    this.showCursor(place);
+    const near = this.nearness(position);
+    this.stroke = { near, from: position, at: position, sent: position };
+    if (this.sends !== "line") this.brush(position, [0, 0]);
+    this.showCursor(position);
   }
 
   move(event) {
-    const place = this.place(event), before = this.pointers.get(event.pointerId);
+    const position = this.position(event), before = this.pointers.get(event.pointerId);
     if (!before) {
-      if (event.pointerType === "mouse") this.showCursor(place);
+      if (event.pointerType === "mouse") this.showCursor(position);
       return;
     }
-    const columns = place[0] - before[0], rows = place[1] - before[1];
+    const columns = position[0] - before[0], rows = position[1] - before[1];
     const others = [...this.pointers].filter(([id]) => id !== event.pointerId).map(([, at]) => at);
-    this.pointers.set(event.pointerId, place);
+    this.pointers.set(event.pointerId, position);
     const { clientWidth: width, clientHeight: height } = this.canvas;
     if (this.looking) {
       this.camera.drag(columns / this.pointers.size, rows / this.pointers.size, width, height);
       if (others.length) this.camera.magnify(
-        Math.hypot(place[0] - others[0][0], place[1] - others[0][1]) /
+        Math.hypot(position[0] - others[0][0], position[1] - others[0][1]) /
         Math.max(Math.hypot(before[0] - others[0][0], before[1] - others[0][1]), 1));
       this.dirty = true;
     } else if (this.stroke) {
-      this.stroke.at = place;
-      this.showCursor(place);
+      this.stroke.at = position;
+      this.showCursor(position);
     }
   }
 
@@ -450,12 +451,12 @@ class Page {
     return Number.isFinite(nearest) ? nearest : 0;
   }
 
-  // Sends the brush at a place on the canvas, with its movement in pixels.
-  brush(place, pixels) {
+  // Sends the brush at a position on the canvas, with its movement, both in pixels.
+  brush(position, pixels) {
     const { camera, canvas, stroke, tool } = this, { dimension, box } = this.world, { takes } = TOOLS[tool];
     const width = canvas.clientWidth, height = canvas.clientHeight;
     const near = stroke?.near ?? 0;
-    const at = camera.position(...place, width, height, near).slice(0, dimension);
+    const at = camera.position(...position, width, height, near).slice(0, dimension);
     const move = camera.movement(...pixels, width, height, near).slice(0, dimension);
     const wrapped = box ? at.map((v, k) => v - box[k] * Math.round(v / box[k])) : at;
     if (stroke) stroke.source ??= wrapped;
@@ -496,7 +497,7 @@ class Page {
     }
   }
 
-  // Each frame of the screen: the brush, and new frames of the world.
+  // In each frame of the screen: the brush acts, and new frames of the world are drawn.
 
   drawIfNeeded() {
     requestAnimationFrame(() => this.drawIfNeeded());
@@ -504,7 +505,7 @@ class Page {
     if (stroke) {
       const move = [stroke.at[0] - stroke.sent[0], stroke.at[1] - stroke.sent[1]], moved = Math.hypot(...move) > 0;
       if (sends === "frame" || (sends === "motion" && moved)) this.brush(stroke.sent, move);
-      if (sends === "place" && moved) this.brush(stroke.at, [0, 0]);
+      if (sends === "position" && moved) this.brush(stroke.at, [0, 0]);
       stroke.sent = stroke.at;
     }
     if (!this.undrawn && !this.dirty) return;
@@ -514,7 +515,7 @@ class Page {
     this.dirty = false;
   }
 
-  // Also for frames that later ones have replaced: the engine waits for each.
+  // Reports frames as drawn, also those that later ones have replaced: the engine waits for each.
   reportDrawn() {
     for (; this.undrawn > 0; this.undrawn--) this.send({ type: "drawn" });
   }

@@ -2,7 +2,7 @@
 // and events.
 
 import { clump, cut, wipeState, inject, insideBall, push, stateAround } from "./brushes.js";
-import { Colouring, Look } from "./colours.js";
+import { Colouring, RuleColours } from "./colours.js";
 import { fastestKernels } from "./kernels_simd.js";
 import { padded, Physics, prepareRule, wrap } from "./physics.js";
 import { GpuPhysics, openDevice } from "./physics_gpu.js";
@@ -63,7 +63,7 @@ export class LiveWorld {
     this.undrawn = 0;
     this.show = "colours";
     this.seed = settings.seed;
-    this.plant(this.rules[0]);
+    this.choose(this.rules[0]);
   }
 
   ruleNamed(name) {
@@ -72,8 +72,8 @@ export class LiveWorld {
     return rule;
   }
 
-  // Starts a fresh world of a rule, with the settings of its task.
-  plant(rule) {
+  // Chooses a rule with the settings of its task, and starts a fresh world.
+  choose(rule) {
     this.rule = rule;
     this.values = {};
     for (const [name, { value }] of Object.entries(rule.world.settings)) this.values[name] = value;
@@ -82,7 +82,7 @@ export class LiveWorld {
     this.reset(this.seed);
   }
 
-  // Starts a fresh world of the chosen rule alone.
+  // Starts a fresh world whose particles all follow the chosen rule.
   reset(seed) {
     this.seed = seed;
     this.random = new Random(seed);
@@ -132,7 +132,7 @@ export class LiveWorld {
   prepare() {
     const kernels = (this.kernels = fastestKernels(padded(this.channels), this.dimension));
     this.physics = new Physics(this.species.map((rule) => prepareRule(rule, kernels)), this.world.count, kernels);
-    this.looks = this.species.map((rule) => new Look(rule, kernels));
+    this.ruleColours = this.species.map((rule) => new RuleColours(rule, kernels));
     this.gpu?.close();
     this.gpu = null;
     // Steps that are left of the trial, and the shortest time of a step on each [ms].
@@ -211,7 +211,7 @@ export class LiveWorld {
 
   set(name, value) {
     if (name === "loss") return;
-    if (name === "rule") return this.plant(this.ruleNamed(value));
+    if (name === "rule") return this.choose(this.ruleNamed(value));
     if (name === "show") {
       if (!this.rule.world.shows.includes(value)) throw Error(`nothing to show is called ${value}`);
       this.show = value;
@@ -277,7 +277,7 @@ export class LiveWorld {
     return this.constants.AGREEMENTS.every((field) => rule[field] === this.rule[field]);
   }
 
-  // Damages the world by its name, at a random particle or through the middle at a random angle.
+  // Damages the world at a random particle, or through the middle at a random angle. name: of DAMAGES.
   damage(name) {
     const apply = entry(DAMAGES, name, "damage");
     const { dimension, world: { x, count } } = this;
@@ -330,7 +330,7 @@ export class LiveWorld {
   }
 }
 
-// Returns a row of a table; an unknown name is an error.
+// Returns table[name]; throws an error if there is none. what: the kind of name, for its message.
 function entry(table, name, what) {
   if (!Object.hasOwn(table, name)) throw Error(`no ${what} is called ${name}`);
   return table[name];
@@ -358,7 +358,7 @@ function cross(a, b) {
   return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 }
 
-// A rule with its weights and clouds as numbers.
+// Returns a rule with its weights and clouds as arrays of numbers.
 function decoded(rule) {
   const floats = (text) => new Float32Array(bytesOf(text).buffer);
   const weights = {};
@@ -385,7 +385,7 @@ export function serve(scope) {
   };
 
   // One message, or one frame where there is none, never two at a time.
-  const go = async () => {
+  const handleNext = async () => {
     if (busy) return;
     busy = true;
     const message = messages.shift();
@@ -401,10 +401,10 @@ export function serve(scope) {
     if (messages.length > 0 || live?.pending) clock.port2.postMessage(null);
   };
 
-  clock.port1.onmessage = go;
+  clock.port1.onmessage = handleNext;
   scope.onmessage = ({ data }) => {
     messages.push(data);
-    go();
+    handleNext();
   };
 }
 
@@ -429,7 +429,7 @@ class Random {
     return sum;
   }
 
-  // In [0, 1).
+  // A number uniform in [0, 1).
   uniform() {
     return this.bits() / 2 ** 32;
   }
@@ -447,7 +447,7 @@ class Random {
     return Float32Array.from({ length }, () => deviation * this.normal());
   }
 
-  // A vector of length 1.
+  // A random vector of length 1.
   direction(dimension) {
     const vector = Array.from({ length: dimension }, () => this.normal());
     const length = Math.hypot(...vector) || 1;

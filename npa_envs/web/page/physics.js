@@ -43,14 +43,14 @@ export function prepareRule(description, kernels) {
 // The kernels in plain JavaScript. `floats` and `integers` return zeroed arrays for them.
 export function plainKernels() {
   // Sums over the neighbours of a particle whose state begins at `own`, into `sums` [1 + D, width]:
-  // Σ a s_j, and Σ k (s_j - s_i) for each axis. Neighbours' states begin where `place` says.
-  function gather(states, width, dimension, own, { count, place, a, slopes }, sums) {
+  // Σ a s_j, and Σ k (s_j - s_i) for each axis. `stateAt` has the indices of neighbours' first channels.
+  function gather(states, width, dimension, own, { count, stateAt, a, slopes }, sums) {
     const [kx, ky, kz] = slopes;
     for (let c = 0; c < width; c++) {
       const mine = states[own + c];
       let blur = 0, x = 0, y = 0, z = 0;
       for (let n = 0; n < count; n++) {
-        const other = states[place[n] + c], offset = other - mine;
+        const other = states[stateAt[n] + c], offset = other - mine;
         blur += a[n] * other;
         x += kx[n] * offset;
         y += ky[n] * offset;
@@ -66,7 +66,7 @@ export function plainKernels() {
   // Lists the neighbours of sorted particle i among runs of particles, with their factors in `gather`,
   // and adds up their moment matrix: xx, xy, xz, yy, yz, zz.
   function pairs({ x, y, z, volume }, i, ranges, used, { eps, weight, slope, sides, perSide, width }, list, moment) {
-    const { place, a, slopes: [kx, ky, kz] } = list;
+    const { stateAt, a, slopes: [kx, ky, kz] } = list;
     const [sideX, sideY, sideZ] = sides;
     const halfX = 0.5 / perSide[0], halfY = 0.5 / perSide[1], halfZ = 0.5 / perSide[2];
     const squaredRadius = eps * eps;
@@ -89,7 +89,7 @@ export function plainKernels() {
         const distance = Math.sqrt(squared);
         const k = squared > 0 ? (slope * (eps - distance) * (eps - distance)) / distance : 0;
         const factor = k * volume[j];
-        place[count] = j * width;
+        stateAt[count] = j * width;
         a[count] = weight * left * left * left * volume[j];
         kx[count] = factor * dx;
         ky[count] = factor * dy;
@@ -107,7 +107,7 @@ export function plainKernels() {
     moment.set([xx, xy, xz, yy, yz, zz]);
   }
 
-  // out = W in + b for `count` rows; max(out, 0) where `rectified`.
+  // Writes W row + b for `count` rows to `out`; max(., 0) of it where `rectified`.
   function product({ inputs, width, weights, offset }, count, rows, rowWidth, out, rectified) {
     for (let tile = 0; tile < width; tile += TILE_OUTPUTS) {
       for (let row = 0; row < count; row++) {
@@ -192,10 +192,10 @@ export class Physics {
     this.cellOf = new Int32Array(capacity);
     this.starts = new Int32Array(1);
     this.states = kernels.floats(capacity * this.width);
-    // The neighbours of one particle: where their states begin, and their factors in the sums.
+    // The neighbours of one particle: indices of their first channels, and their factors in the sums.
     this.list = {
       count: 0,
-      place: kernels.integers(room),
+      stateAt: kernels.integers(room),
       a: floats(),
       slopes: [floats(), floats(), floats()],
     };
