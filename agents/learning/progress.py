@@ -42,7 +42,7 @@ class Budget:
     """Steps times particles that took them, of environments and rollouts together."""
 
     def __post_init__(self) -> None:
-        """Check both; raises NPAError."""
+        """Check both limits; raises NPAError."""
         if self.seconds is None and self.particle_steps is None:
             raise NPAError(
                 "a budget must say something: Budget(seconds=60) or particle_steps=10**7"
@@ -94,7 +94,7 @@ class Learner(Protocol):
 
 
 class Progress:
-    """Counts what a learner spends, evaluates its rules at regular parts of the budget, saves them.
+    """Counts what a learner spends, evaluates its rules at regular intervals, and saves them.
 
     A learner makes its worlds, compiles what it needs, and then calls `run`, or itself `start`, and
     until the budget is `over`, `advance` and `look` after each iteration.
@@ -272,7 +272,7 @@ class Progress:
             self._agree_on_time()
 
     def look(self, policy: RuleSet | Callable[[Any], Any], force: bool = False) -> bool:
-        """Evaluate if the next point of the curve is due, or with `force`; return whether it did.
+        """Evaluate if the curve's next point is due, or with `force`; return whether it was done.
 
         Without particle-steps since the last evaluation there is none.
 
@@ -425,7 +425,7 @@ def check_finite(rules: RuleSet, particle_steps: int) -> None:
 
 
 def learner_state(learner: Learner) -> dict[str, Any]:
-    """Return the state of a learner without its worlds."""
+    """Return a learner's modules, optimisers and random source as checkpoints contain them."""
     random = learner.random
     # The counter of draws is the same in all worlds.
     drawn = random.episodes[:1] if isinstance(random, WorldRandom) else random.get_state()

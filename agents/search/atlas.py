@@ -33,7 +33,7 @@ Pictures = Mapping[tuple[int, ...], NDArray[np.uint8]]
 
 
 def write_elites(search: Search, folder: Path) -> Pictures:
-    """Write each elite's rule as `elites/CELL.safetensors`; return pictures of first worlds."""
+    """Write each elite's rule as `elites/CELL.safetensors`; return pictures of their worlds."""
     pictures: dict[tuple[int, ...], NDArray[np.uint8]] = {}
     count = search.world.particle_count
     for elite in search.elites():
