@@ -8,9 +8,9 @@ whose actor is a set of rules, is this library's.
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from gymnasium.spaces import Dict, Space
@@ -247,14 +247,12 @@ class GardenOptions:
     """Discount of a reward one step later (dimensionless)."""
     learning_rate: float = 3e-4
     """Adam's learning rate."""
-    counts: ClassVar[tuple[str, ...]] = ()
-    """Names of the fields that are whole numbers."""
 
     def __post_init__(self) -> None:
         """Check every field; raises NPAError."""
         check_fraction(self, "gamma")
         check_positive(self, float, "learning_rate")
-        check_positive(self, int, *self.counts)
+        check_positive(self, int, *(f.name for f in fields(self) if isinstance(f.default, int)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -263,7 +261,6 @@ class SACOptions(GardenOptions):
 
     learning_starts: int = 1000
     """Steps of worlds before the first gradient step."""
-    counts = ("learning_starts",)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -274,7 +271,6 @@ class GardenPPOOptions(GardenOptions):
     """Steps of each world in a round."""
     batch_size: int = 64
     """Steps of worlds in a minibatch, at least 2."""
-    counts = ("steps", "batch_size")
 
 
 def train_garden_sac(progress: Progress, options: SACOptions = SACOptions()) -> GardenPolicy:

@@ -167,8 +167,10 @@ def make_plan(options: CompareOptions) -> ComparisonPlan:
     if suite and quick and not options.tasks:
         tasks = tasks[:1]
     methods, own = _chosen_methods(options.methods, suite.methods if suite else METHODS)
-    changed_options = _method_options(options.options, methods, own) if suite else {}
-    for name in changed_options.keys() - own.keys():
+    if not (suite or options.methods):
+        methods = [name for name in methods if name != "clone"]  # It needs a teacher.
+    changed_options = _method_options(options.options, methods, own)
+    for name in changed_options.keys() - own.keys() if suite else ():
         raise NPAError(
             f"options of {name!r} are frozen in {options.suite}: give it a name of its own, "
             f"--methods my_{name}={name} --options my_{name}.NAME=VALUE"
@@ -186,11 +188,8 @@ def make_plan(options: CompareOptions) -> ComparisonPlan:
         ]
         seeds, episodes = 1 if quick else npa_bench.MIN_SEEDS, npa_bench.EPISODES
     else:
-        if not options.methods:
-            methods = [name for name in methods if name != "clone"]  # It needs a teacher.
         problems = {name: make_problem(name, quick=quick) for name in tasks}
         budgets = {axis: dict.fromkeys(tasks, limit) for axis, limit in _budgets(options).items()}
-        changed_options = _method_options(options.options, methods, own)
         left_out = [] if options.methods else list(LEFT_OUT)
         seeds, episodes = 3, 32
     return ComparisonPlan(
