@@ -50,7 +50,7 @@ class Episodes(NamedTuple):
 
 
 def evaluate_policy(env: Any, policy: Callable[[Any], Any], seeds: Iterable[int]) -> Episodes:
-    """Run one episode from each seed, in all worlds of the environment at a time.
+    """Run one episode from each seed, as many at a time as the environment has worlds.
 
     Each is the first episode after a reset with its seed, so that results do not depend on the
     number of worlds or on the lengths of episodes.

@@ -21,7 +21,7 @@ FREE_PLACES = 8
 
 
 class BrushPolicy:
-    """A policy for the brushes of a garden, single or vector, with actions="grid" or "free"."""
+    """A policy for an environment with brushes, single or vector, on a grid or free."""
 
     def __init__(self, env: Any) -> None:
         inner = unwrapped(env)
@@ -169,9 +169,9 @@ class ScriptedShepherd(BrushPolicy):
 
 
 class GradientGardener(BrushPolicy):
-    """Plan by the gradient of rewards through brushes, rule and picture.
+    """Plan by the gradient of rewards, differentiated through brushes, rule and picture.
 
-    In each step it simulates the worlds for `horizon` steps, with separate random masks and
+    In each step it simulates the worlds for `horizon` steps, with update masks of its own and
     without damage, and improves the actions by Adam, starting from those of `ScriptedGardener` or
     `ScriptedShepherd`. It takes the first step of the best plan.
 

@@ -41,7 +41,7 @@ def unwrapped(env: Any) -> Any:
 
 
 def interface_of(env: Any) -> Interface:
-    """Return the meaning of an environment's observations and actions.
+    """Return what the columns of an environment's observations and actions mean.
 
     Args:
         env: A single or a vector environment of `npa_envs`, wrapped or not.
@@ -69,7 +69,7 @@ def acting_interface(env: Any) -> Interface:
 
 
 def spans_of(counts: Iterable[int]) -> list[slice]:
-    """Return the slice of each of consecutive groups of `counts` particles."""
+    """Return the slices of consecutive groups of particles, for the number in each group."""
     ends = [0, *accumulate(counts)]
     return [slice(*pair) for pair in pairwise(ends)]
 
@@ -265,7 +265,7 @@ class SpreadPolicy(Policy):
 
     Args:
         env: The environment.
-        gain: Displacement, as a fraction of α ε, for a density gradient c^{1+D} ∇ρ / N of 1.
+        gain: Displacement, as a fraction of α ε, for a gradient c^{1+D} ∇ρ / N of 1, c = ε / ε0.
 
     Raises:
         NPAError: The gain is not a finite number.

@@ -145,8 +145,8 @@ def write_rows(
 ) -> list[Path]:
     """Write the runs of each method as METHOD.json (a row of the suite), and return the paths.
 
-    Failed runs are left out. Runs of other problems and seeds in an existing file are kept. It then
-    names the commands, commits, machines and versions of all its runs, separated by semicolons.
+    Failed runs are left out. A file that exists keeps its runs of other problems and seeds, and
+    names the commands, commits, machines and versions of all runs, separated by semicolons.
     """
     paths = []
     ended = [record for record in records if record.status != "failed"]
@@ -187,7 +187,7 @@ def check_rows(suite: Suite, plan: ComparisonPlan, folder: Path) -> None:
 def _stored_row(
     suite: Suite, plan: ComparisonPlan, method: str, folder: Path
 ) -> dict[str, Any] | None:
-    """Return the object in METHOD.json, None without the file, after the check of `check_rows`."""
+    """Return the object in METHOD.json, None without the file; raises as `check_rows`."""
     path = folder / f"{method}.json"
     if not path.exists():
         return None

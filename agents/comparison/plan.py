@@ -99,7 +99,7 @@ AXES: tuple[Axis, ...] = get_args(Axis)
 
 @dataclass(frozen=True)
 class Job:
-    """One run: a method of `npa_envs.agents.learning` on a task of `PROBLEMS`, from a seed."""
+    """One run: a method of `npa_envs.agents.learning` on a task of the plan, from a seed."""
 
     axis: Axis
     task: str
@@ -156,7 +156,7 @@ class ComparisonPlan:
         return part_of(self.jobs(), part, lambda job: (job.axis, job.seed, job.task))
 
     def teacher(self, job: Job) -> Job | None:
-        """Return the run of "gradient" whose rules a run of "clone" imitates, else None."""
+        """Return the "gradient" run that a "clone" run imitates; None where no run is imitated."""
         if self.own.get(job.method, job.method) != "clone":
             return None
         if "teacher" in self.options.get(job.method, {}):

@@ -89,7 +89,7 @@ class RunRecord:
 
     @classmethod
     def read(cls, folder: Path, facts: Mapping[str, Any]) -> RunRecord | None:
-        """Return the record in a run's folder, if any; raises NPAError if its facts are others."""
+        """Return the record in a run's folder, if any; raises NPAError if it has other `facts`."""
 
         def make(content: dict[str, Any]) -> RunRecord:
             points: list[dict[str, Any]]

@@ -179,7 +179,7 @@ class GaussianRules(nn.Module):
 
     @torch.no_grad()
     def set_noise(self, factor: float) -> None:
-        """Rescale the standard deviations by `factor` over the previous `noise_factor`."""
+        """Rescale the standard deviations by `factor` over `noise_factor`, and store it there."""
         self.log_std.add_(math.log(factor / self.noise_factor))
         self.noise_factor = factor
 
@@ -267,7 +267,7 @@ class Critic(nn.Module):
 
     @torch.no_grad()
     def rescale(self, targets: Tensor, ranks: ProcessGroup = ALONE) -> None:
-        """Update the outputs' running scale, the RMS of targets, and the network to keep values."""
+        """Update the outputs' running scale, the RMS of targets; the last layer offsets it."""
         before = self.scale.clone()
         square = targets.square().mean()
         ranks.reduce([square])
@@ -277,7 +277,7 @@ class Critic(nn.Module):
             parameter.mul_(before / self.scale)
 
     def _rate(self, moment: int) -> Tensor:
-        """Count a batch of inputs (`moment` 0) or targets (1); return its weight, on the device."""
+        """Count a batch of inputs (`moment` 0) or targets (1); return its weight in the moment."""
         self.updates[moment] += 1.0
         return (1.0 / self.updates[moment]).clamp(min=MIN_RATE)
 
@@ -290,7 +290,7 @@ def seeded_critic(progress: Progress, input_dim: int, inputs: CriticInput) -> Cr
 
 
 def learner_random(progress: Progress, total: int, indices: Tensor) -> Randomness:
-    """Return a learner's generator, or with several processes a random stream of each world."""
+    """Return a generator, or with several processes streams of worlds `indices` of `total`."""
     if progress.ranks.distributed:
         return world_streams((progress.seed,), total, indices, progress.device)
     return torch.Generator(progress.device).manual_seed(progress.seed)

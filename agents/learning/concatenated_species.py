@@ -54,7 +54,7 @@ class ConcatenatedSpeciesEnv(MultiSpeciesVectorEnv):
     def reset(  # type: ignore[override]
         self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Tensor, dict[str, Any]]:
-        """Start episodes as `MultiSpeciesVectorEnv.reset`; infos have `loss`."""
+        """Start episodes as `MultiSpeciesVectorEnv.reset` does; infos have `loss`, [B]."""
         observations, infos = super().reset(seed, options)
         chosen = worlds_to_reset(options, self.num_envs)
         self._reasons[chosen] = None

@@ -105,7 +105,7 @@ class RuleWeights:
             )
 
     def scales(self) -> NDArray[np.float64]:
-        """Return weights' standard deviations if drawn by Xavier, gain 1, shape [W]; b1 as W1."""
+        """Return the standard deviations of weights drawn by Xavier, gain 1, [W]; b1 as W1."""
         sizes = []
         for rule in self._rules:
             hidden, bias, output = layers_of(rule)
@@ -177,7 +177,7 @@ def fitness(
 def _strategy(
     rule_weights: RuleWeights, options: EvolutionOptions, draws: np.random.Generator
 ) -> Any:
-    """Return an evolution strategy of `cma`, with `ask`, `tell` and `mean`, around the rules."""
+    """Return an evolution strategy of `cma` that starts at the rules, with `ask`, `tell` and `mean`."""
     try:
         import cma
     except ImportError as error:

@@ -137,7 +137,7 @@ class BudgetTrainConfig(TrainConfig[Any]):
 class EnvironmentTask(ParticleTask[Any]):
     """A problem as a task of the trainer: start worlds, loss and physics of its episodes.
 
-    All species must have one loss, and no particle may leave a world.
+    All species must share one loss, and no particle may leave a world.
     """
 
     def __init__(self, problem: Problem, device: torch.device) -> None:
@@ -179,7 +179,7 @@ class EnvironmentTask(ParticleTask[Any]):
         return Particles(x, s, goal=rest[1] if rest else None)
 
     def with_goal(self, goal: Tensor | None) -> Self:
-        """Return the task with losses for the worlds' goals, [B]; None: itself."""
+        """Return a copy whose losses are for these goals of worlds, [B]; None: the task itself."""
         return self if goal is None else self._with(inner=self.inner.with_goal(goal))
 
     def compare(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:
@@ -259,7 +259,7 @@ class ClampedWeights(FoldedRule):
     rule: ClampedRule
 
     def __call__(self, rows: Tensor) -> Tensor:
-        """Map padded perceptions [z | 1 | 0] to padded updates [δ | Δs | 0], Δs clamped."""
+        """Map padded perceptions [z | 1 | 0] to displacements and clamped state steps, padded."""
         return self.rule.clamped(super().__call__(rows))
 
 

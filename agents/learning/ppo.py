@@ -168,7 +168,7 @@ class PPOLearner:
 
     @torch.no_grad()
     def play(self) -> Round:
-        """Return T steps of all worlds with their advantages, which the next round overwrites."""
+        """Play T steps, and return them with advantages; the next round overwrites them."""
         memory, options = self.memory, self.options
         memory.observations[0].copy_(memory.observations[-1])
         last_observations = {}
@@ -342,7 +342,7 @@ class PPOLearner:
         return [value[index] for value in values]
 
     def _rule_rows(self, minibatch: int, values: Sequence[Tensor]) -> list[list[Tensor]]:
-        """Return the rules' minibatch of each tensor: worlds, or by species its particles."""
+        """Return the rules' minibatch of each tensor, of worlds, or by species of its particles."""
         indices = [group[minibatch] for group in self._minibatches.indices[:-1]]
         if self.options.ratio == "world":
             return [[value[index] for value in values] for index in indices]

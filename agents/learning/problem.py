@@ -188,8 +188,8 @@ class Problem:
         Args:
             num_envs: Worlds B; None: the problem's.
             device: Device of the worlds.
-            row_rewards: Adds `infos["particle_reward"]`, [B, N]: "particle", each particle's own
-                part of the improvement, or "marginal", the difference that its action makes. With
+            row_rewards: Adds `infos["particle_reward"]`, [B, N]: "particle", the decrease of each
+                particle's own loss, or "marginal", the difference that its action makes. With
                 several species it is always there: the reward of the particle's species.
             tell_updated: Adds `infos["updated"]`, [B, N]: which actions took effect; not with
                 several species.

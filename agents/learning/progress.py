@@ -274,7 +274,7 @@ class Progress:
     def look(self, policy: RuleSet | Callable[[Any], Any], force: bool = False) -> bool:
         """Evaluate if the curve's next point is due, or with `force`; return whether it was done.
 
-        Without particle-steps since the last evaluation there is none.
+        None is done if no particle-steps have been counted since the last one.
 
         Raises:
             DivergedError: A weight of the rules is not finite, or an action.
@@ -330,7 +330,7 @@ class Progress:
             torch.cuda.synchronize(self.device)
 
     def _save(self, rules: RuleSet, learner: Learner | None) -> None:
-        """Write checkpoint, rules and curve, after a check that all processes have the same."""
+        """Write checkpoint, rules and curve, after a check that processes have equal weights."""
         folder = self._run.folder
         if folder is None:
             return

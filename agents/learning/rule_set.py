@@ -151,7 +151,7 @@ class RuleSet(nn.Module):
     def actions(
         self, observation: Tensor, action_by_rule: Callable[[NPARule, Tensor], Tensor]
     ) -> Tensor:
-        """Return actions [B, N, A]; `action_by_rule` maps a rule and perceptions to [K, A]."""
+        """Return actions [B, N, A]; `action_by_rule` maps a rule and [K, P] to actions [K, A]."""
         actions = []
         for rule, span in zip(self, self.spans, strict=True):
             rows = observation[:, span]

@@ -146,7 +146,7 @@ class ProgressCallback(BaseCallback):
 
 
 class RoundCallback(ProgressCallback):
-    """Reports once a round, anneals the rules' noise, and at first lets only the critic learn."""
+    """Reports once a round; anneals the rules' noise; at first lets only the critic learn."""
 
     def __init__(self, progress: Progress, options: WorldOptions, schedule: Schedule) -> None:
         super().__init__(progress)

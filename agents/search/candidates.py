@@ -74,11 +74,11 @@ class SearchWorld:
 
     @property
     def particle_steps(self) -> int:
-        """Cost of one candidate: B N T."""
+        """Cost of one candidate in particle-steps: B N T."""
         return self.world_count * self.particle_count * self.steps
 
     def make_rule(self) -> NPARule:
-        """Return a rule with arbitrary weights, on the CPU."""
+        """Return a rule of these sizes with arbitrary weights, on the CPU."""
         with torch.random.fork_rng(devices=()):
             return NPARule(2, self.state_dim, self.hidden_dim, eps0=self.eps).requires_grad_(False)
 

@@ -258,7 +258,7 @@ class Search:
         enough: Callable[[], bool] = lambda: False,
         progress: Callable[[int], None] = lambda _: None,
     ) -> None:
-        """Evaluate batches of candidates while the search stays within its budget.
+        """Propose and evaluate batches of candidates while the search is within its budget.
 
         Args:
             budget: Particle-steps of the whole search, with those before a resume.
