@@ -177,7 +177,7 @@ def fitness(
 def _strategy(
     rule_weights: RuleWeights, options: EvolutionOptions, draws: np.random.Generator
 ) -> Any:
-    """Return an evolution strategy of `cma` that starts at the rules, with `ask`, `tell` and `mean`."""
+    """Return an evolution strategy of `cma` around the rules, with `ask`, `tell` and `mean`."""
     try:
         import cma
     except ImportError as error:

@@ -124,7 +124,8 @@ def check_same_run(
 def check_entries(content: Mapping[str, Any], types: Mapping[str, type], path: Path) -> None:
     """Check that a checkpoint has entries of these types; numbers must be finite and >= 0."""
     for name, kind in types.items():
-        value, noun = content.get(name), kind.__name__
+        value: Any = content.get(name)
+        noun = kind.__name__
         right = isinstance(value, kind)
         if kind in (int, float):
             noun = f"{'whole' if kind is int else 'finite'} number of at least 0"
