@@ -15,7 +15,7 @@ import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Literal, NamedTuple, Self
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -86,13 +86,6 @@ class PPOOptions(CommonOptions):
                 "advantage a world"
             )
 
-    @property
-    def largest_change(self) -> float:
-        """Distance from 1 at which likelihood ratios are clipped."""
-        if self.clip is not None:
-            return self.clip
-        return 0.2 if self.ratio == "particle" else 0.02
-
 
 def train(progress: Progress, options: PPOOptions = PPOOptions()) -> RuleSet:
     """Return the rules that proximal policy optimisation learns within the budget."""
@@ -146,7 +139,8 @@ class PPOLearner:
         observation = self._reset_worlds(0)
         self.critic.observe(observation, ranks)
         self.memory = RoundMemory(options, observation, problem.interface.action_dim)
-        self.update = UpdateState.new(self._minibatches.count, device)
+        shapes: tuple[tuple[int, ...], ...] = ((), (), (2,), (self._minibatches.count, 2))
+        self.update = UpdateState(*(torch.zeros(shape, device=device) for shape in shapes))
         self._play_graphs = GraphedMethods(device)
         self._update_graphs = GraphedMethods(device, share_memory=True)
 
@@ -315,7 +309,7 @@ class PPOLearner:
         if options.ratio == "world":
             log_ratio = particle_means(log_ratio, acted)
         weights, total = self._ratio_weights(acted), self.update.weight_sums[minibatch, 1]
-        clip = options.largest_change
+        clip = options.clip or (0.2 if options.ratio == "particle" else 0.02)
         objective = clipped_objective(log_ratio, advantages, weights, total, clip=clip)
         if options.entropy_weight:
             objective = objective + options.entropy_weight * actor.entropy()
@@ -376,12 +370,6 @@ class UpdateState(NamedTuple):
     """Sums of a minibatch's KL estimates [nats] and of their weights, shape [2]."""
     weight_sums: Tensor
     """Sums of the weights of the critic's and of the rules' samples by minibatch, shape [M, 2]."""
-
-    @classmethod
-    def new(cls, minibatch_count: int, device: torch.device) -> Self:
-        """Return the state before the first update."""
-        shapes = ((), (), (2,), (minibatch_count, 2))
-        return cls(*(torch.zeros(shape, device=device) for shape in shapes))
 
 
 class GraphedMethods:
