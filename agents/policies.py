@@ -361,7 +361,7 @@ def bounded_update(rule: NPARule, observation: Tensor) -> tuple[Tensor, Tensor]:
     and unbounded state steps Δs (dimensionless), [K, C].
     """
     weight = rule.hidden.weight
-    rows = perceived(rule, observation.to(weight.device, weight.dtype))
+    rows = columns_read(rule, observation.to(weight.device, weight.dtype))
     network = rule.network()
     if network is not None:
         # The same operations as in a rollout, as a rule amplifies rounding errors.
@@ -371,17 +371,17 @@ def bounded_update(rule: NPARule, observation: Tensor) -> tuple[Tensor, Tensor]:
         update = network(padded)[:, : rule.update_dim]
     else:
         update = rule(rows)
-    return bounded(rule, update)
+    return split_update(rule, update)
 
 
-def bounded(rule: NPARule, update: Tensor) -> tuple[Tensor, Tensor]:
+def split_update(rule: NPARule, update: Tensor) -> tuple[Tensor, Tensor]:
     """Split raw updates [K, A] into displacements δ / (1 + |δ|), [K, D], and state steps [K, C]."""
     moved = 0 if rule.static else rule.space_dim
     delta, state_step = update[:, :moved], update[:, moved:]
     return delta / (1.0 + delta.norm(dim=1, keepdim=True)), state_step
 
 
-def perceived(rule: NPARule, rows: Tensor) -> Tensor:
+def columns_read(rule: NPARule, rows: Tensor) -> Tensor:
     """Return those columns of observations [K, P] that a rule reads, in the rule's order."""
     if rule.state_gradient and rule.density_gradient:
         return rows

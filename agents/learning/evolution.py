@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from npa_envs.agents.learning.problem import FIRST_EVALUATION_SEED
 from npa_envs.agents.learning.progress import Progress
 from npa_envs.agents.learning.rule_set import RuleSet
-from npa_envs.agents.policies import bounded, perceived
+from npa_envs.agents.policies import columns_read, split_update
 from npa_envs.checks import check_positive
 from npa_envs.errors import MissingDependencyError, NPAError
 from npa_envs.rule.folded_network import without_small
@@ -147,10 +147,10 @@ def candidates_actions(rules: RuleSet, weights: Tensor, observation: Tensor) -> 
     weights_of = dict(zip(rules, torch.split(weights, sizes, dim=1), strict=True))
 
     def action(rule: NPARule, observation: Tensor) -> Tensor:
-        rows = perceived(rule, observation)
+        rows = columns_read(rule, observation)
         rows = rows.view(len(weights), -1, rows.shape[1])
         update = updates_of(rule, weights_of[rule], rows).flatten(0, 1)
-        return rules.interface.action(*bounded(rule, update))
+        return rules.interface.action(*split_update(rule, update))
 
     return rules.actions(observation, action)
 

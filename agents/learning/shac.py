@@ -249,17 +249,17 @@ def world_values(critic: Critic, features: Tensor) -> Tensor:
 
 
 def td_lambda_targets(
-    rewards: Tensor, following: Tensor, *, gamma: float, td_lambda: float
+    rewards: Tensor, next_values: Tensor, *, gamma: float, td_lambda: float
 ) -> Tensor:
     """Return TD(λ) targets before each step of a window, shape [h, ...].
 
     They are discounted sums of later rewards, in which the critic's values after each step,
-    `following`, have the weight 1 - λ, and 1 after the last step. Source: arXiv 2204.07137,
+    `next_values`, have the weight 1 - λ, and 1 after the last step. Source: arXiv 2204.07137,
     equation 7.
     """
     targets = torch.empty_like(rewards)
-    later = following[-1]
+    later = next_values[-1]
     for step in reversed(range(len(rewards))):
-        later = rewards[step] + gamma * torch.lerp(following[step], later, td_lambda)
+        later = rewards[step] + gamma * torch.lerp(next_values[step], later, td_lambda)
         targets[step] = later
     return targets
