@@ -23,7 +23,7 @@ _REASONS = {"reason", "diverged", "success"}
 
 
 class Episodes(NamedTuple):
-    """Episodes of a policy, one entry a seed, shape [E]."""
+    """Results of a policy's episodes, one for each seed: arrays of shape [E]."""
 
     returns: NDArray[np.float64]
     """Sums of the rewards."""
@@ -50,7 +50,7 @@ class Episodes(NamedTuple):
 
 
 def evaluate_policy(env: Any, policy: Callable[[Any], Any], seeds: Iterable[int]) -> Episodes:
-    """Run one episode from each seed, in all worlds of the environment at a time.
+    """Run one episode from each seed, as many at a time as the environment has worlds.
 
     Each is the first episode after a reset with its seed, so that results do not depend on the
     number of worlds or on the lengths of episodes.
@@ -92,7 +92,7 @@ def evaluate_policy(env: Any, policy: Callable[[Any], Any], seeds: Iterable[int]
 
 
 def checked_seeds(name: str, seeds: Iterable[int]) -> list[int]:
-    """Return seeds as a list; `name` is the argument in errors."""
+    """Return seeds as a list, or raise an NPAError that calls the argument `name`."""
     if not isinstance(seeds, Iterable):
         raise NPAError(
             f"{name} must be one for each episode, got {shown(seeds)}: give {name}=range(8)"
@@ -106,13 +106,13 @@ def checked_seeds(name: str, seeds: Iterable[int]) -> list[int]:
 
 
 def policy_in(env: Any, policy: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """Return the policy, or if it reads the worlds, the one made for the environment."""
+    """Return `policy.made_for(env)` of a policy that reads the worlds, else the policy itself."""
     make = getattr(policy, "made_for", None)
     return policy if make is None else make(env)
 
 
 def _run(env: Any, policy: Callable[[Any], Any], seeds: list[int]) -> tuple[NDArray[Any], ...]:
-    """Run the first episode of each world: returns, start and final losses, lengths, endings."""
+    """Return fields of `Episodes`: those of each world's first episode, from a seed for each."""
     observation, infos = env.reset(seed=seeds)
     if "loss" not in infos:
         raise NPAError(
@@ -146,7 +146,7 @@ def _run(env: Any, policy: Callable[[Any], Any], seeds: list[int]) -> tuple[NDAr
 def _run_single(
     env: Any, policy: Callable[[Any], Any], seeds: list[int]
 ) -> tuple[NDArray[Any], ...]:
-    """As `_run`, for a single environment."""
+    """Return fields of `Episodes`, of length 1: those of a single environment's episode."""
     observation, info = env.reset(seed=seeds[0])
     start_loss, total, steps, over = info["loss"], 0.0, 0, False
     while not over:
@@ -179,6 +179,6 @@ def _step_limit(env: Any) -> int | None:
 
 
 def _host(value: Any) -> NDArray[Any]:
-    """Return numbers as an array, float64 unless bool."""
+    """Return a tensor or an array as a NumPy array, float64 unless bool."""
     array = value.cpu().numpy() if isinstance(value, torch.Tensor) else np.asarray(value)
     return array if array.dtype == bool else array.astype(np.float64)

@@ -21,7 +21,7 @@ FREE_PLACES = 8
 
 
 class BrushPolicy:
-    """A policy for a garden, single or vector, with actions="grid" or "free"."""
+    """A policy for an environment with brushes, single or vector, on a grid or free."""
 
     def __init__(self, env: Any) -> None:
         inner = unwrapped(env)
@@ -38,7 +38,7 @@ class BrushPolicy:
         """Shape of a world's actions, (K, W)."""
 
     def __call__(self, observation: Any) -> Any:
-        """Return the brushes' actions, [K, W], or [B, K, W] for observations of B worlds.
+        """Return actions of K brushes, W columns each: [K, W], or [B, K, W] for B worlds.
 
         Only type and shape of the observation count: policies read their environment's worlds.
         """
@@ -48,11 +48,11 @@ class BrushPolicy:
         return action if isinstance(array, Tensor) else action.cpu().numpy()
 
     def act(self) -> Tensor:
-        """Return the brushes' actions in the environment's worlds, float32, shape [B, K, W]."""
+        """Return the actions of each world's brushes, float32, shape [B, K, W]."""
         raise NotImplementedError
 
     def still(self) -> Tensor:
-        """Return actions that do nothing."""
+        """Return actions that do nothing: zeros, shape [B, K, W]."""
         return torch.zeros(self.worlds.world_count, *self.shape, device=self.task.device)
 
 
@@ -60,7 +60,7 @@ class StillGardener(BrushPolicy):
     """Do nothing, so that only the rule acts."""
 
     def act(self) -> Tensor:
-        """Return zeros."""
+        """Return zeros, shape [B, K, W]."""
         return self.still()
 
 
@@ -72,20 +72,21 @@ class RandomGardener(BrushPolicy):
         self._random = PolicyRandom(seed)
 
     def act(self) -> Tensor:
-        """Return numbers from [-1, 1)."""
+        """Return actions drawn from [-1, 1), shape [B, K, W]."""
         random = self._random.next_step(self.worlds.world_count, self.task.device)
         return 2.0 * random.uniform(*self.shape) - 1.0
 
 
 class ScriptedGardener(BrushPolicy):
-    """Push particles towards places with too few of them.
+    """Push particles towards places with a deficit: with less density than the target.
 
-    On a grid actions are linear in observations. Free brushes go one by one to the place of the
-    longest push that has no brush yet.
+    On a grid pushes are linear in observations. Free brushes go one by one to the place that needs
+    the longest push and has no brush yet.
 
     Args:
-        gain: Push by the gradient of the deficit at a place (dimensionless).
-        share: Push towards each other place by the deficit there (dimensionless).
+        gain: Factor on the deficit's gradient, a brush's push at its place (dimensionless).
+        share: Factor on a brush's pushes towards all other places, by the deficit at each
+            (dimensionless).
         width: Standard deviation of the Gaussian weight of other places [length units].
     """
 
@@ -106,7 +107,7 @@ class ScriptedGardener(BrushPolicy):
         self._pulls = (checked_positive("share", share) * weight[..., None] * away).double()
 
     def act(self) -> Tensor:
-        """Return pushes towards places where worlds have less than the target."""
+        """Return actions that push towards places with a deficit, shape [B, K, W]."""
         worlds, action = self.worlds, self.still()
         deficit = self._deficit(worlds.particles, self.task.middle(worlds.x))
         pull = torch.einsum("bq,pqd->bpd", deficit[..., 0].double(), self._pulls).to(deficit.dtype)
@@ -126,10 +127,10 @@ class ScriptedGardener(BrushPolicy):
 
 
 class ScriptedShepherd(BrushPolicy):
-    """Push all particles towards the goal of "move", "reshape" or "turn".
+    """Push all particles towards the world's goal, of `aim` "move", "reshape" or "turn".
 
     Args:
-        gain: Fraction of the distance to the goal in a step (dimensionless).
+        gain: Fraction of the distance to the goal that a push covers (dimensionless).
         ring: Radius of the circle on which free brushes are placed [length units].
     """
 
@@ -149,7 +150,7 @@ class ScriptedShepherd(BrushPolicy):
             self._places = ring * torch.stack((angle.cos(), angle.sin()), dim=1)
 
     def act(self) -> Tensor:
-        """Return pushes towards the goals of the worlds."""
+        """Return actions that push towards the goals of the worlds, shape [B, K, W]."""
         worlds, action = self.worlds, self.still()
         achieved = self.task.achieved(worlds.particles, worlds.context)
         missing = (self.task.desired(worlds.context) - achieved)[:, None, :2]
@@ -168,9 +169,9 @@ class ScriptedShepherd(BrushPolicy):
 
 
 class GradientGardener(BrushPolicy):
-    """Plan by the gradient of rewards through brushes, rule and picture.
+    """Plan by the gradient of rewards, differentiated through brushes, rule and picture.
 
-    In each step it simulates the worlds for `horizon` steps, with separate random masks and
+    In each step it simulates the worlds for `horizon` steps, with update masks of its own and
     without damage, and improves the actions by Adam, starting from those of `ScriptedGardener` or
     `ScriptedShepherd`. It takes the first step of the best plan.
 
@@ -196,7 +197,7 @@ class GradientGardener(BrushPolicy):
         self._random = PolicyRandom(seed)
 
     def act(self) -> Tensor:
-        """Return the first step of the best plan."""
+        """Return the actions of the best plan's first step, shape [B, K, W]."""
         random = self._random.next_step(self.worlds.world_count, self.task.device)
         first = self._scripted.act()
         plan = torch.stack([first] + [self.still()] * (self._horizon - 1))
@@ -219,7 +220,7 @@ class GradientGardener(BrushPolicy):
 
     @torch.enable_grad()
     def planned_rewards(self, plan: Tensor, random: WorldRandom) -> Tensor:
-        """Return the sum of each world's rewards in the steps of a plan, [T, B, K, W], [B]."""
+        """Return the sum [B] of each world's rewards in the T steps of a plan [T, B, K, W]."""
         worlds, task = self.worlds, self.task
         particles = worlds.particles
         random = random.substream(StreamId.POLICY)

@@ -41,7 +41,7 @@ def unwrapped(env: Any) -> Any:
 
 
 def interface_of(env: Any) -> Interface:
-    """Return the meaning of an environment's observations and actions.
+    """Return what the columns of an environment's observations and actions mean.
 
     Args:
         env: A single or a vector environment of `npa_envs`, wrapped or not.
@@ -55,7 +55,7 @@ def interface_of(env: Any) -> Interface:
 
 
 def acting_interface(env: Any) -> Interface:
-    """Return `interface_of` an environment, after a check that its actions are of particles."""
+    """Return `interface_of(env)`; raises NPAError if its actions are not rows of particles."""
     interface = interface_of(env)
     space = getattr(env, "single_action_space", None) or getattr(env, "action_space", None)
     # In PettingZoo's environments, whose agents are species, `action_space` is a method.
@@ -69,7 +69,7 @@ def acting_interface(env: Any) -> Interface:
 
 
 def spans_of(counts: Iterable[int]) -> list[slice]:
-    """Return the slices of consecutive groups of the given numbers of particles."""
+    """Return the slices of consecutive groups of particles, for the number in each group."""
     ends = [0, *accumulate(counts)]
     return [slice(*pair) for pair in pairwise(ends)]
 
@@ -115,7 +115,7 @@ class Policy:
         return self._act_on(torch.from_numpy(writable)).cpu().numpy()
 
     def _act_by_agent(self, observations: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the actions of agents that observe [P] or [N_k, P] or [B, N_k, P]."""
+        """Return agents' actions by name, for their observations [P], [N_k, P] or [B, N_k, P]."""
         if not observations:
             return {}
         rows = {agent: torch.as_tensor(values) for agent, values in observations.items()}
@@ -142,7 +142,7 @@ class Policy:
         return result
 
     def _spans(self, counts: Mapping[str, int]) -> dict[str, slice]:
-        """Return the slice of each agent's particles; counts: particles of each agent."""
+        """Return the slice of each agent's particles; counts: their numbers by agent."""
         return dict(zip(counts, spans_of(counts.values()), strict=True))
 
     def _act_on(self, observation: Tensor) -> Tensor:
@@ -204,7 +204,7 @@ class RulePolicy(Policy):
         self.rule = rule
 
     def act(self, observation: Tensor) -> Tensor:
-        """Return the rule's bounded update of every particle."""
+        """Return the actions [B, N, A] that the rule gives particles."""
         return self.interface.action(*bounded_update(self.rule, observation.flatten(0, 1))).float()
 
 
@@ -215,7 +215,7 @@ class ZeroPolicy(Policy):
         super().__init__(acting_interface(env))
 
     def act(self, observation: Tensor) -> Tensor:
-        """Return zeros."""
+        """Return zeros, shape [B, N, A]."""
         return observation.new_zeros(*observation.shape[:2], self.interface.action_dim)
 
 
@@ -227,7 +227,7 @@ class PolicyRandom:
         self._streams: WorldRandom | None = None
 
     def next_step(self, world_count: int, device: torch.device) -> WorldRandom:
-        """Return the next step's streams; another `world_count` restarts them from the seed."""
+        """Return the worlds' streams for the next step; another `world_count` restarts them."""
         if self._streams is None or self._streams.world_count != world_count:
             seeds = range(self._seed, self._seed + world_count)
             # A substream, as an environment with the same seed uses these streams itself.
@@ -254,7 +254,7 @@ class RandomPolicy(Policy):
         self._random = PolicyRandom(seed)
 
     def act(self, observation: Tensor) -> Tensor:
-        """Return numbers from [-1, 1)."""
+        """Return actions drawn from [-1, 1), shape [B, N, A]."""
         world_count, particle_count, _ = observation.shape
         random = self._random.next_step(world_count, observation.device)
         return 2.0 * random.uniform(particle_count, self.interface.action_dim) - 1.0
@@ -265,7 +265,7 @@ class SpreadPolicy(Policy):
 
     Args:
         env: The environment.
-        gain: Displacement, as a fraction of α ε, for a density gradient c^{1+D} ∇ρ / N of 1.
+        gain: Displacement, as a fraction of α ε, for a gradient c^{1+D} ∇ρ / N of 1, c = ε / ε0.
 
     Raises:
         NPAError: The gain is not a finite number.
@@ -276,7 +276,7 @@ class SpreadPolicy(Policy):
         self._gain = checked_finite("gain", gain)
 
     def act(self, observation: Tensor) -> Tensor:
-        """Return displacements down the gradient and the subclass's state steps."""
+        """Return actions [B, N, A]: displacements down the gradient, and `state_step`."""
         displacement = -self._gain * self.interface.density_gradient(observation)
         return self.interface.action(displacement, self.state_step(observation))
 
@@ -318,7 +318,7 @@ class PaintPolicy(SpreadPolicy):
             )
 
     def state_step(self, observation: Tensor) -> Tensor:
-        """Return the wanted colour minus the particle's in the last three channels, else 0."""
+        """Return state steps [B, N, C]: `colour` minus the own one in the last three, else 0."""
         step = torch.zeros_like(self.interface.states(observation))
         target = self._colour.to(step.device) - COLOUR_OFFSET
         step[..., -3:] = target - self.interface.states(observation)[..., -3:]
@@ -342,14 +342,14 @@ class MendPolicy(SpreadPolicy):
         self._blank = checked_finite("blank", blank)
 
     def state_step(self, observation: Tensor) -> Tensor:
-        """Return the neighbours' mean state minus the own one for blank particles, else 0."""
+        """Return state steps [B, N, C]: neighbours' mean minus own states if blank, else 0."""
         states = self.interface.states(observation)
         blank = states.norm(dim=-1, keepdim=True) < self._blank
         return torch.where(blank, self.interface.mean_states(observation) - states, 0.0)
 
 
 def rule_interface(rule: NPARule, state_scale: float) -> Interface:
-    """Return the interface that a rule needs."""
+    """Return the observations' and actions' columns that a rule needs, as an `Interface`."""
     moving = not rule.static
     return Interface(rule.space_dim, rule.state_dim, moving, state_scale, rule.species_count)
 
@@ -361,7 +361,7 @@ def bounded_update(rule: NPARule, observation: Tensor) -> tuple[Tensor, Tensor]:
     and unbounded state steps Δs (dimensionless), [K, C].
     """
     weight = rule.hidden.weight
-    rows = perceived(rule, observation.to(weight.device, weight.dtype))
+    rows = columns_read(rule, observation.to(weight.device, weight.dtype))
     network = rule.network()
     if network is not None:
         # The same operations as in a rollout, as a rule amplifies rounding errors.
@@ -371,18 +371,18 @@ def bounded_update(rule: NPARule, observation: Tensor) -> tuple[Tensor, Tensor]:
         update = network(padded)[:, : rule.update_dim]
     else:
         update = rule(rows)
-    return bounded(rule, update)
+    return split_update(rule, update)
 
 
-def bounded(rule: NPARule, update: Tensor) -> tuple[Tensor, Tensor]:
-    """Split raw updates [K, A] into bounded displacements and state steps."""
+def split_update(rule: NPARule, update: Tensor) -> tuple[Tensor, Tensor]:
+    """Split raw updates [K, A] into displacements δ / (1 + |δ|), [K, D], and state steps [K, C]."""
     moved = 0 if rule.static else rule.space_dim
     delta, state_step = update[:, :moved], update[:, moved:]
     return delta / (1.0 + delta.norm(dim=1, keepdim=True)), state_step
 
 
-def perceived(rule: NPARule, rows: Tensor) -> Tensor:
-    """Return the columns of observations [K, P] that a rule reads, in its order."""
+def columns_read(rule: NPARule, rows: Tensor) -> Tensor:
+    """Return those columns of observations [K, P] that a rule reads, in the rule's order."""
     if rule.state_gradient and rule.density_gradient:
         return rows
     first, end = 2 * rule.state_dim, rule_interface(rule, 1.0).shared_dim

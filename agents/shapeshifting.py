@@ -14,7 +14,7 @@ from npa_envs.world.particles import Particles
 
 
 class RecognisingShapeshifter:
-    """Choose the code of the picture that is nearest to the goal; for arrays and tensors alike.
+    """Choose the code of the picture nearest to the goal's, for observations as arrays or tensors.
 
     It knows the picture of each code of `npa/Shapeshifter2D-v0`, single or vector, with either form
     of actions, and otherwise reads the observation only.
@@ -38,7 +38,7 @@ class RecognisingShapeshifter:
         self._goals = observation.chunk(2, dim=1)[1].cpu()
 
     def __call__(self, observation: Any) -> Any:
-        """Return the action for an observation, [8 G²], or those of B worlds, [B, 8 G²]."""
+        """Return the action for an observation [8 G²], G² grid cells, or for those of B worlds."""
         array = torch.as_tensor(observation).cpu()
         goal = array.unflatten(-1, (2, -1))[..., 1, :]  # type: ignore[no-untyped-call]
         away = (goal[..., None, :] - self._goals).square().sum(dim=-1)

@@ -59,7 +59,7 @@ LEFT_OUT = frozenset({("npa/PointClassificationSmall-v0", "scripted")})
 
 @dataclass(frozen=True)
 class Suite:
-    """Problems and budgets; a change would make another version."""
+    """A frozen benchmark: problems and their budgets. A changed one must have another name."""
 
     name: str
     groups: Mapping[str, Mapping[str, int]]
@@ -67,28 +67,28 @@ class Suite:
 
     @property
     def budgets(self) -> dict[str, int]:
-        """Particle-steps of a run by ids, of all groups."""
+        """Particle-steps of a run by environment id, of all groups."""
         return {env_id: steps for group in self.groups.values() for env_id, steps in group.items()}
 
     @property
     def tasks(self) -> dict[str, str]:
-        """Ids by task names."""
+        """Environment ids by task name (see `task_name`)."""
         return {task_name(env_id): env_id for env_id in self.budgets}
 
     @property
     def methods(self) -> list[str]:
-        """Methods that can learn at least one of the problems."""
+        """Names of the methods that can learn at least one of the problems."""
         known = [methods_for(self.problem_of(task)) for task in self.tasks]
         return [name for name in METHODS if any(name in table for table in known)]
 
     def problem_of(self, task: str) -> Problem:
-        """Return the problem of a task name: the registered environment in 16 or 64 worlds."""
+        """Return a task's problem: its registered environment, in 16 worlds, or 64 of a garden."""
         env_id = self.tasks[task]
         steps, worlds = registration_of(env_id).steps, 64 if env_id in GARDEN_IDS else 16
         return Problem(env_id=env_id, episode_steps=steps, num_envs=worlds, hidden_dim=HIDDEN_DIM)
 
     def leaves_out(self, task: str, method: str) -> bool:
-        """Return whether a method cannot learn a task; "module:function" can learn any."""
+        """Return whether a method is not run on a task; a user's "module:function" always is."""
         if ":" in method:
             return False
         known = methods_for(self.problem_of(task))
@@ -96,7 +96,7 @@ class Suite:
 
 
 def task_name(env_id: str) -> str:
-    """Return the task name of an id: without "npa/"."""
+    """Return the task name of an environment id: the id without "npa/"."""
     return env_id.removeprefix("npa/")
 
 
@@ -143,10 +143,10 @@ SUITES: Mapping[str, Suite] = {
 def write_rows(
     suite: Suite, plan: ComparisonPlan, records: Sequence[RunRecord], folder: Path, command: str
 ) -> list[Path]:
-    """Write METHOD.json for each method of a suite's plan, and return the paths.
+    """Write the runs of each method as METHOD.json (a row of the suite), and return the paths.
 
-    Runs of other problems and seeds in an existing file are kept. It then names the commands,
-    commits, machines and versions of all of its runs, separated by semicolons.
+    Failed runs are left out. A file that exists keeps its runs of other problems and seeds, and
+    names the commands, commits, machines and versions of all runs, separated by semicolons.
     """
     paths = []
     ended = [record for record in records if record.status != "failed"]
@@ -179,7 +179,7 @@ def write_rows(
 
 
 def check_rows(suite: Suite, plan: ComparisonPlan, folder: Path) -> None:
-    """Check that runs of a plan can be added to the rows in a folder."""
+    """Raise an NPAError if a plan's runs cannot be added to the METHOD.json files in a folder."""
     for method in plan.methods:
         _stored_row(suite, plan, method, folder)
 
@@ -187,7 +187,7 @@ def check_rows(suite: Suite, plan: ComparisonPlan, folder: Path) -> None:
 def _stored_row(
     suite: Suite, plan: ComparisonPlan, method: str, folder: Path
 ) -> dict[str, Any] | None:
-    """Return a method's row in a folder as JSON, or None; raises if runs cannot be added."""
+    """Return the object in METHOD.json, None without the file; raises as `check_rows`."""
     path = folder / f"{method}.json"
     if not path.exists():
         return None
@@ -219,7 +219,7 @@ def _stored_row(
 
 
 def _joined(suite: Suite, stored: Mapping[str, Any], row: dict[str, Any]) -> dict[str, Any]:
-    """Return `row` with the runs of the stored row added that it lacks."""
+    """Return the new `row` together with those runs of the `stored` row that it does not repeat."""
     new = {(run["id"], run["seed"]) for run in row["runs"]}
     old = [dict(run) for run in stored["runs"] if (run["id"], run["seed"]) not in new]
     if not old:
@@ -234,16 +234,16 @@ def _joined(suite: Suite, stored: Mapping[str, Any], row: dict[str, Any]) -> dic
     runs.sort(key=lambda run: (run["seed"], order.index(run["id"]) if run["id"] in order else -1))
     before, now = stored.get("versions", {}), row["versions"]
     versions = {
-        name: _both(before.get(name, version), now.get(name, version))
+        name: _united(before.get(name, version), now.get(name, version))
         for name, version in {**before, **now}.items()
     }
-    both = {name: _both(stored[name], row[name]) for name in ("command", "commit", "machine")}
+    both = {name: _united(stored[name], row[name]) for name in ("command", "commit", "machine")}
     date = max(stored["date"], row["date"])
     return {**row, **both, "date": date, "versions": versions, "runs": runs}
 
 
-def _both(first: str | None, second: str | None) -> str | None:
-    """Join two lists that are separated by semicolons, without duplicates."""
+def _united(first: str | None, second: str | None) -> str | None:
+    """Join two texts, each a list separated by semicolons, without duplicates."""
     if first == second:
         return first
     items = [item for text in (first, second) for item in str(text).split("; ")]

@@ -78,7 +78,7 @@ QUICK = {"episode_steps": 16, "num_envs": 4, "hidden_dim": 16}
 
 
 def make_problem(name: str, *, quick: bool = False) -> Problem:
-    """Return one of `PROBLEMS`; `quick`: a tiny one."""
+    """Return the problem of a name in `PROBLEMS`; `quick`: with tiny worlds and rules."""
     fields = {"num_envs": 32, **PROBLEMS[name]}
     if quick:
         keywords = {**fields["keywords"], "particle_count": 64, **QUICK_KEYWORDS[name]}
@@ -99,7 +99,7 @@ AXES: tuple[Axis, ...] = get_args(Axis)
 
 @dataclass(frozen=True)
 class Job:
-    """One run: a method of `npa_envs.agents.learning` on a task of `PROBLEMS`, from a seed."""
+    """One run: a method of `npa_envs.agents.learning` on a task of the plan, from a seed."""
 
     axis: Axis
     task: str
@@ -109,7 +109,7 @@ class Job:
 
     @property
     def folder(self) -> PurePosixPath:
-        """Folder of its results, relative to the comparison's."""
+        """Folder of the run's results, relative to the folder of the comparison."""
         return PurePosixPath(self.axis, self.task, self.method, f"seed-{self.seed}")
 
     def __str__(self) -> str:
@@ -118,7 +118,7 @@ class Job:
 
 @dataclass(frozen=True, kw_only=True)
 class ComparisonPlan:
-    """A whole comparison."""
+    """Tasks, methods, seeds, budgets and settings of a comparison, which fix its results."""
 
     tasks: Mapping[str, Mapping[str, Any]]
     """Problems as JSON (`Problem.to_json`), by their names."""
@@ -135,10 +135,10 @@ class ComparisonPlan:
     episodes: int = 32
     """Held-out episodes after each run."""
     settings: Mapping[str, Any] = field(default_factory=dict)
-    """Other facts that results depend on: device, machine, runs at once, commit, versions."""
+    """Other settings that results depend on: device, machine, runs at once, commit, versions."""
 
     def jobs(self) -> list[Job]:
-        """Return all runs in the order of their seeds."""
+        """Return all runs of the comparison: by kind of budget, then by seed."""
         return [
             Job(axis, task, method, seed)
             for axis in self.budgets
@@ -149,14 +149,14 @@ class ComparisonPlan:
         ]
 
     def part(self, part: str | None) -> list[Job]:
-        """Return the runs of one of several machines, as `npa_envs.measure.process_queue.part_of`.
+        """Return the runs of machine K of N, for `part` "K/N"; None: all runs.
 
         All methods on a task from a seed run on one machine, as some use rules that others learned.
         """
         return part_of(self.jobs(), part, lambda job: (job.axis, job.seed, job.task))
 
     def teacher(self, job: Job) -> Job | None:
-        """Return the run whose rules a run clones; None if it does not, or has another teacher."""
+        """Return the "gradient" run that a "clone" run imitates; None where no run is imitated."""
         if self.own.get(job.method, job.method) != "clone":
             return None
         if "teacher" in self.options.get(job.method, {}):
@@ -164,7 +164,7 @@ class ComparisonPlan:
         return replace(job, method="gradient")
 
     def facts(self, job: Job) -> dict[str, Any]:
-        """Return the facts that the results of one of `jobs()` depend on, of JSON's types."""
+        """Return all settings that the results of a run depend on, of JSON's types."""
         return {
             "problem": dict(self.tasks[job.task]),
             "budget": self.budgets[job.axis][job.task],

@@ -43,20 +43,20 @@ TABLE, FIGURES, CURVES = "comparison.md", "comparison.json", "comparison.csv"
 def write_table(
     plan: ComparisonPlan, records: Sequence[RunRecord], folder: Path, command: str
 ) -> str:
-    """Write the table, in Markdown and as JSON, and all curves; return the table in Markdown."""
-    table = rows(records)
-    shown = text(table)
+    """Write comparison.md and .json (results by method) and .csv (curves); return the Markdown."""
+    table = report_rows(records)
+    shown = markdown(table)
     facts = {"command": command, **asdict(plan), "left_out": sorted(map(list, plan.left_out))}
     write_text(folder / TABLE, f"`{command}`\n\n{shown}")
     Record(facts, folder / FIGURES, table).write()
-    write_text(folder / CURVES, curves(records))
+    write_text(folder / CURVES, curves_csv(records))
     return shown
 
 
 def write_pictures(records: Sequence[RunRecord], folder: Path) -> list[str]:
-    """Write filmstrips and, with matplotlib, curves; return a line of text for each file."""
+    """Write filmstrips and, with matplotlib, plots of curves; return "wrote PATH" for each."""
     strips = [f"wrote {path}" for path in write_strips(records, folder)]
-    return [*strips, *write_plots(lambda: pictures(records), folder / "curves_*.png", "curves")]
+    return [*strips, *write_plots(lambda: curve_plots(records), folder / "curves_*.png", "curves")]
 
 
 # Rows: the results of a method on a task
@@ -64,7 +64,7 @@ def write_pictures(records: Sequence[RunRecord], folder: Path) -> list[str]:
 
 @dataclass(frozen=True)
 class Estimate:
-    """A mean over seeds."""
+    """A mean over seeds with its standard error."""
 
     mean: float
     standard_error: float
@@ -78,7 +78,7 @@ UNKNOWN = Estimate(math.nan, math.nan)
 
 
 def estimate(values: Iterable[float]) -> Estimate:
-    """Return the mean of the finite values, one for each seed, with its standard error."""
+    """Return the mean and standard error of the finite ones among `values`, one for each seed."""
     finite = [value for value in values if math.isfinite(value)]
     mean = mean_of(finite)
     if len(finite) < 2:
@@ -116,8 +116,8 @@ class ReportRow:
         return self.done + self.diverged + self.failed
 
 
-def rows(records: Iterable[RunRecord]) -> list[ReportRow]:
-    """Return a row for each axis, task and method, in the order of the records."""
+def report_rows(records: Iterable[RunRecord]) -> list[ReportRow]:
+    """Return a row for each kind of budget, task and method, in the order of the records."""
     groups: dict[tuple[Axis, str, str], list[RunRecord]] = {}
     for record in records:
         job = record.job
@@ -158,8 +158,9 @@ def rows(records: Iterable[RunRecord]) -> list[ReportRow]:
 def fraction(result: Estimate, nothing: Estimate, yardstick: Estimate) -> Estimate:
     """Return (R - R_nothing) / (R_yardstick - R_nothing) of mean returns R, with its error.
 
-    It is NaN if the yardstick is not better than nothing. The errors of R and R_yardstick are
-    propagated to first order; that of R_nothing, which is in both differences, is ignored.
+    `nothing` is of the method "zero", `yardstick` of "gradient". The fraction is NaN if the
+    yardstick is not better than nothing. The standard errors of R and R_yardstick are propagated to
+    first order; that of R_nothing, which is in both differences, is ignored.
     """
     gain = yardstick.mean - nothing.mean
     if not gain > 0.0 or math.isnan(result.mean):
@@ -172,8 +173,8 @@ def fraction(result: Estimate, nothing: Estimate, yardstick: Estimate) -> Estima
 # Rows as text
 
 
-def text(table: Sequence[ReportRow]) -> str:
-    """Return a table in Markdown for each axis and task."""
+def markdown(table: Sequence[ReportRow]) -> str:
+    """Return the rows in Markdown, one table for each kind of budget and task."""
     sections = []
     for axis in AXES:
         axis_rows = [row for row in table if row.axis == axis]
@@ -218,8 +219,8 @@ def _table(table: Sequence[ReportRow]) -> str:
 # Learning curves
 
 
-def curves(records: Iterable[RunRecord]) -> str:
-    """Return all learning curves as comma-separated values, a line for each point."""
+def curves_csv(records: Iterable[RunRecord]) -> str:
+    """Return the points of all learning curves as comma-separated values, one in a line."""
     names = [field.name for field in fields(CurvePoint)]
     lines = [
         [r.job.axis, r.job.task, r.job.method, r.job.seed, r.status, *astuple(point)]
@@ -237,7 +238,7 @@ CURVE_POINTS = 64
 
 
 class Curve(NamedTuple):
-    """A mean over seeds at K points: abscissa, mean, and standard error, shape [K] each."""
+    """A mean learning curve at K points: abscissa, mean return, standard error; [K] each."""
 
     across: NDArray[np.float64]
     mean: NDArray[np.float64]
@@ -245,11 +246,12 @@ class Curve(NamedTuple):
     """0 for a single seed."""
 
 
-def curve(records: Sequence[RunRecord], across: str) -> Curve | None:
-    """Return the mean of learning curves, interpolated linearly, where they overlap, or None.
+def mean_curve(records: Sequence[RunRecord], across: str) -> Curve | None:
+    """Return the mean over runs of a method's learning curves; None if they do not overlap.
 
-    A method that does not learn has a single point. Failed and diverged runs, whose curves are
-    short, count only if there are no others.
+    Curves are interpolated linearly where all of them overlap; `across` is the field of
+    `CurvePoint` that is the abscissa. A method that does not learn has a single point. Failed and
+    diverged runs, whose curves are short, count only if there are no others.
     """
     lines = []
     for record in [record for record in records if record.status == "done"] or records:
@@ -270,8 +272,8 @@ def curve(records: Sequence[RunRecord], across: str) -> Curve | None:
     return Curve(grid, values.mean(axis=0), error)
 
 
-def pictures(records: Sequence[RunRecord]) -> dict[str, bytes]:
-    """Return PNG files of the curves by task. Needs matplotlib."""
+def curve_plots(records: Sequence[RunRecord]) -> dict[str, bytes]:
+    """Return a PNG file of the mean learning curves for each task, by name. Needs matplotlib."""
     tasks = dict.fromkeys(record.job.task for record in records)
     return {task: _picture([r for r in records if r.job.task == task]) for task in tasks}
 
@@ -290,7 +292,7 @@ def _picture(records: Sequence[RunRecord]) -> bytes:
                 method_records = [
                     r for r in records if (r.job.axis, r.job.method) == (axis, method)
                 ]
-                _draw(panel, curve(method_records, across), f"C{number}", name)
+                _draw(panel, mean_curve(method_records, across), f"C{number}", name)
             panel.set(xlabel=label, ylabel="return of held-out episodes")
             panel.set_title(HEADINGS[axis], fontsize=9, loc="left")
             panel.grid(alpha=0.3)
@@ -316,9 +318,10 @@ def _draw(panel: Any, drawn: Curve | None, colour: str, name: str) -> None:
 
 
 def write_strips(records: Sequence[RunRecord], folder: Path) -> list[Path]:
-    """Write a filmstrip for each task and axis: a column for each method, a row for each seed.
+    """Write a filmstrip of final worlds for each kind of budget and task; return the paths.
 
-    The pictures of the runs are read from the comparison's folder.
+    It has a column for each method and a row for each seed, from the runs' pictures in the
+    comparison's folder.
     """
     groups: dict[tuple[Axis, str], dict[tuple[int, str], RunRecord]] = {}
     for record in records:

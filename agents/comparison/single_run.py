@@ -56,7 +56,7 @@ FIRST_TEST_SEED = 2_000_000
 
 @dataclass(frozen=True, kw_only=True)
 class RunRecord:
-    """The result of one run."""
+    """The result of one run, as its folder's `run.json` has it."""
 
     job: Job
     facts: Mapping[str, Any]
@@ -89,7 +89,7 @@ class RunRecord:
 
     @classmethod
     def read(cls, folder: Path, facts: Mapping[str, Any]) -> RunRecord | None:
-        """Return the record in a run's folder, or None."""
+        """Return the record in a run's folder, if any; raises NPAError if it has other `facts`."""
 
         def make(content: dict[str, Any]) -> RunRecord:
             points: list[dict[str, Any]]
@@ -104,13 +104,13 @@ class RunRecord:
 
 
 def mean_of(values: Sequence[float]) -> float:
-    """Return the mean of numbers, NaN without any."""
+    """Return the mean of numbers, NaN if there are none."""
     return sum(values) / len(values) if values else math.nan
 
 
 @dataclass(frozen=True)
 class RunRequest:
-    """Request to a process: one run."""
+    """A run that a process is asked to do, in `request.json`."""
 
     job: Job
     facts: dict[str, Any]
@@ -120,7 +120,7 @@ class RunRequest:
 
     @classmethod
     def read(cls, folder: Path) -> RunRequest:
-        """Return the request in a folder."""
+        """Return the request that a folder contains."""
         content = json.loads((folder / REQUEST).read_text("utf-8"))
         return cls(**content | {"job": Job(**content["job"])})
 
@@ -190,7 +190,7 @@ def _learn(
 def final_picture(
     problem: Problem, policy: Callable[[Any], Any], seed: int, *, device: str
 ) -> NDArray[np.uint8]:
-    """Return a picture of the world at the end of an episode, uint8, shape [SIZE, SIZE, 3].
+    """Return a picture of the world at the end of an episode, uint8, shape [192, 192, 3].
 
     The policy maps observations, [1, N, P], to actions, [1, N, A].
     """
@@ -211,7 +211,7 @@ def final_picture(
 
 
 def main(folder: Path) -> None:
-    """Do the run of a folder on the device that standard input names, then those of others."""
+    """Do the run of a folder, and then of each folder that standard input names with a device."""
     lines: SimpleQueue[str] = SimpleQueue()
 
     def listen() -> None:
@@ -252,7 +252,7 @@ LAST_OUTPUT = 2000
 
 @dataclass
 class RunProcess(Child):
-    """The process of a run, in the run's temporary folder."""
+    """A run in progress: its request, process and temporary folder."""
 
     request: RunRequest
     folder: Path
@@ -265,7 +265,7 @@ class RunProcess(Child):
         return (self.folder / RECORD).exists() or self.process.poll() is not None
 
     def begin_work(self, device: str) -> None:
-        """Start the run on a device."""
+        """Tell the waiting process the device, on which it starts the run."""
         self.begin = time.perf_counter()
         _send(self.process, device)
 
@@ -285,7 +285,7 @@ def _send(process: subprocess.Popen[bytes], line: str) -> None:
 
 
 def shares_process(plan: ComparisonPlan, job: Job) -> bool:
-    """Return whether a process may do other runs before and after this one.
+    """Return whether the process of a run may do other runs before and after it.
 
     Runs with a time budget have separate processes, for equal conditions, and so do functions from
     outside this library, which may leave objects in memory.
@@ -296,7 +296,7 @@ def shares_process(plan: ComparisonPlan, job: Job) -> bool:
 
 
 def held_records(plan: ComparisonPlan, folder: Path) -> dict[Job, RunRecord]:
-    """Return the records in a folder of an earlier comparison, without failed runs."""
+    """Return the records of a plan's runs that a folder contains, without those that failed."""
     records = {job: RunRecord.read(folder / job.folder, plan.facts(job)) for job in plan.jobs()}
     return {job: one for job, one in records.items() if one is not None and one.status in MEASURED}
 
@@ -313,10 +313,10 @@ def run_jobs(
 ) -> None:
     """Run jobs of a plan in processes; a failed run is recorded, and the others continue.
 
-    A process does several runs with budgets of particle-steps, as long as none fails; other runs
-    have a process each, which on GPUs is started before its turn. A run's folder appears when the
-    run is over, and `written` is called with its record. No run starts after `max_seconds`. An
-    interrupt ends all processes and removes their unfinished folders.
+    A process does several runs with budgets of particle-steps, as long as none fails. Other runs
+    have a process each; on GPUs it loads its libraries while an earlier run learns. A run's folder
+    appears when the run is over, and `written` is called with its record. No run starts after
+    `max_seconds`. An interrupt ends all processes and removes their unfinished folders.
     """
     for job in jobs:
         teacher = plan.teacher(job)
@@ -376,7 +376,7 @@ def run_jobs(
 def _start(
     request: RunRequest, folder: Path, threads: int, idle: list[subprocess.Popen[bytes]]
 ) -> RunProcess:
-    """Return the process of a run, an idle or a new one, which waits for its device."""
+    """Return a run in an idle or a new process, which waits to be told a device."""
     target = folder / request.job.folder
     temporary = target.parent / f".{target.name}.{secrets.token_hex(4)}"
     temporary.mkdir(parents=True)

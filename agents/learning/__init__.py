@@ -74,7 +74,7 @@ GARDEN_METHODS: dict[str, str] = {
 
 
 class Trained(NamedTuple):
-    """Result of a run."""
+    """What `train` returns: rules or a policy, and the learning curve."""
 
     rules: RuleSet | None
     """The rules, on the run's device; None if the method returns a policy."""
@@ -85,7 +85,7 @@ class Trained(NamedTuple):
     of PettingZoo's parallel environments, to a dict of their actions."""
 
     def save(self, folder: str | Path) -> list[Path]:
-        """Write the files of the rules or of the policy, if it has any; return their paths.
+        """Write the rules' or the policy's files, if it can be saved; return their paths.
 
         Raises:
             NPAError: As for `RuleSet.save`.
@@ -199,7 +199,7 @@ def train(
 
 
 def methods_for(problem: Problem) -> dict[str, str]:
-    """Return the methods that can learn a problem, as `METHODS`; none for codes."""
+    """Return `METHODS`, or `GARDEN_METHODS` in a garden, or none where actions are codes."""
     if problem.controlled == "codes":
         return {}
     return GARDEN_METHODS if problem.controlled == "brushes" else METHODS
@@ -228,7 +228,7 @@ def _options_of(function: Callable[..., Any]) -> dict[str, Any]:
 
 
 def _default_options(function: Callable[..., Any]) -> Any:
-    """Return the options of a method that declares them as a dataclass, else None."""
+    """Return the default of a method's argument `options`, if that is a dataclass, else None."""
     parameter = inspect.signature(function).parameters.get("options")
     default = None if parameter is None else parameter.default
     return default if is_dataclass(default) else None

@@ -19,7 +19,7 @@ from npa_envs.world.randomness import Randomness, WorldRandom, normal_draws
 
 
 class Schedule(NamedTuple):
-    """Options of `CommonOptions` whose defaults depend on whether the run has a `start`."""
+    """Values of the `CommonOptions` whose defaults depend on `start`, the rules to begin with."""
 
     learning_rate: float
     initial_std: float
@@ -101,22 +101,22 @@ class CommonOptions:
         check_word(self, "critic", get_args(CriticInput))
 
     def schedule(self, start: RuleSet | None) -> Schedule:
-        """Return the options that depend on `start`, with defaults in place of None."""
+        """Return the options that depend on `start`, with the defaults in place of None."""
         chosen = {name: getattr(self, name) for name in Schedule._fields}
         chosen = {name: value for name, value in chosen.items() if value is not None}
         return (NEW_RULES if start is None else START_RULES)._replace(**chosen)
 
     def noise_factor(self, remaining_budget: float, last_noise: float) -> float:
-        """Return the factor on the first noise: 1 until the last `noise_decay_share` of the budget.
+        """Return the factor on the initial standard deviations of actions, for the budget left.
 
-        There it falls exponentially to `last_noise`, as rules learn with noise, but are evaluated
-        without.
+        It is 1 until the last `noise_decay_share` of the budget, and there falls exponentially to
+        `last_noise`, as rules learn with noise, but are evaluated without.
         """
         return math.pow(last_noise, max(0.0, 1.0 - remaining_budget / self.noise_decay_share))
 
 
 def find_gradients(optimiser: torch.optim.Optimizer, loss: Tensor) -> None:
-    """Write the gradients of a loss into an optimiser's parameters."""
+    """Compute a loss's gradients, and write them into `grad` of an optimiser's parameters."""
     # Read-outs and frozen layers have no gradients.
     parameters = [p for p in optimiser.param_groups[0]["params"] if p.requires_grad]
     # Not backward(): its accumulation nodes keep the stream of their first use, which a capture
@@ -131,7 +131,7 @@ def find_gradients(optimiser: torch.optim.Optimizer, loss: Tensor) -> None:
 
 
 def gradients_of(optimiser: torch.optim.Optimizer) -> list[Tensor]:
-    """Return the gradients of an optimiser's parameters, without those that have none."""
+    """Return `grad` of each of an optimiser's parameters where it is not None."""
     return [p.grad for p in optimiser.param_groups[0]["params"] if p.grad is not None]
 
 
@@ -139,16 +139,17 @@ HALF_LOG_TAU = 0.5 * math.log(2.0 * math.pi)
 
 
 def gaussian_log_prob(mean: Tensor, log_std: Tensor, action: Tensor) -> Tensor:
-    """Return the log-probability of each row of actions [..., A], shape [...]."""
+    """Return Gaussian log-probabilities [...] of actions [..., A], summed over columns."""
     noise = (action - mean) * torch.exp(-log_std)
     return -(0.5 * noise.square() + log_std + HALF_LOG_TAU).sum(dim=-1)
 
 
 class GaussianRules(nn.Module):
-    """Gaussian actions: means by copies of the rules, one standard deviation a column and species.
+    """A policy of Gaussian actions, whose means are those of copies of the rules.
 
-    A particle's log-probability is the sum over its action's columns. A world's is the mean over
-    its particles, not the sum, whose ratio would be far from 1 after the smallest update.
+    Standard deviations are learned, one for each species and action column. A particle's
+    log-probability is the sum over columns. A world's is the mean over its particles, as with their
+    sum a likelihood ratio would be far from 1 after the smallest update.
     """
 
     row_species: Tensor
@@ -173,19 +174,19 @@ class GaussianRules(nn.Module):
         self.noise_factor = state
 
     def row_log_std(self) -> Tensor:
-        """Return the logarithms of the standard deviations of every particle, shape [N, A]."""
+        """Return the logarithms of the standard deviations of particles' actions, shape [N, A]."""
         return self.log_std[self.row_species]
 
     @torch.no_grad()
     def set_noise(self, factor: float) -> None:
-        """Set the factor on the first standard deviations, which are also learned."""
+        """Rescale the standard deviations by `factor` over `noise_factor`, and store it there."""
         self.log_std.add_(math.log(factor / self.noise_factor))
         self.noise_factor = factor
 
     def sample(
         self, observation: Tensor, generator: Randomness | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Draw unclipped actions for observations [M, N, P], and log-probabilities [M, N]."""
+        """Draw unclipped actions for observations [M, N, P], with log-probabilities [M, N]."""
         mean, log_std = self.rules.mean(observation), self.row_log_std()
         noise = normal_draws(generator, mean.shape, mean)
         action = mean + log_std.exp() * noise
@@ -196,7 +197,7 @@ class GaussianRules(nn.Module):
         return gaussian_log_prob(self.rules.mean(observation), self.row_log_std(), action)
 
     def row_log_prob(self, species: int, rows: Tensor, action: Tensor) -> Tensor:
-        """Return log-probabilities [K] of actions [K, A] of one species that observes [K, P]."""
+        """Return log-probabilities [K] of a species' actions [K, A] at observations [K, P]."""
         mean = self.rules.mean_by_rule(list(self.rules)[species], rows)
         return gaussian_log_prob(mean, self.log_std[species], action)
 
@@ -213,9 +214,9 @@ INPUT_LIMIT = 8.0
 
 
 class Critic(nn.Module):
-    """Network of particles' values, whose inputs and outputs are scaled by running moments.
+    """Network of each particle's value, whose inputs and outputs are scaled by running moments.
 
-    Its input is a particle's perception; a "central" one also has the mean features of its world.
+    Its input is a particle's perception, and if "central" also the mean features of the world.
     """
 
     mean: Tensor
@@ -256,7 +257,7 @@ class Critic(nn.Module):
 
     @torch.no_grad()
     def observe(self, observation: Tensor, ranks: ProcessGroup = ALONE) -> None:
-        """Update the moments of inputs by observations [..., P] of all processes."""
+        """Update the inputs' running moments by observations [..., P], averaged over processes."""
         rate = self._rate(0)
         rows = observation.flatten(0, -2)
         mean, square = rows.mean(dim=0), rows.square().mean(dim=0)
@@ -266,7 +267,7 @@ class Critic(nn.Module):
 
     @torch.no_grad()
     def rescale(self, targets: Tensor, ranks: ProcessGroup = ALONE) -> None:
-        """Update the scale by targets; the network is changed so that values stay the same."""
+        """Update the outputs' running scale, the RMS of targets; the last layer offsets it."""
         before = self.scale.clone()
         square = targets.square().mean()
         ranks.reduce([square])
@@ -276,33 +277,33 @@ class Critic(nn.Module):
             parameter.mul_(before / self.scale)
 
     def _rate(self, moment: int) -> Tensor:
-        """Count a batch, and return its weight in a running moment, on the device."""
+        """Count a batch of inputs (`moment` 0) or targets (1); return its weight in the moment."""
         self.updates[moment] += 1.0
         return (1.0 / self.updates[moment]).clamp(min=MIN_RATE)
 
 
 def seeded_critic(progress: Progress, input_dim: int, inputs: CriticInput) -> Critic:
-    """Return a new critic, on the device; torch's global random state does not change."""
+    """Return a new critic, drawn by the run's seed; torch's global random state is unchanged."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(progress.seed)
         return Critic(input_dim, progress.problem.counts, inputs).to(progress.device)
 
 
 def learner_random(progress: Progress, total: int, indices: Tensor) -> Randomness:
-    """Return a learner's random source: with several processes one stream a world."""
+    """Return a generator, or with several processes streams of worlds `indices` of `total`."""
     if progress.ranks.distributed:
         return world_streams((progress.seed,), total, indices, progress.device)
     return torch.Generator(progress.device).manual_seed(progress.seed)
 
 
 class Minibatches:
-    """Minibatches: the rows of a round, shuffled for each pass and split into `count` parts.
+    """Indices of a round's samples, shuffled for each pass and split into `count` minibatches.
 
-    There are several groups of rows, which are shuffled separately: one with n in `group_sizes` has
-    n rows per world and step, in the order [T, B, n]. Few rows make fewer minibatches. One process
-    shuffles all rows; of several each shuffles the rows of each world by the world's own stream,
-    and a minibatch has equally many of each world, so that minibatches do not depend on the number
-    of processes.
+    There are several groups of samples, which are shuffled separately: one with n in `group_sizes`
+    has n samples per world and step, in the order [T, B, n]. Few samples make fewer minibatches.
+    One process shuffles all samples. Of several, each shuffles those of each world by the world's
+    own random stream, and a minibatch has equally many of each world, so that minibatches do not
+    depend on the number of processes.
     """
 
     def __init__(
@@ -325,14 +326,14 @@ class Minibatches:
             for n in group_sizes
         ]
         self.indices: list[tuple[Tensor, ...]] = []
-        """Rows of each minibatch by group, int64: views that `shuffle` overwrites."""
+        """Indices of each minibatch by group, int64: views that `shuffle` overwrites."""
         for order in self._orders:
             # Sizes as of `tensor_split`.
             sizes = [unit * ((len(order) // unit + k) // self.count) for k in range(self.count)]
             self.indices.append(torch.split(order, sizes[::-1]))
 
     def shuffle(self) -> None:
-        """Draw the orders of the next pass."""
+        """Draw new random orders, for the next pass."""
         restart(self._random)
         for order, group_size in zip(self._orders, self._group_sizes, strict=True):
             if isinstance(self._random, WorldRandom):
@@ -341,7 +342,7 @@ class Minibatches:
                 torch.randperm(len(order), generator=self._random, out=order)
 
     def _shuffled_by_world(self, random: WorldRandom, group_size: int) -> Tensor:
-        """Return all rows of a group, minibatch by minibatch, shape [T B n]."""
+        """Return the indices of a group's samples, minibatch by minibatch, shape [T B n]."""
         order = random.uniform(self._steps * group_size).argsort(dim=1, stable=True)
         world = torch.arange(self._world_count, device=order.device)[:, None]
         step, row = order // group_size, order % group_size

@@ -36,24 +36,24 @@ GAINS = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, -0.01, -0.03, -0.1, -0.3)
 """Gains of scripted policies, as for `SpreadPolicy`; below 0 particles attract each other."""
 
 
-def train_random(progress: Progress) -> Policy | Tending:
+def train_random(progress: Progress) -> Policy | UnboundGardener:
     """Return the policy that acts at random; no particle-steps are used."""
     return _evaluate_once(progress, RandomPolicy, RandomGardener, seed=progress.seed)
 
 
-def train_zero(progress: Progress) -> Policy | Tending:
+def train_zero(progress: Progress) -> Policy | UnboundGardener:
     """Return the policy that does nothing; no particle-steps are used."""
     return _evaluate_once(progress, ZeroPolicy, StillGardener)
 
 
 def _evaluate_once(
     progress: Progress, policy: Callable[..., Policy], gardener: Any, **options: int
-) -> Policy | Tending:
-    """Return the policy for particles, or the one for brushes, after its evaluation."""
+) -> Policy | UnboundGardener:
+    """Make the `policy` for particles, or in gardens the `gardener`, evaluate and return it."""
     check_no_start(progress)
-    result: Policy | Tending
+    result: Policy | UnboundGardener
     if progress.problem.controlled == "brushes":
-        result = Tending(lambda env: gardener(env, **options))
+        result = UnboundGardener(lambda env: gardener(env, **options))
     else:
         result = policy(progress.problem.make_envs(1, device=progress.device), **options)
     progress.start(result)
@@ -61,10 +61,10 @@ def _evaluate_once(
 
 
 def train_scripted(progress: Progress, *, gains: Sequence[float] = GAINS) -> Policy:
-    """Return the best of: doing nothing, and the policies of `SCRIPTED` at each of the gains.
+    """Return the policy of the highest mean return: `ZeroPolicy`, or one of `SCRIPTED` at a gain.
 
-    Each plays one episode in each of the problem's worlds, from seeds that evaluations do not use,
-    until the budget is spent.
+    Each policy is tried for one episode in each of the problem's worlds, from seeds that
+    evaluations do not use, until the budget is spent.
     """
     check_no_start(progress)
     if not isinstance(gains, list | tuple) or not all(map(is_real, gains)):
@@ -97,7 +97,7 @@ def train_scripted(progress: Progress, *, gains: Sequence[float] = GAINS) -> Pol
 
 
 def check_no_start(progress: Progress) -> None:
-    """Check that the run has no `start`."""
+    """Raise an NPAError if the run has a `start`: rules to begin with."""
     if progress.initial is not None:
         if progress.problem.controlled == "brushes":
             raise NPAError("start must be None in a garden, where the world's rule is not learned")
@@ -111,8 +111,8 @@ def check_no_start(progress: Progress) -> None:
 
 
 @dataclass(frozen=True)
-class Tending:
-    """A policy that reads the worlds, not the observations: `made_for` makes it for worlds."""
+class UnboundGardener:
+    """A gardener for any garden: `made_for(env)` makes the policy that reads its worlds."""
 
     made_for: Callable[[Any], BrushPolicy]
 
@@ -123,12 +123,12 @@ class Tending:
         )
 
 
-def tend_scripted(progress: Progress) -> Policy | Tending:
+def tend_scripted(progress: Progress) -> Policy | UnboundGardener:
     """Return the scripted gardener, or in `npa/Shepherd2D-v0` the scripted shepherd."""
     shepherd = issubclass(progress.problem.task_type, ShepherdTask)
     return _evaluate_once(progress, ZeroPolicy, ScriptedShepherd if shepherd else ScriptedGardener)
 
 
-def tend_gradient(progress: Progress) -> Policy | Tending:
+def tend_gradient(progress: Progress) -> Policy | UnboundGardener:
     """Return the gardener that plans by the gradient through the world's physics."""
     return _evaluate_once(progress, ZeroPolicy, GradientGardener, seed=progress.seed)

@@ -23,7 +23,7 @@ VARIANCE_FLOOR = 1e-8
 
 @dataclass(frozen=True, kw_only=True)
 class CloneOptions:
-    """Options of `train`."""
+    """Options of behaviour cloning."""
 
     teacher: Source | Iterable[Source] | None = None
     """A rule, a shipped rule's name or a file, for all species or one for each, or a set of rules.
@@ -53,7 +53,7 @@ class CloneOptions:
 
 
 def train(progress: Progress, options: CloneOptions = CloneOptions()) -> RuleSet:
-    """Learn a teacher's actions in worlds where the teacher acts, and where the student acts.
+    """Return rules that imitate a teacher's actions, in worlds where the teacher or they act.
 
     The loss is the squared error of actions over the variance of the teacher's, column by column.
     In a fraction of the worlds the student acts, so that it learns the teacher's actions also in
@@ -89,7 +89,7 @@ def train(progress: Progress, options: CloneOptions = CloneOptions()) -> RuleSet
 def _from_teacher(
     progress: Progress, rules: RuleSet, options: CloneOptions
 ) -> tuple[Callable[[], int], Demonstrations]:
-    """Return a function that collects demonstrations and returns the steps, and these."""
+    """Return a function that adds demonstrations and returns how many, and their buffer."""
     problem, device, source = progress.problem, progress.device, options.teacher
     if source is None:
         raise NPAError("teacher must be given to clone, or a dataset: for example teacher='heart'")
@@ -115,7 +115,7 @@ def _from_teacher(
 
 
 def _from_dataset(progress: Progress, options: CloneOptions) -> Demonstrations:
-    """Return the demonstrations of a dataset, on a device."""
+    """Return the demonstrations of a Minari dataset, on the run's device."""
     from npa_envs.wrappers.minari import read_pairs
 
     if options.teacher is not None:
@@ -137,9 +137,9 @@ def _from_dataset(progress: Progress, options: CloneOptions) -> Demonstrations:
 
 
 def unexplained_variance(rules: RuleSet, observation: Tensor, action: Tensor) -> Tensor:
-    """Return the squared error of rules over the variance of the actions: 1 - R², a scalar.
+    """Return 1 - R²: the rules' squared error over the variance of the teacher's actions.
 
-    Observations have shape [B, N, P], the teacher's actions [B, N, A].
+    It is a mean over species and columns, for observations [B, N, P] and actions [B, N, A].
     """
     ratios, errors = [], (rules.mean(observation) - action).square()
     for span in rules.spans:
@@ -150,9 +150,9 @@ def unexplained_variance(rules: RuleSet, observation: Tensor, action: Tensor) ->
 
 
 class Demonstrations:
-    """Ring buffer of the last `capacity` worlds' observations and of the teacher's actions.
+    """Ring buffer of `capacity` worlds, each with observations [N, P] and actions [N, A].
 
-    Shapes and device are those of the observation and action that it is made with.
+    The shapes, types and device are those of the `observation` and `action` that are given first.
     """
 
     def __init__(self, capacity: int, observation: Tensor, action: Tensor) -> None:
@@ -170,7 +170,7 @@ class Demonstrations:
         self.count += len(observation)
 
     def draw(self, world_count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Return observations and actions of worlds drawn with replacement."""
+        """Return observations [B, N, P] and actions [B, N, A] of worlds drawn with replacement."""
         stored, device = min(self.count, len(self.observations)), self.observations.device
         index = torch.randint(stored, (world_count,), generator=generator, device=device)
         return self.observations[index], self.actions[index]

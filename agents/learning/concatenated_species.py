@@ -22,9 +22,9 @@ DIVERGED = "left the world"
 
 
 class ConcatenatedSpeciesEnv(MultiSpeciesVectorEnv):
-    """Worlds of several species as one agent: species concatenated to [B, N, P] and [B, N, A].
+    """Worlds of several species as one agent, with observations [B, N, P] and actions [B, N, A].
 
-    It has what learners need of the interface of `NPAVectorEnv`. Reward and loss of a world are
+    It has those attributes of `NPAVectorEnv` that learners need. Reward and loss of a world are
     means over its species; a species that ended keeps its last loss. A world terminates once all
     of its species have; its reason is that of the first one, or "left the world" if any did.
     Infos of a step have for each particle, [B, N], the `particle_reward` of its species, whether it
@@ -54,7 +54,7 @@ class ConcatenatedSpeciesEnv(MultiSpeciesVectorEnv):
     def reset(  # type: ignore[override]
         self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Tensor, dict[str, Any]]:
-        """Start episodes as `MultiSpeciesVectorEnv.reset`; infos have `loss`."""
+        """Start episodes as `MultiSpeciesVectorEnv.reset` does; infos have `loss`, [B]."""
         observations, infos = super().reset(seed, options)
         chosen = worlds_to_reset(options, self.num_envs)
         self._reasons[chosen] = None
@@ -95,7 +95,7 @@ class ConcatenatedSpeciesEnv(MultiSpeciesVectorEnv):
         return observation, reward, over & ~cut, over & cut, info
 
     def _update_reasons(self, infos: Mapping[str, Mapping[str, Any]]) -> None:
-        """Keep each world's first reason of a termination, or that a species diverged."""
+        """Store why each world ends: the reason of its first species, or that any diverged."""
         for agent in self.agents:
             reasons = infos[agent].get("reason")
             if reasons is not None:
@@ -111,6 +111,6 @@ class ConcatenatedSpeciesEnv(MultiSpeciesVectorEnv):
         return torch.stack([infos[agent][name] for agent in self.agents], dim=1)
 
     def _by_particle(self, values: Tensor) -> Tensor:
-        """Return values of species, [B, K], for each of their particles, shape [B, N]."""
+        """Repeat the values of K species, [B, K], for each of their particles, shape [B, N]."""
         count = self.single_action_space.shape[0]
         return values.repeat_interleave(self._counts, dim=1, output_size=count)

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from npa_envs.agents.learning.problem import FIRST_EVALUATION_SEED
 from npa_envs.agents.learning.progress import Progress
 from npa_envs.agents.learning.rule_set import RuleSet
-from npa_envs.agents.policies import bounded, perceived
+from npa_envs.agents.policies import columns_read, split_update
 from npa_envs.checks import check_positive
 from npa_envs.errors import MissingDependencyError, NPAError
 from npa_envs.rule.folded_network import without_small
@@ -33,7 +33,7 @@ MAX_HIDDEN = 2**27
 
 @dataclass(frozen=True, kw_only=True)
 class EvolutionOptions:
-    """Options of `train`."""
+    """Options of evolution."""
 
     population: int = 32
     """Candidates of a generation, at least 4."""
@@ -76,9 +76,9 @@ def train(progress: Progress, options: EvolutionOptions = EvolutionOptions()) ->
 
 
 class RuleWeights:
-    """Reads and writes the weights of plain rules as one vector: W1, b1, W2, rule after rule.
+    """Reads and writes rules' weights as one vector: W1, b1, W2, rule after rule.
 
-    Read-outs do not change.
+    Rules must have networks of these two layers; read-outs are left as they are.
     """
 
     def __init__(self, rules: Iterable[NPARule]) -> None:
@@ -105,7 +105,7 @@ class RuleWeights:
             )
 
     def scales(self) -> NDArray[np.float64]:
-        """Return each weight's standard deviation by Xavier, gain 1, shape [W]; biases as W1."""
+        """Return the standard deviations of weights drawn by Xavier, gain 1, [W]; b1 as W1."""
         sizes = []
         for rule in self._rules:
             hidden, bias, output = layers_of(rule)
@@ -116,12 +116,12 @@ class RuleWeights:
 
 
 def layers_of(rule: NPARule) -> tuple[Tensor, Tensor, Tensor]:
-    """Return W1 [H, P], b1 [H] and W2 [A, H]."""
+    """Return a rule's weights: W1 [H, P], b1 [H] and W2 [A, H]."""
     return rule.hidden.weight, rule.hidden.bias, rule.output.weight
 
 
 def updates_of(rule: NPARule, weights: Tensor, rows: Tensor) -> Tensor:
-    """Return raw updates [K, R, A] of K candidates' weights [K, W] for their rows [K, R, P]."""
+    """Return raw updates [K, R, A] of K candidates, weights [K, W], for perceptions [K, R, P]."""
     shapes = [tuple(part.shape) for part in layers_of(rule)]
     sizes = [math.prod(shape) for shape in shapes]
     first, bias, second = (
@@ -139,18 +139,18 @@ def updates_of(rule: NPARule, weights: Tensor, rows: Tensor) -> Tensor:
 
 @torch.no_grad()
 def candidates_actions(rules: RuleSet, weights: Tensor, observation: Tensor) -> Tensor:
-    """Return actions [K * M, N, A] of K candidates, weights [K, W], in M worlds each.
+    """Return actions [K * M, N, A] of K candidates, with weights [K, W], in M worlds of each.
 
-    Observations [K * M, N, P] are ordered by candidate.
+    Observations, [K * M, N, P], are ordered by candidate.
     """
     sizes = [sum(part.numel() for part in layers_of(rule)) for rule in rules]
     weights_of = dict(zip(rules, torch.split(weights, sizes, dim=1), strict=True))
 
     def action(rule: NPARule, observation: Tensor) -> Tensor:
-        rows = perceived(rule, observation)
+        rows = columns_read(rule, observation)
         rows = rows.view(len(weights), -1, rows.shape[1])
         update = updates_of(rule, weights_of[rule], rows).flatten(0, 1)
-        return rules.interface.action(*bounded(rule, update))
+        return rules.interface.action(*split_update(rule, update))
 
     return rules.actions(observation, action)
 
@@ -177,7 +177,7 @@ def fitness(
 def _strategy(
     rule_weights: RuleWeights, options: EvolutionOptions, draws: np.random.Generator
 ) -> Any:
-    """Return the strategy of `cma`, with `ask`, `tell` and `mean`."""
+    """Return an evolution strategy of `cma` around the rules, with `ask`, `tell` and `mean`."""
     try:
         import cma
     except ImportError as error:
@@ -199,7 +199,7 @@ def _strategy(
 
 
 def costs(returns: NDArray[np.float64]) -> list[float]:
-    """Return costs to minimise for mean returns [K]; not finite ones get the highest cost."""
+    """Return costs to minimise: minus the mean returns [K]. Not finite ones cost the most."""
     finite = np.isfinite(returns)
     worst = returns[finite].min() - 1.0 if finite.any() else 0.0
     minimised: list[float] = (-np.where(finite, returns, worst)).tolist()

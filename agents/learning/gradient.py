@@ -40,7 +40,7 @@ KEY_RANGE = -(2**63), 2**63 - 1
 
 @dataclass(frozen=True, kw_only=True)
 class GradientOptions:
-    """Options of `train`; most are checked by the `TrainConfig` that they are passed to."""
+    """Options of gradient descent; `TrainConfig`, which most are passed to, checks them."""
 
     steps: tuple[int, int] | None = None
     """Range [lo, hi) of the steps of a rollout; None: whole episodes of up to 96 steps, and 32 to
@@ -74,7 +74,7 @@ class GradientOptions:
 
 
 def train(progress: Progress, options: GradientOptions = GradientOptions()) -> RuleSet:
-    """Descend the loss at the end of rollouts, differentiated through all of their steps.
+    """Return rules that descend the loss at the end of rollouts, by gradients through all steps.
 
     Rollouts start new episodes, or continue earlier ones from a pool as in the paper (arXiv
     2601.16096). State steps are clamped as in environments. Observations are not clipped.
@@ -130,14 +130,14 @@ class BudgetTrainConfig(TrainConfig[Any]):
     """Learning rate at the end, as a fraction of the first (dimensionless)."""
 
     def learning_rate_at(self, iteration: int, share: float = 0.0) -> float:
-        """Return the current learning rate, half a cosine over the budget; ignores arguments."""
+        """Return the learning rate for the budget spent, half a cosine; ignores the arguments."""
         return annealed(self.learning_rate, self.last_rate, self.progress.spent_fraction)
 
 
 class EnvironmentTask(ParticleTask[Any]):
-    """A problem as a task of the trainer: its episodes' starts, loss and physics.
+    """A problem as a task of the trainer: start worlds, loss and physics of its episodes.
 
-    All species must have one loss, and no particle may leave a world.
+    All species must share one loss, and no particle may leave a world.
     """
 
     def __init__(self, problem: Problem, device: torch.device) -> None:
@@ -170,7 +170,7 @@ class EnvironmentTask(ParticleTask[Any]):
     def seed(
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
     ) -> Particles:
-        """Return the first worlds of episodes, with their goals, if any."""
+        """Return start worlds of episodes, [B, N, ...], with their goals, if the task has any."""
         if isinstance(generator, WorldRandom):
             keys = generator.integers(KEY_RANGE[1])
         else:
@@ -179,7 +179,7 @@ class EnvironmentTask(ParticleTask[Any]):
         return Particles(x, s, goal=rest[1] if rest else None)
 
     def with_goal(self, goal: Tensor | None) -> Self:
-        """Return a copy of the task whose losses are for these goals, shape [B]."""
+        """Return a copy whose losses are for these goals of worlds, [B]; None: the task itself."""
         return self if goal is None else self._with(inner=self.inner.with_goal(goal))
 
     def compare(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:
@@ -188,7 +188,7 @@ class EnvironmentTask(ParticleTask[Any]):
         return torch.stack(list(losses.values())).sum(), losses
 
     def penalties(self, *_: Any) -> dict[str, tuple[float, Tensor]]:
-        """Return no terms: environments have none."""
+        """Return no penalties: environments have none."""
         return {}
 
     def world_losses(self, worlds: Particles) -> Tensor:
@@ -219,7 +219,7 @@ class EnvironmentTask(ParticleTask[Any]):
         return run(rule, x, s, steps, **options)
 
     def _losses(self, worlds: Particles) -> Mapping[str, Tensor]:
-        """Return the parts of each world's loss, shape [B], or [B, K] of K species."""
+        """Return the terms of each world's loss by name, shape [B], or [B, K] of K species."""
         x, s, *_ = worlds
         losses: Mapping[str, Tensor]
         if isinstance(self.inner, SpeciesTask):
@@ -237,7 +237,7 @@ class EnvironmentTask(ParticleTask[Any]):
 
 
 class _ClampInward(torch.autograd.Function):
-    """Clamps values to ± a limit; beyond it gradients pass only if descent leads back inside."""
+    """Clamps values to ± `limit`. Beyond it, gradients pass only if descent leads back inside."""
 
     @staticmethod
     def forward(ctx: Any, values: Tensor, limit: float) -> Tensor:
@@ -254,12 +254,12 @@ class _ClampInward(torch.autograd.Function):
 
 
 class ClampedWeights(FoldedRule):
-    """The `FoldedRule` of a `ClampedRule`: it clamps the state part of each update."""
+    """The `FoldedRule` (weights as two matrix products) of a `ClampedRule`; clamps state steps."""
 
     rule: ClampedRule
 
     def __call__(self, rows: Tensor) -> Tensor:
-        """Map rows [z | 1 | 0] to updates [δ | clamped Δs | 0]."""
+        """Map padded perceptions [z | 1 | 0] to displacements and clamped state steps, padded."""
         return self.rule.clamped(super().__call__(rows))
 
 
@@ -276,25 +276,25 @@ class ClampedRule(NPARule):
         self.rule_is_plain = rule.is_plain()
 
     def forward(self, perception: Tensor) -> Tensor:
-        """Map perception vectors [..., P] to updates with clamped state steps."""
+        """Map perceptions [..., P] to raw updates [..., A] with clamped state steps."""
         return self.clamped(super().forward(perception))
 
     def clamped(self, update: Tensor) -> Tensor:
-        """Return updates [..., δ | Δs] with clamped state steps."""
+        """Return raw updates [δ | Δs], shape [..., A], with the state steps Δs clamped."""
         first = self.update_dim - self.state_dim
         state_step = _ClampInward.apply(update[..., first:], self.limit)  # type: ignore[no-untyped-call]
         return torch.cat((update[..., :first], state_step), dim=-1)
 
     def is_plain(self) -> bool:
-        """Return whether the other rule is plain, so that `folded` may replace `forward`."""
+        """Return whether the other rule is only its two layers, so that `folded` may replace it."""
         return self.rule_is_plain
 
     def has_network(self) -> bool:
-        """Return False: the network without `forward` would not clamp the state steps."""
+        """Return False, as `NPARule.network` would not clamp the state steps."""
         return False
 
     def folded(self) -> FoldedRule:
-        """Return the folded weights with clamped state steps."""
+        """Return the other rule's `FoldedRule`, with clamped state steps."""
         clamped = ClampedWeights(*super().folded())
         clamped.rule = self
         return clamped

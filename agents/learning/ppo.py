@@ -15,7 +15,7 @@ import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Literal, NamedTuple, Self
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -53,7 +53,7 @@ MEMORY_FRACTION = 0.25
 
 @dataclass(frozen=True, kw_only=True)
 class PPOOptions(CommonOptions):
-    """Options of `train`."""
+    """Options of PPO on the device."""
 
     num_envs: int | None = None
     """Worlds B of all processes; None: the problem's `num_envs`, or more on CUDA: 131 072 particles
@@ -86,16 +86,9 @@ class PPOOptions(CommonOptions):
                 "advantage a world"
             )
 
-    @property
-    def largest_change(self) -> float:
-        """Distance from 1 at which ratios are clipped."""
-        if self.clip is not None:
-            return self.clip
-        return 0.2 if self.ratio == "particle" else 0.02
-
 
 def train(progress: Progress, options: PPOOptions = PPOOptions()) -> RuleSet:
-    """Return the rules that proximal policy optimisation finds within a budget."""
+    """Return the rules that proximal policy optimisation learns within the budget."""
     problem, device, ranks = progress.problem, progress.device, progress.ranks
     count = ranks.broadcast(total_num_envs(problem, options, device, progress.budget, ranks))
     learner = PPOLearner(progress, replace(options, num_envs=count))
@@ -113,7 +106,7 @@ class PPOLearner:
     """Rules, critic and worlds, which alternately `play` a round and `improve` from it.
 
     With several processes (`ranks`) each has some of the worlds, which have random streams of their
-    own, and gradients, moments and weights are averaged, between CUDA graphs.
+    own. Gradients, moments and weights are averaged over them between replays of CUDA graphs.
     """
 
     def __init__(self, progress: Progress, options: PPOOptions) -> None:
@@ -146,7 +139,8 @@ class PPOLearner:
         observation = self._reset_worlds(0)
         self.critic.observe(observation, ranks)
         self.memory = RoundMemory(options, observation, problem.interface.action_dim)
-        self.update = UpdateState.new(self._minibatches.count, device)
+        shapes: tuple[tuple[int, ...], ...] = ((), (), (2,), (self._minibatches.count, 2))
+        self.update = UpdateState(*(torch.zeros(shape, device=device) for shape in shapes))
         self._play_graphs = GraphedMethods(device)
         self._update_graphs = GraphedMethods(device, share_memory=True)
 
@@ -168,7 +162,7 @@ class PPOLearner:
 
     @torch.no_grad()
     def play(self) -> Round:
-        """Act for T steps in all worlds, and compute advantages; the next round overwrites them."""
+        """Play T steps, and return them with advantages; the next round overwrites them."""
         memory, options = self.memory, self.options
         memory.observations[0].copy_(memory.observations[-1])
         last_observations = {}
@@ -227,7 +221,7 @@ class PPOLearner:
         )
         memory.targets.copy_(advantages + values)
         if self.options.ratio == "world":
-            advantages = over_particles(advantages, memory.acted)
+            advantages = particle_means(advantages, memory.acted)
         memory.advantages.copy_(standardised(advantages, memory.acted, self.ranks))
 
     def improve(self, remaining_budget: float) -> None:
@@ -271,7 +265,7 @@ class PPOLearner:
         self._descend(self.optimisers["critic"])
 
     def _sum_weights(self) -> None:
-        """Sum the weights of the critic's and of the rules' rows in each minibatch of a pass."""
+        """Sum the weights of the samples in each minibatch of a pass, for critic and rules."""
         acted = [self.memory.round.acted]
         for minibatch in range(self._minibatches.count):
             (worlds,) = self._critic_rows(minibatch, acted)
@@ -293,7 +287,7 @@ class PPOLearner:
         find_gradients(self.optimisers["critic"], loss)
 
     def _objective(self, minibatch: int) -> tuple[Tensor, Tensor]:
-        """Return PPO's clipped objective, and the sums of `UpdateState.kl_sums`."""
+        """Return PPO's clipped objective of a minibatch, and its `UpdateState.kl_sums`."""
         options, actor = self.options, self.actor
         groups = [Round(*rows) for rows in self._rule_rows(minibatch, self.memory.round)]
         if options.ratio == "world":
@@ -313,9 +307,9 @@ class PPOLearner:
         divergence = (acted * (torch.expm1(log_ratio) - log_ratio)).sum().detach()
         kl_sums = torch.stack((divergence, acted.sum()))
         if options.ratio == "world":
-            log_ratio = over_particles(log_ratio, acted)
+            log_ratio = particle_means(log_ratio, acted)
         weights, total = self._ratio_weights(acted), self.update.weight_sums[minibatch, 1]
-        clip = options.largest_change
+        clip = options.clip or (0.2 if options.ratio == "particle" else 0.02)
         objective = clipped_objective(log_ratio, advantages, weights, total, clip=clip)
         if options.entropy_weight:
             objective = objective + options.entropy_weight * actor.entropy()
@@ -337,12 +331,12 @@ class PPOLearner:
         optimiser.step()
 
     def _critic_rows(self, minibatch: int, values: Sequence[Tensor]) -> list[Tensor]:
-        """Return the critic's minibatch of tensors [T B, N, ...]: worlds at some steps."""
+        """Return the critic's minibatch of each tensor [T B, N, ...]: worlds at some steps."""
         index = self._minibatches.indices[-1][minibatch]
         return [value[index] for value in values]
 
     def _rule_rows(self, minibatch: int, values: Sequence[Tensor]) -> list[list[Tensor]]:
-        """Return the rules' rows of a minibatch: worlds, or particles of each species."""
+        """Return the rules' minibatch of each tensor, of worlds, or by species of its particles."""
         indices = [group[minibatch] for group in self._minibatches.indices[:-1]]
         if self.options.ratio == "world":
             return [[value[index] for value in values] for index in indices]
@@ -375,13 +369,7 @@ class UpdateState(NamedTuple):
     kl_sums: Tensor
     """Sums of a minibatch's KL estimates [nats] and of their weights, shape [2]."""
     weight_sums: Tensor
-    """Sums of the weights of the critic's and of the rules' rows by minibatch, shape [M, 2]."""
-
-    @classmethod
-    def new(cls, minibatch_count: int, device: torch.device) -> Self:
-        """Return the state before the first update."""
-        shapes = ((), (), (2,), (minibatch_count, 2))
-        return cls(*(torch.zeros(shape, device=device) for shape in shapes))
+    """Sums of the weights of the critic's and of the rules' samples by minibatch, shape [M, 2]."""
 
 
 class GraphedMethods:
@@ -457,7 +445,7 @@ class RoundMemory:
 
     @property
     def round(self) -> Round:
-        """The round, as views."""
+        """The round, as views of these tensors."""
         others = (self.actions, self.log_probs, self.advantages, self.targets, self.acted)
         return Round(*(values.flatten(0, 1) for values in (self.observations[:-1], *others)))
 
@@ -488,14 +476,14 @@ def generalised_advantages(
     return advantages
 
 
-def over_particles(values: Tensor, weights: Tensor) -> Tensor:
-    """Return weighted means of values [..., N] over particles, 0 without weights, [..., 1]."""
+def particle_means(values: Tensor, weights: Tensor) -> Tensor:
+    """Return weighted means [..., 1] of values [..., N]; 0 where all weights are 0."""
     total = (values * weights).sum(dim=-1, keepdim=True)
     return total / weights.sum(dim=-1, keepdim=True).clamp(min=1e-8)
 
 
 def standardised(values: Tensor, weights: Tensor, ranks: ProcessGroup = ALONE) -> Tensor:
-    """Subtract each step's weighted mean from values, and divide by the standard deviation of all.
+    """Return values minus the weighted mean of their step, over the standard deviation of all.
 
     Means are by step, as the mean over worlds depends on the step of the episode, which a critic
     learns only slowly; a single world has one mean of all steps. Values have shape [T, B, N] or
@@ -533,7 +521,7 @@ def total_num_envs(
     budget: Budget,
     ranks: ProcessGroup = ALONE,
 ) -> int:
-    """Return the worlds B of all processes, as `PPOOptions.num_envs` defines them."""
+    """Return the number of worlds B of all processes, as `PPOOptions.num_envs` defines it."""
     if options.num_envs is not None:
         return options.num_envs
     if device.type != "cuda":
@@ -549,7 +537,7 @@ def total_num_envs(
 
 
 def world_bytes(problem: Problem, options: PPOOptions, device: torch.device) -> int:
-    """Return about the memory of a world, its part of a round and of its gradients [bytes]."""
+    """Return roughly the memory of one world, its steps in a round and their gradients [bytes]."""
     interface, count = problem.interface, problem.particle_count
     columns = interface.perception_dim + interface.action_dim
     # A step stores observations, actions and rewards; a minibatch also gradients.

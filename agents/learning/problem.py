@@ -119,12 +119,12 @@ class Problem:
 
     @cached_property
     def registration(self) -> RegisteredEnv:
-        """What the id is registered with."""
+        """What `env_id` stands for."""
         return registration_of(self.env_id)
 
     @property
     def task_type(self) -> type[EnvTask[Any]] | type[SpeciesTask]:
-        """Class of the task."""
+        """Class of the environment's task."""
         return self.registration.task_type
 
     @cached_property
@@ -149,7 +149,7 @@ class Problem:
 
     @property
     def counts(self) -> tuple[int, ...]:
-        """Particles of each species that is an agent; one number without species."""
+        """Numbers of particles of the species that act; one number without species."""
         config = self.config
         if isinstance(config, SpeciesConfig):
             return config.agent_particle_counts
@@ -157,11 +157,11 @@ class Problem:
 
     @property
     def particle_count(self) -> int:
-        """Particles of a world that act, N."""
+        """Number of particles of a world that act, N."""
         return sum(self.counts)
 
     def make_task(self, device: str | torch.device = "cpu") -> EnvTask[Any] | SpeciesTask:
-        """Return the task, which has starts and losses, for worlds on a device.
+        """Return the environment's task, which makes start worlds and their losses, on a device.
 
         Raises:
             NPAError: Something that the task needs cannot be loaded.
@@ -178,7 +178,7 @@ class Problem:
         tell_updated: bool = False,
         copy: bool = True,
     ) -> NPAVectorEnv | ConcatenatedSpeciesEnv:
-        """Return batched worlds on a device; observations, actions and the rest are tensors there.
+        """Return a batch of worlds, whose observations, actions, rewards and flags are tensors.
 
         `reset(seed=0)` returns observations, [B, N, P], and infos; `step(actions)`, of [B, N, A],
         returns observations, rewards, terminations and truncations, [B] each, and infos. Worlds
@@ -188,8 +188,8 @@ class Problem:
         Args:
             num_envs: Worlds B; None: the problem's.
             device: Device of the worlds.
-            row_rewards: Adds `infos["particle_reward"]`, [B, N]: "particle", each particle's own
-                part of the improvement, or "marginal", the difference that its action makes. With
+            row_rewards: Adds `infos["particle_reward"]`, [B, N]: "particle", the decrease of each
+                particle's own loss, or "marginal", the difference that its action makes. With
                 several species it is always there: the reward of the particle's species.
             tell_updated: Adds `infos["updated"]`, [B, N]: which actions took effect; not with
                 several species.
@@ -256,7 +256,7 @@ class Problem:
 
 
 class RegisteredEnv(NamedTuple):
-    """What an id is registered with."""
+    """What an environment id stands for: a class of tasks and its settings."""
 
     task_type: type[EnvTask[Any]] | type[SpeciesTask]
     """Class of the task."""
@@ -269,7 +269,7 @@ class RegisteredEnv(NamedTuple):
 
 
 def registration_of(env_id: Any) -> RegisteredEnv:
-    """Return what an id is registered with; raises NPAError without a batched environment."""
+    """Return what an environment id stands for; raises NPAError if it has no batched form."""
     if isinstance(env_id, str) and env_id in SPECIES:
         name, keywords = task_settings(env_id)
         steps = keywords.pop("max_cycles", DEFAULT_STEPS)
@@ -298,9 +298,9 @@ def check_run_seed(seed: Any) -> None:
 
 
 def world_seeds(seed: int, count: int, resumption: int = 0) -> list[int]:
-    """Return the seeds of a run's worlds, which no other run has.
+    """Return seeds of `count` worlds, which no run with another seed has.
 
-    Each `resumption` of the run has new seeds; after `WORLDS_PER_SEED` seeds they repeat.
+    Each `resumption` of the run has new ones; they repeat after `WORLDS_PER_SEED` worlds.
     """
     check_run_seed(seed)
     if count > WORLDS_PER_SEED:

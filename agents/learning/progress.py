@@ -17,10 +17,10 @@ from npa_envs.agents.evaluation import checked_seeds, evaluate_policy
 from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.learning.rule_set import RuleSet
 from npa_envs.atomic_files import json_text, write_text
-from npa_envs.checks import check_count, check_positive, is_real
+from npa_envs.checks import check_count, check_positive
 from npa_envs.devices import check_device
 from npa_envs.errors import DivergedError, NPAError, shown
-from npa_envs.training.checkpoint import check_content, unusable_checkpoint
+from npa_envs.training.checkpoint import check_entries, unusable_checkpoint
 from npa_envs.training.optimiser import load_moments
 from npa_envs.training.process_group import ProcessGroup
 from npa_envs.training.run_folder import Run, RunFolder
@@ -42,7 +42,7 @@ class Budget:
     """Steps times particles that took them, of environments and rollouts together."""
 
     def __post_init__(self) -> None:
-        """Check both; raises NPAError."""
+        """Check both limits; raises NPAError."""
         if self.seconds is None and self.particle_steps is None:
             raise NPAError(
                 "a budget must say something: Budget(seconds=60) or particle_steps=10**7"
@@ -94,7 +94,7 @@ class Learner(Protocol):
 
 
 class Progress:
-    """Counts what a learner spends, evaluates its rules at regular parts of the budget, saves them.
+    """Counts what a learner spends, evaluates its rules at regular intervals, and saves them.
 
     A learner makes its worlds, compiles what it needs, and then calls `run`, or itself `start`, and
     until the budget is `over`, `advance` and `look` after each iteration.
@@ -272,9 +272,9 @@ class Progress:
             self._agree_on_time()
 
     def look(self, policy: RuleSet | Callable[[Any], Any], force: bool = False) -> bool:
-        """Evaluate if the next point of the curve is due, or with `force`; return whether it did.
+        """Evaluate if the curve's next point is due, or with `force`; return whether it was done.
 
-        Without particle-steps since the last evaluation there is none.
+        None is done if no particle-steps have been counted since the last one.
 
         Raises:
             DivergedError: A weight of the rules is not finite, or an action.
@@ -330,7 +330,7 @@ class Progress:
             torch.cuda.synchronize(self.device)
 
     def _save(self, rules: RuleSet, learner: Learner | None) -> None:
-        """Write checkpoint, rules and curve, after a check that all processes have the same."""
+        """Write checkpoint, rules and curve, after a check that processes have equal weights."""
         folder = self._run.folder
         if folder is None:
             return
@@ -361,39 +361,27 @@ class Progress:
 
     def _restore(self, learner: Learner, content: dict[str, Any]) -> None:
         assert self._run.folder is not None, "it contains the checkpoint"
-        path, like = self._run.folder.checkpoint, learner_state(learner)
-        like |= {"iteration": 0, "resumptions": 0, "particle_steps": 0, "seconds": 0.0}
-        moments = content.get("optimisers")
-        for name, optimiser in learner.optimisers.items():
-            stored = moments.get(name) if isinstance(moments, dict) else None
-            # Parameters without a gradient have no moments.
-            like["optimisers"][name] = {
-                index: {"step": torch.zeros(()), "exp_avg": value, "exp_avg_sq": value}
-                for index, value in enumerate(optimiser.param_groups[0]["params"])
-                if isinstance(stored, dict) and index in stored
-            }
-        random, drawn = learner.random, content.get("random")
-        if not isinstance(drawn, Tensor) or drawn.shape != like["random"].shape:
-            # The checkpoint is of one process and the run of several, or the reverse, so that the
-            # random sources differ in kind: this one starts from its seed.
-            content["random"] = like["random"]
-        check_content(content, like, path)
+        path = self._run.folder.checkpoint
+        counts = {"iteration": int, "resumptions": int, "particle_steps": int, "seconds": float}
+        check_entries(content, counts, path)
         try:
-            self.log = [CurvePoint(**point) for point in content.get("curve") or ()]
-            numbers = [value for point in self.log for value in asdict(point).values()]
+            self.log = [CurvePoint(**point) for point in content["curve"]]
             for name, module in learner.modules.items():
                 module.load_state_dict(content["modules"][name])
             for name, optimiser in learner.optimisers.items():
                 load_moments(optimiser, content["optimisers"][name])
-            if isinstance(random, WorldRandom):
-                random.episodes.fill_(int(content["random"]))
-            else:
-                random.set_state(content["random"])
-        except (TypeError, RuntimeError) as error:
+            random, drawn = learner.random, content["random"]
+            # Random sources of one process and of several differ in kind: this one then starts from
+            # its seed.
+            if drawn.shape == learner_state(learner)["random"].shape:
+                if isinstance(random, WorldRandom):
+                    random.episodes.fill_(int(drawn))
+                else:
+                    random.set_state(drawn)
+        except (KeyError, TypeError, AttributeError, ValueError, RuntimeError) as error:
             raise unusable_checkpoint(path, f"it cannot be used ({shown(error)})") from error
-        # A single episode has an infinite standard error.
-        if not self.log or not all(is_real(value) or value == math.inf for value in numbers):
-            raise unusable_checkpoint(path, "curve must hold the numbers of its points")
+        if not self.log:
+            raise unusable_checkpoint(path, "curve must hold its points")
         self._run.iteration, self._resumptions = content["iteration"], content["resumptions"] + 1
         self.particle_steps = content["particle_steps"]
         self._seconds = self._agreed_seconds = content["seconds"]
@@ -425,7 +413,7 @@ def check_finite(rules: RuleSet, particle_steps: int) -> None:
 
 
 def learner_state(learner: Learner) -> dict[str, Any]:
-    """Return the state of a learner without its worlds."""
+    """Return a learner's modules, optimisers and random source as checkpoints contain them."""
     random = learner.random
     # The counter of draws is the same in all worlds.
     drawn = random.episodes[:1] if isinstance(random, WorldRandom) else random.get_state()

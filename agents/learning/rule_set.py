@@ -144,14 +144,14 @@ class RuleSet(nn.Module):
         return self.actions(observation, self.mean_by_rule)
 
     def mean_by_rule(self, rule: NPARule, rows: Tensor) -> Tensor:
-        """Return `mean` for particles of one rule that observe [K, P], shape [K, A]."""
+        """Return actions [K, A], as `mean`, of one rule for K particles' observations [K, P]."""
         delta, state_step = bounded_update(rule, rows)
         return torch.cat((delta, state_step / self.interface.state_scale), dim=-1)
 
     def actions(
         self, observation: Tensor, action_by_rule: Callable[[NPARule, Tensor], Tensor]
     ) -> Tensor:
-        """Return actions [B, N, A]; `action_by_rule` maps a rule and rows [K, P] to [K, A]."""
+        """Return actions [B, N, A]; `action_by_rule` maps a rule and [K, P] to actions [K, A]."""
         actions = []
         for rule, span in zip(self, self.spans, strict=True):
             rows = observation[:, span]
@@ -165,14 +165,14 @@ class RuleSet(nn.Module):
 
 
 class RuleSetPolicy(Policy):
-    """A set of rules as a policy, on the rules' device."""
+    """A set of rules as a policy, which computes on the rules' device."""
 
     def __init__(self, rules: RuleSet) -> None:
         super().__init__(rules.interface)
         self.rules = rules
 
     def act(self, observation: Tensor) -> Tensor:
-        """Return the rules' bounded updates of all particles."""
+        """Return the actions [B, N, A] of particles by their species' rules."""
 
         def action(rule: NPARule, rows: Tensor) -> Tensor:
             return self.interface.action(*bounded_update(rule, rows))

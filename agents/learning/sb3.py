@@ -8,9 +8,9 @@ whose actor is a set of rules, is this library's.
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from gymnasium.spaces import Dict, Space
@@ -49,7 +49,7 @@ KL_FACTOR = 1.5
 
 @dataclass(frozen=True, kw_only=True)
 class WorldOptions(CommonOptions):
-    """Options of `train`; common ones have the defaults of `ppo.py`."""
+    """Options of PPO with one likelihood for each world."""
 
     clip: float = 0.02
     """Likelihood ratios are clipped to 1 ± this (dimensionless); it is small, as log-ratios are
@@ -116,7 +116,7 @@ def world_kl(particle_kl: float) -> float:
 class ProgressCallback(BaseCallback):
     """Reports to `Progress` while Stable-Baselines3 learns; stops it at the end of the budget.
 
-    By default it does both at every step of all worlds.
+    It does both after each step of all worlds.
     """
 
     def __init__(self, progress: Progress) -> None:
@@ -126,7 +126,7 @@ class ProgressCallback(BaseCallback):
         """Particle-steps of a step of all worlds."""
 
     def learn(self, model: Any, learned: LearnedT) -> LearnedT:
-        """Let a model learn until the budget is spent; evaluate and return what is learned."""
+        """Let a model learn until the budget is spent; evaluate and return its rules or policy."""
         self.learned: Any = learned
         # Stable-Baselines3 would use the seeds seed, seed + 1, and so on.
         model.env.seed(world_seeds(self.progress.seed, self.progress.problem.num_envs)[0])
@@ -146,7 +146,7 @@ class ProgressCallback(BaseCallback):
 
 
 class RoundCallback(ProgressCallback):
-    """As `ProgressCallback`, once a round; anneals the noise, and lets the critic begin alone."""
+    """Reports once a round; anneals the rules' noise; at first lets only the critic learn."""
 
     def __init__(self, progress: Progress, options: WorldOptions, schedule: Schedule) -> None:
         super().__init__(progress)
@@ -215,7 +215,7 @@ class WorldRulePolicy(ActorCriticPolicy):
         return action, self.predict_values(obs), log_prob.mean(dim=1)
 
     def evaluate_actions(self, obs: Any, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return values [M, 1], log-probabilities [M] and entropies [M] of actions."""
+        """Return values [M, 1], log-probabilities [M] and entropies [M] of worlds' actions."""
         log_prob = self.actor.log_prob(obs, actions.view(*obs.shape[:2], -1))
         return self.predict_values(obs), log_prob.mean(dim=1), self.actor.entropy().expand(len(obs))
 
@@ -241,40 +241,36 @@ ALGORITHMS: dict[str, type[SAC] | type[PPO]] = {"sac": SAC, "ppo": PPO}
 
 @dataclass(frozen=True, kw_only=True)
 class GardenOptions:
-    """Options of both algorithms; all others are Stable-Baselines3's defaults."""
+    """Options of SAC and PPO in gardens; others have the defaults of Stable-Baselines3."""
 
     gamma: float = 0.9
     """Discount of a reward one step later (dimensionless)."""
     learning_rate: float = 3e-4
     """Adam's learning rate."""
-    counts: ClassVar[tuple[str, ...]] = ()
-    """Names of the fields that are whole numbers."""
 
     def __post_init__(self) -> None:
         """Check every field; raises NPAError."""
         check_fraction(self, "gamma")
         check_positive(self, float, "learning_rate")
-        check_positive(self, int, *self.counts)
+        check_positive(self, int, *(f.name for f in fields(self) if isinstance(f.default, int)))
 
 
 @dataclass(frozen=True, kw_only=True)
 class SACOptions(GardenOptions):
-    """Options of `train_garden_sac`."""
+    """Options of SAC in gardens."""
 
     learning_starts: int = 1000
     """Steps of worlds before the first gradient step."""
-    counts = ("learning_starts",)
 
 
 @dataclass(frozen=True, kw_only=True)
 class GardenPPOOptions(GardenOptions):
-    """Options of `train_garden_ppo`."""
+    """Options of PPO in gardens."""
 
     steps: int = 32
     """Steps of each world in a round."""
     batch_size: int = 64
     """Steps of worlds in a minibatch, at least 2."""
-    counts = ("steps", "batch_size")
 
 
 def train_garden_sac(progress: Progress, options: SACOptions = SACOptions()) -> GardenPolicy:
@@ -327,7 +323,7 @@ class GardenPolicy:
         self._shapes = _shapes(space.spaces if isinstance(space, Dict) else space)
 
     def __call__(self, observation: Any) -> NDArray[np.float32]:
-        """Return actions [B, K, W] for observations [B, ...]."""
+        """Return actions of K brushes, W columns each, [B, K, W], for observations [B, ...]."""
         shapes = {name: shape[1:] for name, shape in _shapes(observation).items()}
         if shapes != self._shapes:
             raise NPAError(
@@ -367,6 +363,6 @@ class GardenPolicy:
 
 
 def _shapes(values: Any) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of an observation or a space, or of those in a dict, by name."""
+    """Return the shapes of a dict of arrays or spaces by name; a single one is "observation"."""
     named = values if isinstance(values, dict) else {"observation": values}
     return {name: tuple(value.shape) for name, value in named.items()}

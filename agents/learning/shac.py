@@ -36,7 +36,7 @@ from npa_envs.world.randomness import WorldRandom
 
 @dataclass(frozen=True, kw_only=True)
 class SHACOptions:
-    """Options of `train`."""
+    """Options of the short-horizon actor-critic."""
 
     steps: int = 16
     """Most steps of a window, h; windows of an episode have equal lengths."""
@@ -87,7 +87,7 @@ def train(progress: Progress, options: SHACOptions = SHACOptions()) -> RuleSet:
 
 
 class StepWindow(NamedTuple):
-    """h steps of B worlds, differentiable."""
+    """Features and losses of B worlds over h steps, differentiable."""
 
     features: Tensor
     """The critic's inputs before and after each step, shape [h + 1, B, N, F]."""
@@ -101,10 +101,10 @@ class StepWindow(NamedTuple):
 
 
 class SHACLearner:
-    """Rules, critic and worlds.
+    """Rules, critic and worlds, which `learn` runs and trains window by window.
 
     With several processes (`ranks`) each has some of the worlds, which have random streams of their
-    own, and gradients and moments are averaged.
+    own. Gradients and moments are averaged over processes.
     """
 
     def __init__(self, progress: Progress, options: SHACOptions) -> None:
@@ -148,7 +148,7 @@ class SHACLearner:
     def learn(self, rate: float) -> None:
         """Run the worlds for a window, and train rules and critic on it."""
         window, optimiser = self.play(), self.optimisers["rules"]
-        find_gradients(optimiser, -self.gain(window))
+        find_gradients(optimiser, -self.objective(window))
         means = gradients_of(optimiser)
         self.ranks.reduce(means)
         normalise_gradients(means)
@@ -189,7 +189,7 @@ class SHACLearner:
         return StepWindow(features, losses)
 
     def _restart(self) -> None:
-        """Start new episodes in worlds whose last window this was."""
+        """Start new episodes in worlds whose episode ended with this window."""
         restart(self.random)
         self.windows_left = [left - 1 for left in self.windows_left]
         over = [world for world, left in enumerate(self.windows_left) if left == 0]
@@ -204,8 +204,8 @@ class SHACLearner:
             random = random.take(torch.tensor(worlds, device=self.device))
         return self.task.seed(len(worlds), generator=random, device=self.device)
 
-    def gain(self, window: StepWindow) -> Tensor:
-        """Return the rules' objective: discounted rewards plus the value at the end, averaged."""
+    def objective(self, window: StepWindow) -> Tensor:
+        """Return the rules' objective: mean discounted rewards of a window plus its end's value."""
         gamma, steps = self.options.gamma, self.window
         discounts = gamma ** torch.arange(steps, device=self.device, dtype=torch.float32)
         returns = (discounts[:, None] * window.rewards).sum(dim=0)
@@ -213,7 +213,7 @@ class SHACLearner:
         return (returns + self.options.value_weight * gamma**steps * value).mean()
 
     def learn_values(self, window: StepWindow) -> None:
-        """Train the critic on a window's targets, and move the target critic towards it."""
+        """Train the critic on a window's TD(λ) targets, and move the target critic towards it."""
         options = self.options
         features = window.features[:-1].flatten(0, 1)
         with torch.no_grad():
@@ -243,23 +243,23 @@ class SHACLearner:
 
 
 def world_values(critic: Critic, features: Tensor) -> Tensor:
-    """Return the values of worlds with features [M, N, F], shape [M]."""
+    """Return values [M] of worlds with features [M, N, F]: means over particles."""
     each: Tensor = critic(features)
     return each.mean(dim=-1)
 
 
 def td_lambda_targets(
-    rewards: Tensor, following: Tensor, *, gamma: float, td_lambda: float
+    rewards: Tensor, next_values: Tensor, *, gamma: float, td_lambda: float
 ) -> Tensor:
     """Return TD(λ) targets before each step of a window, shape [h, ...].
 
     They are discounted sums of later rewards, in which the critic's values after each step,
-    `following`, have the weight 1 - λ, and 1 after the last step. Source: arXiv 2204.07137,
+    `next_values`, have the weight 1 - λ, and 1 after the last step. Source: arXiv 2204.07137,
     equation 7.
     """
     targets = torch.empty_like(rewards)
-    later = following[-1]
+    later = next_values[-1]
     for step in reversed(range(len(rewards))):
-        later = rewards[step] + gamma * torch.lerp(following[step], later, td_lambda)
+        later = rewards[step] + gamma * torch.lerp(next_values[step], later, td_lambda)
         targets[step] = later
     return targets

@@ -33,7 +33,7 @@ Pictures = Mapping[tuple[int, ...], NDArray[np.uint8]]
 
 
 def write_elites(search: Search, folder: Path) -> Pictures:
-    """Write each elite's rule as `elites/CELL.safetensors`; return pictures of first worlds."""
+    """Write each elite's rule as `elites/CELL.safetensors`; return pictures of their worlds."""
     pictures: dict[tuple[int, ...], NDArray[np.uint8]] = {}
     count = search.world.particle_count
     for elite in search.elites():
@@ -57,7 +57,7 @@ def write_elites(search: Search, folder: Path) -> Pictures:
     return pictures
 
 
-def page(search: Search, pictures: Pictures) -> str:
+def atlas_html(search: Search, pictures: Pictures) -> str:
     """Return the atlas as one HTML page: a table for each cell of the last axis.
 
     The first axis goes from left to right, the second one upwards.
@@ -118,7 +118,7 @@ def _span(axis: Axis, cell: int) -> str:
     return f"{begin:.3g} to {begin + width:.3g}"
 
 
-def figure(axes: Sequence[Axis], pictures: Pictures) -> bytes:
+def atlas_png(axes: Sequence[Axis], pictures: Pictures) -> bytes:
     """Return the atlas as a PNG file: a panel for each cell of the last axis, two in a row."""
     across, up, last = axes
     width, height = ((axis.highest - axis.lowest) / axis.cells for axis in (across, up))

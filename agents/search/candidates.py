@@ -35,7 +35,7 @@ Numbers = NDArray[np.float64]
 
 
 class Axis(NamedTuple):
-    """A descriptor: name, range and number of cells."""
+    """A descriptor of worlds: name, range and number of the archive's cells."""
 
     name: str
     lowest: float
@@ -45,7 +45,7 @@ class Axis(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class SearchWorld:
-    """Sizes of the candidates' rules and worlds."""
+    """Sizes of the candidate rules and of the worlds that they are tried in."""
 
     particle_count: int = 128
     """Particles N."""
@@ -74,16 +74,16 @@ class SearchWorld:
 
     @property
     def particle_steps(self) -> int:
-        """Cost of one candidate: B N T."""
+        """Cost of one candidate in particle-steps: B N T."""
         return self.world_count * self.particle_count * self.steps
 
     def make_rule(self) -> NPARule:
-        """Return a rule with arbitrary weights, on the CPU."""
+        """Return a rule of these sizes with arbitrary weights, on the CPU."""
         with torch.random.fork_rng(devices=()):
             return NPARule(2, self.state_dim, self.hidden_dim, eps0=self.eps).requires_grad_(False)
 
     def axes(self) -> tuple[Axis, ...]:
-        """Return the descriptors.
+        """Return the descriptors by which the archive distinguishes worlds.
 
         `speed` is the mean path length of a step [ε], at most α times the probability of an update.
         `crowding` is log(ρ / ρ₁) / log N for the mean density ρ at particles and the density ρ₁ of
@@ -100,7 +100,7 @@ class SearchWorld:
 
 
 class Found(NamedTuple):
-    """Result of a candidate."""
+    """Quality and descriptors of a candidate."""
 
     quality: float
     """`bounded` times `alive`, in (0, 1]."""
@@ -119,8 +119,8 @@ class Trials(NamedTuple):
 class RuleStack(NPARule):
     """K rules of one architecture in one batch of worlds, where each updates its own worlds.
 
-    Each rule must have the same number of worlds with the same masks, so that each has the same
-    number of rows of perception. Weights [K, W] are in the order of `RuleWeights`.
+    Each rule must have the same number of worlds with the same update masks, so that each gets the
+    same number of perceptions. Weights [K, W] are in the order of `RuleWeights`.
     """
 
     def __init__(self, rule: NPARule, weights: Tensor) -> None:
@@ -130,7 +130,7 @@ class RuleStack(NPARule):
         self.to(weights.device)
 
     def forward(self, perception: Tensor) -> Tensor:
-        """Map rows of perception [K R, P] to raw updates [K R, A]."""
+        """Map perceptions [K R, P], R of each rule, to raw updates [K R, A]."""
         count = len(self.weights)
         if len(perception) % count:
             # If no particle is updated there is one row, which is not used.
@@ -140,10 +140,10 @@ class RuleStack(NPARule):
 
 
 class Candidates:
-    """Evaluates rules with given weights, all from the same seeds and with the same masks.
+    """Evaluates candidates, all from the same seeds and with the same update masks.
 
-    On a CPU candidates share a batch of worlds. On CUDA, where the number of rows of perception is
-    unknown, they run one after the other. The seeds of the B worlds are 0 to B - 1 by default.
+    On a CPU candidates share a batch of worlds. On CUDA, where the number of perceptions is not
+    known, they run one after the other. The seeds of the B worlds are 0 to B - 1 by default.
     """
 
     def __init__(
@@ -160,18 +160,18 @@ class Candidates:
 
     @property
     def weight_count(self) -> int:
-        """Weights of a candidate, W."""
+        """Number of weights of a candidate, W."""
         return len(self.scales)
 
     def rule_of(self, solution: Numbers) -> NPARule:
-        """Return the rule of a candidate's weights in units of `scales`, [W], on the CPU."""
+        """Return the rule with the weights `solution` [W], in units of `scales`, on the CPU."""
         rule = self.world.make_rule()
         RuleWeights([rule]).set_vector(solution * self.scales)
         return rule
 
     @torch.no_grad()
     def try_all(self, solutions: Numbers) -> Trials:
-        """Run the worlds of candidates; their weights [K, W] are in units of `scales`."""
+        """Run the worlds of candidates with weights `solutions` [K, W] in units of `scales`."""
         weights = torch.as_tensor(solutions * self.scales, dtype=torch.float32).to(self.device)
         batch_size = len(weights) if self.device.type == "cpu" else 1
         batches = [self._try(batch) for batch in torch.split(weights, batch_size)]
@@ -207,7 +207,7 @@ class Candidates:
         return Trials(found, later.map(lambda values: values[-1]))
 
     def crowding_and_mixing(self, worlds: Particles) -> tuple[float, float]:
-        """Return two descriptors of worlds."""
+        """Return the descriptors `crowding` and `mixing` of `axes`, averaged over worlds."""
         colours = _colours(worlds)
         fields = perception_fields(worlds.x, colours, eps=self.world.eps)
         excess = math.log(float(fields.rho.mean()) / self._alone)
@@ -221,7 +221,7 @@ def _colours(worlds: Particles) -> Tensor:
 
 
 def quality_of(worlds: Particles) -> Tensor:
-    """Return bounded * alive of worlds [T, B, N, ·], in [0, 1], shape [].
+    """Return the quality bounded * alive, in [0, 1], of worlds [T, B, N, ·] at T times, shape [].
 
     bounded = 1 / (1 + mean |s − clip(s, −1, 1)| + mean |x − clip(x, −1, 1)|), with the terms that
     training penalises. alive = twice the standard deviation over the T times of a particle's colour

@@ -69,7 +69,7 @@ def make_archive(weight_count: int, axes: tuple[Axis, ...], seed: int = 0) -> An
 
 
 class RandomEmitter:
-    """Random candidates, whose standard deviations of weights are log-uniform."""
+    """Proposes `random_weights` as an emitter of pyribs; ignores the archive."""
 
     def __init__(self, archive: Any, batch_size: int, seed: int) -> None:
         self.solution_dim: int = archive.solution_dim
@@ -77,7 +77,7 @@ class RandomEmitter:
         self._draws = np.random.default_rng(seed)
 
     def ask(self) -> Numbers:
-        """Return candidates, shape [K, W]."""
+        """Return the weights of new candidates, shape [K, W]."""
         return random_weights(self._draws, self._batch_size, self.solution_dim)
 
     def tell(self, *_: Any, **results: Any) -> None:
@@ -85,7 +85,7 @@ class RandomEmitter:
 
 
 def random_weights(draws: np.random.Generator, count: int, weight_count: int) -> Numbers:
-    """Return random candidates, [count, W], of log-uniform deviations `MIN_STD` to `MAX_STD`."""
+    """Return Gaussian weights [count, W]; each row's deviation is drawn log-uniformly."""
     deviations = np.exp(draws.uniform(np.log(MIN_STD), np.log(MAX_STD), (count, 1)))
     return deviations * draws.standard_normal((count, weight_count))
 
@@ -139,7 +139,7 @@ draws independent candidates.
 def qualities_and_measures(
     found: Sequence[Found | None], axes: Sequence[Axis]
 ) -> tuple[Numbers, Numbers]:
-    """Return qualities [K] and descriptors [K, M], which are 0 for candidates without a result."""
+    """Return qualities [K] and M descriptors [K, M] of candidates: 0 without a result."""
     nothing = Found(0.0, (0.0,) * len(axes))
     qualities, measures = zip(*(one or nothing for one in found), strict=True)
     return np.array(qualities), np.array(measures)
@@ -149,7 +149,7 @@ def qualities_and_measures(
 
 
 class Growth(NamedTuple):
-    """Statistics of an archive."""
+    """Statistics of an archive after some evaluations."""
 
     evaluations: int
     """Candidates tried so far."""
@@ -162,7 +162,7 @@ class Growth(NamedTuple):
 
 
 class Elite(NamedTuple):
-    """The best candidate of a cell."""
+    """The best candidate in a cell of the archive."""
 
     cell: tuple[int, ...]
     """Index on each axis."""
@@ -243,7 +243,7 @@ class Search:
 
     @property
     def evaluations(self) -> int:
-        """Candidates that have been tried."""
+        """Number of candidates that have been evaluated."""
         return sum(len(batch["found"]) for batch in self._batches)
 
     @property
@@ -258,7 +258,7 @@ class Search:
         enough: Callable[[], bool] = lambda: False,
         progress: Callable[[int], None] = lambda _: None,
     ) -> None:
-        """Evaluate batches of candidates while the search stays within its budget.
+        """Propose and evaluate batches of candidates while the search is within its budget.
 
         Args:
             budget: Particle-steps of the whole search, with those before a resume.
@@ -294,7 +294,7 @@ class Search:
         self.growth.append(growth_of(self.archive, self.evaluations))
 
     def _replay(self) -> None:
-        """Repeat the proposals of the record, if there is one, with its results."""
+        """Propose the candidates of the record, if there is one, again; take its results."""
         if self._path is None:
             return
         stored = read_record(self._path, self.facts, batches_of, command="search")
@@ -311,7 +311,7 @@ class Search:
 
 
 def batches_of(content: Mapping[str, Any]) -> list[Batch]:
-    """Return the batches of a record's JSON object."""
+    """Return the batches of candidates in a record's JSON object, with checked types."""
     return [
         {
             "fingerprint": int(batch["fingerprint"]),

@@ -48,7 +48,7 @@ def main(arguments: Sequence[str]) -> int:
     """Search; write the elites' rules, and a page and a picture that show them."""
     options = common.parse_options(SearchOptions, "search", arguments)
     common.check_numbers(options, threads=1)
-    from npa_envs.agents.search.atlas import PAGE, figure, page, write_elites
+    from npa_envs.agents.search.atlas import PAGE, atlas_html, atlas_png, write_elites
     from npa_envs.agents.search.quality_diversity import RESULTS, Search
     from npa_envs.atomic_files import write_text
     from npa_envs.measure.benchmark_records import time_limit
@@ -87,10 +87,10 @@ def main(arguments: Sequence[str]) -> int:
         f"{growth.evaluations} candidates, {len(pictures)} elites: coverage {growth.coverage:.3f}, "
         f"QD score {growth.qd_score:.3f}, best quality {growth.best:.3f}"
     )
-    write_text(folder / PAGE, page(search, pictures))
+    write_text(folder / PAGE, atlas_html(search, pictures))
     print(f"wrote {folder / PAGE} and the elites' rules")
     drawn = write_plots(
-        lambda: {"": figure(search.axes, pictures)}, folder / "atlas.png", "picture of the atlas"
+        lambda: {"": atlas_png(search.axes, pictures)}, folder / "atlas.png", "picture of the atlas"
     )
     print("\n".join(drawn))
     return 0

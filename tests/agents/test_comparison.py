@@ -21,11 +21,11 @@ from npa_envs.agents.comparison import single_run as one_run
 from npa_envs.agents.comparison.plan import LEFT_OUT, PROBLEMS, ComparisonPlan, Job, make_problem
 from npa_envs.agents.comparison.report import (
     Estimate,
-    curve,
-    curves,
+    curves_csv,
     fraction,
-    rows,
-    text,
+    markdown,
+    mean_curve,
+    report_rows,
 )
 from npa_envs.agents.comparison.single_run import (
     SIZE,
@@ -432,8 +432,8 @@ Fractions need runs of `zero` and `gradient`.
 
 
 def test_a_table_has_the_right_numbers_the_best_first_and_leaves_no_method_out():
-    assert text(rows(synthetic())) == TABLE
-    ppo = next(row for row in rows(synthetic()) if row.method == "ppo")
+    assert markdown(report_rows(synthetic())) == TABLE
+    ppo = next(row for row in report_rows(synthetic()) if row.method == "ppo")
     assert ppo.fraction == Estimate(0.5, pytest.approx(math.hypot(1.0, 0.5 * 0.5) / 3.0))
     assert ppo.episodes_diverged == pytest.approx(2 / 6)
     # No fraction of an improvement that there is not.
@@ -445,7 +445,7 @@ def test_a_table_has_the_right_numbers_the_best_first_and_leaves_no_method_out()
 def test_curves_have_a_line_for_each_point_of_each_run():
     some = [record("ppo", 0, curve=points((1.25, 0.125))), record("zero", 0)]
     some.append(record("evolution", 1, status="diverged", curve=points((2.0, math.nan))))
-    assert curves(some).splitlines() == [
+    assert curves_csv(some).splitlines() == [
         "axis,task,method,seed,status,seconds,particle_steps,mean_return,standard_error,final_loss",
         "seconds,growth,ppo,0,done,1.25,125,0.125,0,0.875",
         "seconds,growth,evolution,1,diverged,2,200,nan,0,nan",
@@ -457,7 +457,7 @@ def test_curves_have_a_line_for_each_point_of_each_run():
 
 def test_a_curve_is_the_mean_of_seeds_where_all_of_them_are():
     def mean_of(*records):
-        return curve(records, "seconds")
+        return mean_curve(records, "seconds")
 
     some = [
         record("ppo", 0, curve=points((0.0, 0.0), (2.0, 2.0), (4.0, 2.0))),

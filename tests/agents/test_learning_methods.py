@@ -338,10 +338,10 @@ def test_an_undiscounted_gain_is_what_the_windows_took_off_the_loss_and_what_is_
     window = made.play()
     assert window.losses.shape == (5, 3)
     fell = window.losses[0] - window.losses[-1]
-    torch.testing.assert_close(made.gain(window), fell.mean())
+    torch.testing.assert_close(made.objective(window), fell.mean())
     with torch.no_grad():
         made.target.value.bias.fill_(0.25)
-    torch.testing.assert_close(made.gain(window), fell.mean() + 0.25)
+    torch.testing.assert_close(made.objective(window), fell.mean() + 0.25)
     assert window.losses.requires_grad
     # The next window begins where this one ended, but where an episode of two windows was over; no
     # gradient leads back.

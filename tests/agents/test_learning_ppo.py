@@ -19,7 +19,7 @@ from npa_envs.agents.learning.ppo import (
     PPOOptions,
     clipped_objective,
     generalised_advantages,
-    over_particles,
+    particle_means,
     standardised,
     total_num_envs,
     world_bytes,
@@ -134,7 +134,7 @@ def test_likelihoods_are_those_of_gaussians_and_a_world_s_is_their_mean():
         )
         rows = (part[:, span].flatten(0, 1) for part in (observation, action))
         torch.testing.assert_close(actor.row_log_prob(k, *rows), by_hand[:, span].flatten())
-    world = over_particles(by_hand, torch.ones(5, 32))
+    world = particle_means(by_hand, torch.ones(5, 32))
     torch.testing.assert_close(world, by_hand.mean(dim=1, keepdim=True))
 
 

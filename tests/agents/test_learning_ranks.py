@@ -61,7 +61,7 @@ def learned(form):
             learner.improve(share_left)
             values = batch.advantages.square().mean(), batch.targets.mean()
         else:
-            values = learner.play().losses[-1].mean(), learner.gain(learner.play())
+            values = learner.play().losses[-1].mean(), learner.objective(learner.play())
             learner.learn(0.01 * share_left)
         means.append([float(part.detach()) for part in values])
     weights = [
