@@ -160,7 +160,7 @@ class _PreparedLaunch:
             _description(value, declared) if isinstance(value, Tensor) else value
             for value, declared in zip(arguments, types, strict=True)
         ]
-        loaded = (kernel.module, device) in _loaded
+        loaded = (kernel.module, device) in loaded_modules
         # One process at a time compiles a module.
         alone = contextlib.nullcontext() if loaded else in_turn(kernel.module.name)
         with kernel_lock, quiet_warp(), alone:
@@ -173,7 +173,7 @@ class _PreparedLaunch:
                 record_tape=False,
                 record_cmd=True,
             )
-            _loaded.add((kernel.module, device))
+            loaded_modules.add((kernel.module, device))
         self._device = device
         self._bounds = {size: self._launch.bounds}
         parameters = self._launch.params[1:]
@@ -257,7 +257,7 @@ class _PreparedLaunch:
         self._launch.hooks.forward(ctypes.byref(self._bounds_of(size)), ctypes.byref(memory))
 
 
-_loaded: set[tuple[Any, torch.device]] = set()
+loaded_modules: set[tuple[Any, torch.device]] = set()
 """Modules of kernels that have been loaded, each with its device."""
 
 MAX_BOUNDS = 4096

@@ -27,7 +27,7 @@ from npa_envs.kernels.pictures.blending import block_kernels
 from npa_envs.kernels.pictures.errors import gather_errors
 from npa_envs.kernels.portable.rewards_and_ends import update_episodes
 from npa_envs.ops import warmup
-from npa_envs.ops.launch import launched
+from npa_envs.ops.launch import loaded_modules
 
 
 def perception(*switches: Any, **more: Any) -> wp.Kernel:
@@ -86,27 +86,26 @@ MODERN = (80, 86, 89, 90, 100, 120)
 """Compute capabilities, times ten, from which kernels/cuda/ is used."""
 
 
-def compile_for(kernel, capability, folder):
-    wp.compile_aot_module(kernel.module, arch=capability, module_dir=folder, use_ptx=False)
+def compile_for(module, capability, folder):
+    wp.compile_aot_module(module, arch=capability, module_dir=folder, use_ptx=False)
 
 
 @pytest.mark.parametrize("capability", [TURING, MODERN[-1]])
 def test_a_kernel_compiles_with_all_native_code_for_the_oldest_and_the_newest(capability, tmp_path):
-    compile_for(update_episodes, capability, tmp_path)
+    compile_for(update_episodes.module, capability, tmp_path)
     assert list(tmp_path.glob(f"*.sm{capability}.cubin"))
 
 
 @pytest.mark.slow
 def test_portable_kernels_compile_for_turing(tmp_path):
     warmup("cpu", space_dims=(2, 3))
-    modules = {kernel.module.name: kernel for kernel, _ in launched}
-    assert len(modules) > 15
-    for kernel in modules.values():
-        compile_for(kernel, TURING, tmp_path)
+    assert len(loaded_modules) > 15
+    for module, _ in loaded_modules:
+        compile_for(module, TURING, tmp_path)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("capability", MODERN)
 def test_cuda_kernels_compile_from_ampere_on(capability, tmp_path):
     for kernel in VARIANTS.values():
-        compile_for(kernel(), capability, tmp_path)
+        compile_for(kernel().module, capability, tmp_path)
