@@ -107,7 +107,7 @@ class PicturesTask(PictureEnvTask[Pictures2DEnvConfig]):
 
     def fresh(self, random: WorldRandom) -> Start:
         """Return the training task's initial worlds, and the indices of their pictures."""
-        x, s, _, number = self.task.seed(random.world_count, generator=random, device=self.device)
+        x, s, *_, number = self.task.seed(random.world_count, generator=random, device=self.device)
         # Drops the channels of codes, which only rules of many pictures use.
         return Start(x, s[..., -self.config.state_dim :].contiguous(), goal=number)
 

@@ -101,7 +101,7 @@ class PointClassificationTask(TargetEnvTask[PointClassificationEnvConfig]):
 
     def fresh(self, random: WorldRandom) -> Start:
         """Return random clouds with all states zero, and their classes."""
-        x, s, _, label = self.task.seed(random.world_count, generator=random, device=self.device)
+        x, s, *_, label = self.task.seed(random.world_count, generator=random, device=self.device)
         return Start(x, s, goal=label)
 
     def losses(self, x: Tensor, s: Tensor) -> Mapping[str, Tensor]:

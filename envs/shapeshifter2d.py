@@ -177,7 +177,7 @@ class ShapeshifterTask(RuleDriven, PictureEnvTask[Shapeshifter2DEnvConfig]):
 
     def fresh(self, random: WorldRandom) -> Start:
         """Return grown worlds of random pictures, with another picture as their goal."""
-        x, s, _, picture = self.task.seed(random.world_count, generator=random, device=self.device)
+        x, s, *_, picture = self.task.seed(random.world_count, generator=random, device=self.device)
         assert picture is not None, "worlds of many pictures have goals"
         seeds = Particles(x, self.rule.with_code(s, self.codes.table[picture][:, None]))
         x, s, *_ = grow(self.rule, self.config, seeds, random)

@@ -360,12 +360,12 @@ def run(
     if not ranks.first:
         return INTERRUPTED if result.interrupted else 0
     rules = [folder.rule]
-    interact_command = ""
+    influence_command = ""
     if task_entry(task_name).joint:
         rules = [folder.rule_of(number) for number in range(len(config.task.species))]
-        interact_command = f"npa-envs interact {shlex.join(map(str, rules))}"
-        interact_command += f" --distances {config.task.distance:g}"
-        interact_command += f" --particle-count {sum(config.task.counts[:2])}"
+        influence_command = f"npa-envs influence {shlex.join(map(str, rules))}"
+        influence_command += f" --distances {config.task.distance:g}"
+        influence_command += f" --particle-count {sum(config.task.counts[:2])}"
     loss = result.record.get("loss")
     figures = "" if loss is None else f", training loss {loss:.4g}"
     if result.finished:
@@ -398,8 +398,8 @@ def run(
             except NPAError as error:
                 # The rule is written in any case; a bad one may diverge while it is measured.
                 print(f"  no report   {error}")
-    if interact_command:
-        print(f"  together    {interact_command}")
+    if influence_command:
+        print(f"  together    {influence_command}")
     shown_path = shlex.quote(str(folder.path))
     if any(importlib.util.find_spec(name) is None for name in VIEWER):
         print(f"  look at it  npa-envs rollout {shown_path} (live: pip install 'npa-envs[view]')")

@@ -318,7 +318,7 @@ MAX_CHANGE = 4.0
 class InteractionRecord(Record[InteractionRow]):
     """Rows of all pairs of rules and settings."""
 
-    command, key = "interact", "settings"
+    command, key = "influence", "settings"
 
     def parse(self, content: dict[str, Any]) -> list[InteractionRow]:
         """Return the rows; null stands for infinite numbers."""

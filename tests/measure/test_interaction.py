@@ -214,7 +214,7 @@ def rules(tmp_path_factory):
 
 def words_of(rules, out, *more):
     paths = [str(rules / f"{name}.safetensors") for name in ("one", "two")]
-    return ["interact", *paths, "--out", str(out), "--no-progress", *more]
+    return ["influence", *paths, "--out", str(out), "--no-progress", *more]
 
 
 def record_in(folder):
@@ -226,8 +226,8 @@ def test_mistakes_are_refused_and_nothing_is_written(rules, tmp_path, capsys):
     save_rule(make_rule(), unknown)
     one = str(rules / "one.safetensors")
     for words, message in (
-        (["interact", one, "--no-itself", "--out", str(out)], "more without itself, got one"),
-        (["interact", str(unknown), "--out", str(out)], "does not say what it grows: leave it"),
+        (["influence", one, "--no-itself", "--out", str(out)], "more without itself, got one"),
+        (["influence", str(unknown), "--out", str(out)], "does not say what it grows: leave it"),
     ):
         assert main(words) == 2
         assert message in capsys.readouterr().err
@@ -278,7 +278,7 @@ def test_pairs_whose_names_look_alike_have_files_of_their_own(rules, tmp_path):
     paths = saved(tmp_path, rules, "p", "p-q", "q-r", "r")
     words = ["--seed-count", "1", "--steps", "2", "--distances", "0", "--no-itself"]
     words += ["--out", str(tmp_path / "out"), "--no-progress"]
-    assert main(["interact", *paths, *words]) == 0
+    assert main(["influence", *paths, *words]) == 0
     names = {path.name for path in (tmp_path / "out").glob("*.png")}
     # 4 rules, each beside 3 others, and the heat map.
     assert len(names) == 13

@@ -78,7 +78,7 @@ def test_gradients_of_the_loss_reach_the_worlds_codes_alone(device):
     task = task_of(device)
     rule = task.make_rule(generator()).to(device)
     task = task.for_rule(rule)
-    x, s, _, goal = task.seed(2, generator=generator(1, device), device=device)
+    x, s, *_, goal = task.seed(2, generator=generator(1, device), device=device)
     goal.fill_(1)
     aimed = task.with_goal(goal)
     s = aimed.with_target_code(s)
@@ -94,7 +94,7 @@ def test_gradients_of_the_loss_reach_the_worlds_codes_alone(device):
 def test_switched_worlds_get_another_goal_and_its_code(device):
     task = task_of(device, switch_share=1.0, targets=("heart", "ring"))
     task = task.for_rule(task.make_rule(generator()).to(device))
-    x, s, _, goal = task.seed(16, generator=generator(1, device), device=device)
+    x, s, *_, goal = task.seed(16, generator=generator(1, device), device=device)
     _, hurt, _, switched = task.damage(Particles(x, s, goal=goal), generator(2, device))
     assert 0 < int((switched != goal).sum()) < 16
     after = task.with_goal(switched).with_target_code(hurt)

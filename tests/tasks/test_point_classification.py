@@ -61,7 +61,7 @@ def test_pictures_have_room_around_the_ink():
 
 
 def test_worlds_are_clouds_of_their_class_with_blank_states(task, device):
-    x, s, _, goal = task.seed(50, generator=random(1, device), device=device)
+    x, s, *_, goal = task.seed(50, generator=random(1, device), device=device)
     assert s.shape == (50, 24, 6)
     assert not s.any()
     assert_goals_fit(x, goal, task.clouds)
@@ -157,7 +157,7 @@ def test_so_many_worlds_of_a_batch_are_fresh_clouds(folder, tmp_path, fraction, 
 
 def test_mutated_worlds_keep_their_states(folder):
     task = task_of(folder, mutated_share=0.5)
-    x, s, _, goal = task.seed(200, generator=random(1))
+    x, s, *_, goal = task.seed(200, generator=random(1))
     s = s + torch.arange(200.0)[:, None, None]
     new_x, new_s, _, new_goal = task.damage(Particles(x, s, goal=goal), random(2))
     assert torch.equal(new_s, s)

@@ -75,7 +75,7 @@ def rule_worlds(
         trained = task_of_rule(name, rule, session.device, particle_count=count, **fields)
         session.cache[name, particles] = rule, trained.task
     rule, task = session.cache[name, particles]
-    x, s, _, goal = task.seed(world_count, generator=session.generator(), device=session.device)
+    x, s, *_, goal = task.seed(world_count, generator=session.generator(), device=session.device)
     return RuleWorlds(rule, task.with_goal(goal), Particles(x.float(), s.float(), goal=goal))
 
 

@@ -251,7 +251,7 @@ class RuleTrial:
         """Return fresh worlds with a fraction of the trained particles, in a shape of `SHAPES`."""
         count = self.particles(fraction)
         random = self.random(StreamId.GROWTH)
-        x, s, _, goal = self.tasks_of(count)[0].seed(
+        x, s, *_, goal = self.tasks_of(count)[0].seed(
             self.world_count, generator=random, device=self._device
         )
         if shape != "trained":

@@ -1,4 +1,4 @@
-"""`npa-envs interact`: grows rules in one world and measures how each changes the other."""
+"""`npa-envs influence`: grows rules in one world and measures how each changes the other."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ QUICK: dict[str, Any] = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class InteractOptions(common.RunOptions, InteractionSettings):
+class InfluenceOptions(common.RunOptions, InteractionSettings):
     """Grow every rule next to every other one, and measure how that changes it.
 
     For every ordered pair of rules, distance, ratio and radius it measures: the first rule's task
@@ -51,8 +51,8 @@ class InteractOptions(common.RunOptions, InteractionSettings):
     stopped run continues.
 
     Examples:
-      npa-envs interact gecko heart
-      npa-envs interact --quick
+      npa-envs influence gecko heart
+      npa-envs influence --quick
     """
 
     rules: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RULE")] = ()
@@ -61,16 +61,16 @@ class InteractOptions(common.RunOptions, InteractionSettings):
     """Also pair each rule with itself."""
     quick: bool = False
     """Two rules, two seeds and distances, few particles and steps: only shows that it runs."""
-    out: Path = Path("runs/interact")
+    out: Path = Path("runs/influence")
     """Folder to write to; created where missing."""
 
 
 def main(arguments: Sequence[str]) -> int:
     """Grow the pairs of rules that are not measured yet; write results and print their table."""
-    options = common.parse_options(InteractOptions, "interact", arguments)
+    options = common.parse_options(InfluenceOptions, "influence", arguments)
     if options.quick:
-        defaults = InteractOptions(**QUICK)
-        options = common.parse_options(InteractOptions, "interact", arguments, default=defaults)
+        defaults = InfluenceOptions(**QUICK)
+        options = common.parse_options(InfluenceOptions, "influence", arguments, default=defaults)
     shipped = list(shipped_rules(TASK))[: 2 if options.quick else None]
     rules = _rules(options.rules or shipped, options.checked_device())
     pairs: dict[str, tuple[RuleUnderTest, RuleUnderTest]] = {}
