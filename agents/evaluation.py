@@ -79,7 +79,7 @@ def evaluate_policy(env: Any, policy: Callable[[Any], Any], seeds: Iterable[int]
     if limits == [None, None] and _step_limit(env) is None:
         raise NPAError("env must end its episodes: make it with max_episode_steps=256")
     seeds = checked_seeds("seeds", seeds)
-    policy = policy_in(env, policy)
+    policy = bound_to(env, policy)
     single = isinstance(env, gymnasium.Env)
     count = 1 if single else env.num_envs
     run = _run_single if single else _run
@@ -105,8 +105,8 @@ def checked_seeds(name: str, seeds: Iterable[int]) -> list[int]:
     return listed
 
 
-def policy_in(env: Any, policy: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """Return `policy.made_for(env)` of a policy that reads the worlds, else the policy itself."""
+def bound_to(env: Any, policy: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """Return the policy, or `policy.made_for(env)` if it needs worlds, not only observations."""
     make = getattr(policy, "made_for", None)
     return policy if make is None else make(env)
 

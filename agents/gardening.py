@@ -21,7 +21,7 @@ FREE_PLACES = 8
 
 
 class BrushPolicy:
-    """A policy for an environment with brushes, single or vector, on a grid or free."""
+    """Policy for an environment, single or vector, of K brushes with W columns each."""
 
     def __init__(self, env: Any) -> None:
         inner = unwrapped(env)
@@ -48,7 +48,7 @@ class BrushPolicy:
         return action if isinstance(array, Tensor) else action.cpu().numpy()
 
     def act(self) -> Tensor:
-        """Return the actions of each world's brushes, float32, shape [B, K, W]."""
+        """Return the actions of each world's K brushes, W columns each, float32, [B, K, W]."""
         raise NotImplementedError
 
     def still(self) -> Tensor:
@@ -72,7 +72,7 @@ class RandomGardener(BrushPolicy):
         self._random = PolicyRandom(seed)
 
     def act(self) -> Tensor:
-        """Return actions drawn from [-1, 1), shape [B, K, W]."""
+        """Return actions of K brushes, W columns each, uniform in [-1, 1), shape [B, K, W]."""
         random = self._random.next_step(self.worlds.world_count, self.task.device)
         return 2.0 * random.uniform(*self.shape) - 1.0
 

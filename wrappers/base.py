@@ -303,7 +303,7 @@ class RewardSums(EpisodeWrapper):
     """Factor on the sum in each step (dimensionless)."""
 
     sums: Tensor | None = None
-    """Sums of the rewards, float64, shape [B]."""
+    """Sums of the rewards of the running episodes, float64, shape [B]; None before a step."""
 
     @abstractmethod
     def use_sums(self, rewards: Tensor, sums: Tensor) -> tuple[Tensor, dict[str, Any]]:
@@ -313,7 +313,7 @@ class RewardSums(EpisodeWrapper):
         """
 
     def after_reset(self, observations: Any, infos: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
-        """Set the sums of the worlds that restarted to zero."""
+        """Set the sums of rewards of worlds that restarted to 0; return the arguments unchanged."""
         self.reset_sums(self.clock.restarted)
         return observations, infos
 

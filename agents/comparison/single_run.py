@@ -32,7 +32,7 @@ import torch
 from numpy.typing import NDArray
 
 from npa_envs.agents.comparison.plan import ComparisonPlan, Job
-from npa_envs.agents.evaluation import Episodes, evaluate_policy, policy_in
+from npa_envs.agents.evaluation import Episodes, bound_to, evaluate_policy
 from npa_envs.agents.learning import method_options, train
 from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.learning.progress import Budget, CurvePoint
@@ -198,7 +198,7 @@ def final_picture(
     # One more step, as an environment at the end of an episode shows the next start.
     longer = replace(problem, keywords=keywords, episode_steps=problem.episode_steps + 1)
     envs: Any = longer.make_envs(1, device=device)
-    policy = policy_in(envs, policy)
+    policy = bound_to(envs, policy)
     observation, _ = envs.reset(seed=[seed])
     (picture,) = envs.render()
     for _ in range(problem.episode_steps):
@@ -211,7 +211,7 @@ def final_picture(
 
 
 def main(folder: Path) -> None:
-    """Do the run of a folder, and then of each folder that standard input names with a device."""
+    """Do the run in `folder`, then others; lines of standard input: device, folder, device, ..."""
     lines: SimpleQueue[str] = SimpleQueue()
 
     def listen() -> None:

@@ -190,7 +190,7 @@ class WorldConfig:
         )
 
     def interface(self, physics: Physics) -> Interface:
-        """Return the meaning of the columns of observations and actions."""
+        """Return what each column of observations and of actions means."""
         limits = physics.limits
         return Interface(physics.space_dim, self.state_dim, physics.moving, limits.state_scale)
 
@@ -288,7 +288,7 @@ class EnvConfig(WorldConfig):
         return 0
 
     def interface(self, physics: Physics) -> Interface:
-        """Return the meaning of the columns, those of the target included."""
+        """Return what action and observation columns mean; observations end with the target's."""
         return super().interface(physics)._replace(target_dim=self.target_dim)
 
     @property

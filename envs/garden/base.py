@@ -57,7 +57,7 @@ class RuleDrivenWorlds(BatchedWorlds):
     @torch.no_grad()
     @makes_plain_tensors
     def queue(self, action: Tensor, out: Tensor | None = None) -> Tensor:
-        """As in `BatchedWorlds`, but synchronises to check that the actions are finite."""
+        """Step the worlds; return observations [B, ...]. Synchronises to check the actions."""
         action = action.to(self.device)
         if not bool(torch.isfinite(action).all()):
             raise not_finite(action)
@@ -252,14 +252,14 @@ class GardenTask(RuleDriven, GrownTask[Config]):
         return particles
 
     def episode_context(self, start: Start, loss: Tensor, random: WorldRandom) -> Any:
-        """Return the losses of the grown pictures, and their rise if the pictures turn grey."""
+        """Return each grown picture's loss [B], and its rise [B] if all states became 0 (grey)."""
         blank = torch.zeros_like(start.s)
         grey = sum(self.losses(start.x, blank).values(), torch.zeros_like(loss))
         # The loss of a picture that did not grow may not rise at all.
         return GardenContext(loss, (grey - loss).maximum(MIN_RISE * loss))
 
     def lost_fraction(self, loss: Tensor, context: Any) -> Tensor:
-        """Return the lost fraction of each picture, [B]: 0 as at its start, 1 as bad as grey."""
+        """Return each picture's lost fraction, [B]: 0 as at its start, 1 as with all states 0."""
         fraction: Tensor = (loss - context.intact_loss) / context.rise
         return fraction
 
@@ -268,7 +268,7 @@ class GardenTask(RuleDriven, GrownTask[Config]):
         return world_mean(x) - self.task.target.points.mean(dim=0)
 
     def observe(self, particles: Particles, loss: Tensor, context: Any) -> Tensor:
-        """Return observations, shape [B, O], in the form that `observe` names."""
+        """Return observations [B, O] in the form of `config.observe`: grid, moments or picture."""
         if self.config.observe == "grid":
             observed = self.deficit(particles, self.middle(particles.x))
         elif self.config.observe == "moments":

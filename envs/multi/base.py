@@ -167,7 +167,7 @@ class SpeciesConfig(WorldConfig):
 
 
 class Population(NamedTuple):
-    """Particles of B worlds, sorted by species; the same N of them remain in every world."""
+    """Particles of B worlds, sorted by species; if agents were removed, the same in every world."""
 
     x: Tensor
     """Positions [length units], shape [B, N, 2]."""
@@ -257,7 +257,7 @@ class SpeciesTask(WorldTask[Any]):
 
     @property
     def open_half_width(self) -> float:
-        """Half of a picture's side in open space [length units]; at least 1 is used."""
+        """Half a rendered picture's side in open space [length units]; if below 1, 1 is used."""
         return 1.25 * float(self.config.seed_span)
 
     def draw(self, population: Population) -> NDArray[np.uint8]:

@@ -56,13 +56,13 @@ def main(arguments: Sequence[str]) -> int:
     """Record the episodes and write the dataset."""
     options = common.parse_options(RecordOptions, "record-dataset", arguments)
     common.check_numbers(options, episodes=1, num_envs=1)
-    from npa_envs.agents.evaluation import policy_in
+    from npa_envs.agents.evaluation import bound_to
     from npa_envs.measure.benchmark_records import command_text
     from npa_envs.wrappers.minari import ROOT, record_episodes, spec_of, write_dataset
 
     problem = problem_of(options)
     envs: Any = problem.make_envs(device=options.device)
-    policy = policy_in(envs, policy_of(options, problem))
+    policy = bound_to(envs, policy_of(options, problem))
     seeds = range(options.first_seed, options.first_seed + options.episodes)
     returns: list[float] = []
     if options.root is not None:

@@ -40,7 +40,7 @@ def scalar_name(scalar: type) -> str:
 def kernel_module(
     topic: str, space_dim: int, scalar: type, width: int = 0, lanes: int = 0
 ) -> wp.Module:
-    """Return the Warp module named after a topic, such as "sort", and after the kernels' sizes."""
+    """Return the Warp module of a topic, such as "sort", for a D, scalar type, width and lanes."""
     variant = f"{space_dim}d_{scalar_name(scalar)}"
     variant += f"_w{width}" * bool(width) + f"_l{lanes}" * bool(lanes)
     return native.module(f"npa_envs.kernels.{topic}_{variant}")
@@ -126,10 +126,7 @@ def domain_types(space_dim: int, scalar: type) -> SimpleNamespace:
 
     @wp.func
     def segment_count(domain: Domain, cell: cell_vector):
-        """Return the number of runs of adjacent cells around a cell.
-
-        There is one for each line of cells, or two where lines wrap around.
-        """
+        """Return the number of runs around a cell: one for each line of cells, two if it wraps."""
         lines = wp.int32(1)
         for d in range(1, wp.static(space_dim)):
             lines *= cells_around(domain, d)

@@ -109,7 +109,7 @@ def log_scaled(v: Any):
 
 @wp.func
 def log_scale_tangential(length: Any):
-    """Derivative of L(v) across v, from the length |L|: |L| / (exp|L| - 1)."""
+    """Derivative |L| / |v| of L(v) for changes of v perpendicular to v, from `length` = |L|."""
     ratio = type(length)(1.0)
     if length < type(length)(SMALL_LOG):
         series = type(length)(1.0)
@@ -123,7 +123,7 @@ def log_scale_tangential(length: Any):
 
 @wp.func
 def log_scale_adjoint(scaled: Any, cotangent: Any):
-    """Cotangent of v from that of the logarithmic scaling L(v), and from `scaled` = L(v)."""
+    """Loss gradient by v, from `cotangent`, that by L(v) of `log_scaled`, and `scaled` = L(v)."""
     length = wp.length(scaled)
     tangential = log_scale_tangential(length)
     result = tangential * cotangent
@@ -211,7 +211,7 @@ def make_fast_exp2(scalar: type) -> Any:
 
 @cached_under_lock()
 def make_log_scale_pull(vector: type) -> Any:
-    """Return the Warp function `log_scale_adjoint` on CUDA in float32, with fewer instructions."""
+    """Return a faster `log_scale_adjoint`, the backward pass of L(v), for CUDA in float32."""
 
     @native.func_native()
     def log_scale_pull(scaled: vector, cotangent: vector) -> vector: ...

@@ -46,7 +46,7 @@ class Record(Generic[Row]):
         self.facts, self.path, self.rows = facts, path, list(rows)
 
     def content(self) -> Mapping[str, Any]:
-        """Return the fields of the file, except the facts."""
+        """Return the fields of the file except `facts`, the settings the rows depend on."""
         return {"rows": as_objects(self.rows)}
 
     def parse(self, content: dict[str, Any]) -> list[Row]:

@@ -131,7 +131,7 @@ class _StructArgument:
         self._last: Any = None
 
     def set(self, value: Any) -> None:
-        """Copy a struct's bytes, unless this object was copied last."""
+        """Copy a struct's bytes; nothing is done if `value` is the object of the last call."""
         if value is not self._last:
             _overwrite(self._memory, value.__ctype__())
             self._last = value

@@ -35,7 +35,7 @@ class ArrangedWeights(NamedTuple):
 
 
 def _arrange_layers(first: Tensor, second: Tensor) -> list[Tensor]:
-    """Return weights [H, width] and [outputs, H] in tensor-core tiles, and scales of outputs."""
+    """Return weights [H, width] and [outputs, H] in tensor-core tiles, and factors of outputs."""
     hidden, width = first.shape
     steps, tiles = -(-width // 16), -(-second.shape[0] // 8)
     half = functools.partial(torch.empty, dtype=torch.float16, device=first.device)

@@ -149,7 +149,7 @@ NUMBER_FIELDS = ("eps", "eps0", "max_displacement", "update_prob", "dt", "positi
 
 
 def _constants(value: Any) -> Any:
-    """Return a field's value, in which torch.compile takes floats for constants."""
+    """Return a field's value; its floats are marked so that torch.compile keeps them constant."""
     if type(value) is tuple:
         return tuple([constant(side) for side in value])
     return constant(value) if type(value) is float else value
@@ -162,7 +162,7 @@ Arguments = ParamSpec("Arguments")
 
 
 def _cached(make: Callable[Arguments, Physics]) -> Callable[Arguments, Physics]:
-    """Cache a function's results by its arguments, unless one is mutable or torch compiles."""
+    """Cache a function's results by its arguments; not if one is mutable or torch compiles."""
     remembered = cast("Callable[Arguments, Physics]", functools.lru_cache(256, typed=True)(make))
 
     @functools.wraps(make)

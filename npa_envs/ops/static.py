@@ -183,7 +183,7 @@ def static_rows(
 def static_worlds(
     plan: KernelPlan, worlds: StaticWorlds, rows: StaticRows, x: Tensor, s: Tensor
 ) -> tuple[SortedWorlds, Densities]:
-    """Return what the perception pass of a step reads: sorted worlds and densities."""
+    """Return a step's sorted worlds and densities: those of the rollout with the step's rows."""
     lists = None
     if plan.lists_neighbours:
         steps, lengths, records = worlds.lists

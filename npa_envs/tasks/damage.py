@@ -249,7 +249,7 @@ def damage_pool(worlds: Particles, damage: PoolDamage, *, generator: Randomness)
     x, s, *_ = worlds
 
     def chosen_worlds(probability: float) -> Tensor:
-        """Return for each world 1 with this probability, else 0, shape [B]."""
+        """Return 1 with this probability, else 0, for each of the B worlds in x, shape [B]."""
         return (uniform_draws(generator, (len(x), 1), x)[:, 0] < probability).to(x.dtype)
 
     if damage.damage_radius > 0.0:

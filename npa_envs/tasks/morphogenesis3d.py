@@ -176,7 +176,7 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
         self._rule: NPARule | None = None
 
     def for_rule(self, rule: NPARule) -> Self:
-        """Return the task that draws particles by a rule's read-out; the target is shared."""
+        """Return a task with this target that renders particles by a rule's read-out network."""
         if rule.readout_dim not in (0, OUTPUTS):
             raise NPAError(
                 f"the rule must have a read-out of {OUTPUTS} outputs, or none, got readout_dim="

@@ -246,7 +246,7 @@ class TrainConfig(Generic[TaskConfigT]):
 
     @property
     def fresh_count(self) -> int:
-        """Number of fresh worlds in a batch that gets some (`seed_interval`)."""
+        """Number of fresh worlds in each batch that gets some: every `seed_interval`-th."""
         return max(1, round(self.fresh_share * self.world_count))
 
     @property

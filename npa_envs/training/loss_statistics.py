@@ -112,7 +112,7 @@ class LossStatistics:
         }
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the statistics of the current interval, for a checkpoint."""
+        """Return the sums of losses and counts since the last `send`, for a checkpoint."""
         return {
             "sums": self._sums,
             "replaced": self._replaced,
@@ -121,7 +121,7 @@ class LossStatistics:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore the interval that `state_dict` returned."""
+        """Restore the sums since the last `send`, as `state_dict` returned them."""
         self._sums.copy_(state["sums"])
         self._replaced.copy_(state["replaced"])
         self._count = state["count"]
@@ -139,7 +139,7 @@ class LossStatistics:
 def divergence_error(
     task: Task, rule: NPARule, snapshot: dict[str, Any], diagnosis: Path
 ) -> DivergedError:
-    """Return the error that ends a run whose loss is not finite."""
+    """Return the error that ends a run whose loss is not finite; it names the file `diagnosis`."""
     terms = [name for name, value in snapshot["terms"].items() if not math.isfinite(value)]
     named_terms = [name for name in terms if name != "loss"] or terms
     worlds = diverged_worlds(task, rule, snapshot)

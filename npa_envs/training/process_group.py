@@ -231,5 +231,5 @@ def restart(*sources: Randomness) -> None:
 
 
 def registered(source: Randomness) -> torch.Generator | None:
-    """Return the generator to register with a CUDA graph; per-world streams have none."""
+    """Return the torch generator that a CUDA graph must register; None: draws are by world."""
     return source if isinstance(source, torch.Generator) else None

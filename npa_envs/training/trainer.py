@@ -179,8 +179,8 @@ class Trainer:
 
         Raises:
             DivergedError: The loss is not finite.
-            NPAError: A file cannot be written, or a process of several is lost; the last checkpoint
-                is intact. Or another trainer writes to the folder, or has done so since this one
+            NPAError: A file cannot be written, or a process of several is lost (the last checkpoint
+                is intact), or another trainer writes to the folder, or has done so since this one
                 was made.
         """
         check_seconds(max_seconds)

@@ -145,7 +145,7 @@ class DivergenceWatch:
 
 
 def make_watch(on_divergence: str, worlds: Particles) -> DivergenceWatch | None:
-    """Return the watch of a rollout, None with `on_divergence="ignore"`."""
+    """Return the check of a rollout for divergence, None with `on_divergence="ignore"`."""
     if checked_choice("on_divergence", on_divergence, get_args(OnDivergence)) == "ignore":
         return None
     if worlds.x.is_cuda and torch.cuda.is_current_stream_capturing():

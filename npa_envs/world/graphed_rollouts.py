@@ -433,7 +433,7 @@ class _Recording:
         return [*call.particles.with_zero_paths(self._no_paths).tensors(), *call.weights]
 
     def record(self, steps: int, call: _Call) -> None:
-        """Record rollouts of a number of steps, after a warm-up with the inputs of a call."""
+        """Capture `steps` steps as CUDA graphs; before the first, run some of `call` eagerly."""
         if not self.graphs:
             self._warm_up(min(steps, WARM_UP_STEPS), call)
         elif len(self.graphs) >= MAX_GRAPHS:
@@ -478,7 +478,7 @@ class _Recording:
         self.bytes += max(torch.cuda.memory_reserved(self.device) - bytes_before, 0)
 
     def _warm_up(self, steps: int, call: _Call) -> None:
-        """Launch a rollout with the inputs of a call, and count the numbers that it draws."""
+        """Run `steps` steps of a call eagerly, and count the random numbers that they draw."""
         spec = self._spec._replace(steps=steps, keep_every=None)
         with torch.no_grad():
             torch._foreach_copy_(self._inputs, self._inputs_of(call))

@@ -340,7 +340,7 @@ class SpeciesStep(Step):
             self.species.append(Species(rule, rule.network(), particles, spec, fraction, ratio))
             first = particles.stop
         self.update_fraction: Tensor | None = None
-        """Fraction of its drawn updates that each particle keeps, shape [N]; None: all of them."""
+        """Probability p / max p with which a particle keeps a drawn update, shape [N]; None: 1."""
         specs = [species.spec for species in self.species]
         if min(spec.update_prob for spec in specs) < physics.update_prob:
             fractions = [
@@ -350,7 +350,7 @@ class SpeciesStep(Step):
             self.update_fraction = torch.cat(fractions)
 
     def draw_step(self, like: Tensor, source: Randomness | None) -> Draws:
-        """Return mask and noise as for one rule; each species keeps its fraction of the mask."""
+        """Return a step's mask, 1 with each species' own update probability, and its noise."""
         drawn = super().draw_step(like, source)
         if self.update_fraction is None:
             return drawn
@@ -456,7 +456,7 @@ def _recounted(scaled: Tensor, ratio: float) -> Tensor:
 
 
 def _update_of(species: Species, z: Tensor) -> Tensor:
-    """Return the updates [R, A], or wider with zeros, of a species' rows z of perception."""
+    """Return a species' updates [R, A] of rows z [R, P]; `network` may append columns of zeros."""
     rule = species.rule
     if species.network is None:
         update: Tensor = rule(z[:, : rule.perception_dim])

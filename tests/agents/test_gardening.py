@@ -10,7 +10,7 @@ from small_envs import begun
 
 import npa_envs
 from npa_envs.agents import evaluate_policy
-from npa_envs.agents.evaluation import policy_in
+from npa_envs.agents.evaluation import bound_to
 from npa_envs.agents.gardening import (
     GradientGardener,
     RandomGardener,
@@ -105,7 +105,7 @@ def test_gardeners_that_learn_nothing_act_in_the_worlds_that_they_are_asked_abou
         envs = problem.make_envs()
         again = evaluate_policy(envs, trained.policy, SEEDS)
         assert again.mean_return == trained.log[0].mean_return
-        pushes[method] = policy_in(envs, trained.policy)(envs.reset(seed=0)[0]).abs().sum()
+        pushes[method] = bound_to(envs, trained.policy)(envs.reset(seed=0)[0]).abs().sum()
     assert pushes["zero"] == 0.0
     assert min(pushes["random"], pushes["scripted"]) > 0.0
     refused("reads the worlds: call made_for", trained.policy, None)

@@ -158,10 +158,10 @@ def row_search(space_dim: int, periodic: bool) -> SimpleNamespace:
 
     @wp.func
     def run_cells(domain: Domain, line: int, begin: int, end: int, run: int):
-        """Return the first and last + 1 cell of run number `run` around a line of cells.
+        """Return the first and last + 1 cell (row-major index) of run number `run` around `line`.
 
-        Runs are the columns `begin` to `end` of all lines within eps; where these columns wrap
-        around the grid, a line has two. Cells are indexed in row-major order.
+        A line is a row of cells along x. Of each line within eps of `line` the columns `begin` to
+        before `end` are one run of adjacent cells, or two if they wrap around the grid.
         """
         nx = domain.cell_shape[0]
         first = begin

@@ -80,9 +80,10 @@ def block_functions(capacity: int) -> SimpleNamespace:
 
     @native.func_native(*sizes)
     def span_of_slice(address: wp.uint64, begin: int, end: int) -> wp.vec2i:
-        """Return the range of provisional indices of all particles that may be sorted into a slice.
+        """Return the first and last + 1 provisional index of all cells that a slice touches.
 
-        The slice consists of the sorted indices from `begin` to `end`.
+        A block writes one slice of its world: the sorted indices from `begin` to before `end`.
+        Provisional indices go by cell, then by arrival. `address`: that of `block_memory`.
         """
 
     @native.func_native(*sizes)

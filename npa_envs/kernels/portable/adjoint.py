@@ -4,7 +4,7 @@ Notation: centre i perceives neighbour j at r = x_j - x_i, with smoothing W_ij, 
 K_ij = f r and volume v_j = 1 / ρ_j. x̄ (`x_bar`) = dL/dx, the gradient of the loss L: b̄_i by centre
 i's smoothed state, Ḡ_i by its state gradient before the correction, q̄_i by its density gradient,
 z̄_i by its own state in the perception vector. The moment correction is a stopped gradient, so it
-has no adjoint.
+has no adjoint. `kernels/portable/__init__.py` defines the arguments.
 
 State:     s̄_k = z̄_k + v_k Σ_i (W_ik b̄_i + Ḡ_i K_ik) - Ḡ_k Σ_j v_j K_kj
 Density:   ρ̄_k = -v_k² v̄_k,  v̄_k = Σ_i (W_ik s_k · b̄_i + (s_k - s_i) · Ḡ_i K_ik)
@@ -73,7 +73,7 @@ def adjoint_kernels(
         gradient_bar: wp.array[scalar],
         density_gradient_bar: wp.array[vector],
     ):
-        """Write each row's cotangents before the logarithmic scaling, from those of perception."""
+        """Write dL/d(row before its logarithmic scaling) from `perception_bar`, by parts."""
         row, channel = wp.tid()
         row += range_start
         if row >= starts[starts.shape[0] - 1] - row_base:
@@ -120,7 +120,7 @@ def adjoint_kernels(
         first: int,
         end: int,
     ):
-        """Return the rows within eps of a block of candidates, from `first` on, and their count."""
+        """Return the rows within eps in a candidate block, from `first` on, and their count."""
         near = indices()
         count = wp.int32(0)
         if wp.static(listed):
@@ -162,7 +162,7 @@ def adjoint_kernels(
     ):
         """Write the cotangent of each particle's state, summed over the active particles around it.
 
-        With neighbour lists, all arrays are in sorted order.
+        `flat_gradient_bar`: `gradient_bar` by number. With lists all arrays are in sorted order.
         """
         k, g = wp.tid()
         k += range_start
@@ -227,7 +227,7 @@ def adjoint_kernels(
         # outputs
         density_bar: wp.array[scalar],
     ):
-        """Write the cotangent of each particle's density, through its volume 1 / rho."""
+        """Write dL/d(density) of each particle: its volume 1 / rho depends on the density."""
         k = range_start + wp.tid()
         entry = particles[k]
         position = space.position_of(entry)
@@ -293,7 +293,7 @@ def adjoint_kernels(
         # outputs
         positions_bar: wp.array[vector],
     ):
-        """Write the cotangent of each position: of a neighbour of others, and of a centre."""
+        """Write dL/dx of each particle, as a neighbour of others plus as a centre."""
         k = range_start + wp.tid()
         entry = particles[k]
         position = space.position_of(entry)

@@ -2,7 +2,7 @@
 
 Sums run over sorted particles, one contiguous run of cells after the other.
 
-Source: arXiv 2601.16096, section 3.
+Source: arXiv 2601.16096, section 3. Arguments: see `kernels/portable/__init__.py`.
 """
 
 from types import SimpleNamespace

@@ -1,7 +1,7 @@
 """Vectors of equivariant rules: mixed vectors, rotation-invariant products, steering.
 
-`npa_envs/ops/equivariance.py` has the formulas. A thread computes a few numbers of a row.
-Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
+`npa_envs/ops/equivariance.py` has the formulas, `kernels/portable/__init__.py` the arguments. A
+thread computes a few numbers of a row.
 """
 
 from types import SimpleNamespace
@@ -108,7 +108,7 @@ def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         # outputs
         whole_bar: vectors,
     ):
-        """Write each mixed vector's cotangent: the given one, plus that through the products."""
+        """Write dL/d(mixed vector): the given `mixed_bar`, plus the part through the products."""
         t = range_start + wp.tid()
         count = mixed.shape[1]
         row = t / count
@@ -140,7 +140,7 @@ def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         # outputs
         rows_bar: numbers,
     ):
-        """Write the cotangent of each row of perception, zero for its constant and padding."""
+        """Write dL/d(row) of each row of perception, 0 for the constant 1 and the padding."""
         # A thread writes a perceived vector, and some scalars.
         t = range_start + wp.tid()
         count = mixing.shape[0]
@@ -208,7 +208,7 @@ def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         output_bar: numbers,
         mixed_bar: vectors,
     ):
-        """Write the cotangents of outputs and mixed vectors from those of updates."""
+        """Write dL/d(output) and dL/d(mixed vector) from `update_bar` = dL/d(update)."""
         t = range_start + wp.tid()
         width = output.shape[1]
         row = t / width

@@ -3,7 +3,7 @@
 One thread serves a particle and a group of its state channels. Sums run over sorted particles, one
 run of cells after the other, or over neighbour lists in the same order.
 
-Source: arXiv 2601.16096, section 3 (smoothing, gradients, moment matrix, scaling).
+Source: arXiv 2601.16096, section 3. Arguments: see `kernels/portable/__init__.py`.
 """
 
 from types import SimpleNamespace
@@ -208,10 +208,7 @@ def perception_kernels(
         moment_field: wp.array[square],
         corrected_field: wp.array3d[scalar],
     ):
-        """Write density, smoothed state, gradients and moments of each particle, before scaling.
-
-        They are in the caller's order of particles.
-        """
+        """Write unscaled density, smoothed state, gradients and moments, in the caller's order."""
         k, g = wp.tid()
         k += range_start
         i = source[k]

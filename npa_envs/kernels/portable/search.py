@@ -56,10 +56,7 @@ def make_search(
         k: int,
         r: int,
     ):
-        """Return the first and last + 1 candidate of particle k in run number r.
-
-        `base` is the first cell of the particle's world.
-        """
+        """Return k's first and last + 1 candidate in run r; `base`: first cell of its world."""
         begin = wp.int32(0)
         end = wp.int32(0)
         if wp.static(listed):

@@ -4,7 +4,7 @@ Particles are sorted by world, then cell, then index. A row of cells is contiguo
 neighbourhood of a cell is a few contiguous runs of particles. The particles whose update mask is
 set ("active") get a second, compact order of the same kind: their rows. Integer atomics assign
 provisional positions; the last kernel replaces them by ranks among indices, so that every later
-sum has the same order on every run and device.
+sum has the same order on every run and device. Arguments: see `kernels/portable/__init__.py`.
 """
 
 from types import SimpleNamespace

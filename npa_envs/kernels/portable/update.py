@@ -2,8 +2,7 @@
 
 A displacement is alpha eps delta / (1 + |delta|): it never exceeds alpha eps. Actions are fractions
 of alpha eps.
-Source: arXiv 2601.16096, section 3.
-Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
+Source: arXiv 2601.16096, section 3. Arguments: see `kernels/portable/__init__.py`.
 """
 
 from types import SimpleNamespace
@@ -50,10 +49,7 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
 
     @wp.func
     def displaced(position: vector, factor: wp.float64, direction: vector_f64):
-        """Return a position moved by factor times direction.
-
-        In float64: the position is then rounded once, and rules amplify its rounding.
-        """
+        """Return a position plus factor times direction; in float64, to round it only once."""
         result = position
         for d in range(wp.static(space_dim)):
             result[d] = scalar(wp.float64(position[d]) + factor * direction[d])
@@ -203,7 +199,7 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         # outputs
         update_bar: wp.array[scalar],
     ):
-        """Write the cotangent of every row's update, zero beyond the last active row."""
+        """Write dL/d(update) of every row, 0 beyond the last active row."""
         await_earlier()
         allow_next_launch()
         # A thread writes some adjacent columns of a row.

@@ -334,7 +334,7 @@ def wipe(x: Tensor, s: Tensor, random: WorldRandom, box: Box) -> tuple[Tensor, T
 
 
 def slit(x: Tensor, s: Tensor, random: WorldRandom, box: Box) -> tuple[Tensor, Tensor]:
-    """Open a slit at a random angle through the centroid, in a box through a random particle."""
+    """Cut a slit at a random angle through the centroid, or in a periodic box a random particle."""
     centre = world_mean(x) if box is None else random_particle(x, random)
     normal = random.normal(x.shape[2], dtype=x.dtype)
     change = partial(cut, normal=normal, gap=DAMAGE_SIZES["cut"])
