@@ -376,7 +376,7 @@ def run_jobs(
 def _start(
     request: RunRequest, folder: Path, threads: int, idle: list[subprocess.Popen[bytes]]
 ) -> RunProcess:
-    """Return a run in an idle or a new process, which waits to be told a device."""
+    """Return a run in an idle or a new process, which waits for a device."""
     target = folder / request.job.folder
     temporary = target.parent / f".{target.name}.{secrets.token_hex(4)}"
     temporary.mkdir(parents=True)

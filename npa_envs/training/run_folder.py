@@ -351,6 +351,7 @@ class JsonlLog:
     def truncate(self, iteration: int | None = None) -> None:
         """Drop an incomplete last line, and the lines after an iteration, if given."""
         write_text(self.path, "".join(json.dumps(r) + "\n" for r in self.records(iteration)))
+        self._is_complete = True
 
     def records(self, iteration: int | None = None) -> list[dict[str, Any]]:
         """Return the records, up to an iteration if given, without an incomplete last line."""
