@@ -23,9 +23,9 @@ from pathlib import Path
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "support"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
-from browser import DESK, browser
+from support.browser import DESK, browser
 from websockets.sync.client import connect
 
 from npa_envs.web.server import HEADER

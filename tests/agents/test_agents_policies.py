@@ -6,8 +6,8 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from refusals import refused
-from small_envs import begun
+from support.refusals import refused
+from support.small_envs import begun
 
 import npa_envs
 from npa_envs.agents import (

@@ -3,8 +3,8 @@
 import gymnasium
 import numpy as np
 import pytest
-from learning_problems import heart, species
-from refusals import refused
+from support.learning_problems import heart, species
+from support.refusals import refused
 
 import npa_envs
 from npa_envs.agents import (

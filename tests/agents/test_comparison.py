@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from refusals import refused
+from support.refusals import refused
 
 from npa_envs.agents import RandomPolicy, ZeroPolicy
 from npa_envs.agents.comparison import single_run as one_run

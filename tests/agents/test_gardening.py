@@ -5,8 +5,8 @@ from dataclasses import replace
 import gymnasium
 import numpy as np
 import pytest
-from refusals import refused
-from small_envs import begun
+from support.refusals import refused
+from support.small_envs import begun
 
 import npa_envs
 from npa_envs.agents import evaluate_policy

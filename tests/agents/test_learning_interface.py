@@ -5,10 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-from clock import Clock
-from learning_problems import heart, species, wild_rules
-from refusals import refused
-from small_envs import begun
+from support.clock import Clock
+from support.learning_problems import heart, species, wild_rules
+from support.refusals import refused
+from support.small_envs import begun
 
 import npa_envs
 from npa_envs.agents import SpreadPolicy

@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from learning_problems import digits, heart, progress_of, species, wild_rules
-from refusals import refused
+from support.learning_problems import digits, heart, progress_of, species, wild_rules
+from support.refusals import refused
 
 import npa_envs
 from npa_envs.agents import (

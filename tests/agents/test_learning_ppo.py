@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 import torch.distributed as dist
-from learning_problems import heart, progress_of, wild_rules
+from support.learning_problems import heart, progress_of, wild_rules
 
 from npa_envs.agents import RandomPolicy, evaluate_policy
 from npa_envs.agents.learning import Budget, Problem, RuleSet, ppo, train

@@ -7,9 +7,9 @@ import signal
 
 import pytest
 import torch
-from learning_problems import heart, progress_of, species
-from processes import on_ranks
-from refusals import refused
+from support.learning_problems import heart, progress_of, species
+from support.processes import on_ranks
+from support.refusals import refused
 
 from npa_envs.agents.learning import Budget, RuleSet, ppo, shac, train
 from npa_envs.rule.files import load_rule

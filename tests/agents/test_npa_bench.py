@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from refusals import refused
+from support.refusals import refused
 
 from npa_envs.agents.comparison.npa_bench import SUITES, check_rows, write_rows
 from npa_envs.agents.comparison.single_run import RunRecord

@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 import torch
-from refusals import refused
+from support.refusals import refused
 
 from npa_envs import load_rule, rollout
 from npa_envs.agents.search import Search, SearchWorld, tried_again

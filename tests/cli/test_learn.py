@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
-from clock import Clock
+from support.clock import Clock
 
 from npa_envs.cli import main
 from npa_envs.cli.common import problem_of

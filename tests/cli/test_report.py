@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import pytest
 from PIL import Image
-from small_digits import write_idx
+from support.small_digits import write_idx
 
 from npa_envs.cli import main
 from npa_envs.cli import train_report as report

@@ -4,8 +4,8 @@ import json
 
 import pytest
 import torch
-from circle_task import circle_config
-from training_runs import trainer_of
+from support.circle_task import circle_config
+from support.training_runs import trainer_of
 
 from npa_envs.cli import main
 from npa_envs.cli.common import torch_threads

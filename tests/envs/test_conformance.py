@@ -6,15 +6,14 @@ import re
 import warnings
 from pathlib import Path
 
-import crowds
 import gymnasium
 import numpy as np
 import pytest
-import small_envs
 import torch
 from gymnasium.utils.env_checker import check_env
-from refusals import refused
-from small_envs import IDS, SPECIAL, assert_batch_of_singles, assert_same, begun
+from support import crowds, small_envs
+from support.refusals import refused
+from support.small_envs import IDS, SPECIAL, assert_batch_of_singles, assert_same, begun
 
 from npa_envs.envs import multispecies_v0
 from npa_envs.registration import GARDENS, SIZES

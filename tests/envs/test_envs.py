@@ -7,8 +7,8 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from refusals import refused
-from small_envs import IDS, assert_same, begun, make, make_vec
+from support.refusals import refused
+from support.small_envs import IDS, assert_same, begun, make, make_vec
 
 import npa_envs
 from npa_envs import reference

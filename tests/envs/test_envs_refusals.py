@@ -7,11 +7,11 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from crowds import drawn, few, still
-from crowds import make as make_species
-from crowds import small as small_species
-from refusals import refused
-from small_envs import IDS, assert_same, begun, make, make_vec, small
+from support.crowds import drawn, few, still
+from support.crowds import make as make_species
+from support.crowds import small as small_species
+from support.refusals import refused
+from support.small_envs import IDS, assert_same, begun, make, make_vec, small
 
 from npa_envs.envs import gardeners_v0, multispecies_v0, particles_v0
 

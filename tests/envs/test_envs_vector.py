@@ -6,9 +6,9 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import torch
-from crowds import still
-from refusals import refused
-from small_envs import IDS, assert_batch_of_singles, assert_same, begun, make, make_vec
+from support.crowds import still
+from support.refusals import refused
+from support.small_envs import IDS, assert_batch_of_singles, assert_same, begun, make, make_vec
 
 import npa_envs
 from npa_envs.envs import multispecies_v0

@@ -8,8 +8,8 @@ import pettingzoo
 import pytest
 import torch
 from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test
-from refusals import refused
-from small_envs import begun, make, make_vec, small
+from support.refusals import refused
+from support.small_envs import begun, make, make_vec, small
 
 import npa_envs
 from npa_envs.agents.gardening import ScriptedGardener

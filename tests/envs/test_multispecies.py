@@ -4,13 +4,13 @@ import numpy as np
 import pettingzoo
 import pytest
 import torch
-from crowds import TASKS, drawn, few, make, module_of, placed, small, still
 from pettingzoo.test import api_test, parallel_api_test, render_test, seed_test
 from pettingzoo.test.max_cycles_test import max_cycles_test
 from pettingzoo.test.seed_test import parallel_seed_test
 from pettingzoo.test.state_test import state_test
-from refusals import refused
-from small_envs import begun
+from support.crowds import TASKS, drawn, few, make, module_of, placed, small, still
+from support.refusals import refused
+from support.small_envs import begun
 
 import npa_envs
 from npa_envs.envs import multispecies_v0, particles_v0

@@ -5,7 +5,7 @@ import random as python_random
 import numpy as np
 import pytest
 import torch
-from refusals import refused
+from support.refusals import refused
 
 from npa_envs import NPAError, world_mean
 from npa_envs.envs import EnvTask, NPAEnv, NPAVectorEnv, Start

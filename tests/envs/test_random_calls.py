@@ -16,10 +16,10 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from crowds import few, small
-from fuzz_values import wrong
-from small_envs import IDS, assert_same
-from small_envs import small as small_keywords
+from support.crowds import few, small
+from support.fuzz_values import wrong
+from support.small_envs import IDS, assert_same
+from support.small_envs import small as small_keywords
 
 from npa_envs import DivergedError, NPAError
 from npa_envs.envs import multispecies_v0, particles_v0

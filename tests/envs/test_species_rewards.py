@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from crowds import HALF_WAY, apart, drawn, make, pair, pair_entropy, placed, small, still
-from small_envs import begun
+from support.crowds import HALF_WAY, apart, drawn, make, pair, pair_entropy, placed, small, still
+from support.small_envs import begun
 
 from npa_envs.envs import multispecies_v0, particles_v0
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 import torch
-from crowds import TASKS, drawn, make, small
-from refusals import refused
+from support.crowds import TASKS, drawn, make, small
+from support.refusals import refused
 
 from npa_envs.envs import multispecies_v0
 from npa_envs.envs.core import world_state

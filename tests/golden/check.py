@@ -31,7 +31,7 @@ def start(tree, folder, only):
     folder.mkdir()
     tests = tree / "tests"
     # In older commits the modules of `support` are in `tests` itself.
-    paths = os.pathsep.join(map(str, (tree, tests / "support", tests, tests / "golden")))
+    paths = os.pathsep.join(map(str, (tree, tests, tests / "golden")))
     variables = os.environ | {"PYTHONPATH": paths, "OMP_NUM_THREADS": "1", "COLUMNS": "200"}
     script = str(tests / "golden" / "wide.py")
     command = [sys.executable, "-P", "-W", "ignore", script, str(folder / "out.npz"), only]

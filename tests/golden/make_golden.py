@@ -1,6 +1,6 @@
 """Write the golden files anew: only at a commit whose results are known to be right.
 
-Run by hand: `PYTHONPATH=.:tests/support OMP_NUM_THREADS=1 python tests/golden/make_golden.py`.
+Run by hand: `PYTHONPATH=.:tests OMP_NUM_THREADS=1 python tests/golden/make_golden.py`.
 Worlds that are stored stay: 12 to 32 steps of shipped rules from the seeds of their tasks, with
 random numbers that take no particle near a jump of the dynamics. The folders of unfinished runs
 were written by `npa-envs train` with the options of `config.json`, killed after the first

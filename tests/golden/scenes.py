@@ -9,10 +9,9 @@ import math
 from functools import partial
 from pathlib import Path
 
-import crowds
 import numpy as np
-import small_envs
 import torch
+from support import crowds, small_envs
 from torch import Tensor
 
 import npa_envs

@@ -18,12 +18,11 @@ import time
 from functools import partial
 from pathlib import Path
 
-import crowds
 import gymnasium
 import numpy as np
 import scenes as golden
-import small_envs
 import torch
+from support import crowds, small_envs
 
 import npa_envs
 from npa_envs import WorldRandom, load_rule, rollout

@@ -5,7 +5,7 @@ import os
 import pytest
 import torch
 import warp as wp
-from processes import on_ranks
+from support.processes import on_ranks
 
 from npa_envs.ops.launch import launch
 from npa_envs.runtime import start_warp

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from worlds import relative_error
+from support.worlds import relative_error
 
 from npa_envs.kernels import native_functions as native
 from npa_envs.kernels.cuda import equivariance as cuda

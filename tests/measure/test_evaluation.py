@@ -5,7 +5,7 @@ from dataclasses import astuple
 
 import pytest
 import torch
-from circle_task import PARTICLE_COUNT, STATE_DIM, CircleTask
+from support.circle_task import PARTICLE_COUNT, STATE_DIM, CircleTask
 
 import npa_envs.measure.quality
 from npa_envs.errors import NPAError

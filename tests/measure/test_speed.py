@@ -8,8 +8,8 @@ from functools import partial
 
 import pytest
 import torch
-from clock import Clock
 from drift import DriftRow
+from support.clock import Clock
 
 from npa_envs.cli import main
 from npa_envs.measure.speed import suites

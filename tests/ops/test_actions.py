@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from worlds import assert_same, random_mask
+from support.worlds import assert_same, random_mask
 
 from npa_envs.errors import NPAError
 from npa_envs.ops import apply_actions

@@ -9,10 +9,10 @@ from dataclasses import replace
 
 import pytest
 import torch
+from support.worlds import assert_same, random_world, tensors
+from support.worlds import lively_rule as made_rule
 from torch.autograd import forward_ad
 from torch.testing._internal.two_tensor import TwoTensor
-from worlds import assert_same, random_world, tensors
-from worlds import lively_rule as made_rule
 
 import npa_envs
 from npa_envs import reference

@@ -4,9 +4,9 @@ import dataclasses
 import math
 
 import pytest
-import reference_gaussians as oracle
 import torch
-from worlds import assert_same, cotangents, relative_error
+from support import reference_gaussians as oracle
+from support.worlds import assert_same, cotangents, relative_error
 
 from npa_envs.ops import render_gaussians
 from npa_envs.ops.pictures.cameras import Cameras, look_at, orbit

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from worlds import assert_same, relative_error
+from support.worlds import assert_same, relative_error
 
 from npa_envs.rule.folded_network import fold_weights
 from npa_envs.rule.rule import NPARule

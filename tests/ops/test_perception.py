@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 import torch
-from worlds import (
+from support.worlds import (
     assert_same,
     cotangents,
     degenerate_world,

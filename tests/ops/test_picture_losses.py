@@ -4,7 +4,7 @@ import functools
 
 import pytest
 import torch
-from worlds import assert_same, tensors
+from support.worlds import assert_same, tensors
 
 from npa_envs import WorldRandom
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig

@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 
 import hypothesis.strategies as st
 import torch
-from legal_worlds import GRID, UNIT, every, within
+from support.legal_worlds import GRID, UNIT, every, within
+from support.worlds import assert_same
 from torch import Tensor
-from worlds import assert_same
 
 from npa_envs.ops import Cameras, orbit, periodic_splat, render_gaussians, splat
 

@@ -7,7 +7,7 @@ and prints what reproduces a failure.
 import functools
 
 import torch
-from legal_worlds import (
+from support.legal_worlds import (
     allowances,
     clear_of_threshold,
     every,
@@ -15,7 +15,7 @@ from legal_worlds import (
     within,
     worlds,
 )
-from worlds import assert_same
+from support.worlds import assert_same
 
 import npa_envs
 

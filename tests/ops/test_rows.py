@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from worlds import (
+from support.worlds import (
     assert_same,
     cotangents,
     random_mask,

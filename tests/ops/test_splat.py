@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from worlds import assert_same, exact, relative_error, with_gradients
+from support.worlds import assert_same, exact, relative_error, with_gradients
 
 from npa_envs import reference as oracle
 from npa_envs.ops import periodic_splat, splat

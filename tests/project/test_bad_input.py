@@ -4,7 +4,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from refusals import calls
+from support.refusals import calls
 
 import npa_envs
 from npa_envs import (

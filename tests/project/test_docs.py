@@ -14,11 +14,11 @@ import imageio.v3 as imageio
 import numpy as np
 import pytest
 import torch
-from crowds import TASKS, still
-from crowds import small as small_crowd
 from gymnasium.utils.env_checker import check_env
 from PIL import Image
-from small_envs import make
+from support.crowds import TASKS, still
+from support.crowds import small as small_crowd
+from support.small_envs import make
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import npa_envs

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from fuzz_targets import TARGETS
-from fuzz_values import wrong
+from support.fuzz_targets import TARGETS
+from support.fuzz_values import wrong
 
 from npa_envs import NPAError
 

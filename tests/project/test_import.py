@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from learning_problems import heart
+from support.learning_problems import heart
 
 from npa_envs import wrappers
 from npa_envs.agents.learning import Budget, train

@@ -13,8 +13,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from crowds import small as small_crowd
 from PIL import Image
+from support.crowds import small as small_crowd
 
 import npa_envs
 from npa_envs.envs import multispecies_v0

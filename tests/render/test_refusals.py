@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
-from refusals import calls
+from support.refusals import calls
 
 from npa_envs.errors import NPAError
 from npa_envs.render import (

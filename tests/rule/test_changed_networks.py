@@ -5,7 +5,7 @@ import functools
 
 import pytest
 import torch
-from worlds import lively_rule, random_world
+from support.worlds import lively_rule, random_world
 
 import npa_envs
 

@@ -2,8 +2,8 @@
 
 import pytest
 import torch
+from support.worlds import assert_near, lively_rule, random_world
 from test_rule_files import assert_same_rule
-from worlds import assert_near, lively_rule, random_world
 
 import npa_envs
 from npa_envs.errors import NPAError

@@ -4,9 +4,9 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from circle_task import CircleTask, circle_config
-from training_runs import train
-from worlds import assert_near, assert_same, lively_rule, random_world
+from support.circle_task import CircleTask, circle_config
+from support.training_runs import train
+from support.worlds import assert_near, assert_same, lively_rule, random_world
 
 import npa_envs
 from npa_envs import NPAError, NPARule

@@ -4,7 +4,7 @@ import copy
 
 import pytest
 import torch
-from worlds import assert_near, lively_rule, random_world, relative_error
+from support.worlds import assert_near, lively_rule, random_world, relative_error
 
 import npa_envs
 from npa_envs.kernels.cuda.equivariance import fits_block, rows_of_warp

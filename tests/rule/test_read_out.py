@@ -4,7 +4,7 @@ import copy
 
 import pytest
 import torch
-from circle_task import STATE_DIM, CircleTask, circle_config, plain_rollout
+from support.circle_task import STATE_DIM, CircleTask, circle_config, plain_rollout
 
 from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
 from npa_envs.tasks.base import untrained_rule

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import save_file
-from worlds import relative_error
+from support.worlds import relative_error
 
 from npa_envs.errors import NPAError
 from npa_envs.rule.authors import save_demo_json

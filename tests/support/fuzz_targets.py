@@ -13,12 +13,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import crowds
 import gymnasium
 import numpy as np
-import small_envs
 import torch
 from PIL import Image
+from support import crowds, small_envs
 from torch import Tensor
 
 import npa_envs

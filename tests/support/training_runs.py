@@ -4,9 +4,9 @@ import contextlib
 
 import pytest
 import torch
-from circle_task import CircleTask, plain_rollout
+from support.circle_task import CircleTask, plain_rollout
+from support.worlds import tensors
 from torch.utils._python_dispatch import TorchDispatchMode
-from worlds import tensors
 
 from npa_envs.training import JsonlLog, Trainer
 from npa_envs.training.cycle import TrainingCycle

@@ -1,8 +1,8 @@
 """Small environments for tests of wrappers, and a deterministic policy for them."""
 
 import numpy as np
-import small_envs
 import torch
+from support import small_envs
 
 STEPS = 8
 ACTIONS = 18

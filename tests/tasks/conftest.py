@@ -1,7 +1,7 @@
 """Data that several files of this folder share."""
 
 import pytest
-from small_digits import write_idx
+from support.small_digits import write_idx
 
 
 @pytest.fixture(scope="session")

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import small_envs
 import torch
+from support import small_envs
 
 from npa_envs import load_rule
 from npa_envs.errors import NPAError

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from small_digits import COUNTS, idx, pictures, write_idx
+from support.small_digits import COUNTS, idx, pictures, write_idx
 
 from npa_envs.errors import NPAError
 from npa_envs.tasks.targets.digit_clouds import (

@@ -4,7 +4,7 @@ import json
 
 import pytest
 import torch
-from training_runs import lively_rule, log_of, worlds_of
+from support.training_runs import lively_rule, log_of, worlds_of
 
 from npa_envs.cli import main
 from npa_envs.errors import NPAError

@@ -6,7 +6,7 @@ import re
 import pytest
 import torch
 from PIL import Image
-from training_runs import make_cycle
+from support.training_runs import make_cycle
 
 import npa_envs
 from npa_envs.cli import main

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from training_runs import lively_rule, worlds_of
+from support.training_runs import lively_rule, worlds_of
 
 from npa_envs.errors import NPAError
 from npa_envs.measure.quality import measure

@@ -4,7 +4,7 @@ import json
 
 import pytest
 import torch
-from training_runs import make_cycle
+from support.training_runs import make_cycle
 
 from npa_envs.cli import main
 from npa_envs.errors import NPAError

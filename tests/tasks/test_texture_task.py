@@ -4,7 +4,7 @@ import dataclasses
 
 import pytest
 import torch
-from training_runs import worlds_of
+from support.training_runs import worlds_of
 
 from npa_envs.cli import main
 from npa_envs.rule.files import load_rule

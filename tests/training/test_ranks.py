@@ -9,9 +9,9 @@ import time
 import pytest
 import torch
 import torch.distributed as dist
-from processes import on_ranks
-from training_runs import log_of
-from worlds import assert_same
+from support.processes import on_ranks
+from support.training_runs import log_of
+from support.worlds import assert_same
 
 from npa_envs.errors import NPAError
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D

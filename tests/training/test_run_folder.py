@@ -9,8 +9,8 @@ import sys
 
 import pytest
 import torch
-from circle_task import circle_config
-from training_runs import Killed, KilledTask, kill, log_of, train, trainer_of
+from support.circle_task import circle_config
+from support.training_runs import Killed, KilledTask, kill, log_of, train, trainer_of
 
 from npa_envs.atomic_files import write_text
 from npa_envs.errors import NPAError

@@ -2,10 +2,10 @@
 
 import pytest
 import torch
-from circle_task import CircleTask, circle_config
-from small_digits import write_idx
-from training_runs import Recording, make_cycle, runaway
-from worlds import assert_same
+from support.circle_task import CircleTask, circle_config
+from support.small_digits import write_idx
+from support.training_runs import Recording, make_cycle, runaway
+from support.worlds import assert_same
 
 import npa_envs
 from npa_envs.errors import NPAError

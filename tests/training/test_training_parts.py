@@ -5,7 +5,7 @@ import math
 
 import pytest
 import torch
-from circle_task import CircleTask, circle_config, plain_rollout
+from support.circle_task import CircleTask, circle_config, plain_rollout
 from torch import nn
 
 from npa_envs.devices import check_device, parse_device

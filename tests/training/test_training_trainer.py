@@ -11,11 +11,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from circle_task import CircleTask, circle_config, plain_rollout
-from clock import Clock
 from PIL import Image
-from training_runs import Killed, KilledTask, full_disk, kill, log_of, runaway, train, trainer_of
-from worlds import assert_same
+from support.circle_task import CircleTask, circle_config, plain_rollout
+from support.clock import Clock
+from support.training_runs import (
+    Killed,
+    KilledTask,
+    full_disk,
+    kill,
+    log_of,
+    runaway,
+    train,
+    trainer_of,
+)
+from support.worlds import assert_same
 
 from npa_envs.errors import NPAError
 from npa_envs.rule.files import load_rule, rule_metadata, save_rule

@@ -3,7 +3,7 @@
 import shutil
 
 import pytest
-from browser import browser
+from support.browser import browser
 
 from npa_envs.web.export import PAGE
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from page_worlds import SPECIES, TOLERANCE, WORLDS, example, packed, unpacked
+from support.page_worlds import SPECIES, TOLERANCE, WORLDS, example, packed, unpacked
 from torch import Tensor
 
 from npa_envs.cli import main

@@ -7,8 +7,8 @@ import re
 
 import pytest
 import torch
-from browser import DESK, PHONE, browser
-from page_worlds import SPECIES, TOLERANCE, WORLDS, example
+from support.browser import DESK, PHONE, browser
+from support.page_worlds import SPECIES, TOLERANCE, WORLDS, example
 
 from npa_envs.web.export import export_web, joined_modules
 

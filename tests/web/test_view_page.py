@@ -13,8 +13,8 @@ import time
 import numpy as np
 import pytest
 import torch
-from browser import DESK, PHONE
 from PIL import Image
+from support.browser import DESK, PHONE
 
 pytest.importorskip("uvicorn")
 

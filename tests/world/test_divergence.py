@@ -5,8 +5,8 @@ import re
 
 import pytest
 import torch
+from support.worlds import random_world
 from torch.utils._python_dispatch import TorchDispatchMode
-from worlds import random_world
 
 import npa_envs
 from npa_envs import DivergedError, NPAError, NPARule

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from worlds import assert_same
+from support.worlds import assert_same
 
 from npa_envs.world.particles import Particles, combined
 

@@ -4,7 +4,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
-from worlds import assert_same, lively_rule, random_world
+from support.worlds import assert_same, lively_rule, random_world
 
 import npa_envs
 from npa_envs.world import execute

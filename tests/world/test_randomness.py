@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from worlds import assert_same, lively_rule, random_world
+from support.worlds import assert_same, lively_rule, random_world
 
 import npa_envs
 from npa_envs import WorldRandom

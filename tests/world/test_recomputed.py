@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from worlds import assert_same, lively_rule, random_world
+from support.worlds import assert_same, lively_rule, random_world
 
 import npa_envs
 

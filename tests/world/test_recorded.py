@@ -5,8 +5,8 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
+from support.worlds import random_world
 from torch.utils.checkpoint import checkpoint
-from worlds import random_world
 
 import npa_envs
 from npa_envs.world import graphed_rollouts

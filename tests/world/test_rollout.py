@@ -5,7 +5,14 @@ import sys
 import numpy as np
 import pytest
 import torch
-from worlds import assert_near, assert_same, cotangents, lively_rule, random_world, relative_error
+from support.worlds import (
+    assert_near,
+    assert_same,
+    cotangents,
+    lively_rule,
+    random_world,
+    relative_error,
+)
 
 import npa_envs
 from npa_envs import reference as oracle

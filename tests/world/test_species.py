@@ -4,7 +4,7 @@ import functools
 
 import pytest
 import torch
-from worlds import assert_near, cotangents, lively_rule, random_world, relative_error
+from support.worlds import assert_near, cotangents, lively_rule, random_world, relative_error
 
 import npa_envs
 from npa_envs import reference as oracle

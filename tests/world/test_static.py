@@ -4,7 +4,7 @@ import functools
 
 import pytest
 import torch
-from worlds import (
+from support.worlds import (
     assert_same,
     cotangents,
     degenerate_world,

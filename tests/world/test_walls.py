@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from worlds import assert_same, cotangents, lively_rule, random_world, relative_error
+from support.worlds import assert_same, cotangents, lively_rule, random_world, relative_error
 
 from npa_envs import NPAError, at_rest, rollout, rollout_species
 from npa_envs import reference as oracle

@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import gymnasium
 import numpy as np
 import pytest
-from learning_problems import heart, wild_rules
-from refusals import refused
+from support.learning_problems import heart, wild_rules
+from support.refusals import refused
 
 from npa_envs.agents import evaluate_policy
 from npa_envs.agents.learning import Budget, train

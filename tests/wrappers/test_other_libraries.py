@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from crowds import small, still
-from refusals import refused
-from small_envs import begun
+from support.crowds import small, still
+from support.refusals import refused
+from support.small_envs import begun
 
 from npa_envs.envs import multispecies_v0, particles_v0
 from npa_envs.registration import ALL, SPECIES_SIZES

@@ -7,8 +7,8 @@ import torch
 from gymnasium import wrappers
 from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers import vector
-from small_envs import assert_batch_of_singles, assert_same, begun
-from wrapped_envs import ACTIONS, STEPS, batched, policy, single
+from support.small_envs import assert_batch_of_singles, assert_same, begun
+from support.wrapped_envs import ACTIONS, STEPS, batched, policy, single
 
 import npa_envs  # noqa: F401 (registers the environments)
 from npa_envs.tasks.damage import DamageEvent, parse_damage

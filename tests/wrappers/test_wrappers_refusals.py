@@ -4,12 +4,12 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from crowds import make as make_species
-from crowds import small
 from gymnasium.wrappers import FlattenObservation, TimeAwareObservation
 from gymnasium.wrappers.vector import FlattenObservation as FlattenAll
-from refusals import refused
-from wrapped_envs import ACTIONS, batched, single
+from support.crowds import make as make_species
+from support.crowds import small
+from support.refusals import refused
+from support.wrapped_envs import ACTIONS, batched, single
 
 import npa_envs
 from npa_envs.cli import main

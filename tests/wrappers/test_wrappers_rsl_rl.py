@@ -2,10 +2,10 @@
 
 import pytest
 import torch
-import wrapped_envs
-from refusals import refused
-from small_envs import begun
-from wrapped_envs import ACTIONS, STEPS, policy
+from support import wrapped_envs
+from support.refusals import refused
+from support.small_envs import begun
+from support.wrapped_envs import ACTIONS, STEPS, policy
 
 from npa_envs.errors import NPAError
 

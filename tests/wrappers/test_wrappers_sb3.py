@@ -4,11 +4,11 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-import wrapped_envs
-from crowds import small
-from refusals import refused
-from small_envs import assert_same
-from wrapped_envs import ACTIONS, STEPS, policy
+from support import wrapped_envs
+from support.crowds import small
+from support.refusals import refused
+from support.small_envs import assert_same
+from support.wrapped_envs import ACTIONS, STEPS, policy
 
 from npa_envs.envs import multispecies_v0, particles_v0
 from npa_envs.wrappers import VectorNormalizePerception, VectorSpeciesTags

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
-from small_envs import begun
-from wrapped_envs import ACTIONS, STEPS, batched, policy, single
+from support.small_envs import begun
+from support.wrapped_envs import ACTIONS, STEPS, batched, policy, single
 
 import npa_envs  # noqa: F401 (registers the environments)
 from npa_envs.wrappers import (

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 import torch
-import wrapped_envs
-from refusals import refused
-from small_envs import make_vec
-from wrapped_envs import STEPS, policy
+from support import wrapped_envs
+from support.refusals import refused
+from support.small_envs import make_vec
+from support.wrapped_envs import STEPS, policy
 
 torchrl = pytest.importorskip("torchrl.envs")
 from tensordict import TensorDict  # noqa: E402
