@@ -18,7 +18,7 @@ from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.targets.digit_clouds import Split
 from npa_envs.world.particles import Particles, combined
 from npa_envs.world.randomness import StreamId, WorldRandom
-from npa_envs.world.rollout import rollout
+from npa_envs.world.rollout import rollout_particles
 
 FIRST_RULES = {"gecko": "gecko-v0", "heart": "heart-first"}
 """Default rules for these targets; other targets are grown by the shipped rule of their name.
@@ -117,8 +117,7 @@ def run_rule(
     """
     names = ("eps", "box", "boundary", "update_prob", "dt", "position_noise")
     constants = {name: getattr(config, name) for name in names} | changes
-    x, s = rollout(rule, particles.x, particles.s, steps, generator=random, **constants)
-    return particles._replace(x=x, s=s)
+    return rollout_particles(rule, particles, steps, generator=random, **constants)
 
 
 def grow(

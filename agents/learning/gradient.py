@@ -11,7 +11,6 @@ from typing import Any, Self, cast
 import torch
 from torch import Tensor
 
-import npa_envs
 from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.learning.progress import Progress, annealed
 from npa_envs.agents.learning.rule_set import RuleSet, species_of
@@ -26,7 +25,8 @@ from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.cycle import TrainingCycle
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness, WorldRandom
-from npa_envs.world.rollout import Memory
+from npa_envs.world.rollout import Memory, rollout_particles
+from npa_envs.world.species import species_particles
 
 MAX_STEPS = 96
 """Most steps of a rollout by default: longer episodes continue in a pool."""
@@ -197,7 +197,7 @@ class EnvironmentTask(ParticleTask[Any]):
         total = torch.stack(list(losses.values())).sum(dim=0)
         return total.flatten(1).mean(dim=1) if total.dim() > 1 else total
 
-    def rollout(self, rules: Any, x: Tensor, s: Tensor, steps: int, /, **options: Any) -> Any:
+    def rollout(self, rules: Any, worlds: Particles, steps: int, /, **options: Any) -> Particles:
         """Run a `RuleSet` by the environment's physics; options are those of `npa_envs.rollout`."""
         physics, config = self.physics, self.config
         if self._clamped is None or self._clamped[0] is not rules:
@@ -213,10 +213,11 @@ class EnvironmentTask(ParticleTask[Any]):
         }
         if isinstance(config, SpeciesConfig):
             options |= {"counts": config.counts, "perception": config.perception}
-            run: Any = npa_envs.rollout_species
+            run: Any = species_particles
         else:
-            run, (rule,) = npa_envs.rollout, rule
-        return run(rule, x, s, steps, **options)
+            run, (rule,) = rollout_particles, rule
+        after: Particles = run(rule, worlds, steps, **options)
+        return after
 
     def _losses(self, worlds: Particles) -> Mapping[str, Tensor]:
         """Return the terms of each world's loss by name, shape [B], or [B, K] of K species."""

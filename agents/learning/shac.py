@@ -163,8 +163,7 @@ class SHACLearner:
         restart(self.random)
         later = task.rollout(
             self.rules,
-            begin.x,
-            begin.s,
+            begin,
             steps,
             eps=task.eps,
             update_prob=task.update_prob,
@@ -172,7 +171,7 @@ class SHACLearner:
             keep_every=1,
             cuda_graph=True,
         )
-        x, s = (torch.cat(pair) for pair in zip((begin.x[None], begin.s[None]), later, strict=True))
+        x, s = torch.cat((begin.x[None], later.x)), torch.cat((begin.s[None], later.s))
         every = Particles(x, s).map(lambda values: values.flatten(0, 1))
         if begin.goal is not None:
             every = every._replace(goal=begin.goal.repeat(steps + 1))

@@ -12,12 +12,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs import NPARule, WorldRandom, perception_fields, rollout
+from npa_envs import NPARule, WorldRandom, perception_fields
 from npa_envs.agents.learning.evolution import RuleWeights, updates_of
 from npa_envs.checks import check_positive
 from npa_envs.errors import NPAError
 from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.world.particles import Particles, combined
+from npa_envs.world.rollout import rollout_particles
 
 SNAPSHOTS = 16
 """Times at which a world is measured, evenly spread; the later half counts."""
@@ -187,15 +188,18 @@ class Candidates:
         every, late = world.steps // SNAPSHOTS, SNAPSHOTS // 2
         options: dict[str, Any] = {"generator": random, "keep_every": every}
         options |= {"update_prob": UPDATE_PROB, "return_path_length": True}
-        x, s, path = rollout(RuleStack(self._rule, weights), x, s, world.steps, **options)
+        rule = RuleStack(self._rule, weights)
+        after = rollout_particles(rule, Particles(x, s), world.steps, **options)
+        path = after.path_length
+        assert path is not None, "it is asked for"
         travelled = (path[-1] - path[late - 1]).mean(dim=1) / ((SNAPSHOTS - late) * every)
         speeds = travelled.view(count, -1).mean(dim=1) / world.eps
-        later = Particles(x, s).map(
+        later = after.map(
             lambda values: values[late:].view(SNAPSHOTS - late, count, -1, *values.shape[2:])
         )
         found: list[Found | None] = []
         for k in range(count):
-            snapshots = Particles(later.x[:, k], later.s[:, k])
+            snapshots = later.map(lambda values: values[:, k])  # noqa: B023
             quality = float(quality_of(snapshots))
             # It is 0 or NaN where worlds came to rest or diverged.
             if quality > 0.0:

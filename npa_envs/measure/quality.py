@@ -25,7 +25,7 @@ from npa_envs.tasks.point_classification import PointClassification, majority
 from npa_envs.world.brushes import cut, wipe_state
 from npa_envs.world.particles import Particles, combined
 from npa_envs.world.randomness import Randomness, WorldRandom
-from npa_envs.world.rollout import rollout
+from npa_envs.world.rollout import rollout_particles
 
 PROGRESS_STEPS = 32
 """Steps between two reports of progress."""
@@ -425,15 +425,16 @@ class RuleRunner:
     @torch.no_grad()
     def run(self, worlds: Particles, steps: int) -> Particles:
         """Return worlds after `steps` steps."""
-        x, s, *_ = worlds
         most = steps if self._progress is None else PROGRESS_STEPS
         while steps > 0:
             count = min(steps, most)
-            x, s = rollout(self.rule, x, s, count, generator=self.generator, **self._options)
+            worlds = rollout_particles(
+                self.rule, worlds, count, generator=self.generator, **self._options
+            )
             if self._progress is not None:
                 self._progress(count)
             steps -= count
-        return worlds._replace(x=x, s=s)
+        return worlds
 
     def at(self, steps: Sequence[int], worlds: Particles) -> Iterator[tuple[int, Particles]]:
         """Run worlds; yield each of the increasing `steps`, with the worlds then."""

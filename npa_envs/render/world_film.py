@@ -24,7 +24,7 @@ from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Task
 from npa_envs.tasks.damage import DamageEvent, damage_worlds
 from npa_envs.world.particles import Particles
-from npa_envs.world.rollout import rollout
+from npa_envs.world.rollout import rollout_particles
 
 SCREEN = 256
 """Least default resolution of a film [pixels]."""
@@ -110,24 +110,29 @@ def film_world(
     every = every or math.ceil(steps / FRAME_COUNT)
     stops = {damage.step for damage in damages if first_step <= damage.step < last}
     stops |= {*range(first_step, last, every), last}
-    x, s, *_ = worlds
     now = first_step
     for step in sorted(stops):
-        x, s = rollout(rule, x, s, step - now, generator=generator, **task.rollout_options)
+        worlds = rollout_particles(
+            rule, worlds, step - now, generator=generator, **task.rollout_options
+        )
         progress(step - now)
         now = step
         if not film.frames or step > first_step:
-            film.add(task, Particles(x, s), step)
+            film.add(task, worlds, step)
         for damage in damages:
             if damage.step == step < last:
                 x, s = damage_worlds(
-                    x, s, kind=damage.kind, size=damage.size, box=task.box, generator=generator
+                    *worlds[:2],
+                    kind=damage.kind,
+                    size=damage.size,
+                    box=task.box,
+                    generator=generator,
                 )
-                s = task.with_target_code(s)
-                film.add(task, Particles(x, s), step, damage.text)
+                worlds = worlds._replace(x=x, s=task.with_target_code(s))
+                film.add(task, worlds, step, damage.text)
         if stop():
             break
-    return worlds._replace(x=x, s=s), film
+    return worlds, film
 
 
 @torch.no_grad()

@@ -164,7 +164,7 @@ class TrainingCycle:
             config,
             batch,
             self.random.masks,
-            npa_envs.world.rollout.rollout if rollout is None else rollout,
+            npa_envs.world.rollout.rollout_particles if rollout is None else rollout,
             take_means=None if processes.count == 1 else processes.reduce,
         )
         self.optimiser = RuleOptimiser(self.batch.parameters, config, rule)

@@ -23,8 +23,8 @@ from npa_envs.world.randomness import Randomness, WorldRandom
 WARM_UP_STEPS = 2
 """Steps of the eager rollout that loads every kernel before the first capture."""
 
-Rollout = Callable[..., tuple[Tensor, ...]]
-"""Type of `npa_envs.rollout` in training: returns positions, states and path lengths."""
+Rollout = Callable[..., Particles]
+"""Type of `rollout_particles` in training, of a rule, worlds and the number of steps."""
 
 
 def power_mean(values: Tensor, power: float) -> Tensor:
@@ -55,7 +55,7 @@ class EagerIteration:
         take_means: Callable[[Sequence[Tensor]], None] | None = None,
     ) -> None:
         self.start = worlds.map(torch.clone)
-        self.end = self.start._replace(x=torch.empty_like(worlds.x), s=torch.empty_like(worlds.s))
+        self.end = worlds._replace(goal=None).map(torch.empty_like)._replace(goal=self.start.goal)
         task = task.with_goal(self.start.goal)
         self.grown = torch.zeros_like(worlds.x[:, 0, 0], dtype=torch.bool)
         """Worlds to which the stillness loss applies, bool, shape [B]."""
@@ -83,17 +83,15 @@ class EagerIteration:
         first_states = self._task.with_target_code(self.start.s)
         if first_states is not self.start.s:
             self.start.s.copy_(first_states.detach())
-        fields = self._rollout(
+        end = self._rollout(
             self._rule,
-            self.start.x,
-            first_states,
+            self.start._replace(s=first_states),
             steps,
             memory=self._config.memory,
             generator=self._generator,
             return_path_length=True,
             **self._task.rollout_options,
         )
-        end = Particles(*fields)
         single = self._take_means is None
         with contextlib.nullcontext() if single else counted_together(self._mean):
             total, parts = self._loss(end)
@@ -105,8 +103,8 @@ class EagerIteration:
         for buffer, gradient in zip(self.gradients, gradients, strict=True):
             buffer.copy_(gradient)
         self.terms.copy_(torch.stack([total, *parts.values()]).detach())
-        self.end.x.copy_(end.x.detach())
-        self.end.s.copy_(end.s.detach())
+        kept = end._replace(path_length=None, goal=None).map(Tensor.detach)
+        self.end._replace(goal=None).copy_(kept)
 
     def _mean(self, value: Tensor) -> Tensor:
         """Return the mean of a tensor over all processes, computed between two graphs."""
@@ -119,7 +117,8 @@ class EagerIteration:
         """Return the task's loss plus the stillness loss of grown worlds, and its terms by name."""
         total, parts = self._task.loss(end)
         if self._config.stillness_weight > 0.0:
-            x, s, path = end.per_particle()
+            x, s, path, *_ = end
+            assert path is not None, "the rollout returns path lengths"
             change = s - self.start.s
             if self._divides:
                 # Births and deaths do not count.

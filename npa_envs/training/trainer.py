@@ -36,7 +36,7 @@ from npa_envs.training.loss_statistics import divergence_error
 from npa_envs.training.process_group import ProcessGroup
 from npa_envs.training.run_folder import Run, RunFolder, RunLog
 from npa_envs.training.task_table import config_to_dict
-from npa_envs.world.species import rollout_species
+from npa_envs.world.species import species_particles
 
 JOINT_TASK_NAME = "co_morphogenesis2d"
 """Name of the task of several rules in checkpoints."""
@@ -80,7 +80,8 @@ class Trainer:
         task_name: The task's name in checkpoints.
         resume: Continue from the checkpoint in `config.out`.
         overwrite: Remove the files of an earlier run in `config.out`.
-        rollout: The rollout to train through; None: `npa_envs.rollout`.
+        rollout: The function that runs a rule from some `Particles` for some steps and returns them
+            with path lengths; None: that of `npa_envs.rollout`.
         processes: The processes of the run; None: those of torch's default group.
         rules: Initial rules of several species, which are copied; None: those of the configuration.
 
@@ -126,7 +127,7 @@ class Trainer:
         if hasattr(task, "make_rules"):
             rule = JointRules(_species_rules(config, task.make_rules(schedule), saved, rules))
             counts = config.task.counts
-            rollout = functools.partial(rollout_species, counts=counts, density_counts=counts)
+            rollout = functools.partial(species_particles, counts=counts, density_counts=counts)
         else:
             rule = task.make_rule(schedule)
             rule = initial_rule(config, rule) if saved is None else rule_like(saved)

@@ -27,8 +27,8 @@ from npa_envs.web.live_world import ColouredWorld, Colouring, LiveWorld, Range, 
 from npa_envs.world.brushes import inside_ball, wipe_state
 from npa_envs.world.division import living
 from npa_envs.world.particles import Particles
-from npa_envs.world.rollout import at_rest, rollout
-from npa_envs.world.species import AGREEMENTS, rollout_species
+from npa_envs.world.rollout import at_rest, rollout_particles
+from npa_envs.world.species import AGREEMENTS, species_particles
 
 MAX_PARTICLES = {"cpu": 16384, "cuda": 131072}
 """Most particles of a world, by device type."""
@@ -256,19 +256,21 @@ class RuleWorld(LiveWorld):
     def _rollout(self, steps: int, options: Mapping[str, Any]) -> Tensor:
         """Run steps and return particles' path lengths [length units], shape [1, N]."""
         rules = [live_rule.rule for live_rule in self.live_rules]
-        x, s, *_ = self.particles
         if self._is_unchanged():
-            x, s, path_length = rollout(rules[0], x, s, steps, return_path_length=True, **options)
+            after = rollout_particles(
+                rules[0], self.particles, steps, return_path_length=True, **options
+            )
         else:
             # Divided by the particles of a fresh world: particles that a brush adds or removes
             # change only the densities around them.
             divisors = [live_rule.divisor for live_rule in self.live_rules]
-            x, s, path_length = rollout_species(
-                rules, x, s, steps, counts=self.counts, density_counts=divisors,
+            after = species_particles(
+                rules, self.particles, steps, counts=self.counts, density_counts=divisors,
                 return_path_length=True, **options,
             )  # fmt: skip
-        self.particles = self.particles._replace(x=x, s=s)
-        return path_length
+        assert after.path_length is not None, "it is asked for"
+        self.particles = after._replace(path_length=None)
+        return after.path_length
 
     def _coloured(self) -> ColouredWorld:
         x, s, *_ = self.particles

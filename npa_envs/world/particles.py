@@ -26,7 +26,7 @@ class Particles(NamedTuple):
         if zeros is None:
             zeros = self.x.new_zeros(self.x.shape[:2])
         # Not by `_replace`: torch.compile cannot trace it.
-        return Particles(self.x, self.s, path_length=zeros, goal=self.goal)
+        return Particles(self.x, self.s, zeros, *self[3:])
 
     def per_particle(self) -> tuple[Tensor, Tensor, Any]:
         """Return x, s and the path lengths, in the order that `update_particles` takes."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import get_args
+from collections.abc import Sequence
+from typing import Any, get_args
 
 from torch import Tensor
 
@@ -24,11 +25,11 @@ def checked_physics(
     rule: NPARule,
     worlds: Particles,
     *,
-    eps: float | None,
-    box: Box,
-    boundary: Boundary | None,
-    update_prob: float = 1.0,
-    dt: float,
+    eps: float | None = None,
+    box: Box = None,
+    boundary: Boundary | None = None,
+    update_prob: float = 0.5,
+    dt: float = 1.0,
     position_noise: float = 0.0,
 ) -> Physics:
     """Check that worlds fit a rule, and return the constants of its rollouts."""
@@ -72,12 +73,9 @@ def _check_rule_of_one_species(rule: NPARule) -> None:
         )
 
 
-def returned_fields(after: Particles, return_path_length: bool) -> tuple[Tensor, ...]:
-    """Return x, s and, if asked for, path lengths."""
-    if not return_path_length:
-        return after.x, after.s
-    assert after.path_length is not None, "rollouts measure paths"
-    return after.x, after.s, after.path_length
+def returned_fields(after: Particles) -> tuple[Tensor, ...]:
+    """Return x, s and, if they were asked for, path lengths."""
+    return (after.x, after.s) if after.path_length is None else (*after.per_particle(),)
 
 
 def checked_steps(
@@ -255,33 +253,81 @@ def rollout(
         DivergedError: A world diverged and `on_divergence` is "raise"; the message says which, in
             which step, and which number of which particle.
     """
-    steps, keep_every = checked_steps(steps, keep_every, memory, cuda_graph)
-    _check_rule_of_one_species(rule)
-    worlds = Particles(x, s)
-    constants = checked_physics(
+    after = rollout_particles(
         rule,
-        worlds,
+        Particles(x, s),
+        steps,
         eps=eps,
         box=box,
         boundary=boundary,
         update_prob=update_prob,
         dt=dt,
         position_noise=position_noise,
+        detach_positions=detach_positions,
+        memory=memory,
+        generator=generator,
+        on_divergence=on_divergence,
+        keep_every=keep_every,
+        cuda_graph=cuda_graph,
+        return_path_length=return_path_length,
     )
+    return returned_fields(after)
+
+
+def rollout_particles(
+    rule: NPARule,
+    worlds: Particles,
+    steps: int,
+    *,
+    detach_positions: bool = True,
+    memory: Memory = "store",
+    generator: Randomness | None = None,
+    on_divergence: OnDivergence = "ignore",
+    keep_every: int | None = None,
+    cuda_graph: CudaGraph = "auto",
+    return_path_length: bool = False,
+    **physics: Any,
+) -> Particles:
+    """Run a rule as `rollout`, whose options these are; return worlds with all their fields."""
+    steps, keep_every = checked_steps(steps, keep_every, memory, cuda_graph)
+    _check_rule_of_one_species(rule)
+    constants = checked_physics(rule, worlds, **physics)
     detach_positions = checked_flag("detach_positions", detach_positions)
-    check_generator(generator, x.device, x.shape[0])
-    if rule.divides and box is not None:
+    if rule.divides and physics.get("box") is not None:
         raise NPAError(
-            f"box must be None where particles divide, got {shown(box)}: the dead need a place far "
-            "from all others"
+            f"box must be None where particles divide, got {shown(physics['box'])}: the dead need "
+            "a place far from all others"
         )
-    after = execute(
+    return run_checked(
         RolloutSpec(steps, constants, detach_positions, memory, keep_every),
         (rule,),
         worlds,
+        generator,
+        cuda_graph,
+        on_divergence,
+        return_path_length,
+    )
+
+
+def run_checked(
+    spec: RolloutSpec,
+    rules: Sequence[NPARule],
+    worlds: Particles,
+    generator: Randomness | None,
+    cuda_graph: CudaGraph,
+    on_divergence: OnDivergence,
+    return_path_length: bool,
+) -> Particles:
+    """Run a checked rollout; path lengths are None in the result unless they are asked for."""
+    check_generator(generator, worlds.x.device, worlds.x.shape[0])
+    after = execute(
+        spec,
+        rules,
+        Particles(*worlds[:-1]),
         generator,
         graph=cuda_graph,
         watch=make_watch(on_divergence, worlds),
         may_rest=not return_path_length,
     )
-    return returned_fields(after, return_path_length)
+    path_length = after.path_length if return_path_length else None
+    return Particles(after.x, after.s, path_length, *after[3:-1], worlds.goal)

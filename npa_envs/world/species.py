@@ -19,12 +19,17 @@ from npa_envs.errors import NPAError, shown
 from npa_envs.ops.physics_constants import Boundary
 from npa_envs.ops.species_density import checked_counts
 from npa_envs.rule.rule import NPARule
-from npa_envs.world.divergence import OnDivergence, make_watch
-from npa_envs.world.execute import Memory, RolloutSpec, execute
+from npa_envs.world.divergence import OnDivergence
+from npa_envs.world.execute import Memory, RolloutSpec
 from npa_envs.world.graphed_rollouts import CudaGraph
 from npa_envs.world.particles import Particles
-from npa_envs.world.randomness import Randomness, check_generator
-from npa_envs.world.rollout import checked_physics, checked_steps, returned_fields
+from npa_envs.world.randomness import Randomness
+from npa_envs.world.rollout import (
+    checked_physics,
+    checked_steps,
+    returned_fields,
+    run_checked,
+)
 from npa_envs.world.steps import SpeciesSpec
 
 SpeciesPerception = Literal["shared", "per_species"]
@@ -102,40 +107,73 @@ def rollout_species(
         NPAError: Rules do not agree, counts do not fit, or as for `rollout`.
         DivergedError: As for `rollout`.
     """
+    after = species_particles(
+        rules,
+        Particles(x, s),
+        steps,
+        counts=counts,
+        eps=eps,
+        update_prob=update_prob,
+        box=box,
+        boundary=boundary,
+        dt=dt,
+        position_noise=position_noise,
+        generator=generator,
+        detach_positions=detach_positions,
+        perception=perception,
+        density_counts=density_counts,
+        memory=memory,
+        on_divergence=on_divergence,
+        keep_every=keep_every,
+        cuda_graph=cuda_graph,
+        return_path_length=return_path_length,
+    )
+    return returned_fields(after)
+
+
+def species_particles(
+    rules: Sequence[NPARule],
+    worlds: Particles,
+    steps: int,
+    *,
+    counts: Sequence[int],
+    update_prob: float | Sequence[float] = 0.5,
+    generator: Randomness | None = None,
+    detach_positions: bool = True,
+    perception: SpeciesPerception = "shared",
+    density_counts: float | Sequence[float] | None = None,
+    memory: Memory = "store",
+    on_divergence: OnDivergence = "ignore",
+    keep_every: int | None = None,
+    cuda_graph: CudaGraph = "auto",
+    return_path_length: bool = False,
+    **physics: Any,
+) -> Particles:
+    """Run rules as `rollout_species`, whose options these are; return worlds with all fields."""
     steps, keep_every = checked_steps(steps, keep_every, memory, cuda_graph)
-    check_world(x, s)
-    sizes = checked_counts(counts, x.shape[1])
+    check_world(worlds.x, worlds.s)
+    particle_count = worlds.x.shape[1]
+    sizes = checked_counts(counts, particle_count)
     species_rules = _checked_rules(rules, len(sizes), perception)
     probabilities = _for_each_species("update_prob", update_prob, len(sizes))
     divisors = _for_each_species(
-        "density_counts", x.shape[1] if density_counts is None else density_counts, len(sizes)
+        "density_counts", particle_count if density_counts is None else density_counts, len(sizes)
     )
     divisors = [checked_positive("an entry of density_counts", count) for count in divisors]
     # With one species this is `rollout`.
-    alone = perception == "shared" and divisors == [x.shape[1]]
-    worlds = Particles(x, s)
+    alone = perception == "shared" and divisors == [particle_count]
     constants = [
-        checked_physics(
-            rule,
-            worlds,
-            eps=eps,
-            box=box,
-            boundary=boundary,
-            update_prob=chance,
-            dt=dt,
-            position_noise=position_noise,
-        )
-        for rule, chance in zip(species_rules, probabilities, strict=True)
+        checked_physics(rule, worlds, update_prob=probability, **physics)
+        for rule, probability in zip(species_rules, probabilities, strict=True)
     ]
     common = constants[0]._replace(
-        update_prob=max(own.update_prob for own in constants),
-        max_displacement=max(own.max_displacement for own in constants),
+        update_prob=max(each.update_prob for each in constants),
+        max_displacement=max(each.max_displacement for each in constants),
     )
     species = [
-        SpeciesSpec(size, own.update_prob, divisor)
-        for size, own, divisor in zip(sizes, constants, divisors, strict=True)
+        SpeciesSpec(size, each.update_prob, divisor)
+        for size, each, divisor in zip(sizes, constants, divisors, strict=True)
     ]
-    check_generator(generator, x.device, x.shape[0])
     spec = RolloutSpec(
         steps,
         common,
@@ -145,16 +183,9 @@ def rollout_species(
         () if alone else tuple(species),
         perception == "per_species",
     )
-    after = execute(
-        spec,
-        species_rules,
-        worlds,
-        generator,
-        graph=cuda_graph,
-        watch=make_watch(on_divergence, worlds),
-        may_rest=False,
+    return run_checked(
+        spec, species_rules, worlds, generator, cuda_graph, on_divergence, return_path_length
     )
-    return returned_fields(after, return_path_length)
 
 
 def _checked_rules(rules: Any, species_count: int, perception: str) -> list[NPARule]:

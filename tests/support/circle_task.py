@@ -71,16 +71,16 @@ class CircleTask(ParticleTask):
 
 def plain_rollout(
     rule: NPARule,
-    x: Tensor,
-    s: Tensor,
+    worlds: Particles,
     steps: int,
     *,
     eps: float,
     update_prob: float,
     generator: torch.Generator,
     **options: object,
-) -> tuple[Tensor, Tensor, Tensor]:
+) -> Particles:
     """Particles that see nothing but their own position and state."""
+    x, s, _, goal = worlds
     path_length = torch.zeros_like(x[..., 0])
     blind = s.new_zeros(*s.shape[:2], rule.perception_dim - rule.state_dim - 2)
     for _ in range(steps):
@@ -90,7 +90,7 @@ def plain_rollout(
         step = rule.alpha * eps * delta / (1.0 + delta.norm(dim=-1, keepdim=True).clamp(min=1e-9))
         x, s = x + step, s + update[..., 2:]
         path_length = path_length + step.square().sum(-1).add(1e-12).sqrt()
-    return x, s, path_length
+    return Particles(x, s, path_length, goal)
 
 
 def circle_config(out: object, **fields: object) -> TrainConfig[Morphogenesis2DConfig]:

@@ -49,10 +49,10 @@ def kill():
     raise Killed
 
 
-def runaway(rule, x, s, steps, **options):
+def runaway(rule, worlds, steps, **options):
     """A rollout that moves the second world so far away that the pool replaces it."""
-    x, s, path_length = plain_rollout(rule, x, s, steps, **options)
-    return x + torch.tensor([0.0, 100.0, 0.0])[:, None, None], s, path_length
+    after = plain_rollout(rule, worlds, steps, **options)
+    return after._replace(x=after.x + torch.tensor([0.0, 100.0, 0.0])[:, None, None])
 
 
 @contextlib.contextmanager

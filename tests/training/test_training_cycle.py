@@ -14,6 +14,7 @@ from npa_envs.tasks.point_classification import PointClassification
 from npa_envs.training import preset, train
 from npa_envs.training.iteration import EagerIteration, GraphedIteration
 from npa_envs.world.particles import Particles
+from npa_envs.world.rollout import rollout_particles
 
 
 def circle_cycle(tmp_path, **fields):
@@ -34,13 +35,14 @@ def world_cycle(tmp_path, **fields):
     )
 
 
-def jittered(rule, x, s, steps, generator, **options):
+def jittered(rule, worlds, steps, generator, **options):
     """The engine's rollout, but without gradients, where it would wait for a CPU, a jitter."""
     if torch.is_grad_enabled():
-        return npa_envs.rollout(rule, x, s, steps, generator=generator, **options)
+        return rollout_particles(rule, worlds, steps, generator=generator, **options)
     for _ in range(steps):
         generator.advance()
-    return x + 0.01 * generator.normal(*x.shape[1:], dtype=x.dtype), s, torch.zeros_like(x[..., 0])
+    x = worlds.x + 0.01 * generator.normal(*worlds.x.shape[1:], dtype=worlds.x.dtype)
+    return worlds._replace(x=x).with_zero_paths()
 
 
 def clouds_cycle(tmp_path, per_world_streams=False, **fields):

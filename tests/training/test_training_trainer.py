@@ -159,9 +159,9 @@ def test_log_has_terms_rate_steps_and_time(tmp_path):
 def watching(note):
     """A rollout that first notes the worlds and steps that it is given."""
 
-    def rollout(rule, x, s, steps, **options):
-        note(x, s, steps)
-        return plain_rollout(rule, x, s, steps, **options)
+    def rollout(rule, worlds, steps, **options):
+        note(worlds.x, worlds.s, steps)
+        return plain_rollout(rule, worlds, steps, **options)
 
     return rollout
 
@@ -212,9 +212,9 @@ def test_worlds_that_have_lived_are_replaced_by_seeds_and_all_others_grow_older(
 def test_worlds_that_are_old_and_never_damaged_count_as_grown(tmp_path, damage):
     seen = []
 
-    def rollout(rule, x, s, steps, **options):
+    def rollout(rule, worlds, steps, **options):
         seen.append(trainer._cycle.batch.grown.tolist())
-        return plain_rollout(rule, x, s, 2, **options)
+        return plain_rollout(rule, worlds, 2, **options)
 
     fields = {"iterations": 6, "world_count": 4, "pool_size": 4, "max_age_range": (200, 6000)}
     fields |= {"steps": (256, 257), "damage_share": 0.5 * damage, "stillness_weight": 1.0}
@@ -336,12 +336,12 @@ def explode_after(iterations):
     """A rollout that spoils the last world of the batch in one iteration."""
     calls = []
 
-    def rollout(rule, x, s, steps, **options):
+    def rollout(rule, worlds, steps, **options):
         calls.append(steps)
-        x, s, path_length = plain_rollout(rule, x, s, steps, **options)
+        after = plain_rollout(rule, worlds, steps, **options)
         if len(calls) == iterations:
-            x = torch.cat([x[:2], x[2:] * math.inf])
-        return x, s, path_length
+            after = after._replace(x=torch.cat([after.x[:2], after.x[2:] * math.inf]))
+        return after
 
     return rollout
 

@@ -26,7 +26,7 @@ from npa_envs.world.brushes import nearest_image
 from npa_envs.world.cuda_graph import capture
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import WorldRandom
-from npa_envs.world.rollout import rollout
+from npa_envs.world.rollout import rollout_particles
 
 TASKS = ("morphogenesis2d", "morphogenesis3d", "texture", "point_classification")
 """Tasks whose rules can be checked."""
@@ -205,10 +205,9 @@ def outcome(
     rule.load_state_dict(start.rule.state_dict())
     rule.to(dtype)
     first_states = start.worlds.s.to(dtype).requires_grad_()
-    x, s, lengths = rollout(
+    x, s, lengths, *_ = rollout_particles(
         rule,
-        start.worlds.x.to(dtype),
-        first_states,
+        start.worlds._replace(x=start.worlds.x.to(dtype), s=first_states),
         steps,
         generator=session.generator(1),
         memory="minimal" if steps > 8 else "store",
@@ -216,6 +215,7 @@ def outcome(
         **start.task.rollout_options,
     )
     weights = torch.Generator().manual_seed(3)
+    assert lengths is not None, "they are asked for"
     worlds = torch.cat((x, s, lengths[..., None]), dim=2)
     # A mean over particles, so that norms at different N can be compared.
     terms = worlds * torch.randn(worlds.shape, generator=weights).to(worlds)
