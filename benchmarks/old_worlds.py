@@ -22,7 +22,7 @@ from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
 from npa_envs.training import preset
-from npa_envs.world.graphed_rollouts import release_recordings
+from npa_envs.world.graphed_rollouts import release_captures
 from npa_envs.world.particles import Particles, combined
 from npa_envs.world.rollout import rollout
 
@@ -166,7 +166,7 @@ def run_healing(arguments: argparse.Namespace) -> None:
             rule, task, grow_steps=grow, heal_steps=heal, seeds=seeds, device=arguments.device
         )
         if task.target_picture.is_cuda:
-            release_recordings()
+            release_captures()
         line = {"picture": picture, "healing": [asdict(row) for row in rows]}
         append_line(arguments.out / "healing.jsonl", line)
         healed = [f"{row.damage}: {row.worlds_healed} of {row.world_count}" for row in rows]

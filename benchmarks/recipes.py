@@ -55,7 +55,7 @@ from npa_envs.render.colours import to_uint8
 from npa_envs.rule.files import save_rule
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2DTrainConfig
 from npa_envs.training import Trainer, task_entry
-from npa_envs.world.graphed_rollouts import release_recordings
+from npa_envs.world.graphed_rollouts import release_captures
 
 STEPS = (64, 128, 256, 512, 1024, 2048, 4096)
 """Steps at which worlds are measured, before `LAST`."""
@@ -130,7 +130,7 @@ def measured(trainer: Trainer, size: str, last_step: int = LAST) -> dict[str, An
                 rule, task, grow_steps=grow, heal_steps=heal, seeds=SEEDS, device=device
             )
     if trainer.config.device.startswith("cuda"):
-        release_recordings()
+        release_captures()
     found = {"growth": [asdict(row) for row in rows], "healing": [asdict(row) for row in healed]}
     pool = trainer.pool
     if pool.age is not None:
@@ -237,7 +237,7 @@ def run_all(arguments: argparse.Namespace) -> None:
                     steps = (4, 8) if run.size == "tiny" else (32, 64, 128, 512, 4096)
                     Image.fromarray(strip(trainer, steps)).save(out / f"strip-{run.name}.png")
                     if arguments.device.startswith("cuda"):
-                        release_recordings()
+                        release_captures()
                 append_line(out / f"runs-{arguments.process}.jsonl", line)
                 losses = " ".join(f"{r['step']}:{r['loss']:.3f}" for r in line["growth"])
                 print(f"{run.name} {seconds:.0f} s  {losses}", flush=True)

@@ -35,7 +35,7 @@ from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.texture import Texture
 from npa_envs.training import Trainer, preset
 from npa_envs.training.task_of_rule import task_of_rule
-from npa_envs.world.graphed_rollouts import release_recordings
+from npa_envs.world.graphed_rollouts import release_captures
 
 SEEDS = tuple(range(1_000_000, 1_000_008))
 """Seeds of the worlds for the judge."""
@@ -55,7 +55,7 @@ def measured(
 
     rows = evaluate(rule, task, checkpoints=steps, seeds=seeds, device=device, watch=watch)
     if device.startswith("cuda"):
-        release_recordings()
+        release_captures()
     strip = np.concatenate(list(to_uint8(torch.cat(frames))), axis=1)
     return {"growth": as_objects(rows), "judge": as_objects(judged)}, strip
 
@@ -96,7 +96,7 @@ def run(arguments: argparse.Namespace) -> None:
         trainer.save()
         (out / f"rule-{name}.safetensors").write_bytes(trainer.folder.rule.read_bytes())
     if arguments.device.startswith("cuda"):
-        release_recordings()
+        release_captures()
     seeds = SEEDS[: 8 if arguments.device.startswith("cuda") else 1]
     for name, trainer in zip(names, trainers, strict=True):
         begun = time.perf_counter()

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.envs.core.config import EnvConfig, WorldConfig
+from npa_envs.envs.core.marginal_gains import marginal_gains
 from npa_envs.errors import NPAError, shown
 from npa_envs.render import draw_worlds
-from npa_envs.world.cuda_graph import recording_lock
-from npa_envs.world.environment_steps import marginal_gains
+from npa_envs.world.cuda_graph import capture_lock
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import StreamId, WorldRandom
 
@@ -426,7 +426,7 @@ def global_rng_states(device: torch.device) -> dict[str, Any]:
     }
     if device.type == "cuda":
         # A capture in another thread replaces this generator for a moment.
-        with recording_lock:
+        with capture_lock:
             states["torch's on CUDA"] = torch.cuda.get_rng_state(device).numpy().tobytes()
     return states
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.envs.core.config import EnvConfig
+from npa_envs.envs.core.marginal_gains import with_mean_reward
 from npa_envs.envs.core.rewards_and_ends import ParticleRewards, StepReport, total
 from npa_envs.envs.core.task import (
     EnvTask,
@@ -45,7 +46,6 @@ from npa_envs.world.environment_steps import (
     EpisodeUpdate,
     NeighbourState,
     build_neighbours,
-    with_mean_reward,
 )
 from npa_envs.world.particles import Particles
 

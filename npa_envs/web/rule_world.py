@@ -269,7 +269,7 @@ class RuleWorld(LiveWorld):
                 return_path_length=True, **options,
             )  # fmt: skip
         assert after.path_length is not None, "it is asked for"
-        self.particles = after._replace(path_length=None)
+        self.particles = after._replace(path_length=self.particles.path_length)
         return after.path_length
 
     def _coloured(self) -> ColouredWorld:

@@ -37,7 +37,7 @@ Result = TypeVar("Result")
 ABANDONED_POOLS = 8
 """Memory pools of deleted graphs after which their memory is freed."""
 
-recording_lock = threading.RLock()
+capture_lock = threading.RLock()
 """Lock of captures and their preparation: all graphs share one stream and torch's capture state."""
 
 
@@ -132,7 +132,7 @@ def _capture_stream(device_index: int) -> torch.cuda.Stream:
 
 def prepare_capture(function: Callable[[], object], device: torch.device) -> None:
     """Run a function on the capture stream, which loads its kernels and allocates workspaces."""
-    with recording_lock, torch.cuda.device(device), plain_tensors():
+    with capture_lock, torch.cuda.device(device), plain_tensors():
         stream = _capture_stream(torch.cuda.current_device())
         stream.wait_stream(torch.cuda.current_stream())
         with torch.cuda.stream(stream):
@@ -258,7 +258,7 @@ def capture(
     Without `warm_up` nothing synchronises, unlike in `torch.cuda.graph`. A graph's pool cannot use
     cached memory, so the cache is freed after the warm-up, and if a capture runs out of memory.
     """
-    with recording_lock, torch.cuda.device(device), plain_tensors():
+    with capture_lock, torch.cuda.device(device), plain_tensors():
         stream = _capture_stream(torch.cuda.current_device())
         if GraphSequence.abandoned >= ABANDONED_POOLS:
             # Torch does not reuse the memory of pools whose graphs are deleted.

@@ -6,7 +6,7 @@ Nothing waits for the device.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -24,8 +24,9 @@ from npa_envs.ops.rewards_and_ends import TIME_LIMIT as TIME_LIMIT
 from npa_envs.ops.rewards_and_ends import EpisodeRules as EpisodeRules
 from npa_envs.ops.rewards_and_ends import EpisodeUpdate as EpisodeUpdate
 from npa_envs.ops.species_density import perceive_by_species
-from npa_envs.ops.update import ActedWorlds, PreparedActions, wrapped
-from npa_envs.ops.world_mean import world_mean
+from npa_envs.ops.update import ActedWorlds, PreparedActions
+from npa_envs.ops.update import wrapped as wrapped
+from npa_envs.ops.world_mean import world_mean as world_mean
 from npa_envs.world.randomness import WorldRandom
 from npa_envs.world.steps import draw_step
 
@@ -82,42 +83,3 @@ class Actions(PreparedActions):
         """Return which particles the last draw updates, bool, shape [B, N]."""
         mask = self._worlds.mask
         return self._everyone if mask is None else mask.bool()
-
-
-def marginal_gains(
-    losses: Callable[[Tensor, Tensor], Mapping[str, Tensor]],
-    before: tuple[Tensor, Tensor],
-    after: tuple[Tensor, Tensor],
-    box: tuple[float, ...] | None,
-) -> Tensor | None:
-    """Return marginal credit: how much each particle's action lowered the loss, times N; [B, N].
-
-    A particle's credit is the change that it made in the step, times the gradient of the loss in
-    the middle of the step. The mean over the particles is the decrease of the loss, and the credit
-    is the particle's Shapley value: exactly for losses that are quadratic in the changes, and up to
-    third order for others. Detached parts of the loss get no credit.
-
-    `losses` maps positions and states to the named parts of each world's loss, shape [B] each. The
-    result is None if no gradient flows from them to positions or states.
-    """
-    moved, changed = wrapped(after[0] - before[0], box), after[1] - before[1]
-    with torch.enable_grad():
-        x = wrapped(after[0] - 0.5 * moved, box).requires_grad_()
-        s = (after[1] - 0.5 * changed).requires_grad_()
-        total = torch.stack(list(losses(x, s).values())).sum()
-        if not total.requires_grad:
-            return None
-        slopes = torch.autograd.grad(total, (x, s), allow_unused=True)
-    gains = torch.zeros_like(moved[..., 0])
-    for slope, change in zip(slopes, (moved, changed), strict=True):
-        if slope is not None:
-            # Added one by one, because torch's sums have no fixed order.
-            for column in (slope * change).unbind(dim=-1):
-                gains = gains - column
-    return gains * gains.shape[1]
-
-
-def with_mean_reward(gains: Tensor, reward: Tensor) -> Tensor:
-    """Shift each world's gains, [B, N], by a constant so that their mean is its reward, [B]."""
-    missed = reward - world_mean(gains[..., None])[:, 0]
-    return gains + missed[:, None]

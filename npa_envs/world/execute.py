@@ -23,11 +23,11 @@ from npa_envs.world.cuda_graph import draws_alone
 from npa_envs.world.divergence import DivergenceWatch
 from npa_envs.world.graphed_rollouts import (
     LAUNCHED_FIRST,
-    CallKinds,
+    CallGroups,
     CudaGraph,
-    rule_form,
-    run_recorded,
+    run_captured,
 )
+from npa_envs.world.network_fingerprint import rule_form
 from npa_envs.world.particles import Particles, combined
 from npa_envs.world.randomness import Randomness
 from npa_envs.world.steps import (
@@ -55,8 +55,8 @@ MIN_RESTING = 256
 MAX_TOTAL = 4096
 """Most particles of a batch whose steps are on a tape: in larger ones kernels take most time."""
 
-MAX_KINDS = 32
-"""Most kinds of calls whose tapes are cached."""
+MAX_GROUPS = 32
+"""Most groups of calls whose tapes are cached."""
 
 FIRST_PART = {"cpu": 64, "cuda": 1024}
 """Steps until the first check for resting worlds, by device; each further part is twice as long. A
@@ -64,7 +64,7 @@ GPU idles during a check."""
 
 
 class RolloutSpec(NamedTuple):
-    """The checked arguments of a rollout except its tensors; hashable, for keys of recordings."""
+    """The checked arguments of a rollout except its tensors; hashable, for keys of captures."""
 
     steps: int
     physics: Physics
@@ -119,10 +119,10 @@ class RolloutSpec(NamedTuple):
         interval = STORED_INTERVAL[self.memory] if torch.is_grad_enabled() else 1
         trajectory: list[Particles] = []
         # During a capture torch's random state cannot be read, and draws belong to the graph.
-        recorded = particles.x.is_cuda and torch.cuda.is_current_stream_capturing()
+        capturing = particles.x.is_cuda and torch.cuda.is_current_stream_capturing()
         with_modules = not all(rule.has_network() for rule in rules)
-        redraw = with_modules and not recorded
-        if with_modules and recorded and not draws_alone():
+        redraw = with_modules and not capturing
+        if with_modules and capturing and not draws_alone():
             # Recomputed, a module that draws random numbers would draw others.
             interval = 1
         recomputed = None
@@ -266,12 +266,12 @@ def run_all_steps(
 ) -> Particles:
     """Run a checked rollout as `execute` does, without skipping steps."""
     if watch is None:
-        recorded = run_recorded(spec, rules, particles, source, cuda_graph=graph)
-        if recorded is not None:
-            return recorded
+        replayed = run_captured(spec, rules, particles, source, cuda_graph=graph)
+        if replayed is not None:
+            return replayed
     check_finite_positions(particles.x)
     if particles.x.is_cuda and torch.is_grad_enabled():
-        # Gradients are added in the order of a recording: first those of this rollout.
+        # Gradients are added in the order of a capture: first those of this rollout.
         particles = particles.map(lambda value: value.view_as(value))
     return spec.run(rules, particles.with_zero_paths(), source, watch)
 
@@ -306,7 +306,7 @@ def _can_rest(spec: RolloutSpec, rules: Sequence[NPARule], x: Tensor) -> bool:
 # Small worlds on a CPU: a step takes some 50 µs in kernels and several times as much in Python, for
 # checks, memory and arguments of launches. From the third call with the same shapes and options on,
 # a rollout without gradients replays launches from a tape, which go back and forth between two
-# buffers. The same kernels run on the same numbers. Recorded rollouts on CUDA are the same idea.
+# buffers. The same kernels run on the same numbers. Captured rollouts on CUDA are the same idea.
 
 
 class _TapedStep:
@@ -372,10 +372,10 @@ class TapedSteps:
         return trajectory
 
 
-_kinds = CallKinds()
+_groups = CallGroups()
 
 _lock = threading.Lock()
-"""Lock of `_kinds`."""
+"""Lock of `_groups`."""
 
 
 def run_taped(
@@ -407,12 +407,12 @@ def run_taped(
         return None
     key = (step.physics, rule_form(step.rule), x.shape, s.shape[2], x.dtype)
     with _lock:
-        kind = _kinds.count(key, MAX_KINDS)
-    if kind.calls <= LAUNCHED_FIRST:
+        group = _groups.count(key, MAX_GROUPS)
+    if group.calls <= LAUNCHED_FIRST:
         return None
     # Another thread may have taken the last one in the meantime.
     try:
-        taped = kind.free.pop()
+        taped = group.free.pop()
     except IndexError:
         with torch.inference_mode(False), torch.no_grad():
             taped = TapedSteps(step, particles)
@@ -421,5 +421,5 @@ def run_taped(
         with torch.autocast("cpu", enabled=False):
             trajectory = taped.run(step.network, particles, masks, keep_every or steps)
     finally:
-        kind.free.append(taped)
+        group.free.append(taped)
     return trajectory[0] if keep_every is None else combined(torch.stack, trajectory)

@@ -1,17 +1,21 @@
-"""Inputs of a custom network: its modules' tensors, attributes, hooks and modes.
+"""What a captured rollout depends on in a rule: its settings, and the tensors that it reads.
 
-A recording of a rule with such a network is replayed only as long as these are the same.
+A custom network's settings are its modules' attributes, hooks and modes. A capture is replayed only
+as long as all settings are the same.
 """
 
 from __future__ import annotations
 
 import inspect
+import operator
 import weakref
-from collections.abc import Hashable
+from collections.abc import Callable, Hashable
 from typing import Any
 
 import torch
 from torch import Tensor, nn
+
+from npa_envs.rule.rule import HYPER_PARAMETERS, NPARule
 
 NUMBERS = (int, float, complex, bool, str, bytes, type(None), torch.dtype, torch.device)
 """Types of attributes that are compared by value."""
@@ -75,3 +79,25 @@ def _setting(value: Any, device: torch.device, *, in_container: bool = False) ->
     except TypeError:
         return id(value)
     return reference
+
+
+rule_form: Callable[[NPARule], Hashable] = operator.attrgetter(
+    *HYPER_PARAMETERS.keys() - {"readout_dim", "readout_hidden_dim", "code_names", "encoder"}
+)
+"""Returns all settings of a plain rule that its steps depend on, except weights."""
+
+
+def settings_and_weights(rule: NPARule, plain: bool) -> tuple[Hashable, list[Tensor]]:
+    """Return a rule's settings, which a capture depends on, and its weights."""
+    if plain:
+        weights = rule.network_weights()
+        return (rule_form(rule), *map(tensor_form, weights)), weights
+    device = rule.hidden.weight.device
+    settings = tuple(rule_settings(rule, device).items())
+    deterministic = torch.are_deterministic_algorithms_enabled()
+    return (weakref.ref(rule), settings, deterministic), rule_tensors(rule, device)
+
+
+def tensor_form(tensor: Tensor) -> Hashable:
+    """Return shape, dtype and device of a tensor."""
+    return tensor.shape, tensor.dtype, tensor.device

@@ -17,6 +17,7 @@ from npa_envs.world.execute import Memory, RolloutSpec, execute, resting
 from npa_envs.world.graphed_rollouts import CUDA_GRAPH_CHOICES, CudaGraph
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness, check_generator
+from npa_envs.world.steps import SpeciesSpec
 
 __all__ = ["Memory", "at_rest", "rollout", "step"]
 
@@ -76,23 +77,6 @@ def _check_rule_of_one_species(rule: NPARule) -> None:
 def returned_fields(after: Particles) -> tuple[Tensor, ...]:
     """Return x, s and, if they were asked for, path lengths."""
     return (after.x, after.s) if after.path_length is None else (*after.per_particle(),)
-
-
-def checked_steps(
-    steps: int, keep_every: int | None, memory: Memory, cuda_graph: CudaGraph
-) -> tuple[int, int | None]:
-    """Return `steps` and `keep_every`, which must divide it, as ints; also check two choices."""
-    steps = checked_count("steps", steps)
-    if keep_every is not None:
-        keep_every = checked_count("keep_every", keep_every)
-        if keep_every == 0 or steps == 0 or steps % keep_every:
-            raise NPAError(
-                f"steps must be a multiple of keep_every, got {steps} and {keep_every}: the last "
-                f"world kept is the one at the end"
-            )
-    checked_choice("memory", memory, get_args(Memory))
-    checked_choice("cuda_graph", cuda_graph, CUDA_GRAPH_CHOICES)
-    return steps, keep_every
 
 
 def step(
@@ -274,11 +258,34 @@ def rollout(
     return returned_fields(after)
 
 
+PHYSICS_OPTIONS = ("eps", "box", "boundary", "dt", "position_noise")
+"""Options of a rollout that are constants of its physics, the same for all species."""
+
+
 def rollout_particles(
-    rule: NPARule,
+    rule: NPARule, worlds: Particles, steps: int, *, update_prob: float = 0.5, **options: Any
+) -> Particles:
+    """Run a rule as `rollout`, whose options these are; return worlds with all their fields."""
+    _check_rule_of_one_species(rule)
+    physics = {name: options.pop(name) for name in PHYSICS_OPTIONS if name in options}
+    constants = checked_physics(rule, worlds, update_prob=update_prob, **physics)
+    box = physics.get("box")
+    if rule.divides and box is not None:
+        raise NPAError(
+            f"box must be None where particles divide, got {shown(box)}: the dead need a place far "
+            "from all others"
+        )
+    return run_rules((rule,), worlds, steps, constants, **options)
+
+
+def run_rules(
+    rules: Sequence[NPARule],
     worlds: Particles,
     steps: int,
+    constants: Physics,
+    species: Sequence[SpeciesSpec] = (),
     *,
+    per_species: bool = False,
     detach_positions: bool = True,
     memory: Memory = "store",
     generator: Randomness | None = None,
@@ -286,42 +293,24 @@ def rollout_particles(
     keep_every: int | None = None,
     cuda_graph: CudaGraph = "auto",
     return_path_length: bool = False,
-    **physics: Any,
 ) -> Particles:
-    """Run a rule as `rollout`, whose options these are; return worlds with all their fields."""
-    steps, keep_every = checked_steps(steps, keep_every, memory, cuda_graph)
-    _check_rule_of_one_species(rule)
-    constants = checked_physics(rule, worlds, **physics)
+    """Check the options of a rollout and run it; path lengths are None unless asked for."""
+    steps = checked_count("steps", steps)
+    if keep_every is not None:
+        keep_every = checked_count("keep_every", keep_every)
+        if keep_every == 0 or steps == 0 or steps % keep_every:
+            raise NPAError(
+                f"steps must be a multiple of keep_every, got {steps} and {keep_every}: the last "
+                f"world kept is the one at the end"
+            )
+    checked_choice("memory", memory, get_args(Memory))
+    checked_choice("cuda_graph", cuda_graph, CUDA_GRAPH_CHOICES)
     detach_positions = checked_flag("detach_positions", detach_positions)
-    if rule.divides and physics.get("box") is not None:
-        raise NPAError(
-            f"box must be None where particles divide, got {shown(physics['box'])}: the dead need "
-            "a place far from all others"
-        )
-    return run_checked(
-        RolloutSpec(steps, constants, detach_positions, memory, keep_every),
-        (rule,),
-        worlds,
-        generator,
-        cuda_graph,
-        on_divergence,
-        return_path_length,
-    )
-
-
-def run_checked(
-    spec: RolloutSpec,
-    rules: Sequence[NPARule],
-    worlds: Particles,
-    generator: Randomness | None,
-    cuda_graph: CudaGraph,
-    on_divergence: OnDivergence,
-    return_path_length: bool,
-) -> Particles:
-    """Run a checked rollout; path lengths are None in the result unless they are asked for."""
     check_generator(generator, worlds.x.device, worlds.x.shape[0])
     after = execute(
-        spec,
+        RolloutSpec(
+            steps, constants, detach_positions, memory, keep_every, tuple(species), per_species
+        ),
         rules,
         Particles(*worlds[:-1]),
         generator,

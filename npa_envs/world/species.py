@@ -7,29 +7,17 @@ from typing import Any, Literal, get_args
 
 from torch import Tensor
 
-from npa_envs.checks import (
-    Box,
-    as_list,
-    check_world,
-    checked_choice,
-    checked_flag,
-    checked_positive,
-)
+from npa_envs.checks import Box, as_list, check_world, checked_choice, checked_positive
 from npa_envs.errors import NPAError, shown
 from npa_envs.ops.physics_constants import Boundary
 from npa_envs.ops.species_density import checked_counts
 from npa_envs.rule.rule import NPARule
 from npa_envs.world.divergence import OnDivergence
-from npa_envs.world.execute import Memory, RolloutSpec
+from npa_envs.world.execute import Memory
 from npa_envs.world.graphed_rollouts import CudaGraph
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness
-from npa_envs.world.rollout import (
-    checked_physics,
-    checked_steps,
-    returned_fields,
-    run_checked,
-)
+from npa_envs.world.rollout import PHYSICS_OPTIONS, checked_physics, returned_fields, run_rules
 from npa_envs.world.steps import SpeciesSpec
 
 SpeciesPerception = Literal["shared", "per_species"]
@@ -138,19 +126,11 @@ def species_particles(
     *,
     counts: Sequence[int],
     update_prob: float | Sequence[float] = 0.5,
-    generator: Randomness | None = None,
-    detach_positions: bool = True,
     perception: SpeciesPerception = "shared",
     density_counts: float | Sequence[float] | None = None,
-    memory: Memory = "store",
-    on_divergence: OnDivergence = "ignore",
-    keep_every: int | None = None,
-    cuda_graph: CudaGraph = "auto",
-    return_path_length: bool = False,
-    **physics: Any,
+    **options: Any,
 ) -> Particles:
     """Run rules as `rollout_species`, whose options these are; return worlds with all fields."""
-    steps, keep_every = checked_steps(steps, keep_every, memory, cuda_graph)
     check_world(worlds.x, worlds.s)
     particle_count = worlds.x.shape[1]
     sizes = checked_counts(counts, particle_count)
@@ -160,8 +140,7 @@ def species_particles(
         "density_counts", particle_count if density_counts is None else density_counts, len(sizes)
     )
     divisors = [checked_positive("an entry of density_counts", count) for count in divisors]
-    # With one species this is `rollout`.
-    alone = perception == "shared" and divisors == [particle_count]
+    physics = {name: options.pop(name) for name in PHYSICS_OPTIONS if name in options}
     constants = [
         checked_physics(rule, worlds, update_prob=probability, **physics)
         for rule, probability in zip(species_rules, probabilities, strict=True)
@@ -174,17 +153,12 @@ def species_particles(
         SpeciesSpec(size, each.update_prob, divisor)
         for size, each, divisor in zip(sizes, constants, divisors, strict=True)
     ]
-    spec = RolloutSpec(
-        steps,
-        common,
-        checked_flag("detach_positions", detach_positions),
-        memory,
-        keep_every,
-        () if alone else tuple(species),
-        perception == "per_species",
-    )
-    return run_checked(
-        spec, species_rules, worlds, generator, cuda_graph, on_divergence, return_path_length
+    per_species = perception == "per_species"
+    if not per_species and divisors == [particle_count]:
+        # With one species this is `rollout`.
+        species = []
+    return run_rules(
+        species_rules, worlds, steps, common, species, per_species=per_species, **options
     )
 
 

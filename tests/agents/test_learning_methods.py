@@ -86,14 +86,14 @@ def test_what_is_differentiated_is_the_environments_own_episode(problem):
         observation, _, _, _, infos = envs.step(rules.policy()(observation))
     # State steps were clipped, and what follows is clamped alike.
     assert largest > 1.5
-    x, s, path_length = task.rollout(
-        rules, x, s, steps,
+    after = task.rollout(
+        rules, Particles(x, s), steps,
         eps=task.eps, box=task.box, update_prob=task.update_prob,
         memory="store", generator=random, return_path_length=True,
     )  # fmt: skip
-    for ours, theirs in ((envs.worlds.x, x), (envs.worlds.s, s)):
+    for ours, theirs in ((envs.worlds.x, after.x), (envs.worlds.s, after.s)):
         torch.testing.assert_close(ours, theirs.detach(), atol=STEP_TOLERANCE, rtol=0.0)
-    loss, _ = task.loss(Particles(x, s, path_length))
+    loss, _ = task.loss(after)
     assert loss.item() == pytest.approx(infos["loss"][0].item(), abs=2e-4)
     bars = torch.autograd.grad(loss, [rule.output.weight for rule in rules])
     assert all(bar.abs().sum() > 0.0 for bar in bars)
@@ -103,11 +103,11 @@ def test_what_is_differentiated_is_the_environments_own_episode(problem):
 def test_repeated_rollouts_stay_clamped_where_they_are_recorded(cuda_graph, device):
     problem = heart(state_scale=0.1)
     rules, task = wild_rules(problem).to(device), EnvironmentTask(problem, device)
-    x, s, *_ = task.seed(2, generator=torch.Generator(device).manual_seed(0), device=device)
+    worlds = task.seed(2, generator=torch.Generator(device).manual_seed(0), device=device)
     found = []
     for _ in range(4):
-        _, after, _ = task.rollout(
-            rules, x, s, 3,
+        _, after, *_ = task.rollout(
+            rules, worlds, 3,
             eps=task.eps, box=task.box, update_prob=1.0, memory="store",
             generator=torch.Generator(device).manual_seed(1), return_path_length=True,
             cuda_graph=cuda_graph,

@@ -45,10 +45,10 @@ def test_rule_that_does_nothing_leaves_the_seed_at_every_checkpoint():
 
 
 def test_rule_is_run_for_as_many_steps_as_the_table_says(monkeypatch):
-    def count(rule, x, s, steps, **options):
-        return x, s + steps
+    def count(rule, worlds, steps, **options):
+        return worlds._replace(s=worlds.s + steps)
 
-    monkeypatch.setattr(npa_envs.measure.quality, "rollout", count)
+    monkeypatch.setattr(npa_envs.measure.quality, "rollout_particles", count)
     done = []
     rows = evaluate(
         make_rule(0.0), CircleTask(), checkpoints=[2, 5, 30], seeds=[0], progress=done.append
@@ -61,16 +61,15 @@ def test_rule_is_run_for_as_many_steps_as_the_table_says(monkeypatch):
 def shrink(rate):
     """A rollout that brings every particle to the circle, its distance times `rate` a step."""
 
-    def rollout(rule, x, s, steps, **options):
-        radius = x.norm(dim=-1, keepdim=True)
-        goal = x / radius * 0.5
-        return goal + (x - goal) * rate**steps, s
+    def rollout(rule, worlds, steps, **options):
+        goal = worlds.x / worlds.x.norm(dim=-1, keepdim=True) * 0.5
+        return worlds._replace(x=goal + (worlds.x - goal) * rate**steps)
 
     return rollout
 
 
 def test_healing_counts_the_steps_until_the_loss_is_back(monkeypatch):
-    monkeypatch.setattr(npa_envs.measure.quality, "rollout", shrink(0.98))
+    monkeypatch.setattr(npa_envs.measure.quality, "rollout_particles", shrink(0.98))
     steps = {"grow_steps": 100, "heal_steps": 205, "every": 25}
     cut, wiped = healing(make_rule(0.0), CircleTask(), **steps, seeds=[0, 1, 2], cut_gap=1.0)
     assert (cut.damage, wiped.damage) == ("cut, gap 1", "wiped disk, radius 0.2")
@@ -95,7 +94,7 @@ def test_rule_that_does_nothing_never_heals_a_cut():
 
 
 def test_worlds_that_run_away_have_not_healed(monkeypatch):
-    monkeypatch.setattr(npa_envs.measure.quality, "rollout", shrink(1.05))
+    monkeypatch.setattr(npa_envs.measure.quality, "rollout_particles", shrink(1.05))
     steps = {"grow_steps": 10, "heal_steps": 100, "every": 25}
     for row in healing(make_rule(0.0), CircleTask(), **steps, seeds=[0, 1, 2], cut_gap=0.1):
         assert row.after < 1.2 * row.before
@@ -106,11 +105,11 @@ def test_worlds_that_run_away_have_not_healed(monkeypatch):
 def test_wiped_disk_blanks_states_of_the_grown_world(monkeypatch):
     seen = []
 
-    def fill(rule, x, s, steps, **options):
-        seen.append((s == 0).all(-1).float().mean(1).tolist())
-        return x, torch.ones_like(s)
+    def fill(rule, worlds, steps, **options):
+        seen.append((worlds.s == 0).all(-1).float().mean(1).tolist())
+        return worlds._replace(s=torch.ones_like(worlds.s))
 
-    monkeypatch.setattr(npa_envs.measure.quality, "rollout", fill)
+    monkeypatch.setattr(npa_envs.measure.quality, "rollout_particles", fill)
     steps = dict.fromkeys(("grow_steps", "heal_steps", "every"), 1)
     healing(make_rule(0.0), CircleTask(), **steps, seeds=[0], wipe_radius=0.1)
     blank_after_cut, blank_after_erasure = seen[1][0], seen[2][0]

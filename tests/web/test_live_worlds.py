@@ -23,6 +23,7 @@ from npa_envs.web.environment_world import EnvironmentWorld, make_environment
 from npa_envs.web.live_world import ColouredWorld, Colouring, signed_colours, species_colours
 from npa_envs.web.rule_world import RuleWorld, RunWorld
 from npa_envs.world.division import living
+from npa_envs.world.rollout import rollout_particles
 
 CPU = torch.device("cpu")
 COUNT = 96
@@ -170,10 +171,10 @@ def test_a_world_at_rest_is_not_stepped_until_something_changes_it(tmp_path, dev
     step_counts = []
 
     def noted(*args, **options):
-        step_counts.append(args[3])
-        return rollout(*args, **options)
+        step_counts.append(args[2])
+        return rollout_particles(*args, **options)
 
-    monkeypatch.setattr(rule_world, "rollout", noted)
+    monkeypatch.setattr(rule_world, "rollout_particles", noted)
     put(world, speed=16)
     advance(world, 8)
     assert step_counts == [16] * 3

@@ -11,6 +11,6 @@ def nothing_recorded():
     """No recordings before and after a test, where there is a CUDA device."""
     for before in (True, False):
         if torch.cuda.is_available():
-            graphed_rollouts.release_recordings()
+            graphed_rollouts.release_captures()
         if before:
             yield

@@ -70,7 +70,7 @@ def together(*works):
 
 
 def is_recorded():
-    return graphed_rollouts.recorded_memory(DEVICE) > 0
+    return graphed_rollouts.captured_memory(DEVICE) > 0
 
 
 @pytest.mark.parametrize("gradients", [False, True])
@@ -334,6 +334,6 @@ def test_nothing_leaks_over_ten_thousand_calls_of_changing_shapes():
         del states
         if call in (4_999, 9_999):
             torch.cuda.synchronize()
-            taken.append((torch.cuda.memory_allocated(), graphed_rollouts.recorded_memory(DEVICE)))
+            taken.append((torch.cuda.memory_allocated(), graphed_rollouts.captured_memory(DEVICE)))
     assert taken[1][0] <= taken[0][0] + 2**20
     assert taken[1][1] == taken[0][1]

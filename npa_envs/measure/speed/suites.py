@@ -31,7 +31,7 @@ from npa_envs.measure.speed.timing import (
     timed_calls,
 )
 from npa_envs.rule.rule import NPARule
-from npa_envs.world.graphed_rollouts import release_recordings
+from npa_envs.world.graphed_rollouts import release_captures
 from npa_envs.world.rollout import Memory, rollout
 from npa_envs.world.species import rollout_species
 
@@ -129,7 +129,7 @@ def _public_row(session: TimingSession, workload: Workload) -> PublicRow:
             run, _ = rollout_call(workload, x, s, train=train, **options)
             timing = timed_calls(run, session.device, warm=3, repeats=session.repeats)
             timings.append(timing.divided(workload.steps))
-    release_recordings()
+    release_captures()
     return PublicRow(workload.name, *timings)
 
 
