@@ -164,15 +164,15 @@ def test_iteration_leaves_the_worlds_the_terms_and_the_gradients(tmp_path):
     gradients = [p.grad.clone() for p in iteration.parameters]
 
     generator = torch.Generator().manual_seed(3)
-    x, s, path_length = plain_rollout(
-        rule, iteration.start.x, iteration.start.s, 5, eps=task.eps, box=None, update_prob=0.5,
+    after = plain_rollout(
+        rule, iteration.start, 5, eps=task.eps, box=None, update_prob=0.5,
         memory="store", generator=generator, return_path_length=True
     )  # fmt: skip
-    total, parts = task.loss(Particles(x, s, path_length))
+    total, parts = task.loss(after)
     rule.zero_grad()
     total.backward()
-    assert torch.equal(iteration.end.x, x.detach())
-    assert torch.equal(iteration.end.s, s.detach())
+    assert torch.equal(iteration.end.x, after.x.detach())
+    assert torch.equal(iteration.end.s, after.s.detach())
     assert iteration.term_names == ("loss", "distance", "state", "motion")
     assert iteration.terms.tolist() == [total.item(), *(v.item() for v in parts.values())]
     for ours, parameter in zip(gradients, rule.parameters(), strict=True):
@@ -180,7 +180,7 @@ def test_iteration_leaves_the_worlds_the_terms_and_the_gradients(tmp_path):
         torch.testing.assert_close(ours, parameter.grad, rtol=1e-12, atol=0)
     # Masks differ from run to run.
     iteration.run(5)
-    assert not torch.equal(iteration.end.x, x.detach())
+    assert not torch.equal(iteration.end.x, after.x.detach())
 
 
 @pytest.mark.parametrize("power", [1.0, 2.0, 4.0])
