@@ -7,8 +7,8 @@ from npa_envs.world import graphed_rollouts
 
 
 @pytest.fixture
-def nothing_recorded():
-    """No recordings before and after a test, where there is a CUDA device."""
+def nothing_captured():
+    """No captures before and after a test, where there is a CUDA device."""
     for before in (True, False):
         if torch.cuda.is_available():
             graphed_rollouts.release_captures()

@@ -1,17 +1,17 @@
-"""Recorded rules with a network of their own: changes are followed, or they are launched."""
+"""Captured rules with a network of their own: changes are followed, or they are launched."""
 
 import functools
 
 import pytest
 import torch
-from test_recorded import DEVICE, EPS, is_recorded, same, worlds
-from test_recorded import as_launched as follows
+from test_captured_rollouts import DEVICE, EPS, is_captured, same, worlds
+from test_captured_rollouts import as_launched as follows
 from torch import nn
 
 import npa_envs
 from npa_envs.world.network_fingerprint import rule_settings
 
-pytestmark = pytest.mark.usefixtures("nothing_recorded")
+pytestmark = pytest.mark.usefixtures("nothing_captured")
 
 CPU = torch.device("cpu")
 as_launched = functools.partial(follows, calls=3, cuda_graph=True)
@@ -113,7 +113,7 @@ def test_what_a_network_depends_on_is_seen(change):
 def test_a_changed_rule_is_followed(change):
     rule = of_type(Scaled)
     as_launched(rule)
-    assert is_recorded()
+    assert is_captured()
     change(rule)
     as_launched(rule)
 
@@ -173,7 +173,7 @@ def test_gradients_are_those_of_what_was_dropped_within_a_graph_of_the_caller():
 def test_eval_ends_dropout():
     rule = of_type(Dropping)
     as_launched(rule.eval(), gradients=False)
-    assert is_recorded()
+    assert is_captured()
     x, s = worlds()
     seen = [npa_envs.rollout(rule.train(), x, s, 6, cuda_graph=True)[1] for _ in range(3)]
     assert not torch.equal(seen[1], seen[2])
@@ -193,7 +193,7 @@ def test_running_statistics_go_on(gradients):
         states.append([rule.norm.running_mean, rule.norm.running_var])
         assert int(rule.norm.num_batches_tracked) == 350
     same(*states)
-    assert is_recorded()
+    assert is_captured()
 
 
 @pytest.mark.gpu
@@ -212,9 +212,9 @@ def test_a_rule_that_counts_its_calls_is_launched(kind, caplog):
         seen.append(calls)
     if kind is Counting:
         same(*seen)
-        assert not is_recorded()
+        assert not is_captured()
     else:
-        # What records it calls it too, so that its count differs, and is not held.
+        # What captures it calls it too, so that its count differs, and is not held.
         assert not torch.equal(seen[1][-1], seen[1][-3])
         assert "a replay gives other numbers" in caplog.text
 
@@ -224,6 +224,6 @@ def test_within_autocast_own_networks_are_launched():
     rule = of_type(Scaled)
     with torch.autocast("cuda", dtype=torch.bfloat16):
         as_launched(rule)
-    assert not is_recorded()
+    assert not is_captured()
     as_launched(rule)
-    assert is_recorded()
+    assert is_captured()

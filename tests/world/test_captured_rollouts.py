@@ -1,4 +1,4 @@
-"""Recorded rollouts: what they give is what launched ones give, bit for bit."""
+"""Captured rollouts: what they give is what launched ones give, bit for bit."""
 
 import functools
 from concurrent.futures import ThreadPoolExecutor
@@ -11,7 +11,7 @@ from torch.utils.checkpoint import checkpoint
 import npa_envs
 from npa_envs.world import graphed_rollouts
 
-pytestmark = [pytest.mark.gpu, pytest.mark.usefixtures("nothing_recorded")]
+pytestmark = [pytest.mark.gpu, pytest.mark.usefixtures("nothing_captured")]
 
 DEVICE = torch.device("cuda", 0)
 EPS = 0.3
@@ -54,7 +54,7 @@ def same(first, second):
 
 
 def as_launched(rule, calls=4, cuda_graph="auto", **options):
-    """Check that calls that may be recorded give what launched ones give."""
+    """Check that calls that may be captured give what launched ones give."""
     for call in range(calls):
         form = {"space_dim": rule.space_dim, "dtype": rule.hidden.weight.dtype}
         x, s = worlds(seed=call, **form)
@@ -69,7 +69,7 @@ def together(*works):
             done.result()
 
 
-def is_recorded():
+def is_captured():
     return graphed_rollouts.captured_memory(DEVICE) > 0
 
 
@@ -98,12 +98,12 @@ def is_recorded():
     ],
     ids=str,
 )
-def test_a_recorded_rollout_is_the_launched_one(form, options, gradients):
+def test_a_captured_rollout_is_the_launched_one(form, options, gradients):
     rule = make_rule(**form)
     as_launched(rule, 2, gradients=gradients, **options)
-    assert not is_recorded()
+    assert not is_captured()
     as_launched(rule, 3, gradients=gradients, **options)
-    assert is_recorded()
+    assert is_captured()
 
 
 def test_numbers_of_steps_vary():
@@ -210,13 +210,13 @@ def test_training_follows_the_same_path(arrange, memory):
 
     x, s = worlds()
     same(*(optimise(make_rule(), x, s, graph, arranged) for graph in (False, "auto")))
-    assert is_recorded()
+    assert is_captured()
 
 
 def test_rollouts_within_a_checkpoint_are_launched():
     """Their draws come from the generator twice, so that only the lack of an error is certain."""
     optimise(make_rule(), *worlds(), "auto", checkpointed)
-    assert not is_recorded()
+    assert not is_captured()
 
 
 def test_a_second_backward_pass_is_refused_as_ever():
@@ -227,7 +227,7 @@ def test_a_second_backward_pass_is_refused_as_ever():
         loss.backward()
         with pytest.raises(RuntimeError, match="backward through the graph a second time"):
             loss.backward()
-    assert is_recorded()
+    assert is_captured()
 
 
 def test_positions_that_are_not_finite_are_refused_and_nothing_is_drawn():
@@ -255,19 +255,19 @@ class Doubled(npa_envs.NPARule):
         return 2.0 * super().forward(perception)
 
 
-def test_rules_with_a_network_of_their_own_are_recorded_where_asked():
+def test_rules_with_a_network_of_their_own_are_captured_where_asked():
     torch.manual_seed(0)
     rule = Doubled(2, 8, 32, eps0=EPS).to(DEVICE)
     as_launched(rule)
-    assert not is_recorded()
+    assert not is_captured()
     as_launched(rule, cuda_graph=True)
-    assert is_recorded()
+    assert is_captured()
     before = Doubled.runs
     run(rule, *worlds(), cuda_graph=True)
     assert Doubled.runs == before
 
 
-def test_species_are_recorded():
+def test_species_are_captured():
     rules = [make_rule(seed=k) for k in range(2)]
     parameters = [own for rule in rules for own in rule.parameters()]
     for call in range(4):
@@ -280,7 +280,7 @@ def test_species_are_recorded():
             loss = after[0].sum() + after[1].square().sum()
             result.append([*after, *torch.autograd.grad(loss, parameters)])
         same(*result)
-    assert is_recorded()
+    assert is_captured()
 
 
 def test_streams_and_threads():

@@ -1,4 +1,4 @@
-"""Recorded rollouts among torch's modes, other threads and other work on the device."""
+"""Captured rollouts among torch's modes, other threads and other work on the device."""
 
 import os
 import subprocess
@@ -7,10 +7,10 @@ import threading
 
 import pytest
 import torch
-from test_recorded import (
+from test_captured_rollouts import (
     DEVICE,
     as_launched,
-    is_recorded,
+    is_captured,
     make_rule,
     run,
     same,
@@ -22,11 +22,11 @@ import npa_envs
 from npa_envs.ops import launch
 from npa_envs.world.cuda_graph import capture, plain_tensors
 
-pytestmark = [pytest.mark.gpu, pytest.mark.usefixtures("nothing_recorded")]
+pytestmark = [pytest.mark.gpu, pytest.mark.usefixtures("nothing_captured")]
 
 
 @pytest.mark.parametrize("by_world", [False, True])
-def test_what_is_recorded_in_inference_mode_serves_other_calls(by_world):
+def test_what_is_captured_in_inference_mode_serves_other_calls(by_world):
     rule = make_rule()
     x, s = worlds()
     expected = run(rule, x, s, cuda_graph=False, gradients=False, by_world=by_world)
@@ -38,7 +38,7 @@ def test_what_is_recorded_in_inference_mode_serves_other_calls(by_world):
                     generator = npa_envs.WorldRandom([0, 1, 2], device=DEVICE)
                 result = npa_envs.rollout(rule, x, s, 7, generator=generator)
             same(list(result), expected[:2])
-    assert is_recorded()
+    assert is_captured()
 
 
 def test_threads_that_share_a_generator_draw_different_numbers():
@@ -71,7 +71,7 @@ def test_with_cuda_as_default_device():
             made = torch.zeros(2)
     finally:
         torch.set_default_device(None)
-    assert is_recorded()
+    assert is_captured()
     assert made.device.type == "cpu"
     made.add_(1)
 
@@ -83,7 +83,7 @@ def test_matrix_precision_chosen_in_the_new_way(monkeypatch):
         as_launched(rule)
 
 
-def test_others_draw_while_something_is_recorded():
+def test_others_draw_while_something_is_captured():
     numbers = torch.zeros(10, device=DEVICE)
     drawn = []
 
