@@ -27,9 +27,11 @@ def kernel_bodies():
 
 def test_kernels_that_wait_do_so_first():
     for name, body in kernel_bodies():
-        calls = [k for k, line in enumerate(body) if "await_earlier()" in ast.unparse(line)]
-        assert calls in ([], [0]), name
-        assert not calls or ast.unparse(body[0]) == "await_earlier()", name
+        first, *others = map(ast.unparse, body)
+        assert first == "wait_for_previous_kernel()" or "wait_for_previous_kernel" not in first, (
+            name
+        )
+        assert "wait_for_previous_kernel" not in "".join(others), name
 
 
 def test_no_load_may_be_moved_ahead_of_the_wait():

@@ -23,11 +23,11 @@ from npa_envs.kernels.mathematics import falloff_within, smoothing_of
 from npa_envs.kernels.primitives import (
     WARP,
     as_word,
-    await_earlier,
     load_integer,
     make_lane_sum,
     make_wide_load,
     thread_number,
+    wait_for_previous_kernel,
     wide_store,
 )
 from npa_envs.thread_lock import cached_under_lock
@@ -82,22 +82,20 @@ def listed_density(
     positions_ahead = wp.types.matrix((many, space_dim), scalar)
     room = min(capacity, SHARE_OF_LIST * capacity // lanes)
 
-    @native.func_native(room, many, LIST_BLOCK)
-    def list_address() -> wp.uint32: ...
-
-    @native.func_native(LIST_BLOCK)
-    def list_end_of(address: wp.uint32, entries: int) -> LIST_END: ...
-
-    @native.func_native(LIST_BLOCK)
-    def append_step(end: LIST_END, weight: float, step: int) -> LIST_END: ...
-
-    @native.func_native(room, LIST_BLOCK)
-    def cut_off(address: wp.uint32, end: LIST_END) -> LIST_END: ...
-
-    @native.func_native(room, LIST_BLOCK, capacity, lanes)
-    def leave_list(
-        address: wp.uint32, list_end: LIST_END, row: int, lists: wp.array3d[wp.int16]
-    ) -> int: ...
+    list_address = native.function("list_address", room, many, LIST_BLOCK, returns=wp.uint32)
+    list_end_of = native.function(
+        "list_end_of", LIST_BLOCK, address=wp.uint32, entries=int, returns=LIST_END
+    )
+    append_step = native.function(
+        "append_step", LIST_BLOCK, end=LIST_END, weight=float, step=int, returns=LIST_END
+    )
+    bounds = {"address": wp.uint32, "end": LIST_END}
+    cut_off = native.function("cut_off", room, LIST_BLOCK, **bounds, returns=LIST_END)
+    sizes = room, LIST_BLOCK, capacity, lanes
+    lists_type = wp.array3d[wp.int16]
+    leave_list = native.function(
+        "leave_list", *sizes, **bounds, row=int, lists=lists_type, returns=int
+    )
 
     @wp.func
     def falloff_at(domain: Domain, offset: vector):
@@ -151,7 +149,7 @@ def listed_density(
         `records` also have the index of the particle's state, in 2D; `particles` is left out if
         empty. A list that is too long is not written; its length is then larger than the capacity.
         """
-        await_earlier()
+        wait_for_previous_kernel()
         thread = wp.tid()
         k = thread >> wp.static(lanes.bit_length() - 1)
         lane = thread & wp.static(lanes - 1)
@@ -259,20 +257,22 @@ def tiled_density(periodic: bool, capacity: int, masked: bool) -> wp.Kernel:
     vector, particle, Domain = space.vector, space.particle, space.Domain
     load_vector = make_wide_load(vector)
 
-    @native.func_native(capacity, periodic)
-    def density_of_tile(
-        domain: Domain,
-        starts: wp.array[wp.int32],
-        sorted_cell: wp.array[wp.int32],
-        sorted_positions: wp.array[vector],
-        base: int,
-        first: int,
-        k: int,
-        inside: bool,
-        row: int,
-        lists: wp.array3d[wp.int16],
-        list_lengths: wp.array[wp.int32],
-    ) -> float: ...
+    density_of_tile = native.function(
+        "density_of_tile",
+        *(capacity, periodic),
+        domain=Domain,
+        starts=wp.array[wp.int32],
+        sorted_cell=wp.array[wp.int32],
+        sorted_positions=wp.array[vector],
+        base=int,
+        first=int,
+        k=int,
+        inside=bool,
+        row=int,
+        lists=wp.array3d[wp.int16],
+        list_lengths=wp.array[wp.int32],
+        returns=float,
+    )
 
     topic = "tiled_density" + "_in_box" * periodic + f"_{capacity}" + "_of_rows" * masked
 
@@ -298,7 +298,7 @@ def tiled_density(periodic: bool, capacity: int, masked: bool) -> wp.Kernel:
         list_lengths: wp.array[wp.int32],
     ):
         """Write what the kernel of `listed_density` writes, but lists one after the other."""
-        await_earlier()
+        wait_for_previous_kernel()
         thread = thread_number()
         tile = thread >> wp.static(WARP.bit_length() - 1)
         lane = thread & wp.static(WARP - 1)

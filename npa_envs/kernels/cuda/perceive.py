@@ -41,7 +41,6 @@ from npa_envs.kernels.primitives import (
     CUDA_LANES,
     any_in_warp,
     as_number,
-    await_earlier,
     largest_in_warp,
     load_integer,
     make_lane_sum,
@@ -49,6 +48,7 @@ from npa_envs.kernels.primitives import (
     of_lane,
     sync_warp,
     thread_number,
+    wait_for_previous_kernel,
 )
 from npa_envs.thread_lock import cached_under_lock
 
@@ -69,8 +69,8 @@ CANDIDATES = 16
 
 load_record = make_wide_load(RECORD)
 
-stage = native.generic("stage", 3)
-"""Writes to a `slot`, at an offset of 32-bit words, a `value`."""
+stage = native.function("stage", untyped="slot word value")
+"""Write a value to a slot, at an offset of 32-bit words."""
 
 
 class PerceptionVariant(NamedTuple):
@@ -129,29 +129,23 @@ def slot_functions(variant: PerceptionVariant, lane_channels: type) -> SimpleNam
     # The additional 16 bytes spread a warp's slots over the banks of shared memory.
     slot_bytes = max(SLOT_ENTRIES * (16 if space_dim == 2 else 20), 4 * row_words) + 16
 
-    @native.func_native(slot_bytes, lanes, CUDA_BLOCK)
-    def slot_address() -> wp.uint32: ...
-
-    @native.func_native()
-    def part_address(states: wp.array[lane_channels], part: int) -> wp.uint64: ...
-
-    @native.func_native(lane_channels)
-    def part_of_state(address: wp.uint64, part_count: int, number: int) -> lane_channels: ...
-
-    @native.func_native(space_dim, SLOT_ENTRIES, lanes)
-    def append_number(slot: wp.uint32, count: int, accepted: bool, number: int) -> int: ...
-
-    @native.func_native(space_dim, SLOT_ENTRIES)
-    def number_at(slot: wp.uint32, entry: int) -> int: ...
-
-    @native.func_native(space_dim, SLOT_ENTRIES)
-    def put_entry(slot: wp.uint32, entry: int, smooth: float, kernel: vector, number: int): ...
-
-    @native.func_native(space_dim, SLOT_ENTRIES)
-    def entry_at(slot: wp.uint32, entry: int) -> entry_type: ...
-
+    slot_address = native.function("slot_address", slot_bytes, lanes, CUDA_BLOCK, returns=wp.uint32)
+    part_address = native.function(
+        "part_address", states=wp.array[lane_channels], part=int, returns=wp.uint64
+    )
+    state = {"address": wp.uint64, "part_count": int, "number": int}
+    part_of_state = native.function("part_of_state", lane_channels, **state, returns=lane_channels)
+    layout, entry = (space_dim, SLOT_ENTRIES), {"slot": wp.uint32, "entry": int}
+    found = {"slot": wp.uint32, "count": int, "accepted": bool, "number": int}
+    append_number = native.function("append_number", *layout, lanes, **found, returns=int)
+    number_at = native.function("number_at", *layout, **entry, returns=int)
+    weights = {"smooth": float, "kernel": vector, "number": int}
+    put_entry = native.function("put_entry", *layout, **entry, **weights)
+    entry_at = native.function("entry_at", *layout, **entry, returns=entry_type)
     sizes = space_dim, width, lanes, row_words, slot_bytes, variant.grouped
-    write_rows = native.generic("write_rows", 6, *sizes)
+    write_rows = native.function(
+        "write_rows", *sizes, untyped="slot destination group state_dim limit rows"
+    )
 
     @wp.func
     def padded(count: int):
@@ -179,16 +173,10 @@ def weighing_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> Si
     indices_of_pair = wp.types.vector(PAIR, wp.int32)
     records_of_pair = wp.types.matrix((PAIR, 4), scalar)
 
-    @native.func_native(variant.capacity, variant.tiled)
-    def steps_at(lists: wp.array3d[wp.int16], row: int, pair: int) -> int:
-        """Return two entries of a neighbour list, packed in 32 bits.
-
-        An entry, or step, is the neighbour's sorted index minus the particle's.
-        """
-
-    @native.func_native()
-    def step_of(steps: int, entry: int) -> int:
-        """Return entry 0 or 1 of two packed entries of a neighbour list."""
+    # A list's entry, or step, is the neighbour's sorted index minus the particle's.
+    pair = {"lists": wp.array3d[wp.int16], "row": int, "pair": int}
+    steps_at = native.function("steps_at", variant.capacity, variant.tiled, **pair, returns=int)
+    step_of = native.function("step_of", steps=int, entry=int, returns=int)
 
     @wp.struct
     class Centre:
@@ -598,7 +586,7 @@ def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
         `row_destination[k]`, by default to row k. Numbers are clipped to plus and minus `limit`
         unless it is 0.
         """
-        await_earlier()
+        wait_for_previous_kernel()
         thread = thread_number()
         lane = thread & wp.static(lanes - 1)
         row = thread >> wp.static(lanes.bit_length() - 1)

@@ -22,7 +22,6 @@ import warp as wp
 
 from npa_envs.kernels import native_functions as native
 from npa_envs.kernels.domain import scalar_name
-from npa_envs.kernels.mathematics import make_fast_exp2
 from npa_envs.kernels.native_functions import TILES, in_ranges, namespace
 from npa_envs.kernels.pictures.gaussians import (
     CHANNELS,
@@ -66,7 +65,7 @@ def blending_functions(scalar: type) -> SimpleNamespace:
     """Return the functions of all kernels: a Gaussian's effect on a pixel, and its adjoint."""
     types = gaussian_types(scalar)
     Frame, quad, footprint_type, pulls_type = types.Frame, types.quad, types.footprint, types.pulls
-    fast_exp2 = make_fast_exp2(scalar)
+    fast_exp2 = native.function("fast_exp2", value=scalar, returns=scalar)
 
     @wp.func
     def strength(footprint: footprint_type, x: scalar, y: scalar):
@@ -264,9 +263,10 @@ def block_kernels(scalar: type) -> SimpleNamespace:
     load_footprint = make_wide_load(footprint_type)
     add_warp = make_lane_sum(pulls_type, WARP, whole_warps=True)
 
-    @native.func_native(BATCH, TILE_PIXELS // WARP)
-    def store_or_sum(write: bool, i: int, entry: int, value: pulls_type) -> scalar:
-        """Store a warp's cotangents of pair i (`write`), or return an entry of the warps' sum."""
+    # Store a warp's cotangents of pair i (`write`), or return an entry of the warps' sum.
+    arguments = {"write": bool, "i": int, "entry": int, "value": pulls_type}
+    sizes = BATCH, TILE_PIXELS // WARP
+    store_or_sum = native.function("store_or_sum", *sizes, **arguments, returns=scalar)
 
     @wp.func
     def own_pixel(frame: Frame, tile: int, k: int):

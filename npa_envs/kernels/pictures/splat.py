@@ -20,15 +20,12 @@ import warp as wp
 
 from npa_envs.kernels import native_functions as native
 from npa_envs.kernels.domain import scalar_name
-from npa_envs.kernels.mathematics import make_fast_exp2
 from npa_envs.kernels.native_functions import PAIRS, WORLDS, in_ranges, namespace
 from npa_envs.kernels.primitives import (
-    await_earlier,
     load_integer,
-    make_kept,
-    make_lane_collect,
     make_lane_sum,
     make_wide_load,
+    wait_for_previous_kernel,
     wide_store,
 )
 from npa_envs.thread_lock import cached_under_lock
@@ -138,7 +135,7 @@ def splat_functions(scalar: type) -> SimpleNamespace:
     types = splat_types(scalar)
     View, vector, colour_type = types.View, types.vector, types.colour
     footprint_type = types.footprint
-    fast_exp2 = make_fast_exp2(scalar)
+    fast_exp2 = native.function("fast_exp2", value=scalar, returns=scalar)
 
     @wp.func
     def patch_weight(falloff: scalar, slope: scalar, offset: scalar):
@@ -219,8 +216,11 @@ def gather_functions(scalar: type, lanes: int) -> SimpleNamespace:
     columns_type, rows_type, weights_type = types.columns, types.rows, types.weights
     runs_type = wp.types.vector(RUNS, wp.int32)
     load_footprint = make_wide_load(footprint_type)
-    kept = make_kept(scalar)
-    collect = make_lane_collect(tile_type, lanes)
+    # Each lane gets a row of the tile.
+    collected_type = wp.types.matrix((CHANNELS, TILE_WIDTH * TILE_HEIGHT // lanes), scalar)
+    sizes = collected_type, scalar, CHANNELS, TILE_WIDTH * TILE_HEIGHT, lanes
+    collect = native.function("lane_collect", *sizes, value=tile_type, returns=collected_type)
+    kept = native.function("kept", value=scalar, returns=scalar)
 
     @wp.func
     def candidate_count(
@@ -338,7 +338,7 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
 
         Those of cell c are counted at counts[c + 1]; counts[0] stays 0 for the prefix sum.
         """
-        await_earlier()
+        wait_for_previous_kernel()
         i = wp.tid()
         world = i / particle_count
         position = position_in_world(view, positions[i], means, goal, world)
@@ -355,7 +355,7 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         arrived: wp.array[wp.int32],
     ):
         """List the particles by cell, in the order in which they were counted."""
-        await_earlier()
+        wait_for_previous_kernel()
         i = wp.tid()
         arrived[starts[cell[i]] + arrival[i]] = i
 
@@ -376,7 +376,7 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         source: wp.array[wp.int32],
     ):
         """Write the particles' footprints sorted by cell, and by index within a cell."""
-        await_earlier()
+        wait_for_previous_kernel()
         k = wp.tid()
         i = arrived[k]
         c = cell[i]
