@@ -38,12 +38,12 @@ def scalar_name(scalar: type) -> str:
 
 @cached_under_lock()
 def kernel_module(
-    topic: str, space_dim: int, scalar: type, width: int = 0, lanes: int = 0
+    module_name: str, space_dim: int, scalar: type, width: int = 0, lanes: int = 0
 ) -> wp.Module:
-    """Return the Warp module of a topic, such as "sort", for a D, scalar type, width and lanes."""
+    """Return the Warp module of kernels such as "sort", for a D, scalar type, width and lanes."""
     variant = f"{space_dim}d_{scalar_name(scalar)}"
     variant += f"_w{width}" * bool(width) + f"_l{lanes}" * bool(lanes)
-    return native.module(f"npa_envs.kernels.{topic}_{variant}")
+    return native.module(f"npa_envs.kernels.{module_name}_{variant}")
 
 
 @cached_under_lock()

@@ -134,8 +134,8 @@ def log_scale_adjoint(scaled: Any, cotangent: Any):
     return result
 
 
-def perception_topic(state_gradient: bool, moment_inverse: str | None) -> str:
-    """Return the part of a perception module's name that tells its kind of state gradient."""
+def perception_module_name(state_gradient: bool, moment_inverse: str | None) -> str:
+    """Return the part of a perception module's name that says which state gradient it has."""
     if not state_gradient:
         return "smoothing"
     corrections = {None: "uncorrected_", "threshold": "", "smooth": "smoothly_corrected_"}

@@ -236,9 +236,9 @@ def listed_adjoint(
     vector, Domain = space.vector, space.Domain
     thread_gradient = wp.types.matrix((space_dim, THREAD_CHANNELS), scalar)
     weight_count = 1 + space_dim if state_gradient else 1
-    topic = "listed_adjoint" if state_gradient else "listed_smoothing_adjoint"
-    topic += "_in_box" * periodic + "_grouped" * grouped
-    module = kernel_module(topic, space_dim, scalar, width)
+    module_name = "listed_adjoint" if state_gradient else "listed_smoothing_adjoint"
+    module_name += "_in_box" * periodic + "_grouped" * grouped
+    module = kernel_module(module_name, space_dim, scalar, width)
     load_vector = make_wide_load(vector)
     search = row_search(space_dim, periodic)
     parts = width // THREAD_CHANNELS

@@ -67,7 +67,7 @@ TILE_REGISTERS = 64
 def listed_density(
     space_dim: int, lanes: int, periodic: bool, capacity: int, masked: bool
 ) -> wp.Kernel:
-    """Return the kernel that computes densities and lists neighbours, `lanes` threads a particle.
+    """Return the kernel that computes densities and lists neighbours, `lanes` threads per particle.
 
     `capacity`: longest list. `masked`: only active particles get lists. With several lanes,
     launches have complete warps, whose threads write lists together.
@@ -122,11 +122,11 @@ def listed_density(
         last = wp.int32(wp.floor(within_cell[0] + along))
         return wp.max(first + 2, 0), wp.max(2 - last, 0)
 
-    topic = "listed_density" + "_in_box" * periodic + f"_{capacity}" + "_of_rows" * masked
+    module_name = "listed_density" + "_in_box" * periodic + f"_{capacity}" + "_of_rows" * masked
 
     @wp.kernel(
         enable_backward=False,
-        module=kernel_module(topic, space_dim, scalar, 0, lanes),
+        module=kernel_module(module_name, space_dim, scalar, 0, lanes),
         cuda_max_registers=CUDA_REGISTERS,
         grid_stride=False,
     )
@@ -274,11 +274,11 @@ def tiled_density(periodic: bool, capacity: int, masked: bool) -> wp.Kernel:
         returns=float,
     )
 
-    topic = "tiled_density" + "_in_box" * periodic + f"_{capacity}" + "_of_rows" * masked
+    module_name = "tiled_density" + "_in_box" * periodic + f"_{capacity}" + "_of_rows" * masked
 
     @wp.kernel(
         enable_backward=False,
-        module=kernel_module(topic, 2, wp.float32),
+        module=kernel_module(module_name, 2, wp.float32),
         cuda_max_registers=TILE_REGISTERS,
         grid_stride=False,
     )

@@ -41,8 +41,8 @@ WIDE, WIDE_REGISTERS = range(81, 97), 128
 def two_layer_kernel(steps: int, tiles: int, mode: str) -> wp.Kernel:
     """Return the kernel that applies a network of two layers to rows; a warp serves 16 rows.
 
-    Rows have at most 16 `steps` columns, outputs at most 8 `tiles`. `mode` "rectify" applies ReLU
-    to hidden units, "note" also stores its mask, and "mask" applies a stored mask instead.
+    Rows have at most 16 `steps` columns, outputs at most 8 `tiles`. `mode` "relu" applies ReLU
+    to hidden units, "relu_store_mask" also stores its mask, and "apply_mask" applies a stored one.
 
     Arguments: number of hidden units H, a multiple of 16; rows [K, width]; weights of both layers,
     from `arrange_hidden` and `arrange_output`; scales of the outputs [8 `tiles`]; masks of ReLU, a

@@ -31,7 +31,7 @@ from npa_envs.kernels.mathematics import (
     log_scale_of_square,
     log_scaled_huge,
     make_corrected,
-    perception_topic,
+    perception_module_name,
     smoothing,
     spiky_factor_f64,
     within,
@@ -113,11 +113,11 @@ class PerceptionVariant(NamedTuple):
 
     def module(self) -> wp.Module:
         """Return the Warp module of the kernel with these options."""
-        topic = "listed_" + perception_topic(self.state_gradient, self.moment_inverse)
-        topic += "_in_box" * self.periodic + "_grouped" * self.grouped + f"_{self.capacity}"
-        topic += "_for_adjoint" * self.for_adjoint + "_by_place" * self.per_particle
-        topic += "_tiled" * self.tiled
-        return kernel_module(topic, self.space_dim, wp.float32, self.width, self.lanes)
+        module_name = "listed_" + perception_module_name(self.state_gradient, self.moment_inverse)
+        module_name += "_in_box" * self.periodic + "_grouped" * self.grouped + f"_{self.capacity}"
+        module_name += "_for_adjoint" * self.for_adjoint + "_by_place" * self.per_particle
+        module_name += "_tiled" * self.tiled
+        return kernel_module(module_name, self.space_dim, wp.float32, self.width, self.lanes)
 
 
 def slot_functions(variant: PerceptionVariant, lane_channels: type) -> SimpleNamespace:

@@ -9,10 +9,10 @@ The backward pass divides T by 1 - alpha from the last Gaussian to the first. Wi
 (c . c̄) alpha T over farther Gaussians plus the final T times its cotangent, the cotangent of alpha
 is T (c . c̄) - b / (1 - alpha).
 
-On CUDA a block serves a tile and a thread a pixel; sums over pixels use shuffles within warps and
-shared memory among warps. On a CPU a thread serves a tile, one Gaussian after the other, each only
-at the pixels that it covers. Either way every pair of a tile and a Gaussian has its own slot for
-the cotangents from that tile (its pull): no sum depends on the order of threads.
+On CUDA there is a block per tile and a thread per pixel; sums over pixels use shuffles within warps
+and shared memory among warps. On a CPU a thread serves a tile, one Gaussian after the other, each
+only at the pixels that it covers. Either way every pair of a tile and a Gaussian has a place for the
+cotangents from that tile (its pull): no sum depends on the order of threads.
 Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
 """
 
@@ -141,7 +141,7 @@ def blending_functions(scalar: type) -> SimpleNamespace:
 
 @cached_under_lock()
 def tile_kernels(scalar: type) -> SimpleNamespace:
-    """Return the kernels that blend Gaussians, and the adjoint, one thread a tile; for CPUs."""
+    """Return the kernels that blend Gaussians, and the adjoint, one thread per tile; for CPUs."""
     types = gaussian_types(scalar)
     Frame, footprint_type, pulls_type = types.Frame, types.footprint, types.pulls
     blending = blending_functions(scalar)
@@ -253,7 +253,7 @@ def tile_kernels(scalar: type) -> SimpleNamespace:
 
 @cached_under_lock()
 def block_kernels(scalar: type) -> SimpleNamespace:
-    """Return the kernels that blend Gaussians, and the adjoint, one block a tile; for CUDA."""
+    """Return the kernels that blend Gaussians, and the adjoint, one block per tile; for CUDA."""
     types = gaussian_types(scalar)
     Frame, quad, footprint_type, pulls_type = types.Frame, types.quad, types.footprint, types.pulls
     blending = blending_functions(scalar)

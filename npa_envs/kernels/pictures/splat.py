@@ -209,7 +209,7 @@ def splat_functions(scalar: type) -> SimpleNamespace:
 
 @cached_under_lock()
 def gather_functions(scalar: type, lanes: int) -> SimpleNamespace:
-    """Return functions that sum the particles around a tile, by 1 thread or by one a row."""
+    """Return functions that sum the particles around a tile, by 1 thread or by one per row."""
     assert lanes in (1, TILE_HEIGHT)
     types, splat = splat_types(scalar), splat_functions(scalar)
     View, footprint_type, tile_type = types.View, types.footprint, types.tile

@@ -46,9 +46,9 @@ def adjoint_kernels(
     vector, particle, Domain = space.vector, space.particle, space.Domain
     group = wp.types.vector(width, scalar)
     group_gradient = wp.types.matrix((space_dim, width), scalar)
-    topic = "adjoint" if state_gradient else "smoothing_adjoint"
-    topic = "listed_per_particle_" * listed + "unfiltered_" * (not on_cpu) + topic
-    module = kernel_module(topic, space_dim, scalar, width)
+    module_name = "adjoint" if state_gradient else "smoothing_adjoint"
+    module_name = "listed_per_particle_" * listed + "cuda_" * (not on_cpu) + module_name
+    module = kernel_module(module_name, space_dim, scalar, width)
     search = make_search(space_dim, scalar, vector, on_cpu, listed)
     indices = wp.types.vector(search.stride, wp.int32)
     add_scaled = make_add_scaled(group)

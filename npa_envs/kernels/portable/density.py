@@ -18,12 +18,12 @@ from npa_envs.thread_lock import cached_under_lock
 
 @cached_under_lock()
 def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespace:
-    """Return the kernels of densities and neighbour lists, with one thread a particle."""
+    """Return the kernels of densities and neighbour lists, with one thread per particle."""
     space = domain_types(space_dim, scalar)
     vector, particle, Domain = space.vector, space.particle, space.Domain
     vector_f64 = wp.types.vector(space_dim, wp.float64)
     search = make_search(space_dim, scalar, particle, on_cpu)
-    module = kernel_module("density" if on_cpu else "unfiltered_density", space_dim, scalar)
+    module = kernel_module("density" if on_cpu else "cuda_density", space_dim, scalar)
 
     @wp.func
     def spiky_f64(domain: Domain, centre: vector, neighbour: vector):

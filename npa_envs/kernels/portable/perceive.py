@@ -14,7 +14,7 @@ from npa_envs.kernels.domain import domain_types, kernel_module
 from npa_envs.kernels.mathematics import (
     log_scaled,
     make_corrected,
-    perception_topic,
+    perception_module_name,
     smoothing,
     spiky_factor,
 )
@@ -49,9 +49,9 @@ def perception_kernels(
     group = wp.types.vector(width, scalar)
     group_gradient = wp.types.matrix((space_dim, width), scalar)
     square = wp.types.matrix((space_dim, space_dim), scalar)
-    topic = "listed_per_particle_" * listed + "unfiltered_" * (not on_cpu)
-    topic += perception_topic(state_gradient, moment_inverse)
-    module = kernel_module(topic, space_dim, scalar, width)
+    module_name = "listed_per_particle_" * listed + "cuda_" * (not on_cpu)
+    module_name += perception_module_name(state_gradient, moment_inverse)
+    module = kernel_module(module_name, space_dim, scalar, width)
     search = make_search(space_dim, scalar, particle, on_cpu, listed)
     add_scaled = make_add_scaled(group)
     load_group = make_wide_load(group)
