@@ -179,6 +179,21 @@ def domain_types(space_dim: int, scalar: type) -> SimpleNamespace:
         return result
 
     @wp.func
+    def boxes_f64(domain: Domain, d: int, difference: scalar):
+        """Return the multiple of the box's side d that is nearest to a difference, in float64."""
+        return wp.float64(wp.round(difference * domain.inverse_box[d])) * wp.float64(domain.box[d])
+
+    @wp.func
+    def difference_f64(domain: Domain, centre: vector, neighbour: vector):
+        """Return the minimum image of neighbour - centre, in float64 [length units]."""
+        result = double_vector()
+        for d in range(wp.static(space_dim)):
+            result[d] = wp.float64(neighbour[d]) - wp.float64(centre[d])
+            if domain.periodic != 0:
+                result[d] -= boxes_f64(domain, d, neighbour[d] - centre[d])
+        return result
+
+    @wp.func
     def position_of(entry: particle):
         result = vector()
         for d in range(wp.static(space_dim)):

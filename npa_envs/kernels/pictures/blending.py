@@ -11,7 +11,7 @@ is T (c . c̄) - b / (1 - alpha).
 
 On CUDA there is a block per tile and a thread per pixel; sums over pixels use shuffles within warps
 and shared memory among warps. On a CPU a thread serves a tile, one Gaussian after the other, each
-only at the pixels that it covers. Either way every pair of a tile and a Gaussian has a place for the
+only at the pixels that it covers. Every pair of a tile and a Gaussian has its own place for the
 cotangents from that tile (its pull): no sum depends on the order of threads.
 Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
 """

@@ -29,12 +29,7 @@ def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespa
     def spiky_f64(domain: Domain, centre: vector, neighbour: vector):
         """Return the spiky gradient kernel of a pair in float64."""
         kernel = vector_f64()
-        r = vector_f64()
-        for d in range(wp.static(space_dim)):
-            r[d] = wp.float64(neighbour[d]) - wp.float64(centre[d])
-            if domain.periodic != 0:
-                images = wp.round((neighbour[d] - centre[d]) * domain.inverse_box[d])
-                r[d] -= wp.float64(images) * wp.float64(domain.box[d])
+        r = space.difference_f64(domain, centre, neighbour)
         exact = wp.dot(r, r)
         # The start must be near this very distance: across a seam that of the float32 positions
         # may be off by a rounding of the box's size.
@@ -192,12 +187,7 @@ def species_kernel(space_dim: int, scalar: type, species_count: int) -> wp.Kerne
                     species = sorted_species[j]
                     weight = smoothing(squared, domain.inverse_squared_eps, domain.smoothing_norm)
                     densities[species] += wp.float64(weight)
-                    away = vector_f64()
-                    for d in range(wp.static(space_dim)):
-                        away[d] = wp.float64(neighbour[d]) - wp.float64(position[d])
-                        if domain.periodic != 0:
-                            images = wp.round((neighbour[d] - position[d]) * domain.inverse_box[d])
-                            away[d] -= wp.float64(images) * wp.float64(domain.box[d])
+                    away = space.difference_f64(domain, position, neighbour)
                     factor = spiky_factor(
                         wp.length(away),
                         wp.float64(domain.inverse_eps),
