@@ -329,7 +329,7 @@ def listed_adjoint(
         group_count: int,
         starts: wp.array[wp.int32],
         particles: wp.array[scalar],
-        source: wp.array[wp.int32],
+        original_index: wp.array[wp.int32],
         row_of: wp.array[wp.int32],
         row_positions: wp.array[vector],
         row_kernel_sum: wp.array[vector],
@@ -362,7 +362,7 @@ def listed_adjoint(
         written = first + 2 * (lane & 3) + ((lane >> 2) & 1)
         part = lane >> 3
         channel = g * wp.static(width) + part * wp.static(THREAD_CHANNELS)
-        i = load_integer(source, wp.min(written, end - 1))
+        i = load_integer(original_index, wp.min(written, end - 1))
         position = search.load_position(particles, wp.min(k, end - 1))
         own_row = load_integer(row_of, i)
         if own_row >= 0 and channel < state_dim:

@@ -136,7 +136,7 @@ def listed_density(
         sorted_cell: wp.array[wp.int32],
         sorted_positions: wp.array[vector],
         state_index: wp.array[wp.int32],
-        source: wp.array[wp.int32],
+        original_index: wp.array[wp.int32],
         row_of: wp.array[wp.int32],
         # outputs
         particles: wp.array[particle],
@@ -162,7 +162,7 @@ def listed_density(
         cell = space.cell_at(domain, local)
         row = k
         if wp.static(masked):
-            row = load_integer(row_of, load_integer(source, k))
+            row = load_integer(row_of, load_integer(original_index, k))
         row = wp.where(inside and row < list_lengths.shape[0], row, wp.int32(-1))
         list_begin = list_address()
         # A particle without a row is treated as if its list were too long.
@@ -289,7 +289,7 @@ def tiled_density(periodic: bool, capacity: int, masked: bool) -> wp.Kernel:
         sorted_cell: wp.array[wp.int32],
         sorted_positions: wp.array[vector],
         state_index: wp.array[wp.int32],
-        source: wp.array[wp.int32],
+        original_index: wp.array[wp.int32],
         row_of: wp.array[wp.int32],
         # outputs
         particles: wp.array[particle],
@@ -311,7 +311,7 @@ def tiled_density(periodic: bool, capacity: int, masked: bool) -> wp.Kernel:
         k = wp.where(inside, k, first)
         row = k
         if wp.static(masked):
-            row = load_integer(row_of, load_integer(source, k))
+            row = load_integer(row_of, load_integer(original_index, k))
         row = wp.where(inside and row < list_lengths.shape[0], row, wp.int32(-1))
         total = density_of_tile(
             domain,

@@ -106,7 +106,7 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
         row_capacity: int,
         # outputs
         starts: wp.array[wp.int32],
-        source: wp.array[wp.int32],
+        original_index: wp.array[wp.int32],
         sorted_cell: wp.array[wp.int32],
         row_of: wp.array[wp.int32],
         row_source: wp.array[wp.int32],
@@ -189,7 +189,7 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
                 if inside and sorted_states.shape[0] > 0:
                     wide_store(sorted_states, target * parts + part, state)
                 if inside and part == 0:
-                    wide_store(source, target, i)
+                    wide_store(original_index, target, i)
                     wide_store(sorted_cell, target, first_cell + ranked[1])
                     wide_store(sorted_positions, target, position)
                     if row_of.shape[0] > 0:
@@ -236,7 +236,7 @@ def sort_small_splats(capacity: int) -> wp.Kernel:
         # outputs
         starts: wp.array[wp.int32],
         footprints: wp.array[footprint_type],
-        source: wp.array[wp.int32],
+        original_index: wp.array[wp.int32],
     ):
         """Write the footprints of a world, sorted by cell, then index; a block writes a slice."""
         wait_for_previous_kernel()
@@ -285,7 +285,7 @@ def sort_small_splats(capacity: int) -> wp.Kernel:
                     target += first_particle
                     footprint = splat.footprint_of(view, position, i, states, shift)
                     wide_store(footprints, target, footprint)
-                    wide_store(source, target, i)
+                    wide_store(original_index, target, i)
 
     return sort_splats
 
@@ -313,7 +313,7 @@ def order_particles(space_dim: int, width: int) -> wp.Kernel:
         arrived: wp.array[wp.vec2i],
         starts: wp.array[wp.int32],
         # outputs
-        source: wp.array[wp.int32],
+        original_index: wp.array[wp.int32],
         sorted_cell: wp.array[wp.int32],
         row_of: wp.array[wp.int32],
         row_source: wp.array[wp.int32],
@@ -345,7 +345,7 @@ def order_particles(space_dim: int, width: int) -> wp.Kernel:
                 active_rank += other & 1
         target = begin + rank
         if k < total:
-            wide_store(source, target, i)
+            wide_store(original_index, target, i)
             wide_store(sorted_cell, target, c)
             wide_store(sorted_positions, target, position)
             if row_of.shape[0] > 0:

@@ -373,7 +373,7 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         starts: wp.array[wp.int32],
         # outputs
         footprints: wp.array[footprint_type],
-        source: wp.array[wp.int32],
+        original_index: wp.array[wp.int32],
     ):
         """Write the particles' footprints sorted by cell, and by index within a cell."""
         wait_for_previous_kernel()
@@ -392,7 +392,7 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
                 if arrived[other] < i:
                     target += 1
         wide_store(footprints, target, footprint)
-        source[target] = i
+        original_index[target] = i
 
     @wp.func
     def tile_of(view: View, t: int):
@@ -453,7 +453,7 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         picture: wp.array3d[colour_type],
         # outputs
         footprints: wp.array[footprint_type],
-        source: wp.array[wp.int32],
+        original_index: wp.array[wp.int32],
     ):
         """Draw the picture of a world, particle after particle; for devices with few threads."""
         world = range_start + wp.tid()
@@ -461,7 +461,7 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
             position = position_in_world(view, positions[i], means, goal, world)
             footprint = splat.footprint_of(view, position, i, states, shift)
             footprints[i] = footprint
-            source[i] = i
+            original_index[i] = i
             if splat.visible(view, splat.patch_centre(position)):
                 column = wp.int32(footprint[2])
                 row = wp.int32(footprint[3])
@@ -487,7 +487,7 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         view: View,
         particle_count: int,
         footprints: wp.array[footprint_type],
-        source: wp.array[wp.int32],
+        original_index: wp.array[wp.int32],
         picture_bar: wp.array[colour_type],
         # outputs
         positions_bar: wp.array[vector],
@@ -546,7 +546,7 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
                 for d in range(2):
                     position_bar[d] = pulls[4 + d] - gained * moments[d] / sums[d]
                 colour_bar *= footprint[7]
-            i = source[k]
+            i = original_index[k]
             positions_bar[i] = view.pull * position_bar
             for c in range(3):
                 colours_bar[i, c] = colour_bar[c]

@@ -47,7 +47,7 @@ def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespa
         particle_count: int,
         density_gradient: int,
         starts: wp.array[wp.int32],
-        source: wp.array[wp.int32],
+        original_index: wp.array[wp.int32],
         row_of: wp.array[wp.int32],
         sorted_positions: wp.array[vector],
         # outputs
@@ -63,7 +63,7 @@ def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespa
         position = sorted_positions[k]
         row = wp.int32(-1)
         if density_gradient != 0:
-            row = row_of[source[k]]
+            row = row_of[original_index[k]]
         base = (k / particle_count) * domain.cell_count
         cell = space.cell_of(domain, position)
         density = scalar(0.0)
@@ -124,7 +124,7 @@ def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespa
             begin = ends[k - 1]
         next_entry = begin
         for r in range(search.run_count(domain, cell)):
-            first, end = search.run_range(domain, starts, neighbours, base, cell, k, r)
+            first, end = search.run_range(domain, starts, ends, base, cell, k, r)
             for candidate in range(first, end, wp.static(search.stride)):
                 near, count = search.filter_near(
                     domain, particles, neighbours, position, candidate, end
@@ -162,7 +162,7 @@ def species_kernel(space_dim: int, scalar: type, species_count: int) -> wp.Kerne
         gradient_scale: wp.float64,
         logarithmic: int,
         starts: wp.array[wp.int32],
-        source: wp.array[wp.int32],
+        original_index: wp.array[wp.int32],
         sorted_species: wp.array[wp.int32],
         sorted_positions: wp.array[vector],
         # outputs
@@ -197,7 +197,7 @@ def species_kernel(space_dim: int, scalar: type, species_count: int) -> wp.Kerne
                         gradients[species, d] += factor * away[d]
         # A particle always counts itself.
         densities[sorted_species[k]] += wp.float64(domain.smoothing_norm)
-        i = source[k]
+        i = original_index[k]
         for q in range(wp.static(species_count)):
             density[i, q] = scalar(density_scale * densities[q])
             sum = vector_f64()

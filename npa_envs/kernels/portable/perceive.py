@@ -200,7 +200,7 @@ def perception_kernels(
         starts: wp.array[wp.int32],
         particles: wp.array[particle],
         states: wp.array[group],
-        source: wp.array[wp.int32],
+        original_index: wp.array[wp.int32],
         # outputs
         density: wp.array[scalar],
         blur_field: wp.array2d[scalar],
@@ -211,9 +211,10 @@ def perception_kernels(
         """Write unscaled density, smoothed state, gradients and moments, in the caller's order."""
         k, g = wp.tid()
         k += range_start
-        i = source[k]
+        i = original_index[k]
+        no_list = starts
         blur, gradient, _kernel_sum, moment = sum_neighbours(
-            domain, particle_count, starts, starts, starts, particles, states, k, g, group_count
+            domain, particle_count, starts, no_list, no_list, particles, states, k, g, group_count
         )
         straight = corrected(gradient, moment)
         for c in range(wp.static(width)):

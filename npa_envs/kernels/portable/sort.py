@@ -90,7 +90,7 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
         arrived: wp.array[wp.vec2i],
         starts: wp.array[wp.int32],
         # outputs
-        source: wp.array[wp.int32],
+        original_index: wp.array[wp.int32],
         sorted_cell: wp.array[wp.int32],
         row_of: wp.array[wp.int32],
         row_source: wp.array[wp.int32],
@@ -115,7 +115,7 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
             if other < entry[0]:
                 target += 1
                 row += other & 1
-        source[target] = i
+        original_index[target] = i
         sorted_cell[target] = c
         sorted_positions[target] = positions[i]
         if row_of.shape[0] > 0:
@@ -149,7 +149,7 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
         # outputs
         cell: wp.array[wp.int32],
         starts: wp.array[wp.int32],
-        source: wp.array[wp.int32],
+        original_index: wp.array[wp.int32],
         sorted_cell: wp.array[wp.int32],
         row_of: wp.array[wp.int32],
         row_source: wp.array[wp.int32],
@@ -200,7 +200,7 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
             c = cell[i]
             target = starts[c]
             starts[c] = target + 1
-            source[target] = i
+            original_index[target] = i
             sorted_cell[target] = c
             sorted_positions[target] = positions[i]
             row = target
