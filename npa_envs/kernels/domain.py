@@ -38,12 +38,12 @@ def scalar_name(scalar: type) -> str:
 
 @cached_under_lock()
 def kernel_module(
-    topic: str, space_dim: int, scalar: type, width: int = 0, lanes: int = 0
+    module_name: str, space_dim: int, scalar: type, width: int = 0, lanes: int = 0
 ) -> wp.Module:
-    """Return the Warp module of a topic, such as "sort", for a D, scalar type, width and lanes."""
+    """Return the Warp module of kernels such as "sort", for a D, scalar type, width and lanes."""
     variant = f"{space_dim}d_{scalar_name(scalar)}"
     variant += f"_w{width}" * bool(width) + f"_l{lanes}" * bool(lanes)
-    return native.module(f"npa_envs.kernels.{topic}_{variant}")
+    return native.module(f"npa_envs.kernels.{module_name}_{variant}")
 
 
 @cached_under_lock()
@@ -176,6 +176,21 @@ def domain_types(space_dim: int, scalar: type) -> SimpleNamespace:
         result = difference
         if domain.periodic != 0:
             result = periodic_image(domain, difference)
+        return result
+
+    @wp.func
+    def boxes_f64(domain: Domain, d: int, difference: scalar):
+        """Return the multiple of the box's side d that is nearest to a difference, in float64."""
+        return wp.float64(wp.round(difference * domain.inverse_box[d])) * wp.float64(domain.box[d])
+
+    @wp.func
+    def difference_f64(domain: Domain, centre: vector, neighbour: vector):
+        """Return the minimum image of neighbour - centre, in float64 [length units]."""
+        result = double_vector()
+        for d in range(wp.static(space_dim)):
+            result[d] = wp.float64(neighbour[d]) - wp.float64(centre[d])
+            if domain.periodic != 0:
+                result[d] -= boxes_f64(domain, d, neighbour[d] - centre[d])
         return result
 
     @wp.func

@@ -134,8 +134,8 @@ def log_scale_adjoint(scaled: Any, cotangent: Any):
     return result
 
 
-def perception_topic(state_gradient: bool, moment_inverse: str | None) -> str:
-    """Return the part of a perception module's name that tells its kind of state gradient."""
+def perception_module_name(state_gradient: bool, moment_inverse: str | None) -> str:
+    """Return the part of a perception module's name that says which state gradient it has."""
     if not state_gradient:
         return "smoothing"
     corrections = {None: "uncorrected_", "threshold": "", "smooth": "smoothly_corrected_"}
@@ -196,44 +196,18 @@ def make_corrected(space_dim: int, scalar: type, width: int, moment_inverse: str
     return corrected
 
 
-# The same formulas in C++, with fewer instructions.
+# The same formulas in C++ for CUDA, with fewer instructions.
 
+falloff_within = native.function(
+    "falloff_within", squared=float, inverse_squared_eps=float, returns=float
+)
+"""1 - r^2 / eps^2, 0 beyond eps and for NaN."""
 
-@cached_under_lock()
-def make_fast_exp2(scalar: type) -> Any:
-    """Return a Warp function for 2^value; in float32 on CUDA the relative error is about 2e-7."""
+log_scale_of_square = native.function("log_scale_of_square", squared=float, returns=float)
+"""Factor L(v) / v of the logarithmic scaling, from v . v: log(1 + |v|) / |v|."""
 
-    @native.func_native()
-    def fast_exp2(value: scalar) -> scalar: ...
+inverse_root = native.function("inverse_root", value=float, returns=float)
+"""1 / sqrt(value), with an error of at most two units in the last place."""
 
-    return fast_exp2
-
-
-@cached_under_lock()
-def make_log_scale_pull(vector: type) -> Any:
-    """Return a faster `log_scale_adjoint`, the backward pass of L(v), for CUDA in float32."""
-
-    @native.func_native()
-    def log_scale_pull(scaled: vector, cotangent: vector) -> vector: ...
-
-    return log_scale_pull
-
-
-@native.func_native()
-def falloff_within(squared: float, inverse_squared_eps: float) -> float:
-    """1 - r^2 / eps^2 on CUDA, 0 beyond eps and for NaN."""
-
-
-@native.func_native()
-def log_scale_of_square(squared: float) -> float:
-    """Factor L(v) / v of the logarithmic scaling, from v . v, on CUDA: log(1 + |v|) / |v|."""
-
-
-@native.func_native()
-def inverse_root(value: float) -> float:
-    """1 / sqrt(value) on CUDA, with an error of at most two units in the last place."""
-
-
-@native.func_native()
-def within(value: float, limit: float) -> float:
-    """The value clipped to plus and minus a limit, on CUDA; unchanged if the limit is NaN."""
+within = native.function("within", value=float, limit=float, returns=float)
+"""The value clipped to plus and minus a limit; unchanged if the limit is NaN."""

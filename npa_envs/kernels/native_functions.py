@@ -1,7 +1,7 @@
 """C++ functions for Warp kernels, from the `.cuh` files of this folder, and ranges of CPU threads.
 
-A kernel module made by `module` begins with the text of those files. `@native.func_native` makes a
-Warp function of a C++ function. Plain Warp has no loads of 16 bytes, no votes of a warp, no memory
+A kernel module made by `module` begins with the text of those files. `function` makes a Warp
+function of a C++ function. Plain Warp has no loads of 16 bytes, no votes of a warp, no memory
 shared by a few threads, and no tensor cores.
 """
 
@@ -58,35 +58,32 @@ def module(name: str) -> wp.Module:
     return result
 
 
-def func_native(*parameters: Any) -> Callable[[Any], Any]:
-    """Return a decorator that makes a Warp function of the C++ function `npa::` of the same name.
+def function(
+    name: str, /, *parameters: Any, untyped: str = "", returns: Any = None, **arguments: Any
+) -> Any:
+    """Return a Warp function of the C++ function `npa::name`, which does what the file says.
 
-    It decorates a stub with the types of arguments and result. Warp recognises a stub by exactly
-    this decorator's name, used as an attribute of a module. `parameters` are the C++ template
-    parameters that do not follow from the arguments: numbers, booleans, `npa`'s constants, types.
+    `parameters` are the C++ template parameters that do not follow from the arguments: numbers,
+    booleans, `npa`'s constants, types. `untyped` names arguments of any types, separated by spaces,
+    and `arguments` others with their types, as all are of functions that return a value.
     """
-    return lambda stub: _native(stub, stub.__name__, parameters)
-
-
-def generic(name: str, argument_count: int, *parameters: Any) -> Any:
-    """Return a Warp function of the C++ function `npa::name`, with arguments of any types."""
-
-    def stub(): ...
-
-    arguments = [f"argument_{k}" for k in range(argument_count)]
-    stub.__annotations__, stub.__qualname__ = dict.fromkeys(arguments, Any), name
-    stub.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
-        [inspect.Parameter(each, 1, annotation=Any) for each in arguments]
-    )
-    return _native(stub, name, parameters)
-
-
-def _native(stub: Any, name: str, parameters: tuple[Any, ...]) -> Any:
+    arguments = dict.fromkeys(untyped.split(), Any) | arguments
     template = f"<{', '.join(map(_in_cpp, parameters))}>" if parameters else ""
-    signature = inspect.signature(stub)
-    returns = signature.return_annotation is not inspect.Signature.empty
-    call = f"npa::{name}{template}({', '.join(signature.parameters)});"
-    return wp.func_native(f"    {'return ' * returns}{call}\n")(stub)
+    call = f"npa::{name}{template}({', '.join(arguments)});"
+
+    def declare(stub: Any) -> Any:
+        stub.__qualname__ = name
+        stub.__annotations__ = arguments if returns is None else arguments | {"return": returns}
+        stub.__signature__ = inspect.Signature([inspect.Parameter(key, 1) for key in arguments])
+        return wp.func_native(f"    {'return ' * (returns is not None)}{call}\n")(stub)
+
+    # Warp lets a stub return something if its only decorator is some object's `func_native`.
+    native = SimpleNamespace(func_native=lambda: declare)
+
+    @native.func_native()
+    def stub() -> Any: ...
+
+    return stub
 
 
 def namespace(scope: dict[str, Any], **others: Any) -> SimpleNamespace:

@@ -6,7 +6,7 @@ namespace npa {
 
 // Wait until all earlier launches have ended and their writes are visible. Every kernel that is
 // launched early waits, so its end implies the end of all earlier ones.
-CUDA_CALLABLE inline void await_earlier()
+CUDA_CALLABLE inline void wait_for_previous_kernel()
 {
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900
     asm volatile("griddepcontrol.wait;" ::: "memory");

@@ -26,23 +26,18 @@ CUDA_BLOCK = 128
 """Default number of threads of a block."""
 
 
-@native.func_native()
-def await_earlier():
-    """Wait for earlier launches; kernels call it first, before they access memory.
+wait_for_previous_kernel = native.function("wait_for_previous_kernel")
+"""Wait for earlier launches; kernels call it first, before they access memory.
 
-    On compute capability 9.0 and above such a kernel is started before the previous one has ended
-    (`npa_envs/ops/cuda_driver.py`). It must not load by `__ldg` or `ld.global.nc`, which the
-    compiler moves ahead of the wait.
-    """
+On compute capability 9.0 and above such a kernel is started before the previous one has ended
+(`npa_envs/ops/cuda_driver.py`). It must not load by `__ldg` or `ld.global.nc`, which the compiler
+moves ahead of the wait."""
 
+allow_next_launch = native.function("allow_next_launch")
+"""Allow the next kernel's blocks to start before this kernel's blocks have ended.
 
-@native.func_native()
-def allow_next_launch():
-    """Allow the next kernel's blocks to start before this kernel's blocks have ended.
-
-    They start wherever there is room, so a kernel with few blocks may get several of them on one
-    multiprocessor. Only kernels call it whose successor is not slowed down by that.
-    """
+They start wherever there is room, so a kernel with few blocks may get several of them on one
+multiprocessor. Only kernels call it whose successor is not slowed down by that."""
 
 
 @cached_under_lock()
@@ -52,19 +47,14 @@ def make_wide_load(value_type: type) -> Any:
     The array must be dense and aligned to the size of an entry, or to 16 bytes; the index must not
     be negative. Warp's own indexing, without these conditions, takes several instructions more.
     """
-
-    @native.func_native()
-    def wide_load(entries: wp.array[value_type], index: int) -> value_type: ...
-
-    return wide_load
+    return native.function("wide_load", entries=wp.array[value_type], index=int, returns=value_type)
 
 
 load_integer = make_wide_load(wp.int32)
 load_scalar = make_wide_load(wp.float32)
 
-
-wide_store = native.generic("wide_store", 3)
-"""Writes to `entries` at `index` a `value`, in few, wide stores; as for `make_wide_load`."""
+wide_store = native.function("wide_store", untyped="entries index value")
+"""Write a value to an entry of a flat array, in few, wide stores; as for `make_wide_load`."""
 
 
 def scalar_of(value_type: Any) -> Any:
@@ -78,12 +68,10 @@ def make_read_at(value_type: type, alignment: int) -> Any:
 
     The vector's address must be a multiple of `alignment` bytes, 4, 8 or 16: the width of a load.
     """
-    scalar = scalar_of(value_type)
-
-    @native.func_native(value_type, alignment)
-    def read_at(values: wp.array[scalar], index: int) -> value_type: ...
-
-    return read_at
+    values = wp.array[scalar_of(value_type)]
+    return native.function(
+        "read_at", value_type, alignment, values=values, index=int, returns=value_type
+    )
 
 
 @cached_under_lock()
@@ -109,8 +97,8 @@ def make_read_channels(value_type: Any) -> Any:
     return read_channels
 
 
-write_at = native.generic("write_at", 3)
-"""Writes to an array of scalars, from `index` on, a vector `value`, at multiples of 16 bytes."""
+write_at = native.function("write_at", untyped="values index value")
+"""Write a vector to an array of scalars, from `index` on, at multiples of 16 bytes."""
 
 
 @cached_under_lock()
@@ -120,135 +108,58 @@ def make_lane_sum(value_type: type, lanes: int, whole_warps: bool = False, strid
     On a CPU there is one thread. With `whole_warps` all threads of a warp must call it together,
     which takes fewer instructions. Every `stride`-th thread is summed, a power of two.
     """
-
-    @native.func_native(scalar_of(value_type), lanes, whole_warps, stride)
-    def lane_sum(value: value_type) -> value_type: ...
-
-    return lane_sum
+    options = scalar_of(value_type), lanes, whole_warps, stride
+    return native.function("lane_sum", *options, value=value_type, returns=value_type)
 
 
-@cached_under_lock()
-def make_lane_collect(value_type: Any, lanes: int) -> Any:
-    """Return a Warp function that sums matrices [D, W] over threads; each gets some columns.
-
-    Those of thread i are group i of the columns. Its matrix has group i ^ k as k-th, so its own
-    comes first: then all indices are constants.
-    """
-    scalar, (rows, width) = scalar_of(value_type), value_type._shape_
-    lane_columns = wp.types.matrix((rows, width // lanes), scalar)
-
-    @native.func_native(lane_columns, scalar, rows, width, lanes)
-    def lane_collect(value: value_type) -> lane_columns: ...
-
-    return lane_collect
-
-
-@cached_under_lock()
-def make_kept(scalar: type) -> Any:
-    """Return a Warp function that returns its argument, of type `scalar`, kept in a register.
-
-    CUDA's compiler would otherwise convert an integer to float again in every pass of a loop.
-    """
-
-    @native.func_native()
-    def kept(value: scalar) -> scalar: ...
-
-    return kept
-
-
-@cached_under_lock()
-def make_shuffle(scalar: type) -> wp.Function:
-    """Return a Warp function that reads a value of another thread of the warp; on a CPU its own."""
-
-    @native.func_native()
-    def shuffle(value: scalar, thread: int) -> scalar: ...
-
-    return shuffle
-
-
-of_warp = make_shuffle(wp.int32)
-scalar_of_warp = make_shuffle(wp.float32)
-
-
-@native.func_native()
-def of_lane(value: int, lane: int, lanes: wp.uint32) -> int:
-    """Return the value of thread number `lane` of the `lanes` threads that share a particle."""
-
-
-@native.func_native()
-def thread_number() -> int:
-    """Return this thread's index in the launch, without the divisions of `wp.tid`."""
-
-
-@native.func_native()
-def block_number() -> int:
-    """Return this block's index in the launch."""
-
-
-@native.func_native()
-def thread_of_block() -> int:
-    """Return this thread's index in its block."""
-
-
-@native.func_native()
-def sync_block():
-    """Synchronize the threads of the block, and make their writes visible to each other."""
-
-
-@native.func_native()
-def sync_warp():
-    """Synchronize the threads of the warp, and make their writes visible to each other."""
-
-
-@native.func_native()
-def any_in_warp(condition: bool) -> bool:
-    """Return whether a condition is true for some thread of the warp."""
-
-
-@native.func_native()
-def first_in_warp(condition: bool) -> int:
-    """Return the first thread for which a condition is true, -1 for none."""
-
-
-@native.func_native()
-def vote_of_warp(condition: bool) -> wp.uint32:
-    """Return a number with a bit for each thread of the warp: whether a condition is true."""
-
-
-@native.func_native()
-def largest_in_warp(value: int) -> int:
-    """Return the largest value of the warp's threads."""
-
-
-@native.func_native()
-def sum_up_to(value: int) -> int:
-    """Return the sum of the values of this thread and of those before it in the warp."""
-
-
-@native.func_native()
-def thread_of(ends: int, number: int) -> int:
-    """Return the first thread of the warp whose `ends` is above `number`; `ends` must ascend."""
-
-
-@native.func_native()
-def as_number(word: float) -> int:
-    """Return the integer whose bits are those of a float32."""
-
-
-@native.func_native()
-def as_word(number: int) -> float:
-    """Return the float32 whose bits are those of an integer."""
-
-
-@cached_under_lock()
 def make_add_scaled(group: type) -> Any:
-    """Return a Warp function for total + factor * value, rounded after each operation on a CPU.
+    """Return a Warp function for total + factor * value, rounded after each operation on a CPU."""
+    types = {"total": group, "factor": scalar_of(group), "value": group}
+    return native.function("add_scaled", **types, returns=group)
 
-    It uses vector registers of the CPU, which the compiler does not use by itself.
-    """
-    scalar = scalar_of(group)
 
-    @native.func_native()
-    def add_scaled(total: group, factor: scalar, value: group) -> group: ...
+of_warp = native.function("shuffle", value=int, thread=int, returns=int)
+scalar_of_warp = native.function("shuffle", value=float, thread=int, returns=float)
+"""The value of a thread of the warp; on a CPU this thread's own."""
 
-    return add_scaled
+of_lane = native.function("of_lane", value=int, lane=int, lanes=wp.uint32, returns=int)
+"""The value of thread number `lane` of the `lanes` threads that share a particle."""
+
+thread_number = native.function("thread_number", returns=int)
+"""This thread's index in the launch, without the divisions of `wp.tid`."""
+
+block_number = native.function("block_number", returns=int)
+"""This block's index in the launch."""
+
+thread_of_block = native.function("thread_of_block", returns=int)
+"""This thread's index in its block."""
+
+sync_block = native.function("sync_block")
+"""Synchronize the threads of the block, and make their writes visible to each other."""
+
+sync_warp = native.function("sync_warp")
+"""Synchronize the threads of the warp, and make their writes visible to each other."""
+
+any_in_warp = native.function("any_in_warp", condition=bool, returns=bool)
+"""Whether a condition is true for some thread of the warp."""
+
+first_in_warp = native.function("first_in_warp", condition=bool, returns=int)
+"""The first thread for which a condition is true, -1 for none."""
+
+vote_of_warp = native.function("vote_of_warp", condition=bool, returns=wp.uint32)
+"""A number with a bit for each thread of the warp: whether a condition is true."""
+
+largest_in_warp = native.function("largest_in_warp", value=int, returns=int)
+"""The largest value of the warp's threads."""
+
+sum_up_to = native.function("sum_up_to", value=int, returns=int)
+"""The sum of the values of this thread and of those before it in the warp."""
+
+thread_of = native.function("thread_of", ends=int, number=int, returns=int)
+"""The first thread of the warp whose `ends` is above `number`; `ends` must ascend."""
+
+as_number = native.function("as_number", word=float, returns=int)
+"""The integer whose bits are those of a float32."""
+
+as_word = native.function("as_word", number=int, returns=float)
+"""The float32 whose bits are those of an integer."""

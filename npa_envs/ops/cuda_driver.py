@@ -2,8 +2,8 @@
 
 Rollouts and environments are chains of kernels of some microseconds each, and the gaps between
 kernels take a large part of the time. With programmatic dependent launch (compute capability 9.0
-and above) a kernel that begins with `await_earlier` is started before the previous kernel has
-ended, and waits inside until it has: the results are the same.
+and above) a kernel that begins with `wait_for_previous_kernel` is started before the previous one
+has ended, and waits inside until it has: the results are the same.
 
 Such a kernel must not load with `ld.global.nc` or `__ldg`, which declare that nothing writes to
 the memory while the kernel runs: the compiler moves these loads ahead of the wait.
@@ -107,7 +107,8 @@ class DriverLaunch:
     def __init__(self, launch: Any, device: torch.device, addresses: Any) -> None:
         capability = launch.device.get_cuda_compile_arch() or 0
         self._waits = (
-            capability >= OVERLAPPING_CAPABILITY and "await_earlier()" in launch.kernel.adj.source
+            capability >= OVERLAPPING_CAPABILITY
+            and "wait_for_previous_kernel()" in launch.kernel.adj.source
         )
         self._device = device
         self._block = launch.block_dim

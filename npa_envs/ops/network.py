@@ -120,12 +120,9 @@ def _run_network(
     mode: str,
     stored_signs: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
-    """Return outputs [K, out_width] of rows [K, width], and in mode "note" the ReLU masks.
-
-    "rectify" stores no masks; "mask" multiplies by `stored_signs` instead, for backward passes.
-    """
+    """Return outputs [K, out_width] of rows [K, width], and masks; modes: `two_layer_kernel`."""
     steps, tiles = -(-int(rows.shape[1]) // 16), -(-out_width // 8)
-    words = 4 * -(-unit_count // SIGN_UNITS) if mode == "note" else 0
+    words = 4 * -(-unit_count // SIGN_UNITS) if mode == "relu_store_mask" else 0
     signs = rows.new_empty(rows.shape[0], words, dtype=torch.int32)
     output = rows.new_empty(rows.shape[0], out_width)
     warps = -(-rows.shape[0] // ROW_GROUP)
@@ -197,7 +194,9 @@ class _Network(torch.autograd.Function):
         arranged: ArrangedWeights,
     ) -> Tensor:
         update: Tensor
-        update, signs = _run_network(rows, arranged.forward, out_width, unit_count, "note", None)
+        update, signs = _run_network(
+            rows, arranged.forward, out_width, unit_count, "relu_store_mask", None
+        )
         ctx.save_for_backward(rows, signs, *arranged.backward)
         ctx.unit_count = unit_count
         return update
@@ -209,7 +208,7 @@ class _Network(torch.autograd.Function):
         unit_count, width = ctx.unit_count, rows.shape[1]
         rows_bar = weights_bar = None
         if ctx.needs_input_grad[0]:
-            rows_bar, _ = _run_network(update_bar, arranged, width, unit_count, "mask", signs)
+            rows_bar, _ = _run_network(update_bar, arranged, width, unit_count, "apply_mask", signs)
         if ctx.needs_input_grad[1]:
             weights_bar = _weight_gradients(rows, update_bar, signs, arranged, unit_count)
         return rows_bar, weights_bar, None, None, None
@@ -237,7 +236,7 @@ def run_network(
         output_weight = weights[end:].view(out_width, unit_count)
         arranged = arrange(hidden_weight, output_weight, with_backward=True)
     if not needs_gradient:
-        return _run_network(rows, arranged.forward, out_width, unit_count, "rectify", None)[0]
+        return _run_network(rows, arranged.forward, out_width, unit_count, "relu", None)[0]
     update: Tensor = _Network.apply(  # type: ignore[no-untyped-call]
         rows, weights, out_width, unit_count, arranged
     )

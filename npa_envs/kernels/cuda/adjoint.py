@@ -8,19 +8,18 @@ Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
 """
 
 from types import SimpleNamespace
+from typing import Any
 
 import warp as wp
 
 from npa_envs.kernels import native_functions as native
 from npa_envs.kernels.domain import SLACK, TERMS_PER_SUM, domain_types, kernel_module
-from npa_envs.kernels.mathematics import make_log_scale_pull
 from npa_envs.kernels.primitives import (
     CUDA_BLOCK,
     WARP,
     allow_next_launch,
     any_in_warp,
     as_word,
-    await_earlier,
     first_in_warp,
     largest_in_warp,
     load_integer,
@@ -31,6 +30,7 @@ from npa_envs.kernels.primitives import (
     sum_up_to,
     thread_of,
     vote_of_warp,
+    wait_for_previous_kernel,
     wide_store,
 )
 from npa_envs.thread_lock import cached_under_lock
@@ -59,86 +59,44 @@ MAX_LENGTH = 3.4028234663852886e38
 load_channels = make_wide_load(CHANNELS)
 
 
-@cached_under_lock()
-def make_sum_listed(space_dim: int, width: int, weight_count: int, periodic: bool) -> wp.Function:
-    """Return a Warp function that sums cotangents of listed rows, weighted by kernels.
-
-    It sums for a warp's 8 particles. A row of perception has `width` cotangents for each of
-    `weight_count` weights of a pair: 1 of the smoothing kernel, and perhaps D of the spiky
-    gradient.
-    """
-    vector = wp.types.vector(space_dim, wp.float32)
-
-    @native.func_native(space_dim, width, weight_count, periodic)
-    def sum_listed(
-        address: wp.uint32,
-        count: int,
-        position: vector,
-        inverse_eps: float,
-        inverse_squared_eps: float,
-        box: vector,
-        inverse_box: vector,
-        channels: wp.array[wp.float32],
-        value: CHANNELS,
-    ) -> CHANNELS: ...
-
-    return sum_listed
-
-
-@native.func_native(CUDA_BLOCK // WARP, LIST_ENTRIES)
-def row_list_address() -> wp.uint32:
-    """Return the address in shared memory of this warp's list of nearby rows."""
+row_list_address = native.function(
+    "row_list_address", CUDA_BLOCK // WARP, LIST_ENTRIES, returns=wp.uint32
+)
+"""The address in shared memory of this warp's list of nearby rows."""
 
 
 @cached_under_lock()
-def make_read_columns(count: int) -> wp.Function:
+def make_read_columns(count: int) -> Any:
     """Return a Warp function that reads `count` adjacent numbers of a row, 0 from `end` on."""
+    place = {"values": wp.array2d[wp.float32], "row": int, "column": int, "end": int}
     result_type = wp.types.vector(count, wp.float32)
-
-    @native.func_native(count)
-    def read_columns(
-        values: wp.array2d[wp.float32], row: int, column: int, end: int
-    ) -> result_type: ...
-
-    return read_columns
-
-
-@native.func_native()
-def write_columns(values: wp.array2d[wp.float32], row: int, column: int, numbers: CHANNELS):
-    """Write four adjacent numbers of a matrix row, except those beyond its end."""
-
-
-@native.func_native()
-def append_entry(address: wp.uint32, count: int, accepted: bool, entry: ENTRY) -> int:
-    """Append the entries of threads with `accepted` to a list of `count`; return its new length."""
-
-
-@native.func_native()
-def pad_list(address: wp.uint32, count: int, entry: ENTRY) -> int:
-    """Pad a list of `count` entries with `entry` to a multiple of 8; return its new length."""
-
-
-@native.func_native()
-def keep_unsummed(address: wp.uint32, summed_count: int, count: int):
-    """Move a list's entries from `summed_count` to `count`, at most seven, to its beginning."""
-
-
-@native.func_native()
-def prefetch_columns(values: wp.array2d[wp.float32], row: int, column: int):
-    """Load the memory at a row and column of a matrix into the L2 cache, for a later read."""
-
-
-@native.func_native()
-def regroup_tile(total: CHANNELS) -> CHANNELS:
-    """Exchange sums between threads: from two channels of two particles to four channels of one."""
-
-
-@native.func_native()
-def smallest_in_tile(value: float) -> float:
-    """Return the smallest value among a warp's 8 particles, each of which has four threads."""
+    return native.function("read_columns", count, **place, returns=result_type)
 
 
 read_channels = make_read_columns(THREAD_CHANNELS)
+
+write_columns = native.function("write_columns", untyped="values row column numbers")
+"""Write four adjacent numbers of a matrix row, except those beyond its end."""
+
+append_entry = native.function(
+    "append_entry", address=wp.uint32, count=int, accepted=bool, entry=ENTRY, returns=int
+)
+"""Append the entries of threads with `accepted` to a list of `count`; return its new length."""
+
+pad_list = native.function("pad_list", address=wp.uint32, count=int, entry=ENTRY, returns=int)
+"""Pad a list of `count` entries with `entry` to a multiple of 8; return its new length."""
+
+keep_unsummed = native.function("keep_unsummed", untyped="address summed_count count")
+"""Move a list's entries from `summed_count` to `count`, at most seven, to its beginning."""
+
+prefetch_columns = native.function("prefetch_columns", untyped="values row column")
+"""Load the memory at a row and column of a matrix into the L2 cache, for a later read."""
+
+regroup_tile = native.function("regroup_tile", total=CHANNELS, returns=CHANNELS)
+"""Exchange sums between threads: from two channels of two particles to four channels of one."""
+
+smallest_in_tile = native.function("smallest_in_tile", value=float, returns=float)
+"""The smallest value among a warp's 8 particles, each of which has four threads."""
 
 
 def row_search(space_dim: int, periodic: bool) -> SimpleNamespace:
@@ -278,14 +236,30 @@ def listed_adjoint(
     vector, Domain = space.vector, space.Domain
     thread_gradient = wp.types.matrix((space_dim, THREAD_CHANNELS), scalar)
     weight_count = 1 + space_dim if state_gradient else 1
-    topic = "listed_adjoint" if state_gradient else "listed_smoothing_adjoint"
-    topic += "_in_box" * periodic + "_grouped" * grouped
-    module = kernel_module(topic, space_dim, scalar, width)
+    module_name = "listed_adjoint" if state_gradient else "listed_smoothing_adjoint"
+    module_name += "_in_box" * periodic + "_grouped" * grouped
+    module = kernel_module(module_name, space_dim, scalar, width)
     load_vector = make_wide_load(vector)
     search = row_search(space_dim, periodic)
     parts = width // THREAD_CHANNELS
-    sum_listed = make_sum_listed(space_dim, width, weight_count, periodic)
-    log_scale_pull = make_log_scale_pull(vector)
+    # Of a warp's 8 particles: the sum of the listed rows' cotangents, weighted by kernels.
+    sum_listed = native.function(
+        "sum_listed",
+        *(space_dim, width, weight_count, periodic),
+        address=wp.uint32,
+        count=int,
+        position=vector,
+        inverse_eps=float,
+        inverse_squared_eps=float,
+        box=vector,
+        inverse_box=vector,
+        channels=wp.array[scalar],
+        value=CHANNELS,
+        returns=CHANNELS,
+    )
+    log_scale_pull = native.function(
+        "log_scale_pull", scaled=vector, cotangent=vector, returns=vector
+    )
     read_gradients = make_read_columns(THREAD_CHANNELS * space_dim)
 
     @wp.kernel(enable_backward=False, module=module, grid_stride=False)
@@ -306,7 +280,7 @@ def listed_adjoint(
 
         Those of smoothed states are multiplied by `blur_scale`.
         """
-        await_earlier()
+        wait_for_previous_kernel()
         allow_next_launch()
         thread = wp.tid()
         row_parts = group_count * wp.static(parts)
@@ -355,7 +329,7 @@ def listed_adjoint(
         group_count: int,
         starts: wp.array[wp.int32],
         particles: wp.array[scalar],
-        source: wp.array[wp.int32],
+        original_index: wp.array[wp.int32],
         row_of: wp.array[wp.int32],
         row_positions: wp.array[vector],
         row_kernel_sum: wp.array[vector],
@@ -370,7 +344,7 @@ def listed_adjoint(
         A world's particles are `tile_count` tiles of 8; a warp serves a tile and a group of
         channels. `norm` is the normalising constant of the kernels, which multiplies the sum.
         """
-        await_earlier()
+        wait_for_previous_kernel()
         allow_next_launch()
         thread = wp.tid()
         lane = thread & wp.static(WARP - 1)
@@ -388,7 +362,7 @@ def listed_adjoint(
         written = first + 2 * (lane & 3) + ((lane >> 2) & 1)
         part = lane >> 3
         channel = g * wp.static(width) + part * wp.static(THREAD_CHANNELS)
-        i = load_integer(source, wp.min(written, end - 1))
+        i = load_integer(original_index, wp.min(written, end - 1))
         position = search.load_position(particles, wp.min(k, end - 1))
         own_row = load_integer(row_of, i)
         if own_row >= 0 and channel < state_dim:

@@ -23,11 +23,11 @@ from npa_envs.kernels.mathematics import falloff_within, smoothing_of
 from npa_envs.kernels.primitives import (
     WARP,
     as_word,
-    await_earlier,
     load_integer,
     make_lane_sum,
     make_wide_load,
     thread_number,
+    wait_for_previous_kernel,
     wide_store,
 )
 from npa_envs.thread_lock import cached_under_lock
@@ -67,7 +67,7 @@ TILE_REGISTERS = 64
 def listed_density(
     space_dim: int, lanes: int, periodic: bool, capacity: int, masked: bool
 ) -> wp.Kernel:
-    """Return the kernel that computes densities and lists neighbours, `lanes` threads a particle.
+    """Return the kernel that computes densities and lists neighbours, `lanes` threads per particle.
 
     `capacity`: longest list. `masked`: only active particles get lists. With several lanes,
     launches have complete warps, whose threads write lists together.
@@ -82,22 +82,20 @@ def listed_density(
     positions_ahead = wp.types.matrix((many, space_dim), scalar)
     room = min(capacity, SHARE_OF_LIST * capacity // lanes)
 
-    @native.func_native(room, many, LIST_BLOCK)
-    def list_address() -> wp.uint32: ...
-
-    @native.func_native(LIST_BLOCK)
-    def list_end_of(address: wp.uint32, entries: int) -> LIST_END: ...
-
-    @native.func_native(LIST_BLOCK)
-    def append_step(end: LIST_END, weight: float, step: int) -> LIST_END: ...
-
-    @native.func_native(room, LIST_BLOCK)
-    def cut_off(address: wp.uint32, end: LIST_END) -> LIST_END: ...
-
-    @native.func_native(room, LIST_BLOCK, capacity, lanes)
-    def leave_list(
-        address: wp.uint32, list_end: LIST_END, row: int, lists: wp.array3d[wp.int16]
-    ) -> int: ...
+    list_address = native.function("list_address", room, many, LIST_BLOCK, returns=wp.uint32)
+    list_end_of = native.function(
+        "list_end_of", LIST_BLOCK, address=wp.uint32, entries=int, returns=LIST_END
+    )
+    append_step = native.function(
+        "append_step", LIST_BLOCK, end=LIST_END, weight=float, step=int, returns=LIST_END
+    )
+    bounds = {"address": wp.uint32, "end": LIST_END}
+    cut_off = native.function("cut_off", room, LIST_BLOCK, **bounds, returns=LIST_END)
+    sizes = room, LIST_BLOCK, capacity, lanes
+    lists_type = wp.array3d[wp.int16]
+    leave_list = native.function(
+        "leave_list", *sizes, **bounds, row=int, lists=lists_type, returns=int
+    )
 
     @wp.func
     def falloff_at(domain: Domain, offset: vector):
@@ -124,11 +122,11 @@ def listed_density(
         last = wp.int32(wp.floor(within_cell[0] + along))
         return wp.max(first + 2, 0), wp.max(2 - last, 0)
 
-    topic = "listed_density" + "_in_box" * periodic + f"_{capacity}" + "_of_rows" * masked
+    module_name = "listed_density" + "_in_box" * periodic + f"_{capacity}" + "_of_rows" * masked
 
     @wp.kernel(
         enable_backward=False,
-        module=kernel_module(topic, space_dim, scalar, 0, lanes),
+        module=kernel_module(module_name, space_dim, scalar, 0, lanes),
         cuda_max_registers=CUDA_REGISTERS,
         grid_stride=False,
     )
@@ -138,7 +136,7 @@ def listed_density(
         sorted_cell: wp.array[wp.int32],
         sorted_positions: wp.array[vector],
         state_index: wp.array[wp.int32],
-        source: wp.array[wp.int32],
+        original_index: wp.array[wp.int32],
         row_of: wp.array[wp.int32],
         # outputs
         particles: wp.array[particle],
@@ -151,7 +149,7 @@ def listed_density(
         `records` also have the index of the particle's state, in 2D; `particles` is left out if
         empty. A list that is too long is not written; its length is then larger than the capacity.
         """
-        await_earlier()
+        wait_for_previous_kernel()
         thread = wp.tid()
         k = thread >> wp.static(lanes.bit_length() - 1)
         lane = thread & wp.static(lanes - 1)
@@ -164,7 +162,7 @@ def listed_density(
         cell = space.cell_at(domain, local)
         row = k
         if wp.static(masked):
-            row = load_integer(row_of, load_integer(source, k))
+            row = load_integer(row_of, load_integer(original_index, k))
         row = wp.where(inside and row < list_lengths.shape[0], row, wp.int32(-1))
         list_begin = list_address()
         # A particle without a row is treated as if its list were too long.
@@ -259,26 +257,28 @@ def tiled_density(periodic: bool, capacity: int, masked: bool) -> wp.Kernel:
     vector, particle, Domain = space.vector, space.particle, space.Domain
     load_vector = make_wide_load(vector)
 
-    @native.func_native(capacity, periodic)
-    def density_of_tile(
-        domain: Domain,
-        starts: wp.array[wp.int32],
-        sorted_cell: wp.array[wp.int32],
-        sorted_positions: wp.array[vector],
-        base: int,
-        first: int,
-        k: int,
-        inside: bool,
-        row: int,
-        lists: wp.array3d[wp.int16],
-        list_lengths: wp.array[wp.int32],
-    ) -> float: ...
+    density_of_tile = native.function(
+        "density_of_tile",
+        *(capacity, periodic),
+        domain=Domain,
+        starts=wp.array[wp.int32],
+        sorted_cell=wp.array[wp.int32],
+        sorted_positions=wp.array[vector],
+        base=int,
+        first=int,
+        k=int,
+        inside=bool,
+        row=int,
+        lists=wp.array3d[wp.int16],
+        list_lengths=wp.array[wp.int32],
+        returns=float,
+    )
 
-    topic = "tiled_density" + "_in_box" * periodic + f"_{capacity}" + "_of_rows" * masked
+    module_name = "tiled_density" + "_in_box" * periodic + f"_{capacity}" + "_of_rows" * masked
 
     @wp.kernel(
         enable_backward=False,
-        module=kernel_module(topic, 2, wp.float32),
+        module=kernel_module(module_name, 2, wp.float32),
         cuda_max_registers=TILE_REGISTERS,
         grid_stride=False,
     )
@@ -289,7 +289,7 @@ def tiled_density(periodic: bool, capacity: int, masked: bool) -> wp.Kernel:
         sorted_cell: wp.array[wp.int32],
         sorted_positions: wp.array[vector],
         state_index: wp.array[wp.int32],
-        source: wp.array[wp.int32],
+        original_index: wp.array[wp.int32],
         row_of: wp.array[wp.int32],
         # outputs
         particles: wp.array[particle],
@@ -298,7 +298,7 @@ def tiled_density(periodic: bool, capacity: int, masked: bool) -> wp.Kernel:
         list_lengths: wp.array[wp.int32],
     ):
         """Write what the kernel of `listed_density` writes, but lists one after the other."""
-        await_earlier()
+        wait_for_previous_kernel()
         thread = thread_number()
         tile = thread >> wp.static(WARP.bit_length() - 1)
         lane = thread & wp.static(WARP - 1)
@@ -311,7 +311,7 @@ def tiled_density(periodic: bool, capacity: int, masked: bool) -> wp.Kernel:
         k = wp.where(inside, k, first)
         row = k
         if wp.static(masked):
-            row = load_integer(row_of, load_integer(source, k))
+            row = load_integer(row_of, load_integer(original_index, k))
         row = wp.where(inside and row < list_lengths.shape[0], row, wp.int32(-1))
         total = density_of_tile(
             domain,

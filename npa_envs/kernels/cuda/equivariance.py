@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from npa_envs.kernels import native_functions as native
-from npa_envs.kernels.primitives import WARP, await_earlier
+from npa_envs.kernels.primitives import WARP, wait_for_previous_kernel
 from npa_envs.thread_lock import cached_under_lock
 
 READ_WARPS, PULL_WARPS, STEER_WARPS, MIXING_SUM_WARPS = 4, 4, 4, 16
@@ -58,8 +58,14 @@ def row_kernels(
     form = space_dim, scalars, perceived, mixed_count, chiral
     module = native.module(f"npa_envs.kernels.vector_rows_{'_'.join(str(int(k)) for k in form)}")
     warp_rows = rows_of_warp(mixed_count)
-    read_vectors = native.generic("read_vectors", 4, *form, READ_WARPS, warp_rows)
-    pull_back_vectors = native.generic("pull_back_vectors", 7, *form, PULL_WARPS, warp_rows)
+    read_vectors = native.function(
+        "read_vectors", *form, READ_WARPS, warp_rows, untyped="rows mixing mixed inputs"
+    )
+    pull_back_vectors = native.function(
+        "pull_back_vectors",
+        *(*form, PULL_WARPS, warp_rows),
+        untyped="rows mixing mixed mixed_bar inputs_bar rows_bar partial_sums",
+    )
 
     @wp.kernel(enable_backward=False, module=module)
     def read_rows(
@@ -70,7 +76,7 @@ def row_kernels(
         inputs: wp.array2d[wp.float32],
     ):
         """Write the mixed vectors and the network's inputs, from rows of perception."""
-        await_earlier()
+        wait_for_previous_kernel()
         read_vectors(rows, mixing, mixed, inputs)
 
     @wp.kernel(enable_backward=False, module=module)
@@ -85,7 +91,7 @@ def row_kernels(
         partial_sums: wp.array2d[wp.float32],
     ):
         """Write the cotangents of rows, and each block's sum of those of the mixing weights."""
-        await_earlier()
+        wait_for_previous_kernel()
         pull_back_vectors(rows, mixing, mixed, mixed_bar, inputs_bar, rows_bar, partial_sums)
 
     return SimpleNamespace(read_rows=read_rows, pull_back_rows=pull_back_rows)
@@ -94,7 +100,9 @@ def row_kernels(
 @cached_under_lock()
 def mixing_sum() -> wp.Kernel:
     """Return the kernel that adds up the blocks' sums of the mixing weights' gradients."""
-    add_partial_sums = native.generic("add_partial_sums", 2, MIXING_SUM_WARPS)
+    add_partial_sums = native.function(
+        "add_partial_sums", MIXING_SUM_WARPS, untyped="partial_sums total"
+    )
 
     @wp.kernel(
         enable_backward=False,
@@ -107,7 +115,7 @@ def mixing_sum() -> wp.Kernel:
         total: wp.array[wp.float32],
     ):
         """Add up the mixing weights' gradients that the blocks of `pull_back_rows` have written."""
-        await_earlier()
+        wait_for_previous_kernel()
         add_partial_sums(partial_sums, total)
 
     return add_blocks
@@ -122,8 +130,11 @@ def steering_kernels(space_dim: int, mixed_count: int, chiral: bool) -> SimpleNa
     """
     form = space_dim, mixed_count, chiral
     module = native.module(f"npa_envs.kernels.steering_{'_'.join(str(int(k)) for k in form)}")
-    steer_by_gates = native.generic("steer_by_gates", 4, *form, STEER_WARPS, STEERED_ROWS)
-    pull_back_gates = native.generic("pull_back_gates", 6, *form, STEER_WARPS, STEERED_ROWS)
+    sizes = *form, STEER_WARPS, STEERED_ROWS
+    steer_by_gates = native.function("steer_by_gates", *sizes, untyped="output mixed signs update")
+    pull_back_gates = native.function(
+        "pull_back_gates", *sizes, untyped="output mixed signs update_bar output_bar mixed_bar"
+    )
 
     @wp.kernel(enable_backward=False, module=module)
     def steer(
@@ -134,7 +145,7 @@ def steering_kernels(space_dim: int, mixed_count: int, chiral: bool) -> SimpleNa
         update: wp.array2d[wp.float32],
     ):
         """Write updates from a network's gates and state changes, and from mixed vectors."""
-        await_earlier()
+        wait_for_previous_kernel()
         steer_by_gates(output, mixed, signs, update)
 
     @wp.kernel(enable_backward=False, module=module)
@@ -148,7 +159,7 @@ def steering_kernels(space_dim: int, mixed_count: int, chiral: bool) -> SimpleNa
         mixed_bar: wp.array[wp.float32],
     ):
         """Write the cotangents of outputs and mixed vectors from those of updates."""
-        await_earlier()
+        wait_for_previous_kernel()
         pull_back_gates(output, mixed, signs, update_bar, output_bar, mixed_bar)
 
     return SimpleNamespace(steer=steer, pull_back_steering=pull_back_steering)

@@ -91,6 +91,7 @@ __device__ inline int steps_at(const wp::array_t<wp::int16>& lists, int row, int
     return *reinterpret_cast<const int*>(from);
 }
 
+// Entry 0 or 1 of two packed entries.
 __device__ inline int step_of(int steps, int entry) { return (short)(steps >> 16 * entry); }
 
 }  // namespace npa

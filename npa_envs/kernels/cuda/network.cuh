@@ -11,9 +11,8 @@
 
 namespace npa {
 
-// Treatment of hidden units between two products: ReLU, ReLU that also stores its mask, or a stored
-// mask.
-enum Between { RECTIFY, NOTE, MASK };
+// What is done to hidden units between two products.
+enum HiddenMode { RELU, RELU_STORE_MASK, APPLY_MASK };
 
 // The first of two numbers is in the lower half of a word.
 __device__ inline void split_half(float a, float b, unsigned& high, unsigned& low)
@@ -63,7 +62,7 @@ __device__ inline float scale_to(float size, unsigned target)
 }
 
 // STEPS: groups of 16 input columns. TILES: groups of 8 output columns.
-template <int STEPS, int TILES, Between BETWEEN, unsigned TARGET, typename Half>
+template <int STEPS, int TILES, HiddenMode MODE, unsigned TARGET, typename Half>
 __device__ inline void two_layers(
     int unit_count, const wp::array_t<float>& rows, const wp::array_t<Half>& hidden_weights,
     const wp::array_t<Half>& output_weights, const wp::array_t<float>& output_unscale,
@@ -133,7 +132,7 @@ __device__ inline void two_layers(
             const int row = first + 8 * half;
             int* word = signs_of.data + (size_t)row * words + (unit / 8) * 4 + t;
             unsigned& mask = signs[half];
-            if constexpr (BETWEEN == MASK) {
+            if constexpr (MODE == APPLY_MASK) {
                 if ((unit & 7) == 0 && row < count) mask = *word;
             }
             #pragma unroll
@@ -144,25 +143,25 @@ __device__ inline void two_layers(
                     const int entry = 2 * half + i;
                     value[i] = small[0][tile][entry] + small[1][tile][entry] + sum[tile][entry];
                     const unsigned bit = 1u << (2 * tile + i);
-                    if constexpr (BETWEEN == MASK) {
+                    if constexpr (MODE == APPLY_MASK) {
                         if (!(mask & bit)) value[i] = 0.0f;
                     } else if (value[i] <= 0.0f) {
                         // A hidden unit that is NaN stays so, as it does in torch.
                         value[i] = 0.0f;
-                    } else if (BETWEEN == NOTE) {
+                    } else if (MODE == RELU_STORE_MASK) {
                         mask |= bit << (4 * (unit & 7));
                     }
                 }
                 split_half(
                     value[0], value[1], high_units[2 * tile + half], low_units[2 * tile + half]);
             }
-            if constexpr (BETWEEN == NOTE) {
+            if constexpr (MODE == RELU_STORE_MASK) {
                 if ((unit & 7) == 7 || unit + 1 == units) {
                     if (row < count) *word = mask;
                     mask = 0u;
                 }
             }
-            if constexpr (BETWEEN == MASK) mask >>= 4;
+            if constexpr (MODE == APPLY_MASK) mask >>= 4;
         }
         #pragma unroll
         for (int tile = 0; tile < TILES; ++tile) {
@@ -255,14 +254,14 @@ __device__ inline void weight_sums(
             : "=r"(to[0]), "=r"(to[1]), "=r"(to[2]), "=r"(to[3])
             : "r"((unsigned)__cvta_generic_to_shared(from)) : "memory");
     };
-    const auto fetch_turned = [](unsigned (&to)[4], const unsigned short* from) {
+    const auto fetch_transposed = [](unsigned (&to)[4], const unsigned short* from) {
         asm volatile("ldmatrix.sync.aligned.m8n8.x4.trans.shared.b16 {%0, %1, %2, %3}, [%4];"
             : "=r"(to[0]), "=r"(to[1]), "=r"(to[2]), "=r"(to[3])
             : "r"((unsigned)__cvta_generic_to_shared(from)) : "memory");
     };
     // Where this lane's part of 16 rows and 16 columns begins, as stored and transposed.
     const int straight = (lane & 7) + (lane >> 4) * 8, straight_column = (lane >> 3 & 1) * 8;
-    const int turned = lane & 15, turned_column = (lane >> 4) * 8;
+    const int transposed = lane & 15, transposed_column = (lane >> 4) * 8;
 
     // Adds the transposed product of two groups of 16 units and of a fragment's rows and columns.
     using Units = float[2][2][4];
@@ -356,9 +355,9 @@ __device__ inline void weight_sums(
             #pragma unroll
             for (int tile = 0; tile < TILES; tile += 2) {
                 unsigned high[4], low[4];
-                const int from = (row + turned) * pitch + 8 * tile + turned_column;
-                fetch_turned(high, inputs[0] + from);
-                fetch_turned(low, inputs[1] + from);
+                const int from = (row + transposed) * pitch + 8 * tile + transposed_column;
+                fetch_transposed(high, inputs[0] + from);
+                fetch_transposed(low, inputs[1] + from);
                 #pragma unroll
                 for (int other = 0; other < 2 && tile + other < TILES; ++other) {
                     #pragma unroll
@@ -371,9 +370,9 @@ __device__ inline void weight_sums(
             #pragma unroll
             for (int tile = 0; tile < OUT_TILES; tile += 2) {
                 unsigned high[4], low[4];
-                const int from = (row + turned) * out_pitch + 8 * tile + turned_column;
-                fetch_turned(high, bars[0] + from);
-                fetch_turned(low, bars[1] + from);
+                const int from = (row + transposed) * out_pitch + 8 * tile + transposed_column;
+                fetch_transposed(high, bars[0] + from);
+                fetch_transposed(low, bars[1] + from);
                 #pragma unroll
                 for (int other = 0; other < 2 && tile + other < OUT_TILES; ++other) {
                     #pragma unroll

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from npa_envs.kernels import native_functions as native
-from npa_envs.kernels.primitives import WARP, allow_next_launch, await_earlier
+from npa_envs.kernels.primitives import WARP, allow_next_launch, wait_for_previous_kernel
 from npa_envs.thread_lock import cached_under_lock
 
 UNIT_GROUP = 16
@@ -41,8 +41,8 @@ WIDE, WIDE_REGISTERS = range(81, 97), 128
 def two_layer_kernel(steps: int, tiles: int, mode: str) -> wp.Kernel:
     """Return the kernel that applies a network of two layers to rows; a warp serves 16 rows.
 
-    Rows have at most 16 `steps` columns, outputs at most 8 `tiles`. `mode` "rectify" applies ReLU
-    to hidden units, "note" also stores its mask, and "mask" applies a stored mask instead.
+    Rows have at most 16 `steps` columns, outputs at most 8 `tiles`. `mode` "relu" applies ReLU
+    to hidden units, "relu_store_mask" also stores its mask, and "apply_mask" applies a stored one.
 
     Arguments: number of hidden units H, a multiple of 16; rows [K, width]; weights of both layers,
     from `arrange_hidden` and `arrange_output`; scales of the outputs [8 `tiles`]; masks of ReLU, a
@@ -53,7 +53,11 @@ def two_layer_kernel(steps: int, tiles: int, mode: str) -> wp.Kernel:
     name = f"npa_envs.kernels.network_{mode}_{steps}_{tiles}"
     registers = WIDE_REGISTERS if max(16 * steps, 8 * tiles) in WIDE else LAYER_REGISTERS
 
-    two_layers = native.generic("two_layers", 7, steps, tiles, mode.upper(), ROW_TARGET)
+    two_layers = native.function(
+        "two_layers",
+        *(steps, tiles, mode.upper(), ROW_TARGET),
+        untyped="unit_count rows hidden_weights output_weights output_unscale signs output",
+    )
 
     @wp.kernel(enable_backward=False, module=native.module(name), cuda_max_registers=registers)
     def network_layers(
@@ -67,7 +71,7 @@ def two_layer_kernel(steps: int, tiles: int, mode: str) -> wp.Kernel:
         output: wp.array2d[wp.float32],
     ):
         """Write a network's outputs for rows of inputs; its hidden units stay in registers."""
-        await_earlier()
+        wait_for_previous_kernel()
         two_layers(unit_count, rows, hidden_weights, output_weights, output_unscale, signs, output)
 
     return network_layers
@@ -88,8 +92,13 @@ def weight_gradient_kernels(
     variant = f"{steps}_{tiles}_{out_tiles}_{warps}_{unit_blocks}_{words}"
     module = native.module(f"npa_envs.kernels.network_gradients_{variant}")
     sizes = steps, tiles, out_tiles, warps, unit_blocks, words, ROW_TILE
-    weight_sums = native.generic("weight_sums", 8, *sizes)
-    add_partial_sums = native.generic("add_partial_sums", 2, SUM_WARPS)
+    weight_sums = native.function(
+        "weight_sums",
+        *sizes,
+        untyped="unit_count part_rows rows output_bar signs hidden_weights output_weights "
+        "partial_sums",
+    )
+    add_partial_sums = native.function("add_partial_sums", SUM_WARPS, untyped="partial_sums total")
 
     @wp.kernel(enable_backward=False, module=module, cuda_max_registers=GRADIENT_REGISTERS)
     def sum_weight_gradients(
@@ -104,7 +113,7 @@ def weight_gradient_kernels(
         partial_sums: wp.array2d[wp.float32],
     ):
         """Write both layers' weight gradients, summed over each range of `part_rows` rows."""
-        await_earlier()
+        wait_for_previous_kernel()
         allow_next_launch()
         weight_sums(
             unit_count,
@@ -124,16 +133,15 @@ def weight_gradient_kernels(
         total: wp.array[wp.float32],
     ):
         """Add up the weight gradients of all ranges of rows."""
-        await_earlier()
+        wait_for_previous_kernel()
         allow_next_launch()
         add_partial_sums(partial_sums, total)
 
     return SimpleNamespace(sum_weight_gradients=sum_weight_gradients, add_parts=add_parts)
 
 
-@native.func_native()
-def scale_to(size: float, exponent: wp.uint32) -> float:
-    """Return the power of two that scales a positive number into [2^exponent, 2^(exponent + 1))."""
+scale_to = native.function("scale_to", size=float, exponent=wp.uint32, returns=float)
+"""The power of two that scales a positive number into [2^exponent, 2^(exponent + 1))."""
 
 
 @cached_under_lock()
@@ -152,7 +160,7 @@ def arrangement_kernels() -> SimpleNamespace:
         fragments: wp.array[wp.float16],
     ):
         """Scale and lay out a first layer's weights [H, width]: H / 8, ceil(width / 16) warps."""
-        await_earlier()
+        wait_for_previous_kernel()
         tile, step, lane = wp.tid()
         unit = 8 * tile + lane / 4
         size = wp.float32(0.0)
@@ -180,7 +188,7 @@ def arrangement_kernels() -> SimpleNamespace:
         fragments: wp.array[wp.float16],
     ):
         """Scale and lay out a second layer's weights [width, H]: H / 16, ceil(width / 8) warps."""
-        await_earlier()
+        wait_for_previous_kernel()
         step, tile, lane = wp.tid()
         column = 8 * tile + lane / 4
         size = wp.float32(0.0)
@@ -207,7 +215,7 @@ def arrangement_kernels() -> SimpleNamespace:
         fragments: wp.array[wp.bfloat16],
     ):
         """Lay out weights [H, width] as products' left operand: H / 16, ceil(width / 16) warps."""
-        await_earlier()
+        wait_for_previous_kernel()
         group, step, lane = wp.tid()
         fragment = (group * ((weights.shape[1] + 15) / 16) + step) * 2 * wp.static(WARP)
         first = (fragment + lane) * 8

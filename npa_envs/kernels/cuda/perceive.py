@@ -31,7 +31,7 @@ from npa_envs.kernels.mathematics import (
     log_scale_of_square,
     log_scaled_huge,
     make_corrected,
-    perception_topic,
+    perception_module_name,
     smoothing,
     spiky_factor_f64,
     within,
@@ -41,7 +41,6 @@ from npa_envs.kernels.primitives import (
     CUDA_LANES,
     any_in_warp,
     as_number,
-    await_earlier,
     largest_in_warp,
     load_integer,
     make_lane_sum,
@@ -49,6 +48,7 @@ from npa_envs.kernels.primitives import (
     of_lane,
     sync_warp,
     thread_number,
+    wait_for_previous_kernel,
 )
 from npa_envs.thread_lock import cached_under_lock
 
@@ -69,8 +69,8 @@ CANDIDATES = 16
 
 load_record = make_wide_load(RECORD)
 
-stage = native.generic("stage", 3)
-"""Writes to a `slot`, at an offset of 32-bit words, a `value`."""
+stage = native.function("stage", untyped="slot word value")
+"""Write a value to a slot, at an offset of 32-bit words."""
 
 
 class PerceptionVariant(NamedTuple):
@@ -113,11 +113,11 @@ class PerceptionVariant(NamedTuple):
 
     def module(self) -> wp.Module:
         """Return the Warp module of the kernel with these options."""
-        topic = "listed_" + perception_topic(self.state_gradient, self.moment_inverse)
-        topic += "_in_box" * self.periodic + "_grouped" * self.grouped + f"_{self.capacity}"
-        topic += "_for_adjoint" * self.for_adjoint + "_by_place" * self.per_particle
-        topic += "_tiled" * self.tiled
-        return kernel_module(topic, self.space_dim, wp.float32, self.width, self.lanes)
+        module_name = "listed_" + perception_module_name(self.state_gradient, self.moment_inverse)
+        module_name += "_in_box" * self.periodic + "_grouped" * self.grouped + f"_{self.capacity}"
+        module_name += "_for_adjoint" * self.for_adjoint + "_by_place" * self.per_particle
+        module_name += "_tiled" * self.tiled
+        return kernel_module(module_name, self.space_dim, wp.float32, self.width, self.lanes)
 
 
 def slot_functions(variant: PerceptionVariant, lane_channels: type) -> SimpleNamespace:
@@ -129,29 +129,23 @@ def slot_functions(variant: PerceptionVariant, lane_channels: type) -> SimpleNam
     # The additional 16 bytes spread a warp's slots over the banks of shared memory.
     slot_bytes = max(SLOT_ENTRIES * (16 if space_dim == 2 else 20), 4 * row_words) + 16
 
-    @native.func_native(slot_bytes, lanes, CUDA_BLOCK)
-    def slot_address() -> wp.uint32: ...
-
-    @native.func_native()
-    def part_address(states: wp.array[lane_channels], part: int) -> wp.uint64: ...
-
-    @native.func_native(lane_channels)
-    def part_of_state(address: wp.uint64, part_count: int, number: int) -> lane_channels: ...
-
-    @native.func_native(space_dim, SLOT_ENTRIES, lanes)
-    def append_number(slot: wp.uint32, count: int, accepted: bool, number: int) -> int: ...
-
-    @native.func_native(space_dim, SLOT_ENTRIES)
-    def number_at(slot: wp.uint32, entry: int) -> int: ...
-
-    @native.func_native(space_dim, SLOT_ENTRIES)
-    def put_entry(slot: wp.uint32, entry: int, smooth: float, kernel: vector, number: int): ...
-
-    @native.func_native(space_dim, SLOT_ENTRIES)
-    def entry_at(slot: wp.uint32, entry: int) -> entry_type: ...
-
+    slot_address = native.function("slot_address", slot_bytes, lanes, CUDA_BLOCK, returns=wp.uint32)
+    part_address = native.function(
+        "part_address", states=wp.array[lane_channels], part=int, returns=wp.uint64
+    )
+    state = {"address": wp.uint64, "part_count": int, "number": int}
+    part_of_state = native.function("part_of_state", lane_channels, **state, returns=lane_channels)
+    layout, entry = (space_dim, SLOT_ENTRIES), {"slot": wp.uint32, "entry": int}
+    found = {"slot": wp.uint32, "count": int, "accepted": bool, "number": int}
+    append_number = native.function("append_number", *layout, lanes, **found, returns=int)
+    number_at = native.function("number_at", *layout, **entry, returns=int)
+    weights = {"smooth": float, "kernel": vector, "number": int}
+    put_entry = native.function("put_entry", *layout, **entry, **weights)
+    entry_at = native.function("entry_at", *layout, **entry, returns=entry_type)
     sizes = space_dim, width, lanes, row_words, slot_bytes, variant.grouped
-    write_rows = native.generic("write_rows", 6, *sizes)
+    write_rows = native.function(
+        "write_rows", *sizes, untyped="slot destination group state_dim limit rows"
+    )
 
     @wp.func
     def padded(count: int):
@@ -161,14 +155,18 @@ def slot_functions(variant: PerceptionVariant, lane_channels: type) -> SimpleNam
     return native.namespace(locals())
 
 
-def weighing_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> SimpleNamespace:
-    """Return the functions that write neighbours' kernel weights to shared memory (the slot).
+def sum_functions(
+    variant: PerceptionVariant, slots: SimpleNamespace, lane_channels: type, lane_gradient: type
+) -> SimpleNamespace:
+    """Return the functions that write neighbours' kernel weights to the slot, and add up sums.
 
-    They also add up what has no channels: volume times spiky kernel (v K), the moment matrix and
-    the density gradient. Each thread adds up those of its own neighbours.
+    A lane adds up what has channels for all of its team's neighbours, the rest for its own ones.
     """
     scalar = wp.float32
     space_dim, lanes, periodic = variant.space_dim, variant.lanes, variant.periodic
+    lane_width, teams = variant.lane_width, variant.teams
+    entries_together = wp.types.matrix((TOGETHER, space_dim + 2), scalar)
+    states_together = wp.types.matrix((TOGETHER, lane_width), scalar)
     state_gradient, for_adjoint = variant.state_gradient, variant.for_adjoint
     moment_correction = variant.moment_inverse is not None
     flat = space_dim == 2
@@ -179,64 +177,56 @@ def weighing_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> Si
     indices_of_pair = wp.types.vector(PAIR, wp.int32)
     records_of_pair = wp.types.matrix((PAIR, 4), scalar)
 
-    @native.func_native(variant.capacity, variant.tiled)
-    def steps_at(lists: wp.array3d[wp.int16], row: int, pair: int) -> int:
-        """Return two entries of a neighbour list, packed in 32 bits.
-
-        An entry, or step, is the neighbour's sorted index minus the particle's.
-        """
-
-    @native.func_native()
-    def step_of(steps: int, entry: int) -> int:
-        """Return entry 0 or 1 of two packed entries of a neighbour list."""
+    # A list's entry, or step, is the neighbour's sorted index minus the particle's.
+    pair = {"lists": wp.array3d[wp.int16], "row": int, "pair": int}
+    steps_at = native.function("steps_at", variant.capacity, variant.tiled, **pair, returns=int)
+    step_of = native.function("step_of", steps=int, entry=int, returns=int)
 
     @wp.struct
-    class Centre:
-        """The particle of a thread: sorted index k, address `slot` of its shared memory."""
+    class Lane:
+        """A thread and its particle: sorted index k, position, slot, and this lane's channels.
+
+        `states`, `part_count`: arguments of `part_of_state`. `first`: first neighbour of its team.
+        """
 
         k: int
         lane: int
+        first: int
         slot: wp.uint32
+        states: wp.uint64
+        part_count: int
+        own_state: lane_channels
         position: vector
         precise: vector_f64
         inverse_eps: wp.float64
 
     @wp.struct
     class Sums:
-        """A thread's sums over neighbours: v K, moment matrix, density gradient / `spiky_norm`."""
+        """A lane's sums over neighbours; `kernel`: of v K, volume times spiky kernel.
 
+        `density_gradient` has no factor `spiky_norm` yet.
+        """
+
+        blur: lane_channels
+        gradient: lane_gradient
         kernel: vector
         moment: square
         density_gradient: vector_f64
 
     @wp.func
-    def centre_at(domain: Domain, k: int, lane: int, slot: wp.uint32, position: vector):
-        """Return the `Centre` of sorted particle k, for thread `lane` of its threads."""
-        centre = Centre()
-        centre.k = k
-        centre.lane = lane
-        centre.slot = slot
-        centre.position = position
-        for d in range(wp.static(space_dim)):
-            centre.precise[d] = wp.float64(position[d])
-        centre.inverse_eps = wp.float64(domain.inverse_eps)
-        return centre
-
-    @wp.func
-    def spiky_f64(domain: Domain, centre: Centre, neighbour: vector, squared: scalar):
+    def spiky_f64(domain: Domain, own: Lane, neighbour: vector, squared: scalar):
         """Return a pair's spiky factor f / `spiky_norm` and its offset r, in float64."""
         r = vector_f64()
         start = squared
         for d in range(wp.static(space_dim)):
-            r[d] = wp.float64(neighbour[d]) - centre.precise[d]
+            r[d] = wp.float64(neighbour[d]) - own.precise[d]
         if wp.static(periodic):
             for d in range(wp.static(space_dim)):
-                images = wp.round((neighbour[d] - centre.position[d]) * domain.inverse_box[d])
-                r[d] -= wp.float64(images) * wp.float64(domain.box[d])
+                r[d] -= space.boxes_f64(domain, d, neighbour[d] - own.position[d])
             start = scalar(wp.dot(r, r))
         exact = wp.dot(r, r)
         apart = wp.where(start > scalar(0.0), inverse_root(start), scalar(0.0))
-        return spiky_factor_f64(exact, apart, centre.inverse_eps, wp.float64(1.0)), r
+        return spiky_factor_f64(exact, apart, own.inverse_eps, wp.float64(1.0)), r
 
     @wp.func
     def weigh(
@@ -244,7 +234,7 @@ def weighing_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> Si
         state_index: wp.array[wp.int32],
         entry: int,
         j: int,
-        centre: Centre,
+        own: Lane,
         record: RECORD,
         is_neighbour: bool,
         sums: Sums,
@@ -262,12 +252,12 @@ def weighing_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> Si
         for d in range(wp.static(space_dim)):
             neighbour[d] = record[d]
         volume = wp.where(is_neighbour, record[wp.static(space_dim)], scalar(0.0))
-        offset = neighbour - centre.position
+        offset = neighbour - own.position
         if wp.static(periodic):
             offset = space.periodic_image(domain, offset)
         squared = wp.dot(offset, offset)
         weight = smoothing(squared, domain.inverse_squared_eps, volume * domain.smoothing_norm)
-        factor, r = spiky_f64(domain, centre, neighbour, squared)
+        factor, r = spiky_f64(domain, own, neighbour, squared)
         sums.density_gradient += factor * r
         weighted = vector()
         if wp.static(state_gradient):
@@ -278,7 +268,7 @@ def weighing_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> Si
                 for row in range(wp.static(space_dim)):
                     for column in range(row, wp.static(space_dim)):
                         sums.moment[row, column] += offset[row] * weighted[column]
-        slots.put_entry(centre.slot, entry, weight, weighted, number)
+        slots.put_entry(own.slot, entry, weight, weighted, number)
         return sums
 
     @wp.func
@@ -288,25 +278,25 @@ def weighing_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> Si
         state_index: wp.array[wp.int32],
         begin: int,
         count: int,
-        centre: Centre,
+        own: Lane,
         sums: Sums,
     ):
         """Weigh the neighbours `begin` to `count` of those whose indices a search has written."""
         sync_warp()
-        for first in range(centre.lane, slots.padded(count), wp.static(PAIR * lanes)):
+        for first in range(own.lane, slots.padded(count), wp.static(PAIR * lanes)):
             indices = indices_of_pair()
             loaded = records_of_pair()
             for a in range(wp.static(PAIR)):
                 entry = first + a * wp.static(lanes)
                 listed = entry >= begin and entry < count
-                indices[a] = wp.where(listed, slots.number_at(centre.slot, entry), centre.k)
+                indices[a] = wp.where(listed, slots.number_at(own.slot, entry), own.k)
             for a in range(wp.static(PAIR)):
                 loaded[a] = load_record(records, indices[a])
             for a in range(wp.static(PAIR)):
                 entry = first + a * wp.static(lanes)
                 is_neighbour = entry >= begin and entry < count
                 sums = weigh(
-                    domain, state_index, entry, indices[a], centre, loaded[a], is_neighbour, sums
+                    domain, state_index, entry, indices[a], own, loaded[a], is_neighbour, sums
                 )
         sync_warp()
         return sums
@@ -320,7 +310,7 @@ def weighing_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> Si
         row: int,
         begin: int,
         length: int,
-        centre: Centre,
+        own: Lane,
         steps: int,
         sums: Sums,
     ):
@@ -329,11 +319,11 @@ def weighing_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> Si
         `steps` has this thread's next two entries, loaded before the current ones are used.
         """
         end = begin + slots.padded(wp.clamp(length - begin, 0, wp.static(SLOT_ENTRIES)))
-        for first in range(begin + wp.static(PAIR) * centre.lane, end, wp.static(PAIR * lanes)):
+        for first in range(begin + wp.static(PAIR) * own.lane, end, wp.static(PAIR * lanes)):
             indices = indices_of_pair()
             loaded = records_of_pair()
             for a in range(wp.static(PAIR)):
-                indices[a] = centre.k + wp.where(first + a < length, step_of(steps, a), wp.int32(0))
+                indices[a] = own.k + wp.where(first + a < length, step_of(steps, a), wp.int32(0))
             for a in range(wp.static(PAIR)):
                 loaded[a] = load_record(records, indices[a])
             steps = steps_at(lists, row, (first >> 1) + wp.static(lanes))
@@ -341,65 +331,46 @@ def weighing_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> Si
                 entry = first + a - begin
                 is_neighbour = first + a < length
                 sums = weigh(
-                    domain, state_index, entry, indices[a], centre, loaded[a], is_neighbour, sums
+                    domain, state_index, entry, indices[a], own, loaded[a], is_neighbour, sums
                 )
         sync_warp()
         return steps, sums
 
-    return native.namespace(locals(), Sums=Sums)
-
-
-def make_add_states(
-    variant: PerceptionVariant, slots: SimpleNamespace, lane_channels: type, lane_gradient: type
-) -> wp.Function:
-    """Return the function that adds neighbours' states, times weights in shared memory, to sums."""
-    scalar = wp.float32
-    space_dim, lane_width, teams = variant.space_dim, variant.lane_width, variant.teams
-    state_gradient = variant.state_gradient
-    entries_together = wp.types.matrix((TOGETHER, space_dim + 2), scalar)
-    states_together = wp.types.matrix((TOGETHER, lane_width), scalar)
-
     @wp.func
-    def add_states(
-        states: wp.uint64,
-        part_count: int,
-        first: int,
-        slot: wp.uint32,
-        count: int,
-        own_state: lane_channels,
-        blur: lane_channels,
-        gradient: lane_gradient,
-    ):
-        """Add a team's neighbours' states, times their weights, to the sums `blur` and `gradient`.
+    def add_states(own: Lane, count: int, sums: Sums):
+        """Add the team's share of the slot's `count` neighbours' states, times their weights.
 
-        A particle's teams of threads take its neighbours in turn, this one from `first` on.
+        A particle's teams of lanes take its neighbours in turn.
         """
-        for entry in range(first, slots.padded(count), wp.static(teams * TOGETHER)):
+        for entry in range(own.first, slots.padded(count), wp.static(teams * TOGETHER)):
             packed = entries_together()
             loaded = states_together()
             for a in range(wp.static(TOGETHER)):
-                weights = slots.entry_at(slot, entry + a * wp.static(teams))
+                weights = slots.entry_at(own.slot, entry + a * wp.static(teams))
                 for n in range(wp.static(space_dim + 2)):
                     packed[a, n] = weights[n]
             for a in range(wp.static(TOGETHER)):
                 number = as_number(packed[a, wp.static(space_dim + 1)])
-                loaded[a] = slots.part_of_state(states, part_count, number)
+                loaded[a] = slots.part_of_state(own.states, own.part_count, number)
             for a in range(wp.static(TOGETHER)):
-                blur += packed[a, 0] * loaded[a]
+                sums.blur += packed[a, 0] * loaded[a]
                 if wp.static(state_gradient):
-                    difference = loaded[a] - own_state
+                    difference = loaded[a] - own.own_state
                     for d in range(wp.static(space_dim)):
                         for c in range(wp.static(lane_width)):
-                            gradient[d, c] += packed[a, d + 1] * difference[c]
+                            sums.gradient[d, c] += packed[a, d + 1] * difference[c]
         sync_warp()
-        return blur, gradient
+        return sums
 
-    return add_states
+    return native.namespace(locals(), Lane=Lane, Sums=Sums)
 
 
-def search_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> SimpleNamespace:
-    """Return the functions that search cells for neighbours of particles with too long a list."""
+def make_add_searched(
+    variant: PerceptionVariant, slots: SimpleNamespace, summing: SimpleNamespace
+) -> wp.Function:
+    """Return the function that searches cells for neighbours of particles with too long a list."""
     space_dim, lanes = variant.space_dim, variant.lanes
+    Lane, Sums = summing.Lane, summing.Sums
     space = domain_types(space_dim, wp.float32)
     vector, Domain = space.vector, space.Domain
     load_vector = make_wide_load(vector)
@@ -431,13 +402,12 @@ def search_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> Simp
     def append_near(
         domain: Domain,
         sorted_positions: wp.array[vector],
-        slot: wp.uint32,
-        position: vector,
+        own: Lane,
         first: int,
         end: int,
         count: int,
     ):
-        """Append indices of neighbours to those in shared memory; return their new number.
+        """Append indices of neighbours to those in the slot; return their new number.
 
         This thread tests a few candidates, from `first` on, before `end`.
         """
@@ -449,14 +419,70 @@ def search_functions(variant: PerceptionVariant, slots: SimpleNamespace) -> Simp
             loaded[a] = load_vector(sorted_positions, index)
         for a in range(wp.static(ahead)):
             candidate = first + a * wp.static(lanes)
-            offset = loaded[a] - position
+            offset = loaded[a] - own.position
             if wp.static(variant.periodic):
                 offset = space.periodic_image(domain, offset)
             near = wp.dot(offset, offset) < domain.squared_eps
-            total = slots.append_number(slot, total, candidate < end and near, candidate)
+            total = slots.append_number(own.slot, total, candidate < end and near, candidate)
         return total
 
-    return native.namespace(locals(), ahead=ahead)
+    @wp.func
+    def add_searched(
+        domain: Domain,
+        starts: wp.array[wp.int32],
+        sorted_cell: wp.array[wp.int32],
+        sorted_positions: wp.array[vector],
+        records: wp.array[RECORD],
+        state_index: wp.array[wp.int32],
+        searching: bool,
+        own: Lane,
+        sums: Sums,
+    ):
+        """Add the neighbours of particles that are `searching`; a complete warp calls it."""
+        world_cell = wp.int32(0)
+        cell = cell_vector()
+        particle_runs = wp.int32(0)
+        if any_in_warp(searching):
+            index = load_integer(sorted_cell, own.k)
+            local = wp.int32(wp.uint32(index) % wp.uint32(domain.cell_count))
+            world_cell = index - local
+            cell = space.cell_at(domain, local)
+            particle_runs = wp.where(searching, space.segment_count(domain, cell), wp.int32(0))
+        # Each lane looks up one run of cells; all lanes then go through the runs in order.
+        warp_runs = largest_in_warp(particle_runs)
+        next_run = wp.int32(0)
+        lane_begin = wp.int32(0)
+        lane_end = wp.int32(0)
+        candidate = own.lane
+        end = wp.int32(0)
+        # The next round leaves as many entries free as this one has beyond a multiple of the lanes:
+        # a neighbour's lane then depends only on its index, not on the rest of the warp.
+        begin = wp.int32(0)
+        unfinished = warp_runs > 0
+        while unfinished:
+            count = wp.int32(begin)
+            filling = wp.bool(True)
+            while filling:
+                while next_run < warp_runs and not any_in_warp(candidate - own.lane < end):
+                    if next_run % wp.static(lanes) == 0:
+                        lane_begin, lane_end = look_up_run(
+                            domain, starts, world_cell, cell, particle_runs, next_run + own.lane
+                        )
+                    from_lane = next_run % wp.static(lanes)
+                    candidate = of_lane(lane_begin, from_lane, wp.uint32(lanes)) + own.lane
+                    end = of_lane(lane_end, from_lane, wp.uint32(lanes))
+                    next_run += 1
+                count = append_near(domain, sorted_positions, own, candidate, end, count)
+                candidate += wp.static(ahead * lanes)
+                unfinished = next_run < warp_runs or any_in_warp(candidate - own.lane < end)
+                crowded = any_in_warp(count > wp.static(SLOT_ENTRIES - ahead * lanes))
+                filling = unfinished and not crowded
+            sums = summing.weigh_searched(domain, records, state_index, begin, count, own, sums)
+            sums = summing.add_states(own, count, sums)
+            begin = count & wp.static(lanes - 1)
+        return sums
+
+    return add_searched
 
 
 def row_functions(variant: PerceptionVariant) -> SimpleNamespace:
@@ -555,10 +581,9 @@ def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
     add_gradient = make_lane_sum(lane_gradient, lanes, whole_warps=True, stride=team)
     corrected = make_corrected(space_dim, scalar, lane_width, variant.moment_inverse)
     slots = slot_functions(variant, lane_channels)
-    weighing = weighing_functions(variant, slots)
-    cell_vector = wp.types.vector(space_dim, wp.int32)
-    search, rows = search_functions(variant, slots), row_functions(variant)
-    add_states = make_add_states(variant, slots, lane_channels, lane_gradient)
+    summing = sum_functions(variant, slots, lane_channels, lane_gradient)
+    add_searched = make_add_searched(variant, slots, summing)
+    rows = row_functions(variant)
 
     @wp.kernel(
         enable_backward=False,
@@ -598,7 +623,7 @@ def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
         `row_destination[k]`, by default to row k. Numbers are clipped to plus and minus `limit`
         unless it is 0.
         """
-        await_earlier()
+        wait_for_previous_kernel()
         thread = thread_number()
         lane = thread & wp.static(lanes - 1)
         row = thread >> wp.static(lanes.bit_length() - 1)
@@ -606,19 +631,17 @@ def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
         if wp.static(grouped):
             g = row % group_count
             row = row / group_count
-        slot = slots.slot_address()
-        # This lane's channels, and the first of its team's neighbours.
+        own = summing.Lane()
+        own.lane = lane
+        own.slot = slots.slot_address()
         part = lane & wp.static(team - 1)
-        first = lane >> wp.static(team.bit_length() - 1)
-        part_count = wp.int32(wp.static(team))
+        own.first = lane >> wp.static(team.bit_length() - 1)
+        own.part_count = wp.int32(wp.static(team))
         if wp.static(grouped):
             part += g * wp.static(team)
-            part_count = group_count * wp.static(team)
+            own.part_count = group_count * wp.static(team)
         row_count = load_integer(starts, starts.shape[0] - 1) - row_base
         present = row < wp.min(row_count, row_capacity)
-        blur = lane_channels()
-        gradient = lane_gradient()
-        sums = weighing.Sums()
         # Rows beyond the last one read the first particle, with no neighbours.
         safe_row = wp.where(present, row, wp.int32(0))
         k = safe_row
@@ -630,10 +653,13 @@ def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
         own_index = k
         if state_index.shape[0] > 0:
             own_index = load_integer(state_index, k)
-        parts = slots.part_address(states, part)
-        own_state = slots.part_of_state(parts, part_count, own_index)
-        position = load_vector(sorted_positions, k)
-        centre = weighing.centre_at(domain, k, lane, slot, position)
+        own.k = k
+        own.states = slots.part_address(states, part)
+        own.own_state = slots.part_of_state(own.states, own.part_count, own_index)
+        own.position = load_vector(sorted_positions, k)
+        for d in range(wp.static(space_dim)):
+            own.precise[d] = wp.float64(own.position[d])
+        own.inverse_eps = wp.float64(domain.inverse_eps)
         list_number = safe_row
         if wp.static(per_particle):
             list_number = k
@@ -641,69 +667,27 @@ def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
         searching = length > wp.static(capacity)
         length = wp.where(searching, wp.int32(0), length)
         longest = largest_in_warp(length)
-        steps = weighing.steps_at(lists, list_number, lane)
-        for first_entry in range(0, longest, wp.static(SLOT_ENTRIES)):
-            steps, sums = weighing.weigh_listed(
-                domain,
-                records,
-                lists,
-                state_index,
-                list_number,
-                first_entry,
-                length,
-                centre,
-                steps,
-                sums,
+        sums = summing.Sums()
+        steps = summing.steps_at(lists, list_number, lane)
+        for begin in range(0, longest, wp.static(SLOT_ENTRIES)):
+            steps, sums = summing.weigh_listed(
+                domain, records, lists, state_index, list_number, begin, length, own, steps, sums
             )
-            fetched = wp.clamp(length - first_entry, 0, wp.static(SLOT_ENTRIES))
-            blur, gradient = add_states(
-                parts, part_count, first, slot, fetched, own_state, blur, gradient
-            )
-        world_cell = wp.int32(0)
-        cell = cell_vector()
-        particle_runs = wp.int32(0)
-        if any_in_warp(searching):
-            index = load_integer(sorted_cell, k)
-            local = wp.int32(wp.uint32(index) % wp.uint32(domain.cell_count))
-            world_cell = index - local
-            cell = space.cell_at(domain, local)
-            particle_runs = wp.where(searching, space.segment_count(domain, cell), wp.int32(0))
-        # Each lane looks up one run of cells; all lanes then go through the runs in order.
-        warp_runs = largest_in_warp(particle_runs)
-        next_run = wp.int32(0)
-        lane_begin = wp.int32(0)
-        lane_end = wp.int32(0)
-        candidate = lane
-        end = wp.int32(0)
-        # The next round leaves as many entries free as this one has beyond a multiple of the lanes:
-        # a neighbour's lane then depends only on its index, not on the rest of the warp.
-        begin = wp.int32(0)
-        unfinished = warp_runs > 0
-        while unfinished:
-            count = wp.int32(begin)
-            filling = wp.bool(True)
-            while filling:
-                while next_run < warp_runs and not any_in_warp(candidate - lane < end):
-                    if next_run % wp.static(lanes) == 0:
-                        lane_begin, lane_end = search.look_up_run(
-                            domain, starts, world_cell, cell, particle_runs, next_run + lane
-                        )
-                    source_lane = next_run % wp.static(lanes)
-                    candidate = of_lane(lane_begin, source_lane, wp.uint32(lanes)) + lane
-                    end = of_lane(lane_end, source_lane, wp.uint32(lanes))
-                    next_run += 1
-                count = search.append_near(
-                    domain, sorted_positions, slot, position, candidate, end, count
-                )
-                candidate += wp.static(search.ahead * lanes)
-                unfinished = next_run < warp_runs or any_in_warp(candidate - lane < end)
-                crowded = any_in_warp(count > wp.static(SLOT_ENTRIES - search.ahead * lanes))
-                filling = unfinished and not crowded
-            sums = weighing.weigh_searched(domain, records, state_index, begin, count, centre, sums)
-            blur, gradient = add_states(
-                parts, part_count, first, slot, count, own_state, blur, gradient
-            )
-            begin = count & wp.static(lanes - 1)
+            count = wp.clamp(length - begin, 0, wp.static(SLOT_ENTRIES))
+            sums = summing.add_states(own, count, sums)
+        sums = add_searched(
+            domain,
+            starts,
+            sorted_cell,
+            sorted_positions,
+            records,
+            state_index,
+            searching,
+            own,
+            sums,
+        )
+        blur = sums.blur
+        gradient = sums.gradient
         gradient_f64 = wp.float64(domain.spiky_norm) * add_f64(sums.density_gradient)
         if wp.static(teams > 1):
             blur = add_channels(blur)
@@ -714,10 +698,10 @@ def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
                 for c in range(r):
                     moment[r, c] = moment[c, r]
             gradient = corrected(gradient, moment)
-        staged_state = wp.where(present, own_state, lane_channels())
-        rows.stage_sums(slot, lane, staged_state, blur, gradient_scale, gradient)
+        staged_state = wp.where(present, own.own_state, lane_channels())
+        rows.stage_sums(own.slot, lane, staged_state, blur, gradient_scale, gradient)
         bound = wp.where(limit > scalar(0.0), limit, scalar(wp.static(math.nan)))
-        slots.write_rows(slot, destination, g, state_dim, bound, perception)
+        slots.write_rows(own.slot, destination, g, state_dim, bound, perception)
         if wp.static(for_adjoint):
             kernel_sum = add_vector(sums.kernel)
             if destination >= 0 and lane == 0 and g == 0:

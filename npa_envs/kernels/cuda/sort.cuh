@@ -14,6 +14,7 @@ template <int CAPACITY, int BLOCK, int GRID> struct SortMemory {
     unsigned short members[CAPACITY];
 };
 
+// The address of the block's memory.
 template <int CAPACITY, int BLOCK, int GRID> __device__ inline unsigned long long block_memory()
 {
     __shared__ SortMemory<CAPACITY, BLOCK, GRID> memory;
@@ -40,6 +41,7 @@ __device__ inline int count_active(const wp::array_t<wp::uint8>& mask, int count
     return sum;
 }
 
+// Set all cells' counts to 0; sum `earlier`, the rows of earlier worlds by thread.
 template <int CAPACITY, int BLOCK, int GRID>
 __device__ inline void clear_counts(unsigned long long address, int cell_count, int earlier)
 {
@@ -51,6 +53,7 @@ __device__ inline void clear_counts(unsigned long long address, int cell_count, 
     if ((threadIdx.x & 31u) == 0) atomicAdd(&memory.earlier, sum);
 }
 
+// Count a particle in its cell, and store its order of arrival there.
 template <int CAPACITY, int BLOCK, int GRID>
 __device__ inline void count_particle(unsigned long long address, int particle, int cell, bool active)
 {
@@ -60,7 +63,8 @@ __device__ inline void count_particle(unsigned long long address, int particle, 
     memory.arrivals[particle] = (before & 0xffff) << 1 | active;
 }
 
-// A thread sums some adjacent cells, a warp its threads, and every thread the warps before it.
+// Replace each cell's count by its start, the sum of the counts of all cells before. A thread sums
+// some adjacent cells, a warp its threads, and every thread the warps before it.
 template <int CAPACITY, int BLOCK, int GRID>
 __device__ inline void add_up_counts(unsigned long long address, int cell_count)
 {
@@ -86,6 +90,7 @@ __device__ inline void add_up_counts(unsigned long long address, int cell_count)
     __syncthreads();
 }
 
+// The sorted index in the world, and row among all worlds, where a cell begins.
 template <int CAPACITY, int BLOCK, int GRID>
 __device__ inline wp::vec_t<2, int> start_of(unsigned long long address, int cell)
 {
@@ -94,6 +99,7 @@ __device__ inline wp::vec_t<2, int> start_of(unsigned long long address, int cel
     return wp::vec_t<2, int>(start & 0xffff, memory.earlier + (start >> 16));
 }
 
+// Write a particle to its provisional index: its cell's start plus its order of arrival.
 template <int CAPACITY, int BLOCK, int GRID>
 __device__ inline void place_arrived(unsigned long long address, int particle)
 {
@@ -103,7 +109,9 @@ __device__ inline void place_arrived(unsigned long long address, int particle)
     memory.members[place] = particle << 1 | arrival & 1;
 }
 
-// From the start of the cell of the slice's first place to the end of the cell of its last one.
+// The first and last + 1 provisional index of all cells that a slice touches. A block writes one slice
+// of its world: the sorted indices from `begin` to before `end`. Provisional indices go by cell, then
+// by arrival.
 template <int CAPACITY, int BLOCK, int GRID>
 __device__ inline wp::vec_t<2, int> span_of_slice(unsigned long long address, int begin, int end)
 {
@@ -115,7 +123,8 @@ __device__ inline wp::vec_t<2, int> span_of_slice(unsigned long long address, in
     );
 }
 
-// In the cell `unordered` provisional positions are final.
+// The sorted index, cell and row (-1: none) of the particle at a provisional index. In the cell
+// `unordered` (-1: none) provisional indices are final.
 template <int CAPACITY, int BLOCK, int GRID>
 __device__ inline wp::vec_t<3, int> ranked_at(unsigned long long address, int place, int unordered)
 {
@@ -136,6 +145,7 @@ __device__ inline wp::vec_t<3, int> ranked_at(unsigned long long address, int pl
     return wp::vec_t<3, int>(ranked, cell, row);
 }
 
+// The particle at a provisional index, by its index in the world.
 template <int CAPACITY, int BLOCK, int GRID>
 __device__ inline int member_at(unsigned long long address, int place)
 {

@@ -7,6 +7,7 @@ a slice.
 """
 
 from types import SimpleNamespace
+from typing import Any
 
 import warp as wp
 
@@ -17,7 +18,6 @@ from npa_envs.kernels.portable.world_mean import CHUNK
 from npa_envs.kernels.primitives import (
     CUDA_LANES,
     WARP,
-    await_earlier,
     block_number,
     load_integer,
     make_read_channels,
@@ -25,6 +25,7 @@ from npa_envs.kernels.primitives import (
     of_warp,
     sync_block,
     thread_of_block,
+    wait_for_previous_kernel,
     wide_store,
 )
 from npa_envs.thread_lock import cached_under_lock
@@ -44,9 +45,8 @@ THREAD_CHANNELS = 4
 """Adjacent channels that a thread moves."""
 
 
-@native.func_native()
-def count_active(mask: wp.array[wp.uint8], count: int) -> int:
-    """Return the number of active particles in this thread's part of `mask`, up to `count`."""
+count_active = native.function("count_active", mask=wp.array[wp.uint8], count=int, returns=int)
+"""The number of active particles in this thread's part of `mask`, up to `count`."""
 
 
 @cached_under_lock()
@@ -54,50 +54,21 @@ def block_functions(capacity: int) -> SimpleNamespace:
     """Return the functions by which a block sorts a world of up to `capacity` particles."""
     sizes = capacity, BLOCKS[capacity], MAX_GRID
 
-    @native.func_native(*sizes)
-    def block_memory() -> wp.uint64:
-        """Return the address of the block's shared memory."""
+    def of_block(name: str, returns: Any = None, **arguments: Any) -> Any:
+        """Return a function whose first argument is the address of the block's shared memory."""
+        return native.function(name, *sizes, address=wp.uint64, **arguments, returns=returns)
 
-    @native.func_native(*sizes)
-    def clear_counts(address: wp.uint64, cell_count: int, earlier: int):
-        """Set all cells' counts to 0; sum `earlier`, the rows of earlier worlds by thread."""
-
-    @native.func_native(*sizes)
-    def count_particle(address: wp.uint64, particle: int, cell: int, active: bool):
-        """Count a particle in its cell, and note its order of arrival there."""
-
-    @native.func_native(*sizes)
-    def add_up_counts(address: wp.uint64, cell_count: int):
-        """Replace each cell's count by its start, the sum of the counts of all cells before."""
-
-    @native.func_native(*sizes)
-    def start_of(address: wp.uint64, cell: int) -> wp.vec2i:
-        """Return the sorted index in the world, and row among all worlds, where a cell begins."""
-
-    @native.func_native(*sizes)
-    def place_arrived(address: wp.uint64, particle: int):
-        """Write a particle to its provisional index: its cell's start plus its order of arrival."""
-
-    @native.func_native(*sizes)
-    def span_of_slice(address: wp.uint64, begin: int, end: int) -> wp.vec2i:
-        """Return the first and last + 1 provisional index of all cells that a slice touches.
-
-        A block writes one slice of its world: the sorted indices from `begin` to before `end`.
-        Provisional indices go by cell, then by arrival. `address`: that of `block_memory`.
-        """
-
-    @native.func_native(*sizes)
-    def ranked_at(address: wp.uint64, provisional: int, unordered: int) -> wp.vec3i:
-        """Return the sorted index, cell and row (-1: none) of the particle at a provisional index.
-
-        In the cell `unordered` (-1: none) provisional indices are final.
-        """
-
-    @native.func_native(*sizes)
-    def member_at(address: wp.uint64, provisional: int) -> int:
-        """Return the particle at a provisional index, by its index in the world."""
-
-    return native.namespace(locals())
+    return SimpleNamespace(
+        block_memory=native.function("block_memory", *sizes, returns=wp.uint64),
+        clear_counts=of_block("clear_counts", cell_count=int, earlier=int),
+        count_particle=of_block("count_particle", particle=int, cell=int, active=bool),
+        add_up_counts=of_block("add_up_counts", cell_count=int),
+        start_of=of_block("start_of", wp.vec2i, cell=int),
+        place_arrived=of_block("place_arrived", particle=int),
+        span_of_slice=of_block("span_of_slice", wp.vec2i, begin=int, end=int),
+        ranked_at=of_block("ranked_at", wp.vec3i, provisional=int, unordered=int),
+        member_at=of_block("member_at", int, provisional=int),
+    )
 
 
 @cached_under_lock()
@@ -135,7 +106,7 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
         row_capacity: int,
         # outputs
         starts: wp.array[wp.int32],
-        source: wp.array[wp.int32],
+        original_index: wp.array[wp.int32],
         sorted_cell: wp.array[wp.int32],
         row_of: wp.array[wp.int32],
         row_source: wp.array[wp.int32],
@@ -148,7 +119,7 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
 
         States and rows are left out where their arrays are empty.
         """
-        await_earlier()
+        wait_for_previous_kernel()
         world = block_number() / slice_count
         slice_number = block_number() - world * slice_count
         lane = thread_of_block()
@@ -218,7 +189,7 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
                 if inside and sorted_states.shape[0] > 0:
                     wide_store(sorted_states, target * parts + part, state)
                 if inside and part == 0:
-                    wide_store(source, target, i)
+                    wide_store(original_index, target, i)
                     wide_store(sorted_cell, target, first_cell + ranked[1])
                     wide_store(sorted_positions, target, position)
                     if row_of.shape[0] > 0:
@@ -246,9 +217,8 @@ def sort_small_splats(capacity: int) -> wp.Kernel:
     load_vector = make_wide_load(vector)
     sorting = block_functions(capacity)
 
-    @native.func_native(capacity, CHUNK)
-    def mean_of_world(positions: wp.array[vector], first: int, count: int) -> vector:
-        """Return the mean position of a world; all threads of the block must call it."""
+    world = {"positions": wp.array[vector], "first": int, "count": int}
+    mean_of_world = native.function("mean_of_world", capacity, CHUNK, **world, returns=vector)
 
     @wp.kernel(
         enable_backward=False,
@@ -266,10 +236,10 @@ def sort_small_splats(capacity: int) -> wp.Kernel:
         # outputs
         starts: wp.array[wp.int32],
         footprints: wp.array[footprint_type],
-        source: wp.array[wp.int32],
+        original_index: wp.array[wp.int32],
     ):
         """Write the footprints of a world, sorted by cell, then index; a block writes a slice."""
-        await_earlier()
+        wait_for_previous_kernel()
         world = block_number() / slice_count
         slice_number = block_number() - world * slice_count
         lane = thread_of_block()
@@ -315,7 +285,7 @@ def sort_small_splats(capacity: int) -> wp.Kernel:
                     target += first_particle
                     footprint = splat.footprint_of(view, position, i, states, shift)
                     wide_store(footprints, target, footprint)
-                    wide_store(source, target, i)
+                    wide_store(original_index, target, i)
 
     return sort_splats
 
@@ -343,7 +313,7 @@ def order_particles(space_dim: int, width: int) -> wp.Kernel:
         arrived: wp.array[wp.vec2i],
         starts: wp.array[wp.int32],
         # outputs
-        source: wp.array[wp.int32],
+        original_index: wp.array[wp.int32],
         sorted_cell: wp.array[wp.int32],
         row_of: wp.array[wp.int32],
         row_source: wp.array[wp.int32],
@@ -357,7 +327,7 @@ def order_particles(space_dim: int, width: int) -> wp.Kernel:
         States and rows are left out where their arrays are empty. Launched with whole warps;
         threads beyond the last particle help to move states.
         """
-        await_earlier()
+        wait_for_previous_kernel()
         k = wp.tid()
         total = arrived.shape[0]
         entry = load_pair(arrived, wp.min(k, total - 1))
@@ -375,7 +345,7 @@ def order_particles(space_dim: int, width: int) -> wp.Kernel:
                 active_rank += other & 1
         target = begin + rank
         if k < total:
-            wide_store(source, target, i)
+            wide_store(original_index, target, i)
             wide_store(sorted_cell, target, c)
             wide_store(sorted_positions, target, position)
             if row_of.shape[0] > 0:

@@ -9,10 +9,10 @@ The backward pass divides T by 1 - alpha from the last Gaussian to the first. Wi
 (c . c̄) alpha T over farther Gaussians plus the final T times its cotangent, the cotangent of alpha
 is T (c . c̄) - b / (1 - alpha).
 
-On CUDA a block serves a tile and a thread a pixel; sums over pixels use shuffles within warps and
-shared memory among warps. On a CPU a thread serves a tile, one Gaussian after the other, each only
-at the pixels that it covers. Either way every pair of a tile and a Gaussian has its own slot for
-the cotangents from that tile (its pull): no sum depends on the order of threads.
+On CUDA there is a block per tile and a thread per pixel; sums over pixels use shuffles within warps
+and shared memory among warps. On a CPU a thread serves a tile, one Gaussian after the other, each
+only at the pixels that it covers. Every pair of a tile and a Gaussian has its own place for the
+cotangents from that tile (its pull): no sum depends on the order of threads.
 Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
 """
 
@@ -22,7 +22,6 @@ import warp as wp
 
 from npa_envs.kernels import native_functions as native
 from npa_envs.kernels.domain import scalar_name
-from npa_envs.kernels.mathematics import make_fast_exp2
 from npa_envs.kernels.native_functions import TILES, in_ranges, namespace
 from npa_envs.kernels.pictures.gaussians import (
     CHANNELS,
@@ -66,7 +65,7 @@ def blending_functions(scalar: type) -> SimpleNamespace:
     """Return the functions of all kernels: a Gaussian's effect on a pixel, and its adjoint."""
     types = gaussian_types(scalar)
     Frame, quad, footprint_type, pulls_type = types.Frame, types.quad, types.footprint, types.pulls
-    fast_exp2 = make_fast_exp2(scalar)
+    fast_exp2 = native.function("fast_exp2", value=scalar, returns=scalar)
 
     @wp.func
     def strength(footprint: footprint_type, x: scalar, y: scalar):
@@ -142,7 +141,7 @@ def blending_functions(scalar: type) -> SimpleNamespace:
 
 @cached_under_lock()
 def tile_kernels(scalar: type) -> SimpleNamespace:
-    """Return the kernels that blend Gaussians, and the adjoint, one thread a tile; for CPUs."""
+    """Return the kernels that blend Gaussians, and the adjoint, one thread per tile; for CPUs."""
     types = gaussian_types(scalar)
     Frame, footprint_type, pulls_type = types.Frame, types.footprint, types.pulls
     blending = blending_functions(scalar)
@@ -254,7 +253,7 @@ def tile_kernels(scalar: type) -> SimpleNamespace:
 
 @cached_under_lock()
 def block_kernels(scalar: type) -> SimpleNamespace:
-    """Return the kernels that blend Gaussians, and the adjoint, one block a tile; for CUDA."""
+    """Return the kernels that blend Gaussians, and the adjoint, one block per tile; for CUDA."""
     types = gaussian_types(scalar)
     Frame, quad, footprint_type, pulls_type = types.Frame, types.quad, types.footprint, types.pulls
     blending = blending_functions(scalar)
@@ -264,9 +263,10 @@ def block_kernels(scalar: type) -> SimpleNamespace:
     load_footprint = make_wide_load(footprint_type)
     add_warp = make_lane_sum(pulls_type, WARP, whole_warps=True)
 
-    @native.func_native(BATCH, TILE_PIXELS // WARP)
-    def store_or_sum(write: bool, i: int, entry: int, value: pulls_type) -> scalar:
-        """Store a warp's cotangents of pair i (`write`), or return an entry of the warps' sum."""
+    # Store a warp's cotangents of pair i (`write`), or return an entry of the warps' sum.
+    arguments = {"write": bool, "i": int, "entry": int, "value": pulls_type}
+    sizes = BATCH, TILE_PIXELS // WARP
+    store_or_sum = native.function("store_or_sum", *sizes, **arguments, returns=scalar)
 
     @wp.func
     def own_pixel(frame: Frame, tile: int, k: int):

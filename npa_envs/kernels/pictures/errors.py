@@ -22,11 +22,11 @@ from npa_envs.kernels.pictures.splat import (
 from npa_envs.kernels.primitives import (
     CUDA_BLOCK,
     WARP,
-    await_earlier,
     block_number,
     make_lane_sum,
     make_wide_load,
     thread_of_block,
+    wait_for_previous_kernel,
 )
 from npa_envs.thread_lock import cached_under_lock
 
@@ -78,13 +78,8 @@ def gather_errors(scalar: type) -> wp.Kernel:
     load_colour = make_wide_load(colour_type)
     lane_sum = make_lane_sum(wp.vec2d, TILE_LANES)
 
-    @native.func_native(BLOCK_TILES)
-    def rank_tiles(tile_count: int, candidates: int):
-        """Sort the block's tiles, one a thread, by descending numbers of particles around."""
-
-    @native.func_native(BLOCK_TILES)
-    def ranked_tile(rank: int) -> wp.vec2i:
-        """Return the tile of a rank in the block and its number of particles, -1 for no tile."""
+    rank_tiles = native.function("rank_tiles", BLOCK_TILES, tile_count=int, candidates=int)
+    ranked_tile = native.function("ranked_tile", BLOCK_TILES, rank=int, returns=wp.vec2i)
 
     @wp.kernel(
         enable_backward=False,
@@ -102,7 +97,7 @@ def gather_errors(scalar: type) -> wp.Kernel:
         partial_sums: wp.array2d[wp.vec2d],
     ):
         """Write the sums of density and colour errors over each tile."""
-        await_earlier()
+        wait_for_previous_kernel()
         # Adjacent tiles belong to different blocks, so that all blocks of a world do equal work.
         tiles = view.tile_columns * view.tile_rows
         stride = (tiles + tile_count - 1) / tile_count

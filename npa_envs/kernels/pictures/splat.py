@@ -20,15 +20,12 @@ import warp as wp
 
 from npa_envs.kernels import native_functions as native
 from npa_envs.kernels.domain import scalar_name
-from npa_envs.kernels.mathematics import make_fast_exp2
 from npa_envs.kernels.native_functions import PAIRS, WORLDS, in_ranges, namespace
 from npa_envs.kernels.primitives import (
-    await_earlier,
     load_integer,
-    make_kept,
-    make_lane_collect,
     make_lane_sum,
     make_wide_load,
+    wait_for_previous_kernel,
     wide_store,
 )
 from npa_envs.thread_lock import cached_under_lock
@@ -138,7 +135,7 @@ def splat_functions(scalar: type) -> SimpleNamespace:
     types = splat_types(scalar)
     View, vector, colour_type = types.View, types.vector, types.colour
     footprint_type = types.footprint
-    fast_exp2 = make_fast_exp2(scalar)
+    fast_exp2 = native.function("fast_exp2", value=scalar, returns=scalar)
 
     @wp.func
     def patch_weight(falloff: scalar, slope: scalar, offset: scalar):
@@ -212,15 +209,18 @@ def splat_functions(scalar: type) -> SimpleNamespace:
 
 @cached_under_lock()
 def gather_functions(scalar: type, lanes: int) -> SimpleNamespace:
-    """Return functions that sum the particles around a tile, by 1 thread or by one a row."""
+    """Return functions that sum the particles around a tile, by 1 thread or by one per row."""
     assert lanes in (1, TILE_HEIGHT)
     types, splat = splat_types(scalar), splat_functions(scalar)
     View, footprint_type, tile_type = types.View, types.footprint, types.tile
     columns_type, rows_type, weights_type = types.columns, types.rows, types.weights
     runs_type = wp.types.vector(RUNS, wp.int32)
     load_footprint = make_wide_load(footprint_type)
-    kept = make_kept(scalar)
-    collect = make_lane_collect(tile_type, lanes)
+    # Each lane gets a row of the tile.
+    collected_type = wp.types.matrix((CHANNELS, TILE_WIDTH * TILE_HEIGHT // lanes), scalar)
+    sizes = collected_type, scalar, CHANNELS, TILE_WIDTH * TILE_HEIGHT, lanes
+    collect = native.function("lane_collect", *sizes, value=tile_type, returns=collected_type)
+    kept = native.function("kept", value=scalar, returns=scalar)
 
     @wp.func
     def candidate_count(
@@ -338,7 +338,7 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
 
         Those of cell c are counted at counts[c + 1]; counts[0] stays 0 for the prefix sum.
         """
-        await_earlier()
+        wait_for_previous_kernel()
         i = wp.tid()
         world = i / particle_count
         position = position_in_world(view, positions[i], means, goal, world)
@@ -355,7 +355,7 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         arrived: wp.array[wp.int32],
     ):
         """List the particles by cell, in the order in which they were counted."""
-        await_earlier()
+        wait_for_previous_kernel()
         i = wp.tid()
         arrived[starts[cell[i]] + arrival[i]] = i
 
@@ -373,10 +373,10 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         starts: wp.array[wp.int32],
         # outputs
         footprints: wp.array[footprint_type],
-        source: wp.array[wp.int32],
+        original_index: wp.array[wp.int32],
     ):
         """Write the particles' footprints sorted by cell, and by index within a cell."""
-        await_earlier()
+        wait_for_previous_kernel()
         k = wp.tid()
         i = arrived[k]
         c = cell[i]
@@ -392,7 +392,7 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
                 if arrived[other] < i:
                     target += 1
         wide_store(footprints, target, footprint)
-        source[target] = i
+        original_index[target] = i
 
     @wp.func
     def tile_of(view: View, t: int):
@@ -453,7 +453,7 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         picture: wp.array3d[colour_type],
         # outputs
         footprints: wp.array[footprint_type],
-        source: wp.array[wp.int32],
+        original_index: wp.array[wp.int32],
     ):
         """Draw the picture of a world, particle after particle; for devices with few threads."""
         world = range_start + wp.tid()
@@ -461,7 +461,7 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
             position = position_in_world(view, positions[i], means, goal, world)
             footprint = splat.footprint_of(view, position, i, states, shift)
             footprints[i] = footprint
-            source[i] = i
+            original_index[i] = i
             if splat.visible(view, splat.patch_centre(position)):
                 column = wp.int32(footprint[2])
                 row = wp.int32(footprint[3])
@@ -487,7 +487,7 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         view: View,
         particle_count: int,
         footprints: wp.array[footprint_type],
-        source: wp.array[wp.int32],
+        original_index: wp.array[wp.int32],
         picture_bar: wp.array[colour_type],
         # outputs
         positions_bar: wp.array[vector],
@@ -546,7 +546,7 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
                 for d in range(2):
                     position_bar[d] = pulls[4 + d] - gained * moments[d] / sums[d]
                 colour_bar *= footprint[7]
-            i = source[k]
+            i = original_index[k]
             positions_bar[i] = view.pull * position_bar
             for c in range(3):
                 colours_bar[i, c] = colour_bar[c]

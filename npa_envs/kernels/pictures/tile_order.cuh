@@ -10,6 +10,7 @@ template <int CAPACITY> __device__ inline int* ranked_tiles()
     return ranked;
 }
 
+// Sort the block's tiles, one per thread, by descending numbers of particles around them.
 template <int CAPACITY> __device__ inline void rank_tiles(int tile_count, int candidates)
 {
     __shared__ int4 keys[CAPACITY / 4];
@@ -33,6 +34,7 @@ template <int CAPACITY> __device__ inline void rank_tiles(int tile_count, int ca
     __syncthreads();
 }
 
+// The tile of a rank in the block and its number of particles, -1 for no tile.
 template <int CAPACITY> __device__ inline wp::vec_t<2, int> ranked_tile(int rank)
 {
     const unsigned key = ranked_tiles<CAPACITY>()[rank] + CAPACITY;  // which is not negative

@@ -46,14 +46,26 @@ def adjoint_kernels(
     vector, particle, Domain = space.vector, space.particle, space.Domain
     group = wp.types.vector(width, scalar)
     group_gradient = wp.types.matrix((space_dim, width), scalar)
-    topic = "adjoint" if state_gradient else "smoothing_adjoint"
-    topic = "listed_per_particle_" * listed + "unfiltered_" * (not on_cpu) + topic
-    module = kernel_module(topic, space_dim, scalar, width)
+    module_name = "adjoint" if state_gradient else "smoothing_adjoint"
+    module_name = "listed_per_particle_" * listed + "cuda_" * (not on_cpu) + module_name
+    module = kernel_module(module_name, space_dim, scalar, width)
     search = make_search(space_dim, scalar, vector, on_cpu, listed)
     indices = wp.types.vector(search.stride, wp.int32)
     add_scaled = make_add_scaled(group)
     load_group = make_wide_load(group)
     load_gradient = make_wide_load(group_gradient)
+
+    @wp.func
+    def unscaled(
+        perception: wp.array2d[scalar], perception_bar: wp.array2d[scalar], row: int, column: int
+    ):
+        """Return the cotangent before the logarithmic scaling of the vector from `column` on."""
+        scaled = vector()
+        bar = vector()
+        for d in range(wp.static(space_dim)):
+            scaled[d] = perception[row, column + d]
+            bar[d] = perception_bar[row, column + d]
+        return log_scale_adjoint(scaled, bar)
 
     @in_ranges(PAIRS)
     @wp.kernel(enable_backward=False, module=module)
@@ -78,19 +90,13 @@ def adjoint_kernels(
         row += range_start
         if row >= starts[starts.shape[0] - 1] - row_base:
             return
-        gradient_start = 2 * state_dim
         blur = scalar(0.0)
         gradient = vector()
         if channel < state_dim:
             blur = perception_bar[row, state_dim + channel]
             if wp.static(state_gradient):
-                place = gradient_start + channel * wp.static(space_dim)
-                scaled = vector()
-                bar = vector()
-                for d in range(wp.static(space_dim)):
-                    scaled[d] = perception[row, place + d]
-                    bar[d] = perception_bar[row, place + d]
-                gradient = gradient_scale * log_scale_adjoint(scaled, bar)
+                column = 2 * state_dim + channel * wp.static(space_dim)
+                gradient = gradient_scale * unscaled(perception, perception_bar, row, column)
         entry = row * group_count + channel / wp.static(width)
         c = channel % wp.static(width)
         blur_bar[entry * wp.static(width) + c] = blur
@@ -99,15 +105,10 @@ def adjoint_kernels(
         if channel == 0 and density_gradient_bar.shape[0] > 0:
             pull = vector()
             if density_gradient != 0:
-                density_start = gradient_start
+                column = 2 * state_dim
                 if wp.static(state_gradient):
-                    density_start += state_dim * wp.static(space_dim)
-                scaled = vector()
-                bar = vector()
-                for d in range(wp.static(space_dim)):
-                    scaled[d] = perception[row, density_start + d]
-                    bar[d] = perception_bar[row, density_start + d]
-                pull = density_scale * log_scale_adjoint(scaled, bar)
+                    column += state_dim * wp.static(space_dim)
+                pull = density_scale * unscaled(perception, perception_bar, row, column)
             density_gradient_bar[row] = pull
 
     @wp.func
@@ -149,7 +150,7 @@ def adjoint_kernels(
         ends: wp.array[wp.int32],
         neighbours: wp.array[wp.int32],
         particles: wp.array[particle],
-        source: wp.array[wp.int32],
+        original_index: wp.array[wp.int32],
         row_of: wp.array[wp.int32],
         row_positions: wp.array[vector],
         row_kernel_sum: wp.array[vector],
@@ -193,7 +194,7 @@ def adjoint_kernels(
                         )
                         total += kernel * load_gradient(gradient_bar, row * group_count + g)
         total = entry[wp.static(space_dim)] * total
-        i = source[k]
+        i = original_index[k]
         row = row_of[i]
         for c in range(wp.static(width)):
             channel = g * wp.static(width) + c
@@ -220,7 +221,7 @@ def adjoint_kernels(
         starts: wp.array[wp.int32],
         particles: wp.array[particle],
         states: wp.array[group],
-        source: wp.array[wp.int32],
+        original_index: wp.array[wp.int32],
         row_of: wp.array[wp.int32],
         blur_bar: wp.array[group],
         gradient_bar: wp.array[group_gradient],
@@ -240,7 +241,7 @@ def adjoint_kernels(
             for j in range(starts[base + first], starts[base + last]):
                 offset = space.minimum_image(domain, position - space.position_of(particles[j]))
                 squared = wp.dot(offset, offset)
-                row = row_of[source[j]]
+                row = row_of[original_index[j]]
                 if squared < domain.squared_eps and row >= 0:
                     weight = smoothing(squared, domain.inverse_squared_eps, domain.smoothing_norm)
                     kernel = offset * spiky_factor(
@@ -284,7 +285,7 @@ def adjoint_kernels(
         starts: wp.array[wp.int32],
         particles: wp.array[particle],
         states: wp.array[group],
-        source: wp.array[wp.int32],
+        original_index: wp.array[wp.int32],
         row_of: wp.array[wp.int32],
         density_bar: wp.array[scalar],
         blur_bar: wp.array[group],
@@ -298,7 +299,7 @@ def adjoint_kernels(
         entry = particles[k]
         position = space.position_of(entry)
         volume = entry[wp.static(space_dim)]
-        own_row = row_of[source[k]]
+        own_row = row_of[original_index[k]]
         pull = vector()
         base = (k / particle_count) * domain.cell_count
         cell = space.cell_of(domain, position)
@@ -310,7 +311,7 @@ def adjoint_kernels(
                 squared = wp.dot(offset, offset)
                 if squared < domain.squared_eps and j != k:
                     other_volume = other[wp.static(space_dim)]
-                    row = row_of[source[j]]
+                    row = row_of[original_index[j]]
                     as_neighbour = density_bar[j]
                     as_centre = density_bar[k]
                     neighbour_kernel = vector()
@@ -338,6 +339,6 @@ def adjoint_kernels(
                             )
                     pull += pair_pull(domain, offset, squared, as_neighbour, neighbour_kernel)
                     pull -= pair_pull(domain, -offset, squared, as_centre, centre_kernel)
-        positions_bar[source[k]] = pull
+        positions_bar[original_index[k]] = pull
 
     return namespace(locals())

@@ -18,23 +18,18 @@ from npa_envs.thread_lock import cached_under_lock
 
 @cached_under_lock()
 def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespace:
-    """Return the kernels of densities and neighbour lists, with one thread a particle."""
+    """Return the kernels of densities and neighbour lists, with one thread per particle."""
     space = domain_types(space_dim, scalar)
     vector, particle, Domain = space.vector, space.particle, space.Domain
     vector_f64 = wp.types.vector(space_dim, wp.float64)
     search = make_search(space_dim, scalar, particle, on_cpu)
-    module = kernel_module("density" if on_cpu else "unfiltered_density", space_dim, scalar)
+    module = kernel_module("density" if on_cpu else "cuda_density", space_dim, scalar)
 
     @wp.func
     def spiky_f64(domain: Domain, centre: vector, neighbour: vector):
         """Return the spiky gradient kernel of a pair in float64."""
         kernel = vector_f64()
-        r = vector_f64()
-        for d in range(wp.static(space_dim)):
-            r[d] = wp.float64(neighbour[d]) - wp.float64(centre[d])
-            if domain.periodic != 0:
-                images = wp.round((neighbour[d] - centre[d]) * domain.inverse_box[d])
-                r[d] -= wp.float64(images) * wp.float64(domain.box[d])
+        r = space.difference_f64(domain, centre, neighbour)
         exact = wp.dot(r, r)
         # The start must be near this very distance: across a seam that of the float32 positions
         # may be off by a rounding of the box's size.
@@ -52,7 +47,7 @@ def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespa
         particle_count: int,
         density_gradient: int,
         starts: wp.array[wp.int32],
-        source: wp.array[wp.int32],
+        original_index: wp.array[wp.int32],
         row_of: wp.array[wp.int32],
         sorted_positions: wp.array[vector],
         # outputs
@@ -68,7 +63,7 @@ def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespa
         position = sorted_positions[k]
         row = wp.int32(-1)
         if density_gradient != 0:
-            row = row_of[source[k]]
+            row = row_of[original_index[k]]
         base = (k / particle_count) * domain.cell_count
         cell = space.cell_of(domain, position)
         density = scalar(0.0)
@@ -129,7 +124,7 @@ def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespa
             begin = ends[k - 1]
         next_entry = begin
         for r in range(search.run_count(domain, cell)):
-            first, end = search.run_range(domain, starts, neighbours, base, cell, k, r)
+            first, end = search.run_range(domain, starts, ends, base, cell, k, r)
             for candidate in range(first, end, wp.static(search.stride)):
                 near, count = search.filter_near(
                     domain, particles, neighbours, position, candidate, end
@@ -167,7 +162,7 @@ def species_kernel(space_dim: int, scalar: type, species_count: int) -> wp.Kerne
         gradient_scale: wp.float64,
         logarithmic: int,
         starts: wp.array[wp.int32],
-        source: wp.array[wp.int32],
+        original_index: wp.array[wp.int32],
         sorted_species: wp.array[wp.int32],
         sorted_positions: wp.array[vector],
         # outputs
@@ -192,12 +187,7 @@ def species_kernel(space_dim: int, scalar: type, species_count: int) -> wp.Kerne
                     species = sorted_species[j]
                     weight = smoothing(squared, domain.inverse_squared_eps, domain.smoothing_norm)
                     densities[species] += wp.float64(weight)
-                    away = vector_f64()
-                    for d in range(wp.static(space_dim)):
-                        away[d] = wp.float64(neighbour[d]) - wp.float64(position[d])
-                        if domain.periodic != 0:
-                            images = wp.round((neighbour[d] - position[d]) * domain.inverse_box[d])
-                            away[d] -= wp.float64(images) * wp.float64(domain.box[d])
+                    away = space.difference_f64(domain, position, neighbour)
                     factor = spiky_factor(
                         wp.length(away),
                         wp.float64(domain.inverse_eps),
@@ -207,7 +197,7 @@ def species_kernel(space_dim: int, scalar: type, species_count: int) -> wp.Kerne
                         gradients[species, d] += factor * away[d]
         # A particle always counts itself.
         densities[sorted_species[k]] += wp.float64(domain.smoothing_norm)
-        i = source[k]
+        i = original_index[k]
         for q in range(wp.static(species_count)):
             density[i, q] = scalar(density_scale * densities[q])
             sum = vector_f64()

@@ -14,7 +14,7 @@ from npa_envs.kernels.domain import domain_types, kernel_module
 from npa_envs.kernels.mathematics import (
     log_scaled,
     make_corrected,
-    perception_topic,
+    perception_module_name,
     smoothing,
     spiky_factor,
 )
@@ -49,9 +49,9 @@ def perception_kernels(
     group = wp.types.vector(width, scalar)
     group_gradient = wp.types.matrix((space_dim, width), scalar)
     square = wp.types.matrix((space_dim, space_dim), scalar)
-    topic = "listed_per_particle_" * listed + "unfiltered_" * (not on_cpu)
-    topic += perception_topic(state_gradient, moment_inverse)
-    module = kernel_module(topic, space_dim, scalar, width)
+    module_name = "listed_per_particle_" * listed + "cuda_" * (not on_cpu)
+    module_name += perception_module_name(state_gradient, moment_inverse)
+    module = kernel_module(module_name, space_dim, scalar, width)
     search = make_search(space_dim, scalar, particle, on_cpu, listed)
     add_scaled = make_add_scaled(group)
     load_group = make_wide_load(group)
@@ -200,7 +200,7 @@ def perception_kernels(
         starts: wp.array[wp.int32],
         particles: wp.array[particle],
         states: wp.array[group],
-        source: wp.array[wp.int32],
+        original_index: wp.array[wp.int32],
         # outputs
         density: wp.array[scalar],
         blur_field: wp.array2d[scalar],
@@ -211,9 +211,10 @@ def perception_kernels(
         """Write unscaled density, smoothed state, gradients and moments, in the caller's order."""
         k, g = wp.tid()
         k += range_start
-        i = source[k]
+        i = original_index[k]
+        no_list = starts
         blur, gradient, _kernel_sum, moment = sum_neighbours(
-            domain, particle_count, starts, starts, starts, particles, states, k, g, group_count
+            domain, particle_count, starts, no_list, no_list, particles, states, k, g, group_count
         )
         straight = corrected(gradient, moment)
         for c in range(wp.static(width)):

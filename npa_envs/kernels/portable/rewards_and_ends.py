@@ -3,7 +3,7 @@
 import warp as wp
 
 from npa_envs.kernels import native_functions as native
-from npa_envs.kernels.primitives import await_earlier
+from npa_envs.kernels.primitives import wait_for_previous_kernel
 
 SUCCESS, DIVERGED, TIME_LIMIT = 1, 2, 4
 """Bits of an ending, the reasons why an episode is over; 0 while it runs."""
@@ -39,7 +39,7 @@ def update_episodes(
     `numbers` are the reward, the loss, its parts and their decreases; `flags` are terminated,
     truncated, success and diverged.
     """
-    await_earlier()
+    wait_for_previous_kernel()
     world = wp.tid()
     count = elapsed.shape[0]
     is_enabled = enabled[0]

@@ -70,15 +70,6 @@ def make_search(
         return begin, end
 
     @wp.func
-    def is_near(domain: Domain, entries: wp.array[entry_type], position: vector, j: int):
-        offset = vector()
-        entry = entries[j]
-        for d in range(wp.static(space_dim)):
-            offset[d] = entry[d] - position[d]
-        offset = space.minimum_image(domain, offset)
-        return wp.where(wp.dot(offset, offset) < domain.squared_eps, 1, 0)
-
-    @wp.func
     def filter_near(
         domain: Domain,
         entries: wp.array[entry_type],
@@ -96,7 +87,11 @@ def make_search(
                 count += 1
             else:
                 near[count] = c
-                count += is_near(domain, entries, position, c)
+                offset = vector()
+                for d in range(wp.static(space_dim)):
+                    offset[d] = entries[c][d] - position[d]
+                offset = space.minimum_image(domain, offset)
+                count += wp.where(wp.dot(offset, offset) < domain.squared_eps, 1, 0)
         return near, count
 
     return SimpleNamespace(

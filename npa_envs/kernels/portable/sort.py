@@ -14,9 +14,9 @@ import warp as wp
 from npa_envs.kernels.domain import domain_types, kernel_module
 from npa_envs.kernels.native_functions import PARTICLES, WORLDS, in_ranges, namespace
 from npa_envs.kernels.primitives import (
-    await_earlier,
     load_integer,
     make_read_channels,
+    wait_for_previous_kernel,
     wide_store,
 )
 from npa_envs.thread_lock import cached_under_lock
@@ -44,7 +44,7 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
         counts: wp.array[wp.int32],
     ):
         """Count particles, and the active ones, of cell c at counts[c + 1]; counts[0] stays 0."""
-        await_earlier()
+        wait_for_previous_kernel()
         i = wp.tid()
         index = (i / particle_count) * domain.cell_count
         index += space.cell_index(domain, space.cell_of(domain, positions[i]))
@@ -66,7 +66,7 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
 
         An entry is twice the particle's index, plus one if it is active; then its cell.
         """
-        await_earlier()
+        wait_for_previous_kernel()
         i = wp.tid()
         entry = 2 * i
         if mask.shape[0] == 0 or mask[i] != wp.uint8(0):
@@ -90,7 +90,7 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
         arrived: wp.array[wp.vec2i],
         starts: wp.array[wp.int32],
         # outputs
-        source: wp.array[wp.int32],
+        original_index: wp.array[wp.int32],
         sorted_cell: wp.array[wp.int32],
         row_of: wp.array[wp.int32],
         row_source: wp.array[wp.int32],
@@ -103,7 +103,7 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
 
         States and rows are left out where their arrays are empty.
         """
-        await_earlier()
+        wait_for_previous_kernel()
         k = range_start + wp.tid()
         entry = arrived[k]
         i = entry[0] / 2
@@ -115,7 +115,7 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
             if other < entry[0]:
                 target += 1
                 row += other & 1
-        source[target] = i
+        original_index[target] = i
         sorted_cell[target] = c
         sorted_positions[target] = positions[i]
         if row_of.shape[0] > 0:
@@ -149,7 +149,7 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
         # outputs
         cell: wp.array[wp.int32],
         starts: wp.array[wp.int32],
-        source: wp.array[wp.int32],
+        original_index: wp.array[wp.int32],
         sorted_cell: wp.array[wp.int32],
         row_of: wp.array[wp.int32],
         row_source: wp.array[wp.int32],
@@ -200,7 +200,7 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
             c = cell[i]
             target = starts[c]
             starts[c] = target + 1
-            source[target] = i
+            original_index[target] = i
             sorted_cell[target] = c
             sorted_positions[target] = positions[i]
             row = target
@@ -255,7 +255,7 @@ def give_rows(space_dim: int, scalar: type) -> wp.Kernel:
         particle or start, whichever are more. `active_before` is the cumulative number of active
         particles over all steps, up to and with each particle.
         """
-        await_earlier()
+        wait_for_previous_kernel()
         step, t = wp.tid()
         earlier = wp.int32(0)
         if step > 0:

@@ -14,10 +14,10 @@ from npa_envs.kernels.domain import domain_types, kernel_module, scalar_name
 from npa_envs.kernels.native_functions import ELEMENTS, in_ranges, namespace
 from npa_envs.kernels.primitives import (
     allow_next_launch,
-    await_earlier,
     load_integer,
     make_read_at,
     make_wide_load,
+    wait_for_previous_kernel,
     write_at,
 )
 from npa_envs.thread_lock import cached_under_lock
@@ -128,7 +128,7 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         new_path_length: wp.array[scalar],
     ):
         """Write positions, states and path lengths, updated where a particle has a row."""
-        await_earlier()
+        wait_for_previous_kernel()
         # Of the threads of a group of particles, the first move one particle each, and the others
         # change some channels each.
         chunks = (state_dim + wp.static(THREAD_CHANNELS - 1)) / wp.static(THREAD_CHANNELS)
@@ -200,7 +200,7 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         update_bar: wp.array[scalar],
     ):
         """Write dL/d(update) of every row, 0 beyond the last active row."""
-        await_earlier()
+        wait_for_previous_kernel()
         allow_next_launch()
         # A thread writes some adjacent columns of a row.
         chunks = (update_width + wp.static(THREAD_CHANNELS - 1)) / wp.static(THREAD_CHANNELS)
@@ -265,7 +265,7 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         diverged: wp.array[wp.uint8],
     ):
         """Apply the actions of active particles, and mark worlds in which a value was clipped."""
-        await_earlier()
+        wait_for_previous_kernel()
         # All loads are issued before any value is used, as the kernel waits for memory.
         chunks = (state_dim + wp.static(THREAD_CHANNELS - 1)) / wp.static(THREAD_CHANNELS)
         t = range_start + wp.tid()
@@ -370,7 +370,7 @@ def find_not_finite(scalar: type) -> wp.Kernel:
         finite: wp.array[wp.uint8],
     ):
         """Write 0 to `finite` if a value is infinite or NaN; values are aligned to 16 bytes."""
-        await_earlier()
+        wait_for_previous_kernel()
         t = wp.tid()
         wild = wp.int32(0)
         for k in range(wp.static(VALUES_PER_THREAD // QUAD)):

@@ -9,7 +9,7 @@ import warp as wp
 
 from npa_envs.kernels import native_functions as native
 from npa_envs.kernels.domain import scalar_name
-from npa_envs.kernels.primitives import await_earlier, make_lane_sum
+from npa_envs.kernels.primitives import make_lane_sum, wait_for_previous_kernel
 from npa_envs.thread_lock import cached_under_lock
 
 CHUNK = 256
@@ -32,7 +32,7 @@ def mean_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         partial_sums: wp.array3d[wp.float64],
     ):
         """Write the sum of each chunk of `CHUNK` values of a world."""
-        await_earlier()
+        wait_for_previous_kernel()
         world, k, chunk, lane = wp.tid()
         total = wp.float64(0.0)
         end = wp.min((chunk + 1) * wp.static(CHUNK), values.shape[1])
@@ -50,7 +50,7 @@ def mean_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         means: wp.array2d[scalar],
     ):
         """Add the partial sums of each world and divide by the number of values."""
-        await_earlier()
+        wait_for_previous_kernel()
         world, k, lane = wp.tid()
         total = wp.float64(0.0)
         for part in range(lane, partial_sums.shape[1], wp.static(lanes)):
