@@ -30,7 +30,7 @@ def rows_and_gradient(x, s, *, mask=None, spare_rows=0, spare_columns=0, **optio
     width = options.get("terms", Terms()).perception_dim(x.shape[2], s.shape[2])
     size = {"capacity": max(active, 1) + spare_rows, "width": width + spare_columns}
     perception, rows = rows_of(x, s, mask, eps0=0.2, **size, **options)
-    source = rows.row_source[:active].long()
+    source = rows.row_particle[:active].long()
     (cotangent,) = cotangents([perception.new_empty(total, width)])
     bar = torch.full_like(perception, float("nan"))
     bar[:active, :width] = cotangent[source]
