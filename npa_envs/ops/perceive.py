@@ -2,7 +2,6 @@
 
 Each is a custom torch operator, which torch.compile does not trace. The autograd functions save
 only tensors that the adjoint of the case reads.
-Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
 """
 
 from __future__ import annotations

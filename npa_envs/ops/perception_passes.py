@@ -1,7 +1,4 @@
-"""The passes over sorted worlds: arguments and launches of density, perception and adjoint.
-
-Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
-"""
+"""The passes over sorted worlds: arguments and launches of density, perception and adjoint."""
 
 from __future__ import annotations
 

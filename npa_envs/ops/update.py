@@ -1,7 +1,4 @@
-"""Updates of particles: by a rule's outputs, as a torch operator, and by actions, in place.
-
-Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
-"""
+"""Updates of particles: by a rule's outputs, as a torch operator, and by actions, in place."""
 
 from __future__ import annotations
 
@@ -129,8 +126,6 @@ def _update_particles_backward(
 
 
 class _UpdateParticles(torch.autograd.Function):
-    """Autograd function of `update_particles`."""
-
     @staticmethod
     def forward(
         ctx: Any,

@@ -175,7 +175,7 @@ OWN = {"cameras": made(world_to_camera=torch.eye(4).repeat(3, 1, 1, 1))}
         (judging, {"goal": torch.zeros(3)}, r"and \(3,\)"),
         (judging, {"target": torch.zeros(1, 1, 4)}, "resolution must be at least 2"),
         (judging, {"sigma": 0.0}, "sigma must be positive"),
-        (world_mean, {"values": torch.zeros(4, 3)}, r"values must .*\[B, M, K\] .*, got \(4, 3\)"),
+        (world_mean, {"values": torch.zeros(4, 3)}, r"values must .*\[B, M, F\] .*, got \(4, 3\)"),
         (world_mean, {"values": torch.zeros(4, 0, 3)}, r"got \(4, 0, 3\)"),
         (world_mean, {"values": torch.zeros(4, 2, 3).half()}, "or float64, got torch.float16"),
         (world_mean, {"values": torch.zeros(4, 2, 3).long()}, r"convert it with \.float\(\)"),
