@@ -139,7 +139,7 @@ def test_a_position_that_is_not_a_number_leaves_other_worlds_alone(device):
         assert torch.equal(value.view(2, 83, -1)[1], answer.view(2, 83, -1)[1])
 
 
-def test_gradients_that_kernels_could_not_index_are_refused(monkeypatch):
+def test_gradients_that_kernels_could_not_index_are_rejected(monkeypatch):
     x, s = random_world(1, 20, 3, 5, dtype=torch.float64, device="cpu")
     z = npa_envs.perceive(x, s.requires_grad_(), 0.3)
     monkeypatch.setattr(perception_passes, "MAX_INDEX", 20 * 8 * 3)

@@ -1,4 +1,4 @@
-"""What operators refuse, and what they say then."""
+"""What operators reject, and what they say then."""
 
 import math
 
@@ -183,7 +183,7 @@ OWN = {"cameras": made(world_to_camera=torch.eye(4).repeat(3, 1, 1, 1))}
         (perceiving, {"word": "soft"}, "must be 'threshold' or 'smooth', got 'soft'"),
     ],
 )
-def test_what_does_not_fit_is_refused(call, change, message):
+def test_what_does_not_fit_is_rejected(call, change, message):
     assert made().count == 2
     with pytest.raises(NPAError, match=message):
         call(**change)
