@@ -207,13 +207,11 @@ def choose(operator: Operator, request: KernelRequest) -> Implementation:
 
 def describe(request: KernelRequest) -> list[str]:
     """Return a text line for each operator: the chosen implementation, its file, when it runs."""
-    chosen: dict[Operator, Implementation] = {}
-    for row in TABLE:
-        if row.holds(request):
-            chosen.setdefault(row.operator, row)
+    chosen = {row.operator: row for row in reversed(TABLE) if row.holds(request)}
     return [
         f"{row.operator:8}  {row.name:8}  {row.where:28}  {row.condition}"
-        for row in chosen.values()
+        for row in TABLE
+        if row is chosen.get(row.operator)
     ]
 
 
@@ -234,37 +232,26 @@ class ListLayout(NamedTuple):
     """Whether the density pass is `tiled_density`."""
 
 
-CAPACITY, CROWDED_CAPACITY = 128, 256
-"""Longest neighbour lists: by default, and in crowded boxes."""
-
-SMALL_WORLD_CAPACITY, HUGE_WORLD_CAPACITY = 64, 96
-"""The same in small worlds of environments, and in huge worlds of rollouts."""
-
 CROWD = range(80, 200)
-"""Mean neighbours at which many lists are longer than `CAPACITY`, and few `CROWDED_CAPACITY`."""
+"""Mean neighbours at which many lists are longer than 128, and few longer than 256."""
 
 HUGE_WORLD = 2**22
 """Particles of the largest world whose neighbour lists may take more memory than its rows."""
-
-DENSITY_LANES = 4
-"""Threads that share a particle in the density pass of small worlds."""
 
 
 def rollout_lists(request: KernelRequest, mean_neighbours: float) -> ListLayout:
     """Return the lists of rollouts: more threads per particle, so that few worlds fill a GPU."""
     if request.particle_count <= SHARED_WORLD:
-        crowded = int(mean_neighbours) in CROWD
-        capacity = CROWDED_CAPACITY if crowded else CAPACITY
+        capacity = 256 if int(mean_neighbours) in CROWD else 128
         tiled = choose("density", request).name == "tiles"
-        return ListLayout(capacity, lanes=DENSITY_LANES, teams=2, tiled=tiled)
+        return ListLayout(capacity, lanes=4, teams=2, tiled=tiled)
     # The lists of worlds that fill a device's memory would be the largest part of it.
-    huge = request.particle_count > HUGE_WORLD
-    return ListLayout(HUGE_WORLD_CAPACITY if huge else CAPACITY, lanes=1, teams=1)
+    return ListLayout(96 if request.particle_count > HUGE_WORLD else 128, lanes=1, teams=1)
 
 
 def environment_lists(request: KernelRequest) -> ListLayout:
     """Return the lists of environments: fewer threads per world, since batches fill a GPU."""
     if request.particle_count <= SMALL_WORLD:
-        return ListLayout(SMALL_WORLD_CAPACITY, lanes=1, teams=1)
+        return ListLayout(64, lanes=1, teams=1)
     tiled = choose("density", request).name == "tiles"
-    return ListLayout(CAPACITY, lanes=DENSITY_LANES if tiled else 1, teams=1, tiled=tiled)
+    return ListLayout(128, lanes=4 if tiled else 1, teams=1, tiled=tiled)

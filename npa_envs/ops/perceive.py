@@ -185,7 +185,7 @@ class Rows(NamedTuple):
     row_particle: Tensor
     """Particle of each row, int32, shape [K]; undefined beyond the last active row."""
     starts: Tensor
-    """Cell starts; the last entry minus `row_base` is the number of active rows."""
+    """`SortedWorlds.starts`; the last entry minus `row_base` is the number of active rows."""
     row_base: int
 
 
@@ -330,9 +330,7 @@ def perceive_rows(
     else:
         saved, row_particle = _perceived(*arguments, False)
         perception, maps = saved.perception, [saved.row_of, row_particle, saved.starts]
-    if rows is not None:
-        maps = [rows.row_of, rows.row_particle, rows.starts]
-    row_of, row_particle, starts = maps
+    row_of, row_particle, starts = maps if rows is None else rows[:3]
     return perception, Rows(row_of, row_particle, starts, x.shape[0] * x.shape[1] if masked else 0)
 
 
@@ -363,10 +361,8 @@ def updates_in_parts(
     updates = None
     for first in range(0, row_capacity, ROWS_TOGETHER):
         part = perception[: min(ROWS_TOGETHER, row_capacity - first)]
-        arguments = perception_launch(
-            plan, ordered, densities, part, first_row=first, row_count=len(part)
-        )
-        launch(*arguments)
+        rows = {"first_row": first, "row_count": len(part)}
+        launch(*perception_launch(plan, ordered, densities, part, **rows))
         mapped = network(part)
         if updates is None:
             updates = mapped.new_empty(row_capacity, mapped.shape[1])

@@ -260,7 +260,7 @@ def perception_launch(
 
 
 class SavedPerception(NamedTuple):
-    """Tensors that the forward pass saves for the adjoint of perception."""
+    """Tensors that the adjoint of perception reads; some are in `SortedWorlds` and `Densities`."""
 
     perception: Tensor
     """Rows of perception, dimensionless, shape [K, row_width]."""
@@ -268,17 +268,12 @@ class SavedPerception(NamedTuple):
     """Sums over neighbours of volume times kernel gradient [1 / length units], shape [K, D];
     undefined beyond the last active row."""
     row_of: Tensor
-    """Row of each particle, -1 for none, int32, shape [B N]."""
     starts: Tensor
-    """First sorted index of every cell, then first row of every cell (plus `row_base`), int32."""
     original_index: Tensor
-    """Caller's index of each sorted particle, int32, shape [B N]."""
     particles: Tensor
-    """Sorted positions [length units] with volumes 1 / rho, shape [B N, D + 1]."""
     row_positions: Tensor
-    """Positions of the rows [length units], shape [K, D]; undefined beyond the last active row."""
     states: Tensor | None = None
-    """Sorted states, dimensionless, shape [B N G, W]; None where positions get no gradient."""
+    """Of `SortedWorlds`; None where positions get no gradient."""
 
 
 @custom_op("npa::perceive_rows_backward")

@@ -29,22 +29,17 @@ MAX_LISTS = 2**31
 
 
 class StaticWorlds(NamedTuple):
-    """Sorted worlds whose particles do not move, with densities; made by `prepare_static`."""
+    """Worlds whose particles do not move: parts of their `SortedWorlds` and `Densities`."""
 
     original_index: Tensor
-    """Caller's index of each sorted particle, int32, shape [B N]."""
     sorted_index: Tensor
     """Sorted index of each particle in the caller's order, int32, shape [B N]."""
     all_indices: Tensor
     """0, 1, ... B N - 1, int32: all sorted indices."""
     starts: Tensor
-    """First sorted index of every cell, int32."""
     cell: Tensor
-    """Cell of each sorted particle, counted through all worlds, int32, shape [B N]."""
     particles: Tensor
-    """Positions [length units] with volumes 1 / rho, shape [B N, D + 1]."""
     density_gradient: Tensor
-    """Density gradients, float64, shape [B N, D]; empty for the CUDA backend."""
     lists: list[Tensor]
     """For the CUDA backend steps, lengths and records of `NeighbourLists`; on a CPU the tensors of
     `StaticNeighbours`, or none if they take too much memory; none elsewhere."""
@@ -114,16 +109,15 @@ def prepare_static(x: Tensor, physics: Physics) -> StaticWorlds:
 
 
 class StaticRows(NamedTuple):
-    """Which particles of static worlds are active in one step, and their rows of perception."""
+    """The particles of static worlds that are active in one step, as in `SortedWorlds`.
+
+    Indices are those of sorted particles, for the caller's order is that order.
+    """
 
     row_of: Tensor
-    """Row of each sorted particle, -1 for none, int32, shape [B N]."""
     row_particle: Tensor
-    """Sorted particle of each row, int32, shape [K]; undefined beyond the last active row."""
     starts: Tensor
-    """First sorted index of every cell, then first row of every cell (plus `row_base`), int32."""
     row_positions: Tensor
-    """Positions of the rows [length units], shape [K, D]; undefined beyond the last active row."""
 
 
 @custom_op("npa::static_rows")
@@ -171,12 +165,10 @@ def static_rows(
     if x.is_cuda:
         return steps
     # Reading the number of rows is free on a CPU; on CUDA it would wait for the device.
+    counts = [max(count, 1) for count in active.tolist()]
     return [
-        step._replace(
-            row_particle=step.row_particle[: max(count, 1)],
-            row_positions=step.row_positions[: max(count, 1)],
-        )
-        for step, count in zip(steps, active.tolist(), strict=True)
+        StaticRows(row_of, row_particle[:count], starts, row_positions[:count])
+        for count, (row_of, row_particle, starts, row_positions) in zip(counts, steps, strict=True)
     ]
 
 

@@ -1,7 +1,4 @@
-"""Pictures of 2D worlds as a differentiable torch operator, and their losses in fused kernels.
-
-Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
-"""
+"""Pictures of 2D worlds as a differentiable torch operator, and their losses in fused kernels."""
 
 from __future__ import annotations
 
