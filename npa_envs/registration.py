@@ -5,6 +5,7 @@ Entry points are strings: torch and Warp are not imported before an environment 
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
@@ -16,7 +17,8 @@ class Registration:
     """An environment to register with Gymnasium, or a variant of another size.
 
     Args:
-        name: Name of the environment: its classes are `nameEnv` and `nameVectorEnv`.
+        name: Name of the environment: its classes are `nameEnv` and `nameVectorEnv`, in the module
+            of the name in snake case.
         max_episode_steps: Steps after which an episode is truncated.
         size: "Small", "Large" or "", which the id has after the name.
         keywords: Keyword arguments of the classes.
@@ -25,8 +27,7 @@ class Registration:
     def __init__(self, name: str, max_episode_steps: int, size: str = "", **keywords: Any) -> None:
         self.id = f"npa/{name}{size}-v0"
         self.name = name
-        module = "point_classification" if name == "PointClassification" else name.lower()
-        self.module = f"npa_envs.envs.{module}"
+        self.module = f"npa_envs.envs.{re.sub('(?<=[a-z])(?=[A-Z])', '_', name).lower()}"
         self.entry_point = f"{self.module}:{name}Env"
         self.vector_entry_point = f"{self.module}:{name}VectorEnv"
         self.max_episode_steps = max_episode_steps

@@ -76,7 +76,7 @@ class _DamagesWorlds(WrapperBase):
                     s[chosen],
                     kind=event.kind,
                     size=event.size,
-                    box=worlds.physics.box,
+                    box=worlds.physics.periodic_box,
                     generator=stream,
                 )
         return x, s

@@ -165,7 +165,7 @@ class EnvironmentTask(ParticleTask[Any]):
     @property
     def box(self) -> tuple[float, ...] | None:
         """Sides of the periodic box, None in open space [length units]."""
-        return self.physics.box
+        return self.physics.periodic_box
 
     def seed(
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
@@ -208,8 +208,8 @@ class EnvironmentTask(ParticleTask[Any]):
         options |= {
             "dt": physics.dt,
             "position_noise": physics.position_noise,
-            "box": physics.box or physics.walls,
-            "boundary": config.boundary,
+            "box": physics.box,
+            "boundary": physics.boundary,
         }
         if isinstance(config, SpeciesConfig):
             options |= {"counts": config.counts, "perception": config.perception}

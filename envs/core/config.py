@@ -166,15 +166,13 @@ class WorldConfig:
 
     def physics(self, space_dim: int, *, static: bool) -> Physics:
         """Return the constants of motion and perception; `static`: particles never move."""
-        sides = None if self.box is None else (self.box,) * space_dim
-        periodic = self.boundary == "periodic"
         return Physics(
             space_dim=space_dim,
             state_dim=self.state_dim,
             eps=self.eps,
             eps0=self.eps0,
-            box=sides if periodic else None,
-            walls=None if periodic else sides,
+            boundary=self.boundary,
+            box=None if self.box is None else (self.box,) * space_dim,
             terms=Terms(moment_inverse=self.moment_inverse),
             moving=not static,
             max_displacement=self.alpha * self.eps,

@@ -498,7 +498,7 @@ class Cohort:
         x, s, physics = self.population.x, self.population.s, self._physics
         inside = (s.abs() < physics.limits.state).all(dim=-1)
         # In a box positions reach the limit only by wrapping onto an edge that lies there.
-        if (physics.box or physics.walls) is None:
+        if physics.boundary == "open":
             inside &= (x.abs() < physics.limits.position).all(dim=-1)
         # Sums of ones are exact in any order.
         count = torch.zeros(len(inside), self._agent_count, device=inside.device)

@@ -1,4 +1,7 @@
-"""SPH operators as torch functions: the one place that knows both torch and Warp."""
+"""SPH operators as torch functions: the one place that knows both torch and Warp.
+
+In all modules `x_bar` is dL/dx, the gradient of the loss L with respect to x.
+"""
 
 from npa_envs.ops.perceive import PerceptionFields, perceive, perception_fields
 from npa_envs.ops.pictures.cameras import Cameras, cameras_of_poses, look_at, orbit

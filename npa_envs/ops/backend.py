@@ -3,8 +3,9 @@
 There are two backends. `kernels/portable/` is plain Warp for a CPU and for CUDA, in float32 and
 float64; it reads like `reference.py`. `kernels/cuda/` is for CUDA in float32 on compute capability
 8.0 and above: neighbour lists in 16 bits, sums shared by threads, tensor cores. An operator takes
-the first implementation in `TABLE` whose condition holds for a call. `npa-envs bench --explain`
-prints what was chosen. The operators of `ops/pictures/` choose by the device alone.
+the first implementation in `TABLE` whose condition holds for a call; perception is in the backend
+of the density pass, and there is one update. `npa-envs bench --explain` prints what was chosen. The
+operators of `ops/pictures/` choose by the device alone.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from npa_envs.kernels.cuda.equivariance import fits_block
 from npa_envs.kernels.cuda.network import WARP_UNITS
 from npa_envs.kernels.cuda.sort import BLOCKS, MAX_GRID
 
-Operator = Literal["sort", "density", "perceive", "adjoint", "vectors", "network", "update"]
+Operator = Literal["sort", "density", "adjoint", "vectors", "network"]
 
 MAX_ROW, MAX_UPDATE, MAX_HIDDEN = 128, 32, 512
 """Widest rows and updates, and most hidden units, that the fused network takes."""
@@ -162,10 +163,6 @@ TABLE: tuple[Implementation, ...] = (
     ),
     Implementation("density", "portable", "kernels/portable/density.py"),
     Implementation(
-        "perceive", "cuda", "kernels/cuda/perceive.py", f"{_MODERN}: from neighbour lists", _cuda
-    ),
-    Implementation("perceive", "portable", "kernels/portable/perceive.py"),
-    Implementation(
         "adjoint",
         "cuda",
         "kernels/cuda/adjoint.py",
@@ -198,7 +195,6 @@ TABLE: tuple[Implementation, ...] = (
         _fused,
     ),
     Implementation("network", "torch", "torch's products"),
-    Implementation("update", "portable", "kernels/portable/update.py", "always"),
 )
 """All implementations. A call takes the first one of its operator whose condition is true."""
 
@@ -211,17 +207,15 @@ def choose(operator: Operator, request: KernelRequest) -> Implementation:
 
 def describe(request: KernelRequest) -> list[str]:
     """Return a text line for each operator: the chosen implementation, its file, when it runs."""
-    chosen: dict[Operator, Implementation] = {}
-    for row in TABLE:
-        if row.holds(request):
-            chosen.setdefault(row.operator, row)
+    chosen = {row.operator: row for row in reversed(TABLE) if row.holds(request)}
     return [
         f"{row.operator:8}  {row.name:8}  {row.where:28}  {row.condition}"
-        for row in chosen.values()
+        for row in TABLE
+        if row is chosen.get(row.operator)
     ]
 
 
-class Listing(NamedTuple):
+class ListLayout(NamedTuple):
     """Length of neighbour lists on CUDA, and how many threads compute a particle together.
 
     It depends on the device and on one world's size and box, never on the number of worlds: it
@@ -238,37 +232,26 @@ class Listing(NamedTuple):
     """Whether the density pass is `tiled_density`."""
 
 
-CAPACITY, CROWDED_CAPACITY = 128, 256
-"""Longest neighbour lists: by default, and in crowded boxes."""
-
-SMALL_WORLD_CAPACITY, HUGE_WORLD_CAPACITY = 64, 96
-"""The same in small worlds of environments, and in huge worlds of rollouts."""
-
 CROWD = range(80, 200)
-"""Mean neighbours at which many lists are longer than `CAPACITY`, and few `CROWDED_CAPACITY`."""
+"""Mean neighbours at which many lists are longer than 128, and few longer than 256."""
 
 HUGE_WORLD = 2**22
 """Particles of the largest world whose neighbour lists may take more memory than its rows."""
 
-DENSITY_LANES = 4
-"""Threads that share a particle in the density pass of small worlds."""
 
-
-def rollout_listing(request: KernelRequest, mean_neighbours: float = 0.0) -> Listing:
-    """Return the `Listing` of rollouts: more threads a particle, so that few worlds fill a GPU."""
+def rollout_lists(request: KernelRequest, mean_neighbours: float) -> ListLayout:
+    """Return the lists of rollouts: more threads per particle, so that few worlds fill a GPU."""
     if request.particle_count <= SHARED_WORLD:
-        crowded = int(mean_neighbours) in CROWD
-        capacity = CROWDED_CAPACITY if crowded else CAPACITY
+        capacity = 256 if int(mean_neighbours) in CROWD else 128
         tiled = choose("density", request).name == "tiles"
-        return Listing(capacity, lanes=DENSITY_LANES, teams=2, tiled=tiled)
+        return ListLayout(capacity, lanes=4, teams=2, tiled=tiled)
     # The lists of worlds that fill a device's memory would be the largest part of it.
-    huge = request.particle_count > HUGE_WORLD
-    return Listing(HUGE_WORLD_CAPACITY if huge else CAPACITY, lanes=1, teams=1)
+    return ListLayout(96 if request.particle_count > HUGE_WORLD else 128, lanes=1, teams=1)
 
 
-def batch_listing(request: KernelRequest) -> Listing:
-    """Return the `Listing` of environments: fewer threads a world, since batches fill a GPU."""
+def environment_lists(request: KernelRequest) -> ListLayout:
+    """Return the lists of environments: fewer threads per world, since batches fill a GPU."""
     if request.particle_count <= SMALL_WORLD:
-        return Listing(SMALL_WORLD_CAPACITY, lanes=1, teams=1)
+        return ListLayout(64, lanes=1, teams=1)
     tiled = choose("density", request).name == "tiles"
-    return Listing(CAPACITY, lanes=DENSITY_LANES if tiled else 1, teams=1, tiled=tiled)
+    return ListLayout(128, lanes=4 if tiled else 1, teams=1, tiled=tiled)

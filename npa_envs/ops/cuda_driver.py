@@ -92,9 +92,8 @@ def _follows_kernel(stream: int) -> bool:
     nodes, edges = ctypes.POINTER(ctypes.c_void_p)(), ctypes.c_void_p()
     count = ctypes.c_size_t()
     results = (status, identifier, graph, nodes, edges, count)
-    if driver.cuStreamGetCaptureInfo_v3(ctypes.c_void_p(stream), *map(ctypes.byref, results)):
-        return False
-    if count.value != 1:
+    failed = driver.cuStreamGetCaptureInfo_v3(ctypes.c_void_p(stream), *map(ctypes.byref, results))
+    if failed or count.value != 1:
         return False
     node_type = ctypes.c_int(-1)
     failed = driver.cuGraphNodeGetType(ctypes.c_void_p(nodes[0]), ctypes.byref(node_type))
@@ -102,7 +101,7 @@ def _follows_kernel(stream: int) -> bool:
 
 
 class DriverLaunch:
-    """A CUDA launch recorded by Warp, to be repeated through the driver API."""
+    """A CUDA launch prepared by Warp, to be repeated through the driver API."""
 
     def __init__(self, launch: Any, device: torch.device, addresses: Any) -> None:
         capability = launch.device.get_cuda_compile_arch() or 0
@@ -126,9 +125,8 @@ class DriverLaunch:
 
     def run(self, thread_count: int, stream: int) -> bool:
         """Launch `thread_count` threads on a stream; return False where Warp has to."""
-        if self._launch is None or thread_count > MAX_THREADS:
-            return False
-        if torch.cuda.current_device() != self._device.index:
+        other_device = torch.cuda.current_device() != self._device.index
+        if self._launch is None or thread_count > MAX_THREADS or other_device:
             return False
         config = self._config
         config.grid_x = -(-thread_count // self._block)

@@ -1,7 +1,7 @@
 """Custom torch operators around kernels, which `torch.compile` calls without tracing them.
 
 Backward passes are kernels as well and have no derivatives of their own. Second derivatives,
-forward-mode derivatives and functions of `torch.func` are refused with an error.
+forward-mode derivatives and functions of `torch.func` are rejected with an error.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ Result = TypeVar("Result")
 
 _transforms_active = torch._C._are_functorch_transforms_active
 
-PLAIN_TYPES = {Tensor, nn.Parameter, Physics, torch.dtype, bool, int, float, str, list, NoneType}
+DIRECT_TYPES = {Tensor, nn.Parameter, Physics, torch.dtype, bool, int, float, str, list, NoneType}
 """Types of arguments that kernels can read; a tensor subclass may wrap other tensors."""
 
 HINT = "or take small worlds with the slow operators of npa_envs.reference, which are plain torch"
@@ -37,10 +37,6 @@ def check_derivatives(**arguments: Any) -> None:
     """Check that no forward-mode derivative and no function of `torch.func` uses these arguments.
 
     Forward-mode derivatives would be lost silently where no tensor requires a gradient.
-
-    Raises:
-        NPAError: A tensor carries a tangent of forward-mode derivatives, or a function of
-            `torch.func` makes the call.
     """
     # In this order: a compiler cannot trace the second condition.
     if not torch.compiler.is_compiling() and _transforms_active():
@@ -73,7 +69,7 @@ def _check_tangents(arguments: dict[str, Any]) -> None:
 
 
 def _tensors(value: Any) -> Iterator[Tensor]:
-    """Yield the tensors in a tensor, list, tuple or module, also in a module's plain attributes."""
+    """Yield the tensors in a tensor, list, tuple or module, also in a module's attributes."""
     if isinstance(value, Tensor):
         yield value
     elif isinstance(value, nn.Module):
@@ -91,7 +87,7 @@ class CustomOp(Generic[Arguments, Result]):
     """A function of tensors that becomes a torch operator only where torch has to see one.
 
     That is under torch.compile, in dispatch modes and for tensor subclasses. Other calls run the
-    plain function, as an operator's call costs as much CPU time as several launches. Arguments are
+    function itself, as an operator's call costs as much CPU time as several launches. Arguments are
     positional. Results share no memory with each other or with arguments. The operator takes a
     `Physics` as the list `Physics.numbers`. For tensors without memory, as in tracing, the function
     runs without its launches.
@@ -122,14 +118,14 @@ class CustomOp(Generic[Arguments, Result]):
         return unpacked
 
     def __call__(self, *args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
-        """Call the plain function, or the torch operator where torch has to see one."""
+        """Call the function, or the torch operator where torch has to see one."""
         assert not kwargs, "arguments are positional"
         if forward_ad._current_level >= 0:
             _check_tangents(dict(zip(self._signature.parameters, args, strict=False)))
         # In this order: a compiler cannot trace the other conditions.
         if (
             torch.compiler.is_compiling()
-            or not PLAIN_TYPES.issuperset(map(type, args))
+            or not DIRECT_TYPES.issuperset(map(type, args))
             or is_in_torch_dispatch_mode()
         ):
             flat = [value.numbers() if isinstance(value, Physics) else value for value in args]
@@ -161,14 +157,11 @@ def without_autocast(backward: Callable[Arguments, Result]) -> Callable[Argument
 
 
 def once_differentiable(backward: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """Wrap the backward pass of an autograd function, so that it refuses second derivatives.
+    """Wrap a backward pass, so that it rejects second derivatives and several cotangents at once.
 
     Torch's own `once_differentiable` raises no error where the incoming gradient requires none, as
-    that of a sum: second derivatives are then silently zero. Compiled functions refuse them
+    that of a sum: second derivatives are then silently zero. Compiled functions reject them
     themselves, except under torch.compile's debugging backend "eager".
-
-    Raises:
-        NPAError: When called with `create_graph=True`, or with several cotangents at once.
     """
     backward = without_autocast(backward)
 

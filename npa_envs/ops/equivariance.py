@@ -4,7 +4,6 @@ v are a particle's perceived gradients, u = mixing^T v linear combinations of th
 the world rotates all of them and leaves u_a · u_b unchanged, in 2D also u_a × u_b, whose sign
 changes in a mirror. Each formula exists twice: in plain torch, for any tensors (`invariants`,
 `steered`), and as kernels with hand-written adjoints, for rollouts (`read_rows`, `steer_rows`).
-Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
 """
 
 from __future__ import annotations
@@ -230,8 +229,6 @@ def _steer_rows_backward(
 
 
 class _ReadRows(torch.autograd.Function):
-    """Autograd function of `read_rows`."""
-
     @staticmethod
     def forward(
         ctx: Any, rows: Tensor, mixing: Tensor, width: int, sizes: VectorSizes
@@ -252,8 +249,6 @@ class _ReadRows(torch.autograd.Function):
 
 
 class _SteerRows(torch.autograd.Function):
-    """Autograd function of `steer_rows`."""
-
     @staticmethod
     def forward(ctx: Any, output: Tensor, mixed: Tensor, signs: Tensor, width: int) -> Tensor:
         ctx.save_for_backward(output, mixed, signs)

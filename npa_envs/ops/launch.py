@@ -180,11 +180,16 @@ class _PreparedLaunch:
         fields = [(f"a{k}", type(value)) for k, value in enumerate(parameters)]
         self._memory: Any = _struct(tuple(fields))(*parameters)
         self._names = [name for name, _ in fields]
-        setters = [
-            self._setter(*argument) for argument in zip(self._names, types, arguments, strict=True)
-        ]
-        self._described = [(k, setter) for k, setter in enumerate(setters) if setter is not None]
-        self._numbers = [k for k, setter in enumerate(setters) if setter is None]
+        self._described: list[tuple[int, Callable[[Any], None]]] = []
+        self._numbers: list[int] = []
+        for k, (name, declared) in enumerate(zip(self._names, types, strict=True)):
+            memory = getattr(self._memory, name)
+            if isinstance(declared, wp.array):
+                self._described.append((k, _ArrayArgument(memory, declared).set))
+            elif hasattr(arguments[k], "__ctype__"):
+                self._described.append((k, _StructArgument(memory).set))
+            else:
+                self._numbers.append(k)
         self._last: list[Any] = [None] * len(parameters)
         self._addresses: Any = None
         self._driven: DriverLaunch | None = None
@@ -195,18 +200,10 @@ class _PreparedLaunch:
             self._launch.params_addr = self._addresses
             self._driven = DriverLaunch(self._launch, device, self._addresses)
 
-    def _setter(self, name: str, declared: Any, value: Any) -> Any:
-        """Return the function that writes an array or struct; None for numbers."""
-        if isinstance(declared, wp.array):
-            return _ArrayArgument(getattr(self._memory, name), declared).set
-        if hasattr(value, "__ctype__"):
-            return _StructArgument(getattr(self._memory, name)).set
-        return None
-
     def set(self, arguments: tuple[Any, ...]) -> None:
         """Replace the kernel's arguments for the next launch."""
-        for k, setter in self._described:
-            setter(arguments[k])
+        for k, write in self._described:
+            write(arguments[k])
         last = self._last
         for k in self._numbers:
             value = arguments[k]
@@ -304,12 +301,12 @@ def _described(kernel: Any, size: tuple[int, ...]) -> Launch:
 
 
 class _ThreadState(threading.local):
-    """A thread's prepared launches, and whether it records or traces launches."""
+    """A thread's prepared launches, and whether it tapes or traces launches."""
 
     def __init__(self) -> None:
         self.by_kernel: dict[tuple[Any, torch.device, int], _PreparedLaunch] = {}
         self.tape: Tape | None = None
-        """The tape that records this thread's launches, if any."""
+        """The tape of this thread's launches, if any."""
         self.traced = False
         """Whether tensors have no memory, so that nothing is launched."""
 
@@ -377,13 +374,13 @@ def aligned(tensor: Tensor) -> Tensor:
     return tensor if is_aligned(tensor) else tensor.clone()
 
 
-def is_recorded() -> bool:
-    """Return whether a tape records this thread's launches."""
+def is_taped() -> bool:
+    """Return whether this thread's launches are put on a tape."""
     return _thread.tape is not None
 
 
 class Tape:
-    """A recorded sequence of launches that is replayed on the same tensors in the same memory."""
+    """A sequence of launches that is replayed on the same tensors in the same memory."""
 
     def __init__(self) -> None:
         self._launches: list[tuple[_PreparedLaunch, tuple[int, ...]]] = []
@@ -398,18 +395,18 @@ class Tape:
         *arguments: Any,
         block_dim: int = CUDA_BLOCK,
     ) -> _PreparedLaunch:
-        """Record a launch with arguments as of `launch`, and return it; it is not made yet."""
+        """Append a launch with the arguments of `launch`, and return it; it is not made yet."""
         size = (size,) if isinstance(size, int) else size
         arguments = (0, *arguments) if kernel in MIN_RANGES else arguments
-        recorded = _PreparedLaunch(kernel, size, device, block_dim, arguments)
-        recorded.set(arguments)
-        self._launches.append((recorded, size))
+        prepared = _PreparedLaunch(kernel, size, device, block_dim, arguments)
+        prepared.set(arguments)
+        self._launches.append((prepared, size))
         self._tensors.append(list(arguments))
-        return recorded
+        return prepared
 
     @contextlib.contextmanager
     def recording(self) -> Iterator[None]:
-        """Make and record this thread's launches in the block."""
+        """Make this thread's launches in the block, and append them."""
         _thread.tape, before = self, _thread.tape
         try:
             yield

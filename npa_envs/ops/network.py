@@ -1,7 +1,4 @@
-"""The rule's network: fused operators on CUDA's tensor cores, their adjoint, and its weights.
-
-Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
-"""
+"""The rule's network: fused operators on CUDA's tensor cores, their adjoint, and its weights."""
 
 from __future__ import annotations
 
@@ -66,16 +63,6 @@ def _arrange_weights(
     return arranged
 
 
-def arrange(
-    hidden_weight: Tensor, output_weight: Tensor, *, with_backward: bool
-) -> ArrangedWeights:
-    """Return weights in the layout of the CUDA kernels, of the backward pass too if asked for."""
-    arranged = _arrange_weights(
-        hidden_weight.detach().contiguous(), output_weight.detach().contiguous(), with_backward
-    )
-    return ArrangedWeights(arranged[:3], arranged[3:])
-
-
 def arrange_weights(hidden_weight: Tensor, output_weight: Tensor) -> ArrangedWeights | None:
     """Return a rule's weights in the layout of `run_network`; None if no kernel supports them.
 
@@ -92,7 +79,9 @@ def arrange_weights(hidden_weight: Tensor, output_weight: Tensor) -> ArrangedWei
     )
     if choose("network", request).name != "cuda":
         return None
-    return arrange(hidden_weight, output_weight, with_backward=torch.is_grad_enabled())
+    weights = hidden_weight.detach().contiguous(), output_weight.detach().contiguous()
+    arranged = _arrange_weights(*weights, torch.is_grad_enabled())
+    return ArrangedWeights(arranged[:3], arranged[3:])
 
 
 ROW_GROUP = 16
@@ -182,8 +171,6 @@ def _weight_gradients(
 
 
 class _Network(torch.autograd.Function):
-    """Autograd function of `run_network`."""
-
     @staticmethod
     def forward(
         ctx: Any,
@@ -234,7 +221,7 @@ def run_network(
         end = unit_count * rows.shape[1]
         hidden_weight = weights[:end].view(unit_count, -1)
         output_weight = weights[end:].view(out_width, unit_count)
-        arranged = arrange(hidden_weight, output_weight, with_backward=True)
+        arranged = arrange_weights(hidden_weight, output_weight) or arranged
     if not needs_gradient:
         return _run_network(rows, arranged.forward, out_width, unit_count, "relu", None)[0]
     update: Tensor = _Network.apply(  # type: ignore[no-untyped-call]

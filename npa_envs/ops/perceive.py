@@ -2,7 +2,6 @@
 
 Each is a custom torch operator, which torch.compile does not trace. The autograd functions save
 only tensors that the adjoint of the case reads.
-Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from npa_envs.checks import (
     checked_eps,
     checked_flag,
 )
-from npa_envs.ops.backend import batch_listing
+from npa_envs.ops.backend import environment_lists
 from npa_envs.ops.custom_op import check_derivatives, custom_op, once_differentiable
 from npa_envs.ops.launch import Tape, is_aligned, launch
 from npa_envs.ops.perception_passes import (
@@ -34,7 +33,7 @@ from npa_envs.ops.perception_passes import (
     perception_launch,
     portable_kernels,
 )
-from npa_envs.ops.physics_constants import Physics, Terms, make_physics
+from npa_envs.ops.physics_constants import ALL_TERMS, Physics, Terms, make_physics
 from npa_envs.ops.sort import plan_kernels, sort_worlds
 from npa_envs.ops.static import StaticRows, StaticWorlds, static_worlds
 
@@ -98,30 +97,36 @@ def perceive(
         NPAError: Shapes, dtypes or devices do not fit, a position is not finite, eps or eps0 is
             not positive and finite, a box side is below 2 eps, or `moment_inverse` is unknown.
     """
-    check_world(x, s)
-    check_derivatives(x=x, s=s)
-    space_dim, state_dim = x.shape[2], s.shape[2]
-    if eps0 is not None:
-        eps0 = checked_eps("eps0", eps0, space_dim, x.dtype)
     inverse = checked_choice("moment_inverse", moment_inverse, get_args(MomentInverse))
     terms = Terms(
         checked_flag("state_gradient", state_gradient),
         inverse if checked_flag("moment_correction", moment_correction) else None,
         checked_flag("density_gradient", density_gradient),
     )
-    constants = make_physics(
-        space_dim, state_dim, x.dtype, eps=eps, eps0=eps0, box=box, terms=terms
-    )
-    check_finite_positions(x)
+    physics = checked_physics(x, s, eps, eps0, box, terms)
     perception, rows = perceive_rows(
         x.detach() if checked_flag("detach_positions", detach_positions) else x,
         s,
-        constants,
+        physics,
         mask=None,
         row_capacity=x.shape[0] * x.shape[1],
-        row_width=terms.perception_dim(space_dim, state_dim),
+        row_width=physics.perception_dim,
     )
     return perception.index_select(0, rows.row_of).view(*x.shape[:2], -1)
+
+
+def checked_physics(
+    x: Tensor, s: Tensor, eps: float, eps0: float | None, box: Box, terms: Terms = ALL_TERMS
+) -> Physics:
+    """Return the constants of worlds to perceive, after checking these and the worlds."""
+    check_world(x, s)
+    check_derivatives(x=x, s=s)
+    space_dim, state_dim = x.shape[2], s.shape[2]
+    if eps0 is not None:
+        eps0 = checked_eps("eps0", eps0, space_dim, x.dtype)
+    physics = make_physics(space_dim, state_dim, x.dtype, eps=eps, eps0=eps0, box=box, terms=terms)
+    check_finite_positions(x)
+    return physics
 
 
 @torch.no_grad()
@@ -135,26 +140,14 @@ def perception_fields(
 ) -> PerceptionFields:
     """Return the unscaled SPH fields of every particle; not differentiable (`perceive` is).
 
-    Args:
-        x: Particle positions [length units], shape [B, N, D].
-        s: Particle states, dimensionless, shape [B, N, C].
-        eps: Perception radius [length units].
-        box: Sides of a periodic box centred on the origin [length units], or None for open space.
-        moment_inverse: How `grad1` is corrected, as in `perceive`.
-
-    Raises:
-        NPAError: As `perceive`.
+    Arguments and errors are those of `perceive`; `moment_inverse` is how `grad1` is corrected.
     """
     inverse = checked_choice("moment_inverse", moment_inverse, get_args(MomentInverse))
-    terms = Terms(moment_inverse=inverse)
-    check_world(x, s)
-    check_derivatives(x=x, s=s)
+    physics = checked_physics(x, s, eps, None, box, Terms(moment_inverse=inverse))
     world_count, particle_count, space_dim = x.shape
     state_dim = s.shape[2]
-    constants = make_physics(space_dim, state_dim, x.dtype, eps=eps, box=box, terms=terms)
-    check_finite_positions(x)
     x, s = x.contiguous(), s.contiguous()
-    plan = plan_kernels(x, x.shape, state_dim, world_count * particle_count, False, constants)
+    plan = plan_kernels(x, x.shape, state_dim, world_count * particle_count, False, physics)
     ordered = sort_worlds(plan, x, s, None)
     densities = compute_density_gradients(plan, ordered)
     fields = PerceptionFields(
@@ -176,7 +169,7 @@ def perception_fields(
         ordered.starts,
         densities.particles,
         ordered.states,
-        ordered.source,
+        ordered.original_index,
         *fields[:-1],
     )
     return PerceptionFields(
@@ -189,10 +182,10 @@ class Rows(NamedTuple):
 
     row_of: Tensor
     """Row of each particle, -1 for none, int32, shape [B N]."""
-    row_source: Tensor
+    row_particle: Tensor
     """Particle of each row, int32, shape [K]; undefined beyond the last active row."""
     starts: Tensor
-    """Cell starts; the last entry minus `row_base` is the number of active rows."""
+    """`SortedWorlds.starts`; the last entry minus `row_base` is the number of active rows."""
     row_base: int
 
 
@@ -230,31 +223,31 @@ def _perceive_rows(
         kernel_sum,
         ordered.row_of,
         ordered.starts,
-        ordered.source,
+        ordered.original_index,
         densities.particles,
         ordered.row_positions,
         ordered.states,
-        ordered.row_source,
+        ordered.row_particle,
     ]
 
 
 class _PerceiveRows(torch.autograd.Function):
-    """Autograd function of `perceive_rows`; the backward pass sums over neighbours."""
+    """The backward pass sums over neighbours."""
 
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
-        saved, row_source = _perceived(*arguments, True)
+        saved, row_particle = _perceived(*arguments, True)
         _, s, _, static, _, masked, *_, physics = arguments
         ctx.set_materialize_grads(False)
         ctx.shape, ctx.masked, ctx.physics = s.shape, masked, physics
         tensors = saved if ctx.needs_input_grad[0] else saved[:-1]
-        listed = () if static is None else static.listed or ()
+        neighbours = () if static is None else static.neighbours or ()
         ctx.saved_count = len(tensors)
-        ctx.save_for_backward(*tensors, *listed)
+        ctx.save_for_backward(*tensors, *neighbours)
         if static is not None:
             return (saved.perception,)
-        ctx.mark_non_differentiable(saved.row_of, row_source, saved.starts)
-        return saved.perception, saved.row_of, row_source, saved.starts
+        ctx.mark_non_differentiable(saved.row_of, row_particle, saved.starts)
+        return saved.perception, saved.row_of, row_particle, saved.starts
 
     @staticmethod
     @once_differentiable
@@ -264,9 +257,9 @@ class _PerceiveRows(torch.autograd.Function):
             # Read once: under a checkpoint each reading recomputes them.
             tensors = list(ctx.saved_tensors)
             count, shape = ctx.saved_count, ctx.shape
-            saved, listed = tensors[:count], tensors[count:]
+            saved, neighbours = tensors[:count], tensors[count:]
             states_bar, positions_bar = perceive_rows_backward(
-                bar, saved, listed, shape[1], shape[2], ctx.masked, ctx.physics
+                bar, saved, neighbours, shape[1], shape[2], ctx.masked, ctx.physics
             )
             states_bar = states_bar.view(shape)
             x_bar = positions_bar.view(*shape[:2], -1) if ctx.needs_input_grad[0] else None
@@ -286,19 +279,19 @@ def _perceived(
     `options` are its arguments from `masked` on.
     """
     if static is None or rows is None:
-        *saved_tensors, row_source = _perceive_rows(x, s, mask, [], *options)
-        return SavedPerception(*saved_tensors), row_source
+        *saved_tensors, row_particle = _perceive_rows(x, s, mask, [], *options)
+        return SavedPerception(*saved_tensors), row_particle
     perception, kernel_sum = _perceive_rows(x, s, None, [*rows, *static.to_list()], *options)
     saved = SavedPerception(
         perception,
         kernel_sum,
         row_of=rows.row_of,
         starts=rows.starts,
-        source=static.all_indices,
+        original_index=static.all_indices,
         particles=static.particles,
         row_positions=rows.row_positions,
     )
-    return saved, rows.row_source
+    return saved, rows.row_particle
 
 
 def perceive_rows(
@@ -335,12 +328,10 @@ def perceive_rows(
     if torch.is_grad_enabled() and (x.requires_grad or s.requires_grad):
         perception, *maps = _PerceiveRows.apply(*arguments)  # type: ignore[no-untyped-call]
     else:
-        saved, row_source = _perceived(*arguments, False)
-        perception, maps = saved.perception, [saved.row_of, row_source, saved.starts]
-    if rows is not None:
-        maps = [rows.row_of, rows.row_source, rows.starts]
-    row_of, row_source, starts = maps
-    return perception, Rows(row_of, row_source, starts, x.shape[0] * x.shape[1] if masked else 0)
+        saved, row_particle = _perceived(*arguments, False)
+        perception, maps = saved.perception, [saved.row_of, row_particle, saved.starts]
+    row_of, row_particle, starts = maps if rows is None else rows[:3]
+    return perception, Rows(row_of, row_particle, starts, x.shape[0] * x.shape[1] if masked else 0)
 
 
 ROWS_TOGETHER = 2**22
@@ -370,16 +361,14 @@ def updates_in_parts(
     updates = None
     for first in range(0, row_capacity, ROWS_TOGETHER):
         part = perception[: min(ROWS_TOGETHER, row_capacity - first)]
-        arguments = perception_launch(
-            plan, ordered, densities, part, first_row=first, row_count=len(part)
-        )
-        launch(*arguments)
+        rows = {"first_row": first, "row_count": len(part)}
+        launch(*perception_launch(plan, ordered, densities, part, **rows))
         mapped = network(part)
         if updates is None:
             updates = mapped.new_empty(row_capacity, mapped.shape[1])
         updates[first : first + len(part)] = mapped
     assert updates is not None, "worlds have particles"
-    return updates, Rows(ordered.row_of, ordered.row_source, ordered.starts, plan.row_base)
+    return updates, Rows(ordered.row_of, ordered.row_particle, ordered.starts, plan.row_base)
 
 
 # For environments: every particle, in the caller's order, clipped, without gradients.
@@ -432,19 +421,19 @@ def build_neighbours(
     """
     x, s = x.contiguous(), s.contiguous()
     plan = plan_kernels(x, x.shape, s.shape[2], x.shape[0] * x.shape[1], False, physics)
-    listed = plan.lists_neighbours
-    in_place = listed and plan.state_dim % plan.width == 0 and is_aligned(s)
-    ordered = sort_worlds(plan, x, None if in_place else s, None, with_rows=not listed)
-    # World k of a batch equals that world alone, bit for bit: the listing must not depend on the
+    with_lists = plan.lists_neighbours
+    in_place = with_lists and plan.state_dim % plan.width == 0 and is_aligned(s)
+    ordered = sort_worlds(plan, x, None if in_place else s, None, with_rows=not with_lists)
+    # World k of a batch equals that world alone, bit for bit: the lists must not depend on the
     # number of worlds.
     densities = compute_densities(
         plan,
         ordered,
-        batch_listing(plan.request),
-        state_index=ordered.source if in_place else None,
+        environment_lists(plan.request),
+        state_index=ordered.original_index if in_place else None,
         with_particles=False,
     )
-    destination = ordered.source
+    destination = ordered.original_index
     if world_indices is not None:
         shift = (
             world_indices - torch.arange(len(world_indices), device=x.device)

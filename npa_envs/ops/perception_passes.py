@@ -1,7 +1,4 @@
-"""The passes over sorted worlds: arguments and launches of density, perception and adjoint.
-
-Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
-"""
+"""The passes over sorted worlds: arguments and launches of density, perception and adjoint."""
 
 from __future__ import annotations
 
@@ -19,7 +16,7 @@ from npa_envs.kernels.portable.adjoint import adjoint_kernels
 from npa_envs.kernels.portable.density import density_kernels
 from npa_envs.kernels.portable.perceive import perception_kernels
 from npa_envs.kernels.primitives import WARP
-from npa_envs.ops.backend import Listing
+from npa_envs.ops.backend import ListLayout
 from npa_envs.ops.custom_op import custom_op
 from npa_envs.ops.launch import launch
 from npa_envs.ops.physics_constants import Physics
@@ -32,7 +29,7 @@ INTERLEAVED_LISTS = 32
 class NeighbourLists(NamedTuple):
     """Neighbour lists of active particles (rows) for the CUDA kernels; they include themselves."""
 
-    listing: Listing
+    layout: ListLayout
     """Layout of the lists."""
     steps: Tensor
     """Differences of sorted indices from each neighbour to the next, int16; lists of 32 rows are
@@ -45,8 +42,8 @@ class NeighbourLists(NamedTuple):
     """Whether there is a list for each sorted particle, not for each row."""
 
 
-class ListedNeighbours(NamedTuple):
-    """Neighbour lists of all particles for the portable kernels; they include themselves."""
+class StaticNeighbours(NamedTuple):
+    """Neighbour lists of static particles for the portable kernels; they include themselves."""
 
     neighbours: Tensor
     """Sorted indices of the neighbours of all particles, concatenated, int32, shape [E]."""
@@ -64,12 +61,12 @@ class Densities(NamedTuple):
     others; empty where perception computes them."""
     lists: NeighbourLists | None = None
     """Neighbours found by the density pass of `kernels/cuda/`."""
-    listed: ListedNeighbours | None = None
-    """Neighbours of static worlds on a CPU."""
+    static_neighbours: StaticNeighbours | None = None
+    """Neighbours in static worlds on a CPU."""
 
 
-def portable_kernels(plan: KernelPlan, listed: bool = False) -> Any:
-    """Return the portable perception kernels for a plan; `listed`: that read neighbour lists."""
+def portable_kernels(plan: KernelPlan, with_lists: bool = False) -> Any:
+    """Return the portable perception kernels; `with_lists`: those that read neighbour lists."""
     terms = plan.physics.terms
     return perception_kernels(
         plan.space_dim,
@@ -78,31 +75,31 @@ def portable_kernels(plan: KernelPlan, listed: bool = False) -> Any:
         plan.on_cpu,
         terms.state_gradient,
         terms.correction,
-        listed,
+        with_lists,
     )
 
 
 def compute_densities(
     plan: KernelPlan,
     ordered: SortedWorlds,
-    listing: Listing | None = None,
+    layout: ListLayout | None = None,
     *,
     state_index: Tensor | None = None,
     with_particles: bool = True,
 ) -> Densities:
     """Return densities, with neighbour lists (CUDA) or density gradients (elsewhere).
 
-    `listing` is the layout of the lists, by default that of rollouts. `state_index` has the index
-    of each sorted particle's state, by default in order. `with_particles`: also return `particles`,
+    `layout` of the lists is by default that of rollouts. `state_index` has the index of each sorted
+    particle's state, by default in order. `with_particles`: also return `particles`,
     which the adjoint reads.
     """
     if not plan.lists_neighbours:
         return compute_density_gradients(plan, ordered)
-    listing = listing or plan.listing
+    layout = layout or plan.list_layout
     positions = ordered.positions
     records = positions.new_empty(plan.total, 4)
     particles = positions.new_empty(plan.total if with_particles else 0, plan.space_dim + 1)
-    list_shape = -(-plan.row_capacity // INTERLEAVED_LISTS), listing.capacity, INTERLEAVED_LISTS
+    list_shape = -(-plan.row_capacity // INTERLEAVED_LISTS), layout.capacity, INTERLEAVED_LISTS
     steps = positions.new_empty(list_shape, dtype=torch.int16)
     lengths = positions.new_empty(plan.row_capacity, dtype=torch.int32)
     arrays = (
@@ -110,16 +107,16 @@ def compute_densities(
         ordered.cell,
         positions,
         state_index,
-        ordered.source,
+        ordered.original_index,
         ordered.row_of,
         particles,
         records,
         steps,
         lengths,
     )
-    if listing.tiled:
+    if layout.tiled:
         launch(
-            tiled_density(plan.periodic, listing.capacity, plan.masked),
+            tiled_density(plan.periodic, layout.capacity, plan.masked),
             plan.world_count * -(-plan.particle_count // TILE_PARTICLES) * WARP,
             positions.device,
             plan.domain,
@@ -130,16 +127,16 @@ def compute_densities(
     else:
         launch(
             listed_density(
-                plan.space_dim, listing.lanes, plan.periodic, listing.capacity, plan.masked
+                plan.space_dim, layout.lanes, plan.periodic, layout.capacity, plan.masked
             ),
-            -(-plan.total * listing.lanes // WARP) * WARP,
+            -(-plan.total * layout.lanes // WARP) * WARP,
             positions.device,
             plan.domain,
             *arrays,
             block_dim=LIST_BLOCK,
         )
     no_gradient = positions.new_empty(0, plan.space_dim, dtype=torch.float64)
-    return Densities(particles, no_gradient, NeighbourLists(listing, steps, lengths, records))
+    return Densities(particles, no_gradient, NeighbourLists(layout, steps, lengths, records))
 
 
 def compute_density_gradients(plan: KernelPlan, ordered: SortedWorlds) -> Densities:
@@ -155,7 +152,7 @@ def compute_density_gradients(plan: KernelPlan, ordered: SortedWorlds) -> Densit
         plan.particle_count,
         int(plan.physics.terms.density_gradient),
         ordered.starts,
-        ordered.source,
+        ordered.original_index,
         ordered.row_of,
         positions,
         particles,
@@ -210,13 +207,12 @@ def perception_launch(
             terms.correction,
             plan.periodic,
             plan.group_count > 1,
-            lists.listing.capacity,
+            lists.layout.capacity,
             row_kernel_sum is not None,
-            lists.listing.teams,
+            lists.layout.teams,
             lists.per_particle,
-            lists.listing.tiled,
+            lists.layout.tiled,
         )
-        source = ordered.states if states is None else states
         return (
             listed_perception(variant),
             -(-row_count * plan.group_count * variant.lanes // WARP) * WARP,
@@ -230,8 +226,8 @@ def perception_launch(
             ordered.cell,
             ordered.positions,
             lists.records,
-            source,
-            None if states is None else ordered.source,
+            ordered.states if states is None else states,
+            None if states is None else ordered.original_index,
             row_index,
             destination,
             lists.steps,
@@ -239,9 +235,9 @@ def perception_launch(
             out,
             row_kernel_sum,
         )
-    listed = densities.listed
+    neighbours, ends = densities.static_neighbours or (None, None)
     return (
-        portable_kernels(plan, listed is not None).perceive,
+        portable_kernels(plan, neighbours is not None).perceive,
         (row_count, plan.group_count),
         out.device,
         plan.domain,
@@ -250,8 +246,8 @@ def perception_launch(
         plan.group_count,
         limit,
         ordered.starts,
-        None if listed is None else listed.ends,
-        None if listed is None else listed.neighbours,
+        ends,
+        neighbours,
         densities.particles,
         ordered.states,
         ordered.states.view(plan.total, -1),
@@ -264,7 +260,7 @@ def perception_launch(
 
 
 class SavedPerception(NamedTuple):
-    """Tensors that the forward pass saves for the adjoint of perception."""
+    """Tensors that the adjoint of perception reads; some are in `SortedWorlds` and `Densities`."""
 
     perception: Tensor
     """Rows of perception, dimensionless, shape [K, row_width]."""
@@ -272,24 +268,19 @@ class SavedPerception(NamedTuple):
     """Sums over neighbours of volume times kernel gradient [1 / length units], shape [K, D];
     undefined beyond the last active row."""
     row_of: Tensor
-    """Row of each particle, -1 for none, int32, shape [B N]."""
     starts: Tensor
-    """First sorted index of every cell, then first row of every cell (plus `row_base`), int32."""
-    source: Tensor
-    """Caller's index of each sorted particle, int32, shape [B N]."""
+    original_index: Tensor
     particles: Tensor
-    """Sorted positions [length units] with volumes 1 / rho, shape [B N, D + 1]."""
     row_positions: Tensor
-    """Positions of the rows [length units], shape [K, D]; undefined beyond the last active row."""
     states: Tensor | None = None
-    """Sorted states, dimensionless, shape [B N G, W]; None where positions get no gradient."""
+    """Of `SortedWorlds`; None where positions get no gradient."""
 
 
 @custom_op("npa::perceive_rows_backward")
 def perceive_rows_backward(
     perception_bar: Tensor,
     saved_tensors: list[Tensor],
-    listed: list[Tensor],
+    static_neighbours: list[Tensor],
     particle_count: int,
     state_dim: int,
     masked: bool,
@@ -297,9 +288,8 @@ def perceive_rows_backward(
 ) -> tuple[Tensor, Tensor]:
     """Return gradients with respect to states, [B N, C], and positions, [B N, D] or empty.
 
-    `perception_bar` is that of perception, [K, row_width]. `saved_tensors` are a
-    `SavedPerception`, `listed` a `ListedNeighbours` or empty. Positions get a gradient if states
-    were saved.
+    The tensors are those of a `SavedPerception` and of `StaticNeighbours`, or none. Positions get a
+    gradient if states were saved.
     """
     saved = SavedPerception(*saved_tensors)
     total, space_dim = saved.particles.shape[0], saved.particles.shape[1] - 1
@@ -315,13 +305,14 @@ def perceive_rows_backward(
     if plan.runs("adjoint", position_gradient=saved.states is not None) == "cuda":
         states_bar = _gather_by_tiles(plan, saved, bar)
         return states_bar, states_bar.new_empty(0)
-    return _gather_by_cells(plan, saved, listed, bar)
+    return _gather_by_cells(plan, saved, static_neighbours, bar)
 
 
 def _gather_by_cells(
-    plan: KernelPlan, saved: SavedPerception, listed: list[Tensor], bar: Tensor
+    plan: KernelPlan, saved: SavedPerception, static_neighbours: list[Tensor], bar: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Return both gradients of `perceive_rows_backward`, with the portable kernels."""
+    neighbours, ends = static_neighbours or (None, None)
     entries, space_dim, width = plan.row_capacity * plan.group_count, plan.space_dim, plan.width
     largest = entries * space_dim * width
     if largest >= MAX_INDEX:
@@ -331,10 +322,10 @@ def _gather_by_cells(
         )
     terms, with_positions = plan.physics.terms, saved.states is not None
     kernels = adjoint_kernels(
-        space_dim, plan.scalar, width, plan.on_cpu, terms.state_gradient, bool(listed)
+        space_dim, plan.scalar, width, plan.on_cpu, terms.state_gradient, neighbours is not None
     )
     # Cotangents of each row's sums: of smoothed states, and of gradients before they are scaled.
-    blur_bar = bar.new_empty(entries, width)
+    smoothed_bar = bar.new_empty(entries, width)
     gradient_bar = bar.new_empty(entries, space_dim, width)
     density_gradient_bar = bar.new_empty(plan.row_capacity if with_positions else 0, space_dim)
     launch(
@@ -350,11 +341,10 @@ def _gather_by_cells(
         saved.starts,
         saved.perception,
         bar,
-        blur_bar,
+        smoothed_bar,
         gradient_bar,
         density_gradient_bar,
     )
-    neighbours, ends = listed or (None, None)
     states_bar = bar.new_empty(plan.total, plan.state_dim)
     launch(
         kernels.gather_state_cotangents,
@@ -369,12 +359,12 @@ def _gather_by_cells(
         ends,
         neighbours,
         saved.particles,
-        saved.source,
+        saved.original_index,
         saved.row_of,
         saved.row_positions,
         saved.row_kernel_sum,
         bar,
-        blur_bar,
+        smoothed_bar,
         gradient_bar,
         gradient_bar,
         states_bar,
@@ -392,11 +382,11 @@ def _gather_by_cells(
         saved.starts,
         saved.particles,
         saved.states,
-        saved.source,
+        saved.original_index,
         saved.row_of,
     )
-    launch(kernels.gather_density_cotangents, *common, blur_bar, gradient_bar, density_bar)
-    rows = density_bar, blur_bar, gradient_bar, density_gradient_bar
+    launch(kernels.gather_density_cotangents, *common, smoothed_bar, gradient_bar, density_bar)
+    rows = density_bar, smoothed_bar, gradient_bar, density_gradient_bar
     launch(kernels.gather_position_cotangents, *common, *rows, positions_bar)
     return states_bar, positions_bar
 
@@ -442,7 +432,7 @@ def _gather_by_tiles(plan: KernelPlan, saved: SavedPerception, bar: Tensor) -> T
         plan.group_count,
         saved.starts,
         saved.particles,
-        saved.source,
+        saved.original_index,
         saved.row_of,
         saved.row_positions,
         saved.row_kernel_sum,

@@ -46,8 +46,10 @@ class Terms(NamedTuple):
 
 ALL_TERMS = Terms()
 
+BOUNDARIES: tuple[Boundary, ...] = get_args(Boundary)
+
 INVERSES = (None, "threshold", "smooth")
-"""Inversions of the moment matrix; torch operators take the index."""
+"""Inversions of the moment matrix; torch operators take the index, and that of `BOUNDARIES`."""
 
 
 class Limits(NamedTuple):
@@ -77,8 +79,11 @@ class Physics(NamedTuple):
     """Perception radius ε [length units]."""
     eps0: float
     """Radius ε0 at which the rule was trained [length units]."""
+    boundary: Boundary = "open"
+    """Whether there is a box, and what its sides do; neighbours are those of open space unless it
+    is periodic."""
     box: tuple[float, ...] | None = None
-    """Sides of the periodic box [length units], or None in open space."""
+    """Sides of the box [length units], None in open space."""
     terms: Terms = ALL_TERMS
     """Groups of the perception vector."""
     moving: bool = True
@@ -93,8 +98,11 @@ class Physics(NamedTuple):
     """Standard deviation of the noise on every position in a step [length units]."""
     limits: Limits = NO_LIMITS
     """Bounds of environments."""
-    walls: tuple[float, ...] | None = None
-    """Sides of a box with reflecting walls [length units]; neighbours are those of open space."""
+
+    @property
+    def periodic_box(self) -> tuple[float, ...] | None:
+        """Sides of the box [length units] if it is periodic, else None."""
+        return self.box if self.boundary == "periodic" else None
 
     @property
     def perception_dim(self) -> int:
@@ -110,13 +118,12 @@ class Physics(NamedTuple):
     def from_list(cls, numbers: list[float]) -> Physics:
         """Return the constants in a list by `numbers`: all but limits, D and C."""
         count = len(NUMBER_FIELDS)
-        state_gradient, inverse, density_gradient, moving, reflecting, *packed = numbers[count:]
-        sides = tuple(packed) or None
+        state_gradient, inverse, density_gradient, moving, boundary, *sides = numbers[count:]
         return cls(
             space_dim=0,
             state_dim=0,
-            box=None if reflecting else sides,
-            walls=sides if reflecting else None,
+            boundary=BOUNDARIES[int(boundary)],
+            box=tuple(sides) or None,
             terms=Terms(bool(state_gradient), INVERSES[int(inverse)], bool(density_gradient)),
             moving=bool(moving),
             limits=NO_LIMITS,
@@ -126,11 +133,10 @@ class Physics(NamedTuple):
     def numbers(self) -> list[float]:
         """Return all but limits, D and C as a list of numbers, which torch operators can take."""
         state_gradient, inverse, density_gradient = self.terms
-        reflecting = self.walls is not None
-        flags = state_gradient, INVERSES.index(inverse), density_gradient, self.moving, reflecting
+        choices = INVERSES.index(inverse), BOUNDARIES.index(self.boundary)
+        flags = state_gradient, choices[0], density_gradient, self.moving, choices[1]
         scalars = [getattr(self, name) for name in NUMBER_FIELDS]
-        sides = self.box or self.walls or ()
-        return [constant(number) for number in (*scalars, *map(float, flags), *sides)]
+        return [constant(number) for number in (*scalars, *map(float, flags), *(self.box or ()))]
 
     def scale(self) -> float:
         """Return c = eps / eps0, the factor on perceived gradients."""
@@ -198,7 +204,7 @@ def make_physics(
     """
     if boundary is None:
         boundary = "open" if box is None else "periodic"
-    checked_choice("boundary", boundary, get_args(Boundary))
+    checked_choice("boundary", boundary, BOUNDARIES)
     if boundary == "open" and box is not None:
         raise NPAError(f"box must be None where boundary is 'open', got {shown(box)}: leave it out")
     if boundary != "open" and box is None:
@@ -216,15 +222,14 @@ def make_physics(
         raise NPAError(f"update_prob must lie in (0, 1], got {update_prob}")
     if not (math.isfinite(position_noise) and position_noise >= 0.0):
         raise NPAError(f"position_noise must be finite and not negative, got {position_noise}")
-    periodic = boundary != "reflecting"
-    sides = checked_box(box, space_dim, radius if periodic else None, dtype)
+    sides = checked_box(box, space_dim, radius if boundary == "periodic" else None, dtype)
     return Physics(
         space_dim=space_dim,
         state_dim=state_dim,
         eps=radius,
         eps0=radius0,
-        box=sides if periodic else None,
-        walls=None if periodic else sides,
+        boundary=boundary,
+        box=sides,
         terms=terms,
         moving=moving,
         max_displacement=constant(alpha) * radius,

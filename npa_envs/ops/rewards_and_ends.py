@@ -46,7 +46,7 @@ class EpisodeUpdate:
         first_loss: Loss at the start of each episode, shape [B].
         success_loss: Loss at which each episode ends in success, shape [B].
         elapsed: Steps of each episode, int32, shape [B]; increased by 1.
-        numbers: Reward; loss; its K terms; their decreases; float32, shape [2 + 2 K, B]. Losses
+        numbers: Reward; loss; its L terms; their decreases; float32, shape [2 + 2 L, B]. Losses
             and terms of the step before are read; all become those of this step.
         flags: Terminated; truncated; success; diverged; bool, shape [4, B]; written.
         endings: Bits of each world, such as `SUCCESS`, then `enabled`, uint8, shape [B + 1];
@@ -75,7 +75,7 @@ class EpisodeUpdate:
         """Compute this step's rewards and endings.
 
         Args:
-            parts: Terms whose sum is each world's loss, float32, contiguous, shape [K, B].
+            parts: Terms whose sum is each world's loss, float32, contiguous, shape [L, B].
             broken: Whether another loss of a world is not finite, uint8, shape [B]; read with
                 `on_divergence="ignore"` only.
         """

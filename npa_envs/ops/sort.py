@@ -16,13 +16,13 @@ from npa_envs.kernels.portable.sort import sort_kernels
 from npa_envs.kernels.primitives import CUDA_LANES, WARP
 from npa_envs.ops.backend import (
     KernelRequest,
-    Listing,
+    ListLayout,
     Operator,
     choose,
     multiprocessor_count,
-    rollout_listing,
+    rollout_lists,
 )
-from npa_envs.ops.launch import SCALARS, channel_width, is_aligned, is_recorded, launch
+from npa_envs.ops.launch import SCALARS, channel_width, is_aligned, is_taped, launch
 from npa_envs.ops.physics_constants import Physics
 
 MAX_INDEX = 2**31 - 1
@@ -55,8 +55,8 @@ class KernelPlan(NamedTuple):
     domain: Any
     request: KernelRequest
     """Properties by which the backend table chooses."""
-    listing: Listing
-    """How rollouts list neighbours on CUDA."""
+    list_layout: ListLayout
+    """Neighbour lists of rollouts on CUDA."""
 
     def runs(
         self, operator: Operator, *, aligned: bool = True, position_gradient: bool = False
@@ -128,13 +128,13 @@ class SortedWorlds(NamedTuple):
 
     starts: Tensor
     """First sorted index of every cell, then first row of every cell (plus `row_base`), int32."""
-    source: Tensor
+    original_index: Tensor
     """Caller's index of each sorted particle, int32, shape [B N]."""
     cell: Tensor
     """Cell of each sorted particle, counted through all worlds, int32, shape [B N]."""
     row_of: Tensor
     """Row of each particle, -1 for inactive ones, int32, shape [B N]."""
-    row_source: Tensor
+    row_particle: Tensor
     """Caller's index of each row, int32, shape [K]; undefined beyond the last active row."""
     row_index: Tensor
     """Sorted index of each row, int32, shape [K]; undefined beyond the last active row."""
@@ -162,7 +162,7 @@ def plan_kernels(
     # As integers: symbolic sizes of torch.compile become constants, and other sizes recompile.
     world_count, particle_count, space_dim = (int(size) for size in shape)
     scalar = SCALARS[like.dtype]
-    eps, sides = physics.eps, physics.box
+    eps, sides = physics.eps, physics.periodic_box
     # In 3D smaller cells give many short runs of candidates, which threads share badly.
     cells_per_eps = 1 if space_dim == 3 and like.device.type == "cuda" else 2
     domain = make_domain(space_dim, scalar, eps, sides, particle_count, cells_per_eps)
@@ -186,7 +186,7 @@ def plan_kernels(
         physics=physics,
         domain=domain,
         request=request,
-        listing=rollout_listing(request, mean_neighbours(particle_count, eps, sides)),
+        list_layout=rollout_lists(request, mean_neighbours(particle_count, eps, sides)),
     )
     largest = max(2 * plan.cell_total, plan.total * (1 + plan.state_dim))
     if largest >= MAX_INDEX:
@@ -229,7 +229,7 @@ def sort_worlds(
     if plan.runs("sort") == "world" and earlier <= MAX_THREAD_MASK:
         _sort_by_threads(plan, x, s, mask, ordered)
         return ordered
-    assert not is_recorded(), "a tape would miss torch's operations between these launches"
+    assert not is_taped(), "a tape would miss torch's operations between these launches"
     kernels = sort_kernels(plan.space_dim, plan.scalar, plan.width)
     device, total = x.device, plan.total
     cell, arrival = torch.empty(2, total, dtype=torch.int32, device=device).unbind()
@@ -275,16 +275,16 @@ def sort_worlds(
 def _empty_worlds(plan: KernelPlan, x: Tensor, with_states: bool, with_rows: bool) -> SortedWorlds:
     """Return uninitialised tensors for sorted worlds."""
     total = plan.total
-    source, cell = torch.empty(2, total, dtype=torch.int32, device=x.device).unbind()
+    original_index, cell = torch.empty(2, total, dtype=torch.int32, device=x.device).unbind()
     row_capacity = plan.row_capacity if with_rows else 0
-    row_source = source.new_empty(row_capacity)
+    row_particle = cell.new_empty(row_capacity)
     return SortedWorlds(
-        starts=source.new_empty(plan.start_count),
-        source=source,
+        starts=cell.new_empty(plan.start_count),
+        original_index=original_index,
         cell=cell,
-        row_of=source.new_empty(total if with_rows else 0),
-        row_source=row_source,
-        row_index=torch.empty_like(row_source),
+        row_of=cell.new_empty(total if with_rows else 0),
+        row_particle=row_particle,
+        row_index=torch.empty_like(row_particle),
         positions=x.new_empty(total, plan.space_dim),
         row_positions=x.new_empty(row_capacity, plan.space_dim),
         states=x.new_empty(total * plan.group_count if with_states else 0, plan.width),
@@ -322,7 +322,7 @@ def _sort_by_threads(
         int(s is not None and plan.state_dim % plan.width == 0 and is_aligned(s)),
         s,
         *plan.row_numbers,
-        torch.empty_like(ordered.source),
+        torch.empty_like(ordered.original_index),
         *ordered,
     )
 

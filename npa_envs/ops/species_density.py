@@ -9,20 +9,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from npa_envs.checks import (
-    Box,
-    as_list,
-    check_finite_positions,
-    check_world,
-    checked_count,
-    checked_eps,
-)
+from npa_envs.checks import Box, as_list, checked_count
 from npa_envs.errors import NPAError, shown
 from npa_envs.kernels.portable.density import species_kernel
-from npa_envs.ops.custom_op import check_derivatives, custom_op
+from npa_envs.ops.custom_op import custom_op
 from npa_envs.ops.launch import SCALARS, launch
-from npa_envs.ops.perceive import perceive
-from npa_envs.ops.physics_constants import Physics, make_physics
+from npa_envs.ops.perceive import checked_physics, perceive
+from npa_envs.ops.physics_constants import Physics
 from npa_envs.ops.sort import plan_kernels, sort_worlds
 
 MAX_SPECIES = 64
@@ -33,9 +26,9 @@ class SpeciesFields(NamedTuple):
     """The unscaled density of each species and its gradient at every particle."""
 
     rho: Tensor
-    """Density of each species [1 / length^D], shape [B, N, K]; they sum to the density."""
+    """Density of each species [1 / length^D], shape [B, N, S]; they sum to the density."""
     drho: Tensor
-    """Density gradient of each species [1 / length^(D+1)], shape [B, N, K, D]."""
+    """Density gradient of each species [1 / length^(D+1)], shape [B, N, S, D]."""
 
 
 def checked_counts(counts: Sequence[int], particle_count: int) -> tuple[int, ...]:
@@ -65,11 +58,11 @@ def checked_counts(counts: Sequence[int], particle_count: int) -> tuple[int, ...
 def _gather_species(
     x: Tensor, counts: list[int], physics: Physics, scaled: bool
 ) -> tuple[Tensor, Tensor]:
-    """Return densities [B, N, K] and their gradients [B, N, K, D]; `scaled`: as in perception."""
+    """Return densities [B, N, S] and their gradients [B, N, S, D]; `scaled`: as in perception."""
     world_count, particle_count, space_dim = map(int, x.shape)
     plan = plan_kernels(x, x.shape, 1, world_count * particle_count, False, physics)
     ordered = sort_worlds(plan, x, None, None, with_rows=False)
-    index_in_world = ordered.source % particle_count
+    index_in_world = ordered.original_index % particle_count
     sorted_species = torch.zeros_like(index_in_world)
     # Python numbers instead of a tensor: a CUDA graph must not copy from the host.
     for end in itertools.accumulate(counts[:-1]):
@@ -86,7 +79,7 @@ def _gather_species(
         plan.density_scale if scaled else 1.0,
         int(scaled),
         ordered.starts,
-        ordered.source,
+        ordered.original_index,
         sorted_species,
         ordered.positions,
         density,
@@ -97,7 +90,7 @@ def _gather_species(
 
 
 def perceive_by_species(x: Tensor, counts: tuple[int, ...], physics: Physics) -> Tensor:
-    """Return the scaled density and density gradient of each species, shape [B, N, K (1 + D)].
+    """Return the scaled density and density gradient of each species, shape [B, N, S (1 + D)].
 
     Entries are c^D ρ_k / N for all species, then L(c^(1+D) ∇ρ_k / N) species by species. A species
     may have no particles. No gradient flows into positions.
@@ -112,25 +105,12 @@ def species_fields(
     """Return each species' density and density gradient at every particle; not differentiable.
 
     A particle counts itself in its own species' density. The densities sum to the density of
-    `perception_fields`, and the gradients to its density gradient.
-
-    Args:
-        x: Particle positions [length units], shape [B, N, D], species after species.
-        counts: Particles of each species, K numbers that sum to N: species k is the next
-            `counts[k]` particles.
-        eps: Perception radius [length units].
-        box: Sides of a periodic box centred on the origin [length units], or None for open space.
-
-    Raises:
-        NPAError: Positions or counts do not fit, a position is not finite, eps is not positive and
-            finite, or a box side is below 2 eps.
+    `perception_fields`, and the gradients to its density gradient. Arguments and errors are those
+    of `perceive_species`.
     """
-    check_world(x, x)
-    check_derivatives(x=x)
-    checked = checked_counts(counts, x.shape[1])
-    constants = make_physics(x.shape[2], 1, x.dtype, eps=eps, box=box)
-    check_finite_positions(x)
-    return SpeciesFields(*_gather_species(x.detach().contiguous(), list(checked), constants, False))
+    physics = checked_physics(x, x, eps, None, box)
+    sizes = checked_counts(counts, x.shape[1])
+    return SpeciesFields(*_gather_species(x.detach().contiguous(), list(sizes), physics, False))
 
 
 def perceive_species(
@@ -144,31 +124,17 @@ def perceive_species(
 ) -> Tensor:
     """Perceive neighbourhoods as `perceive`, and of each species its own density and gradient.
 
-    z = [what `perceive` returns ; c^D ρ_k / N (K) ; L(c^(1+D) ∇ρ_k / N) (K x D, species-major)].
-    No gradient flows through the added entries.
+    z = [what `perceive` returns ; c^D ρ_k / N (S) ; L(c^(1+D) ∇ρ_k / N) (S x D, species-major)].
+    No gradient flows through the added entries. Arguments and errors are those of `perceive`, and:
 
     Args:
-        x: Particle positions [length units], shape [B, N, D], species after species.
-        s: Particle states, dimensionless, shape [B, N, C].
-        counts: Particles of each species, K numbers that sum to N.
-        eps: Perception radius [length units].
-        eps0: Radius at which the rules were trained [length units]; default: eps.
-        box: Sides of a periodic box centred on the origin [length units], a number for equal
-            sides, or None for open space.
-        detach_positions: Do not back-propagate into x.
+        counts: Particles of each of S species, numbers that sum to N: species k is the next
+            `counts[k]` particles.
 
     Returns:
-        Perception vectors, dimensionless, shape [B, N, P + K (1 + D)].
-
-    Raises:
-        NPAError: As `perceive`, or the counts do not fit.
+        Perception vectors, dimensionless, shape [B, N, P + S (1 + D)].
     """
-    check_world(x, s)
-    check_derivatives(x=x, s=s)
-    checked = checked_counts(counts, x.shape[1])
-    if eps0 is not None:
-        eps0 = checked_eps("eps0", eps0, x.shape[2], x.dtype)
-    constants = make_physics(x.shape[2], s.shape[2], x.dtype, eps=eps, eps0=eps0, box=box)
-    shared = perceive(x, s, constants.eps, constants.eps0, constants.box, detach_positions)
-    appended = perceive_by_species(x, checked, constants)
-    return torch.cat((shared, appended), dim=-1)
+    physics = checked_physics(x, s, eps, eps0, box)
+    sizes = checked_counts(counts, x.shape[1])
+    shared = perceive(x, s, physics.eps, physics.eps0, physics.box, detach_positions)
+    return torch.cat((shared, perceive_by_species(x, sizes, physics)), dim=-1)

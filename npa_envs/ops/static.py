@@ -17,8 +17,8 @@ from npa_envs.ops.custom_op import custom_op
 from npa_envs.ops.launch import SCALARS, aligned, is_traced, launch
 from npa_envs.ops.perception_passes import (
     Densities,
-    ListedNeighbours,
     NeighbourLists,
+    StaticNeighbours,
     compute_densities,
 )
 from npa_envs.ops.physics_constants import Physics
@@ -29,34 +29,29 @@ MAX_LISTS = 2**31
 
 
 class StaticWorlds(NamedTuple):
-    """Sorted worlds whose particles do not move, with densities; made by `prepare_static`."""
+    """Worlds whose particles do not move: parts of their `SortedWorlds` and `Densities`."""
 
-    source: Tensor
-    """Caller's index of each sorted particle, int32, shape [B N]."""
+    original_index: Tensor
     sorted_index: Tensor
     """Sorted index of each particle in the caller's order, int32, shape [B N]."""
     all_indices: Tensor
     """0, 1, ... B N - 1, int32: all sorted indices."""
     starts: Tensor
-    """First sorted index of every cell, int32."""
     cell: Tensor
-    """Cell of each sorted particle, counted through all worlds, int32, shape [B N]."""
     particles: Tensor
-    """Positions [length units] with volumes 1 / rho, shape [B N, D + 1]."""
     density_gradient: Tensor
-    """Density gradients, float64, shape [B N, D]; empty where neighbours are listed for CUDA."""
     lists: list[Tensor]
     """For the CUDA backend steps, lengths and records of `NeighbourLists`; on a CPU the tensors of
-    `ListedNeighbours`; empty elsewhere."""
+    `StaticNeighbours`, or none if they take too much memory; none elsewhere."""
 
     def to_list(self) -> list[Tensor]:
         """Return all tensors in one list, for torch operators."""
         return [*self[:-1], *self.lists]
 
     @property
-    def listed(self) -> ListedNeighbours | None:
-        """Neighbour lists for the portable kernels; None if there are none."""
-        return ListedNeighbours(*self.lists) if len(self.lists) == 2 else None
+    def neighbours(self) -> StaticNeighbours | None:
+        """Neighbour lists for the portable kernels, if there are any."""
+        return StaticNeighbours(*self.lists) if len(self.lists) == 2 else None
 
     @classmethod
     def from_list(cls, tensors: list[Tensor]) -> StaticWorlds:
@@ -67,7 +62,6 @@ class StaticWorlds(NamedTuple):
 
 @custom_op("npa::prepare_static")
 def _prepare_static(x: Tensor, state_dim: int, physics: Physics) -> list[Tensor]:
-    """Return the result of `prepare_static` as a list, by `StaticWorlds.to_list`."""
     total = x.shape[0] * x.shape[1]
     plan = plan_kernels(x, x.shape, state_dim, total, False, physics)
     ordered = sort_worlds(plan, x, None, None)
@@ -78,7 +72,7 @@ def _prepare_static(x: Tensor, state_dim: int, physics: Physics) -> list[Tensor]
     elif plan.on_cpu:
         lists = _list_neighbours(plan, ordered.starts, densities.particles)
     return StaticWorlds(
-        source=ordered.source,
+        original_index=ordered.original_index,
         sorted_index=ordered.row_of,
         all_indices=torch.arange(total, dtype=torch.int32, device=x.device),
         starts=ordered.starts,
@@ -91,7 +85,7 @@ def _prepare_static(x: Tensor, state_dim: int, physics: Physics) -> list[Tensor]
 
 
 def _list_neighbours(plan: KernelPlan, starts: Tensor, particles: Tensor) -> list[Tensor]:
-    """Return the tensors of `ListedNeighbours`, on a CPU; empty if they take too much memory."""
+    """Return the tensors of `StaticNeighbours`, on a CPU; empty if they take too much memory."""
     kernels = density_kernels(plan.space_dim, plan.scalar, plan.on_cpu)
     common = plan.total, particles.device, plan.domain, plan.particle_count, starts, particles
     counts = starts.new_empty(plan.total)
@@ -115,31 +109,30 @@ def prepare_static(x: Tensor, physics: Physics) -> StaticWorlds:
 
 
 class StaticRows(NamedTuple):
-    """Which particles of static worlds are active in one step, and their rows of perception."""
+    """The particles of static worlds that are active in one step, as in `SortedWorlds`.
+
+    Indices are those of sorted particles, for the caller's order is that order.
+    """
 
     row_of: Tensor
-    """Row of each sorted particle, -1 for none, int32, shape [B N]."""
-    row_source: Tensor
-    """Sorted particle of each row, int32, shape [K]; undefined beyond the last active row."""
+    row_particle: Tensor
     starts: Tensor
-    """First sorted index of every cell, then first row of every cell (plus `row_base`), int32."""
     row_positions: Tensor
-    """Positions of the rows [length units], shape [K, D]; undefined beyond the last active row."""
 
 
 @custom_op("npa::static_rows")
 def _static_rows(
-    x: Tensor, masks: Tensor, source: Tensor, cell_starts: Tensor, row_capacity: int
+    x: Tensor, masks: Tensor, original_index: Tensor, cell_starts: Tensor, row_capacity: int
 ) -> list[Tensor]:
     """Return `StaticRows` of all steps, stacked, and the number of active particles of each."""
-    step_count, total, space_dim = masks.shape[0], source.shape[0], int(x.shape[2])
-    active = masks.view(step_count, total).index_select(1, source)
+    step_count, total, space_dim = masks.shape[0], original_index.shape[0], int(x.shape[2])
+    active = masks.view(step_count, total).index_select(1, original_index)
     # One sum over all steps: torch is fastest on one long row.
     active_before = torch.cumsum(active.view(-1), 0, dtype=torch.int32)
     rows = (
-        source.new_empty(step_count, total),
-        source.new_empty(step_count, row_capacity),
-        source.new_empty(step_count, 2 * cell_starts.shape[0] - 1),
+        cell_starts.new_empty(step_count, total),
+        cell_starts.new_empty(step_count, row_capacity),
+        cell_starts.new_empty(step_count, 2 * cell_starts.shape[0] - 1),
         x.new_empty(step_count, row_capacity, space_dim),
     )
     launch(
@@ -166,17 +159,16 @@ def static_rows(
     """
     if not x.is_cuda:
         row_capacity = x.shape[0] * x.shape[1]
-    *rows, active = _static_rows(x, torch.stack(masks), worlds.source, worlds.starts, row_capacity)
+    order = worlds.original_index, worlds.starts
+    *rows, active = _static_rows(x, torch.stack(masks), *order, row_capacity)
     steps = [StaticRows(*step) for step in zip(*rows, strict=True)]
     if x.is_cuda:
         return steps
     # Reading the number of rows is free on a CPU; on CUDA it would wait for the device.
+    counts = [max(count, 1) for count in active.tolist()]
     return [
-        step._replace(
-            row_source=step.row_source[: max(count, 1)],
-            row_positions=step.row_positions[: max(count, 1)],
-        )
-        for step, count in zip(steps, active.tolist(), strict=True)
+        StaticRows(row_of, row_particle[:count], starts, row_positions[:count])
+        for count, (row_of, row_particle, starts, row_positions) in zip(counts, steps, strict=True)
     ]
 
 
@@ -187,18 +179,18 @@ def static_worlds(
     lists = None
     if plan.lists_neighbours:
         steps, lengths, records = worlds.lists
-        lists = NeighbourLists(plan.listing, steps, lengths, records, per_particle=True)
+        lists = NeighbourLists(plan.list_layout, steps, lengths, records, per_particle=True)
     # States in groups of channels.
     padding = 0, plan.group_count * plan.width - plan.state_dim
     ordered = SortedWorlds(
         starts=rows.starts,
-        source=worlds.all_indices,
+        original_index=worlds.all_indices,
         cell=worlds.cell,
         row_of=rows.row_of,
-        row_source=rows.row_source,
-        row_index=rows.row_source,
+        row_particle=rows.row_particle,
+        row_index=rows.row_particle,
         positions=x.view(plan.total, plan.space_dim),
         row_positions=rows.row_positions,
         states=aligned(torch.nn.functional.pad(s, padding)).view(-1, plan.width),
     )
-    return ordered, Densities(worlds.particles, worlds.density_gradient, lists, worlds.listed)
+    return ordered, Densities(worlds.particles, worlds.density_gradient, lists, worlds.neighbours)

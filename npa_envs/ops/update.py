@@ -1,7 +1,4 @@
-"""Updates of particles: by a rule's outputs, as a torch operator, and by actions, in place.
-
-Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
-"""
+"""Updates of particles: by a rule's outputs, as a torch operator, and by actions, in place."""
 
 from __future__ import annotations
 
@@ -35,11 +32,13 @@ def _threads_for(count: int) -> int:
     return -(-count // THREAD_CHANNELS)
 
 
+BOUNDARIES = {"open": OPEN, "periodic": PERIODIC, "reflecting": REFLECTING}
+"""The kernels' constant for each boundary."""
+
+
 def _boundary(physics: Physics, space_dim: int) -> tuple[int, tuple[float, ...]]:
     """Return the kernels' constant for the boundary, and the sides of its box."""
-    if physics.walls is not None:
-        return REFLECTING, physics.walls
-    return (OPEN, (1.0,) * space_dim) if physics.box is None else (PERIODIC, physics.box)
+    return BOUNDARIES[physics.boundary], physics.box or (1.0,) * space_dim
 
 
 @custom_op("npa::update_particles")
@@ -96,7 +95,7 @@ def _update_particles_backward(
     new_x_bar: Tensor,
     new_s_bar: Tensor,
     new_path_bar: Tensor,
-    row_source: Tensor,
+    row_particle: Tensor,
     starts: Tensor,
     row_base: int,
     physics: Physics,
@@ -116,7 +115,7 @@ def _update_particles_backward(
         update.shape[1],
         int(update.shape[1] % THREAD_CHANNELS == 0),
         starts,
-        row_source,
+        row_particle,
         update.contiguous(),
         new_x_bar.contiguous(),
         new_s_bar.contiguous(),
@@ -127,8 +126,6 @@ def _update_particles_backward(
 
 
 class _UpdateParticles(torch.autograd.Function):
-    """Autograd function of `update_particles`."""
-
     @staticmethod
     def forward(
         ctx: Any,
@@ -140,16 +137,16 @@ class _UpdateParticles(torch.autograd.Function):
         physics: Physics,
     ) -> tuple[Tensor, Tensor, Tensor]:
         ctx.options = rows.row_base, physics
-        before = () if physics.walls is None else (x, rows.row_of)
-        ctx.save_for_backward(update, rows.row_source, rows.starts, *before)
+        before = (x, rows.row_of) if physics.boundary == "reflecting" else ()
+        ctx.save_for_backward(update, rows.row_particle, rows.starts, *before)
         return _update_particles(update, x, s, path_length, rows.row_of, physics, True)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *bars: Tensor) -> tuple[Tensor | None, ...]:
-        update, row_source, starts, *before = ctx.saved_tensors
+        update, row_particle, starts, *before = ctx.saved_tensors
         bars = _before_reflection(ctx.options[1], update, *before, *bars) if before else bars
-        arguments: list[Any] = [update, *bars, row_source, starts, *ctx.options]
+        arguments: list[Any] = [update, *bars, row_particle, starts, *ctx.options]
         update_bar = _update_particles_backward(*arguments)
         return (update_bar, *bars, None, None)
 
@@ -158,11 +155,11 @@ def _before_reflection(
     physics: Physics, update: Tensor, x: Tensor, row_of: Tensor, x_bar: Tensor, *others: Tensor
 ) -> tuple[Tensor, ...]:
     """Return the outputs' gradients, that of positions mirrored where walls reflected them."""
-    assert physics.walls is not None
+    assert physics.box is not None
     # Positions do not depend on states and paths: any tensors of their shapes will do.
     s_bar, path_bar = (bar.contiguous() for bar in others)
     free, *_ = _update_particles(update, x, s_bar, path_bar, row_of, physics, False)
-    return x_bar * _mirror_signs(free, physics.walls), *others
+    return x_bar * _mirror_signs(free, physics.box), *others
 
 
 def update_particles(
@@ -186,9 +183,9 @@ def _images(x: Tensor, sides: tuple[float, ...]) -> Tensor:
     return torch.stack(images, dim=-1)
 
 
-def _mirror_signs(x: Tensor, walls: tuple[float, ...]) -> Tensor:
+def _mirror_signs(x: Tensor, sides: tuple[float, ...]) -> Tensor:
     """Return -1 for coordinates in odd images of the box, which walls mirror, and 1 for others."""
-    return 1.0 - 2.0 * (_images(x, walls) % 2.0)
+    return 1.0 - 2.0 * (_images(x, sides) % 2.0)
 
 
 def wrapped(x: Tensor, box: tuple[float, ...] | None) -> Tensor:
@@ -201,8 +198,10 @@ def wrapped(x: Tensor, box: tuple[float, ...] | None) -> Tensor:
 
 def bounded(x: Tensor, physics: Physics) -> Tensor:
     """Return a copy of positions, wrapped into a periodic box or reflected at walls."""
-    inside = wrapped(x, physics.walls or physics.box)
-    return inside if physics.walls is None else inside * _mirror_signs(x, physics.walls)
+    inside, box = wrapped(x, physics.box), physics.box
+    if box is not None and physics.boundary == "reflecting":
+        return inside * _mirror_signs(x, box)
+    return inside
 
 
 class ActedWorlds(NamedTuple):

@@ -1,7 +1,4 @@
-"""Mean over each world as a torch operator: the same in every batch, bit for bit.
-
-Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
-"""
+"""Mean over each world as a torch operator: the same in every batch, bit for bit."""
 
 from __future__ import annotations
 
@@ -18,7 +15,7 @@ from npa_envs.ops.launch import SCALARS, launch
 
 
 def average_sums(partial_sums: Tensor, value_count: int, like: Tensor) -> Tensor:
-    """Return means [B, K] of `value_count` values from L partial sums each, [B, L, K]."""
+    """Return means [B, F] of `value_count` values from partial sums [B, any, F]."""
     world_count, _, width = partial_sums.shape
     lanes = _lanes(like.device)
     kernels = mean_kernels(SCALARS[like.dtype], lanes)
@@ -75,10 +72,10 @@ def world_mean(values: Tensor) -> Tensor:
     may change with the number of worlds, and with it their last bit.
 
     Args:
-        values: Values to average over M, shape [B, M, K], float32 or float64.
+        values: Values to average over M, shape [B, M, F], float32 or float64.
 
     Returns:
-        The means, shape [B, K].
+        The means, shape [B, F].
 
     Raises:
         NPAError: A wrong shape or dtype, or nothing to average.
@@ -86,7 +83,7 @@ def world_mean(values: Tensor) -> Tensor:
     check_floating("values", values)
     if values.ndim != 3 or 0 in values.shape:
         raise NPAError(
-            f"values must have shape [B, M, K] with at least one of each, "
+            f"values must have shape [B, M, F] with at least one of each, "
             f"got {tuple(values.shape)}: reshape it"
         )
     check_derivatives(values=values)

@@ -77,7 +77,7 @@ class EnvironmentWorld(LiveWorld):
     @property
     def box(self) -> tuple[float, ...] | None:
         """Sides of the periodic box [length units]; None: open space."""
-        box: tuple[float, ...] | None = self._physics.box
+        box: tuple[float, ...] | None = self._physics.periodic_box
         return box
 
     def describe(self) -> dict[str, Any]:

@@ -187,7 +187,7 @@ class RuleStep(Step):
         rule, physics = self.rule, self.physics
         network = self.network or rule
         width = self.network.row_width if self.network else rule.perception_dim
-        total = row_count(mask, x, physics.update_prob) if rows is None else len(rows.row_source)
+        total = row_count(mask, x, physics.update_prob) if rows is None else len(rows.row_particle)
         huge = total > ROWS_KEPT and not torch.is_grad_enabled() and self.static is None
         if huge and not torch.compiler.is_compiling():
             update, active = updates_in_parts(x, s, physics, mask, network.__call__, total, width)
@@ -218,7 +218,7 @@ class StaticStep(RuleStep):
 
     def enter(self, particles: Particles) -> Particles:
         """Return the worlds in sorted order."""
-        return particles._replace(x=self.x).gather(self.sorted.source)
+        return particles._replace(x=self.x).gather(self.sorted.original_index)
 
     def draw(self, like: Tensor, steps: int, source: Randomness | None) -> Iterator[Draws]:
         """Yield each step's draws; few launches assign the rows of several steps together."""

@@ -8,7 +8,7 @@ from support.worlds import assert_same, random_mask
 
 from npa_envs.errors import NPAError
 from npa_envs.ops import apply_actions
-from npa_envs.ops.physics_constants import Limits, Physics
+from npa_envs.ops.physics_constants import Limits, make_physics
 from npa_envs.ops.update import ActedWorlds, PreparedActions
 
 B, N, C = 3, 77, 5
@@ -31,8 +31,8 @@ def physics_of(
     x, *, moving=True, box=None, state_scale=STATE_SCALE, position_limit=50.0, state_limit=20.0
 ):
     limits = Limits(state_scale, position=position_limit, state=state_limit)
-    form = {"box": box, "moving": moving, "max_displacement": MAX_STEP, "dt": DT}
-    return Physics(x.shape[2], C, 1.0, 1.0, **form, limits=limits)
+    physics = make_physics(x.shape[2], C, x.dtype, eps=0.1, box=box, moving=moving, dt=DT)
+    return physics._replace(max_displacement=MAX_STEP, limits=limits)
 
 
 def applied(action, x, s, mask=None, noise=None, enabled=None, diverged=None, **rules):

@@ -1,4 +1,4 @@
-"""Cameras: where things appear on their pictures, and what is refused."""
+"""Cameras: where things appear on their pictures, and what is rejected."""
 
 import math
 

@@ -1,6 +1,6 @@
 """What holds of every differentiable operator: however it is asked, it answers the same.
 
-Torch derives nothing but backward passes from kernels: all else is refused, and never vanishes.
+Torch derives nothing but backward passes from kernels: all else is rejected, and never vanishes.
 """
 
 import copy
@@ -91,7 +91,7 @@ def test_memory_graphs_and_streams_change_nothing(name, device):
 
 
 @every_operator
-def test_a_second_derivative_is_refused_however_the_first_is_asked_for(name, device):
+def test_a_second_derivative_is_rejected_however_the_first_is_asked_for(name, device):
     x, s = random_world(1, 31, 3, 5, dtype=torch.float32, device=device)
     s.requires_grad_()
     for cotangent in (None, 1.0):
@@ -104,7 +104,7 @@ def test_a_second_derivative_is_refused_however_the_first_is_asked_for(name, dev
         assert float(gradient.abs().max()) > 0.0
 
 
-def test_a_compiled_function_refuses_second_derivatives_too():
+def test_a_compiled_function_rejects_second_derivatives_too():
     x, s = torch.rand(1, 12, 2), torch.randn(1, 12, 4, requires_grad=True)
     squares = lambda x, s: npa_envs.perceive(x, s, 0.3).square().sum()  # noqa: E731
     compiled = torch.compile(squares, backend="aot_eager")
@@ -115,7 +115,7 @@ def test_a_compiled_function_refuses_second_derivatives_too():
 
 
 @pytest.mark.parametrize("wrapped", ["x", "s", "both"])
-def test_tensors_that_wrap_others_have_the_results_of_each_or_are_refused(wrapped):
+def test_tensors_that_wrap_others_have_the_results_of_each_or_are_rejected(wrapped):
     x, s = random_world(1, 31, 3, 5, dtype=torch.float32, device="cpu")
     others = [0.5 * v if wrapped in (n, "both") else v for n, v in (("x", x), ("s", s))]
     arguments = zip((x, s), others, strict=True)
@@ -181,10 +181,10 @@ everything = pytest.mark.parametrize("name", EVERYTHING)
 
 @everything
 @pytest.mark.parametrize("gradients", [False, True])
-def test_a_tangent_is_refused(name, gradients, device):
+def test_a_tangent_is_rejected(name, gradients, device):
     x, s = world(device)
     with torch.set_grad_enabled(gradients), forward_ad.dual_level():
-        # Nothing is refused where nothing is asked for.
+        # Nothing is rejected where nothing is asked for.
         EVERYTHING[name](x, s)
         for arguments in (
             (x, forward_ad.make_dual(s, torch.ones_like(s))),
@@ -262,7 +262,7 @@ def test_results_are_the_same_bits_for_every_number_of_threads(name, world_count
 
 
 @pytest.mark.parametrize("name", ["perception", "a rollout", "a picture", "a mean"])
-def test_compiled_functions_refuse_tangents(name, device):
+def test_compiled_functions_reject_tangents(name, device):
     x, s = world(device)
     torch.compiler.reset()
     value = torch.compile(EVERYTHING[name], backend="eager")
@@ -279,7 +279,7 @@ def test_compiled_functions_refuse_tangents(name, device):
 
 
 @everything
-def test_functions_of_torch_func_are_refused(name, device):
+def test_functions_of_torch_func_are_rejected(name, device):
     x, s = world(device)
     value = EVERYTHING[name]
     value(x, s)
@@ -298,7 +298,7 @@ def test_functions_of_torch_func_are_refused(name, device):
 
 
 @every_operator
-def test_a_batch_of_cotangents_is_refused(name, device):
+def test_a_batch_of_cotangents_is_rejected(name, device):
     x, s = world(device)
     s.requires_grad_()
     result = OPERATORS[name](x, s)
@@ -311,7 +311,7 @@ def test_a_batch_of_cotangents_is_refused(name, device):
     assert float(gradient.abs().max()) > 0.0
 
 
-def test_the_reference_has_the_jacobians_that_are_refused(device):
+def test_the_reference_has_the_jacobians_that_are_rejected(device):
     x, s = world(device, torch.float64)
     x, s = x[:, :4], s[:, :4, :2]
 
@@ -341,7 +341,7 @@ class Rollout(torch.nn.Module):
 
 @pytest.mark.parametrize("plain", [True, False])
 @pytest.mark.parametrize("how", ["functional call", "attribute", "states"])
-def test_prepared_rollouts_refuse_tangents_of_weights_and_states(plain, how, device):
+def test_prepared_rollouts_reject_tangents_of_weights_and_states(plain, how, device):
     x, s = world(device)
     rule = copy.deepcopy(own_rule(device))
     if plain:
@@ -364,7 +364,7 @@ def test_prepared_rollouts_refuse_tangents_of_weights_and_states(plain, how, dev
                 torch.func.functional_call(model, weights, (x, s))
 
 
-def test_a_tangent_that_an_own_network_makes_is_refused(device):
+def test_a_tangent_that_an_own_network_makes_is_rejected(device):
     x, s = world(device)
 
     class Dual(npa_envs.NPARule):

@@ -21,7 +21,7 @@ from support.worlds import (
 import npa_envs
 from npa_envs import reference as oracle
 from npa_envs.ops.perceive import build_neighbours
-from npa_envs.ops.physics_constants import Limits, Physics, Terms
+from npa_envs.ops.physics_constants import Limits, Terms, make_physics
 
 # The bound of the tests, then the worst error measured on CPUs and CUDA: a quarter of it at most.
 FORWARD = {torch.float32: 8e-6, torch.float64: 2e-14}  # 1.9e-6, 3.8e-15 (CUDA)
@@ -155,9 +155,9 @@ def test_a_clump_takes_no_more_memory_than_the_same_particles_apart(space_dim):
 
 
 def observed(x, s, *, eps=0.2, eps0=0.2, box=None, limit=16.0, **terms):
-    limits = Limits(perception=limit)
-    physics = Physics(x.shape[2], s.shape[2], eps, eps0, box, Terms(**terms), limits=limits)
-    return build_neighbours(x, s, physics)
+    options = {"eps": eps, "eps0": eps0, "box": box, "terms": Terms(**terms)}
+    physics = make_physics(x.shape[2], s.shape[2], x.dtype, **options)
+    return build_neighbours(x, s, physics._replace(limits=Limits(perception=limit)))
 
 
 @both_inverses
@@ -269,7 +269,7 @@ def test_rows_of_active_particles_equal_the_oracle(room, space_dim, state_dim, b
     assert (perception[:count, width] == 1).all()
     assert (perception[:count, width + 1 :] == 0).all()
     assert (perception[count:] == 0).all()
-    source = rows.row_source[:count].long().cpu()
+    source = rows.row_particle[:count].long().cpu()
     assert torch.equal((rows.row_of >= 0).nonzero()[:, 0].cpu(), source.sort().values)
     assert torch.isin(source, active).all()
     poisoned = torch.full_like(perception, float("nan"))

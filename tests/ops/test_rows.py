@@ -30,7 +30,7 @@ def rows_and_gradient(x, s, *, mask=None, spare_rows=0, spare_columns=0, **optio
     width = options.get("terms", Terms()).perception_dim(x.shape[2], s.shape[2])
     size = {"capacity": max(active, 1) + spare_rows, "width": width + spare_columns}
     perception, rows = rows_of(x, s, mask, eps0=0.2, **size, **options)
-    source = rows.row_source[:active].long()
+    source = rows.row_particle[:active].long()
     (cotangent,) = cotangents([perception.new_empty(total, width)])
     bar = torch.full_like(perception, float("nan"))
     bar[:active, :width] = cotangent[source]
@@ -139,7 +139,7 @@ def test_a_position_that_is_not_a_number_leaves_other_worlds_alone(device):
         assert torch.equal(value.view(2, 83, -1)[1], answer.view(2, 83, -1)[1])
 
 
-def test_gradients_that_kernels_could_not_index_are_refused(monkeypatch):
+def test_gradients_that_kernels_could_not_index_are_rejected(monkeypatch):
     x, s = random_world(1, 20, 3, 5, dtype=torch.float64, device="cpu")
     z = npa_envs.perceive(x, s.requires_grad_(), 0.3)
     monkeypatch.setattr(perception_passes, "MAX_INDEX", 20 * 8 * 3)

@@ -1,4 +1,4 @@
-"""What the operators and the dynamics refuse, and what they say."""
+"""What the operators and the dynamics reject, and what they say."""
 
 import gymnasium
 import numpy as np
@@ -64,7 +64,7 @@ BEYOND, SMALL_BOX = r"eps must lie in .* for torch\.float32", r"at least 2 eps =
         (X, S, 0.1, (1.0, 1.0, 1.0), "box must have 2 sides, got 3"),
     ],
 )
-def test_operators_name_what_they_refuse(function, x, s, eps, box, message):
+def test_operators_name_what_they_reject(function, x, s, eps, box, message):
     with pytest.raises(NPAError, match=message):
         function(x, s, eps, box=box)
 
@@ -179,6 +179,6 @@ WIDE = NPARule(state_dim=2)
         (lambda: TorchNormalizeReward(()), "needs a vector environment, got tuple"),
     ],
 )
-def test_what_else_is_refused_is_a_clear_error(call, message):
+def test_what_else_is_rejected_is_a_clear_error(call, message):
     with pytest.raises(NPAError, match=message):
         call()

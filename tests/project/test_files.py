@@ -117,11 +117,11 @@ def test_long_names_are_written_and_their_left_overs_found(tmp_path: Path, stem:
 
 
 def _fail_with(number: int) -> Any:
-    def refuse(path: Any, *_: Any) -> int:
+    def reject(path: Any, *_: Any) -> int:
         name = None if isinstance(path, int) else os.fspath(path)
         raise OSError(number, os.strerror(number), name)
 
-    return refuse
+    return reject
 
 
 @pytest.mark.parametrize(
@@ -134,7 +134,7 @@ def _fail_with(number: int) -> Any:
         (os, "replace", errno.ENOSPC, "disk is full.*nothing was changed"),
     ],
 )
-def test_what_the_system_refuses_is_said_and_keeps_the_old_file(
+def test_what_the_system_rejects_is_said_and_keeps_the_old_file(
     tmp_path, monkeypatch, place, name, number, message
 ):
     target = tmp_path / "a.bin"

@@ -1,4 +1,4 @@
-"""Small files that would cost gigabytes, block for ever or start programs: refused, and cheaply."""
+"""Small files that would cost gigabytes, block for ever or start programs: cheaply rejected."""
 
 import gzip
 import json
@@ -55,7 +55,7 @@ READERS: dict[str, tuple[str, Callable[[Path], Any]]] = {
 @pytest.mark.skipif(not Path("/dev/ptmx").exists(), reason="no terminals here")
 @pytest.mark.parametrize("reader", READERS)
 @pytest.mark.parametrize("device", ["/dev/zero", "/dev/random", "/dev/ptmx", "pipe"])
-def test_a_device_is_refused_at_once(tmp_path, reader, device):
+def test_a_device_is_rejected_at_once(tmp_path, reader, device):
     suffix, read = READERS[reader]
     path = tmp_path / f"device{suffix}"
     # To read from a pipe or a terminal would block.
@@ -67,7 +67,7 @@ def test_a_device_is_refused_at_once(tmp_path, reader, device):
 # A first run finds no record.
 @pytest.mark.parametrize("reader", [reader for reader in READERS if reader != "record"])
 @pytest.mark.parametrize("name", ["a\0b", "x" * 300, "~\0", "\ud800"])
-def test_names_that_no_file_has_are_refused(tmp_path, reader, name):
+def test_names_that_no_file_has_are_rejected(tmp_path, reader, name):
     suffix, read = READERS[reader]
     with pytest.raises(NPAError) as caught:
         read(tmp_path / f"{name}{suffix}")
@@ -84,7 +84,7 @@ def test_postscript_that_is_called_a_picture_starts_nothing(tmp_path, monkeypatc
     assert not ran
 
 
-def test_a_compressed_state_dict_is_refused_unread(tmp_path):
+def test_a_compressed_state_dict_is_rejected_unread(tmp_path):
     torch.save({"model.0.weight": torch.zeros(1000, 1000)}, tmp_path / "plain.pth")
     path = tmp_path / "rule.pth"
     with (
@@ -160,7 +160,7 @@ def test_a_kernel_cache_that_cannot_be_made_is_named_with_its_hint(tmp_path):
     assert re.search(rf"NPAError: .*{tmp_path / 'file'}.*remove it.*WARP_CACHE_PATH", done.stderr)
 
 
-# Small inputs that are refused, briefly.
+# Small inputs that are rejected, briefly.
 
 RED = (255, 0, 0, 255)
 
@@ -244,7 +244,7 @@ def scaled(factor=1.0, shift=0.0):
 MAX_POINTS = "point_count must be at most 16777216, got 1000000000"
 OUTSIDE = r"must name a file in that folder|no null or invalid characters"
 NUMBER = r"transform_matrix|camera_angle_x"
-REFUSED = [
+REJECTED = [
     (corners, "few and far apart: fill more of the picture"),
     (lambda folder: corners(folder, 2000), "few and far apart: fill more of the picture"),
     (line, "target 'line' is too thin"),
@@ -288,9 +288,9 @@ BRIEFLY = [(lambda _: load_pictures("x" * 10_000), None), (wordy, None)]
 
 @pytest.mark.parametrize(
     ("call", "message", "most"),
-    [(*row, 2500) for row in REFUSED] + [(*row, 600) for row in BRIEFLY],
+    [(*row, 2500) for row in REJECTED] + [(*row, 600) for row in BRIEFLY],
 )
-def test_what_would_cost_gigabytes_or_for_ever_is_refused_briefly(tmp_path, call, message, most):
+def test_what_would_cost_gigabytes_or_for_ever_is_rejected_briefly(tmp_path, call, message, most):
     with pytest.raises(NPAError, match=message) as caught:
         call(tmp_path)
     assert len(str(caught.value)) < most

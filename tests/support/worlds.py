@@ -5,7 +5,7 @@ from torch.utils._pytree import tree_leaves
 
 import npa_envs
 from npa_envs.ops.perceive import perceive_rows
-from npa_envs.ops.physics_constants import Physics, Terms
+from npa_envs.ops.physics_constants import Terms, make_physics
 
 
 def tensors(*values):
@@ -110,7 +110,8 @@ def rows_of(
     x, s, mask=None, *, eps=0.3, eps0=None, box=None, terms=None, width=None, capacity=None
 ):
     """Perceive the active particles, by default in as many rows and columns as they need."""
-    physics = Physics(x.shape[2], s.shape[2], eps, eps0 or eps, box, terms or Terms())
+    options = {"eps": eps, "eps0": eps0, "box": box, "terms": terms or Terms()}
+    physics = make_physics(x.shape[2], s.shape[2], x.dtype, **options)
     active = x.shape[0] * x.shape[1] if mask is None else max(int(mask.sum()), 1)
     return perceive_rows(
         x,

@@ -18,7 +18,7 @@ import npa_envs
 from npa_envs import reference as oracle
 from npa_envs.ops import splat
 from npa_envs.ops.perceive import Rows
-from npa_envs.ops.physics_constants import Physics
+from npa_envs.ops.physics_constants import make_physics
 from npa_envs.ops.update import update_particles
 from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.world.steps import row_capacity
@@ -188,9 +188,8 @@ def test_rows_and_columns_that_nothing_reads_change_nothing(
     width = state_dim + space_dim * moving
     update = torch.randn(122, width, generator=generator).to(device)
 
-    sides = None if box is None else (box,) * space_dim
-    options = {"moving": moving, "max_displacement": 0.1, "dt": 0.7}
-    physics = Physics(space_dim, state_dim, 0.1, 0.1, sides, **options)
+    options = {"moving": moving, "alpha": 1.0, "dt": 0.7}
+    physics = make_physics(space_dim, state_dim, x.dtype, eps=0.1, box=box, **options)
 
     def run(padding):
         padded = torch.nn.functional.pad(update, (0, padding), value=7.0).requires_grad_()

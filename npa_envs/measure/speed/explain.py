@@ -127,9 +127,10 @@ def _reasons(
     )
     neighbours = "searched for in each pass"
     if plan.lists_neighbours:
+        layout = plan.list_layout
         neighbours = (
             "listed by the density pass for the perception pass, "
-            f"{plan.listing.lanes} threads a particle, with room for {plan.listing.capacity} each: "
+            f"{layout.lanes} threads per particle, with room for {layout.capacity} each: "
             "longer lists are searched for again"
         )
     rows = "every particle is perceived and updated"

@@ -271,7 +271,7 @@ def cameras_of_poses(
         got = getattr(camera_to_world, "shape", type(camera_to_world).__name__)
         raise NPAError(f"camera_to_world must have shape [V, 4, 4] or [B, V, 4, 4], got {got}")
     check_floating("camera_to_world", camera_to_world)
-    # Of a rigid motion: R and t become Rᵀ and -Rᵀ t. What is not rigid is refused by `Cameras`.
+    # Of a rigid motion: R and t become Rᵀ and -Rᵀ t. What is not rigid is rejected by `Cameras`.
     flip = camera_to_world.new_tensor([1.0, -1.0, -1.0])
     back = (camera_to_world[..., :3, :3] * flip).mT
     motion = torch.cat((back, -back @ camera_to_world[..., :3, 3:]), dim=-1)

@@ -1,7 +1,4 @@
-"""Pictures of 3D Gaussians as a differentiable torch operator.
-
-Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
-"""
+"""Pictures of 3D Gaussians as a differentiable torch operator."""
 
 from __future__ import annotations
 
@@ -173,20 +170,20 @@ def blend(frame: Any, footprints: Tensor, pairs: Pairs, images: int) -> tuple[Te
     """Return for each of B V H W pixels: colour [K], transmittance, index after its last pair."""
     device, pixels = footprints.device, images * frame.width * frame.height
     scalar = SCALARS[footprints.dtype]
-    listed = (pairs.starts, pairs.owners, footprints)
+    contents = (pairs.starts, pairs.owners, footprints)
     if device.type == "cuda":
         picture = footprints.new_empty(pixels, frame.channels)
         passing = footprints.new_empty(pixels)
         stops = torch.empty(pixels, dtype=torch.int32, device=device)
         threads = images * frame.tile_count * TILE_PIXELS
-        drawn = (*listed, picture, passing, stops)
+        drawn = (*contents, picture, passing, stops)
         kernel = block_kernels(scalar).draw_blocks
         launch(kernel, threads, device, frame, *drawn, block_dim=TILE_PIXELS)
     else:
         picture = footprints.new_zeros(pixels, frame.channels)
         passing = footprints.new_ones(pixels)
         stops = torch.full((pixels,), MAX_INDEX, dtype=torch.int32, device=device)
-        drawn = (*listed, picture, passing, stops)
+        drawn = (*contents, picture, passing, stops)
         launch(tile_kernels(scalar).draw_tiles, images * frame.tile_count, device, frame, *drawn)
     return picture, passing, stops
 
@@ -286,13 +283,13 @@ def _gaussians_backward(
     # Cotangents from tiles, a row for each slot; unused slots are undefined.
     pulls = footprints.new_empty(owners.shape[0], PULLS)
     tiles = starts.shape[0] - 1
-    listed = (starts, owners, pair_slots, footprints, stops, picture_bar)
+    contents = (starts, owners, pair_slots, footprints, stops, picture_bar)
     if device.type == "cuda":
         kernel = block_kernels(scalar).pull_back_blocks
-        pulled = (*listed, passing, passing_bar, pulls.view(-1))
+        pulled = (*contents, passing, passing_bar, pulls.view(-1))
         launch(kernel, tiles * TILE_PIXELS, device, frame, *pulled, block_dim=TILE_PIXELS)
     else:
-        pulled = (*listed, passing.clone(), passing * passing_bar, pulls)
+        pulled = (*contents, passing.clone(), passing * passing_bar, pulls)
         launch(tile_kernels(scalar).pull_back_tiles, tiles, device, frame, *pulled)
     means, scales, quaternions, colours, *_ = scene
     bars = [torch.empty_like(tensor) for tensor in (means, scales, quaternions)]

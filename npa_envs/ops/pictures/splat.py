@@ -1,7 +1,4 @@
-"""Pictures of 2D worlds as a differentiable torch operator, and their losses in fused kernels.
-
-Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
-"""
+"""Pictures of 2D worlds as a differentiable torch operator, and their losses in fused kernels."""
 
 from __future__ import annotations
 
@@ -95,11 +92,11 @@ def sort_splats(splats: Splats, view: Any) -> tuple[Tensor, Tensor, Tensor]:
     cell_total = world_count * view.cell_count
     _check_size(max(cell_total, x.numel()), world_count, view)
     footprints = x.new_empty(total, FOOTPRINT)
-    source = torch.empty(total, dtype=torch.int32, device=x.device)
+    original_index = torch.empty(total, dtype=torch.int32, device=x.device)
     request = KernelRequest(x.device, x.dtype, particle_count, view.cell_count, 2)
     capacity = block_capacity(request, x)
     if capacity:
-        starts = source.new_empty(cell_total + 1)
+        starts = original_index.new_empty(cell_total + 1)
         slices = slice_count(x.device, world_count, particle_count)
         block = BLOCKS[capacity]
         launch(
@@ -112,10 +109,10 @@ def sort_splats(splats: Splats, view: Any) -> tuple[Tensor, Tensor, Tensor]:
             splats.goal,
             starts,
             footprints,
-            source,
+            original_index,
             block_dim=block,
         )
-        return starts, footprints, source
+        return starts, footprints, original_index
     kernels, contents, moves = device_kernels(x), splats.arguments(), splats.means_and_goal()
     cell, arrival, arrived = torch.empty(3, total, dtype=torch.int32, device=x.device).unbind()
     counts = torch.zeros(cell_total + 1, dtype=torch.int32, device=x.device)
@@ -123,9 +120,9 @@ def sort_splats(splats: Splats, view: Any) -> tuple[Tensor, Tensor, Tensor]:
     launch(kernels.count_splats, total, x.device, view, *contents[:2], *moves, *counted)
     starts = torch.cumsum(counts, 0, dtype=torch.int32)
     launch(kernels.place_splats, total, x.device, cell, arrival, starts, arrived)
-    sorted_splats = (cell, arrived, starts, footprints, source)
+    sorted_splats = (cell, arrived, starts, footprints, original_index)
     launch(kernels.order_splats, total, x.device, view, *contents, *moves, *sorted_splats)
-    return starts, footprints, source
+    return starts, footprints, original_index
 
 
 def scatter_splats(splats: Splats, view: Any) -> tuple[Tensor, Tensor, Tensor]:
@@ -133,11 +130,12 @@ def scatter_splats(splats: Splats, view: Any) -> tuple[Tensor, Tensor, Tensor]:
     x, total = splats.x, splats.total
     picture = x.new_zeros(x.shape[0], view.resolution, view.resolution, CHANNELS)
     footprints = x.new_empty(total, FOOTPRINT)
-    source = torch.empty(total, dtype=torch.int32, device=x.device)
+    original_index = torch.empty(total, dtype=torch.int32, device=x.device)
     scratch = x.new_empty(x.shape[0], min(2 * view.radius + 1, view.resolution))
-    drawn = (*splats.arguments(), *splats.means_and_goal(), scratch, picture, footprints, source)
-    launch(device_kernels(x).scatter_splats, x.shape[0], x.device, view, *drawn)
-    return picture, footprints, source
+    drawn = (scratch, picture, footprints, original_index)
+    contents = (*splats.arguments(), *splats.means_and_goal())
+    launch(device_kernels(x).scatter_splats, x.shape[0], x.device, view, *contents, *drawn)
+    return picture, footprints, original_index
 
 
 @custom_op("npa::splat")
@@ -155,20 +153,20 @@ def _splat(
     if x.device.type != "cuda":
         return scatter_splats(splats, view)
     _check_size(x.shape[0] * CHANNELS * view.resolution**2, x.shape[0], view)
-    starts, footprints, source = sort_splats(splats, view)
+    starts, footprints, original_index = sort_splats(splats, view)
     picture = x.new_empty(x.shape[0], view.resolution, view.resolution, CHANNELS)
     groups = x.shape[0] * group_count(view.resolution)
     threads = groups * GROUP_WIDTH * GROUP_HEIGHT * TILE_LANES
     flat = picture.view(-1, CHANNELS)
     launch(device_kernels(x).gather_splats, threads, x.device, view, starts, footprints, flat)
-    return picture, footprints, source
+    return picture, footprints, original_index
 
 
 @custom_op("npa::splat_backward")
 def _splat_backward(
     picture_bar: Tensor,
     footprints: Tensor,
-    source: Tensor,
+    original_index: Tensor,
     pixel_size: float,
     sigma: float,
     low: float,
@@ -185,7 +183,7 @@ def _splat_backward(
         make_view(SCALARS[footprints.dtype], int(resolution), pixel_size, sigma, low, high),
         total // world_count,
         footprints,
-        source,
+        original_index,
         aligned(picture_bar).view(-1, CHANNELS),
         positions_bar,
         colours_bar,

@@ -1,4 +1,4 @@
-"""What operators refuse, and what they say then."""
+"""What operators reject, and what they say then."""
 
 import math
 
@@ -175,7 +175,7 @@ OWN = {"cameras": made(world_to_camera=torch.eye(4).repeat(3, 1, 1, 1))}
         (judging, {"goal": torch.zeros(3)}, r"and \(3,\)"),
         (judging, {"target": torch.zeros(1, 1, 4)}, "resolution must be at least 2"),
         (judging, {"sigma": 0.0}, "sigma must be positive"),
-        (world_mean, {"values": torch.zeros(4, 3)}, r"values must .*\[B, M, K\] .*, got \(4, 3\)"),
+        (world_mean, {"values": torch.zeros(4, 3)}, r"values must .*\[B, M, F\] .*, got \(4, 3\)"),
         (world_mean, {"values": torch.zeros(4, 0, 3)}, r"got \(4, 0, 3\)"),
         (world_mean, {"values": torch.zeros(4, 2, 3).half()}, "or float64, got torch.float16"),
         (world_mean, {"values": torch.zeros(4, 2, 3).long()}, r"convert it with \.float\(\)"),
@@ -183,7 +183,7 @@ OWN = {"cameras": made(world_to_camera=torch.eye(4).repeat(3, 1, 1, 1))}
         (perceiving, {"word": "soft"}, "must be 'threshold' or 'smooth', got 'soft'"),
     ],
 )
-def test_what_does_not_fit_is_refused(call, change, message):
+def test_what_does_not_fit_is_rejected(call, change, message):
     assert made().count == 2
     with pytest.raises(NPAError, match=message):
         call(**change)
