@@ -11,7 +11,7 @@ import math
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 import npa_envs.world.rollout
 from npa_envs.errors import NPAError
@@ -121,7 +121,7 @@ class TrainingCycle:
     def __init__(
         self,
         task: Task,
-        rule: NPARule,
+        rule: nn.Module,
         config: TrainConfig[Any],
         device: torch.device,
         schedule: torch.Generator,
@@ -130,7 +130,7 @@ class TrainingCycle:
         processes: ProcessGroup = ALONE,
         per_world_streams: bool = False,
     ) -> None:
-        self.task = task.for_rule(rule)
+        self.task = task.for_rule(rule) if isinstance(rule, NPARule) else task
         _check_varied_eps(self.task, rule, config)
         self._config = config
         self._processes = processes
@@ -228,7 +228,7 @@ class TrainingCycle:
         return {
             "optimiser": self.optimiser.state_dict(),
             "pool": pool,
-            "meter": self.statistics.state_dict(),
+            "statistics": self.statistics.state_dict(),
             "random_states": self.random.state_dict(),
         }
 
@@ -237,7 +237,7 @@ class TrainingCycle:
         self.optimiser.load_state_dict(state["optimiser"])
         for name, local in self.pool.tensors().items():
             local.copy_(self._processes.local(state["pool"][name], self._section))
-        self.statistics.load_state_dict(state["meter"])
+        self.statistics.load_state_dict(state["statistics"])
         self.random.load_state_dict(state["random_states"], iteration)
 
     @torch.no_grad()
@@ -252,7 +252,7 @@ class TrainingCycle:
         if config.ages:
             age, expired = self.pool.ages_of(self._index)
             self._age.copy_(age.masked_fill(expired, 0))
-            self.batch.grown.copy_((self._age >= config.stillness_min_age) & ~damaged)
+            self.batch.past_min_age.copy_((self._age >= config.stillness_min_age) & ~damaged)
             if config.damage_and_keep_share > 0.0:
                 chance = uniform_draws(worlds, (len(expired), 1), start.x)[:, 0]
                 renewed = expired & (chance < config.damage_and_keep_share)
@@ -291,7 +291,7 @@ class TrainingCycle:
         return seeds._replace(x=seeds.x.to(dtype), s=seeds.s.to(dtype))
 
 
-def _check_varied_eps(task: Task, rule: NPARule, config: TrainConfig[Any]) -> None:
+def _check_varied_eps(task: Task, rule: nn.Module, config: TrainConfig[Any]) -> None:
     if config.vary_eps == (1.0, 1.0):
         return
     if not isinstance(rule, NPARule):
