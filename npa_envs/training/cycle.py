@@ -96,19 +96,16 @@ class WorldPool:
 
         Returns which worlds were replaced, bool, shape [B].
         """
-        largest = torch.maximum(_largest(worlds.x), _largest(worlds.s))
+        largest_x, largest_s = (
+            torch.linalg.vector_norm(values.flatten(1), math.inf, dim=1)
+            for values in (worlds.x, worlds.s)
+        )
         # A comparison with NaN is false, so worlds that are not finite are replaced too.
-        keep = largest <= LARGEST_VALUE
-        self.worlds.put_(index, worlds.where(keep, fresh))
+        diverged = ~(torch.maximum(largest_x, largest_s) <= LARGEST_VALUE)
+        self.worlds.put_(index, fresh.where(diverged, worlds))
         if self.age is not None and age is not None:
-            self.age.index_copy_(0, index, age.masked_fill(~keep, 0))
-        return ~keep
-
-
-def _largest(worlds: Tensor) -> Tensor:
-    """Return each world's largest absolute value, or NaN if it has one; shape [B]."""
-    largest: Tensor = torch.linalg.vector_norm(worlds.flatten(1), math.inf, dim=1)
-    return largest
+            self.age.index_copy_(0, index, age.masked_fill(diverged, 0))
+        return diverged
 
 
 class TrainingCycle:
@@ -176,7 +173,7 @@ class TrainingCycle:
         self._fresh_worlds = batch.map(torch.empty_like)
         graph = functools.partial(GraphedCallable, device=device, recorded=graphed)
         self._draw = graph(self._draw_worlds, generator=registered(self.random.worlds))
-        self._keep = graph(self._keep_worlds)
+        self._store = graph(self._store_worlds)
         self._record = graph(self._record_iteration)
 
     def run(self, iteration: int, least_progress: float = 0.0) -> int:
@@ -195,7 +192,7 @@ class TrainingCycle:
         batch.run(steps)
         self.statistics.begin(iteration + 1, steps)
         self._steps.fill_(steps)
-        self._keep()
+        self._store()
         # Not inside a graph: torch watches NCCL only there for processes that do not answer.
         self._processes.reduce([*batch.gradients, batch.terms], self._replaced)
         self._record()
@@ -268,7 +265,7 @@ class TrainingCycle:
         self.batch.start.copy_(start)
 
     @torch.no_grad()
-    def _keep_worlds(self) -> None:
+    def _store_worlds(self) -> None:
         age = self._age + self._steps if self._config.ages else None
         replaced = self.pool.write(self._index, self.batch.end, self._fresh_worlds, age)
         self._replaced += replaced.sum()
