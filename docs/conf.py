@@ -59,6 +59,9 @@ autodoc_typehints = "none"
 autodoc_mock_imports = ["rsl_rl", "tensordict", "torchrl"]
 napoleon_google_docstring = True
 napoleon_numpy_docstring = False
+# Groups of arguments in the docstring of NPARule.
+_GROUPS = ("Perception", "Outputs", "Equivariance", "Codes")
+napoleon_custom_sections = [(name, "params_style") for name in _GROUPS]
 
 html_theme = "furo"
 html_title = "npa-envs"

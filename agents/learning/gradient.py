@@ -6,7 +6,7 @@ import itertools
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Self, cast
+from typing import Any, Self
 
 import torch
 from torch import Tensor
@@ -108,8 +108,7 @@ def train(progress: Progress, options: GradientOptions = GradientOptions()) -> R
         cuda_graph=not isinstance(task.inner, EnvTask) or task.inner.start_is_short,
     )
     schedule = torch.Generator().manual_seed(seed)
-    # A cycle uses parameters and `task.rollout` only, for which a RuleSet is as good as a rule.
-    cycle = TrainingCycle(task, cast(NPARule, rules), config, device, schedule, task.rollout)
+    cycle = TrainingCycle(task, rules, config, device, schedule, task.rollout)
     # On CUDA there is one recording for each number of steps: make all before the clock starts.
     for number in range(*config.steps) if device.type == "cuda" else (config.steps[0],):
         cycle.batch.run(number)

@@ -82,9 +82,9 @@ def main(arguments: Sequence[str]) -> int:
         world = options.world | {"data_folder": options.data_folder}
         trained = task_of_rule(options.rule, rule, device, **world)
         task = trained.task
-        if trained.doubt is not None:
+        if trained.why_not_measurable is not None:
             raise NPAError(
-                f"cannot measure {options.rule!r}: {trained.doubt}: "
+                f"cannot measure {options.rule!r}: {trained.why_not_measurable}: "
                 "give --target, a built-in name or a picture"
             )
         kwargs["checkpoints"] = options.checkpoints

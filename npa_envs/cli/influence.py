@@ -126,8 +126,8 @@ def _rules(sources: Sequence[str], device: torch.device) -> list[RuleUnderTest]:
         trained = task_of_rule(source, rule, device)
         if trained.task_name != TASK:
             raise NPAError(f"rules must be of the task {TASK}, got {source!r}: leave it out")
-        if trained.doubt is not None:
-            raise NPAError(f"cannot measure {source!r}: {trained.doubt}: leave it out")
+        if trained.why_not_measurable is not None:
+            raise NPAError(f"cannot measure {source!r}: {trained.why_not_measurable}: leave it out")
         name = source.rpartition("#")[2] if "#" in source else Path(source).stem
         if name in rules:
             name = f"{name}-{len(rules) + 1}"

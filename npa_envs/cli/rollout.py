@@ -105,8 +105,8 @@ def main(arguments: Sequence[str]) -> int:
     done = max(film.steps.values())
     if done < options.steps:
         print(f"stopped at step {done} of {options.steps}; the film goes that far")
-    if trained.doubt is not None:
-        print(f"no figures for {options.rule}: {trained.doubt}; give --target")
+    if trained.why_not_measurable is not None:
+        print(f"no figures for {options.rule}: {trained.why_not_measurable}; give --target")
     else:
         row = measure(task, worlds.x, worlds.s, done)
         print(f"step {done}: {row.figures}, extent {row.extent:.3f}")

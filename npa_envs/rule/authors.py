@@ -143,11 +143,16 @@ def _parts(
     return RuleParts(sizes | common | hyper_parameters, weights)
 
 
-def _equivariant_parts(tensors: Mapping[str, Tensor], scalars: Mapping[Any, Any]) -> RuleParts:
-    """Return `RuleParts` of a 2D equivariant rule, from what `models.json` has by these names."""
-    mixing, first, second = (tensors[name] for name in ("W_hidden", "w1.weight", "w2.weight"))
+def _equivariant_parts(
+    tensors: Mapping[str, Tensor], scalars: Mapping[Any, Any], *, padded: bool = False
+) -> RuleParts:
+    """Return `RuleParts` of a 2D equivariant rule, from what `models.json` has by these names.
+
+    Tensors may be `padded` with zeros.
+    """
+    mixing = tensors["W_hidden"]
     state_dim, mixed = mixing.shape[0] - 1, mixing.shape[1]
-    hidden_dim = first.shape[0]
+    hidden_dim = len(tensors["w1.weight"])
     input_dim = 2 * state_dim + mixed * (mixed + 1) // 2
     output_dim = state_dim + mixed
     wanted = {
@@ -157,6 +162,9 @@ def _equivariant_parts(tensors: Mapping[str, Tensor], scalars: Mapping[Any, Any]
         "w2.weight": (output_dim, hidden_dim),
         "w2.bias": (output_dim,),
     }
+    if padded:
+        tensors = {name: tensors[name][tuple(map(slice, wanted[name]))] for name in wanted}
+    first, second = tensors["w1.weight"], tensors["w2.weight"]
     got = {name: tuple(tensors[name].shape) for name in wanted}
     if state_dim < 1 or got != wanted:
         raise NPAError(
@@ -179,7 +187,14 @@ def read_demo_json(data: bytes, name: str | None) -> RuleParts:
     """Return the `RuleParts` of the rule `name` in a JSON file of the authors' web demo."""
     entry, index = _demo_rule(parse_json(data), name)
     if "W_hidden" in entry:
-        return _read_equivariant_entry(entry, index)
+        tensors = {
+            known: _decode(entry, known, 1 if known.endswith("bias") else 2, index)
+            for known in _EQUIVARIANT_NAMES.values()
+        }
+        # Each number is repeated.
+        repeated = ("W_hidden", "W_out")
+        tensors |= {known: tensors[known][:, ::_TEXEL] for known in repeated}
+        return _equivariant_parts(tensors, entry, padded=True)
     first = _decode(entry, "w1.weight", 2, index)
     bias = _decode(entry, "w1.bias", 1, index)
     second = _decode(entry, "w2.weight.T", 2, index)
@@ -228,23 +243,6 @@ def _demo_rule(content: Any, name: str | None) -> tuple[Mapping[str, Any], int |
     if name not in rules:
         raise NPAError(f"the file holds no rule {shown(name)}: {suggest(name, rules)}")
     return rules[name]
-
-
-def _read_equivariant_entry(entry: Mapping[str, Any], index: int | None) -> RuleParts:
-    """Return the `RuleParts` of an equivariant rule, without the zeros that pad its tensors."""
-    tensors = {
-        name: _decode(entry, name, 1 if name.endswith("bias") else 2, index)
-        for name in _EQUIVARIANT_NAMES.values()
-    }
-    for name in ("W_hidden", "W_out"):
-        tensors[name] = tensors[name][:, ::_TEXEL]
-    state_dim, mixed = tensors["W_hidden"].shape[0] - 1, tensors["W_hidden"].shape[1]
-    hidden_dim = tensors["w1.weight"].shape[0]
-    inputs = 2 * state_dim + mixed * (mixed + 1) // 2
-    cut = {"w1.weight": inputs, "w1.bias": hidden_dim}
-    cut |= {"w2.weight": hidden_dim, "w2.bias": state_dim + mixed}
-    tensors |= {name: tensors[name][..., :size].contiguous() for name, size in cut.items()}
-    return _equivariant_parts(tensors, entry)
 
 
 def save_demo_json(
@@ -334,7 +332,7 @@ def _unpickle(data: bytes) -> Mapping[Any, Any]:
     return state
 
 
-def _check_plain(name: str, tensor: Tensor) -> None:
+def _check_not_expanded(name: str, tensor: Tensor) -> None:
     check_dense(name, tensor)
     stored = tensor.untyped_storage().nbytes()
     if tensor.numel() * tensor.element_size() > stored:
@@ -349,7 +347,7 @@ def _matrix(name: str, value: Any) -> Tensor:
     rank = 1 if name.endswith("bias") else 2
     if not isinstance(value, Tensor):
         raise NPAError(f"{name} must be a tensor, got a {type(value).__name__}")
-    _check_plain(name, value)
+    _check_not_expanded(name, value)
     if value.ndim == 4 and rank == 2 and value.shape[2:] == (1, 1):
         value = value[:, :, 0, 0]
     if value.ndim != rank:
@@ -381,7 +379,7 @@ def _infer_dimensions(
 def _scalar(name: str, value: Any) -> float:
     """Return the shortest decimal number that rounds to `value` in float32."""
     if isinstance(value, Tensor):
-        _check_plain(name, value)
+        _check_not_expanded(name, value)
     number = checked_finite(name, value)
     for digits in range(1, 10):
         rounded = float(f"{number:.{digits}g}")

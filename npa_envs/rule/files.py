@@ -319,8 +319,16 @@ def _parse(header: Mapping[str, str], name: str, cls: type) -> Any:
 
 def _without_weights(hyper_parameters: Mapping[str, Any]) -> NPARule:
     """Return a rule on torch's meta device: its weights have shapes and no memory."""
-    with torch.device("meta"):
-        return NPARule(**hyper_parameters)
+    try:
+        with torch.device("meta"):
+            return NPARule(**hyper_parameters)
+    except (RuntimeError, TypeError, OverflowError) as error:
+        raise NPAError(f"no rule has the hyper-parameters {shown(hyper_parameters)}") from error
+
+
+def rule_like(hyper_parameters: Mapping[str, Any]) -> NPARule:
+    """Return a rule on the CPU whose weights have arbitrary values and are to be loaded."""
+    return _without_weights(hyper_parameters).to_empty(device="cpu")
 
 
 def _shapes(weights: Mapping[str, Tensor]) -> dict[str, tuple[int, ...]]:
@@ -329,12 +337,7 @@ def _shapes(weights: Mapping[str, Tensor]) -> dict[str, tuple[int, ...]]:
 
 def _assemble(parts: RuleParts) -> NPARule:
     """Return the rule with these hyper-parameters and weights; no random weights are drawn."""
-    try:
-        rule = _without_weights(parts.hyper_parameters)
-    except (RuntimeError, TypeError, OverflowError) as error:
-        raise NPAError(
-            f"no rule has the hyper-parameters {shown(parts.hyper_parameters)}"
-        ) from error
+    rule = _without_weights(parts.hyper_parameters)
     expected, got = _shapes(rule.state_dict()), _shapes(parts.weights)
     if got != expected:
         wrong = sorted(

@@ -108,9 +108,9 @@ class FoldedInvariants(NamedTuple):
     form: VectorSizes
     """Positions of vectors in a row."""
     row_width: int
-    """As in `FoldedRule`."""
+    """Length of a row of input."""
     update_width: int
-    """As in `FoldedRule`."""
+    """Length A' of an output."""
 
     def __call__(self, rows: Tensor) -> Tensor:
         """Map K rows of input, [K, row_width], to K updates, each followed by zeros, [K, A']."""

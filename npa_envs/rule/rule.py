@@ -78,8 +78,7 @@ STEP_PARTS = frozenset(
 class NPARule(nn.Module):
     """The update rule of Neural Particle Automata: y = W2 relu(W1 z + b1).
 
-    z is a particle's perception vector and y = [δ (D) ; Δs (C)] its update (no δ if
-    `static`).
+    z is a particle's perception vector and y = [δ (D) ; Δs (C)] its update (no δ if `static`).
     Source: arXiv 2601.16096, section 3; the same network for every particle and every step.
 
     An equivariant rule commutes with rotations: rotated worlds stay rotated. It mixes the gradients
@@ -95,27 +94,35 @@ class NPARule(nn.Module):
         eps0: Perception radius at which the rule is trained [length units]; perception at another
             radius is scaled to it.
         alpha: Largest displacement in one step as a fraction of the perception radius.
-        static: Particles never move: the rule has no displacement outputs.
-        readout_dim: Outputs of the read-out network s -> outputs; 0 for none.
-        readout_hidden_dim: Width of the read-out's hidden layer; needed where `readout_dim` > 0.
-        moment_correction: The perceived state gradient is corrected by the moment matrix.
+
+    Perception:
         state_gradient: The rule perceives the state gradient.
         density_gradient: The rule perceives the density gradient.
-        species_count: Species whose densities and density gradients the rule also perceives
-            separately, as `npa_envs.rollout_species` runs it; 0: it does not distinguish species.
+        moment_correction: The perceived state gradient is corrected by the moment matrix.
         moment_inverse: How the moment matrix is inverted for the correction: "threshold", the
             paper's, or "smooth", as in `npa_envs.perceive`.
+        species_count: Species whose densities and density gradients the rule also perceives
+            separately, as `npa_envs.rollout_species` runs it; 0: it does not distinguish species.
+
+    Outputs:
+        static: Particles never move: the rule has no displacement outputs.
+        dead_zone: Entries y of an update with |y| <= `dead_zone` are set to 0 (dimensionless), so
+            that worlds that hardly change come to rest (`at_rest`).
+        readout_dim: Outputs of the read-out network s -> outputs; 0 for none.
+        readout_hidden_dim: Width of the read-out's hidden layer; needed where `readout_dim` > 0.
+        divides: Particles divide and die, with probabilities that depend on their states. Their
+            first state is 1 for living and 0 for dead particles (`npa_envs.world.division`).
+
+    Equivariance:
         equivariant: The rule is rotation-equivariant.
         chiral: An equivariant rule of 2D worlds distinguishes left from right.
         mixed_vectors: Mixed vectors of an equivariant rule, at least 1.
+
+    Codes:
         code_dim: Length K of a code, which names what to grow: the first K state channels, which
             the rule perceives and never changes.
         code_names: Names of the known codes, at least one if `code_dim` > 0.
         encoder: A network computes codes from pictures (`codes.encode`).
-        divides: Particles divide and die, with probabilities that depend on their states. Their
-            first state is 1 for living and 0 for dead particles (`npa_envs.world.division`).
-        dead_zone: Entries y of an update with |y| <= `dead_zone` are set to 0 (dimensionless), so
-            that worlds that hardly change come to rest (`at_rest`).
 
     Raises:
         NPAError: A dimension or a length is out of range, `moment_inverse` is unknown, or arguments
@@ -456,31 +463,6 @@ class NPARule(nn.Module):
                 f"code must have shape [K], [B, 1, K] or [B, N, K] for {shape}, got "
                 f"{tuple(code.shape)}"
             ) from error
-
-    def _repr_html_(self) -> str:
-        """Return the HTML for Jupyter: perception, update and sizes of the rule."""
-        perceived = ["its own state", "the states around it"]
-        perceived += ["where they change"] * self.state_gradient
-        perceived += ["where particles stand denser"] * self.density_gradient
-        perceived += [f"{self.species_count} species apart"] * (self.species_count > 0)
-        perceived += ["no direction"] * self.equivariant
-        perceived += ["a code of what to grow"] * (self.code_dim > 0)
-        done = "changes its state" if self.static else "moves and changes its state"
-        done += ", divides and dies" * self.divides
-        rows = {
-            "a particle perceives": f"{', '.join(perceived)}: {self.perception_dim} numbers",
-            "how far": f"ε0 = {self.eps0:g} (length units)",
-            "and then": f"{done}: {self.update_dim} numbers",
-            "state": f"{self.state_dim} channels",
-            "network": f"{self.hidden_dim} hidden units, {self.weight_count} weights",
-            "dead zone": f"{self.dead_zone:g}: smaller numbers count as 0" * bool(self.dead_zone),
-            "read-out": f"{self.readout_dim} outputs" * (self.readout is not None),
-        }
-        shown_rows = [
-            f"<tr><th>{name}</th><td>{text}</td></tr>" for name, text in rows.items() if text
-        ]
-        caption = f"<caption>a rule of {self.space_dim}D worlds</caption>"
-        return f"<table>{caption}{''.join(shown_rows)}</table>"
 
     def hyper_parameters(self) -> dict[str, Any]:
         """Return the arguments of `NPARule` that make an untrained rule like this one."""

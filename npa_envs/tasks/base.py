@@ -115,6 +115,9 @@ class ParticleTask(Generic[ConfigT]):
     goal_count: int = 0
     """Number of different goals of worlds; 0: worlds have no goals."""
 
+    species_counts: tuple[int, ...] = ()
+    """Particles of each species, where each has its own rule (`make_rules`); (): one rule."""
+
     _resized_with: tuple[str, ...] = ()
     """Attributes that `resized` passes to the constructor."""
 
@@ -177,6 +180,10 @@ class ParticleTask(Generic[ConfigT]):
         config = self.config
         sizes = {"state_dim": config.state_dim, "hidden_dim": config.hidden_dim}
         return untrained_rule(generator, **(sizes | {"eps0": config.eps} | self.rule_shape))
+
+    def make_rules(self, generator: torch.Generator) -> list[NPARule]:
+        """Return an untrained rule for each species, on the CPU."""
+        return [self.make_rule(generator)]
 
     def places(self, world_count: int, generator: Randomness, device: torch.device) -> Tensor:
         """Return start positions of particles in fresh worlds [length units], shape [B, N, D]."""
@@ -432,9 +439,3 @@ def untrained_rule(generator: torch.Generator, **hyper_parameters: Any) -> NPARu
     with torch.random.fork_rng(devices=()):
         torch.manual_seed(int(torch.randint(2**31, (), generator=generator)))
         return NPARule(**hyper_parameters)
-
-
-def differing_fields(rule: NPARule, task_rule: NPARule) -> list[str]:
-    """Return the names of the hyper-parameters in which a rule differs from a task's."""
-    actual, expected = rule.hyper_parameters(), task_rule.hyper_parameters()
-    return [name for name in expected if actual[name] != expected[name]]

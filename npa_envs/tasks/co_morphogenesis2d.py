@@ -77,6 +77,7 @@ class CoMorphogenesis2D(ParticleTask[Any]):
         device: str | torch.device = "cpu",
     ) -> None:
         self.config = config or CoMorphogenesis2DConfig()
+        self.species_counts = self.config.counts
         self.tasks = [Morphogenesis2D(species, device=device) for species in self.config.species]
         """The task of each species."""
 

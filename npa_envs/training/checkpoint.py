@@ -123,13 +123,13 @@ def check_same_run(
 
 def check_entries(content: Mapping[str, Any], types: Mapping[str, type], path: Path) -> None:
     """Check that a checkpoint has entries of these types; numbers must be finite and >= 0."""
-    for name, kind in types.items():
+    for name, cls in types.items():
         value: Any = content.get(name)
-        noun = kind.__name__
-        right = isinstance(value, kind)
-        if kind in (int, float):
-            noun = f"{'whole' if kind is int else 'finite'} number of at least 0"
-            right = (is_whole(value) if kind is int else is_real(value)) and value >= 0
+        noun, right = cls.__name__, isinstance(value, cls)
+        if cls is int:
+            noun, right = "whole number of at least 0", is_whole(value) and value >= 0
+        elif cls is float:
+            noun, right = "finite number of at least 0", is_real(value) and value >= 0
         if not right:
             raise unusable_checkpoint(path, f"{name} must be a {noun}, got {shown(value)}")
 

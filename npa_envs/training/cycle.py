@@ -11,7 +11,7 @@ import math
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 import npa_envs.world.rollout
 from npa_envs.errors import NPAError
@@ -96,19 +96,16 @@ class WorldPool:
 
         Returns which worlds were replaced, bool, shape [B].
         """
-        largest = torch.maximum(_largest(worlds.x), _largest(worlds.s))
+        largest_x, largest_s = (
+            torch.linalg.vector_norm(values.flatten(1), math.inf, dim=1)
+            for values in (worlds.x, worlds.s)
+        )
         # A comparison with NaN is false, so worlds that are not finite are replaced too.
-        keep = largest <= LARGEST_VALUE
-        self.worlds.put_(index, worlds.where(keep, fresh))
+        diverged = ~(torch.maximum(largest_x, largest_s) <= LARGEST_VALUE)
+        self.worlds.put_(index, fresh.where(diverged, worlds))
         if self.age is not None and age is not None:
-            self.age.index_copy_(0, index, age.masked_fill(~keep, 0))
-        return ~keep
-
-
-def _largest(worlds: Tensor) -> Tensor:
-    """Return each world's largest absolute value, or NaN if it has one; shape [B]."""
-    largest: Tensor = torch.linalg.vector_norm(worlds.flatten(1), math.inf, dim=1)
-    return largest
+            self.age.index_copy_(0, index, age.masked_fill(diverged, 0))
+        return diverged
 
 
 class TrainingCycle:
@@ -121,7 +118,7 @@ class TrainingCycle:
     def __init__(
         self,
         task: Task,
-        rule: NPARule,
+        rule: nn.Module,
         config: TrainConfig[Any],
         device: torch.device,
         schedule: torch.Generator,
@@ -130,7 +127,7 @@ class TrainingCycle:
         processes: ProcessGroup = ALONE,
         per_world_streams: bool = False,
     ) -> None:
-        self.task = task.for_rule(rule)
+        self.task = task.for_rule(rule) if isinstance(rule, NPARule) else task
         _check_varied_eps(self.task, rule, config)
         self._config = config
         self._processes = processes
@@ -176,7 +173,7 @@ class TrainingCycle:
         self._fresh_worlds = batch.map(torch.empty_like)
         graph = functools.partial(GraphedCallable, device=device, recorded=graphed)
         self._draw = graph(self._draw_worlds, generator=registered(self.random.worlds))
-        self._keep = graph(self._keep_worlds)
+        self._store = graph(self._store_worlds)
         self._record = graph(self._record_iteration)
 
     def run(self, iteration: int, least_progress: float = 0.0) -> int:
@@ -195,7 +192,7 @@ class TrainingCycle:
         batch.run(steps)
         self.statistics.begin(iteration + 1, steps)
         self._steps.fill_(steps)
-        self._keep()
+        self._store()
         # Not inside a graph: torch watches NCCL only there for processes that do not answer.
         self._processes.reduce([*batch.gradients, batch.terms], self._replaced)
         self._record()
@@ -228,7 +225,7 @@ class TrainingCycle:
         return {
             "optimiser": self.optimiser.state_dict(),
             "pool": pool,
-            "meter": self.statistics.state_dict(),
+            "statistics": self.statistics.state_dict(),
             "random_states": self.random.state_dict(),
         }
 
@@ -237,7 +234,7 @@ class TrainingCycle:
         self.optimiser.load_state_dict(state["optimiser"])
         for name, local in self.pool.tensors().items():
             local.copy_(self._processes.local(state["pool"][name], self._section))
-        self.statistics.load_state_dict(state["meter"])
+        self.statistics.load_state_dict(state["statistics"])
         self.random.load_state_dict(state["random_states"], iteration)
 
     @torch.no_grad()
@@ -252,7 +249,7 @@ class TrainingCycle:
         if config.ages:
             age, expired = self.pool.ages_of(self._index)
             self._age.copy_(age.masked_fill(expired, 0))
-            self.batch.grown.copy_((self._age >= config.stillness_min_age) & ~damaged)
+            self.batch.past_min_age.copy_((self._age >= config.stillness_min_age) & ~damaged)
             if config.damage_and_keep_share > 0.0:
                 chance = uniform_draws(worlds, (len(expired), 1), start.x)[:, 0]
                 renewed = expired & (chance < config.damage_and_keep_share)
@@ -268,7 +265,7 @@ class TrainingCycle:
         self.batch.start.copy_(start)
 
     @torch.no_grad()
-    def _keep_worlds(self) -> None:
+    def _store_worlds(self) -> None:
         age = self._age + self._steps if self._config.ages else None
         replaced = self.pool.write(self._index, self.batch.end, self._fresh_worlds, age)
         self._replaced += replaced.sum()
@@ -291,7 +288,7 @@ class TrainingCycle:
         return seeds._replace(x=seeds.x.to(dtype), s=seeds.s.to(dtype))
 
 
-def _check_varied_eps(task: Task, rule: NPARule, config: TrainConfig[Any]) -> None:
+def _check_varied_eps(task: Task, rule: nn.Module, config: TrainConfig[Any]) -> None:
     if config.vary_eps == (1.0, 1.0):
         return
     if not isinstance(rule, NPARule):

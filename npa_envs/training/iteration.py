@@ -8,9 +8,9 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from npa_envs.rule.rule import LIFE, NPARule, fate_parameters
+from npa_envs.rule.rule import LIFE, fate_parameters
 from npa_envs.tasks.base import Task
 from npa_envs.tasks.damage import counted_together
 from npa_envs.tasks.train_config import TrainConfig
@@ -46,7 +46,7 @@ class EagerIteration:
     def __init__(
         self,
         task: Task,
-        rule: NPARule,
+        rule: nn.Module,
         config: TrainConfig[Any],
         worlds: Particles,
         generator: Randomness,
@@ -57,7 +57,7 @@ class EagerIteration:
         self.start = worlds.map(torch.clone)
         self.end = worlds._replace(goal=None).map(torch.empty_like)._replace(goal=self.start.goal)
         task = task.with_goal(self.start.goal)
-        self.grown = torch.zeros_like(worlds.x[:, 0, 0], dtype=torch.bool)
+        self.past_min_age = torch.zeros_like(worlds.x[:, 0, 0], dtype=torch.bool)
         """Worlds to which the stillness loss applies, bool, shape [B]."""
         self._config = config
         self._take_means = take_means
@@ -114,7 +114,7 @@ class EagerIteration:
         return mean
 
     def _loss(self, end: Particles) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the task's loss plus the stillness loss of grown worlds, and its terms by name."""
+        """Return the task's loss plus the stillness loss, and its terms by name."""
         total, parts = self._task.loss(end)
         if self._config.stillness_weight > 0.0:
             x, s, path, *_ = end
@@ -128,9 +128,8 @@ class EagerIteration:
                 power_mean(each, self._config.stillness_power) for each in (path, change)
             )
             change_of_world = moved / self._task.eps + changed
-            # The log's name of the stillness loss.
-            parts["rest"] = (self.grown.to(x.dtype) * change_of_world).mean()
-            total = total + self._config.stillness_weight * parts["rest"]
+            parts["stillness"] = (self.past_min_age.to(x.dtype) * change_of_world).mean()
+            total = total + self._config.stillness_weight * parts["stillness"]
         return total, parts
 
 

@@ -113,17 +113,12 @@ class LossStatistics:
 
     def state_dict(self) -> dict[str, Any]:
         """Return the sums of losses and counts since the last `send`, for a checkpoint."""
-        return {
-            "sums": self._sums,
-            "replaced": self._replaced,
-            "count": self._count,
-            "step_sum": self._step_sum,
-        }
+        sums = self._totals[:-2]
+        return {"sums": sums, "count": self._count, "step_sum": self._step_sum}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore the sums since the last `send`, as `state_dict` returned them."""
-        self._sums.copy_(state["sums"])
-        self._replaced.copy_(state["replaced"])
+        self._totals[:-2].copy_(state["sums"])
         self._count = state["count"]
         self._step_sum = state["step_sum"]
 
@@ -137,7 +132,7 @@ class LossStatistics:
 
 
 def divergence_error(
-    task: Task, rule: NPARule, snapshot: dict[str, Any], diagnosis: Path
+    task: Task, rule: nn.Module, snapshot: dict[str, Any], diagnosis: Path
 ) -> DivergedError:
     """Return the error that ends a run whose loss is not finite; it names the file `diagnosis`."""
     terms = [name for name, value in snapshot["terms"].items() if not math.isfinite(value)]
@@ -153,12 +148,13 @@ def divergence_error(
 
 
 @torch.no_grad()
-def diverged_worlds(task: Task, rule: NPARule, snapshot: dict[str, Any]) -> list[int]:
+def diverged_worlds(task: Task, rule: nn.Module, snapshot: dict[str, Any]) -> list[int]:
     """Return the indices of the batch's worlds whose own loss is not finite."""
     rule = copy.deepcopy(rule).cpu()
     trained = [parameter for parameter in rule.parameters() if parameter.requires_grad]
     nn.utils.vector_to_parameters(snapshot["parameters"], trained)
-    task = task.for_rule(rule)
+    if isinstance(rule, NPARule):
+        task = task.for_rule(rule)
     worlds = Particles(snapshot["x"], snapshot["s"], goal=snapshot.get("goal"))
     diverged = []
     for index in range(len(worlds.x)):

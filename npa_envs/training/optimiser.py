@@ -59,14 +59,20 @@ class RuleOptimiser:
     def __init__(
         self, parameters: Sequence[nn.Parameter], config: TrainConfig[Any], rules: nn.Module
     ) -> None:
-        self._parameters = list(parameters)
         self._indices = {id(parameter): index for index, parameter in enumerate(parameters)}
         """Index of each parameter by its `id`."""
         self._config = config
         fates, matrices = (set(map(id, of(rules))) for of in (fate_parameters, layer_weights))
-        self._rate_factors = [FATE_RATE if id(p) in fates else 1.0 for p in self._parameters]
-        muon = config.optimiser == "muon"
-        self._orthogonal = [muon and id(p) in matrices for p in self._parameters]
+        if config.optimiser != "muon":
+            matrices = set()
+        self._orthogonal = [p for p in parameters if id(p) in matrices]
+        others = [p for p in parameters if id(p) not in matrices]
+        self._groups: list[dict[str, Any]] = [
+            {"rate_factor": factor, "params": list(group)}
+            for factor, group in itertools.groupby(
+                others, lambda p: FATE_RATE if id(p) in fates else 1.0
+            )
+        ]
         self._optimisers = self._fresh_optimisers()
 
     def step(self, iteration: int, least_progress: float = 0.0) -> None:
@@ -96,27 +102,22 @@ class RuleOptimiser:
 
     def _fresh_optimisers(self) -> list[Optimizer]:
         """Return new optimisers, whose moments are zero."""
-        parameters, decay = self._parameters, self._config.weight_decay
         optimisers: list[Optimizer] = []
-        orthogonal = list(itertools.compress(parameters, self._orthogonal))
-        if orthogonal:
+        decay = self._config.weight_decay
+        if self._orthogonal:
             # Steps of AdamW's length, so that one learning rate serves both.
             optimisers.append(
                 torch.optim.Muon(
-                    orthogonal,
+                    self._orthogonal,
                     weight_decay=decay,
                     momentum=MUON_MOMENTUM,
                     adjust_lr_fn="match_rms_adamw",
                 )
             )
-        indices = [index for index, flag in enumerate(self._orthogonal) if not flag]
-        if indices:
-            groups = [
-                {"rate_factor": factor, "params": [parameters[index] for index in group]}
-                for factor, group in itertools.groupby(indices, self._rate_factors.__getitem__)
-            ]
+        if self._groups:
+            groups = [dict(group) for group in self._groups]
             # One kernel for all parameters; a loop is as fast on a CPU.
-            fused = parameters[0].is_cuda
+            fused = groups[0]["params"][0].is_cuda
             optimisers.append(torch.optim.AdamW(groups, weight_decay=decay, fused=fused))
         return optimisers
 

@@ -149,15 +149,13 @@ def joined_processes() -> Iterator[ProcessGroup]:
     try:
         dist.init_process_group(backend)
         processes = ProcessGroup.current()
-        heartbeat = None
-        if processes.count > 1:
-            # A separate connection: that of the group blocks while the group waits.
-            address, port = os.environ["MASTER_ADDR"], int(os.environ["MASTER_PORT"])
-            store: Any = dist.TCPStore(address, port, wait_for_workers=False)  # type: ignore[attr-defined]
-            # Torchrun may keep the store when it restarts processes.
-            prefix = processes.broadcast(uuid.uuid4().hex)
-            store = dist.PrefixStore(prefix, store)  # type: ignore[attr-defined]
-            heartbeat = Heartbeat(store, processes.rank, processes.count)
+        # A separate connection: that of the group blocks while the group waits.
+        address, port = os.environ["MASTER_ADDR"], int(os.environ["MASTER_PORT"])
+        store: Any = dist.TCPStore(address, port, wait_for_workers=False)  # type: ignore[attr-defined]
+        # Torchrun may keep the store when it restarts processes.
+        prefix = processes.broadcast(uuid.uuid4().hex)
+        store = dist.PrefixStore(prefix, store)  # type: ignore[attr-defined]
+        heartbeat = Heartbeat(store, processes.rank, processes.count)
     except (RuntimeError, ValueError) as error:
         raise NPAError(
             f"the processes that torchrun starts must reach each other, but this one cannot "
@@ -168,9 +166,8 @@ def joined_processes() -> Iterator[ProcessGroup]:
         yield processes
         finished = True
     finally:
-        if heartbeat is not None:
-            heartbeat.end(finished=finished)
-    # Not after an error: others may be gone. Recorded graphs keep references to the group.
+        heartbeat.end(finished=finished)
+    # Not after an error: others may be gone. Captured graphs keep references to the group.
     gc.collect()
     dist.destroy_process_group()
 
@@ -225,18 +222,16 @@ class Heartbeat:
                 self._store.add(str(self._rank), _FINISHED)
 
     def _watch(self) -> None:
-        count = len(self._beats)
-        last, silent = self._beats.copy(), [0] * count
+        last, silent = self._beats.copy(), [0] * len(self._beats)
         while not self._ended.wait(BEAT_SECONDS):
-            beats = self._beats.copy()
-            for other in range(count):
-                alive = other == self._rank or beats[other] != last[other] or beats[other] < 0
+            for other, beats in enumerate(self._beats):
+                alive = other == self._rank or beats != last[other] or beats < 0
                 silent[other] = 0 if alive else silent[other] + 1
-            last = beats
-            lost = [str(other) for other in range(count) if silent[other] >= SILENT_BEATS]
+                last[other] = beats
+            lost = [str(other) for other, missed in enumerate(silent) if missed >= SILENT_BEATS]
             if lost:
                 print(
-                    f"npa-envs: error: process {self._rank} of {count} has heard nothing from "
+                    f"npa-envs: error: process {self._rank} of {len(last)} has heard nothing from "
                     f"process {', '.join(lost)} for {SILENT_BEATS * BEAT_SECONDS:.0f} s, "
                     "which was killed or stopped, or cannot be reached: the last checkpoint is "
                     "intact; resume it",

@@ -27,7 +27,7 @@ class TrainedTask:
 
     task: Task
 
-    doubt: str | None
+    why_not_measurable: str | None
     """Why comparisons with the target are meaningless; None where they are meaningful."""
     task_name: str
 
@@ -84,20 +84,20 @@ def task_of_rule(
         name = config.task.target if chosen else rule.codes.names[0]
         named = _named(config.task.targets).get(name, name)
         config = override(config, targets=(), target=named)
-    doubt = None if known or chosen else "its file does not say what it grows"
+    why_not_measurable = None if known or chosen else "its file does not say what it grows"
     try:
         task = entry.make(config.task, device).held_out().for_rule(rule)
     except NPAError as error:
         if chosen or not entry.targets():
             raise
-        doubt = f"its target cannot be loaded: {error}"
+        why_not_measurable = f"its target cannot be loaded: {error}"
         config = override(config, target=entry.targets()[0])
         task = entry.make(config.task, device)
         if rule.codes is not None:
             target = replace(cast(Morphogenesis2D, task).target, name=rule.codes.names[0])
             task = Morphogenesis2D(config.task, target=target, device=device)
         task = task.for_rule(rule)
-    return TrainedTask(task, doubt, task_name)
+    return TrainedTask(task, why_not_measurable, task_name)
 
 
 def _file_of(source: str) -> tuple[Path, Mapping[str, str]]:

@@ -20,9 +20,9 @@ from npa_envs.atomic_files import write_text
 from npa_envs.checks import is_real
 from npa_envs.devices import check_device
 from npa_envs.errors import DivergedError, NPAError, shown
-from npa_envs.rule.files import load_rule, preset_rules, save_rule
+from npa_envs.rule.files import load_rule, preset_rules, rule_like, save_rule
 from npa_envs.rule.rule import NPARule, with_codes, with_division
-from npa_envs.tasks.base import Task, differing_fields, untrained_rule
+from npa_envs.tasks.base import Task
 from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.checkpoint import (
     check_same_run,
@@ -52,7 +52,7 @@ FIRST_PICTURE = 10
 class TrainResult:
     """Result of `Trainer.run`."""
 
-    rule: NPARule
+    rule: NPARule | JointRules
     """The rule after the last iteration."""
     iteration: int
     """Iterations done."""
@@ -111,28 +111,28 @@ class Trainer:
         self._log = RunLog(self.folder)
         self._record: dict[str, Any] = {}
         self._sent_record: dict[str, Any] | None = None
-        self._schedule_share = 0.0
+        self._least_progress = 0.0
         self._seconds_before = 0.0
         self._started: float | None = None
-        # On CUDA a record is finished an iteration later, so that the device does not idle.
         device = check_device(config.device)
+        # On CUDA a record is finished an iteration later, so that the device does not idle.
         self._defer_records = device.type == "cuda"
         self._processes = ProcessGroup.current() if processes is None else processes
         check = functools.partial(check_same_run, task_name=task_name, config=config)
         self._run = Run(self.folder, self._processes, check, resume=resume, overwrite=overwrite)
-        content = self._run.take_content()
+        checkpoint = self._run.take_content()
         schedule = torch.Generator().manual_seed(config.seed)
-        saved = None if content is None else content["rule_hyper_parameters"]
-        rule: Any
-        if hasattr(task, "make_rules"):
-            rule = JointRules(_species_rules(config, task.make_rules(schedule), saved, rules))
-            counts = config.task.counts
+        saved = None if checkpoint is None else checkpoint["rule_hyper_parameters"]
+        self.rule: NPARule | JointRules
+        """The trained module: one rule, or the rules of all species."""
+        if task.species_counts:
+            counts = task.species_counts
+            self.rule = JointRules(_species_rules(config, task.make_rules(schedule), saved, rules))
             rollout = functools.partial(species_particles, counts=counts, density_counts=counts)
         else:
-            rule = task.make_rule(schedule)
-            rule = initial_rule(config, rule) if saved is None else rule_like(saved)
-        # A `JointRules` is used only as a module with hyper-parameters.
-        self.rule: NPARule = rule.to(device, config.torch_dtype)
+            untrained = task.make_rule(schedule)
+            self.rule = initial_rule(config, untrained) if saved is None else rule_like(saved)
+        self.rule.to(device, config.torch_dtype)
         self._cycle = TrainingCycle(
             task,
             self.rule,
@@ -143,16 +143,20 @@ class Trainer:
             processes=self._processes,
             # A run of several processes keeps these streams when one process resumes it.
             per_world_streams=self._processes.distributed
-            or (content is not None and has_per_world_streams(content)),
+            or (checkpoint is not None and has_per_world_streams(checkpoint)),
         )
         self.pool = self._cycle.pool
+        self._open_folder(checkpoint)
+
+    def _open_folder(self, checkpoint: dict[str, Any] | None) -> None:
+        """Create the folder; then restore the checkpoint of a resumed run, or write a first one."""
         if self._processes.first:
             rule_bytes = sum(p.nbytes for p in self.rule.parameters())
             pool_bytes = sum(value.nbytes for value in self.pool.worlds.tensors())
             self.folder.prepare(self._processes.count * pool_bytes + 16 * rule_bytes)
         with self._run.locked(begin=True):
-            if content is not None:
-                self._restore(content)
+            if checkpoint is not None:
+                self._restore(checkpoint)
             elif self._processes.first and self._log.records():
                 raise NPAError(
                     f"out must be a folder without a run, but {shown(str(self.folder.path))} "
@@ -161,9 +165,9 @@ class Trainer:
                 )
             if self._processes.first:
                 # Before the first checkpoint, whose resumption needs it.
-                text = json.dumps(config_to_dict(config), indent=2)
+                text = json.dumps(config_to_dict(self.config), indent=2)
                 write_text(self.folder.config, text + "\n")
-            if content is None:
+            if checkpoint is None:
                 # Now, so that a run that is killed early can be resumed and a full disk is noticed.
                 self.save()
 
@@ -233,31 +237,28 @@ class Trainer:
             folder=self.folder.path,
         )
 
-    def iterate(self, share: float = 0.0) -> None:
+    def iterate(self, least_progress: float = 0.0) -> None:
         """Train for one iteration, without synchronising and without writing files.
 
         Args:
-            share: Lower bound on the schedule's progress, in [0, 1]; only "cosine" reads it.
-                `elapsed / seconds` ties the learning rate to a time limit; such a run is not
+            least_progress: Lower bound on the schedule's progress, in [0, 1]; only "cosine" reads
+                it. `elapsed / seconds` ties the learning rate to a time limit; such a run is not
                 repeatable.
-
-        Raises:
-            NPAError: The share is not in [0, 1].
         """
-        if not 0.0 <= share <= 1.0:
+        if not 0.0 <= least_progress <= 1.0:
             raise NPAError(
-                f"share must lie in [0, 1], got {shown(share)}: min(1, elapsed / seconds)"
+                f"least_progress must lie in [0, 1], got {shown(least_progress)}: "
+                "min(1, elapsed / seconds)"
             )
-        self._cycle.run(self.iteration, share)
-        self._schedule_share = share
+        self._cycle.run(self.iteration, least_progress)
+        self._least_progress = least_progress
         self._run.iteration += 1
 
     @property
-    def saved_rule(self) -> NPARule:
+    def saved_rule(self) -> NPARule | JointRules:
         """The rule as it is saved: with the encoder's current codes in its table."""
         rule = self.rule
-        codes = getattr(rule, "codes", None)
-        if codes is not None and codes.encoder is not None:
+        if isinstance(rule, NPARule) and rule.encoder:
             # The table has the codes of the last iteration, before the optimiser's step.
             rule = copy.deepcopy(rule)
             self.task.for_rule(rule)
@@ -298,7 +299,7 @@ class Trainer:
     def _begin_record(self) -> None:
         """Begin the log record of the interval that ends with this iteration."""
         self._cycle.statistics.send()
-        rate = self.config.learning_rate_at(self.iteration - 1, self._schedule_share)
+        rate = self.config.learning_rate_at(self.iteration - 1, self._least_progress)
         self._sent_record = {"iteration": self.iteration, "learning_rate": rate}
         if not self._defer_records:
             self._finish_record()
@@ -391,29 +392,21 @@ class JointRules(nn.Module):
 
 
 def write_rules(
-    rule: NPARule, folder: RunFolder, config: TrainConfig[Any], task_name: str, iteration: int
+    rule: NPARule | JointRules,
+    folder: RunFolder,
+    config: TrainConfig[Any],
+    task_name: str,
+    iteration: int,
 ) -> None:
     """Write the rule of a run, or each of a `JointRules`, with its task and configuration."""
     fields = {k: v for k, v in config_to_dict(config).items() if k not in LEFT_OUT}
-    if not isinstance(rule, JointRules):
-        metadata = {"task": task_name, "config": json.dumps(fields), "iteration": str(iteration)}
+    metadata = {"task": task_name, "config": json.dumps(fields), "iteration": str(iteration)}
+    if isinstance(rule, NPARule):
         save_rule(rule, folder.rule, metadata=metadata)
         return
     for number, (one, species) in enumerate(zip(rule, fields["task"]["species"], strict=True)):
-        metadata = {"task": "morphogenesis2d", "config": json.dumps(fields | {"task": species})}
-        metadata |= {"iteration": str(iteration), "trained_in": JOINT_TASK_NAME}
-        save_rule(one, folder.rule_of(number), metadata=metadata)
-
-
-def rule_like(saved: dict[str, Any]) -> NPARule:
-    """Return a rule with a checkpoint's hyper-parameters, on the CPU, with random weights."""
-    try:
-        return untrained_rule(torch.Generator(), **saved)
-    except (TypeError, RuntimeError, OverflowError) as error:
-        raise NPAError(
-            f"no rule has the hyper-parameters {shown(saved)} of the checkpoint: it is damaged, or "
-            "of another version"
-        ) from error
+        metadata |= {"task": "morphogenesis2d", "config": json.dumps(fields | {"task": species})}
+        save_rule(one, folder.rule_of(number), metadata=metadata | {"trained_in": JOINT_TASK_NAME})
 
 
 def take_options(rule: NPARule, config: TrainConfig[Any]) -> None:
@@ -436,24 +429,30 @@ def initial_rule(config: TrainConfig[Any], untrained: NPARule) -> NPARule:
     rule = load_rule(source)
     if untrained.code_dim and not rule.code_dim:
         rule = with_codes(rule, untrained)
-    if rule.moment_inverse == "threshold":
-        rule.moment_inverse = config.moment_inverse
-    rule.dead_zone = untrained.dead_zone
     if untrained.divides and not rule.divides:
         rule = with_division(rule)
-    theirs, ours = rule.hyper_parameters(), untrained.hyper_parameters()
-    differences = [
-        f"{'eps0, the eps it learned at' if name == 'eps0' else name} "
-        f"({shown(theirs.get(name))}, here {shown(ours.get(name))})"
-        for name in differing_fields(rule, untrained)
-    ]
+    rule.dead_zone = untrained.dead_zone
+    differences = _differences(rule, untrained, config)
     if differences:
         raise NPAError(
             f"initial_rule must be a rule of the task's shape, but {shown(source)} differs in "
-            f"{', '.join(differences)}: change those fields, start from another rule, or from "
-            "random weights (initial_rule='')"
+            f"{differences}: change those fields, start from another rule, or from random weights "
+            "(initial_rule='')"
         )
     return rule
+
+
+def _differences(rule: NPARule, untrained: NPARule, config: TrainConfig[Any]) -> str:
+    """Return in what a rule differs from the task's, once it inverts moments as configured."""
+    if rule.moment_inverse == "threshold":
+        rule.moment_inverse = config.moment_inverse
+    theirs, ours = rule.hyper_parameters(), untrained.hyper_parameters()
+    return ", ".join(
+        f"{'eps0, the eps it learned at' if name == 'eps0' else name} "
+        f"({shown(theirs[name])}, here {shown(ours[name])})"
+        for name in ours
+        if theirs[name] != ours[name]
+    )
 
 
 def _species_rules(
@@ -468,14 +467,14 @@ def _species_rules(
             f"initial_rule is for one rule, got {shown(config.initial_rule)}: give one for each "
             "species as rules"
         )
-    for rule in untrained:
-        take_options(rule, config)
     sources: tuple[str, ...] = getattr(config, "initial_rules", ())
     frozen: tuple[int, ...] = getattr(config, "frozen", ())
     if saved is not None:
         rules = [rule_like(one) for one in saved.get("rules", ())]
     elif rules is None and sources:
         rules = [load_rule(source) for source in sources]
+    for rule in untrained:
+        take_options(rule, config)
     if rules is None:
         if frozen:
             raise NPAError(
@@ -487,14 +486,12 @@ def _species_rules(
     if len(rules) != len(untrained):
         raise NPAError(f"rules must be one for each of {len(untrained)} species, got {len(rules)}")
     for number, (rule, expected) in enumerate(zip(rules, untrained, strict=True)):
-        if rule.moment_inverse == "threshold":
-            rule.moment_inverse = config.moment_inverse
         expected.dead_zone = rule.dead_zone
-        differences = differing_fields(rule, expected)
+        differences = _differences(rule, expected, config)
         if differences:
             raise NPAError(
                 f"rules must have the shape of their species, but rule {number} differs in "
-                f"{', '.join(differences)}: change those fields of species {number}"
+                f"{differences}: change those fields of species {number}"
             )
     if frozen and max(frozen) >= len(rules):
         raise NPAError(

@@ -160,7 +160,7 @@ class RuleWorld(LiveWorld):
             "others": [name for name in self._choices if self._may_join(name)],
             "species": [live_rule.name for live_rule in self.live_rules],
             "damages": list(DAMAGE_SIZES),
-            "capabilities": ["film", *([] if self.trained.doubt else ["loss"])],
+            "capabilities": ["film", *([] if self.trained.why_not_measurable else ["loss"])],
         }
 
     def handle(self, message: Mapping[str, Any]) -> bool:
@@ -295,7 +295,7 @@ class RuleWorld(LiveWorld):
     def _loss(self) -> float | None:
         """Return the task's metric; None if it does not fit the world, or is not due yet."""
         start = time.perf_counter()
-        comparable = self.trained.doubt is None and len(self.live_rules) == 1
+        comparable = self.trained.why_not_measurable is None and len(self.live_rules) == 1
         if not comparable or not self.counts[0] or start < self._loss_due:
             return None
         loss = float(self.task.with_goal(self._goal).metric(*self.particles[:2]))

@@ -162,7 +162,7 @@ def test_the_command_leaves_elites_that_other_commands_open(tmp_path, capsys):
     assert (out / "atlas.png").read_bytes().startswith(b"\x89PNG")
     rule = load_rule(files[0])
     trained = task_of_rule(str(files[0]), rule, CPU)
-    assert trained.doubt == "its file does not say what it grows"
+    assert trained.why_not_measurable == "its file does not say what it grows"
     assert trained.task.config.particle_count == 16
     assert main([*words, "10"]) == 2
     assert "budget must be finite and at least that of one batch" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""What notebooks show of worlds, environments and rules, and a window on a screen."""
+"""What notebooks show of worlds and environments, and a window on a screen."""
 
 import base64
 import io
@@ -16,7 +16,6 @@ import torch
 from PIL import Image
 from support.crowds import small as small_crowd
 
-import npa_envs
 from npa_envs.envs import multispecies_v0
 from npa_envs.render import Window, draw_worlds, show_worlds, write_webp
 
@@ -96,18 +95,6 @@ def test_environments_show_their_worlds(kind):
     assert picture.std() > 5
     assert env._repr_mimebundle_()["text/plain"] == str(env)
     env.close()
-
-
-def test_a_rule_shows_what_it_is():
-    rule = npa_envs.NPARule(2, 8, 16, eps0=0.2)
-    html = rule._repr_html_()
-    assert f"{rule.perception_dim} numbers" in html
-    assert f"16 hidden units, {rule.weight_count} weights" in html
-    assert "ε0 = 0.2 " in html
-    assert "read-out" not in html
-    still = npa_envs.load_rule("digits")._repr_html_()
-    assert "moves" not in still
-    assert "<th>read-out</th><td>10 outputs</td>" in still
 
 
 # A window

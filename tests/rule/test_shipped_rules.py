@@ -75,7 +75,7 @@ GROWING = [
 def test_a_world_grows_as_measured(name, device):
     rule = npa_envs.load_rule(name, device=device)
     trained = task_of_rule(name, rule, device)
-    assert trained.doubt is None
+    assert trained.why_not_measurable is None
     first, *_ = (row for row in scores(name)["growth"])
     rows = evaluate(rule, trained.task, checkpoints=(first["step"],), seeds=UNSEEN, device=device)
     # One world's loss lies about the mean of all as the worst one does.

@@ -91,14 +91,14 @@ def test_births_are_no_unrest(tmp_path):
     batch = EagerIteration(
         task, rule, config, Particles(x, s), torch.Generator().manual_seed(0), npa_envs.rollout
     )
-    batch.grown.fill_(True)
+    batch.past_min_age.fill_(True)
     batch.run(12)
     assert int(living(batch.end.s).sum()) > 8
-    rest = dict(zip(batch.term_names, batch.terms.tolist(), strict=True))["rest"]
+    stillness = dict(zip(batch.term_names, batch.terms.tolist(), strict=True))["stillness"]
     # Nobody moves, and children are born without states.
     assert (batch.end.s[0, 0, LIFE + 1 :] == 0.5).all()
     assert not batch.end.s[0, 1:, LIFE + 1 :].any()
-    assert rest < 1e-6
+    assert stillness < 1e-6
 
 
 def test_fates_learn_at_their_share_of_the_learning_rate(tmp_path, monkeypatch):

@@ -119,7 +119,12 @@ class TestRun:
         ("species", "count", "fields", "message"),
         [
             (("heart", {}), 1, {}, "one for each of 2 species, got 1"),
-            (("heart", {"hidden_dim": 8}), 2, {}, r"rule 1 differs in hidden_dim: .* of species 1"),
+            (
+                ("heart", {"hidden_dim": 8}),
+                2,
+                {},
+                r"rule 1 differs in hidden_dim \(8, .* of species 1",
+            ),
             (None, 0, {"initial_rule": "gecko"}, "initial_rule is for one rule, got 'gecko'"),
         ],
     )

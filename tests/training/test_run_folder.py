@@ -139,7 +139,7 @@ DAMAGES = {
     "optimiser": [None, {}, {"state": 3}],
     "pool/x": [3, torch.zeros(8, 12, 3)],
     "pool": [None, {}],
-    "meter": [None],
+    "statistics": [None],
     "random_states/schedule": [BAD_STATE, BAD_STATE[:10], BAD_STATE.float(), b"x"],
     "random_states": [None, {}],
 }

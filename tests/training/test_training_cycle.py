@@ -73,7 +73,7 @@ def clouds_cycle(tmp_path, per_world_streams=False, **fields):
 )
 def test_replayed_operations_train_the_same_rule_as_called_ones(tmp_path, make, fields):
     (called, called_rule), (replayed, replayed_rule) = (make(tmp_path, **fields) for _ in range(2))
-    replayed._draw, replayed._keep = Recording(replayed._draw), Recording(replayed._keep)
+    replayed._draw, replayed._store = Recording(replayed._draw), Recording(replayed._store)
     replayed._record = Recording(replayed._record)
     for iteration in range(8):
         for cycle in (called, replayed):
@@ -84,7 +84,7 @@ def test_replayed_operations_train_the_same_rule_as_called_ones(tmp_path, make, 
         assert_same(replayed_rule.state_dict(), called_rule.state_dict())
     assert_same(replayed.state_dict(), called.state_dict())
     assert len(replayed._draw.recorded) > 5
-    assert len(replayed._keep.recorded) > 5
+    assert len(replayed._store.recorded) > 5
     assert len(replayed._record.recorded) > 5
 
 

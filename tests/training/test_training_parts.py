@@ -184,14 +184,14 @@ def test_iteration_leaves_the_worlds_the_terms_and_the_gradients(tmp_path):
 
 
 @pytest.mark.parametrize("power", [1.0, 2.0, 4.0])
-def test_the_stillness_loss_is_of_grown_worlds(tmp_path, power):
+def test_the_stillness_loss_is_of_worlds_past_their_minimum_age(tmp_path, power):
     fields = {"dtype": "float64", "max_age_range": (8, 64), "pool_size": 9}
     _, _, plain = make_iteration(circle_config(tmp_path, **fields))
     fields |= {"stillness_weight": 0.5, "stillness_power": power}
     task, _, iteration = make_iteration(circle_config(tmp_path, **fields))
-    assert iteration.term_names == (*plain.term_names, "rest")
-    # The second of three worlds is grown; both iterations draw the same masks.
-    iteration.grown[1] = True
+    assert iteration.term_names == (*plain.term_names, "stillness")
+    # The second of three worlds is old enough; both iterations draw the same masks.
+    iteration.past_min_age[1] = True
     for one in (plain, iteration):
         one.run(6)
     assert torch.equal(iteration.end.x, plain.end.x)
@@ -222,7 +222,7 @@ def test_worlds_that_do_not_move_have_finite_gradients_of_stillness(tmp_path, po
     _, rule, iteration = make_iteration(config)
     with torch.no_grad():
         rule.output.weight.zero_()
-    iteration.grown[:] = True
+    iteration.past_min_age[:] = True
     iteration.run(3)
     assert torch.equal(iteration.end.x, iteration.start.x)
     assert all(gradient.isfinite().all() for gradient in iteration.gradients)

@@ -209,11 +209,11 @@ def test_worlds_that_have_lived_are_replaced_by_seeds_and_all_others_grow_older(
 
 
 @pytest.mark.parametrize("damage", [True, False])
-def test_worlds_that_are_old_and_never_damaged_count_as_grown(tmp_path, damage):
+def test_worlds_that_are_old_and_never_damaged_are_past_the_minimum_age(tmp_path, damage):
     seen = []
 
     def rollout(rule, worlds, steps, **options):
-        seen.append(trainer._cycle.batch.grown.tolist())
+        seen.append(trainer._cycle.batch.past_min_age.tolist())
         return plain_rollout(rule, worlds, 2, **options)
 
     fields = {"iterations": 6, "world_count": 4, "pool_size": 4, "max_age_range": (200, 6000)}
@@ -274,19 +274,19 @@ def test_worlds_whose_time_is_over_are_damaged_then_and_live_again(tmp_path, sha
     assert sum(again) >= 0.8 * len(again)
 
 
-def test_an_iteration_follows_a_share_of_the_schedule(tmp_path):
+def test_an_iteration_follows_the_progress_that_it_is_given(tmp_path):
     config = circle_config(tmp_path, schedule="cosine", log_interval=1)
     trainer = trainer_of(config)
     parameter = next(trainer.rule.parameters())
     first = parameter.detach().clone()
-    trainer.iterate(share=1.0)
+    trainer.iterate(least_progress=1.0)
     # AdamW's first step is as long as the rate.
     rate = 0.01 * config.learning_rate
     assert (parameter.detach() - first).abs().max().item() == pytest.approx(rate, rel=1e-3)
     trainer._begin_record()
     assert log_of(tmp_path)[-1]["learning_rate"] == pytest.approx(rate)
-    with pytest.raises(NPAError, match=r"share must lie in \[0, 1\], got 1.5"):
-        trainer.iterate(share=1.5)
+    with pytest.raises(NPAError, match=r"least_progress must lie in \[0, 1\], got 1.5"):
+        trainer.iterate(least_progress=1.5)
 
 
 def test_run_leaves_rule_configuration_pictures_and_a_board_with_the_logs_numbers(tmp_path):

@@ -198,8 +198,10 @@ class RuleTrial:
             # Losses are of held-out views, so few training views are enough.
             fields["training_views"] = MIN_VIEWS["training_views"]
         trained = task_of_rule(name, self.rule, device, **fields)
-        if trained.doubt is not None:
-            raise NPAError(f"cannot measure {name!r}: {trained.doubt}: choose another rule")
+        if trained.why_not_measurable is not None:
+            raise NPAError(
+                f"cannot measure {name!r}: {trained.why_not_measurable}: choose another rule"
+            )
         self.task: Any = trained.task
         self.metric_name = trained.task.trial_name
         self.particle_count = int(self.task.config.particle_count)
