@@ -120,8 +120,9 @@ def film_world(
             film.add(task, Particles(x, s), step)
         for damage in damages:
             if damage.step == step < last:
-                x, s = damage_worlds(
-                    x, s, kind=damage.kind, size=damage.size, box=task.box, generator=generator
+                worlds = worlds._replace(x=x, s=s)
+                x, s, *_ = damage_worlds(
+                    worlds, kind=damage.kind, size=damage.size, box=task.box, generator=generator
                 )
                 s = task.with_target_code(s)
                 film.add(task, Particles(x, s), step, damage.text)

@@ -6,6 +6,7 @@ adds those of tasks in which a ball of particles with zero states grows into a t
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Generic, NamedTuple, Self, TypeVar
 
@@ -16,7 +17,7 @@ from npa_envs.checks import check_fraction, check_non_negative, check_positive
 from npa_envs.errors import NPAError, shown
 from npa_envs.ops import Cameras, world_mean
 from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
-from npa_envs.tasks.damage import PoolDamage, damage_pool, escape_motion
+from npa_envs.tasks.damage import PoolDamage, damage_pool
 from npa_envs.tasks.gaussian_outputs import Gaussians
 from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.world.particles import Particles
@@ -239,6 +240,14 @@ class ParticleTask(Generic[ConfigT]):
             raise NPAError("the worlds' goals must be given first: task.with_goal(goal), int64 [B]")
         return self._goal
 
+    def process_mean(self, value: Tensor) -> Tensor:
+        """Return the mean of a tensor over all training processes: by default there is one."""
+        return value
+
+    def with_process_mean(self, mean: Callable[[Tensor], Tensor]) -> Self:
+        """Return the task of one of several training processes, with its `process_mean`."""
+        return self._with(process_mean=mean)
+
     def with_target_code(self, s: Tensor) -> Tensor:
         """Return states [B, N, C] whose first channels hold the code of the world's target again.
 
@@ -402,7 +411,12 @@ class GrowthTask(ParticleTask[GrowthConfigT]):
         terms |= super().penalties(worlds)
         terms["bound"] = config.bound_weight, (bounded - bounded.clamp(-1.0, 1.0)).abs().mean()
         if config.escape_weight > 0.0:
-            terms["stray"] = config.escape_weight, escape_motion(bounded, distances_moved(worlds))
+            # As losses are averaged over processes, so is the number of particles.
+            outside = (bounded.detach().abs().amax(dim=-1) > 1.0).to(bounded.dtype)
+            count = self.process_mean(outside.sum())
+            path_length = (outside * distances_moved(worlds)).sum()
+            stray = path_length / torch.where(count > 0.0, count, 1.0)
+            terms["stray"] = config.escape_weight, stray
         return terms
 
     def bounded(self, x: Tensor) -> Tensor:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import torch
 from torch import Tensor
@@ -116,6 +116,10 @@ class CoMorphogenesis2D(ParticleTask[Any]):
         """Return worlds after random damage of each species, independently."""
         species = zip(self.tasks, worlds.split(self.config.counts), strict=True)
         return together([task.damage(each, generator) for task, each in species])
+
+    def with_process_mean(self, mean: Callable[[Tensor], Tensor]) -> Self:
+        """Return the task whose species average over all training processes."""
+        return self._with(tasks=[task.with_process_mean(mean) for task in self.tasks])
 
     def loss(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the sum of the species' training losses, and terms of species k as "k.term"."""

@@ -51,8 +51,9 @@ def test_random_particle_is_one_of_its_own_world(world):
 
 @pytest.mark.gpu
 def test_generator_of_another_device_is_a_clear_error():
+    x = torch.zeros(1, 4, 2, device="cuda")
     with pytest.raises(NPAError, match=r"generator must be on the worlds' device"):
-        damage.random_particle(torch.zeros(1, 4, 2, device="cuda"), torch.Generator())
+        damage_worlds(Particles(x, x), kind="wipe", generator=torch.Generator())
 
 
 def seeded(seed, device="cpu"):
@@ -174,9 +175,9 @@ def test_damage_is_as_its_formula_says_and_continues_across_the_edges_of_a_box(
     assert int(inside.sum()) > 10
     assert int(across) > 2 or not boxed
     options = {"kind": kind, "size": size, "box": box, "generator": seeded(2, device)}
-    found_x, found_s = damage_worlds(x, s, **options)
-    torch.testing.assert_close(found_x, moved, rtol=1e-5, atol=1e-6)
-    assert torch.equal(found_s, states)
+    found = damage_worlds(Particles(x, s), **options)
+    torch.testing.assert_close(found.x, moved, rtol=1e-5, atol=1e-6)
+    assert torch.equal(found.s, states)
     if kind == "cut":
         blank = torch.zeros_like(centre)
         assert torch.equal(brushes.cut(x, s, centre=centre, normal=blank, gap=size)[0], x)
@@ -264,13 +265,15 @@ def test_as_many_are_thrown_out_as_was_said_and_on_all_sides(device, by_world, s
 
 
 def test_only_the_paths_of_those_outside_count():
+    task, s = Morphogenesis2D(SMALL), torch.zeros(1, 3, 6)
     x = torch.tensor([[[0.5, 0.2], [1.5, 0.0], [0.0, -3.0]]])
     path = torch.tensor([[7.0, 1.0, 2.0]], requires_grad=True)
-    motion = damage.escape_motion(x, path)
+    _, motion = task.penalties(Particles(x, s, path))["stray"]
     assert float(motion.detach()) == 1.5
     motion.backward()
     assert path.grad.tolist() == [[0.0, 0.5, 0.5]]
-    assert float(damage.escape_motion(x[:, :1], path[:, :1]).detach()) == 0.0
+    inside = Particles(0.1 * x, s, path)
+    assert float(task.penalties(inside)["stray"][1].detach()) == 0.0
 
 
 def test_a_share_throws_particles_of_the_pool_out_and_a_weight_counts_their_paths():

@@ -109,11 +109,7 @@ def builtin_textures() -> tuple[str, ...]:
 
 
 def load_texture(
-    source: str | Path,
-    *,
-    resolution: int = 128,
-    tiles: bool = False,
-    device: str | torch.device = "cpu",
+    source: str | Path, *, resolution: int = 128, tiles: bool = False
 ) -> TextureTarget:
     """Make a target from a built-in name or a picture file.
 
@@ -125,11 +121,6 @@ def load_texture(
         source: A name from `builtin_textures`, or the path of a PNG, JPEG or WebP file.
         resolution: Pixels R along each side.
         tiles: Whether the opposite edges of a picture file fit together; built-in textures tile.
-        device: Where the tensor is made.
-
-    Raises:
-        NPAError: The name is unknown, the file is missing, unreadable, damaged, fully transparent
-            or smaller than 2 x 2 pixels, or the resolution is not positive.
     """
     if not isinstance(source, str | Path) or not str(source):
         raise NPAError(
@@ -138,8 +129,7 @@ def load_texture(
         )
     check_count("resolution", resolution, ": try 128", at_most=MAX_RESOLUTION)
     if isinstance(source, str) and source in PATTERNS:
-        drawn = draw_pattern(source, resolution)
-        return _target(source, drawn, True, device)
+        return _target(source, draw_pattern(source, resolution), True)
     path = home_path(source)
     if isinstance(source, str) and not looks_like_path(str(path)):
         raise NPAError(
@@ -156,11 +146,11 @@ def load_texture(
         )
     left, top = (image.width - side) // 2, (image.height - side) // 2
     square = image.crop((left, top, left + side, top + side))
-    return _target(path.stem, scaled_square(square, resolution)[::-1], tiles, device)
+    return _target(path.stem, scaled_square(square, resolution)[::-1], tiles)
 
 
-def _target(name: str, picture: Array, tiles: bool, device: str | torch.device) -> TextureTarget:
-    tensor = torch.tensor(np.ascontiguousarray(picture), dtype=torch.float32, device=device)
+def _target(name: str, picture: Array, tiles: bool) -> TextureTarget:
+    tensor = torch.tensor(np.ascontiguousarray(picture), dtype=torch.float32)
     return TextureTarget(name, tensor, tiles)
 
 
@@ -179,18 +169,13 @@ def draw_pattern(name: str, resolution: int, *, seed: int = 0) -> Array:
 
     The first row is the bottom. Pixel r is centred at (r + 1/2) / R.
     """
-    if name not in PATTERNS:
-        raise NPAError(f"unknown texture {shown(name)}: {suggest(name, PATTERNS)}")
-    if resolution < 1:
-        raise NPAError(f"resolution must be at least 1 pixel, got {resolution}: try 128")
     samples = resolution * OVERSAMPLING
     axis = (np.arange(samples) + 0.5) / samples
     strips = []
     rows = max(1, STRIP_SAMPLES // samples // OVERSAMPLING) * OVERSAMPLING
     for first in range(0, samples, rows):
         positions = np.meshgrid(axis, axis[first : first + rows])
-        # The same random numbers for each strip: scattered things are where they were in the
-        # others.
+        # The same random numbers for each strip: scattered shapes stay where they are.
         rgba = PATTERNS[name](*positions, np.random.default_rng(seed))
         rgba[..., :3] *= rgba[..., 3:]
         blocks = rgba.reshape(-1, OVERSAMPLING, resolution, OVERSAMPLING, 4)
