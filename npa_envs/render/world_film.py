@@ -45,7 +45,7 @@ class WorldFilm:
     frames: list[Frame] = field(default_factory=list)
     captions: list[str] = field(default_factory=list)
     steps: dict[int, int] = field(default_factory=dict)
-    """Steps from the seed by index of frame, without frames that show fresh damage."""
+    """Steps since the initial world by index of frame, without frames just after damage."""
 
     def add(self, task: Task, worlds: Particles, step: int, damage: str = "") -> None:
         """Append a picture of one world, and its caption; `damage` tells what just damaged it."""

@@ -83,8 +83,8 @@ class ParticleTask(Generic[ConfigT]):
     """A task: its worlds, untrained rule, loss, metric and pictures.
 
     A subclass defines where particles start (`places`), the loss (`compare`), a metric and a
-    picture; all else has defaults. In all methods x are positions [length units], shape [B, N, D],
-    and s states (dimensionless), shape [B, N, C].
+    picture; all else has defaults. `seed` returns initial worlds. In all methods x are positions
+    [length units], shape [B, N, D], and s states (dimensionless), shape [B, N, C].
 
     No method may synchronise with the device (no `.item()`, no branch on a tensor's value): the
     trainer captures `seed`, `damage` and `loss` in CUDA graphs and never reads a number back
@@ -107,7 +107,7 @@ class ParticleTask(Generic[ConfigT]):
     has_views: bool = False
     """Whether the task has `views`, `view_psnr` and `gaussians`: pictures from several cameras."""
 
-    has_judge: bool = False
+    has_texture_metric: bool = False
     """Whether `npa_envs.measure.texture_metric` compares pictures of the task."""
 
     classifies: bool = False
@@ -180,13 +180,13 @@ class ParticleTask(Generic[ConfigT]):
         return untrained_rule(generator, **(sizes | {"eps0": config.eps} | self.rule_shape))
 
     def places(self, world_count: int, generator: Randomness, device: torch.device) -> Tensor:
-        """Return start positions of particles in fresh worlds [length units], shape [B, N, D]."""
+        """Return the positions of particles in initial worlds [length units], shape [B, N, D]."""
         raise NotImplementedError
 
     def seed(
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
     ) -> Particles:
-        """Return fresh worlds with all states zero and without goals."""
+        """Return initial worlds, with all states zero and without goals."""
         x = self.places(world_count, generator, torch.device(device))
         return Particles(x, x.new_zeros(*x.shape[:2], self.config.state_dim))
 
@@ -360,7 +360,7 @@ class GrowthConfig(PoolDamage, TaskConfig):
     """Largest displacement in one step, as a fraction of ε (dimensionless)."""
 
     seed_radius: float = 0.2
-    """Radius of the ball that the particles start in [length units]."""
+    """Radius of the ball around the origin that the particles start in [length units]."""
 
     motion_weight: float = 0.01
     """Weight of the path length Σ|Δx| of a rollout (per length unit)."""

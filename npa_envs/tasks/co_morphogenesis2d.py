@@ -36,7 +36,7 @@ class CoMorphogenesis2DConfig:
     """The configuration of each species' task. All have the same eps, update_prob and state_dim."""
 
     distance: float = 0.0
-    """Distance between the centres of neighbouring seeds, on the x axis [length units]."""
+    """Distance between the centres of neighbouring species' start disks, on x [length units]."""
 
     def __post_init__(self) -> None:
         species = self.species if isinstance(self.species, tuple | list) else ()
@@ -104,7 +104,7 @@ class CoMorphogenesis2D(ParticleTask[Any]):
     def seed(
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
     ) -> Particles:
-        """Return fresh worlds: each species uniform in a disk of its own, all states zero."""
+        """Return initial worlds: each species uniform in its start disk, all states zero."""
         return together(
             [
                 _shifted(task.seed(world_count, generator=generator, device=device), centre)
@@ -113,7 +113,7 @@ class CoMorphogenesis2D(ParticleTask[Any]):
         )
 
     def damage(self, worlds: Particles, generator: Randomness) -> Particles:
-        """Return worlds after random damage of each species, independently."""
+        """Return worlds after random damage of each species."""
         species = zip(self.tasks, worlds.split(self.config.counts), strict=True)
         return together([task.damage(each, generator) for task, each in species])
 
@@ -126,7 +126,7 @@ class CoMorphogenesis2D(ParticleTask[Any]):
         total = worlds.x.new_zeros(())
         terms: dict[str, Tensor] = {}
         for k, species in enumerate(worlds.split(self.config.counts)):
-            # Positions relative to the species' seed, around which its loss bounds them.
+            # Positions relative to the centre of the species, around which its loss bounds them.
             loss, species_terms = self.tasks[k].loss(_shifted(species, -self.config.centres[k]))
             total = total + loss
             terms |= {f"{k}.{name}": term for name, term in species_terms.items()}
@@ -172,7 +172,7 @@ def together(species: Sequence[Particles]) -> Particles:
 
 
 DISTANCE = 0.8
-"""Distance between the seeds' centres in every preset [length units]: the pictures overlap."""
+"""`distance` of every preset [length units]: the pictures overlap."""
 
 
 _RUNS: Mapping[str, Mapping[str, Any]] = {

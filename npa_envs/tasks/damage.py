@@ -43,7 +43,7 @@ class DamageEvent:
     """Damage of a world after a number of steps."""
 
     step: int
-    """Steps since the seed."""
+    """Steps since the initial world."""
 
     kind: str
     """One of `DAMAGE_SIZES`."""

@@ -113,7 +113,7 @@ class ManyPictures(Morphogenesis2D):
     def seed(
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
     ) -> Particles:
-        """Return fresh worlds with random goals; particles have the targets' codes."""
+        """Return initial worlds with random goals; particles have the targets' codes."""
         x, s, *_ = super().seed(world_count, generator=generator, device=device)
         goal = drawn_indices(len(self.names), world_count, generator, torch.device(device))
         blank = s.new_zeros(*s.shape[:2], self.config.code_dim)

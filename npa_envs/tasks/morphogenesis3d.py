@@ -132,8 +132,8 @@ GREY = 0.5
 class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
     """The task of arXiv 2601.16096 with its loss.
 
-    Particles are round, and the last three channels of their states are the colour. `for_rule`
-    returns the task that draws particles by the rule's read-out instead.
+    Particles are round, and the last three channels of their states are the colour. In the task
+    that `for_rule` returns, outputs of the rule's read-out network say how they look.
     """
 
     space_dim = 3
@@ -176,7 +176,7 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
         self._rule: NPARule | None = None
 
     def for_rule(self, rule: NPARule) -> Self:
-        """Return a task with this target that renders particles by a rule's read-out network."""
+        """Return a copy of the task that renders particles with outputs of a rule's read-out."""
         if rule.readout_dim not in (0, OUTPUTS):
             raise NPAError(
                 f"the rule must have a read-out of {OUTPUTS} outputs, or none, got readout_dim="
@@ -346,7 +346,7 @@ MORPHOGENESIS3D_PRESETS = presets_of(
         milestones=(2_000, 10_000),
         seed_interval=1,
     ),
-    # Half as many particles, which see as many neighbours; half of a batch are seeds:
+    # Half as many particles, which see as many neighbours; half of a batch are initial worlds:
     # docs/morphogenesis3d.md.
     best=TrainConfig(
         task=Morphogenesis3DConfig(

@@ -43,13 +43,13 @@ class PointClassificationConfig(TaskConfig):
     """Seed of the candidates for farthest-point sampling of the pictures."""
 
     rotation: float = 0.0
-    """Largest random rotation of fresh clouds, in either direction [degrees]."""
+    """Largest random rotation of initial clouds, in either direction [degrees]."""
 
     stretch: float = 0.0
-    """Largest random stretch and shear of fresh clouds (dimensionless)."""
+    """Largest random stretch and shear of initial clouds (dimensionless)."""
 
     jitter: float = 0.0
-    """Standard deviation of the noise on fresh clouds' coordinates [length units]."""
+    """Standard deviation of the noise on initial clouds' coordinates [length units]."""
 
     mutated_share: float = 0.0
     """Probability that a damaged world from the pool gets the positions and class of another cloud

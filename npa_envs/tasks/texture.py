@@ -131,7 +131,7 @@ DRAWINGS = 16
 class Texture(ParticleTask[TextureConfig]):
     """The texture task of arXiv 2601.16096, with its loss."""
 
-    has_judge = True
+    has_texture_metric = True
     _resized_with = ("target",)
 
     def __init__(

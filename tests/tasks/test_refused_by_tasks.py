@@ -69,7 +69,7 @@ TINY = replace(SMALL, resolution=12, ssim_weight=0.2)
         (PLANE, TURNED | {"seed_across": -1.0}, "seed_across must be a finite number of at least"),
         (PLANE, TURNED | {"angles": -1}, "angles must be a whole number of at least 0, got -1"),
         (PLANE, TURNED | {"angles": 3}, "angles must be 0 or at least 4, got 3"),
-        (PLANE, TURNED | {"angles": 0, "seed_axis": 0.0}, "angles=0 needs seeds that have a"),
+        (PLANE, TURNED | {"angles": 0, "seed_axis": 0.0}, "angles=0 needs initial worlds"),
         (PLANE, TURNED | {"angles": 0, "chiral": False}, "=0.0 and chiral=False: set seed_across="),
         (PLANE, TURNED | {"division": True}, "division goes neither with equivariant"),
         (PLANE, {"targets": ("ring",), "division": True}, "division goes neither with equivariant"),

@@ -331,15 +331,8 @@ def stars(u: Array, v: Array, random: np.random.Generator) -> Array:
 
 
 PATTERNS: dict[str, Pattern] = {
-    "bubbles": bubbles,
-    "cells": cells,
-    "dots": dots,
-    "droplets": droplets,
-    "grid": grid,
-    "hearts": hearts,
-    "maze": maze,
-    "stars": stars,
-    "stripes": stripes,
+    pattern.__name__: pattern
+    for pattern in (bubbles, cells, dots, droplets, grid, hearts, maze, stars, stripes)
 }
 """Every built-in texture by name."""
 
