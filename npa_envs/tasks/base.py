@@ -157,12 +157,9 @@ class ParticleTask(Generic[ConfigT]):
 
     @property
     def target_picture(self) -> Tensor:
-        """The picture to match, dimensionless, shape [R, R, 4].
+        """The picture to match, dimensionless, shape [R, R, 4]; AttributeError if there is none.
 
         Channels are red, green and blue, each summed over splats, and the density.
-
-        Raises:
-            AttributeError: The task has none.
         """
         if self._target_picture is None:
             raise AttributeError(f"{type(self).__name__} has no picture to match")
@@ -284,12 +281,9 @@ class ParticleTask(Generic[ConfigT]):
         return {"overflow": (self.config.overflow_weight, outside)}
 
     def loss(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the training loss of worlds after a rollout, shape [].
+        """Return the training loss of worlds after a rollout with path lengths, shape [].
 
         The second result has its terms by name, without weights, each of shape [].
-
-        Raises:
-            NPAError: The worlds lack path lengths, or these have another shape than [B, N].
         """
         path, expected = worlds.path_length, tuple(worlds.x.shape[:2])
         if path is None or path.shape != expected:

@@ -132,18 +132,15 @@ def random_particle(x: Tensor, generator: Randomness | None = None) -> Tensor:
 # it drift for ever, too slowly to notice in a picture. Training displaces some particles far out of
 # their worlds and penalises their paths, so that the rule learns to let them rest.
 
+CHANCE = 0.25
+"""Probability of a world to be clumped, to be cut, to lose a flake (dimensionless)."""
+
 NEAREST, FARTHEST = 2.0, 4.0
 """Range of distances from the origin to which particles are displaced [length units]."""
 
 
-def displace(x: Tensor, *, probability: float, generator: Randomness) -> Tensor:
-    """Return positions [B, N, D]; each particle is thrown out of the world with `probability`."""
-    drawn = uniform_draws(generator, (*x.shape[:2], 1), x)
-    return torch.where(drawn < probability, _outside(x, x.shape[1], generator), x)
-
-
-def tear_off(x: Tensor, *, radius: float, probability: float, generator: Randomness) -> Tensor:
-    """Return positions [B, N, D]; worlds lose a flake with `probability`.
+def tear_off(x: Tensor, *, radius: float, generator: Randomness) -> Tensor:
+    """Return positions [B, N, D]; a quarter of the worlds lose a flake.
 
     A flake is a ball around a random particle, of a random radius up to `radius` [length units]. It
     is thrown out of the world in one piece. Its particles perceive each other, and may drift on
@@ -151,7 +148,7 @@ def tear_off(x: Tensor, *, radius: float, probability: float, generator: Randomn
     """
     centre = random_particle(x, generator)
     draws = uniform_draws(generator, (len(x), 2), x)
-    flake_radius = torch.where(draws[:, :1] < probability, radius * draws[:, 1:], -1.0)
+    flake_radius = torch.where(draws[:, :1] < CHANCE, radius * draws[:, 1:], -1.0)
     torn = (x - centre[:, None]).norm(dim=-1) <= flake_radius
     return torch.where(torn[..., None], x + (_outside(x, 1, generator) - centre[:, None]), x)
 
@@ -163,10 +160,6 @@ def _outside(x: Tensor, count: int, generator: Randomness) -> Tensor:
     )
     length: Tensor = ball.norm(dim=-1, keepdim=True)
     return ball * ((NEAREST + (FARTHEST - NEAREST) * length) / length.clamp_min(1e-12))
-
-
-CHANCE = 0.25
-"""Probability of a world to be clumped, to be cut, to lose a flake (dimensionless)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -221,7 +214,8 @@ def damage_pool(worlds: Particles, damage: PoolDamage, *, generator: Randomness)
         hit = chosen_worlds(damage.cut_share)
         x, s = cut(x, s, centre=world_mean(x), normal=normal, gap=damage.cut_gap * hit)
     if damage.flake_radius > 0.0:
-        x = tear_off(x, radius=damage.flake_radius, probability=CHANCE, generator=generator)
+        x = tear_off(x, radius=damage.flake_radius, generator=generator)
     if damage.escape_share > 0.0:
-        x = displace(x, probability=damage.escape_share, generator=generator)
+        drawn = uniform_draws(generator, (*x.shape[:2], 1), x)
+        x = torch.where(drawn < damage.escape_share, _outside(x, x.shape[1], generator), x)
     return worlds._replace(x=x, s=s)

@@ -61,6 +61,8 @@ class ManyPictures(Morphogenesis2D):
     targets, and pictures are scaled so that each target's density is about 1.
     """
 
+    _codes: Codes | None = None
+
     def __init__(
         self, config: Morphogenesis2DConfig, *, device: str | torch.device = "cpu"
     ) -> None:
@@ -82,7 +84,6 @@ class ManyPictures(Morphogenesis2D):
         self._pixel_size = float(sizes.square().mean().sqrt())
         self._scales = (sizes / self._pixel_size).square().to(device)
         self.goal_count = len(named)
-        self._codes: Codes | None = None
         drawn = [
             self._splat(task.target.points[None], task.target.colours[None])[0] for task in alone
         ]

@@ -169,6 +169,7 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
     """
 
     metric_name = "splat loss"
+    _code: Tensor | None = None
 
     def __init__(
         self,
@@ -186,13 +187,12 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
             )
         self.target = target.to(device)
         """The target picture as points."""
-        self._target_mean = self.target.points.mean(dim=0)
-        radius = float((self.target.points - self._target_mean).norm(dim=1).max())
-        self._radius = max(1.0, radius)
+        points, colours = self.target.points, self.target.colours
+        self._target_mean = points.mean(dim=0)
+        # Of the circle around the mean that contains the target at every angle.
+        self._radius = max(1.0, float((points - self._target_mean).norm(dim=1).max()))
         self._pixel_size = self.target.pixel_size
-        self._code: Tensor | None = None
-        points, colours = self.target.points[None], self.target.colours[None]
-        self._target_picture = self._splat(points, colours)[0]
+        self._target_picture = self._splat(points[None], colours[None])[0]
 
     def for_rule(self, rule: NPARule) -> Self:
         """Return the task whose worlds have the rule's code of the target in the first channels.
@@ -253,9 +253,8 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
     def picture(self, x: Tensor, s: Tensor, *, centred: bool = True) -> Tensor:
         """Return each world's picture: sums of colours over splats, density; [B, R, R, 4].
 
-        Args:
-            centred: Move each world's mean to the target's, and rotate worlds of an equivariant
-                rule, as the loss does.
+        `centred`: each world's mean is moved to the target's, and worlds of an equivariant rule are
+        rotated, as the loss does.
         """
         colour = s[..., -3:] + COLOUR_OFFSET
         if centred:
@@ -273,9 +272,9 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
     def splat_errors(self, x: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return each pixel's density error and colour error, dimensionless, shape [B, R, R] each.
 
-        Both are |d| + d^2 of the difference d between the centred picture and the target's; the
-        colour error is averaged over the colours and weighted by exp(-(density error)), without
-        gradient. World k's errors are the same, bit for bit, in every batch.
+        Both are |d| + d² of the difference d between the centred picture and the target's; the
+        colour error is averaged over the colours and weighted by exp(−density error), without
+        gradient. They are the same, bit for bit, in every batch.
         """
         size = (self.picture(x, s) - self.target_picture.to(x)).abs()
         # Added one by one: the order of torch's own sums is not promised.

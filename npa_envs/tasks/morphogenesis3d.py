@@ -140,6 +140,7 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
     metric_name = "view loss"
     has_views = True
     _resized_with = ("target",)
+    _rule: NPARule | None = None
 
     def __init__(
         self,
@@ -150,8 +151,6 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
     ) -> None:
         self.config = config = config or Morphogenesis3DConfig()
         side = config.resolution
-        with_similarity = config.ssim_weight > 0.0
-        self._similarity = MultiScaleSimilarity(side, device=device) if with_similarity else None
         if target is None:
             target = load_views(
                 config.target,
@@ -165,15 +164,16 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
                     f"views must have {side} x {side} pixels as config.resolution says, "
                     f"got {tuple(views.pictures.shape[1:])}: load them at that size"
                 )
-        visible = nearest_camera(target.held_out.cameras, SHOWN_FROM)
         self.target = target.to(device)
         """The views of the target."""
-        self._shown = some_views(self.target.held_out, torch.tensor([visible], device=device))
+        front = nearest_camera(target.held_out.cameras, SHOWN_FROM)
+        self._shown = some_views(self.target.held_out, torch.tensor([front], device=device))
         # The first row of a picture is the bottom.
         self._target_picture = self._shown.pictures[0].flip(0)
         self.schedule = ViewSchedule(len(target.training.pictures), config, device)
         """Views, blur and backgrounds of an iteration."""
-        self._rule: NPARule | None = None
+        with_similarity = config.ssim_weight > 0.0
+        self._similarity = MultiScaleSimilarity(side, device=device) if with_similarity else None
 
     def for_rule(self, rule: NPARule) -> Self:
         """Return a copy of the task that renders particles with outputs of a rule's read-out."""

@@ -91,16 +91,15 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
     """The classification task of arXiv 2601.16096.
 
     The goal of a world is its cloud's class. Class scores are the outputs of the rule's read-out;
-    without a read-out, they are the last channels of the states.
-
-    Args:
-        split: The clouds that worlds are made of; those of "test" are not augmented.
+    without a read-out, they are the last channels of the states. Clouds of the split "test" are not
+    augmented.
     """
 
     metric_name = "mean squared error to the class"
     trial_name = "share of particles that are wrong"
     classifies = True
     _resized_with = ("split",)
+    _rule: NPARule | None = None
 
     def __init__(
         self,
@@ -113,7 +112,6 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         self.split: Split = split
         """The clouds that worlds are made of, "train" or "test"."""
         self._device = torch.device(device)
-        self._rule: NPARule | None = None
         self.goal_count = config.class_count
         # There is no picture to match.
         side = config.resolution

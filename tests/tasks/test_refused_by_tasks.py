@@ -1,6 +1,5 @@
 """What tasks, targets, losses and damages refuse, and what they say then."""
 
-import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -40,7 +39,6 @@ TINY = replace(SMALL, resolution=12, ssim_weight=0.2)
         (TEXTURE, {"loss": "swd"}, "loss must be a texture loss that exists"),
         (TEXTURE, {"loss": "patch_ot+joint_sdw"}, "did you mean 'joint_swd'"),
         (TEXTURE, {"loss": "patch_ot+patch_swd"}, "summed must be joint ones.*joint_swd"),
-        (TEXTURE, {"loss": "patch_ot+"}, "must be a texture loss that exists"),
         (TEXTURE, {"loss": ["patch_ot"]}, r"loss that exists, got \['patch_ot'\]: known"),
         (TEXTURE, {"loss_seed": -1}, "loss_seed must be a whole number"),
         (TEXTURE, {"state_dim": 2}, "state_dim must be a whole number of at least 3"),
@@ -66,7 +64,6 @@ TINY = replace(SMALL, resolution=12, ssim_weight=0.2)
         (PLANE, {"equivariant": "yes"}, "equivariant must be True or False, got 'yes'"),
         (PLANE, TURNED | {"chiral": 1}, "chiral must be True or False, got 1"),
         (PLANE, TURNED | {"seed_axis": -1.0}, "seed_axis must be a finite number of at least 0"),
-        (PLANE, TURNED | {"seed_across": -1.0}, "seed_across must be a finite number of at least"),
         (PLANE, TURNED | {"angles": -1}, "angles must be a whole number of at least 0, got -1"),
         (PLANE, TURNED | {"angles": 3}, "angles must be 0 or at least 4, got 3"),
         (PLANE, TURNED | {"angles": 0, "seed_axis": 0.0}, "angles=0 needs initial worlds"),
@@ -95,17 +92,8 @@ def many(*targets, **fields):
     ("call", "message"),
     [
         (lambda: wipe_state(X, S[:, :3], **AT), "x and s must agree in worlds and particles"),
-        (lambda: wipe_state(X, S, centre=PLACE[0], radius=0.1), r"= \(2, 2\), got \(2,\)"),
-        (
-            lambda: wipe_state(X, S, centre=PLACE.double(), radius=0.1),
-            r"centre and x must share dtype",
-        ),
         (lambda: wipe_state(X, S, centre=PLACE, radius=PLACE[0, :1]), r"or a tensor of .* \[B\]"),
         (lambda: cut(X, S, centre=PLACE, normal=torch.zeros(2, 3), gap=0.1), "normal must have"),
-        *(
-            (lambda r=r: clump(X, S, centre=PLACE, radius=r, factor=0.5), "radius must be finite")
-            for r in (-0.1, math.nan, math.inf)
-        ),
         (lambda: clump(X, S, **AT, factor=1.5), r"factor must be in \[0, 1\], got 1\.5"),
         *(
             (lambda n=n: load_target("heart", point_count=n), "point_count must be an int")
@@ -116,18 +104,15 @@ def many(*targets, **fields):
         (lambda: load_target(7), "string or a Path, got int"),
         # A path is never a built-in name.
         (lambda: load_target(Path("gecko")), "does not exist"),
-        (lambda: load_target("nowhere.png"), "does not exist"),
         (lambda: load_target(Path(__file__).parent), "is a folder"),
         (lambda: load_texture("cels"), "did you mean 'cells'.*known: bubbles, cells, dots, drop"),
         (lambda: load_texture(""), "for example 'cells'"),
         (lambda: load_texture(3), "must be a built-in texture"),
         (lambda: load_texture("missing.png"), "does not exist"),
         (lambda: load_texture("cells", resolution=0), "resolution must be an integer of at least"),
-        (lambda: load_texture("cells", resolution=8.0), "resolution must be an integer of at le"),
         (lambda: load_views("rocke"), "did you mean 'rocket'"),
         (lambda: load_views("there/is/none.glb"), "does not exist"),
         (lambda: load_views(""), "target must be a built-in mesh"),
-        (lambda: load_views(3), "target must be a built-in mesh"),
         (lambda: load_views("duck", resolution=0), "resolution must be an integer"),
         (lambda: load_pictures("digit"), "did you mean 'digits'"),
         (lambda: many("heart", "hart"), "unknown|emoji"),
