@@ -36,7 +36,7 @@ _GAP = 4
 class Shown:
     """A picture or a repeating film, which a notebook displays when it is the value of a cell.
 
-    Frames are pictures of one size, uint8, shape [H, W, 3] each; `fps` of them per second.
+    Frames are pictures of one size, uint8, shape [H, W, 3] each; `fps` is their number per second.
     """
 
     def __init__(self, frames: Iterable[Frame], fps: float) -> None:

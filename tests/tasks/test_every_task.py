@@ -27,7 +27,7 @@ VARIANTS = [
 
 @pytest.fixture
 def tiny(folder, tmp_path):
-    """Returns tiny runs of tasks, each in a folder of its own."""
+    """Returns tiny runs of tasks, each in its own folder."""
 
     def make(name, out="run", **fields):
         if name == "point_classification":

@@ -1,4 +1,4 @@
-"""What tasks, targets, losses and damages refuse, and what they say then."""
+"""What tasks, targets, losses and damages reject, and what they say then."""
 
 from dataclasses import replace
 from pathlib import Path
