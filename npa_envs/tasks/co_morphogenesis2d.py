@@ -150,15 +150,6 @@ class CoMorphogenesis2D(ParticleTask[Any]):
         x, s, *_ = together(targets)
         return self.picture(x, s)[0]
 
-    def metrics(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return the splat loss of each of K species in each world, shape [B, K]."""
-        species = zip(self.tasks, Particles(x, s).split(self.config.counts), strict=True)
-        return torch.stack([task.metric(each.x, each.s) for task, each in species], dim=1)
-
-    def metric(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return each world's mean splat loss of its species, shape [B]."""
-        return self.metrics(x, s).mean(dim=1)
-
 
 def _shifted(worlds: Particles, distance: float) -> Particles:
     """Return worlds moved along the x axis."""

@@ -191,11 +191,11 @@ class TrainConfig(Generic[TaskConfigT]):
         check = partial(check_field, self)
         choices = {"optimiser": OptimiserName, "schedule": Schedule, "memory": Memory}
         choices |= {"moment_inverse": MomentInverse, "dtype": Literal["float32", "float64"]}
-        for name, words in choices.items():
-            check_word(self, name, get_args(words))
+        for name, literal in choices.items():
+            check_word(self, name, get_args(literal))
         fits = 1.0 <= self.stillness_power <= MAX_POWER
         rule = f"be at least 1 and at most {MAX_POWER:g}"
-        check("stillness_power", fits, rule, "1 for plain means")
+        check("stillness_power", fits, rule, "1 for arithmetic means")
         fits = self.damage_and_keep_share < 1.0
         check("damage_and_keep_share", fits, "be below 1", "1 leaves no initial worlds")
         rule = "be the name of a rule or of a file, or '' for none"
@@ -205,10 +205,9 @@ class TrainConfig(Generic[TaskConfigT]):
         check("steps", fits, rule, "hi is exclusive, so exactly 32 steps are steps=(32, 33)")
         milestones, ages = self.milestones, self.max_age_range
         fits = isinstance(milestones, tuple) and all(map(is_whole, milestones))
-        check("milestones", fits, "be a tuple of whole numbers")
-        fits = list(milestones) == sorted({m for m in milestones if m >= 1})
-        rule, hint = "be positive and increasing", "for example milestones=(2000, 4000)"
-        check("milestones", fits, rule, hint)
+        fits = fits and list(milestones) == sorted({m for m in milestones if m >= 1})
+        rule = "be positive and increasing whole numbers in a tuple"
+        check("milestones", fits, rule, "for example milestones=(2000, 4000)")
         rule = f"be at most pool_size={self.pool_size} (batches are drawn without replacement)"
         fits, hint = self.world_count <= self.pool_size, f"set pool_size={self.world_count} or more"
         check("world_count", fits, rule, hint)
