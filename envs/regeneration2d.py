@@ -111,14 +111,10 @@ class RegenerationTask(GrownTask[Regeneration2DEnvConfig]):
         intact = damaged = Particles(x, s)
         for k, kind in enumerate(kinds):
             size = SIZES[kind] if self.config.damage_size is None else self.config.damage_size
-            new_x, new_s = damage_worlds(
-                x, s, kind=kind, size=size, box=self.periodic_sides, generator=random
+            hurt = damage_worlds(
+                intact, kind=kind, size=size, box=self.periodic_sides, generator=random
             )
-            # Each kind changes either positions or states.
-            if new_x is not x:
-                damaged = damaged._replace(x=torch.where(chosen == k, new_x, damaged.x))
-            if new_s is not s:
-                damaged = damaged._replace(s=torch.where(chosen == k, new_s, damaged.s))
+            damaged = hurt.where(chosen[:, 0, 0] == k, damaged)
         if threshold is None:
             least, loss = self._loss(intact), self._loss(damaged)
             healed = least + (1.0 - self.config.healed_share) * (loss - least)

@@ -14,6 +14,7 @@ from npa_envs.checks import as_list
 from npa_envs.envs.core.base import to_output
 from npa_envs.errors import NPAError
 from npa_envs.tasks.damage import DamageEvent, damage_worlds, parse_damage
+from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import StreamId
 from npa_envs.wrappers.base import (
     AnyWrapper,
@@ -63,23 +64,23 @@ class _DamagesWorlds(WrapperBase):
         due: NDArray[np.bool_] = np.array([[event.step] for event in self.events]) == elapsed
         return due
 
-    def _damaged_particles(self, due: NDArray[np.bool_]) -> tuple[Tensor, Tensor]:
-        """Return positions and states of all worlds, damaged by the events `due` there [E, B]."""
+    def _damaged_particles(self, due: NDArray[np.bool_]) -> Particles:
+        """Return the particles of all worlds, damaged by the events `due` there [E, B]."""
         worlds = self._base.worlds
-        x, s = worlds.x.clone(), worlds.s.clone()
+        particles = Particles(worlds.x.clone(), worlds.s.clone())
         for k, (event, mask) in enumerate(zip(self.events, due, strict=True), self._first):
             if mask.any():
-                chosen = world_indices(mask, x.device)
+                chosen = world_indices(mask, worlds.x.device)
                 stream = worlds.random.take(chosen).substream(StreamId.DAMAGE).substream(k)
-                x[chosen], s[chosen] = damage_worlds(
-                    x[chosen],
-                    s[chosen],
+                damaged = damage_worlds(
+                    particles.take(chosen),
                     kind=event.kind,
                     size=event.size,
                     box=worlds.physics.periodic_box,
                     generator=stream,
                 )
-        return x, s
+                particles.put_(chosen, damaged)
+        return particles
 
 
 class DamageEvents(_DamagesWorlds, AnyWrapper):
@@ -127,7 +128,7 @@ class DamageEvents(_DamagesWorlds, AnyWrapper):
             return observation, info
         worlds = self._base.worlds
         before = float(worlds.loss[0])
-        x, s = self._damaged_particles(due)
+        x, s, *_ = self._damaged_particles(due)
         observation = self._base.place_particles(x[0], s[0])
         losses = self._base.losses_of(worlds.report.numbers[:, 0].tolist())
         losses["loss_damage"] = info.get("loss_damage", 0.0) + losses["loss"] - before
@@ -164,7 +165,7 @@ class VectorDamageEvents(_DamagesWorlds, EpisodeWrapper):
         before = worlds.loss.clone()
         damaged = np.asarray(due.any(axis=0))
         chosen = world_indices(damaged, base.task.device)
-        x, s = self._damaged_particles(due)
+        x, s, *_ = self._damaged_particles(due)
         observations = base.place_particles(x[chosen], s[chosen], chosen)
         output = base.config.output
         # Arrays are float64, as in environments, and differences equal those of single ones.

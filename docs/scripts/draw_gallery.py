@@ -22,6 +22,7 @@ from npa_envs.render import to_uint8, turntable_frames, write_webp
 from npa_envs.rule.files import shipped_rules
 from npa_envs.tasks.damage import damage_worlds
 from npa_envs.training.task_of_rule import task_of_rule
+from npa_envs.world.particles import Particles
 
 FOLDER = IMAGES / "gallery"
 SEED = 1_000_001
@@ -46,9 +47,10 @@ def grown_and_cut(name: str) -> Iterator[Frame]:
     rule, task = loaded(name, resolution=RESOLUTION)
     world = FilmedWorld(rule, task, picture(task), seed=SEED)
     yield from world.run(GROWTH)
-    world.x, world.s = damage_worlds(
-        world.x, world.s, kind="cut", size=0.1, generator=world.generator
+    cut = damage_worlds(
+        Particles(world.x, world.s), kind="cut", size=0.1, generator=world.generator
     )
+    world.x, world.s = cut.x, cut.s
     yield from world.run(HEALING)
 
 

@@ -85,7 +85,7 @@ def write_report(
     clouds = task.classifies
     checkpoints = (CLOUD_CHECKPOINTS if clouds else CHECKPOINTS)[: None if thorough else 5]
     seeds = range(FIRST_SEED, FIRST_SEED + (8 if thorough else 2))
-    judge = TextureJudge(task) if task.has_judge else None
+    judge = TextureJudge(task) if task.has_texture_metric else None
     not_filmed = ""
     with common.progress_bar(None, show=progress) as advance:
         tables = tables_of(

@@ -36,9 +36,7 @@ _GAP = 4
 class Shown:
     """A picture or a repeating film, which a notebook displays when it is the value of a cell.
 
-    Args:
-        frames: Pictures of one size, uint8, shape [H, W, 3] each.
-        fps: Frames a second of a film.
+    Frames are pictures of one size, uint8, shape [H, W, 3] each; `fps` is their number per second.
     """
 
     def __init__(self, frames: Iterable[Frame], fps: float) -> None:
@@ -79,11 +77,10 @@ def show_worlds(
             `rollout(..., keep_every=...)` returns it.
         s: Particle states (dimensionless), shape [B, N, C] or [K, B, N, C]; for a rule with a
             read-out give `rule.read_out(s)`.
-        fps: Frames a second of a film.
+        fps: Frames per second of a film.
         pixel_size: Distance between particles [length units]; None: measured at the last step.
         drawing: Other arguments of `draw_worlds`.
     """
-    check_rate(fps)
     tensors = isinstance(x, Tensor) and isinstance(s, Tensor)
     if not tensors or x.ndim != s.ndim or (x.ndim == 4 and len(x) != len(s)):
         sizes = [tuple(each.shape) if isinstance(each, Tensor) else shown(each) for each in (x, s)]
@@ -92,14 +89,11 @@ def show_worlds(
             f"steps in front, got {sizes[0]} and {sizes[1]}: give what rollout returns"
         )
     steps = [(x, s)] if x.ndim != 4 else list(zip(x, s, strict=True))
-    if not steps or 0 in x.shape:
+    if 0 in x.shape:
         raise NPAError(f"x must hold at least one particle, got shape {tuple(x.shape)}")
-    spacing = _spacing(steps[-1][0]) if pixel_size is None else pixel_size
-    frames = [
-        side_by_side(draw_worlds(a[:MAX_SHOWN], b[:MAX_SHOWN], pixel_size=spacing, **drawing))
-        for a, b in steps
-    ]
-    return Shown(frames, fps)
+    drawing["pixel_size"] = _spacing(steps[-1][0]) if pixel_size is None else pixel_size
+    drawn = (draw_worlds(a[:MAX_SHOWN], b[:MAX_SHOWN], **drawing) for a, b in steps)
+    return Shown(map(side_by_side, drawn), fps)
 
 
 def side_by_side(pictures: NDArray[np.uint8]) -> Frame:
@@ -121,8 +115,8 @@ def _spacing(x: Tensor) -> float:
     if not len(points):
         return 1.0
     count, space_dim = points.shape
-    extent = (points.amax(dim=0) - points.amin(dim=0)).clamp(min=1e-6)
-    side = (float(extent.prod()) * _CELL_PARTICLES / count) ** (1.0 / space_dim)
+    spans = (points.amax(dim=0) - points.amin(dim=0)).clamp(min=1e-6)
+    side = (float(spans.prod()) * _CELL_PARTICLES / count) ** (1.0 / space_dim)
     filled = len(torch.unique(torch.floor(points / side), dim=0))
     return max(float((filled / count) ** (1.0 / space_dim) * side), 1e-6)
 
@@ -144,7 +138,7 @@ class Window:
     Args:
         title: Text of the title bar.
         size: Side of the window [screen pixels]. Frames of another size are scaled to it.
-        fps: Largest number of frames a second, kept by waiting in `show`; None: no limit.
+        fps: Largest number of frames per second, kept by waiting in `show`; None: no limit.
 
     Raises:
         MissingDependencyError: pygame is not installed.
@@ -157,7 +151,6 @@ class Window:
         self.size = (checked_side("size", size),) * 2
         """Width and height [screen pixels]."""
         self.fps = fps
-        """Largest number of frames a second; None: no limit."""
         self.closed = False
         """Whether it was closed, by the user, `close` or a new window."""
         os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
@@ -188,16 +181,17 @@ class Window:
         if self._surface is None:
             return
         # Another library of the process may have shut the display down.
-        shut_down = not self._pygame.display.get_init()
-        if shut_down or any(event.type == self._pygame.QUIT for event in self._pygame.event.get()):
+        pygame = self._pygame
+        shut_down = not pygame.display.get_init()
+        if shut_down or any(event.type == pygame.QUIT for event in pygame.event.get()):
             self.close()
             return
         # pygame counts columns first.
-        picture = self._pygame.surfarray.make_surface(pixels.swapaxes(0, 1))
+        picture = pygame.surfarray.make_surface(pixels.swapaxes(0, 1))
         if picture.get_size() != self.size:
-            picture = self._pygame.transform.smoothscale(picture, self.size)
+            picture = pygame.transform.smoothscale(picture, self.size)
         self._surface.blit(picture, (0, 0))
-        self._pygame.display.flip()
+        pygame.display.flip()
         if self.fps is not None:
             self._clock.tick(self.fps)
 

@@ -1,4 +1,7 @@
-"""Picture and film files, written completely or not at all."""
+"""Picture and film files, written completely or not at all.
+
+Frames are pictures of one size, uint8, shape [H, W, 3] each; `fps` is their number per second.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +29,7 @@ Frame = NDArray[np.uint8]
 """Pixels of a picture, uint8, shape [H, W, 3]; the first row is the top."""
 
 GIF_HIGHEST_RATE = 50
-"""Largest number of frames a second of a GIF in players."""
+"""Largest `fps` of a GIF in players."""
 
 _PALETTE_SAMPLE = 2**20
 _MARGIN = 8
@@ -53,15 +56,8 @@ def _encoded(frames: Iterable[Frame], **options: Any) -> bytes:
 def write_gif(path: str | Path, frames: Iterable[Frame], fps: float = 25) -> None:
     """Write a GIF that repeats for ever, with one palette for all frames and no dithering.
 
-    Args:
-        path: The GIF file.
-        frames: Pictures of one size, uint8, shape [H, W, 3] each.
-        fps: Frames a second, at most 50. Times at which frames change are rounded to hundredths of
-            a second.
-
-    Raises:
-        NPAError: Wrong frames or rate, more than 655 s of equal frames, or the file cannot be
-            written.
+    Times at which frames [H, W, 3] change are rounded to hundredths of a second. `fps` is at most
+    50; equal frames last 655 s at most.
     """
     pictures = checked_frames(frames)
     check_rate(fps, highest=GIF_HIGHEST_RATE)
@@ -94,13 +90,9 @@ def write_gif(path: str | Path, frames: Iterable[Frame], fps: float = 25) -> Non
 def write_webp(
     path: str | Path, frames: Iterable[Frame], fps: float = 25, *, quality: int = 50
 ) -> None:
-    """Write a WebP that repeats for ever, a fifth the size of a GIF.
+    """Write frames [H, W, 3] as a WebP that repeats for ever, a fifth the size of a GIF.
 
-    Args:
-        path: The WebP file.
-        frames: Pictures of one size, uint8, shape [H, W, 3] each.
-        fps: Frames a second.
-        quality: 0 to 100.
+    `quality` is 0 to 100.
     """
     write_bytes(path, encode_webp(frames, fps, quality=quality))
 
@@ -117,13 +109,9 @@ def encode_webp(frames: Iterable[Frame], fps: float = 25, *, quality: int = 50) 
 
 
 def write_mp4(path: str | Path, frames: Iterable[Frame], fps: float = 25) -> None:
-    """Write an H.264 film that browsers play.
+    """Write frames [H, W, 3] as an H.264 film that browsers play.
 
-    Args:
-        path: The MP4 file.
-        frames: Pictures of one size, uint8, shape [H, W, 3] each. An odd width or height is made
-            even by repeating the last column or row.
-        fps: Frames a second.
+    An odd width or height is made even by repeating the last column or row.
 
     Raises:
         MissingDependencyError: imageio or its ffmpeg is not installed.
@@ -161,14 +149,10 @@ def write_filmstrip(
     columns: int | None = None,
     background: Background = "white",
 ) -> None:
-    """Write frames in a grid into one picture, each with a caption below.
+    """Write frames [H, W, 3] in a grid into one picture, each with a caption below.
 
-    Args:
-        path: A WebP file where the name ends in `.webp`, else a PNG file.
-        frames: Pictures of one size, uint8, shape [H, W, 3] each.
-        captions: One text for each frame, or None.
-        columns: Frames in a row; None is all of them, at most 8.
-        background: As of `to_uint8`.
+    It is a WebP file where the name ends in `.webp`, else a PNG file. A row has `columns` frames;
+    None: all of them, at most 8.
     """
     pictures = checked_frames(frames)
     count = len(pictures)
@@ -211,7 +195,7 @@ def write_filmstrip(
 
 
 def check_rate(fps: float, *, highest: float = 1000) -> None:
-    """Check a film's rate [frames a second], at least 0.1."""
+    """Check a film's rate [frames per second], at least 0.1."""
     if not (is_real(fps) and 0.1 <= fps <= highest):
         raise NPAError(f"fps must be in [0.1, {highest}], got {shown(fps)}: try 25")
 
@@ -277,19 +261,16 @@ def turntable_frames(
     background: Background = "white",
     device: str | torch.device = "cpu",
 ) -> list[NDArray[np.uint8]]:
-    """Return pictures of a world from cameras on a circle around it.
+    """Return pictures, uint8, [R, R, 3] each, of a world from cameras on a circle around it.
 
     Args:
         views: Returns pictures of V cameras: colours times alpha, and alpha, [1, V, H, W, 4].
         frame_count: Number of pictures in one turn.
-        resolution: Pixels along each side.
+        resolution: Pixels R along each side.
         elevation: Angle of the cameras above the horizon [degrees].
         azimuth: Angle of the first camera around the vertical axis [degrees].
-        background: As of `to_uint8`.
+        background: A colour name, "#rrggbb", or red, green and blue in [0, 1].
         device: The world's device.
-
-    Returns:
-        Pixels, uint8, shape [R, R, 3] each; the first row is the top.
     """
     frame_count = checked_count("frame_count", frame_count)
     azimuth = checked_finite("azimuth", azimuth, " [degrees]")

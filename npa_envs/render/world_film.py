@@ -45,7 +45,7 @@ class WorldFilm:
     frames: list[Frame] = field(default_factory=list)
     captions: list[str] = field(default_factory=list)
     steps: dict[int, int] = field(default_factory=dict)
-    """Steps from the seed by index of frame, without frames that show fresh damage."""
+    """Steps since the initial world by index of frame, without frames just after damage."""
 
     def add(self, task: Task, worlds: Particles, step: int, damage: str = "") -> None:
         """Append a picture of one world, and its caption; `damage` tells what just damaged it."""
@@ -121,14 +121,10 @@ def film_world(
             film.add(task, worlds, step)
         for damage in damages:
             if damage.step == step < last:
-                x, s = damage_worlds(
-                    *worlds[:2],
-                    kind=damage.kind,
-                    size=damage.size,
-                    box=task.box,
-                    generator=generator,
+                worlds = damage_worlds(
+                    worlds, kind=damage.kind, size=damage.size, box=task.box, generator=generator
                 )
-                worlds = worlds._replace(x=x, s=task.with_target_code(s))
+                worlds = worlds._replace(s=task.with_target_code(worlds.s))
                 film.add(task, worlds, step, damage.text)
         if stop():
             break

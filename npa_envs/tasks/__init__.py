@@ -1,1 +1,1 @@
-"""Tasks: what to grow, from which seed, and how far it is from the goal."""
+"""Tasks: what to grow, from which initial worlds, and how far they are from the goal."""

@@ -6,6 +6,7 @@ adds those of tasks in which a ball of particles with zero states grows into a t
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Generic, NamedTuple, Self, TypeVar
 
@@ -16,7 +17,7 @@ from npa_envs.checks import check_fraction, check_non_negative, check_positive
 from npa_envs.errors import NPAError, shown
 from npa_envs.ops import Cameras, world_mean
 from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
-from npa_envs.tasks.damage import PoolDamage, damage_pool, escape_motion
+from npa_envs.tasks.damage import PoolDamage, damage_pool
 from npa_envs.tasks.gaussian_outputs import Gaussians
 from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.world.particles import Particles
@@ -82,8 +83,8 @@ class ParticleTask(Generic[ConfigT]):
     """A task: its worlds, untrained rule, loss, metric and pictures.
 
     A subclass defines where particles start (`places`), the loss (`compare`), a metric and a
-    picture; all else has defaults. In all methods x are positions [length units], shape [B, N, D],
-    and s states (dimensionless), shape [B, N, C].
+    picture; all else has defaults. `seed` returns initial worlds. In all methods x are positions
+    [length units], shape [B, N, D], and s states (dimensionless), shape [B, N, C].
 
     No method may synchronise with the device (no `.item()`, no branch on a tensor's value): the
     trainer captures `seed`, `damage` and `loss` in CUDA graphs and never reads a number back
@@ -106,7 +107,7 @@ class ParticleTask(Generic[ConfigT]):
     has_views: bool = False
     """Whether the task has `views`, `view_psnr` and `gaussians`: pictures from several cameras."""
 
-    has_judge: bool = False
+    has_texture_metric: bool = False
     """Whether `npa_envs.measure.texture_metric` compares pictures of the task."""
 
     classifies: bool = False
@@ -159,12 +160,9 @@ class ParticleTask(Generic[ConfigT]):
 
     @property
     def target_picture(self) -> Tensor:
-        """The picture to match, dimensionless, shape [R, R, 4].
+        """The picture to match, dimensionless, shape [R, R, 4]; AttributeError if there is none.
 
         Channels are red, green and blue, each summed over splats, and the density.
-
-        Raises:
-            AttributeError: The task has none.
         """
         if self._target_picture is None:
             raise AttributeError(f"{type(self).__name__} has no picture to match")
@@ -186,13 +184,13 @@ class ParticleTask(Generic[ConfigT]):
         return [self.make_rule(generator)]
 
     def places(self, world_count: int, generator: Randomness, device: torch.device) -> Tensor:
-        """Return start positions of particles in fresh worlds [length units], shape [B, N, D]."""
+        """Return the positions of particles in initial worlds [length units], shape [B, N, D]."""
         raise NotImplementedError
 
     def seed(
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
     ) -> Particles:
-        """Return fresh worlds with all states zero and without goals."""
+        """Return initial worlds, with all states zero and without goals."""
         x = self.places(world_count, generator, torch.device(device))
         return Particles(x, x.new_zeros(*x.shape[:2], self.config.state_dim))
 
@@ -246,6 +244,14 @@ class ParticleTask(Generic[ConfigT]):
             raise NPAError("the worlds' goals must be given first: task.with_goal(goal), int64 [B]")
         return self._goal
 
+    def process_mean(self, value: Tensor) -> Tensor:
+        """Return the mean of a tensor over all training processes: by default there is one."""
+        return value
+
+    def with_process_mean(self, mean: Callable[[Tensor], Tensor]) -> Self:
+        """Return the task of one of several training processes, with its `process_mean`."""
+        return self._with(process_mean=mean)
+
     def with_target_code(self, s: Tensor) -> Tensor:
         """Return states [B, N, C] whose first channels hold the code of the world's target again.
 
@@ -282,12 +288,9 @@ class ParticleTask(Generic[ConfigT]):
         return {"overflow": (self.config.overflow_weight, outside)}
 
     def loss(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the training loss of worlds after a rollout, shape [].
+        """Return the training loss of worlds after a rollout with path lengths, shape [].
 
         The second result has its terms by name, without weights, each of shape [].
-
-        Raises:
-            NPAError: The worlds lack path lengths, or these have another shape than [B, N].
         """
         path, expected = worlds.path_length, tuple(worlds.x.shape[:2])
         if path is None or path.shape != expected:
@@ -358,7 +361,7 @@ class GrowthConfig(PoolDamage, TaskConfig):
     """Largest displacement in one step, as a fraction of ε (dimensionless)."""
 
     seed_radius: float = 0.2
-    """Radius of the ball that the particles start in [length units]."""
+    """Radius of the ball around the origin that the particles start in [length units]."""
 
     motion_weight: float = 0.01
     """Weight of the path length Σ|Δx| of a rollout (per length unit)."""
@@ -409,7 +412,12 @@ class GrowthTask(ParticleTask[GrowthConfigT]):
         terms |= super().penalties(worlds)
         terms["bound"] = config.bound_weight, (bounded - bounded.clamp(-1.0, 1.0)).abs().mean()
         if config.escape_weight > 0.0:
-            terms["stray"] = config.escape_weight, escape_motion(bounded, distances_moved(worlds))
+            # As losses are averaged over processes, so is the number of particles.
+            outside = (bounded.detach().abs().amax(dim=-1) > 1.0).to(bounded.dtype)
+            count = self.process_mean(outside.sum())
+            path_length = (outside * distances_moved(worlds)).sum()
+            stray = path_length / torch.where(count > 0.0, count, 1.0)
+            terms["stray"] = config.escape_weight, stray
         return terms
 
     def bounded(self, x: Tensor) -> Tensor:

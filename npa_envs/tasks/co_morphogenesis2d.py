@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import torch
 from torch import Tensor
@@ -36,7 +36,7 @@ class CoMorphogenesis2DConfig:
     """The configuration of each species' task. All have the same eps, update_prob and state_dim."""
 
     distance: float = 0.0
-    """Distance between the centres of neighbouring seeds, on the x axis [length units]."""
+    """Distance between the centres of neighbouring species' start disks, on x [length units]."""
 
     def __post_init__(self) -> None:
         species = self.species if isinstance(self.species, tuple | list) else ()
@@ -105,7 +105,7 @@ class CoMorphogenesis2D(ParticleTask[Any]):
     def seed(
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
     ) -> Particles:
-        """Return fresh worlds: each species uniform in a disk of its own, all states zero."""
+        """Return initial worlds: each species uniform in its start disk, all states zero."""
         return together(
             [
                 _shifted(task.seed(world_count, generator=generator, device=device), centre)
@@ -114,16 +114,20 @@ class CoMorphogenesis2D(ParticleTask[Any]):
         )
 
     def damage(self, worlds: Particles, generator: Randomness) -> Particles:
-        """Return worlds after random damage of each species, independently."""
+        """Return worlds after random damage of each species."""
         species = zip(self.tasks, worlds.split(self.config.counts), strict=True)
         return together([task.damage(each, generator) for task, each in species])
+
+    def with_process_mean(self, mean: Callable[[Tensor], Tensor]) -> Self:
+        """Return the task whose species average over all training processes."""
+        return self._with(tasks=[task.with_process_mean(mean) for task in self.tasks])
 
     def loss(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the sum of the species' training losses, and terms of species k as "k.term"."""
         total = worlds.x.new_zeros(())
         terms: dict[str, Tensor] = {}
         for k, species in enumerate(worlds.split(self.config.counts)):
-            # Positions relative to the species' seed, around which its loss bounds them.
+            # Positions relative to the centre of the species, around which its loss bounds them.
             loss, species_terms = self.tasks[k].loss(_shifted(species, -self.config.centres[k]))
             total = total + loss
             terms |= {f"{k}.{name}": term for name, term in species_terms.items()}
@@ -147,15 +151,6 @@ class CoMorphogenesis2D(ParticleTask[Any]):
         x, s, *_ = together(targets)
         return self.picture(x, s)[0]
 
-    def metrics(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return the splat loss of each of K species in each world, shape [B, K]."""
-        species = zip(self.tasks, Particles(x, s).split(self.config.counts), strict=True)
-        return torch.stack([task.metric(each.x, each.s) for task, each in species], dim=1)
-
-    def metric(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return each world's mean splat loss of its species, shape [B]."""
-        return self.metrics(x, s).mean(dim=1)
-
 
 def _shifted(worlds: Particles, distance: float) -> Particles:
     """Return worlds moved along the x axis."""
@@ -169,7 +164,7 @@ def together(species: Sequence[Particles]) -> Particles:
 
 
 DISTANCE = 0.8
-"""Distance between the seeds' centres in every preset [length units]: the pictures overlap."""
+"""`distance` of every preset [length units]: the pictures overlap."""
 
 
 _RUNS: Mapping[str, Mapping[str, Any]] = {

@@ -5,9 +5,7 @@ No function reads a value back from the device, so all may be captured in a CUDA
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
-from contextvars import ContextVar
+from contextlib import suppress
 from dataclasses import dataclass
 
 import torch
@@ -45,7 +43,7 @@ class DamageEvent:
     """Damage of a world after a number of steps."""
 
     step: int
-    """Steps since the seed."""
+    """Steps since the initial world."""
 
     kind: str
     """One of `DAMAGE_SIZES`."""
@@ -60,14 +58,9 @@ class DamageEvent:
             check_positive(self, float, "size")
 
     @property
-    def extent(self) -> float:
-        """The size [length units]; if it is None, the usual one of the kind."""
-        return DAMAGE_SIZES[self.kind] if self.size is None else self.size
-
-    @property
     def text(self) -> str:
         """The damage in a few words, for captions."""
-        return f"{self.kind} {self.extent:g}"
+        return f"{self.kind} {DAMAGE_SIZES[self.kind] if self.size is None else self.size:g}"
 
     def __str__(self) -> str:
         """The text that `parse_damage` reads as this event."""
@@ -92,52 +85,45 @@ def parse_damage(text: str) -> DamageEvent:
 
 
 def damage_worlds(
-    x: Tensor,
-    s: Tensor,
+    worlds: Particles,
     *,
     kind: str,
     size: float | None = None,
     box: Sides = None,
     generator: Randomness | None = None,
-) -> tuple[Tensor, Tensor]:
-    """Damage worlds at a random position, or cut them through the middle at a random angle.
+) -> Particles:
+    """Return worlds damaged at a random position, or cut through the middle at a random angle.
 
     Args:
-        x: Particle positions [length units], shape [B, N, D].
-        s: Particle states (dimensionless), shape [B, N, C].
+        worlds: The worlds; fields other than x and s are returned as they are.
         kind: "wipe", "cut", "clump", or "noise" on every position.
         size: Radius, gap or standard deviation [length units]; None is the usual one.
         box: Sides of the periodic box [length units], across whose edges damage continues; None:
             open space. Positions may leave the box; the next step wraps them.
-        generator: Source of the random position, on the device of `x`; None is torch's own.
-
-    Returns:
-        The new positions, shape [B, N, D], and states, shape [B, N, C].
-
-    Raises:
-        NPAError: An unknown kind, a wrong shape or dtype, or a size that is negative or not finite.
+        generator: Source of the random position, on the worlds' device; None is torch's own.
     """
+    x, s, *_ = worlds
     check_damage(kind)
     check_world(x, s)
     check_generator(generator, x.device, x.shape[0])
-    extent = DAMAGE_SIZES[kind] if size is None else checked_number("size", size)
-    if not 0 <= extent <= torch.finfo(x.dtype).max:
-        raise NPAError(f"the size of a damage must be finite and at least 0, got {extent}: try 0.1")
+    size = DAMAGE_SIZES[kind] if size is None else checked_number("size", size)
+    if not 0 <= size <= torch.finfo(x.dtype).max:
+        raise NPAError(f"the size of a damage must be finite and at least 0, got {size}: try 0.1")
     if kind == "noise":
-        return x + extent * normal_draws(generator, x.shape, x), s
-    if kind == "cut":
+        x = x + size * normal_draws(generator, x.shape, x)
+    elif kind == "cut":
         normal = normal_draws(generator, (len(x), x.shape[2]), x)
-        return cut(x, s, centre=world_mean(x), normal=normal, gap=extent, box=box)
-    centre = random_particle(x, generator)
-    if kind == "clump":
-        return clump(x, s, centre=centre, radius=extent, factor=CLUMP_FACTOR, box=box)
-    return x, wipe_state(x, s, centre=centre, radius=extent, box=box)
+        x, s = cut(x, s, centre=world_mean(x), normal=normal, gap=size, box=box)
+    elif kind == "clump":
+        centre = random_particle(x, generator)
+        x, s = clump(x, s, centre=centre, radius=size, factor=CLUMP_FACTOR, box=box)
+    else:
+        s = wipe_state(x, s, centre=random_particle(x, generator), radius=size, box=box)
+    return worlds._replace(x=x, s=s)
 
 
 def random_particle(x: Tensor, generator: Randomness | None = None) -> Tensor:
     """Return the position of a random particle of each world [length units], shape [B, D]."""
-    check_world(x, x)
-    check_generator(generator, x.device, x.shape[0])
     chosen = drawn_indices(x.shape[1], x.shape[0], generator, x.device)
     return x.take_along_dim(chosen[:, None, None], dim=1).squeeze(1)
 
@@ -146,18 +132,15 @@ def random_particle(x: Tensor, generator: Randomness | None = None) -> Tensor:
 # it drift for ever, too slowly to notice in a picture. Training displaces some particles far out of
 # their worlds and penalises their paths, so that the rule learns to let them rest.
 
+CHANCE = 0.25
+"""Probability of a world to be clumped, to be cut, to lose a flake (dimensionless)."""
+
 NEAREST, FARTHEST = 2.0, 4.0
 """Range of distances from the origin to which particles are displaced [length units]."""
 
 
-def displace(x: Tensor, *, probability: float, generator: Randomness) -> Tensor:
-    """Return positions [B, N, D]; each particle is thrown out of the world with `probability`."""
-    drawn = uniform_draws(generator, (*x.shape[:2], 1), x)
-    return torch.where(drawn < probability, _outside(x, x.shape[1], generator), x)
-
-
-def tear_off(x: Tensor, *, radius: float, probability: float, generator: Randomness) -> Tensor:
-    """Return positions [B, N, D]; worlds lose a flake with `probability`.
+def tear_off(x: Tensor, *, radius: float, generator: Randomness) -> Tensor:
+    """Return positions [B, N, D]; a quarter of the worlds lose a flake.
 
     A flake is a ball around a random particle, of a random radius up to `radius` [length units]. It
     is thrown out of the world in one piece. Its particles perceive each other, and may drift on
@@ -165,7 +148,7 @@ def tear_off(x: Tensor, *, radius: float, probability: float, generator: Randomn
     """
     centre = random_particle(x, generator)
     draws = uniform_draws(generator, (len(x), 2), x)
-    flake_radius = torch.where(draws[:, :1] < probability, radius * draws[:, 1:], -1.0)
+    flake_radius = torch.where(draws[:, :1] < CHANCE, radius * draws[:, 1:], -1.0)
     torn = (x - centre[:, None]).norm(dim=-1) <= flake_radius
     return torch.where(torn[..., None], x + (_outside(x, 1, generator) - centre[:, None]), x)
 
@@ -177,40 +160,6 @@ def _outside(x: Tensor, count: int, generator: Randomness) -> Tensor:
     )
     length: Tensor = ball.norm(dim=-1, keepdim=True)
     return ball * ((NEAREST + (FARTHEST - NEAREST) * length) / length.clamp_min(1e-12))
-
-
-_counting: ContextVar[Callable[[Tensor], Tensor] | None] = ContextVar("counting", default=None)
-"""Averages a count over all processes; None: there is one process."""
-
-
-@contextmanager
-def counted_together(mean: Callable[[Tensor], Tensor]) -> Iterator[None]:
-    """Within the block `escape_motion` divides by the count of particles that `mean` returns.
-
-    `mean` averages a count over all processes.
-    """
-    before = _counting.set(mean)
-    try:
-        yield
-    finally:
-        _counting.reset(before)
-
-
-def escape_motion(x: Tensor, distances: Tensor) -> Tensor:
-    """Return the mean path length of the particles outside of [-1, 1]^D, shape [].
-
-    `distances` [B, N] are the path lengths. The mean of no particles is 0. Within
-    `counted_together` the mean of all processes' results is the mean over all their particles.
-    """
-    outside = (x.detach().abs().amax(dim=-1) > 1.0).to(x.dtype)
-    count, mean = outside.sum(), _counting.get()
-    # Averaged over R processes, it is 0 or at least 1 / R.
-    count = count if mean is None else mean(count)
-    return (outside * distances).sum() / torch.where(count > 0.0, count, 1.0)
-
-
-CHANCE = 0.25
-"""Probability of a world to be clumped, to be cut, to lose a flake (dimensionless)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -249,7 +198,7 @@ def damage_pool(worlds: Particles, damage: PoolDamage, *, generator: Randomness)
     x, s, *_ = worlds
 
     def chosen_worlds(probability: float) -> Tensor:
-        """Return 1 with this probability, else 0, for each of the B worlds in x, shape [B]."""
+        """Return a random 0 or 1 for each of the B worlds, 1 with this probability, shape [B]."""
         return (uniform_draws(generator, (len(x), 1), x)[:, 0] < probability).to(x.dtype)
 
     if damage.damage_radius > 0.0:
@@ -265,7 +214,8 @@ def damage_pool(worlds: Particles, damage: PoolDamage, *, generator: Randomness)
         hit = chosen_worlds(damage.cut_share)
         x, s = cut(x, s, centre=world_mean(x), normal=normal, gap=damage.cut_gap * hit)
     if damage.flake_radius > 0.0:
-        x = tear_off(x, radius=damage.flake_radius, probability=CHANCE, generator=generator)
+        x = tear_off(x, radius=damage.flake_radius, generator=generator)
     if damage.escape_share > 0.0:
-        x = displace(x, probability=damage.escape_share, generator=generator)
+        drawn = uniform_draws(generator, (*x.shape[:2], 1), x)
+        x = torch.where(drawn < damage.escape_share, _outside(x, x.shape[1], generator), x)
     return worlds._replace(x=x, s=s)

@@ -61,6 +61,8 @@ class ManyPictures(Morphogenesis2D):
     targets, and pictures are scaled so that each target's density is about 1.
     """
 
+    _codes: Codes | None = None
+
     def __init__(
         self, config: Morphogenesis2DConfig, *, device: str | torch.device = "cpu"
     ) -> None:
@@ -82,7 +84,6 @@ class ManyPictures(Morphogenesis2D):
         self._pixel_size = float(sizes.square().mean().sqrt())
         self._scales = (sizes / self._pixel_size).square().to(device)
         self.goal_count = len(named)
-        self._codes: Codes | None = None
         drawn = [
             self._splat(task.target.points[None], task.target.colours[None])[0] for task in alone
         ]
@@ -113,7 +114,7 @@ class ManyPictures(Morphogenesis2D):
     def seed(
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
     ) -> Particles:
-        """Return fresh worlds with random goals; particles have the targets' codes."""
+        """Return initial worlds with random goals; particles have the targets' codes."""
         x, s, *_ = super().seed(world_count, generator=generator, device=device)
         goal = drawn_indices(len(self.names), world_count, generator, torch.device(device))
         blank = s.new_zeros(*s.shape[:2], self.config.code_dim)

@@ -81,7 +81,7 @@ class Morphogenesis2DConfig(GrowthConfig):
     """Weight of the splat loss (dimensionless)."""
 
     colour_weight: float = 5.0
-    """Weight of the colour term against the density term inside the splat loss (dimensionless)."""
+    """Weight of the colour term relative to the density term of the splat loss (dimensionless)."""
 
     drift_weight: float = 0.0
     """Weight of the distance of worlds' centroids from the origin (per length unit)."""
@@ -95,9 +95,9 @@ class Morphogenesis2DConfig(GrowthConfig):
     too, where angles are tried."""
 
     seed_axis: float = 0.5
-    """Seeds of an equivariant rule have an axis: the first state rises linearly across the disk,
-    from minus this to this (dimensionless), along a random direction of each world, or along x
-    where `angles` is 0. 0: no axis."""
+    """Initial worlds of an equivariant rule have an axis: the first state rises linearly across the
+    disk, from minus this to this (dimensionless), along a random direction of each world, or along
+    x where `angles` is 0. 0: no axis."""
 
     seed_across: float = 0.0
     """The same for the second state, at right angles to that direction (dimensionless). 0: none."""
@@ -107,8 +107,8 @@ class Morphogenesis2DConfig(GrowthConfig):
 
     angles: int = 16
     """Evenly spaced angles at which an equivariant rule's worlds are compared first; four
-    refinements of four angles each follow, down to 1/39 of the first step. 0: no search; all seeds
-    point the same way, and worlds are compared upright."""
+    refinements of four angles each follow, down to 1/39 of the first step. 0: no search; all
+    initial worlds point the same way, and worlds are compared upright."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -128,7 +128,7 @@ class Morphogenesis2DConfig(GrowthConfig):
         upright = self.seed_across > 0.0 or (self.chiral and self.seed_axis > 0.0)
         if self.equivariant and self.angles == 0 and not upright:
             raise NPAError(
-                "angles=0 needs seeds that have a direction, got "
+                "angles=0 needs initial worlds that have a direction, got "
                 f"seed_axis={self.seed_axis}, seed_across={self.seed_across} and chiral="
                 f"{self.chiral}: set seed_across=0.5, or angles=16"
             )
@@ -169,6 +169,7 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
     """
 
     metric_name = "splat loss"
+    _code: Tensor | None = None
 
     def __init__(
         self,
@@ -186,13 +187,12 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
             )
         self.target = target.to(device)
         """The target picture as points."""
-        self._target_mean = self.target.points.mean(dim=0)
-        radius = float((self.target.points - self._target_mean).norm(dim=1).max())
-        self._radius = max(1.0, radius)
+        points, colours = self.target.points, self.target.colours
+        self._target_mean = points.mean(dim=0)
+        # Of the circle around the mean that contains the target at every angle.
+        self._radius = max(1.0, float((points - self._target_mean).norm(dim=1).max()))
         self._pixel_size = self.target.pixel_size
-        self._code: Tensor | None = None
-        points, colours = self.target.points[None], self.target.colours[None]
-        self._target_picture = self._splat(points, colours)[0]
+        self._target_picture = self._splat(points[None], colours[None])[0]
 
     def for_rule(self, rule: NPARule) -> Self:
         """Return the task whose worlds have the rule's code of the target in the first channels.
@@ -211,7 +211,7 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
     def seed(
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
     ) -> Particles:
-        """Return fresh worlds; with `division` one particle lives, at the origin.
+        """Return initial worlds; with `division` one particle lives, at the origin.
 
         With `equivariant` the first states rise along an axis (`seed_axis`, `seed_across`).
         """
@@ -253,9 +253,8 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
     def picture(self, x: Tensor, s: Tensor, *, centred: bool = True) -> Tensor:
         """Return each world's picture: sums of colours over splats, density; [B, R, R, 4].
 
-        Args:
-            centred: Move each world's mean to the target's, and rotate worlds of an equivariant
-                rule, as the loss does.
+        `centred`: each world's mean is moved to the target's, and worlds of an equivariant rule are
+        rotated, as the loss does.
         """
         colour = s[..., -3:] + COLOUR_OFFSET
         if centred:
@@ -273,9 +272,9 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
     def splat_errors(self, x: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return each pixel's density error and colour error, dimensionless, shape [B, R, R] each.
 
-        Both are |d| + d^2 of the difference d between the centred picture and the target's; the
-        colour error is averaged over the colours and weighted by exp(-(density error)), without
-        gradient. World k's errors are the same, bit for bit, in every batch.
+        Both are |d| + d² of the difference d between the centred picture and the target's; the
+        colour error is averaged over the colours and weighted by exp(−density error), without
+        gradient. They are the same, bit for bit, in every batch.
         """
         size = (self.picture(x, s) - self.target_picture.to(x)).abs()
         # Added one by one: the order of torch's own sums is not promised.
@@ -453,7 +452,7 @@ HALF_SEEDS: Mapping[str, Any] = {
     "damage_share": 1.0,
     "stillness_weight": 0.0,
 }
-"""AdamW, with a seed in every batch and no stillness loss: for several species
+"""AdamW, with an initial world in every batch and no stillness loss: for several species
 (docs/species.md)."""
 
 MORPHOGENESIS2D_PRESETS = presets_of(

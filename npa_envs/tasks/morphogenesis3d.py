@@ -132,14 +132,15 @@ GREY = 0.5
 class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
     """The task of arXiv 2601.16096 with its loss.
 
-    Particles are round, and the last three channels of their states are the colour. `for_rule`
-    returns the task that draws particles by the rule's read-out instead.
+    Particles are round, and the last three channels of their states are the colour. In the task
+    that `for_rule` returns, outputs of the rule's read-out network say how they look.
     """
 
     space_dim = 3
     metric_name = "view loss"
     has_views = True
     _resized_with = ("target",)
+    _rule: NPARule | None = None
 
     def __init__(
         self,
@@ -150,8 +151,6 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
     ) -> None:
         self.config = config = config or Morphogenesis3DConfig()
         side = config.resolution
-        with_similarity = config.ssim_weight > 0.0
-        self._similarity = MultiScaleSimilarity(side, device=device) if with_similarity else None
         if target is None:
             target = load_views(
                 config.target,
@@ -165,18 +164,19 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
                     f"views must have {side} x {side} pixels as config.resolution says, "
                     f"got {tuple(views.pictures.shape[1:])}: load them at that size"
                 )
-        visible = nearest_camera(target.held_out.cameras, SHOWN_FROM)
         self.target = target.to(device)
         """The views of the target."""
-        self._shown = some_views(self.target.held_out, torch.tensor([visible], device=device))
+        front = nearest_camera(target.held_out.cameras, SHOWN_FROM)
+        self._shown = some_views(self.target.held_out, torch.tensor([front], device=device))
         # The first row of a picture is the bottom.
         self._target_picture = self._shown.pictures[0].flip(0)
         self.schedule = ViewSchedule(len(target.training.pictures), config, device)
         """Views, blur and backgrounds of an iteration."""
-        self._rule: NPARule | None = None
+        with_similarity = config.ssim_weight > 0.0
+        self._similarity = MultiScaleSimilarity(side, device=device) if with_similarity else None
 
     def for_rule(self, rule: NPARule) -> Self:
-        """Return a task with this target that renders particles by a rule's read-out network."""
+        """Return a copy of the task that renders particles with outputs of a rule's read-out."""
         if rule.readout_dim not in (0, OUTPUTS):
             raise NPAError(
                 f"the rule must have a read-out of {OUTPUTS} outputs, or none, got readout_dim="
@@ -346,7 +346,7 @@ MORPHOGENESIS3D_PRESETS = presets_of(
         milestones=(2_000, 10_000),
         seed_interval=1,
     ),
-    # Half as many particles, which see as many neighbours; half of a batch are seeds:
+    # Half as many particles, which see as many neighbours; half of a batch are initial worlds:
     # docs/morphogenesis3d.md.
     best=TrainConfig(
         task=Morphogenesis3DConfig(

@@ -43,13 +43,13 @@ class PointClassificationConfig(TaskConfig):
     """Seed of the candidates for farthest-point sampling of the pictures."""
 
     rotation: float = 0.0
-    """Largest random rotation of fresh clouds, in either direction [degrees]."""
+    """Largest random rotation of initial clouds, in either direction [degrees]."""
 
     stretch: float = 0.0
-    """Largest random stretch and shear of fresh clouds (dimensionless)."""
+    """Largest random stretch and shear of initial clouds (dimensionless)."""
 
     jitter: float = 0.0
-    """Standard deviation of the noise on fresh clouds' coordinates [length units]."""
+    """Standard deviation of the noise on initial clouds' coordinates [length units]."""
 
     mutated_share: float = 0.0
     """Probability that a damaged world from the pool gets the positions and class of another cloud
@@ -91,16 +91,15 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
     """The classification task of arXiv 2601.16096.
 
     The goal of a world is its cloud's class. Class scores are the outputs of the rule's read-out;
-    without a read-out, they are the last channels of the states.
-
-    Args:
-        split: The clouds that worlds are made of; those of "test" are not augmented.
+    without a read-out, they are the last channels of the states. Clouds of the split "test" are not
+    augmented.
     """
 
     metric_name = "mean squared error to the class"
     trial_name = "share of particles that are wrong"
     classifies = True
     _resized_with = ("split",)
+    _rule: NPARule | None = None
 
     def __init__(
         self,
@@ -113,7 +112,6 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         self.split: Split = split
         """The clouds that worlds are made of, "train" or "test"."""
         self._device = torch.device(device)
-        self._rule: NPARule | None = None
         self.goal_count = config.class_count
         # There is no picture to match.
         side = config.resolution

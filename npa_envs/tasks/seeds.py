@@ -9,7 +9,13 @@ from npa_envs.checks import DTYPES, as_list, checked_count, checked_finite
 from npa_envs.devices import check_device
 from npa_envs.errors import NPAError, shown
 from npa_envs.ops.sort import MAX_INDEX
-from npa_envs.world.randomness import Randomness, WorldRandom, check_generator, uniform_draws
+from npa_envs.world.randomness import (
+    Randomness,
+    WorldRandom,
+    check_generator,
+    normal_draws,
+    uniform_draws,
+)
 
 
 def uniform_ball(
@@ -22,29 +28,24 @@ def uniform_ball(
     device: str | torch.device = "cpu",
     dtype: torch.dtype = torch.float32,
 ) -> Tensor:
-    """Return points uniform in a ball around the origin [length units], shape [B, N, D].
-
-    Args:
-        radius: Radius of the ball [length units].
-    """
-    device = check_device(device)
-    world_count = checked_count("world_count", world_count)
-    particle_count = checked_count("particle_count", particle_count)
+    """Return points uniform in a ball around the origin [length units], shape [B, N, D]."""
     space_dim = checked_count("space_dim", space_dim)
     if space_dim < 1:
         raise NPAError(f"space_dim must be at least 1, got {shown(space_dim)}: give 2 or 3")
     radius = checked_finite("radius", radius, " [length units]")
     if radius < 0.0:
         raise NPAError(f"radius must not be negative [length units], got {radius:g}")
-    _check_points(world_count * particle_count * space_dim, dtype)
-    check_generator(generator, device, world_count)
+    shape, like = _checked(world_count, particle_count, space_dim, generator, device, dtype)
+    direction = normal_draws(generator, shape, like)
     if isinstance(generator, WorldRandom):
-        return radius * _unit_ball_by_world(generator, particle_count, space_dim, dtype)
-    shape = (world_count, particle_count)
-    direction = torch.randn(*shape, space_dim, generator=generator, device=device, dtype=dtype)
+        # Added one by one and without a root of the distance: the same bits on every device.
+        squares = direction * direction
+        length = sum(squares.unbind(dim=-1), torch.zeros_like(squares[..., 0])).sqrt()
+        distance = generator.uniform(*shape[1:], dtype=dtype).amax(dim=-1)
+        return radius * (direction * (distance / length.clamp_min(1e-12))[..., None])
     # randn is never exactly zero in all coordinates in practice; the floor keeps 0 / 0 away.
     direction /= direction.norm(dim=-1, keepdim=True).clamp_min(1e-12)
-    distance = torch.rand(*shape, 1, generator=generator, device=device, dtype=dtype)
+    distance = uniform_draws(generator, (*shape[:2], 1), like)
     return radius * distance ** (1.0 / space_dim) * direction
 
 
@@ -62,19 +63,14 @@ def uniform_box(
     Args:
         box: Sides of the box [length units], one for each of D dimensions.
     """
-    device = check_device(device)
-    world_count = checked_count("world_count", world_count)
-    particle_count = checked_count("particle_count", particle_count)
     values = as_list(box)
     if not values:
         raise NPAError(
             f"box must hold a side for each dimension, got {shown(box)}: give (2.0, 2.0)"
         )
     sides = [checked_finite("a side of box", side, " [length units]") for side in values]
-    _check_points(world_count * particle_count * len(sides), dtype)
-    check_generator(generator, device, world_count)
-    like = torch.empty(0, device=device, dtype=dtype)
-    fraction = uniform_draws(generator, (world_count, particle_count, len(sides)), like)
+    shape, like = _checked(world_count, particle_count, len(sides), generator, device, dtype)
+    fraction = uniform_draws(generator, shape, like)
     return torch.stack([side * (fraction[..., d] - 0.5) for d, side in enumerate(sides)], dim=-1)
 
 
@@ -93,22 +89,25 @@ def drawn_worlds(x: Tensor, generator: Randomness, probability: float) -> Tensor
     return uniform_draws(generator, (len(x), 1), single)[:, 0] < probability
 
 
-def _check_points(number_count: int, dtype: torch.dtype) -> None:
+def _checked(
+    world_count: int,
+    particle_count: int,
+    space_dim: int,
+    generator: Randomness | None,
+    device: str | torch.device,
+    dtype: torch.dtype,
+) -> tuple[tuple[int, int, int], Tensor]:
+    """Return the shape of points, [B, N, D], and an empty tensor of their device and dtype."""
+    device = check_device(device)
+    world_count = checked_count("world_count", world_count)
+    particle_count = checked_count("particle_count", particle_count)
     if dtype not in DTYPES:
         raise NPAError(f"dtype must be torch.float32 or torch.float64, got {dtype}")
+    number_count = world_count * particle_count * space_dim
     if number_count > MAX_INDEX:
         raise NPAError(
             f"coordinates must be at most {MAX_INDEX} in one batch, got {shown(number_count)}: "
             "make fewer worlds or particles"
         )
-
-
-def _unit_ball_by_world(
-    generator: WorldRandom, particle_count: int, space_dim: int, dtype: torch.dtype
-) -> Tensor:
-    """Return points uniform in the unit ball, [B, N, D], same bits on every device and batch."""
-    direction = generator.normal(particle_count, space_dim, dtype=dtype)
-    squares = direction * direction
-    length = sum(squares.unbind(dim=-1), torch.zeros_like(squares[..., 0])).sqrt()
-    distance = generator.uniform(particle_count, space_dim, dtype=dtype).amax(dim=-1)
-    return direction * (distance / length.clamp_min(1e-12))[..., None]
+    check_generator(generator, device, world_count)
+    return (world_count, particle_count, space_dim), torch.empty(0, device=device, dtype=dtype)

@@ -131,7 +131,7 @@ DRAWINGS = 16
 class Texture(ParticleTask[TextureConfig]):
     """The texture task of arXiv 2601.16096, with its loss."""
 
-    has_judge = True
+    has_texture_metric = True
     _resized_with = ("target",)
 
     def __init__(
@@ -144,16 +144,14 @@ class Texture(ParticleTask[TextureConfig]):
         config = config or TextureConfig()
         if target is None:
             target = load_texture(
-                config.target,
-                resolution=config.resolution,
-                tiles=config.target_tiles,
-                device=device,
+                config.target, resolution=config.resolution, tiles=config.target_tiles
             )
         if target.picture.shape != (config.resolution, config.resolution, 4):
             raise NPAError(
                 f"target must have {config.resolution} x {config.resolution} pixels as "
                 f"config.resolution says, got {tuple(target.picture.shape)}: load it at that size"
             )
+        target = replace(target, picture=target.picture.to(device))
         if config.see_across:
             across = min(2.0 * target.gap * config.box_size, MAX_EPS, 0.5 * config.box_size)
             config = replace(config, see_across=False, eps=max(config.eps, across))
@@ -161,7 +159,7 @@ class Texture(ParticleTask[TextureConfig]):
         """The configuration; its ε may be raised by `see_across`."""
         self.target = target
         """The target texture."""
-        self._target_picture = target.picture.to(device)
+        self._target_picture = target.picture
         self.metric_name = config.loss
         # All particles together have the target's mean density.
         self._pixel_size = config.box_size * (target.coverage / config.particle_count) ** 0.5

@@ -19,6 +19,7 @@ from npa_envs.checks import (
     check_non_negative,
     check_positive,
     check_seed,
+    check_word,
     is_real,
     is_whole,
 )
@@ -64,8 +65,8 @@ class TrainConfig(Generic[TaskConfigT]):
     `rocket-8192`."""
 
     vary_eps: tuple[float, float] = (1.0, 1.0)
-    """Range of random factors on ε, log-uniform, one for each fresh world in open space. Instead of
-    ε, the start positions are divided by the factor, which is equivalent."""
+    """Range of random factors on ε, log-uniform, one for each initial world in open space. Instead
+    of ε, the start positions are divided by the factor, which is equivalent."""
 
     moment_inverse: MomentInverse = "threshold"
     """How the rule's state gradients are corrected: "threshold", the paper's, or "smooth"."""
@@ -108,14 +109,14 @@ class TrainConfig(Generic[TaskConfigT]):
     """The optimiser's weight decay."""
 
     seed_interval: int = 16
-    """Every this many batches, the first worlds of the batch are fresh seeds; 1: in every batch."""
+    """Every this many batches, the batch begins with initial worlds; 1: every batch."""
 
     fresh_share: float = 0.0
-    """Fraction of fresh seeds in a batch with seeds (`seed_interval`); at least one world. No
+    """Fraction of initial worlds in a batch with some (`seed_interval`); at least one world. No
     effect with `max_age_range`."""
 
     max_age_range: tuple[int, int] = (0, 0)
-    """Range of the lifetimes [steps] after which a world of the pool is replaced by a fresh seed,
+    """Range of the lifetimes [steps] after which a world of the pool is replaced by an initial one,
     or damaged and kept (`damage_and_keep_share`): shortest at the pool's first index, longest at
     its last, geometrically spaced between. A batch has one world from each of B equal sections of
     the pool, so it has young and old worlds. (0, 0): `seed_interval` instead."""
@@ -137,7 +138,7 @@ class TrainConfig(Generic[TaskConfigT]):
     particles that move most."""
 
     stillness_min_age: int = 512
-    """Steps since the seed, or since the damage before another lifetime, when a world is grown."""
+    """Age [steps], also since the damage before another lifetime, from which a world is grown."""
 
     damage_share: float = 1.0
     """Fraction in [0, 1] of the pool whose worlds are damaged in every batch, so that a rule learns
@@ -190,15 +191,13 @@ class TrainConfig(Generic[TaskConfigT]):
         check = partial(check_field, self)
         choices = {"optimiser": OptimiserName, "schedule": Schedule, "memory": Memory}
         choices |= {"moment_inverse": MomentInverse, "dtype": Literal["float32", "float64"]}
-        for name, words in choices.items():
-            value, allowed = getattr(self, name), get_args(words)
-            known = isinstance(value, str) and value in allowed
-            check(name, known, f"be one of {', '.join(allowed)}")
+        for name, literal in choices.items():
+            check_word(self, name, get_args(literal))
         fits = 1.0 <= self.stillness_power <= MAX_POWER
         rule = f"be at least 1 and at most {MAX_POWER:g}"
-        check("stillness_power", fits, rule, "1 for plain means")
+        check("stillness_power", fits, rule, "1 for arithmetic means")
         fits = self.damage_and_keep_share < 1.0
-        check("damage_and_keep_share", fits, "be below 1", "with 1 there would be no fresh seeds")
+        check("damage_and_keep_share", fits, "be below 1", "1 leaves no initial worlds")
         rule = "be the name of a rule or of a file, or '' for none"
         check("initial_rule", isinstance(self.initial_rule, str), rule)
         fits = _is_pair(self.steps, is_whole) and 1 <= self.steps[0] < self.steps[1]
@@ -206,10 +205,9 @@ class TrainConfig(Generic[TaskConfigT]):
         check("steps", fits, rule, "hi is exclusive, so exactly 32 steps are steps=(32, 33)")
         milestones, ages = self.milestones, self.max_age_range
         fits = isinstance(milestones, tuple) and all(map(is_whole, milestones))
-        check("milestones", fits, "be a tuple of whole numbers")
-        fits = list(milestones) == sorted({m for m in milestones if m >= 1})
-        rule, hint = "be positive and increasing", "for example milestones=(2000, 4000)"
-        check("milestones", fits, rule, hint)
+        fits = fits and list(milestones) == sorted({m for m in milestones if m >= 1})
+        rule = "be positive and increasing whole numbers in a tuple"
+        check("milestones", fits, rule, "for example milestones=(2000, 4000)")
         rule = f"be at most pool_size={self.pool_size} (batches are drawn without replacement)"
         fits, hint = self.world_count <= self.pool_size, f"set pool_size={self.world_count} or more"
         check("world_count", fits, rule, hint)
@@ -246,7 +244,7 @@ class TrainConfig(Generic[TaskConfigT]):
 
     @property
     def fresh_count(self) -> int:
-        """Number of fresh worlds in each batch that gets some: every `seed_interval`-th."""
+        """Number of initial worlds in each batch that gets some: every `seed_interval`-th."""
         return max(1, round(self.fresh_share * self.world_count))
 
     @property

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import torch
@@ -12,7 +12,6 @@ from torch import Tensor, nn
 
 from npa_envs.rule.rule import LIFE, fate_parameters
 from npa_envs.tasks.base import Task
-from npa_envs.tasks.damage import counted_together
 from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.process_group import registered
 from npa_envs.world.cuda_graph import GraphSequence, capture, host_call
@@ -33,6 +32,13 @@ def power_mean(values: Tensor, power: float) -> Tensor:
     # The gradient of a vector's norm is 0 at 0.
     norm: Tensor = torch.linalg.vector_norm(each, power, dim=1)
     return norm / math.pow(each.shape[1], 1.0 / power)
+
+
+def _process_mean(take_means: Callable[[Sequence[Tensor]], None], value: Tensor) -> Tensor:
+    """Return the mean of a tensor over all processes, computed between two graphs."""
+    mean = value.detach().clone()
+    host_call(lambda: take_means([mean]))
+    return mean
 
 
 class EagerIteration:
@@ -60,13 +66,14 @@ class EagerIteration:
         self.past_min_age = torch.zeros_like(worlds.x[:, 0, 0], dtype=torch.bool)
         """Worlds to which the stillness loss applies, bool, shape [B]."""
         self._config = config
-        self._take_means = take_means
         self._divides = bool(fate_parameters(rule))
         self._task = task
         with torch.no_grad():
             total, parts = self._loss(self.start.with_zero_paths())
         self.term_names: tuple[str, ...] = ("loss", *parts)
         """Names of `terms`."""
+        if take_means is not None:
+            self._task = task.with_process_mean(partial(_process_mean, take_means))
         self.terms = total.new_zeros(len(self.term_names))
         """The loss, followed by its named parts, shape [K]."""
         self.parameters = [p for p in rule.parameters() if p.requires_grad]
@@ -92,9 +99,7 @@ class EagerIteration:
             return_path_length=True,
             **self._task.rollout_options,
         )
-        single = self._take_means is None
-        with contextlib.nullcontext() if single else counted_together(self._mean):
-            total, parts = self._loss(end)
+        total, parts = self._loss(end)
         # Not backward(): its accumulation nodes remember the stream they were first used on,
         # which a capture on another stream must not touch.
         gradients = torch.autograd.grad(
@@ -105,13 +110,6 @@ class EagerIteration:
         self.terms.copy_(torch.stack([total, *parts.values()]).detach())
         kept = end._replace(path_length=None, goal=None).map(Tensor.detach)
         self.end._replace(goal=None).copy_(kept)
-
-    def _mean(self, value: Tensor) -> Tensor:
-        """Return the mean of a tensor over all processes, computed between two graphs."""
-        take_means, mean = self._take_means, value.detach().clone()
-        assert take_means is not None, "there are several processes"
-        host_call(lambda: take_means([mean]))
-        return mean
 
     def _loss(self, end: Particles) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the task's loss plus the stillness loss, and its terms by name."""

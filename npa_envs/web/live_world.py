@@ -200,8 +200,7 @@ class LiveWorld(ABC):
     def _shows(self) -> list[str]: ...
 
     def _damage(self, name: str) -> None:
-        x, s = damage_worlds(self.particles.x, self.particles.s, kind=name, box=self.box)
-        self.particles = self.particles._replace(x=x, s=s)
+        self.particles = damage_worlds(self.particles, kind=name, box=self.box)
 
     def _brush(self, touch: Touch) -> bool:
         """Apply a brush; return whether `describe` returns something else now."""

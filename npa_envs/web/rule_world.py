@@ -305,9 +305,9 @@ class RuleWorld(LiveWorld):
     @torch.no_grad()
     def _damage(self, name: str) -> None:
         if self.particles.x.shape[1]:
-            x, s, *_ = self.particles
-            x, s = damage_worlds(x, s, kind=name, box=self.box, generator=self._generator)
-            self.particles = self.particles._replace(x=x, s=self._all_coded(s))
+            options: Any = {"kind": name, "box": self.box, "generator": self._generator}
+            damaged = damage_worlds(self.particles, **options)
+            self.particles = damaged._replace(s=self._all_coded(damaged.s))
 
     @torch.no_grad()
     def _brush(self, touch: Touch) -> bool:

@@ -334,7 +334,7 @@ def test_a_world_is_paid_for_its_own_picture():
     assert set(asked) == {0, 1}
     for number, name in enumerate(TARGETS["train"]):
         target = load_target(name, point_count=400)
-        chosen = torch.linspace(0, target.point_count - 1, 400).round().long()
+        chosen = torch.linspace(0, len(target.points) - 1, 400).round().long()
         s = torch.zeros(12, 400, 16)
         s[..., -3:] = target.colours[chosen] - 0.5
         envs.unwrapped.place_particles(target.points[chosen].expand(12, -1, -1), s)

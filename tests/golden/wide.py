@@ -275,7 +275,8 @@ def brushed():
         results[word] = found | {"d": d}
     x, s = x.detach(), s.detach()
     for k, kind in enumerate(("wipe", "cut", "clump", "noise")):
-        results[f"damage{k}"] = damage_worlds(x, s, kind=kind, generator=WorldRandom([1, 2]))
+        worlds = damage_worlds(Particles(x, s), kind=kind, generator=WorldRandom([1, 2]))
+        results[f"damage{k}"] = worlds[:2]
     return results
 
 

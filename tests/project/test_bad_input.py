@@ -29,6 +29,7 @@ from npa_envs.tasks.texture import TextureConfig
 from npa_envs.training import preset, train
 from npa_envs.web.export import export_web
 from npa_envs.world.brushes import wipe_state
+from npa_envs.world.particles import Particles
 from npa_envs.wrappers import RowPolicy, TorchNormalizeReward
 
 X, X3, S = torch.zeros(1, 4, 2), torch.zeros(1, 4, 3), torch.zeros(1, 4, 16)
@@ -87,7 +88,7 @@ rolled = calls(rollout, NPARule(), x=X, s=S, steps=1)
 splatted = calls(splat, X, S[..., :3], resolution=8, pixel_size=0.2)
 camera = calls(orbit, 1, width=4, height=4)
 small = calls(gymnasium.make, "npa/Texture-v0", particle_count=16)
-damaged = calls(damage_worlds, X, S, kind="wipe")
+damaged = calls(damage_worlds, Particles(X, S), kind="wipe")
 crowd = multispecies_v0.parallel_env
 PROBLEM = Problem(env_id="npa/Morphogenesis2DSmall-v0", episode_steps=4)
 SPARSE, META = X.to_sparse(), X.to("meta")

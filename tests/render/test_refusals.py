@@ -1,4 +1,4 @@
-"""What pictures, films and windows refuse, and what they say."""
+"""What pictures, films and windows reject, and what they say."""
 
 import math
 from functools import partial

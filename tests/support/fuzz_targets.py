@@ -35,6 +35,7 @@ from npa_envs.tasks.targets.textures import load_texture
 from npa_envs.tasks.targets.views import load_views
 from npa_envs.training import TASKS, load_config, override, preset
 from npa_envs.training.task_table import config_to_dict
+from npa_envs.world.particles import Particles
 
 
 @dataclasses.dataclass(frozen=True)
@@ -151,6 +152,10 @@ def write_pictures(path: Any, frames: Any, fps: Any) -> None:
             write_png(target, frames)
         else:
             write_gif(target, frames, fps)
+
+
+def damage(x: Any, s: Any, **options: Any) -> Particles:
+    return damage_worlds(Particles(x, s), **options)
 
 
 def damaged(draw: random.Random) -> dict[str, Any]:
@@ -418,7 +423,7 @@ TARGETS: dict[str, Target] = {
     "write_gif and write_png": fixed(
         write_pictures, 2, path="a.gif", frames=[np.zeros((8, 6, 3), np.uint8)] * 2, fps=25
     ),
-    "damage_worlds": Target(damage_worlds, damaged, 2),
+    "damage_worlds": Target(damage, damaged, 2),
     "parse_damage": fixed(parse_damage, text="300:cut:0.1"),
     "uniform_ball": fixed(uniform_ball, world_count=2, particle_count=5, space_dim=2, radius=0.2),
     "uniform_box": fixed(uniform_box, world_count=2, particle_count=5, box=(1.0, 2.0)),

@@ -42,17 +42,11 @@ def world(request, device):
     return x.to(device), torch.randn(B, N, C, generator=g, dtype=dtype).to(device)
 
 
-def test_random_particle_is_one_of_its_own_world(world):
-    x, _ = world
-    chosen = damage.random_particle(x, torch.Generator(x.device).manual_seed(0))
-    for b in range(B):
-        assert (x[b] == chosen[b]).all(dim=-1).any()
-
-
 @pytest.mark.gpu
 def test_generator_of_another_device_is_a_clear_error():
+    x = torch.zeros(1, 4, 2, device="cuda")
     with pytest.raises(NPAError, match=r"generator must be on the worlds' device"):
-        damage.random_particle(torch.zeros(1, 4, 2, device="cuda"), torch.Generator())
+        damage_worlds(Particles(x, x), kind="wipe", generator=torch.Generator())
 
 
 def seeded(seed, device="cpu"):
@@ -109,10 +103,8 @@ def test_a_clump_is_one_point():
 
 @pytest.mark.parametrize("space_dim", [2, 3])
 def test_a_flake_leaves_as_it_is(space_dim):
-    x = worlds(60, space_dim).x
-    damaged = damage.tear_off(
-        x, radius=0.3, probability=0.5, generator=torch.Generator().manual_seed(3)
-    )
+    before = worlds(120, space_dim)
+    x, damaged = before.x, damage_pool(before, PoolDamage(flake_radius=0.3), generator=seeded(3)).x
     hit = changed(x, damaged)
     assert 15 <= int(hit.sum()) <= 45
     sizes = []
@@ -174,9 +166,9 @@ def test_damage_is_as_its_formula_says_and_continues_across_the_edges_of_a_box(
     assert int(inside.sum()) > 10
     assert int(across) > 2 or not boxed
     options = {"kind": kind, "size": size, "box": box, "generator": seeded(2, device)}
-    found_x, found_s = damage_worlds(x, s, **options)
-    torch.testing.assert_close(found_x, moved, rtol=1e-5, atol=1e-6)
-    assert torch.equal(found_s, states)
+    found = damage_worlds(Particles(x, s), **options)
+    torch.testing.assert_close(found.x, moved, rtol=1e-5, atol=1e-6)
+    assert torch.equal(found.s, states)
     if kind == "cut":
         blank = torch.zeros_like(centre)
         assert torch.equal(brushes.cut(x, s, centre=centre, normal=blank, gap=size)[0], x)
@@ -243,9 +235,7 @@ def test_whoever_damages_a_periodic_world_wipes_a_whole_disk(wiped):
 
 
 TINY = {"state_dim": 6, "hidden_dim": 24, "eps": 0.3, "resolution": 24, "particle_count": 96}
-SMALL = Morphogenesis2DConfig(
-    target="ring", target_point_count=96, escape_share=0.1, escape_weight=1.0, **TINY
-)
+SMALL = Morphogenesis2DConfig(target="ring", target_point_count=96, escape_weight=1.0, **TINY)
 
 
 @pytest.mark.parametrize("by_world", [False, True])
@@ -253,7 +243,7 @@ SMALL = Morphogenesis2DConfig(
 def test_as_many_are_thrown_out_as_was_said_and_on_all_sides(device, by_world, space_dim):
     x = torch.zeros(2, 4000, space_dim, device=device)
     random = WorldRandom([4, 5], device=device) if by_world else torch.Generator(device)
-    damaged = damage.displace(x, probability=0.25, generator=random)
+    damaged = damage_pool(Particles(x, x), PoolDamage(escape_share=0.25), generator=random).x
     distance = damaged.norm(dim=-1)
     out = distance > 0.0
     assert ((distance[out] >= NEAREST) & (distance[out] <= FARTHEST)).all()
@@ -264,28 +254,16 @@ def test_as_many_are_thrown_out_as_was_said_and_on_all_sides(device, by_world, s
 
 
 def test_only_the_paths_of_those_outside_count():
+    task, s = Morphogenesis2D(SMALL), torch.zeros(1, 3, 6)
     x = torch.tensor([[[0.5, 0.2], [1.5, 0.0], [0.0, -3.0]]])
     path = torch.tensor([[7.0, 1.0, 2.0]], requires_grad=True)
-    motion = damage.escape_motion(x, path)
-    assert float(motion.detach()) == 1.5
+    weight, motion = task.penalties(Particles(x, s, path))["stray"]
+    assert (weight, float(motion.detach())) == (1.0, 1.5)
     motion.backward()
     assert path.grad.tolist() == [[0.0, 0.5, 0.5]]
-    assert float(damage.escape_motion(x[:, :1], path[:, :1]).detach()) == 0.0
-
-
-def test_a_share_throws_particles_of_the_pool_out_and_a_weight_counts_their_paths():
-    task = Morphogenesis2D(SMALL)
-    generator = torch.Generator().manual_seed(1)
-    x, s, *_ = task.seed(2, generator=generator)
-    hurt_x, *_ = task.damage(Particles(x, s), generator)
-    out = hurt_x.norm(dim=-1) > 1.0
-    assert 0 < int(out.sum()) < 60
-    hurt = Particles(hurt_x, s, torch.ones(2, 96))
-    total, parts = task.loss(hurt)
-    plain, without = Morphogenesis2D(replace(SMALL, escape_weight=0.0)).loss(hurt)
-    assert float(parts["stray"]) == 1.0
-    assert "stray" not in without
-    assert float(total) == pytest.approx(float(plain) + 1.0)
+    inside = Particles(0.1 * x, s, path)
+    assert float(task.penalties(inside)["stray"][1].detach()) == 0.0
+    assert "stray" not in Morphogenesis2D(replace(SMALL, escape_weight=0.0)).penalties(inside)
 
 
 def test_the_distance_of_the_centroid_from_where_worlds_begin_is_paid_for():

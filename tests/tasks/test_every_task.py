@@ -27,7 +27,7 @@ VARIANTS = [
 
 @pytest.fixture
 def tiny(folder, tmp_path):
-    """Returns tiny runs of tasks, each in a folder of its own."""
+    """Returns tiny runs of tasks, each in its own folder."""
 
     def make(name, out="run", **fields):
         if name == "point_classification":
@@ -105,10 +105,10 @@ def test_gradients_equal_finite_differences(tiny, name, fields):
 def slope_of(task, x, s, k):
     """The slope of a world's loss by how strongly particle `k` is drawn, by differences."""
     if task.box:
-        # A twin in the same place adds to the colours and the density.
+        # A copy in the same place adds to the colours and the density.
         x, colours = x - x[:, :1], s[..., -3:] + 0.5
-        picture, twin = task.picture(x, s), task.splat(x[:, k : k + 1], colours[:, k : k + 1])
-        pictures = (picture + step * twin for step in (1e-7, -1e-7))
+        picture, copy = task.picture(x, s), task.splat(x[:, k : k + 1], colours[:, k : k + 1])
+        pictures = (picture + step * copy for step in (1e-7, -1e-7))
         ahead, behind = (task.weighted(*task.compare_pictures(each)) for each in pictures)
     else:
         look = task.gaussians(s)

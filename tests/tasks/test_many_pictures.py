@@ -64,7 +64,7 @@ def test_each_world_is_compared_with_its_own_target(device):
     worlds = [singles[k].target for k in goal.tolist()]
     for number, target in enumerate(worlds):
         x = target.points[None].expand(3, -1, -1)
-        s = torch.zeros(3, target.point_count, 8, device=device)
+        s = torch.zeros(3, len(target.points), 8, device=device)
         s[..., -3:] = target.colours - 0.5
         losses = aimed.metric(x, s)
         assert int(losses.argmin()) == number

@@ -1,6 +1,5 @@
-"""What tasks, targets, losses and damages refuse, and what they say then."""
+"""What tasks, targets, losses and damages reject, and what they say then."""
 
-import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +10,6 @@ import torch
 from npa_envs.errors import NPAError
 from npa_envs.measure.quality import picture_rows
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.damage import clump, cut, random_particle, wipe_state
 from npa_envs.tasks.losses.texture import TEXTURE_LOSSES, make_texture_loss
 from npa_envs.tasks.many_pictures import ManyPictures
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2DConfig
@@ -19,9 +17,10 @@ from npa_envs.tasks.morphogenesis3d import Morphogenesis3D, Morphogenesis3DConfi
 from npa_envs.tasks.point_classification import PointClassification, PointClassificationConfig
 from npa_envs.tasks.targets.digit_clouds import load_pictures
 from npa_envs.tasks.targets.picture_points import load_target
-from npa_envs.tasks.targets.textures import draw_pattern, load_texture
+from npa_envs.tasks.targets.textures import load_texture
 from npa_envs.tasks.targets.views import load_views
 from npa_envs.tasks.texture import Texture, TextureConfig
+from npa_envs.world.brushes import clump, cut, wipe_state
 
 PLANE, TEXTURE = Morphogenesis2DConfig, TextureConfig
 SPACE, POINTS = Morphogenesis3DConfig, PointClassificationConfig
@@ -40,7 +39,6 @@ TINY = replace(SMALL, resolution=12, ssim_weight=0.2)
         (TEXTURE, {"loss": "swd"}, "loss must be a texture loss that exists"),
         (TEXTURE, {"loss": "patch_ot+joint_sdw"}, "did you mean 'joint_swd'"),
         (TEXTURE, {"loss": "patch_ot+patch_swd"}, "summed must be joint ones.*joint_swd"),
-        (TEXTURE, {"loss": "patch_ot+"}, "must be a texture loss that exists"),
         (TEXTURE, {"loss": ["patch_ot"]}, r"loss that exists, got \['patch_ot'\]: known"),
         (TEXTURE, {"loss_seed": -1}, "loss_seed must be a whole number"),
         (TEXTURE, {"state_dim": 2}, "state_dim must be a whole number of at least 3"),
@@ -66,10 +64,9 @@ TINY = replace(SMALL, resolution=12, ssim_weight=0.2)
         (PLANE, {"equivariant": "yes"}, "equivariant must be True or False, got 'yes'"),
         (PLANE, TURNED | {"chiral": 1}, "chiral must be True or False, got 1"),
         (PLANE, TURNED | {"seed_axis": -1.0}, "seed_axis must be a finite number of at least 0"),
-        (PLANE, TURNED | {"seed_across": -1.0}, "seed_across must be a finite number of at least"),
         (PLANE, TURNED | {"angles": -1}, "angles must be a whole number of at least 0, got -1"),
         (PLANE, TURNED | {"angles": 3}, "angles must be 0 or at least 4, got 3"),
-        (PLANE, TURNED | {"angles": 0, "seed_axis": 0.0}, "angles=0 needs seeds that have a"),
+        (PLANE, TURNED | {"angles": 0, "seed_axis": 0.0}, "angles=0 needs initial worlds"),
         (PLANE, TURNED | {"angles": 0, "chiral": False}, "=0.0 and chiral=False: set seed_across="),
         (PLANE, TURNED | {"division": True}, "division goes neither with equivariant"),
         (PLANE, {"targets": ("ring",), "division": True}, "division goes neither with equivariant"),
@@ -94,52 +91,30 @@ def many(*targets, **fields):
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: random_particle(X[0]), r"add a world dimension with x\[None\]"),
-        (lambda: random_particle(X[:, :0]), "at least one particle"),
-        (lambda: random_particle(X.long()), r"x must be float32 or float64, got torch\.int64"),
         (lambda: wipe_state(X, S[:, :3], **AT), "x and s must agree in worlds and particles"),
-        (lambda: wipe_state(X, S, centre=PLACE[0], radius=0.1), r"= \(2, 2\), got \(2,\)"),
-        (
-            lambda: wipe_state(X, S, centre=PLACE.double(), radius=0.1),
-            r"centre and x must share dtype",
-        ),
         (lambda: wipe_state(X, S, centre=PLACE, radius=PLACE[0, :1]), r"or a tensor of .* \[B\]"),
         (lambda: cut(X, S, centre=PLACE, normal=torch.zeros(2, 3), gap=0.1), "normal must have"),
-        *(
-            (lambda r=r: clump(X, S, centre=PLACE, radius=r, factor=0.5), "radius must be finite")
-            for r in (-0.1, math.nan, math.inf)
-        ),
         (lambda: clump(X, S, **AT, factor=1.5), r"factor must be in \[0, 1\], got 1\.5"),
         *(
             (lambda n=n: load_target("heart", point_count=n), "point_count must be an int")
             for n in (0, -5, 2.5, True)
-        ),
-        *(
-            (lambda n=n: load_target("heart", extent=n), "extent must be finite")
-            for n in (0.0, -1.0, math.nan, math.inf)
         ),
         (lambda: load_target("gekco"), r"did you mean 'gecko'\?.*known: .*ring"),
         (lambda: load_target(""), "built-in name"),
         (lambda: load_target(7), "string or a Path, got int"),
         # A path is never a built-in name.
         (lambda: load_target(Path("gecko")), "does not exist"),
-        (lambda: load_target("nowhere.png"), "does not exist"),
         (lambda: load_target(Path(__file__).parent), "is a folder"),
         (lambda: load_texture("cels"), "did you mean 'cells'.*known: bubbles, cells, dots, drop"),
         (lambda: load_texture(""), "for example 'cells'"),
         (lambda: load_texture(3), "must be a built-in texture"),
         (lambda: load_texture("missing.png"), "does not exist"),
         (lambda: load_texture("cells", resolution=0), "resolution must be an integer of at least"),
-        (lambda: load_texture("cells", resolution=8.0), "resolution must be an integer of at le"),
-        (lambda: draw_pattern("dot", 8), "did you mean 'dots'"),
-        (lambda: draw_pattern("dots", 0), "at least 1 pixel"),
         (lambda: load_views("rocke"), "did you mean 'rocket'"),
         (lambda: load_views("there/is/none.glb"), "does not exist"),
         (lambda: load_views(""), "target must be a built-in mesh"),
-        (lambda: load_views(3), "target must be a built-in mesh"),
         (lambda: load_views("duck", resolution=0), "resolution must be an integer"),
         (lambda: load_pictures("digit"), "did you mean 'digits'"),
-        (lambda: load_pictures("digits", "half"), "split must be"),
         (lambda: many("heart", "hart"), "unknown|emoji"),
         (lambda: picture_rows(NINE, [None], seeds=(1,)), "pictures must be two or more, got 1"),
         (lambda: many(equivariant=True), "targets need a rule that knows directions"),

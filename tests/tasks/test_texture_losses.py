@@ -97,10 +97,6 @@ def noise(*shape, dtype=torch.float64, seed=0):
     return torch.rand(shape, generator=torch.Generator().manual_seed(seed), dtype=dtype)
 
 
-def seeded(task, world_count=1):
-    return task.seed(world_count, generator=torch.Generator().manual_seed(0))[:2]
-
-
 def rolled_patches(image, size):
     """Every patch of a torus as a row, in NumPy: channel, then row, then column."""
     reach = size // 2
@@ -296,7 +292,7 @@ def test_quantiles_resolve_a_distribution_as_finely_as_asked_for():
 def test_grey_starts_and_empty_places_have_finite_slopes(name):
     for fields in ({}, {"colour_weight": 0.0, "density_weight": 0.0}):
         task = Texture(replace(SMALL, loss=name, **fields))
-        x, s = seeded(task, 2)
+        x, s, *_ = task.seed(2, generator=torch.Generator().manual_seed(0))
         for positions in (x, torch.zeros_like(x)):
             leaves = positions.clone().requires_grad_(), s.clone().requires_grad_()
             loss, _ = task.loss(Particles(*leaves, torch.zeros(x.shape[:2])))
@@ -316,13 +312,6 @@ def test_worlds_may_be_of_another_precision_than_the_target(name, make_loss):
     # Worst error measured: 4e-7.
     torch.testing.assert_close(loss(images.float()).double(), values, rtol=1e-5, atol=0.0)
     assert torch.isfinite(slopes).all()
-    if name in JOINT:
-        task = Texture(replace(SMALL, loss=name))
-        x, s = seeded(task)
-        expected = task.metric(x, s).double()
-        torch.testing.assert_close(
-            task.metric(x.double(), s.double()), expected, rtol=1e-5, atol=0.0
-        )
 
 
 @pytest.mark.parametrize("name", JOINT)
@@ -416,10 +405,6 @@ def test_transport_and_moments_equal_plain_arithmetic():
     means = (a[0].mean(0) - b[0].mean(0)).abs().mean()
     covariances = (torch.cov(a[0].T) - torch.cov(b[0].T)).abs().mean()
     assert float(moment_distance(a, b)) == pytest.approx(float(means + covariances), rel=1e-12)
-    # The order of places does not matter.
-    shuffled = a[:, torch.randperm(7, generator=generator)]
-    assert float(relaxed_transport(shuffled, a)) < 1e-9
-    assert float(moment_distance(shuffled, a)) < 1e-14
 
 
 def test_gradients_of_vgg_lower_the_loss(make_loss):

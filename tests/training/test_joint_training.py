@@ -66,9 +66,6 @@ class TestTask:
         expected = {f"0.{k}": v.item() for k, v in first_parts.items()}
         expected |= {f"1.{k}": v.item() for k, v in second_parts.items()}
         assert {k: v.item() for k, v in parts.items()} == pytest.approx(expected, rel=1e-6)
-        metrics = task.metrics(x, s)
-        assert torch.equal(metrics[:, 1], task.tasks[1].metric(x[:, 48:], s[:, 48:]))
-        assert torch.equal(task.metric(x, s), metrics.mean(dim=1))
 
     def test_the_picture_shows_all_species_where_they_are(self, task):
         x, s, _ = worlds(task)

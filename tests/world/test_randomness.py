@@ -268,7 +268,6 @@ AS_MANY = "generator must have one stream for each world, B = 2, got 3"
     [
         (lambda: uniform_ball(2, 5, 2, 0.2, generator=THREE), AS_MANY),
         (lambda: npa_envs.rollout(RULE, PLACES, WORLD, 1, generator=THREE), AS_MANY),
-        (lambda: random_particle(PLACES, THREE), AS_MANY),
         (lambda: uniform_ball(10**5000, 5, 2, 0.2), "coordinates must be at most .*, got <int>"),
         (lambda: check_generator(WorldRandom(1), CUDA, 1), "device, cuda:1, got cpu: make it with"),
         (lambda: WorldRandom(-1), "a seed must be an integer of at least 0, got -1"),

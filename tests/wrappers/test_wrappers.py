@@ -25,8 +25,8 @@ from npa_envs.wrappers import (
 def test_an_event_is_written_as_it_is_read_and_has_the_usual_size_without_one():
     for text in ("100:cut", "0:wipe:0.25", "7:noise:0.01"):
         assert str(parse_damage(text)) == text
-    assert (parse_damage("5:clump").extent, parse_damage("5:clump").text) == (0.2, "clump 0.2")
-    assert DamageEvent(5, "clump", 0.3).extent == 0.3
+    assert parse_damage("5:clump").text == "clump 0.2"
+    assert DamageEvent(5, "clump", 0.3).text == "clump 0.3"
 
 
 def test_damage_comes_after_the_step_of_its_number_and_is_not_in_its_reward():

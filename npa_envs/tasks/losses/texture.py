@@ -123,10 +123,9 @@ class SlicedWasserstein(TextureDistance):
     At each image size it is the mean over the features of the squared 1D 2-Wasserstein distance
     between their distributions, divided by the target's variance; sizes are summed.
 
-    Args:
-        describe: Class of a descriptor. This maps images to F features at M positions, [B, M, F]
-            for each size. With `wrap` opposite edges are connected, else positions near them are
-            left out. With `thinned` there are at most `POSITIONS` along each side.
+    `describe` is the class of a descriptor: it maps images to F features at M positions, [B, M, F]
+    for each size. With `wrap` opposite edges are connected, else positions near them are left out.
+    With `thinned` there are at most `POSITIONS` along each side.
     """
 
     same_in_every_batch = True

@@ -9,7 +9,7 @@ import os
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -73,11 +73,11 @@ def load_clouds(
     device: torch.device,
 ) -> PointClouds:
     """Return a cloud of `particle_count` points for each picture of a data set; cached."""
-    pictures = load_pictures(data, split, folder=folder)
-    x, area = sample_ink(pictures.ink, particle_count, sample_seed=sample_seed, device=device)
-    height, width = pictures.ink.shape[1:]
+    ink, label = load_pictures(data, split, folder=folder)
+    x, area = sample_ink(ink, particle_count, sample_seed=sample_seed, device=device)
+    height, width = ink.shape[1:]
     coverage = area * (height * width / max(height, width) ** 2)
-    return PointClouds(x, torch.from_numpy(pictures.label).to(device), coverage)
+    return PointClouds(x, torch.from_numpy(label).to(device), coverage)
 
 
 def sample_ink(
@@ -212,21 +212,13 @@ IDX_NAMES = {
 MNIST_DOWNLOAD = "import torchvision; torchvision.datasets.MNIST({folder!r}, download=True)"
 
 
-@dataclass(frozen=True)
-class DigitPictures:
-    """Pictures with their classes."""
+def load_pictures(
+    data: str, split: Split = "train", *, folder: str = "data"
+) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """Return the ink of M pictures in [0, 1], [M, H, W], first row on top, and their classes [M].
 
-    ink: NDArray[np.float32]
-    """Amount of ink in [0, 1], shape [M, H, W]; the first row is the top."""
-
-    label: NDArray[np.int64]
-    """The class of each picture, 0 or more, shape [M]."""
-
-
-def load_pictures(data: str, split: Split = "train", *, folder: str = "data") -> DigitPictures:
-    """Return the pictures of a data set; no picture is in both splits."""
-    if split not in get_args(Split):
-        raise NPAError(f"split must be 'train' or 'test', got {shown(split)}")
+    No picture is in both splits.
+    """
     if data == "digits":
         return _digits(split)
     path = home_path(folder) / "MNIST" / "raw" if data == "mnist" else home_path(data)
@@ -240,15 +232,15 @@ def load_pictures(data: str, split: Split = "train", *, folder: str = "data") ->
             f"data must be a known data set or a folder of IDX files, got {shown(data)}: "
             f"{suggest(data, BUILT_IN)}"
         )
-    images, labels = (read_idx(_find(path, name)) for name in IDX_NAMES[split])
+    images, labels = (read_idx(_found(path, name)) for name in IDX_NAMES[split])
     if images.ndim != 3 or labels.shape != images.shape[:1] or images.size == 0:
         raise NPAError(
             f"the {split} files of {shown(str(path))} must hold pictures [M, H, W] and classes "
             f"[M], got {list(images.shape)} and {list(labels.shape)}: download them again"
         )
-    # By a table: the quotients themselves would take eight bytes a pixel.
+    # By a table: the quotients themselves would take eight bytes per pixel.
     ink = (np.arange(256) / 255.0).astype(np.float32)
-    return DigitPictures(ink[images], labels.astype(np.int64))
+    return ink[images], labels.astype(np.int64)
 
 
 def read_idx(path: Path) -> NDArray[np.uint8]:
@@ -259,7 +251,7 @@ def read_idx(path: Path) -> NDArray[np.uint8]:
             is_gzip = file.read(2) == b"\x1f\x8b"
             file.seek(0)
             unpacked = gzip.GzipFile(fileobj=file) if is_gzip else file
-            # Two zeros, 8 for unsigned bytes, the number of dimensions, then each as four bytes.
+            # Two zeros, 8 for unsigned bytes, the number of dimensions, then four bytes per size.
             head = unpacked.read(4)
             dimensions = head[3] if len(head) == 4 else 0
             sizes = unpacked.read(4 * dimensions)
@@ -287,7 +279,7 @@ def read_idx(path: Path) -> NDArray[np.uint8]:
     return values.reshape(shape)
 
 
-def _digits(split: Split) -> DigitPictures:
+def _digits(split: Split) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
     try:
         from sklearn.datasets import load_digits
     except ImportError as error:
@@ -303,10 +295,10 @@ def _digits(split: Split) -> DigitPictures:
         indices = random.permutation(np.flatnonzero(label == number))
         is_test[indices[: round(TEST_FRACTION * len(indices))]] = True
     chosen = is_test if split == "test" else ~is_test
-    return DigitPictures(np.asarray(bunch.images, np.float32)[chosen] / 16.0, label[chosen])
+    return np.asarray(bunch.images, np.float32)[chosen] / 16.0, label[chosen]
 
 
-def _find(folder: Path, name: str) -> Path:
+def _found(folder: Path, name: str) -> Path:
     for file in (folder / name, folder / f"{name}.gz"):
         if os.path.isfile(file):
             return file

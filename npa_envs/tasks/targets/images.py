@@ -73,7 +73,7 @@ def open_image(path: Path) -> Image.Image:
                 _check_area(opened.size, name)
                 return _to_rgba(ImageOps.exif_transpose(opened))
     except Image.DecompressionBombError as error:
-        raise NPAError(_too_large(name, "more")) from error
+        raise _too_large(name, "more") from error
     except UnidentifiedImageError as error:
         raise NPAError(
             f"target {name} must be a picture ({', '.join(FORMATS)}), "
@@ -102,13 +102,12 @@ def no_foreign_programs() -> Iterator[None]:
 
 def _check_area(size: tuple[int, int], name: str) -> None:
     if size[0] * size[1] > MAX_AREA:
-        raise NPAError(_too_large(name, f"{size[0]} x {size[1]}"))
+        raise _too_large(name, f"{size[0]} x {size[1]}")
 
 
-def _too_large(name: str, got: str) -> str:
-    return (
-        f"target {name} must have at most {MAX_AREA} pixels, got {got}: "
-        "scale the picture down first"
+def _too_large(name: str, got: str) -> NPAError:
+    return NPAError(
+        f"target {name} must have at most {MAX_AREA} pixels, got {got}: scale the picture down"
     )
 
 
@@ -271,24 +270,23 @@ def _connected_to_border(similar: Mask) -> Mask:
             return connected
 
 
+def _sums_of_nine(values: FloatImage) -> FloatImage:
+    """Return the sum of each pixel and its eight neighbours, [H, W, ...]; outside all is 0."""
+    padded = np.pad(values, [(1, 1), (1, 1), (0, 0)][: values.ndim])
+    rows = padded[:-2] + padded[1:-1] + padded[2:]
+    sums: FloatImage = rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:]
+    return sums
+
+
 def _unmix_edge(
     rgb: FloatImage, inside: Mask, background: FloatImage
 ) -> tuple[FloatImage, FloatImage]:
-    height, width = inside.shape
-    padded = np.pad(inside, 1)
-    shifts = [(r, c) for r in range(3) for c in range(3) if (r, c) != (1, 1)]
-    core = inside.copy()
-    for r, c in shifts:
-        core &= padded[r : r + height, c : c + width]
-    edge = inside & ~core
-    weight = np.pad(core, 1).astype(np.float32)
-    weighted = np.pad(rgb * core[..., None], ((1, 1), (1, 1), (0, 0)))
-    total, near = np.zeros_like(rgb), np.zeros(inside.shape, dtype=np.float32)
-    for r, c in shifts:
-        total += weighted[r : r + height, c : c + width]
-        near += weight[r : r + height, c : c + width]
+    """Return the object's colour and alpha, estimated for pixels at its edge."""
+    core = _sums_of_nine(inside.astype(np.float32)) == 9.0
+    near = _sums_of_nine(core.astype(np.float32))
+    total = _sums_of_nine(rgb * core[..., None])
     # The object's colour at an edge pixel is the mean of the inner pixels that touch it.
-    known = edge & (near > 0)
+    known = inside & ~core & (near > 0)
     colour, alpha = rgb.copy(), inside.astype(np.float32)
     inner = total[known] / near[known][:, None]
     contrast = np.linalg.norm(inner - background, axis=-1)

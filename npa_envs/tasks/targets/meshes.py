@@ -117,13 +117,13 @@ def _read_mesh(path: Path) -> Mesh:
             f"{len(vertices) - 1}, got {faces.min()} to {faces.max()}: save it again"
         )
     used = vertices[np.unique(faces)]
-    extent = float((used.max(axis=0) / 2 - used.min(axis=0) / 2).max()) * 2
-    if not _SIZES[0] <= extent <= _SIZES[1] or np.abs(used).max() > _SIZES[1]:
+    size = float((used.max(axis=0) / 2 - used.min(axis=0) / 2).max()) * 2
+    if not _SIZES[0] <= size <= _SIZES[1] or np.abs(used).max() > _SIZES[1]:
         raise NPAError(
             f"target {shown(str(path))} must lie within {_SIZES[1]:g} of the origin and be of a "
-            f"size of at least {_SIZES[0]:g}, got a size of {extent:.3g}: scale it"
+            f"size of at least {_SIZES[0]:g}, got a size of {size:.3g}: scale it"
         )
-    a, b, c = ((vertices[faces[:, k]] - used.min(axis=0)) / extent for k in range(3))
+    a, b, c = ((vertices[faces[:, k]] - used.min(axis=0)) / size for k in range(3))
     if np.linalg.norm(np.cross(b - a, c - a), axis=1).max() < _MIN_AREA:
         raise NPAError(
             f"target {shown(str(path))} must have a surface, but the corners of every triangle "

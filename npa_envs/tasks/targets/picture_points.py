@@ -14,7 +14,7 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from npa_envs.atomic_files import home_path
-from npa_envs.checks import check_count, is_real
+from npa_envs.checks import check_count
 from npa_envs.errors import MissingDependencyError, NPAError, shown, suggest
 from npa_envs.tasks.targets.images import (
     MAX_POINT_COUNT,
@@ -45,11 +45,6 @@ class PointTarget:
     """Distance h between neighbouring points [length units]."""
 
     @property
-    def point_count(self) -> int:
-        """Number of points M."""
-        return self.points.shape[0]
-
-    @property
     def mean_colour(self) -> Tensor:
         """Mean red, green and blue of the points (dimensionless), shape [3]."""
         return self.colours.mean(dim=0)
@@ -58,6 +53,10 @@ class PointTarget:
         """Return the same target with its tensors on another device."""
         return replace(self, points=self.points.to(device), colours=self.colours.to(device))
 
+
+SIDE = 1.8
+"""Side of the smallest square around the origin that contains a target [length units]; pictures
+show [-1, 1]²."""
 
 DRAWINGS = Path(__file__).resolve().parent / "drawings"
 """Folder of the built-in targets: RGBA pictures of 512 x 512 pixels, named as their targets."""
@@ -70,12 +69,7 @@ def builtin_targets() -> tuple[str, ...]:
 
 
 def load_target(
-    source: str | Path,
-    *,
-    point_count: int = 4096,
-    extent: float = 1.8,
-    keep_background: bool = False,
-    device: str | torch.device = "cpu",
+    source: str | Path, *, point_count: int = 4096, keep_background: bool = False
 ) -> PointTarget:
     """Make a target from a built-in name, a picture file or an emoji.
 
@@ -86,23 +80,13 @@ def load_target(
     Args:
         source: A name from `builtin_targets`, the path of a PNG, JPEG or WebP file, or one emoji.
         point_count: Number of points; the result may differ by a few, as the picture allows.
-        extent: Side of the smallest square around the origin, the mean of the points, that contains
-            the target [length units]. Pictures show [-1, 1]; the default leaves a margin of 0.1.
         keep_background: Use the picture's whole rectangle, white where it is transparent: for
             photographs.
-        device: Where the tensors are made.
 
     Raises:
-        NPAError: The name is unknown, the file is missing, unreadable, damaged or fully
-            transparent, it has neither transparency nor a plain background, it is too thin for so
-            few points, or a number is out of range.
         MissingDependencyError: An emoji is asked for, and no colour-emoji font is installed.
     """
     check_count("point_count", point_count, ": try 4096", at_most=MAX_POINT_COUNT)
-    if not is_real(extent) or extent <= 0:
-        raise NPAError(
-            f"extent must be finite and above 0 length units, got {shown(extent)}: try 1.8"
-        )
     if not isinstance(source, str | Path):
         raise NPAError(
             f"target must be a string or a Path, got {type(source).__name__}: "
@@ -123,20 +107,11 @@ def load_target(
         )
     if keep_background:
         image = with_background(image)
-    return target_from_image(
-        image, name=name, point_count=point_count, extent=extent, device=device
-    )
+    return target_from_image(image, name=name, point_count=point_count)
 
 
-def target_from_image(
-    image: Image.Image,
-    *,
-    name: str,
-    point_count: int = 4096,
-    extent: float = 1.8,
-    device: str | torch.device = "cpu",
-) -> PointTarget:
-    """Make a target from the opaque pixels of a picture; it fits into a square of side `extent`."""
+def target_from_image(image: Image.Image, *, name: str, point_count: int = 4096) -> PointTarget:
+    """Make a target from the opaque pixels of a picture."""
     rgba = image.convert("RGBA")
     require_opaque_pixels(rgba, label=name)
     pixels = np.array(resample(rgba, point_count, label=name))
@@ -144,12 +119,12 @@ def target_from_image(
     grid = np.stack([columns, -rows], axis=1).astype(np.float64)
     grid -= grid.mean(axis=0)
     # Half a pixel more on either side: a point represents a square of one pixel.
-    pixel_size = extent / (2 * float(np.abs(grid).max()) + 1)
+    pixel_size = SIDE / (2 * float(np.abs(grid).max()) + 1)
     colours = pixels[rows, columns, :3].astype(np.float32) / 255
     return PointTarget(
         name=name,
-        points=torch.tensor(grid * pixel_size, dtype=torch.float32, device=device),
-        colours=torch.tensor(colours, dtype=torch.float32, device=device),
+        points=torch.tensor(grid * pixel_size, dtype=torch.float32),
+        colours=torch.tensor(colours, dtype=torch.float32),
         pixel_size=pixel_size,
     )
 

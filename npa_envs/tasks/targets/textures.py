@@ -6,8 +6,10 @@ and alpha in [0, 1]; alpha is the target's density.
 
 from __future__ import annotations
 
+import functools
+import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
@@ -32,6 +34,9 @@ from npa_envs.tasks.targets.images import (
 
 Array = NDArray[np.floating[Any]]
 Pattern = Callable[[Array, Array, np.random.Generator], Array]
+
+Layers = Iterator[tuple[NDArray[np.bool_], Array | float]]
+"""Parts of a pattern with their colours, each over those before it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,11 +114,7 @@ def builtin_textures() -> tuple[str, ...]:
 
 
 def load_texture(
-    source: str | Path,
-    *,
-    resolution: int = 128,
-    tiles: bool = False,
-    device: str | torch.device = "cpu",
+    source: str | Path, *, resolution: int = 128, tiles: bool = False
 ) -> TextureTarget:
     """Make a target from a built-in name or a picture file.
 
@@ -125,11 +126,6 @@ def load_texture(
         source: A name from `builtin_textures`, or the path of a PNG, JPEG or WebP file.
         resolution: Pixels R along each side.
         tiles: Whether the opposite edges of a picture file fit together; built-in textures tile.
-        device: Where the tensor is made.
-
-    Raises:
-        NPAError: The name is unknown, the file is missing, unreadable, damaged, fully transparent
-            or smaller than 2 x 2 pixels, or the resolution is not positive.
     """
     if not isinstance(source, str | Path) or not str(source):
         raise NPAError(
@@ -138,8 +134,7 @@ def load_texture(
         )
     check_count("resolution", resolution, ": try 128", at_most=MAX_RESOLUTION)
     if isinstance(source, str) and source in PATTERNS:
-        drawn = draw_pattern(source, resolution)
-        return _target(source, drawn, True, device)
+        return _target(source, draw_pattern(source, resolution), True)
     path = home_path(source)
     if isinstance(source, str) and not looks_like_path(str(path)):
         raise NPAError(
@@ -156,11 +151,11 @@ def load_texture(
         )
     left, top = (image.width - side) // 2, (image.height - side) // 2
     square = image.crop((left, top, left + side, top + side))
-    return _target(path.stem, scaled_square(square, resolution)[::-1], tiles, device)
+    return _target(path.stem, scaled_square(square, resolution)[::-1], tiles)
 
 
-def _target(name: str, picture: Array, tiles: bool, device: str | torch.device) -> TextureTarget:
-    tensor = torch.tensor(np.ascontiguousarray(picture), dtype=torch.float32, device=device)
+def _target(name: str, picture: Array, tiles: bool) -> TextureTarget:
+    tensor = torch.tensor(np.ascontiguousarray(picture), dtype=torch.float32)
     return TextureTarget(name, tensor, tiles)
 
 
@@ -179,18 +174,13 @@ def draw_pattern(name: str, resolution: int, *, seed: int = 0) -> Array:
 
     The first row is the bottom. Pixel r is centred at (r + 1/2) / R.
     """
-    if name not in PATTERNS:
-        raise NPAError(f"unknown texture {shown(name)}: {suggest(name, PATTERNS)}")
-    if resolution < 1:
-        raise NPAError(f"resolution must be at least 1 pixel, got {resolution}: try 128")
     samples = resolution * OVERSAMPLING
     axis = (np.arange(samples) + 0.5) / samples
     strips = []
     rows = max(1, STRIP_SAMPLES // samples // OVERSAMPLING) * OVERSAMPLING
     for first in range(0, samples, rows):
         positions = np.meshgrid(axis, axis[first : first + rows])
-        # The same random numbers for each strip: scattered things are where they were in the
-        # others.
+        # The same random numbers for each strip: scattered shapes stay where they are.
         rgba = PATTERNS[name](*positions, np.random.default_rng(seed))
         rgba[..., :3] *= rgba[..., 3:]
         blocks = rgba.reshape(-1, OVERSAMPLING, resolution, OVERSAMPLING, 4)
@@ -203,25 +193,6 @@ def stripes(u: Array, v: Array, _: np.random.Generator) -> Array:
     phase = 3.0 * u + 2.0 * v + 0.12 * np.sin(2.0 * math.pi * (2.0 * u - 3.0 * v))
     bands = _colours("#1d3557", "#457b9d", "#f1faee", "#e63946")
     return _opaque(bands[np.floor(4.0 * phase).astype(int) % 4])
-
-
-def dots(u: Array, v: Array, _: np.random.Generator) -> Array:
-    """Rimmed dots of two sorts on a slanted lattice, nothing between them."""
-    # Two lattice vectors, (1/4, 0) and (1/8, 1/4), of which the sum of sorts is even or odd.
-    row, along = 4.0 * v, 4.0 * u - 2.0 * v
-    best = np.full(u.shape, np.inf)
-    sort = np.zeros(u.shape, dtype=int)
-    for dr in (0, 1):
-        for da in (-1, 0, 1):
-            j = np.floor(row) + dr
-            k = np.round(along) + da
-            distance = np.hypot((along - k + 0.5 * (row - j)) / 4.0, (row - j) / 4.0)
-            nearer = distance < best
-            best, sort = np.where(nearer, distance, best), np.where(nearer, (k % 2), sort)
-    inner = _colours("#f4a261", "#2a9d8f")[sort.astype(int)]
-    rim = _colours("#6b2d0c", "#0b3b3f")[sort.astype(int)]
-    colour = np.where((best < 0.062)[..., None], inner, rim)
-    return _with_alpha(colour, best < 0.09)
 
 
 def cells(u: Array, v: Array, random: np.random.Generator) -> Array:
@@ -237,7 +208,33 @@ def cells(u: Array, v: Array, random: np.random.Generator) -> Array:
     return _opaque(np.where(wall, _colours("#3d1f14"), colour * shine))
 
 
-def bubbles(u: Array, v: Array, random: np.random.Generator) -> Array:
+def _painted(layers: Callable[[Array, Array, np.random.Generator], Layers]) -> Pattern:
+    """Return the pattern that paints all layers, one over the other, on a transparent ground."""
+
+    @functools.wraps(layers)
+    def pattern(u: Array, v: Array, random: np.random.Generator) -> Array:
+        colour = np.zeros((*u.shape, 3))
+        covered = np.zeros(u.shape, dtype=bool)
+        for mask, tint in layers(u, v, random):
+            colour[mask] = tint
+            covered |= mask
+        return _with_alpha(colour, covered)
+
+    return pattern
+
+
+@_painted
+def dots(u: Array, v: Array, _: np.random.Generator) -> Layers:
+    """Rimmed dots of two sorts on a slanted lattice, nothing between them."""
+    inner, rim = _colours("#f4a261", "#2a9d8f"), _colours("#6b2d0c", "#0b3b3f")
+    for j, k in itertools.product(range(4), range(4)):
+        away = np.hypot(*_away(u, v, np.array((k / 4.0 + j / 8.0, j / 4.0))))
+        yield away < 0.09, rim[k % 2]
+        yield away < 0.062, inner[k % 2]
+
+
+@_painted
+def bubbles(u: Array, v: Array, random: np.random.Generator) -> Layers:
     """Rings of several sizes with a glint, nothing around them."""
     centres = _scattered(random, 12, 0.23)
     gaps = [
@@ -245,18 +242,13 @@ def bubbles(u: Array, v: Array, random: np.random.Generator) -> Array:
         for one in centres
     ]
     tints = _colours("#48cae4", "#0096c7", "#5e60ce", "#80ffdb")
-    colour = np.zeros((*u.shape, 3))
-    covered = np.zeros(u.shape, dtype=bool)
     for k, centre in enumerate(centres):
-        radius = 0.46 * gaps[k]
+        radius, tint = 0.46 * gaps[k], tints[k % len(tints)]
         away = np.hypot(*_away(u, v, centre))
-        body, rim = away < radius, (away > 0.72 * radius) & (away < radius)
-        glint = np.hypot(*_away(u, v, centre + radius * np.array([-0.3, 0.35]))) < 0.2 * radius
-        colour[body] = 0.45 + 0.55 * tints[k % len(tints)]
-        colour[rim] = 0.75 * tints[k % len(tints)]
-        colour[glint] = 1.0
-        covered |= body
-    return _with_alpha(colour, covered)
+        yield away < radius, 0.45 + 0.55 * tint
+        yield (away > 0.72 * radius) & (away < radius), 0.75 * tint
+        glint = np.hypot(*_away(u, v, centre + radius * np.array([-0.3, 0.35])))
+        yield glint < 0.2 * radius, 1.0
 
 
 def grid(u: Array, v: Array, _: np.random.Generator) -> Array:
@@ -288,29 +280,25 @@ def maze(u: Array, v: Array, random: np.random.Generator) -> Array:
     return _opaque(np.where((height > -0.2)[..., None], inside, ground))
 
 
-def hearts(u: Array, v: Array, _: np.random.Generator) -> Array:
+@_painted
+def hearts(u: Array, v: Array, _: np.random.Generator) -> Layers:
     """Upright hearts in rows, alternately red and pink, nothing between them."""
     centres = [((k + 0.5 * (j % 2)) / 4.0, j / 4.0) for j in range(4) for k in range(4)]
-    colour = np.zeros((*u.shape, 3))
-    covered = np.zeros(u.shape, dtype=bool)
     inner, rim = _colours("#e63946", "#ffafcc"), _colours("#8d0f20", "#d6407f")
     for number, centre in enumerate(centres):
         across, up = (offset / 0.084 for offset in _away(u, v, np.array(centre)))
         # Two round halves above a point.
         depth = across**2 + (1.15 * up - 0.25 - 0.72 * np.sqrt(np.abs(across))) ** 2
         depth = np.where(np.abs(across) < 1.5, depth, np.inf)
-        body, middle = depth < 1.1, depth < 0.62
-        colour[body], colour[middle] = rim[number % 2], inner[number % 2]
-        covered |= body
-    return _with_alpha(colour, covered)
+        yield depth < 1.1, rim[number % 2]
+        yield depth < 0.62, inner[number % 2]
 
 
-def droplets(u: Array, v: Array, random: np.random.Generator) -> Array:
+@_painted
+def droplets(u: Array, v: Array, random: np.random.Generator) -> Layers:
     """Slanted drops of three blues, dark at the rim, with a glint; transparent background."""
     centres = _scattered(random, 14, 0.21)
-    body_tints, rim_tints = _colours("#90e0ef", "#4895ef", "#3f37c9"), _colours("#03045e")
-    colour = np.zeros((*u.shape, 3))
-    covered = np.zeros(u.shape, dtype=bool)
+    rim, *inner = _colours("#03045e", "#90e0ef", "#4895ef", "#3f37c9")
     for number, centre in enumerate(centres):
         across, up = (offset / 0.068 for offset in _away(u, v, centre))
         across, up = 0.94 * across + 0.34 * up, 0.94 * up - 0.34 * across
@@ -318,21 +306,18 @@ def droplets(u: Array, v: Array, random: np.random.Generator) -> Array:
         taper = np.where(up > 0.0, np.clip(1.0 - up / 2.0, 0.0, 1.0) ** 0.9, 1.0)
         width = np.where(up > 0.0, taper, np.sqrt(np.clip(1.0 - up**2, 0.0, 1.0)))
         depth = np.abs(across) - width
-        body, middle = (depth < 0.0) & (up < 2.0) & (up > -1.0), depth < -0.27
-        middle &= (up > -0.78) & (up < 1.3)
-        glint = np.hypot(across + 0.3, up + 0.2) < 0.22
-        colour[body], colour[middle & body] = rim_tints[0], body_tints[number % 3]
-        colour[glint] = 1.0
-        covered |= body
-    return _with_alpha(colour, covered)
+        yield (depth < 0.0) & (up < 2.0) & (up > -1.0), rim
+        yield (depth < -0.27) & (up < 1.3) & (up > -0.78), inner[number % 3]
+        yield np.hypot(across + 0.3, up + 0.2) < 0.22, 1.0
 
 
-def stars(u: Array, v: Array, random: np.random.Generator) -> Array:
+@_painted
+def stars(u: Array, v: Array, random: np.random.Generator) -> Layers:
     """Five-pointed stars of two colours, turned and scattered, on a night-blue ground."""
     centres = _scattered(random, 13, 0.23)
     turns = random.random(len(centres)) * 0.8 - 0.4
     ground, *tints = _colours("#14213d", "#fca311", "#f1faee")
-    colour = np.broadcast_to(ground, (*u.shape, 3)).copy()
+    yield np.ones(u.shape, dtype=bool), ground
     for number, (centre, turn) in enumerate(zip(centres, turns, strict=True)):
         across, up = _away(u, v, centre)
         # The angle to the nearest of the five points, and the straight edge that lies there.
@@ -341,20 +326,12 @@ def stars(u: Array, v: Array, random: np.random.Generator) -> Array:
         angle = np.abs((np.arctan2(across, up) + turn + half) % fifth - half)
         below = np.sin(angle) * (1.0 - inner * math.cos(half))
         edge = inner * math.sin(half) / (below + np.cos(angle) * inner * math.sin(half))
-        colour[np.hypot(across, up) < 0.105 * edge] = tints[number % 2]
-    return _opaque(colour)
+        yield np.hypot(across, up) < 0.105 * edge, tints[number % 2]
 
 
 PATTERNS: dict[str, Pattern] = {
-    "bubbles": bubbles,
-    "cells": cells,
-    "dots": dots,
-    "droplets": droplets,
-    "grid": grid,
-    "hearts": hearts,
-    "maze": maze,
-    "stars": stars,
-    "stripes": stripes,
+    pattern.__name__: pattern
+    for pattern in (bubbles, cells, dots, droplets, grid, hearts, maze, stars, stripes)
 }
 """Every built-in texture by name."""
 

@@ -69,7 +69,6 @@ def load_views(
     resolution: int = 192,
     training_count: int = 48,
     held_out_count: int = 12,
-    device: str | torch.device = "cpu",
 ) -> ViewTarget:
     """Make a target from a built-in mesh, a mesh file, or a folder in the format of NeRF-synthetic.
 
@@ -82,11 +81,6 @@ def load_views(
         resolution: Pixels along each side of a view.
         training_count: Largest number of views to train with.
         held_out_count: Largest number of other views, for metrics.
-        device: Where the tensors are made.
-
-    Raises:
-        NPAError: The name is unknown, the file or folder is missing or damaged, or a number is not
-            positive.
     """
     if not isinstance(source, str | Path) or not str(source):
         raise NPAError(
@@ -104,9 +98,9 @@ def load_views(
         )
     folder = home_path(source)
     if os.path.isdir(folder):
-        return read_nerf(folder, resolution, training_count, held_out_count).to(device)
+        return read_nerf(folder, resolution, training_count, held_out_count)
     mesh = load_mesh(source)
-    return views_of_mesh(mesh, folder.stem, resolution, training_count, held_out_count).to(device)
+    return views_of_mesh(mesh, folder.stem, resolution, training_count, held_out_count)
 
 
 def views_of_mesh(
