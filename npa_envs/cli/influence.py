@@ -6,7 +6,7 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import torch
 import tyro
@@ -20,7 +20,7 @@ from npa_envs.measure.rule_interaction import (
     InteractionRecord,
     InteractionSettings,
     RuleUnderTest,
-    heat_map,
+    interaction_map,
 )
 from npa_envs.render import write_filmstrip
 from npa_envs.rule.files import load_rule, rule_digest, shipped_rules
@@ -28,14 +28,6 @@ from npa_envs.training.task_of_rule import task_of_rule
 
 TASK = "morphogenesis2d"
 """The task of all rules."""
-
-QUICK: dict[str, Any] = {
-    "seed_count": 2,
-    "distances": (0.0, 0.5),
-    "steps": 32,
-    "particle_count": 512,
-}
-"""Defaults of `--quick`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,15 +43,13 @@ class InfluenceOptions(common.RunOptions, InteractionSettings):
 
     Examples:
       npa-envs influence gecko heart
-      npa-envs influence --quick
+      npa-envs influence --particle-count 512 --steps 32
     """
 
     rules: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RULE")] = ()
     """Rules of 2D morphogenesis: shipped ones (`npa-envs list`) or files; default: all shipped."""
     itself: bool = True
     """Also pair each rule with itself."""
-    quick: bool = False
-    """Two rules, two seeds and distances, few particles and steps: only shows that it runs."""
     out: Path = Path("runs/influence")
     """Folder to write to; created where missing."""
 
@@ -67,12 +57,9 @@ class InfluenceOptions(common.RunOptions, InteractionSettings):
 def main(arguments: Sequence[str]) -> int:
     """Grow the pairs of rules that are not measured yet; write results and print their table."""
     options = common.parse_options(InfluenceOptions, "influence", arguments)
-    if options.quick:
-        defaults = InfluenceOptions(**QUICK)
-        options = common.parse_options(InfluenceOptions, "influence", arguments, default=defaults)
-    shipped = list(shipped_rules(TASK))[: 2 if options.quick else None]
-    sources = common.named_rules(options.rules or shipped)
-    rules = [_loaded(name, source, options.checked_device()) for name, source in sources.items()]
+    device = options.checked_device()
+    sources = common.named_rules(options.rules or shipped_rules(TASK))
+    rules = [_loaded(name, source, device) for name, source in sources.items()]
     pairs = [
         (first, second)
         for first, second in itertools.product(rules, rules)
@@ -104,7 +91,7 @@ def main(arguments: Sequence[str]) -> int:
     print(table_text(record.rows))
     print(f"wrote {record.path} and a filmstrip of each pair")
     path = folder / "interactions.png"
-    print("\n".join(write_plots(lambda: {"": heat_map(record.rows)}, path, "heat map")))
+    print("\n".join(write_plots(lambda: {"": interaction_map(record.rows)}, path, "heat map")))
     return 0
 
 

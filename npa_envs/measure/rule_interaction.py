@@ -21,7 +21,8 @@ from torch import Tensor
 from npa_envs.checks import check_field, check_positive
 from npa_envs.errors import NPAError
 from npa_envs.measure.benchmark_records import Record
-from npa_envs.measure.plots import draw_matrix, new_figure, png
+from npa_envs.measure.plots import heat_map
+from npa_envs.measure.quality import FIRST_SEED
 from npa_envs.ops import species_fields
 from npa_envs.render import draw_worlds
 from npa_envs.rule.rule import NPARule
@@ -30,9 +31,6 @@ from npa_envs.world.divergence import divergence
 from npa_envs.world.particles import Particles, combined
 from npa_envs.world.randomness import StreamId, WorldRandom
 from npa_envs.world.species import rollout_species
-
-FIRST_SEED = 1_000_000
-"""Seed of the first world."""
 
 MIXED = 0.25
 """Least mixing index of species that mix (dimensionless)."""
@@ -64,8 +62,8 @@ class InteractionSettings:
             check_positive(self, int, "particle_count", at_least=2)
         for name in ("distances", "eps_factors"):
             values = getattr(self, name)
-            legal = all(0.0 <= value < math.inf for value in values)
-            check_field(self, name, values and legal, "be finite and not negative, one or more", 1)
+            legal = len(values) > 0 and all(0.0 <= value < math.inf for value in values)
+            check_field(self, name, legal, "be finite and not negative, one or more")
         fractions = *self.ratios, self.margin
         if not (self.ratios and all(0.0 < value < 1.0 for value in fractions)):
             raise NPAError(
@@ -211,8 +209,8 @@ class Encounters:
             counts = count, self.particle_count - count
             key = first.name, count, factor
             if key not in self._alone:
-                *_, (_, *grown) = self._grow([first], counts[:1], 0.0, factor)
-                self._alone[key] = _loss_and_centroid(first, *grown)
+                *_, (_, worlds, diverged) = self._grow([first], counts[:1], 0.0, factor)
+                self._alone[key] = _loss_and_centroid(first, worlds, diverged)
             losses_alone, centroids_alone = self._alone[key]
             radius = "" if factor == 1.0 else f"eps x {factor:g}, "
             together = self._grow([first, second], counts, distance, factor)
@@ -308,31 +306,19 @@ class InteractionRecord(Record[InteractionRow]):
         return [InteractionRow(**row) for row in rows]
 
 
-MAX_CHANGE = 4.0
-"""Range of the colour map of changes: this, and its inverse."""
-
-
-def heat_map(rows: Sequence[InteractionRow]) -> bytes:
+def interaction_map(rows: Sequence[InteractionRow]) -> bytes:
     """Return a PNG with a matrix for each setting: changes of the loss of rules (rows) by others.
 
     Needs matplotlib.
     """
-    from matplotlib.colors import LogNorm
-
     names = list(dict.fromkeys([row.rule for row in rows] + [row.beside for row in rows]))
-    settings: dict[str, dict[tuple[str, str], InteractionRow]] = {}
+    cells: dict[str, dict[tuple[str, str], float]] = {}
     for row in rows:
         radius = "" if row.eps_factor == 1.0 else f", ε × {row.eps_factor:g}"
-        title = f"distance {row.distance:g}, ratio {row.ratio:g}{radius}"
-        settings.setdefault(title, {})[row.rule, row.beside] = row
-    height = (1.6 + 0.5 * len(names)) * len(settings)
-    figure, grid = new_figure(len(settings), 1, (2.6 + 0.6 * len(names), height))
-    norm = LogNorm(1.0 / MAX_CHANGE, MAX_CHANGE)
-    for (title, pairs), (panel,) in zip(settings.items(), grid, strict=True):
-        values: Any = [[getattr(pairs.get((a, b)), "change", None) for b in names] for a in names]
-        scale = draw_matrix(panel, names, names, values, colours="RdBu_r", norm=norm)
-        panel.set(xlabel="beside", ylabel="rule")
-        panel.set_title(f"loss together / alone\n{title}", fontsize=9)
-        bar = figure.colorbar(scale, ax=panel, ticks=[0.25, 0.5, 1.0, 2.0, 4.0], format="%g")
-        bar.minorticks_off()
-    return png(figure)
+        title = f"loss together / alone, distance {row.distance:g}, ratio {row.ratio:g}{radius}"
+        cells.setdefault(title, {})[row.rule, row.beside] = row.change
+    matrices = {
+        title: (names, names, [[changes.get((a, b)) for b in names] for a in names])
+        for title, changes in cells.items()
+    }
+    return heat_map(matrices, colours="RdBu_r", largest=4.0)

@@ -160,7 +160,7 @@ def test_a_heat_map_is_drawn_of_rows_with_gaps_and_infinities():
     row = interaction.InteractionRow("a", "b", 0.0, 0.5, 0.1, 0.2, 2.0, 0.1, 0.0, "disrupted")
     infinite = dataclasses.replace(row, rule="b", beside="a", change=math.inf)
     rows = [row, infinite, dataclasses.replace(row, distance=1.0, eps_factor=2.0)]
-    assert interaction.heat_map(rows).startswith(b"\x89PNG")
+    assert interaction.interaction_map(rows).startswith(b"\x89PNG")
 
 
 def test_rules_that_cannot_share_a_world_are_named():
@@ -264,13 +264,4 @@ def test_every_pair_is_measured_and_a_stopped_run_ends_as_one_that_was_not(
     assert "margin was 0.2, now 0.9: remove it, or choose another folder with" in error
     save(rules, two=5)
     assert main(words_of(rules, parts, *few)) == 2
-    assert "has figures of other settings: rules was" in capsys.readouterr().err
-
-
-def test_quick_leaves_what_was_said(rules, tmp_path):
-    words = ["--quick", "--steps", "3", "--seed-count", "1", "--distances", "0", "0.5", "1"]
-    assert main(words_of(rules, tmp_path, *words)) == 0
-    stored = record_in(tmp_path)["settings"]
-    # The last is the default, and was said all the same.
-    assert (stored["steps"], stored["seed_count"], stored["distances"]) == (3, 1, [0, 0.5, 1])
-    assert stored["particle_count"] == 512
+    assert "has results of other settings: rules was" in capsys.readouterr().err
