@@ -28,8 +28,6 @@ class BenchOptions(common.MeasureOptions):
     """How often each time is measured; tables show median and range."""
     out: Path | None = None
     """Folder for SUITE_DEVICE.json and plots; default: nothing is written."""
-    max_seconds: float | None = None
-    """Start no measurement after this time [s]; those done are written. Default: never."""
     plots: bool = False
     """Also draw plots into the output folder; needs the extra `bench`."""
     explain: bool = False

@@ -187,6 +187,8 @@ class MeasureOptions(RunOptions):
     """CPU threads of torch and the kernels in each run; they change times, not other results."""
     commit: str | None = None
     """The measured commit, for the record; default: that of the checkout."""
+    max_seconds: float | None = None
+    """Start no measurement after this time [s]; those done are kept. Default: never."""
 
 
 def check_numbers(options: Any, **least: int) -> None:

@@ -37,8 +37,6 @@ class RobustnessOptions(common.MeasureOptions):
     out: Path | None = None
     """Folder for robustness_RULE.json, robustness.md, and curves (extra `bench`); default: nothing
     is written."""
-    max_seconds: float | None = None
-    """Stop after this time [s]; the same command continues. Default: never."""
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -33,8 +33,6 @@ class StressOptions(common.MeasureOptions):
     only: tuple[str, ...] = ()
     """Groups (geometry, values, time, gradients, precision), checks (time/gecko), or beginnings of
     names (geometry/clump); default: all."""
-    max_seconds: float | None = None
-    """Start no check after this time [s]; the others are skipped, and run by the next call."""
     out: Path | None = None
     """Folder for stress_DEVICE.json and heat maps (extra `bench`); default: nothing is written."""
     list: bool = False

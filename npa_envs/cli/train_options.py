@@ -43,7 +43,7 @@ class TrainOptions(common.SharedRunOptions):
     progress: bool = True
     """Show a progress bar."""
     report: bool = True
-    """End with a report in the folder `out`: measured quality, a film and a card of the rule."""
+    """End with a report in the folder `out`: metrics, a film and a model card of the rule."""
 
 
 def resolve_task(task_name: str, arguments: Sequence[str]) -> list[str]:
