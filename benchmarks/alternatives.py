@@ -102,7 +102,7 @@ class Alternatives(TimingSession):
             if why is None:
                 yield precision
             else:
-                self.leave_out(precision.name, why)
+                self.left_out[precision.name] = why
 
     def usable_strategies(self, x: Tensor) -> Iterator[Strategy]:
         """Yield the strategies that have something to measure on worlds like `x`, [B, N, D]."""
@@ -113,7 +113,7 @@ class Alternatives(TimingSession):
             else:
                 number = str(x.dtype).removeprefix("torch.")
                 shape = f"{x.shape[2]}D ({x.shape[0]}, {x.shape[1]})"
-                self.leave_out(f"{strategy.name}, {number}, {shape}", why)
+                self.left_out[f"{strategy.name}, {number}, {shape}"] = why
 
 
 def accuracy(session: Alternatives) -> Tables:
@@ -173,7 +173,7 @@ def perception_rows(session: Alternatives, workload: Workload) -> list[Perceptio
     rows: list[PerceptionRow] = []
     for precision in session.usable_precisions():
         if not precision.reaches_perception:
-            session.leave_out(f"perception in {precision.name}", "only the rule's products differ")
+            session.left_out[f"perception in {precision.name}"] = "only the rule's products differ"
             continue
         places, states = x.to(precision.dtype), precision.kept(s.to(precision.dtype))
         for strategy in session.usable_strategies(places):
@@ -397,7 +397,7 @@ def rollout_rows(session: Alternatives, particle_count: int) -> list[RolloutRow]
     for precision in session.usable_precisions():
         for strategy in session.usable_strategies(grown.x.to(precision.dtype)):
             if session.small and strategy.name in SLOW:
-                session.leave_out(f"rollouts of {strategy.name}", "64 steps of it take too long")
+                session.left_out[f"rollouts of {strategy.name}"] = "64 steps of it take too long"
                 continue
             runner = Runner(strategy, precision, grown)
             task = _task_runner(session, strategy, precision, seed)
@@ -427,7 +427,7 @@ def _task_runner(
     slow = strategy.name in SLOW and particle_count > MAX_SLOW
     if slow or (strategy.name != "library" and (session.small or not session.cuda)):
         why = f"{TASK_STEPS} steps of {particle_count} particles take too long"
-        session.leave_out(f"PSNR of {strategy.name}", why)
+        session.left_out[f"PSNR of {strategy.name}"] = why
         return None
     return Runner(strategy, precision, seed)
 
@@ -503,14 +503,14 @@ def peer_rows(session: Alternatives, workload: Workload) -> list[PeerRow]:
     rows: list[PeerRow] = []
     for name, make in PEERS.items():
         if session.enough():
-            session.leave_out(name, NO_TIME)
+            session.left_out[name] = NO_TIME
             continue
         try:
             with quiet_warp():
                 calls = make(x, s, workload.eps)
                 rows += [_row(session, name, call, x, exact) for call in calls]
         except Exception as error:  # Whatever another library raises is a finding, not ours.
-            session.leave_out(name, f"{type(error).__name__}: {error}")
+            session.left_out[name] = f"{type(error).__name__}: {error}"
         session.progress(1)
     return rows
 

@@ -28,7 +28,7 @@ from side_by_side import iterate_together, on, stream_of
 
 from npa_envs.measure.benchmark_records import as_objects
 from npa_envs.measure.quality import evaluate
-from npa_envs.measure.texture_metric import JudgeRow, TextureJudge
+from npa_envs.measure.texture_metric import TextureMetric, TextureRow
 from npa_envs.render import to_uint8, write_filmstrip
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule
@@ -45,8 +45,8 @@ def measured(
     rule: NPARule, task: Texture, steps: Sequence[int], device: str, seeds: Sequence[int]
 ) -> tuple[dict[str, list[dict[str, Any]]], np.ndarray[Any, Any]]:
     """Return the rows of `npa-envs evaluate --judge`, and a picture of target and world."""
-    judge = TextureJudge(task)
-    judged: list[JudgeRow] = []
+    judge = TextureMetric(task)
+    judged: list[TextureRow] = []
     frames = [task.target_picture[None].cpu()]
 
     def watch(x: torch.Tensor, s: torch.Tensor, step: int) -> None:
@@ -155,7 +155,7 @@ def particles(arguments: argparse.Namespace) -> None:
                 optimiser.zero_grad()
                 total.backward()
                 optimiser.step()
-            found = TextureJudge(task).row(
+            found = TextureMetric(task).row(
                 (x.detach() + half) % (2.0 * half) - half, colour.detach(), 0
             )
             seconds = time.perf_counter() - begun

@@ -14,7 +14,7 @@ from npa_envs.errors import NPAError, suggest
 GROUPS = {
     "make": {
         "demo": "grow a shipped rule, damage it, let it heal; train a small one: a minute on a CPU",
-        "train": "train a rule on a task",
+        "train": "train a rule on a task, by the gradient of its loss",
         "sweep": "train with every combination of some options, over devices and machines",
         "search": "search for rules that differ from each other and stay alive; an archive of them",
     },
@@ -25,7 +25,7 @@ GROUPS = {
         "list": "list tasks, presets, environments, targets, losses and shipped rules",
     },
     "learn": {
-        "learn": "reinforcement learning of an environment, on one GPU or several",
+        "learn": "learn an environment by its rewards, on one GPU or several",
         "compare": "compare reinforcement learning, evolution and the gradient on equal tasks",
         "record-dataset": "write episodes of a policy as a Minari dataset",
     },
@@ -64,7 +64,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # Read when torch is loaded. On a busy machine, threads that wait in busy loops make every
     # operation several times as slow.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-    words = list(sys.argv[1:] if arguments is None else arguments)
+    # Not by `list`, which is the module of a command.
+    words = [*(sys.argv[1:] if arguments is None else arguments)]
     for stream in (sys.stdout, sys.stderr):
         # Terminals without UTF-8 show "?" for letters that are missing.
         if isinstance(stream, io.TextIOWrapper) and stream.encoding.lower() != "utf-8":
@@ -89,7 +90,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return USAGE_ERROR
 
 
-def _dispatch(arguments: list[str]) -> int:
+def _dispatch(arguments: Sequence[str]) -> int:
     if not arguments or arguments[0] in {"-h", "--help", "help"}:
         print(_help())
         return 0 if arguments else USAGE_ERROR
@@ -101,8 +102,8 @@ def _dispatch(arguments: list[str]) -> int:
     name, rest = arguments[0], arguments[1:]
     if name not in COMMANDS:
         raise NPAError(f"unknown command {name!r}: {suggest(name, COMMANDS)}")
-    module = {"list": "listing"}.get(name, name.replace("-", "_"))
-    return int(importlib.import_module(f"npa_envs.cli.{module}").main(rest))
+    module = importlib.import_module(f"npa_envs.cli.{name.replace('-', '_')}")
+    return int(module.main(rest))
 
 
 def _help() -> str:

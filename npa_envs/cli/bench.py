@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from npa_envs.cli import common
 from npa_envs.errors import NPAError
@@ -28,8 +28,6 @@ class BenchOptions(common.MeasureOptions):
     """How often each time is measured; tables show median and range."""
     out: Path | None = None
     """Folder for SUITE_DEVICE.json and plots; default: nothing is written."""
-    max_seconds: float | None = None
-    """Start no measurement after this time [s]; those done are written. Default: never."""
     plots: bool = False
     """Also draw plots into the output folder; needs the extra `bench`."""
     explain: bool = False
@@ -72,13 +70,16 @@ def main(arguments: Sequence[str]) -> int:
 
         from npa_envs.measure.speed.explain import explain
 
-        sizes = (options.space_dim, options.world_count, options.particle_count, 1)
         workload = timing.Workload(
-            *sizes, state_dim=options.state_dim, update_prob=options.update_prob
+            options.space_dim,
+            options.world_count,
+            options.particle_count,
+            steps=1,
+            state_dim=options.state_dim,
+            update_prob=options.update_prob,
         )
-        dtype = getattr(torch, options.dtype)
-        kwargs: dict[str, Any] = {"periodic": options.periodic, "gradients": options.gradients}
-        print(explain(workload, device, dtype, **kwargs))
+        dtype, gradients = getattr(torch, options.dtype), options.gradients
+        print(explain(workload, device, dtype, periodic=options.periodic, gradients=gradients))
         return 0
     folder = None if options.out is None else common.writable_folder(options.out)
     if options.plots:

@@ -116,7 +116,7 @@ def named_rules(arguments: Iterable[str]) -> dict[str, str]:
         name = name_of(source)
         if sources.setdefault(name, source) != source:
             raise NPAError(
-                f"rules must have names of their own, but {sources[name]!r} and {source!r} are "
+                f"rules must have different names, but {sources[name]!r} and {source!r} are "
                 f"both called {name!r}: rename a file or folder, or measure them one by one, each "
                 "with its own --out"
             )
@@ -187,6 +187,8 @@ class MeasureOptions(RunOptions):
     """CPU threads of torch and the kernels in each run; they change times, not other results."""
     commit: str | None = None
     """The measured commit, for the record; default: that of the checkout."""
+    max_seconds: float | None = None
+    """Start no measurement after this time [s]; those done are kept. Default: never."""
 
 
 def check_numbers(options: Any, **least: int) -> None:
@@ -288,20 +290,16 @@ def torch_threads(count: int) -> Iterator[None]:
 @contextlib.contextmanager
 def progress_bar(
     total: int | None, *, show: bool, unit: str = "step"
-) -> Iterator[Callable[[int], None]]:
+) -> Iterator[Callable[[int], Any]]:
     """Show a progress bar; yield a function that is called with the steps since its last call."""
     with tqdm(total=total, disable=not show, unit=unit) as bar:
-
-        def advance(steps: int) -> None:
-            bar.update(steps)
-
-        yield advance
+        yield bar.update
 
 
 @contextlib.contextmanager
 def measuring(
     options: Any, total: int | None, unit: str = "step"
-) -> Iterator[Callable[[int], None]]:
+) -> Iterator[Callable[[int], Any]]:
     """Show a progress bar and use `options.threads` CPU threads within a `with` block."""
     with (
         progress_bar(total, show=options.progress, unit=unit) as advance,

@@ -97,7 +97,7 @@ def main(arguments: Sequence[str]) -> int:
     sys.path.insert(0, str(Path.cwd()))
     plan = make_plan(options)
     folder = common.writable_folder(options.out)
-    # Read before any run, so that a record of other settings is refused at once.
+    # Read before any run, so that a record of other settings is rejected at once.
     records = held_records(plan, folder)
     if options.suite is not None:
         check_rows(SUITES[options.suite], plan, folder / ROWS)
@@ -174,7 +174,7 @@ def make_plan(options: CompareOptions) -> ComparisonPlan:
     if suite:
         for name in changed_options.keys() - own.keys():
             raise NPAError(
-                f"options of {name!r} are frozen in {options.suite}: give it a name of its own, "
+                f"options of {name!r} are frozen in {options.suite}: give it another name, "
                 f"--methods my_{name}={name} --options my_{name}.NAME=VALUE"
             )
         problems = {name: suite.problem_of(name) for name in tasks}

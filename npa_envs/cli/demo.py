@@ -15,6 +15,9 @@ from npa_envs.errors import NPAError
 if TYPE_CHECKING:
     import torch
 
+RULE = "gecko"
+"""The shipped rule that grows."""
+
 GROW_STEPS, HEAL_STEPS, FRAME_STEPS = 512, 384, 8
 
 SMALL_RUN: dict[str, Any] = {
@@ -45,14 +48,10 @@ class DemoOptions(common.RunOptions):
 
     out: Path = Path("demo")
     """Folder to write to; created where missing."""
-    rule: str = "gecko"
-    """The rule to grow: a shipped one, a file, or the folder of a run."""
     target: str = "heart"
     """The picture to train on: a built-in name, an emoji or a path."""
     train_seconds: float = 30.0
     """Time for the training [s]."""
-    seed: int = 0
-    """Seed of all random numbers."""
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -85,13 +84,12 @@ def grow_and_heal(options: DemoOptions, device: torch.device) -> Iterator[str]:
     from npa_envs.tasks.damage import DamageEvent
     from npa_envs.training.task_of_rule import task_of_rule
 
-    rule = load_rule(options.rule, device=device).float()
-    trained = task_of_rule(options.rule, rule, device)
-    generator = torch.Generator(device).manual_seed(options.seed)
-    worlds = trained.task.seed(1, generator=generator, device=device)
-    task = trained.task.with_goal(worlds.goal)
-    yield f"{options.rule}: {worlds.x.shape[1]} particles, {rule.weight_count} weights"
-    figures, film, step = [], WorldFilm(), 0
+    rule = load_rule(RULE, device=device).float()
+    task = task_of_rule(RULE, rule, device).task
+    generator = torch.Generator(device).manual_seed(0)
+    worlds = task.seed(1, generator=generator, device=device)
+    yield f"{RULE}: {worlds.x.shape[1]} particles, {rule.weight_count} weights"
+    results, film, step = [], WorldFilm(), 0
     with common.progress_bar(GROW_STEPS + 2 * HEAL_STEPS, show=options.progress) as advance:
         for kind, steps in ((None, GROW_STEPS), ("cut", HEAL_STEPS), ("wipe", HEAL_STEPS)):
             damages = [] if kind is None else [DamageEvent(step, kind)]
@@ -101,11 +99,10 @@ def grow_and_heal(options: DemoOptions, device: torch.device) -> Iterator[str]:
             )  # fmt: skip
             step += steps
             text = "grown" if kind is None else f"healed after {damages[0].text}"
-            result = trained.why_not_measurable or measure(task, worlds.x, worlds.s, step).figures
-            figures.append(f"  {text} for {steps} steps: {result}")
-    yield from figures
-    name = Path(options.rule.rpartition("#")[2]).stem
-    yield from (f"  wrote {path}" for path in film.write(options.out, name))
+            result = measure(task, worlds.x, worlds.s, step).summary
+            results.append(f"  {text} for {steps} steps: {result}")
+    yield from results
+    yield from (f"  wrote {path}" for path in film.write(options.out, RULE))
 
 
 def train_small(options: DemoOptions, device: torch.device) -> Iterator[str]:
@@ -121,7 +118,6 @@ def train_small(options: DemoOptions, device: torch.device) -> Iterator[str]:
     config = preset(
         "fast",
         target=options.target,
-        seed=options.seed,
         device=options.device,
         out=options.out / "training",
         # A run as short as this one learns most from seeds.
@@ -131,22 +127,19 @@ def train_small(options: DemoOptions, device: torch.device) -> Iterator[str]:
     yield f"training on {options.target}: {config.task.particle_count} particles"
     start = time.perf_counter()
     result = train(
-        config,
-        overwrite=True,
-        progress=options.progress,
-        max_seconds=options.train_seconds,
+        config, overwrite=True, progress=options.progress, max_seconds=options.train_seconds
     )
     if result.interrupted:
         raise KeyboardInterrupt
     yield f"  {result.iteration} iterations in {time.perf_counter() - start:.1f} s"
-    # Figures and film have more pixels than the loss.
+    # Metrics and film have more pixels than the loss.
     task = task_entry("morphogenesis2d").make(override(config, resolution=192).task, device)
-    generator = torch.Generator(device).manual_seed(options.seed + 1)
+    generator = torch.Generator(device).manual_seed(1)
     worlds = task.seed(1, generator=generator, device=device)
     steps = 4 * config.steps[1]
     path = RunFolder(result.folder).rule
     rule = load_rule(path, device=device)
     worlds, film = film_world(rule, task, worlds, steps, generator=generator, every=1)
-    yield f"  grown for {steps} steps: {measure(task, worlds.x, worlds.s, steps).figures}"
+    yield f"  grown for {steps} steps: {measure(task, worlds.x, worlds.s, steps).summary}"
     paths = film.write(options.out, f"trained-{Path(options.target).stem}")
     yield from (f"  wrote {path}" for path in (*paths, path))

@@ -8,7 +8,7 @@ import platform
 import re
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -73,17 +73,18 @@ def examine() -> list[DoctorLine]:
     return lines
 
 
-def _numbers(version: str) -> tuple[int, ...]:
-    return tuple(int(part) for part in re.findall(r"\d+", version.partition("+")[0])[:3])
-
-
-def _packages() -> list[DoctorLine]:
-    """Return lines on this package, each package that it requires, and each of its extras."""
+def _packages() -> Iterator[DoctorLine]:
+    """Yield lines on this package, each package that it requires, and each of its extras."""
     try:
-        lines = [DoctorLine("npa-envs", importlib.metadata.version("npa-envs"))]
+        yield DoctorLine("npa-envs", importlib.metadata.version("npa-envs"))
     except importlib.metadata.PackageNotFoundError:
         text = "not installed, imported from a folder"
-        return [DoctorLine("npa-envs", text, "pip install -e . in the clone", optional=True)]
+        yield DoctorLine("npa-envs", text, "pip install -e . in the clone", optional=True)
+        return
+
+    def numbers(version: str) -> list[int]:
+        return [int(part) for part in re.findall(r"\d+", version.partition("+")[0])[:3]]
+
     extras: dict[str, list[str]] = {}
     for line in importlib.metadata.requires("npa-envs") or []:
         name, oldest, extra = (
@@ -92,30 +93,30 @@ def _packages() -> list[DoctorLine]:
         )
         try:
             version = importlib.metadata.version(name)
-            fault = f"{version} is older than {oldest}"
-            fault = fault if _numbers(version) < _numbers(oldest) else ""
+            old = numbers(version) < numbers(oldest)
+            fault = f"{version} is older than {oldest}" if old else ""
         except importlib.metadata.PackageNotFoundError:
             version, fault = "", "not installed"
         if extra in EXTRAS:
             extras.setdefault(extra, []).extend([f"{name} {fault}"] if fault else [])
         elif not extra:
             fix = f"pip install -U '{name}>={oldest}'" if fault else None
-            lines.append(DoctorLine(name, fault or version, fix))
+            yield DoctorLine(name, fault or version, fix)
     for extra, faults in extras.items():
         fix = f"pip install 'npa-envs[{extra}]'" if faults else None
-        lines.append(DoctorLine(f"[{extra}]", ", ".join(faults) or "installed", fix, True))
-    return lines
+        yield DoctorLine(f"[{extra}]", ", ".join(faults) or "installed", fix, True)
 
 
-def _torch_devices() -> list[DoctorLine]:
+def _torch_devices() -> Iterator[DoctorLine]:
     import torch
 
     cores, threads = os.cpu_count() or 1, torch.get_num_threads()
     idle = cores >= 4 and threads < cores // 2
     fix = "more is faster for large worlds: set OMP_NUM_THREADS, or leave it out" if idle else None
-    lines = [DoctorLine("cpu", f"{threads} threads of {cores} cores", fix, optional=True)]
+    yield DoctorLine("cpu", f"{threads} threads of {cores} cores", fix, optional=True)
     if not torch.cuda.is_available():
-        return [*lines, _no_cuda(torch.version.cuda)]
+        yield _no_cuda(torch.version.cuda)
+        return
     for index in range(torch.cuda.device_count()):
         gpu = torch.cuda.get_device_properties(index)
         text = (
@@ -124,8 +125,7 @@ def _torch_devices() -> list[DoctorLine]:
         )
         fix = "slow: the faster kernels need compute capability 8.0 (Ampere) or newer"
         slow = (gpu.major, gpu.minor) < (8, 0)
-        lines.append(DoctorLine(f"cuda:{index}", text, fix if slow else None, optional=True))
-    return lines
+        yield DoctorLine(f"cuda:{index}", text, fix if slow else None, optional=True)
 
 
 def _no_cuda(built: str | None) -> DoctorLine:
@@ -154,7 +154,7 @@ def _no_cuda(built: str | None) -> DoctorLine:
     return DoctorLine("cuda", f"{name} is idle: {why}", fix)
 
 
-def _warp_devices() -> list[DoctorLine]:
+def _warp_devices() -> Iterator[DoctorLine]:
     import torch
 
     from npa_envs.runtime import warp_devices
@@ -162,36 +162,36 @@ def _warp_devices() -> list[DoctorLine]:
     devices = warp_devices()
     missing = torch.cuda.is_available() and not any(name.startswith("cuda") for name in devices)
     fix = "torch finds a CUDA device and Warp does not: install a newer NVIDIA driver"
-    return [DoctorLine("warp devices", "; ".join(devices), fix if missing else None)]
+    yield DoctorLine("warp devices", "; ".join(devices), fix if missing else None)
 
 
-def _kernel_cache() -> list[DoctorLine]:
+def _kernel_cache() -> Iterator[DoctorLine]:
     from npa_envs.runtime import kernel_cache_folder
 
     folder = kernel_cache_folder()
     if not os.access(folder, os.W_OK):
         fix = "each run would compile all kernels: set WARP_CACHE_PATH to a folder of yours"
-        return [DoctorLine("kernel cache", f"{folder} (cannot be written to)", fix)]
+        yield DoctorLine("kernel cache", f"{folder} (cannot be written to)", fix)
+        return
     count = len(list(folder.glob("wp_npa_envs*")))
     compiled = f"{folder} ({count} modules of npa-envs)"
     fix = "the first use of each kernel compiles it; npa-envs warmup does so now"
-    return [DoctorLine("kernel cache", compiled, None if count else fix, optional=True)]
+    yield DoctorLine("kernel cache", compiled, None if count else fix, optional=True)
 
 
-def _films_and_screen() -> list[DoctorLine]:
+def _films_and_screen() -> Iterator[DoctorLine]:
     try:
         import imageio_ffmpeg
 
-        ffmpeg = DoctorLine("ffmpeg", imageio_ffmpeg.get_ffmpeg_exe())
+        yield DoctorLine("ffmpeg", imageio_ffmpeg.get_ffmpeg_exe())
     except (ImportError, RuntimeError) as error:
-        ffmpeg = DoctorLine("ffmpeg", f"not found ({error})", "pip install -U 'imageio[ffmpeg]'")
+        yield DoctorLine("ffmpeg", f"not found ({error})", "pip install -U 'imageio[ffmpeg]'")
     screen = has_screen()
     fix = (
         "for npa-envs view: run ssh -L 8765:127.0.0.1:8765 THIS-COMPUTER on a computer that has "
         "one, and open the printed link there"
     )
-    text = "found" if screen else "none"
-    return [ffmpeg, DoctorLine("screen", text, None if screen else fix, optional=True)]
+    yield DoctorLine("screen", "found" if screen else "none", None if screen else fix, True)
 
 
 def has_screen() -> bool:

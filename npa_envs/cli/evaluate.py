@@ -34,14 +34,12 @@ class EvaluateOptions(common.RuleOptions):
     8, 16, 24, 32, 64, 128."""
     seed_count: int = 8
     """Worlds to measure, each from a different seed; for point clouds all test clouds."""
-    first_seed: int = 1_000_000
-    """Seed of the first world; training uses others."""
     healing: bool = False
     """Also damage the grown worlds by a cut and a wipe, and measure how they heal. Point clouds are
     always damaged."""
     judge: bool = False
-    """Textures only: also measure three distances from the target that no loss uses, as ratios: 1
-    is the distance of the target drawn by particles."""
+    """Textures only: also measure the texture metric: three distances from the target that no loss
+    uses, as ratios: 1 is the distance of the target drawn by particles."""
     json: Path | None = None
     """Also write the tables to this JSON file."""
 
@@ -52,7 +50,7 @@ def main(arguments: Sequence[str]) -> int:
     from npa_envs.atomic_files import write_text
     from npa_envs.measure import quality
     from npa_envs.measure.benchmark_records import UNMEASURED, table_text, tables_json
-    from npa_envs.measure.texture_metric import TextureJudge
+    from npa_envs.measure.texture_metric import TextureMetric
     from npa_envs.rule.files import load_rule
     from npa_envs.training.task_of_rule import task_of_rule, tasks_of_codes
 
@@ -61,7 +59,7 @@ def main(arguments: Sequence[str]) -> int:
     common.check_numbers(options, seed_count=1)
     device = options.checked_device()
     rule = load_rule(options.rule, device=device).float()
-    seeds = range(options.first_seed, options.first_seed + options.seed_count)
+    seeds = range(quality.FIRST_SEED, quality.FIRST_SEED + options.seed_count)
     kwargs: dict[str, Any] = {"seeds": seeds, "device": device}
     tables: dict[str, Sequence[Any]]
     if rule.codes is not None and options.target is None:
@@ -88,7 +86,7 @@ def main(arguments: Sequence[str]) -> int:
                 "give --target, a built-in name or a picture"
             )
         kwargs["checkpoints"] = options.checkpoints
-        kwargs["judge"] = TextureJudge(task) if options.judge else None
+        kwargs["texture_metric"] = TextureMetric(task) if options.judge else None
         kwargs["changed"] = task.classifies or options.healing
         total = None if kwargs["changed"] else max(checkpoints)
         with common.progress_bar(total, show=options.progress) as advance:

@@ -26,6 +26,9 @@ NUM_ENVS = 16
 class LearnOptions(common.SharedRunOptions, common.RunOptions):
     """Learn an environment by reinforcement learning, and write the run to a folder.
 
+    It learns from rewards, in any environment; `npa-envs train` trains rules on a task by the
+    gradient of its loss through the rollout, which needs far fewer steps.
+
     Each point of the learning curve prints a line and writes a checkpoint. A run that was stopped
     by SIGTERM, Ctrl-C or a kill continues with `--resume`, on any number of processes.
 

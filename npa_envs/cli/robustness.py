@@ -32,18 +32,11 @@ class RobustnessOptions(common.MeasureOptions):
     or folders of runs; default: all shipped ones, or one of each task when quick."""
     seed_count: int | None = None
     """Worlds of each condition, each from its own seed; default: 8, or 2 when quick."""
-    first_seed: int = 1_000_000
-    """The first seed; training uses others."""
-    most_particles: int | None = None
-    """Conditions with more particles in all seeds' worlds together are left out; default: 131072 on
-    a CPU, 2097152 on CUDA."""
     quick: bool = False
     """Small worlds, few steps and values: a test that it runs, at most a minute on two cores."""
     out: Path | None = None
     """Folder for robustness_RULE.json, robustness.md, and curves (extra `bench`); default: nothing
     is written."""
-    max_seconds: float | None = None
-    """Stop after this time [s]; the same command continues. Default: never."""
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -53,11 +46,12 @@ def main(arguments: Sequence[str]) -> int:
     from npa_envs.measure.accuracy.trained_rule_checks import task_name
     from npa_envs.measure.benchmark_records import command_text, measured_facts, time_limit
     from npa_envs.measure.plots import write_plots
+    from npa_envs.measure.quality import FIRST_SEED
     from npa_envs.measure.robustness import report
     from npa_envs.measure.robustness.trials import PLANS, RuleTrial, quick_plan
     from npa_envs.rule.files import load_rule, rule_digest, shipped_rules
 
-    common.check_numbers(options, seed_count=1, first_seed=0, most_particles=1, threads=1)
+    common.check_numbers(options, seed_count=1, threads=1)
     enough = time_limit(options.max_seconds)
     sources = common.named_rules(options.rules or shipped_rules())
     names = list(sources)
@@ -65,15 +59,12 @@ def main(arguments: Sequence[str]) -> int:
         # One of each task.
         names = list({task_name(name): name for name in reversed(names)}.values())[::-1]
     device = options.checked_device()
-    max_particles = options.most_particles or report.MAX_PARTICLES[device.type]
     count = options.seed_count or (QUICK_SEEDS if options.quick else 8)
-    seeds = range(options.first_seed, options.first_seed + count)
-    facts = measured_facts(
-        device, options.commit, quick=options.quick, seeds=list(seeds), most_particles=max_particles
-    )
+    seeds = range(FIRST_SEED, FIRST_SEED + count)
+    facts = measured_facts(device, options.commit, quick=options.quick, seeds=list(seeds))
     folder = None if options.out is None else common.writable_folder(options.out)
     records = {}
-    # Read before any measurement, so that a file of other settings is refused at once.
+    # Read before any measurement, so that a file of other settings is rejected at once.
     for name in names:
         # A rule that is trained again keeps its name, but not its weights.
         records[name] = report.RuleRecord(
@@ -90,7 +81,7 @@ def main(arguments: Sequence[str]) -> int:
                 plan = quick_plan(task) if options.quick else PLANS[task]
                 small = QUICK_PARTICLES if options.quick else None
                 trial = RuleTrial(sources[name], device, plan, seeds, small)
-                report.measure_rule(record, trial, max_particles, enough=enough)
+                report.measure_rule(record, trial, enough=enough)
             advance(1)
     done = [record for record in records.values() if record.done]
     lines = []

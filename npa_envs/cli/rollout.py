@@ -14,7 +14,7 @@ from npa_envs.errors import NPAError
 
 
 @dataclass(frozen=True, kw_only=True)
-class RolloutCommand(common.RuleOptions):
+class RolloutOptions(common.RuleOptions):
     """Grow a rule from its seed, with damage, and write a GIF, an MP4 and a filmstrip.
 
     A 3D world also gets a turntable GIF, and files of the grown cloud as points (PLY) and as
@@ -42,14 +42,14 @@ class RolloutCommand(common.RuleOptions):
     every: int | None = None
     """Steps between two frames; default: for about 150 frames."""
     fps: float = 25.0
-    """Frames a second, 0.1 to 50."""
+    """Frames per second, 0.1 to 50."""
     seed: int = 0
     """Seed of all random numbers, 0 to 2^63 - 1; the same seed gives the same film."""
 
 
 def main(arguments: Sequence[str]) -> int:
     """Grow the rule, print its loss and extent, and write films and point files."""
-    options = common.parse_options(RolloutCommand, "rollout", arguments)
+    options = common.parse_options(RolloutOptions, "rollout", arguments)
     import torch
 
     from npa_envs.measure.quality import measure
@@ -77,7 +77,7 @@ def main(arguments: Sequence[str]) -> int:
         )
     rule = load_rule(options.rule, device=device).float()
     trained = task_of_rule(options.rule, rule, device, **options.world)
-    # The film has the size and style of the options; figures are those of the trained task.
+    # The film has the size and style of the options; metrics are those of the trained task.
     task = trained.task
     points = options.style == "points"
     film_task = task_for_film(
@@ -106,10 +106,10 @@ def main(arguments: Sequence[str]) -> int:
     if done < options.steps:
         print(f"stopped at step {done} of {options.steps}; the film goes that far")
     if trained.why_not_measurable is not None:
-        print(f"no figures for {options.rule}: {trained.why_not_measurable}; give --target")
+        print(f"no metrics for {options.rule}: {trained.why_not_measurable}; give --target")
     else:
         row = measure(task, worlds.x, worlds.s, done)
-        print(f"step {done}: {row.figures}, extent {row.extent:.3f}")
+        print(f"step {done}: {row.summary}, extent {row.extent:.3f}")
     if task.classifies and goal is not None:
         vote = int(majority(cast(PointClassification, task).outputs(worlds.s)))
         print(f"most particles say {vote}; the cloud is a {int(goal)}")

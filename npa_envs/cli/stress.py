@@ -33,10 +33,6 @@ class StressOptions(common.MeasureOptions):
     only: tuple[str, ...] = ()
     """Groups (geometry, values, time, gradients, precision), checks (time/gecko), or beginnings of
     names (geometry/clump); default: all."""
-    max_seconds: float | None = None
-    """Start no check after this time [s]; the others are skipped, and run by the next call."""
-    seed: int = 0
-    """Seed of random worlds."""
     out: Path | None = None
     """Folder for stress_DEVICE.json and heat maps (extra `bench`); default: nothing is written."""
     list: bool = False
@@ -51,9 +47,9 @@ def main(arguments: Sequence[str]) -> int:
     from npa_envs.measure.benchmark_records import measured_facts
     from npa_envs.measure.plots import write_plots
 
-    common.check_numbers(options, seed=0, threads=1)
+    common.check_numbers(options, threads=1)
     rules = common.named_rules(options.rules)
-    checks = accuracy.all_checks(quick=options.quick, seed=options.seed, rules=rules)
+    checks = accuracy.all_checks(quick=options.quick, rules=rules)
     chosen = check_runner.chosen_checks(checks, options.only)
     if options.list:
         for group, summary in check_runner.GROUPS.items():
@@ -67,15 +63,15 @@ def main(arguments: Sequence[str]) -> int:
     if options.out is not None:
         name = f"stress_{device.type}{'_quick' * options.quick}.json"
         path = common.writable_folder(options.out) / name
-    facts = measured_facts(device, options.commit, quick=options.quick, seed=options.seed)
-    record = check_runner.StressRecord(facts, path, [check.name for check in checks]).read()
+    facts = measured_facts(device, options.commit, quick=options.quick)
+    record = check_runner.StressRecord(facts, path).read()
     done = sum(map(record.is_done, chosen))
     if done:
         print(f"{done} of {len(chosen)} checks were done before")
     with common.measuring(options, len(chosen), "check") as advance:
         check_runner.run_checks(
             chosen,
-            check_runner.CheckSession(device, quick=options.quick, seed=options.seed),
+            check_runner.CheckSession(device, quick=options.quick),
             record,
             max_seconds=options.max_seconds,
             progress=advance,
@@ -85,4 +81,4 @@ def main(arguments: Sequence[str]) -> int:
         maps = path.with_name(f"{path.stem}_*.png")
         drawn = write_plots(lambda: check_runner.heat_maps(record), maps, "heat maps")
         print("\n".join([f"wrote {path}", *drawn]))
-    return 1 if record.failed() else 0
+    return 1 if record.counts()["fail"] else 0

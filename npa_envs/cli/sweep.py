@@ -8,7 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 from urllib.parse import quote
@@ -54,8 +54,6 @@ class SweepOptions(common.PartOptions):
     """Devices to distribute the runs over, for example cuda:0 cuda:1."""
     jobs: int | None = None
     """Runs at the same time; default: one for each device."""
-    threads: int = 1
-    """CPU threads of each run."""
     progress: bool = True
     """Show a progress bar."""
 
@@ -69,8 +67,7 @@ class SweepRun(Child):
     arguments: list[str]
     """Arguments after `npa-envs train`."""
     folder: Path
-    threads: int = 1
-    process: subprocess.Popen[bytes] | None = None
+    process: subprocess.Popen[bytes] = field(init=False)
     start_time: float = 0.0
 
     def begin_work(self, device: str) -> None:
@@ -84,7 +81,7 @@ class SweepRun(Child):
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=output,
-                env=os.environ | {"OMP_NUM_THREADS": str(self.threads)},
+                env=os.environ | {"OMP_NUM_THREADS": "1"},
                 # A terminal sends Ctrl-C to its whole group; `stop` would be a second signal,
                 # after which a run ends without a checkpoint.
                 start_new_session=True,
@@ -93,21 +90,18 @@ class SweepRun(Child):
     @property
     def has_ended(self) -> bool:
         """Whether the process has ended."""
-        return self.process is not None and self.process.poll() is not None
+        return self.process.poll() is not None
 
     def stop(self, *, at_once: bool) -> None:
         """Ask the process to end, after a checkpoint unless `at_once`."""
-        if self.process is not None:
-            (self.process.kill if at_once else self.process.terminate)()
+        (self.process.kill if at_once else self.process.terminate)()
 
     def end(self) -> None:
-        """Wait until the process has ended after `stop`."""
-        if self.process is not None:
-            self.process.wait()
+        """Wait for the process."""
+        self.process.wait()
 
     def write(self) -> None:
         """Write the run's arguments, exit code and wall time [s] to its record."""
-        assert self.process is not None, "it is over"
         seconds = time.perf_counter() - self.start_time
         result = {"code": int(self.process.returncode), "seconds": seconds}
         write_record(self.folder / RECORD, {"facts": {"words": self.arguments}, **result})
@@ -132,14 +126,17 @@ def main(arguments: Sequence[str]) -> int:
     """Train the missing runs, print and write the table; return 1 if a run failed."""
     split = arguments.index("--") if "--" in arguments else len(arguments)
     options = common.parse_options(SweepOptions, "sweep", arguments[:split])
-    common.check_numbers(options, jobs=1, threads=1)
+    common.check_numbers(options, jobs=1)
     folder = common.writable_folder(options.out)
-    runs = combinations(options.over, arguments[split + 1 :], folder, options.threads)
+    runs = combinations(options.over, arguments[split + 1 :], folder)
     part_runs = part_of(runs, options.part, lambda run: run.folder.name)
     waiting = [run for run in part_runs if not run.done]
-    slots = Slots(options.devices, options.jobs or len(options.devices), options.threads)
+    slots = Slots(options.devices, options.jobs or len(options.devices))
     hint = "runs are left: call again with the same arguments"
     with common.progress_bar(len(waiting), show=options.progress, unit="run") as advance:
+
+        def start(_: Sequence[SweepRun]) -> SweepRun | None:
+            return waiting.pop(0) if waiting else None
 
         def finished(run: SweepRun) -> None:
             run.write()
@@ -147,13 +144,7 @@ def main(arguments: Sequence[str]) -> int:
             advance(1)
 
         try:
-            run_children(
-                lambda _: waiting.pop(0) if waiting else None,
-                finished,
-                slots,
-                starts_early=False,
-                max_seconds=options.max_seconds,
-            )
+            run_children(start, finished, slots, max_seconds=options.max_seconds)
         except KeyboardInterrupt:
             print(f"interrupted; {sum(not run.done for run in part_runs)} {hint}")
             raise
@@ -171,7 +162,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def combinations(
-    over: Sequence[str], task_words: Sequence[str], folder: Path = Path(), threads: int = 1
+    over: Sequence[str], task_words: Sequence[str], folder: Path = Path()
 ) -> list[SweepRun]:
     """Return a run of `npa-envs train TASK_WORDS` with each combination of values NAME=A,B,C."""
     from npa_envs.training import TASKS
@@ -192,15 +183,14 @@ def combinations(
             raise NPAError(f"over must name each value once, got {word!r}: leave the others out")
         values[name] = each
         used.append(name)
-    for name in RESERVED:
-        if name in used:
-            raise NPAError(f"--{name} must not be given to the runs: a sweep does so by itself")
+    for name in {*RESERVED} & {*used}:
+        raise NPAError(f"--{name} must not be given to the runs: a sweep does so by itself")
     runs = []
     for combination in itertools.product(*values.values()):
         run_values = dict(zip(values, combination, strict=True))
         options = [word for name, value in run_values.items() for word in (f"--{name}", value)]
         name = ",".join(f"{name}={quote(value, safe='')}" for name, value in run_values.items())
-        runs.append(SweepRun(run_values, [*task_words, *options], folder / name, threads))
+        runs.append(SweepRun(run_values, [*task_words, *options], folder / name))
     return runs
 
 

@@ -1,4 +1,4 @@
-"""`npa-envs train TASK`: options, number of processes, output, and the end of a run."""
+"""`npa-envs train TASK`: number of processes, output, and the end of a run."""
 
 from __future__ import annotations
 
@@ -6,31 +6,23 @@ import importlib.util
 import math
 import shlex
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, make_dataclass, replace
-from pathlib import Path
-from typing import Any, Generic, TypeVar, get_type_hints
+from typing import Any
 
 import torch
 import torch.distributed as dist
-import tyro
 
 from npa_envs.cli import INTERRUPTED, common
-from npa_envs.errors import NPAError, shown
-from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2DConfig
-from npa_envs.tasks.morphogenesis2d import Morphogenesis2DConfig
+from npa_envs.cli.train_options import TrainOptions, default_preset, parse_run, resolve_task
+from npa_envs.errors import NPAError
 from npa_envs.training import (
     TASKS,
-    JointTrainConfig,
     RunFolder,
     TrainConfig,
     check_device,
-    config_to_dict,
-    load_config,
-    preset,
     task_entry,
     train,
 )
-from npa_envs.training.checkpoint import check_task, has_per_world_streams, load_checkpoint
+from npa_envs.training.checkpoint import has_per_world_streams, load_checkpoint
 from npa_envs.training.process_group import ProcessGroup
 from npa_envs.training.process_launcher import (
     joined_processes,
@@ -38,254 +30,13 @@ from npa_envs.training.process_launcher import (
     print_once,
     requested_processes,
 )
+from npa_envs.training.trainer import TrainResult
 
 VIEWER = ("starlette", "uvicorn")
 """Packages that `npa-envs view` needs."""
 
 THREADED_BATCH = 4096
 """From this number of particles of a batch on, two threads are faster than one."""
-
-SHOWN = {
-    *("target", "iterations", "device", "out"),
-    *("initial_rule", "initial_rules", "frozen", "repeats", "world_count", "pool_size", "steps"),
-    *("learning_rate", "seed", "targets", "distance", "particle_count", "hidden_dim", "eps"),
-    *("resolution", "loss", "data"),
-}
-"""Fields of configurations that `--help` shows; `--help-all` shows all of them."""
-
-
-EXAMPLES: dict[str, tuple[str, ...]] = {
-    "morphogenesis2d": (
-        "--target heart --out runs/heart",
-        "--preset paper --target lizard.png --device cuda",
-        "--preset paper --target lizard.png --gpus 4",
-    ),
-    "co_morphogenesis2d": (
-        "--targets ring heart",
-        "--preset paper --targets gecko heart --device cuda",
-    ),
-    "morphogenesis3d": (
-        "--target duck --out runs/duck",
-        "--preset paper --target statue.obj --device cuda",
-    ),
-    "texture": (
-        "--target dots --out runs/dots",
-        "--target wall.png --loss filter_swd",
-    ),
-    "point_classification": (
-        "--out runs/digits",
-        "--preset paper --data mnist --device cuda",
-    ),
-}
-"""Options that the help of each task shows as examples."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class TrainOptions(common.SharedRunOptions):
-    """How a run starts and ends."""
-
-    preset: str = ""
-    """Configuration to start from: `paper`, `fast` (minutes on a CPU), `tiny` (seconds), or for
-    pictures and textures `best` (minutes on a GPU); `npa-envs list` prints sizes and times. By
-    default `best` on CUDA if the task has it, else `fast`."""
-    config: Path | None = None
-    """YAML, TOML or JSON file of fields and values, also `preset`; overrides the preset."""
-    max_seconds: float | None = None
-    """Stop after this time [s]; the run can be resumed."""
-    progress: bool = True
-    """Show a progress bar."""
-    report: bool = True
-    """End with a report in the folder `out`: figures, a film and a card of the rule."""
-
-
-def resolve_task(task_name: str, arguments: Sequence[str]) -> list[str]:
-    """Return arguments after replacing `--resume auto`, and adding the device of `--gpus`."""
-    return common.resolve_run(arguments, lambda words: parse_run(task_name, words)[1].out)
-
-
-def parse_run(task_name: str, arguments: Sequence[str]) -> tuple[TrainOptions, TrainConfig[Any]]:
-    """Parse arguments to the options of the run and its training configuration.
-
-    Ends the process after `--help`, which shows the most used options, and `--help-all`.
-    """
-    base = starting_configuration(task_name, arguments)
-    if isinstance(base, JointTrainConfig):
-        return parse_joint(task_name, base, arguments)
-    return _parse_over(base, task_name, arguments)
-
-
-def _check_preset(
-    name: str, run: TrainConfig[Any], task_name: str, folder: RunFolder, arguments: Sequence[str]
-) -> None:
-    """Check that a resumed run has the fields of the preset `name`, except those in `arguments`."""
-    presets = {name: config_to_dict(one) for name, one in task_entry(task_name).presets.items()}
-    values = config_to_dict(run)
-    changed = {word.partition("=")[0].lstrip("-").replace("-", "_") for word in arguments}
-    changed |= {word.removeprefix("no_") for word in changed} | {"out", "device", "task"}
-    others = [
-        f"{field}: {shown(values.get(field))}"
-        for field, value in presets[name].items()
-        if field not in changed
-        and values.get(field) != value
-        and any(fields.get(field) != value for fields in presets.values())
-    ]
-    if others:
-        raise NPAError(
-            f"preset must be the one that the run in {shown(str(folder.path))} was begun with, "
-            f"but {name!r} differs from it ({', '.join(others)} there): leave --preset out"
-        )
-
-
-def starting_configuration(task_name: str, arguments: Sequence[str]) -> TrainConfig[Any]:
-    """Return the configuration of the preset, file or resumed run, before options change it."""
-    first = common.first_options(arguments)
-    device = first.device if first.device and first.config is None else "cpu"
-    base = preset(first.preset or default_preset(task_name, device), task_name)
-    if first.resume and not {"-h", "--help", "--help-all"} & set(arguments):
-        folder = RunFolder(first.out or base.out)
-        if not folder.checkpoint.is_file():
-            raise NPAError(
-                f"there is no checkpoint to resume from at {str(folder.checkpoint)!r}: give the "
-                "folder of an earlier run with --out, or leave --resume out to start a new run"
-            )
-        try:
-            base = load_config(folder.config, base)
-        except NPAError:
-            # The run may be of another task, whose fields are unknown: report that instead.
-            check_task(load_checkpoint(folder.checkpoint), task_name, folder.checkpoint)
-            raise
-        if first.preset and first.config is None:
-            _check_preset(first.preset, base, task_name, folder, arguments)
-    if first.config is not None:
-        presets = task_entry(task_name).presets
-        if first.preset or first.resume:
-            # The preset of the command line, or the resumed run, overrides that of the file.
-            presets = dict.fromkeys(presets, base)
-        base = load_config(first.config, base, presets=presets)
-    return base
-
-
-def default_preset(task_name: str, device: str) -> str:
-    """Return the default preset: `best` on CUDA if the task has it, else `fast`."""
-    cuda = device.startswith("cuda")
-    return "best" if cuda and "best" in task_entry(task_name).presets else "fast"
-
-
-ConfigT = TypeVar("ConfigT", bound=TrainConfig[Any])
-
-
-@dataclass(frozen=True)
-class Command(Generic[ConfigT]):
-    """All options of `npa-envs train TASK`, in the groups of its help."""
-
-    run: TrainOptions
-    training: ConfigT
-
-
-def _parse_over(
-    defaults: ConfigT, task_name: str, arguments: Sequence[str]
-) -> tuple[TrainOptions, ConfigT]:
-    """Parse arguments to the options of the run, and to `defaults` with the options' changes."""
-    description = f"Train on {task_name}. Defaults shown are those of the preset."
-    if {"-h", "--help"} & set(arguments):
-        description += f" All options: npa-envs train {task_name} --help-all"
-        defaults = _with_common_fields(defaults)
-    examples = "".join(f"\n  npa-envs train {task_name} {words}" for words in EXAMPLES[task_name])
-    cls: Any = type(defaults)
-    command_type: Any = Command
-    command = common.parse_options(
-        command_type[cls[type(defaults.task)] if cls.__parameters__ else cls],
-        f"train {task_name}",
-        ["--help" if word == "--help-all" else word for word in arguments],
-        description=f"{description}\n\nExamples:{examples}",
-        default=Command(TrainOptions(), defaults),
-    )
-    return command.run, command.training
-
-
-def _with_common_fields(config: Any) -> Any:
-    """Return a configuration with equal values whose help shows only the fields in `SHOWN`."""
-    cls: Any = type(config)
-    hints = get_type_hints(cls, include_extras=True)
-    suppress: Any = tyro.conf.Suppress
-    types = {name: suppress[hint] for name, hint in hints.items() if name not in SHOWN}
-    values = {name: getattr(config, name) for name in types}
-    if "task" in types:
-        values["task"] = _with_common_fields(config.task)
-        types["task"] = type(values["task"])
-        cls = cls[types["task"]] if cls.__parameters__ else cls
-    hidden = [(name, types[name], field(default=value)) for name, value in values.items()]
-    narrow = make_dataclass(type(config).__name__, hidden, bases=(cls,), frozen=True, kw_only=True)
-    return _of_type(narrow, config, **values)
-
-
-# Options of tasks of several species: one level, although their configurations nest.
-
-
-@dataclass(frozen=True, kw_only=True)
-class SpeciesOptions(Morphogenesis2DConfig):
-    """Options of all species together; a --config file can set them for each species."""
-
-    target: tyro.conf.Suppress[str] = "gecko"
-    code_dim: tyro.conf.Suppress[int] = 8
-    encoder: tyro.conf.Suppress[bool] = False
-    switch_share: tyro.conf.Suppress[float] = 0.1
-
-    particle_count: int = 4096
-    """Particles of each species."""
-    targets: tuple[str, ...] = ()
-    """What each species grows: built-in names, emoji, or paths of pictures, two or more."""
-    distance: float = 0.0
-    """Distance between the centres of neighbouring seeds, which lie in a row [length units]."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class JointOptions(JointTrainConfig[SpeciesOptions]):
-    """Options of a training run of several rules in one world, the same for all species."""
-
-    initial_rule: tyro.conf.Suppress[str] = ""
-
-
-def parse_joint(
-    task_name: str, base: JointTrainConfig[CoMorphogenesis2DConfig], arguments: Sequence[str]
-) -> tuple[TrainOptions, JointTrainConfig[CoMorphogenesis2DConfig]]:
-    """Parse arguments of a run of several species, whose configuration `base` they change."""
-    task = base.task
-    shared_fields = {
-        "targets": tuple(one.target for one in task.species),
-        "distance": task.distance,
-    }
-    # Parsed once for each species, so that fields without an option keep each species' value.
-    parsed = []
-    for species in task.species:
-        species_options = _of_type(SpeciesOptions, species, **shared_fields)
-        defaults: JointOptions = _of_type(JointOptions, base, task=species_options)
-        parsed.append(_parse_over(defaults, task_name, arguments))
-    launch, first = parsed[0]
-    targets = first.task.targets
-    if len(targets) < 2:
-        raise NPAError(f"targets must be two or more, got {len(targets)}: --targets ring heart")
-    configs = tuple(
-        # Targets without a species take the options of the last one.
-        _of_type(
-            Morphogenesis2DConfig,
-            parsed[min(k, len(parsed) - 1)][1].task,
-            target=target,
-            targets=(),
-        )
-        for k, target in enumerate(targets)
-    )
-    together = replace(task, species=configs, distance=first.task.distance)
-    return launch, _of_type(JointTrainConfig, first, task=together)
-
-
-def _of_type(cls: Any, source: Any, **changes: Any) -> Any:
-    """Return a dataclass `cls` with the values of equally named fields of `source`, and changes."""
-    names = {field.name for field in fields(cls)} & {field.name for field in fields(source)}
-    return cls(**{name: getattr(source, name) for name in names} | changes)
-
-
-# The run
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -357,21 +108,32 @@ def run(
     except KeyboardInterrupt:
         print(f"interrupted; the last checkpoint is {folder.checkpoint}\nresume: {resume_command}")
         raise
-    if not ranks.first:
-        return INTERRUPTED if result.interrupted else 0
-    rules = [folder.rule]
-    influence_command = ""
-    if task_entry(task_name).joint:
-        rules = [folder.rule_of(number) for number in range(len(config.task.species))]
-        influence_command = f"npa-envs influence {shlex.join(map(str, rules))}"
-        influence_command += f" --distances {config.task.distance:g}"
-        influence_command += f" --particle-count {sum(config.task.counts[:2])}"
+    if ranks.first:
+        if options.resume:  # The run's file has the options that these arguments leave out.
+            arguments = (task_name, "--config", str(folder.config))
+            arguments += ("--processes", str(ranks.count)) if ranks.count > 1 else ()
+        finish(task_name, options, config, result, arguments, resume_command)
+    return INTERRUPTED if result.interrupted else 0
+
+
+def finish(
+    task_name: str,
+    options: TrainOptions,
+    config: TrainConfig[Any],
+    result: TrainResult,
+    arguments: Sequence[str],
+    resume_command: str,
+) -> None:
+    """Print where the results of a run are and what to do with them; write the report."""
+    folder = RunFolder(config.out)
+    joint = task_entry(task_name).joint
+    rules = [folder.rule_of(k) for k in range(len(_species(config)))] if joint else [folder.rule]
     loss = result.record.get("loss")
-    figures = "" if loss is None else f", training loss {loss:.4g}"
+    last_loss = "" if loss is None else f", training loss {loss:.4g}"
     if result.finished:
-        print(f"finished: {result.iteration} iterations{figures}")
+        print(f"finished: {result.iteration} iterations{last_loss}")
     else:
-        print(f"stopped at iteration {result.iteration}{figures}")
+        print(f"stopped at iteration {result.iteration}{last_loss}")
         print(f"  checkpoint  {folder.checkpoint}\n  go on       {resume_command}")
     for rule in rules:
         print(f"  rule        {rule}")
@@ -379,33 +141,27 @@ def run(
     if options.report and result.iteration > 0 and not result.interrupted:
         from npa_envs.cli.train_report import Training, write_report
 
-        command = ("train", *arguments)
-        if options.resume:  # The run's file has the options that these arguments leave out.
-            command = ("train", task_name, "--config", str(folder.config))
-            command += ("--processes", str(ranks.count)) if ranks.count > 1 else ()
         seconds = result.record.get("seconds", 0.0)
-        training = Training(task_name, command, result.iteration, seconds)
+        training = Training(task_name, ("train", *arguments), result.iteration, seconds)
+        device = check_device(config.device)
         for rule in rules:
             try:
                 card, scores = write_report(
-                    rule,
-                    folder.report,
-                    training,
-                    check_device(config.device),
-                    progress=options.progress,
+                    rule, folder.report, training, device, progress=options.progress
                 )
                 print(f"  report      {card}: {scores}")
             except NPAError as error:
                 # The rule is written in any case; a bad one may diverge while it is measured.
                 print(f"  no report   {error}")
-    if influence_command:
-        print(f"  together    {influence_command}")
+    if joint:
+        where = f"--distances {config.task.distance:g}"
+        where += f" --particle-count {sum(config.task.counts[:2])}"
+        print(f"  together    npa-envs influence {shlex.join(map(str, rules))} {where}")
     shown_path = shlex.quote(str(folder.path))
     if any(importlib.util.find_spec(name) is None for name in VIEWER):
         print(f"  look at it  npa-envs rollout {shown_path} (live: pip install 'npa-envs[view]')")
     else:
         print(f"  look at it  npa-envs view {shown_path}")
-    return INTERRUPTED if result.interrupted else 0
 
 
 def thread_count(config: TrainConfig[Any]) -> int:

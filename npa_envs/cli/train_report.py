@@ -1,4 +1,4 @@
-"""The report that `npa-envs train` ends with: figures, a film and a card of the rule."""
+"""The report that `npa-envs train` ends with: metrics, a film and a model card of the rule."""
 
 from __future__ import annotations
 
@@ -27,11 +27,12 @@ from npa_envs.measure.benchmark_records import (
 from npa_envs.measure.quality import (
     CHECKPOINTS,
     CLOUD_CHECKPOINTS,
+    FIRST_SEED,
     picture_rows,
     score_line,
     tables_of,
 )
-from npa_envs.measure.texture_metric import TextureJudge
+from npa_envs.measure.texture_metric import TextureMetric
 from npa_envs.render.world_film import SCREEN, film_world, write_3d_world
 from npa_envs.rule.files import load_rule
 from npa_envs.tasks.damage import DamageEvent
@@ -39,9 +40,6 @@ from npa_envs.training.task_of_rule import task_for_film, task_of_rule, tasks_of
 
 if TYPE_CHECKING:
     from npa_envs.rule.rule import NPARule
-
-FIRST_SEED = 1_000_000
-"""Seed of the first world; training uses others."""
 
 FILM_STEPS = 512
 """Steps of the film."""
@@ -57,7 +55,7 @@ TITLES: Mapping[str, str] = {
     "accuracy": "",
     "changes": "Some steps after a change of the clouds:",
 }
-"""Line above each table of a card."""
+"""Line above each table of a model card."""
 
 
 class Training(NamedTuple):
@@ -85,7 +83,7 @@ def write_report(
     clouds = task.classifies
     checkpoints = (CLOUD_CHECKPOINTS if clouds else CHECKPOINTS)[: None if thorough else 5]
     seeds = range(FIRST_SEED, FIRST_SEED + (8 if thorough else 2))
-    judge = TextureJudge(task) if task.has_texture_metric else None
+    texture_metric = TextureMetric(task) if task.has_texture_metric else None
     not_filmed = ""
     with common.progress_bar(None, show=progress) as advance:
         tables = tables_of(
@@ -96,7 +94,7 @@ def write_report(
             changed=thorough and (clouds or task.aligned),
             device=device,
             progress=advance,
-            judge=judge,
+            texture_metric=texture_metric,
         )
         generator = torch.Generator(device).manual_seed(FIRST_SEED)
         worlds = task.seed(1, generator=generator, device=device)
@@ -121,7 +119,7 @@ def write_report(
     command = f"npa-envs evaluate {shlex.quote(str(path))} --device {device.type}"
     if not clouds:
         command += f" --seed-count {len(seeds)} --checkpoints {' '.join(map(str, checkpoints))}"
-        command += " --healing" * ("healing" in tables) + " --judge" * (judge is not None)
+        command += " --healing" * ("healing" in tables) + " --judge" * (texture_metric is not None)
     facts = {"command": command, "commit": current_commit(), "date": date.today().isoformat()}
     facts |= {"machine": machine(device), "metric": task.metric_name}
     text = tables_json(tables, **facts)

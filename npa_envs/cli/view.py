@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import re
+import sys
 import webbrowser
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -42,7 +44,7 @@ class ViewOptions(common.DeviceOptions):
 
     what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RULE|RUN|ENV")] = "gecko"
     """A shipped rule (`npa-envs list`), a rule's file, the folder of a run, or the id of an
-    environment such as npa/Texture-v0."""
+    environment: npa/Texture-v0, or MODULE:my/Own-v0 for one that your module registers."""
     policy: str = "zero"
     """The policy in an environment: "zero", "random", or a rule for it."""
     keywords: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE")] = ()
@@ -101,7 +103,9 @@ def world_maker(options: ViewOptions, device: torch.device) -> Callable[[], Live
     from npa_envs.web.environment_world import EnvironmentWorld, make_environment
     from npa_envs.web.rule_world import RuleWorld, RunWorld
 
-    if options.what.startswith("npa/"):
+    folder = Path(options.what)
+    # Ids of Gymnasium end in a version.
+    if re.search(r"-v\d+$", options.what) and not folder.exists():
         policy = options.policy
         keywords = common.named_values("keywords", options.keywords)
         for name in RESERVED:
@@ -113,6 +117,8 @@ def world_maker(options: ViewOptions, device: torch.device) -> Callable[[], Live
                     f"{hint}"
                 )
         keywords = {"particle_count": options.particle_count} | keywords
+        # Modules of the user are imported from the current folder.
+        sys.path.insert(0, str(Path.cwd()))
 
         def make_world() -> LiveWorld:
             env, acting = make_environment(options.what, policy, device=str(device), **keywords)
@@ -126,7 +132,6 @@ def world_maker(options: ViewOptions, device: torch.device) -> Callable[[], Live
         )
     kwargs: dict[str, Any] = {"device": device, "seed": options.seed}
     kwargs["particle_count"] = options.particle_count
-    folder = Path(options.what)
     if folder.is_dir() and any((folder / name).exists() for name in RUN_FILES):
         return lambda: RunWorld(folder, **kwargs)
     return lambda: RuleWorld(options.what, **kwargs)

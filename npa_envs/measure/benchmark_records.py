@@ -1,7 +1,7 @@
-"""Records and tables of measurements: JSON files with rows and the facts that they depend on.
+"""Records and tables of measurements: JSON files with rows, and the facts of the run.
 
-A record is written after every entry, so that a stopped run can continue. Records with other facts
-(device, machine, commit, versions, settings) are refused.
+Facts are what the rows depend on: device, machine, commit, versions, settings. A record is written
+after every entry, so that a stopped run can continue. Records with other facts are rejected.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ Row = TypeVar("Row")
 
 
 class Record(Generic[Row]):
-    """Rows of a measurement and the settings (`facts`) they depend on; with `path`, a JSON file."""
+    """Rows of a measurement and the facts of its run; with `path`, a JSON file."""
 
     command: str
     """The command that writes such records, for errors."""
@@ -46,7 +46,7 @@ class Record(Generic[Row]):
         self.facts, self.path, self.rows = facts, path, list(rows)
 
     def content(self) -> Mapping[str, Any]:
-        """Return the fields of the file except `facts`, the settings the rows depend on."""
+        """Return the fields of the file except the facts of the run."""
         return {"rows": as_objects(self.rows)}
 
     def parse(self, content: dict[str, Any]) -> list[Row]:
@@ -104,7 +104,7 @@ def read_record(
     for name, value in plain_numbers(facts).items():
         if before.get(name) != value:
             raise NPAError(
-                f"{str(path)!r} has figures of other settings: {name} was "
+                f"{str(path)!r} has results of other settings: {name} was "
                 f"{shown(before.get(name))}, now {shown(value)}: {hint}"
             )
     return record

@@ -1,4 +1,4 @@
-"""Plots of measurements: figures without a window, bands, matrices, logarithmic axes, PNG files.
+"""Plots of measurements: drawn without a window, bands, matrices, logarithmic axes, PNG files.
 
 They need matplotlib, of the extra `bench`.
 """
@@ -77,31 +77,33 @@ def draw_band(
     panel.fill_between(across, low, high, color=colour, alpha=0.2, lw=0)
 
 
-def draw_matrix(
-    panel: Any,
-    rows: Sequence[str],
-    columns: Sequence[str],
-    values: Sequence[Sequence[float | None]],
-    *,
-    colours: str,
-    norm: Any,
-) -> Any:
-    """Draw a matrix with its numbers, and return the argument of `figure.colorbar`.
+Matrix = tuple[Sequence[str], Sequence[str], Sequence[Sequence[float | None]]]
+"""Names of rows, names of columns, and positive numbers, row by row; None: a blank cell."""
 
-    Cells with None are blank; `norm` maps numbers to [0, 1].
-    """
-    numbers = [[math.nan if value is None else value for value in line] for line in values]
-    image = panel.imshow(numbers, cmap=colours, norm=norm, aspect="auto")
-    for down, line in enumerate(values):
-        for across, value in enumerate(line):
-            if value is not None:
-                red, green, blue, _ = image.to_rgba(value)
-                ink = "white" if red + green + blue < 1.2 else "black"
-                style = {"color": ink, "ha": "center", "va": "center", "fontsize": 6}
-                panel.text(across, down, f"{value:.2g}", **style)
-    panel.set_xticks(range(len(columns)), columns, rotation=45, ha="right", fontsize=7)
-    panel.set_yticks(range(len(rows)), rows, fontsize=7)
-    return image
+
+def heat_map(matrices: Mapping[str, Matrix], *, colours: str, largest: float) -> bytes:
+    """Return a PNG of matrices by their titles; colours range from 1 / `largest` to `largest`."""
+    from matplotlib.colors import LogNorm
+
+    size = max(len(columns) for _, columns, _ in matrices.values())
+    heights = [1.6 + 0.3 * len(rows) for rows, _, _ in matrices.values()]
+    figure, grid = new_figure(len(matrices), 1, (3.6 + 0.6 * size, sum(heights)))
+    for (title, (rows, columns, values)), (panel,) in zip(matrices.items(), grid, strict=True):
+        numbers = [[math.nan if value is None else value for value in line] for line in values]
+        norm = LogNorm(1.0 / largest, largest)
+        image = panel.imshow(numbers, cmap=colours, norm=norm, aspect="auto")
+        for down, line in enumerate(values):
+            for across, value in enumerate(line):
+                if value is not None:
+                    red, green, blue, _ = image.to_rgba(value)
+                    ink = "white" if red + green + blue < 1.2 else "black"
+                    style = {"color": ink, "ha": "center", "va": "center", "fontsize": 6}
+                    panel.text(across, down, f"{value:.2g}", **style)
+        panel.set_xticks(range(len(columns)), columns, rotation=45, ha="right", fontsize=7)
+        panel.set_yticks(range(len(rows)), rows, fontsize=7)
+        panel.set_title(title, fontsize=9)
+        figure.colorbar(image, ax=panel)
+    return png(figure)
 
 
 def number_plainly(axis: Any, values: Sequence[float] | None = None) -> None:

@@ -13,7 +13,7 @@ import threading
 import time
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from dataclasses import dataclass
 from types import FrameType
 from typing import Any, TypeVar
@@ -72,7 +72,7 @@ def run_children(
     finished: Callable[[SomeChild], None],
     slots: Slots,
     *,
-    starts_early: bool,
+    starts_early: bool = False,
     max_seconds: float = math.inf,
 ) -> None:
     """Run child processes until `start` returns no more; a signal or an error ends all of them.
@@ -90,10 +90,10 @@ def run_children(
         late = time.monotonic() >= deadline
         return None if late else start([*waiting, *running.values()])
 
-    with _Interruption() as interruption:
+    with _caught_signals() as signals:
         try:
             while True:
-                interruption.check()
+                _raise_if_any(signals)
                 while waiting and time.monotonic() >= deadline:
                     _end([waiting.pop()])
                 for slot in range(slots.jobs):
@@ -103,80 +103,73 @@ def run_children(
                     if child is not None:
                         running[slot] = child
                         child.begin_work(slots.devices[slot % len(slots.devices)])
-                        interruption.check()
+                        _raise_if_any(signals)
                 if not running:
                     return
                 while starts_early and len(waiting) < slots.jobs and (child := next_child()):
                     waiting.append(child)
-                    interruption.check()
+                    _raise_if_any(signals)
                 for slot, child in list(running.items()):
                     if child.has_ended:
                         # The signal may have ended it too: then it is not finished.
-                        interruption.check()
+                        _raise_if_any(signals)
                         del running[slot]
                         finished(child)
                 time.sleep(POLL_SECONDS if running else 0.0)
         finally:
-            interruption.came = True  # The next signal raises at once.
+            signals.append(0)  # The next signal raises at once.
             _end([*running.values(), *waiting])
 
 
-def _end(children: Sequence[Child]) -> None:
+def _end(children: Sequence[Child], *, at_once: bool = False) -> None:
     """End children; all are asked before the first is waited for, so that they save in parallel."""
     try:
-        _stop(children, at_once=False)
+        for child in children:
+            child.stop(at_once=at_once)
+        for child in children:
+            child.end()
     except BaseException:
-        _stop(children, at_once=True)
+        if not at_once:
+            _end(children, at_once=True)
         raise
 
 
-def _stop(children: Sequence[Child], *, at_once: bool) -> None:
-    for child in children:
-        child.stop(at_once=at_once)
-    for child in children:
-        child.end()
-
-
-class _Interruption:
-    """Signals within a block: the first raises KeyboardInterrupt in `check`, the next one at once.
+@contextlib.contextmanager
+def _caught_signals() -> Iterator[list[int]]:
+    """Catch signals within a block in the list that is yielded; the second one also raises.
 
     So the first cannot interrupt the start of a process, which would then never be ended. Ignored
     signals, as with nohup, stay ignored. In threads other than the main one, where signals cannot
     be caught, nothing changes.
     """
+    signals: list[int] = []
+    previous: dict[signal.Signals, Any] = {}
 
-    def __init__(self) -> None:
-        self.came = False
-        """Whether the first signal has come."""
-        self._previous: dict[signal.Signals, Any] = {}
+    def catch(number: int, frame: FrameType | None) -> None:
+        signals.append(number)
+        if len(signals) > 1:
+            raise KeyboardInterrupt
 
-    def __enter__(self) -> _Interruption:
-        if threading.current_thread() is not threading.main_thread():
-            return self
+    if threading.current_thread() is threading.main_thread():
         for name in STOPPING:
             # Some systems do not have all of them.
             number = getattr(signal, name, None)
             # None: a handler in C, which could not be restored.
             if number is not None and signal.getsignal(number) not in (None, signal.SIG_IGN):
-                self._previous[number] = signal.signal(number, self._note)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for number, handler in self._previous.items():
+                previous[number] = signal.signal(number, catch)
+    try:
+        yield signals
+    finally:
+        for number, handler in previous.items():
             signal.signal(number, handler)
 
-    def _note(self, number: int, frame: FrameType | None) -> None:
-        if self.came:
-            raise KeyboardInterrupt
-        self.came = True
 
-    def check(self) -> None:
-        """Raise KeyboardInterrupt if a signal has come."""
-        if self.came:
-            # Printing to a closed terminal fails.
-            with contextlib.suppress(OSError):
-                print("\nending all runs; once more to end them at once", file=sys.stderr)
-            raise KeyboardInterrupt
+def _raise_if_any(signals: Sequence[int]) -> None:
+    if signals:
+        # Printing to a closed terminal fails.
+        with contextlib.suppress(OSError):
+            print("\nending all runs; once more to end them at once", file=sys.stderr)
+        raise KeyboardInterrupt
 
 
 Item = TypeVar("Item")

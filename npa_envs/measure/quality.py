@@ -15,7 +15,7 @@ from torch import Tensor
 
 from npa_envs.devices import check_device
 from npa_envs.errors import NPAError, shown, suggest
-from npa_envs.measure.texture_metric import JudgeRow, TextureJudge
+from npa_envs.measure.texture_metric import TextureMetric, TextureRow
 from npa_envs.rule.files import shipped_rules
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Task
@@ -29,6 +29,9 @@ from npa_envs.world.rollout import rollout_particles
 
 PROGRESS_STEPS = 32
 """Steps between two reports of progress."""
+
+FIRST_SEED = 1_000_000
+"""Seed of the first measured world; training uses others."""
 
 CHECKPOINTS = (64, 128, 256, 512, 1024, 2048, 4096)
 """Default steps at which a rule is measured."""
@@ -59,7 +62,7 @@ class EvaluationRow:
     extent: float
 
     @property
-    def figures(self) -> str:
+    def summary(self) -> str:
         """The loss and, if measured, the PSNR, as text."""
         psnr = "" if self.psnr is None else f", PSNR {self.psnr:5.2f} dB"
         return f"loss {self.loss:.4f}{psnr}"
@@ -324,7 +327,7 @@ def _blank_clouds(runner: RuleRunner, index: Tensor) -> Particles:
 def _cloud_means(
     task: PointClassification, measured: Callable[[Tensor], Iterable[Sequence[Tensor]]]
 ) -> list[list[float]]:
-    """Return means over all clouds of the rows of tensors [B] that `measured` yields a batch."""
+    """Return means over all clouds of the rows of tensors [B] that `measured` yields per batch."""
     count = len(task.clouds.label)
     sums = torch.zeros((), dtype=torch.float64)
     for index in torch.split(torch.arange(count, device=task.clouds.x.device), BATCH):
@@ -376,12 +379,13 @@ def tables_of(
     changed: bool = True,
     device: str | torch.device = "cpu",
     progress: Callable[[int], None] | None = None,
-    judge: TextureJudge | None = None,
+    texture_metric: TextureMetric | None = None,
 ) -> dict[str, Sequence[Any]]:
     """Measure a rule of any task; return tables by name.
 
     They are `growth` and, if `changed`, `healing`; for clouds `accuracy` and, if `changed`,
-    `changes`; and `judge`, if given. Clouds run on their task's device, with the first seed.
+    `changes`; and `judge` of `texture_metric`. Clouds run on their task's device, with the first
+    seed.
     """
     options: dict[str, Any] = {"progress": progress}
     tables: dict[str, Sequence[Any]] = {}
@@ -394,13 +398,17 @@ def tables_of(
             tables["changes"] = changes_of_mind(rule, clouds, **options)
         return tables
     options |= {"seeds": seeds, "device": device}
-    judged: list[JudgeRow] = []
-    watch = None if judge is None else lambda *world: judged.append(judge.row(*world))
+    texture_rows: list[TextureRow] = []
+
+    def watch(x: Tensor, s: Tensor, step: int) -> None:
+        if texture_metric is not None:
+            texture_rows.append(texture_metric.row(x, s, step))
+
     steps = checkpoints or CHECKPOINTS
     tables["growth"] = evaluate(rule, task, checkpoints=steps, watch=watch, **options)
     if changed:
         tables["healing"] = healing(rule, task, **options)
-    return tables | ({"judge": judged} if judged else {})
+    return tables | ({"judge": texture_rows} if texture_rows else {})
 
 
 class RuleRunner:
@@ -612,7 +620,7 @@ def score_line(measured: Mapping[str, Any]) -> str:
         return f"PSNR of held-out views {_at_steps(rows, 'psnr', '.1f', ' dB')}"
     if "judge" in measured:
         judged = [row for row in measured["judge"] if row["step"] in SCORED_STEPS]
-        return f"judge's ratio {_at_steps(judged, 'ratio', '.2g', '')}"
+        return f"texture metric {_at_steps(judged, 'ratio', '.2g', '')}"
     return f"{measured['metric']} {_at_steps(rows, 'loss', '.3g', '')}"
 
 

@@ -10,6 +10,7 @@ import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,20 +18,19 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from npa_envs.checks import check_field, check_positive
 from npa_envs.errors import NPAError
 from npa_envs.measure.benchmark_records import Record
-from npa_envs.measure.plots import draw_matrix, new_figure, png
+from npa_envs.measure.plots import heat_map
+from npa_envs.measure.quality import FIRST_SEED
 from npa_envs.ops import species_fields
 from npa_envs.render import draw_worlds
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Task
 from npa_envs.world.divergence import divergence
-from npa_envs.world.particles import Particles
+from npa_envs.world.particles import Particles, combined
 from npa_envs.world.randomness import StreamId, WorldRandom
 from npa_envs.world.species import rollout_species
-
-MARGIN = 0.2
-"""A loss that changes by less than this fraction counts as undisturbed."""
 
 MIXED = 0.25
 """Least mixing index of species that mix (dimensionless)."""
@@ -41,9 +41,7 @@ class InteractionSettings:
     """Settings of an interaction measurement."""
 
     seed_count: int = 8
-    """Worlds of each pair, each from its own seed."""
-    first_seed: int = 1_000_000
-    """The first world's seed; training uses others."""
+    """Worlds of each pair, each from its own seed; training uses others."""
     distances: tuple[float, ...] = (0.0, 0.5, 1.0)
     """Distances between the centres of the two seeds [length units]."""
     ratios: tuple[float, ...] = (0.5,)
@@ -54,36 +52,28 @@ class InteractionSettings:
     """Steps from the seeds."""
     particle_count: int | None = None
     """Particles of both together; default: the most that one of the rules was trained with."""
-    update_prob: float | None = None
-    """Probability of each particle's update in a step; default: of each rule as trained."""
-    margin: float = MARGIN
+    margin: float = 0.2
     """Fraction by which a loss must change to count as changed."""
 
     def __post_init__(self) -> None:
         """Check every field; raises NPAError."""
-        for name, least in (("particle_count", 2), ("steps", 1), ("seed_count", 1)):
-            count = getattr(self, name)
-            if count is not None and count < least:
-                raise NPAError(f"{name} must be at least {least}, got {count}")
+        check_positive(self, int, "steps", "seed_count")
+        if self.particle_count is not None:
+            check_positive(self, int, "particle_count", at_least=2)
         for name in ("distances", "eps_factors"):
-            if not all(0.0 <= value < math.inf for value in getattr(self, name)):
-                raise NPAError(f"{name} must be finite and not negative, got {getattr(self, name)}")
-        if not all(0.0 < value < 1.0 for value in (*self.ratios, self.margin)):
+            values = getattr(self, name)
+            legal = len(values) > 0 and all(0.0 <= value < math.inf for value in values)
+            check_field(self, name, legal, "be finite and not negative, one or more")
+        fractions = *self.ratios, self.margin
+        if not (self.ratios and all(0.0 < value < 1.0 for value in fractions)):
             raise NPAError(
                 f"ratios and margin must lie in (0, 1), got {self.ratios} and {self.margin}"
             )
-        if not (self.distances and self.eps_factors and self.ratios):
-            raise NPAError("distances, eps_factors and ratios must have a value each")
-
-    @property
-    def seeds(self) -> tuple[int, ...]:
-        """Seeds of the worlds; the same seeds give the same table."""
-        return tuple(range(self.first_seed, self.first_seed + self.seed_count))
 
 
 @dataclass(frozen=True)
 class InteractionRow:
-    """One rule A (`rule`), grown together with rule B (`beside`); figures are means of the worlds.
+    """One rule A (`rule`), grown together with rule B (`beside`); numbers are means of the worlds.
 
     `alone` and `together` are A's task metric of its own particles, `change` is together / alone,
     `mixing` the `mixing_index` at the end, `displacement` the distance of A's centroid from its
@@ -109,7 +99,7 @@ class InteractionRow:
     mixing_high: float = math.nan
 
 
-def verdict(change: float, mixing: float, margin: float = MARGIN) -> str:
+def verdict(change: float, mixing: float, margin: float) -> str:
     """Return "cooperates" for a change below 1 - margin, "undisturbed" for one up to 1 + margin.
 
     A larger change, or NaN, is "disrupted". ", mixes" follows if the mixing index is at least
@@ -141,14 +131,12 @@ def ratio_interval(numerators: Tensor, denominators: Tensor) -> tuple[float, flo
 
 
 def mixing_index(x: Tensor, counts: Sequence[int], *, eps: float) -> Tensor:
-    """Return how much the K species of each world are mixed, in [0, 1], shape [B].
+    """Return how much the K >= 2 species of each world are mixed, in [0, 1], shape [B].
 
     It is the entropy of the species' fractions of a particle's density, divided by log K: the mean
     over particles. 0: no particle perceives another species; 1: all species are perceived equally.
     """
     rho = species_fields(x, counts, eps=eps).rho
-    if rho.shape[2] < 2:
-        raise NPAError("counts must name at least two species that can mix, got one")
     fractions = rho / rho.sum(dim=2, keepdim=True)
     entropy: Tensor = torch.special.entr(fractions).sum(dim=2)
     return entropy.mean(dim=1) / math.log(rho.shape[2])
@@ -162,11 +150,15 @@ FRAME_TIMES = (0.0, 0.125, 0.25, 0.5, 1.0)
 
 
 class RuleUnderTest(NamedTuple):
-    """A trained rule that grows in 2D, and its task."""
+    """A trained rule that grows pictures, and its task."""
 
     name: str
     rule: NPARule
     task: Task
+
+    def with_count(self, particle_count: int) -> Task:
+        """Return the task for another number of particles."""
+        return self.task.resized(particle_count).for_rule(self.rule)
 
 
 class Encounters:
@@ -200,11 +192,6 @@ class Encounters:
                     f"{rules[0].name} and {other.name} cannot share a world: {error}"
                 ) from error
 
-    def counts(self, ratio: float) -> tuple[int, int]:
-        """Return the numbers of particles of the measured species and of the other one."""
-        measured = min(max(round(ratio * self.particle_count), 1), self.particle_count - 1)
-        return measured, self.particle_count - measured
-
     @torch.no_grad()
     def meet(
         self, first: RuleUnderTest, second: RuleUnderTest
@@ -218,33 +205,35 @@ class Encounters:
         for factor, ratio, distance in itertools.product(
             settings.eps_factors, settings.ratios, settings.distances
         ):
-            counts = self.counts(ratio)
-            key = first.name, counts[0], factor
+            count = min(max(round(ratio * self.particle_count), 1), self.particle_count - 1)
+            counts = count, self.particle_count - count
+            key = first.name, count, factor
             if key not in self._alone:
-                *_, (_, *grown) = self._grow([first], counts[:1], 0.0, factor)
-                self._alone[key] = self._measured(first, counts[0], *grown)
+                *_, (_, worlds, diverged) = self._grow([first], counts[:1], 0.0, factor)
+                self._alone[key] = _loss_and_centroid(first, worlds, diverged)
             losses_alone, centroids_alone = self._alone[key]
             radius = "" if factor == 1.0 else f"eps x {factor:g}, "
-            for step, *worlds in self._grow([first, second], counts, distance, factor):
+            together = self._grow([first, second], counts, distance, factor)
+            for step, worlds, diverged in together:  # noqa: B007 - read after the loop
                 if step in self._frame_steps:
                     # The picture is centred between the two seeds.
                     frames[f"{radius}d {distance:g}, r {ratio:g}, step {step}"] = draw_worlds(
-                        worlds[0][:1],
-                        worlds[1][:1],
+                        worlds.x[:1],
+                        worlds.s[:1],
                         centre=(0.5 * distance, 0.0),
                         resolution=160,
                         pixel_size=0.5 * math.sqrt(4.0 / self.particle_count),
                         half_width=1.2 + 0.5 * distance,
                     )[0]
-            losses, centroids = self._measured(first, counts[0], *worlds)
-            alone, together = losses_alone.mean().item(), losses.mean().item()
-            change = together / alone if alone > 0.0 else math.inf
-            mixings = mixing_index(worlds[0], counts, eps=factor * first.rule.eps0)
+            losses, centroids = _loss_and_centroid(first, worlds.split(counts)[0], diverged)
+            alone, beside = losses_alone.mean().item(), losses.mean().item()
+            change = beside / alone if alone > 0.0 else math.inf
+            mixings = mixing_index(worlds.x, counts, eps=factor * first.rule.eps0)
             mixing = mixings.mean().item()
             moved = (centroids - centroids_alone).norm(dim=-1)
             row = InteractionRow(
                 first.name, second.name, distance, ratio,
-                alone, together, change, mixing, moved.mean().item(),
+                alone, beside, change, mixing, moved.mean().item(),
                 verdict(change, mixing, settings.margin), factor,
                 *ratio_interval(losses, losses_alone),
                 *ratio_interval(mixings, torch.ones_like(mixings)),
@@ -252,67 +241,56 @@ class Encounters:
             rows.append(row)
         return rows, frames
 
-    @staticmethod
-    def _measured(
-        rule: RuleUnderTest, count: int, x: Tensor, s: Tensor, diverged: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Return metric (inf if diverged) and centroid, [B, 2], of the first `count` particles."""
-        x = x[:, :count]
-        losses = _resized(rule, count).metric(x, s[:, :count])
-        return losses.masked_fill(diverged, math.inf), x.mean(dim=1)
-
     def _grow(
         self,
         rules: Sequence[RuleUnderTest],
         counts: Sequence[int],
         distance: float,
         factor: float,
-    ) -> Iterator[tuple[int, Tensor, Tensor, Tensor]]:
-        """Grow one or two species; yield the step, positions, states, and diverged worlds, [B].
+    ) -> Iterator[tuple[int, Particles, Tensor]]:
+        """Grow one or two species; yield the step, the worlds, and which have diverged, [B].
 
         The first is seeded at the origin and has the same random stream as alone; the second is
         seeded at `distance` along the first axis. Worlds that diverge stay as they were, so that
         the others can be measured.
         """
-        settings = self.settings
         weight = rules[0].rule.hidden.weight
-        random = WorldRandom(settings.seeds, device=weight.device)
-        streams = (random, random.substream(StreamId.SPECIES))
-        species = [
-            _resized(rule, count).seed(settings.seed_count, generator=stream, device=weight.device)
-            for rule, count, stream in zip(rules, counts, streams, strict=False)
-        ]
-        for k, (x, *_) in enumerate(species):
-            x[..., 0] += k * distance
-        x = torch.cat([worlds.x for worlds in species], dim=1).to(weight)
-        s = torch.cat([worlds.s for worlds in species], dim=1).to(weight)
-        diverged = torch.zeros(len(x), dtype=torch.bool, device=x.device)
-        stops = sorted({*range(0, settings.steps, PROGRESS_STEPS), *self._frame_steps})
+        seeds = range(FIRST_SEED, FIRST_SEED + self.settings.seed_count)
+        random = WorldRandom(seeds, device=weight.device)
+        species = []
+        for k, (rule, count) in enumerate(zip(rules, counts, strict=True)):
+            stream = random.substream(StreamId.SPECIES) if k else random
+            seeded = rule.with_count(count).seed(len(seeds), generator=stream, device=weight.device)
+            seeded.x[..., 0] += k * distance
+            species.append(seeded)
+        worlds = combined(partial(torch.cat, dim=1), species).map(lambda part: part.to(weight))
+        diverged = torch.zeros(len(seeds), dtype=torch.bool, device=weight.device)
+        stops = sorted({*range(0, self.settings.steps, PROGRESS_STEPS), *self._frame_steps})
         for before, step in zip([0, *stops], stops, strict=False):
-            new_x, new_s = rollout_species(
+            x, s = rollout_species(
                 [rule.rule for rule in rules],
-                x,
-                s,
+                worlds.x,
+                worlds.s,
                 step - before,
                 counts=counts,
                 eps=factor * rules[0].rule.eps0,
-                update_prob=[settings.update_prob or rule.task.update_prob for rule in rules],
+                update_prob=[rule.task.update_prob for rule in rules],
                 generator=random,
                 density_counts=counts,
             )
-            broken = divergence(new_x, new_s).non_finite
-            x, s = Particles(x, s).where(broken, Particles(new_x, new_s))[:2]
+            broken = divergence(x, s).non_finite
+            worlds = worlds.where(broken, worlds._replace(x=x, s=s))
             diverged = diverged | broken
             self._progress(step - before)
-            yield step, x, s, diverged
+            yield step, worlds, diverged
 
 
-def _resized(rule: RuleUnderTest, particle_count: int) -> Task:
-    return rule.task.resized(particle_count).for_rule(rule.rule)
-
-
-MAX_CHANGE = 4.0
-"""Range of the colour map of changes: this, and its inverse."""
+def _loss_and_centroid(
+    rule: RuleUnderTest, worlds: Particles, diverged: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return the rule's task metric of worlds (inf if diverged), [B], and centroids, [B, 2]."""
+    losses = rule.with_count(worlds.x.shape[1]).metric(worlds.x, worlds.s)
+    return losses.masked_fill(diverged, math.inf), worlds.x.mean(dim=1)
 
 
 class InteractionRecord(Record[InteractionRow]):
@@ -328,32 +306,19 @@ class InteractionRecord(Record[InteractionRow]):
         return [InteractionRow(**row) for row in rows]
 
 
-def heat_map(rows: Sequence[InteractionRow]) -> bytes:
-    """Return a PNG of two matrices for each setting, of rules (rows) and those beside (columns).
+def interaction_map(rows: Sequence[InteractionRow]) -> bytes:
+    """Return a PNG with a matrix for each setting: changes of the loss of rules (rows) by others.
 
-    They hold the change of the loss and the mixing index. Needs matplotlib.
+    Needs matplotlib.
     """
-    from matplotlib.colors import LogNorm, Normalize
-
     names = list(dict.fromkeys([row.rule for row in rows] + [row.beside for row in rows]))
-    settings: dict[str, dict[tuple[str, str], InteractionRow]] = {}
+    cells: dict[str, dict[tuple[str, str], float]] = {}
     for row in rows:
         radius = "" if row.eps_factor == 1.0 else f", ε × {row.eps_factor:g}"
-        title = f"distance {row.distance:g}, ratio {row.ratio:g}{radius}"
-        settings.setdefault(title, {})[row.rule, row.beside] = row
-    ticks = {"ticks": [0.25, 0.5, 1.0, 2.0, 4.0], "format": "%g"}
-    changes = LogNorm(1.0 / MAX_CHANGE, MAX_CHANGE)
-    matrices: tuple[tuple[str, str, str, Any, dict[str, Any]], ...] = (
-        ("change", "loss together / alone", "RdBu_r", changes, ticks),
-        ("mixing", "mixing index", "viridis", Normalize(0.0, 1.0), {}),
-    )
-    width, height = 1.6 + 0.6 * len(names), 1.6 + 0.5 * len(names)
-    figure, grid = new_figure(len(settings), 2, (2 * width + 2.0, height * len(settings)))
-    for (title, pairs), panels in zip(settings.items(), grid, strict=True):
-        for panel, (column, name, colours, norm, bar) in zip(panels, matrices, strict=True):
-            values: Any = [[getattr(pairs.get((a, b)), column, None) for b in names] for a in names]
-            scale = draw_matrix(panel, names, names, values, colours=colours, norm=norm)
-            panel.set(xlabel="beside", ylabel="rule")
-            panel.set_title(f"{name}\n{title}", fontsize=9)
-            figure.colorbar(scale, ax=panel, **bar).minorticks_off()
-    return png(figure)
+        title = f"loss together / alone, distance {row.distance:g}, ratio {row.ratio:g}{radius}"
+        cells.setdefault(title, {})[row.rule, row.beside] = row.change
+    matrices = {
+        title: (names, names, [[changes.get((a, b)) for b in names] for a in names])
+        for title, changes in cells.items()
+    }
+    return heat_map(matrices, colours="RdBu_r", largest=4.0)

@@ -1,4 +1,4 @@
-"""The judge of textures: three distances from the target that no training loss contains.
+"""The metric of textures: three distances from the target that no training loss contains.
 
 Each is divided by the distance of a drawing of the target by particles, or by 2 % of the distance
 of grey noise if that is larger.
@@ -23,7 +23,7 @@ PATCH = 24
 DIRECTIONS = 64
 """Random directions that patches are projected on."""
 BANDS = 7
-"""Logarithmic bands of the wave number, `BAND_RATIO` wide, up to half a wave a pixel."""
+"""Logarithmic bands of the wave number, `BAND_RATIO` wide, up to half a wave per pixel."""
 BAND_RATIO = math.sqrt(2.0)
 ORIENTATIONS = 8
 """Orientations of waves in half a turn."""
@@ -36,7 +36,7 @@ DRAWINGS = 4
 
 
 @dataclass(frozen=True)
-class JudgeRow:
+class TextureRow:
     """Pictures' distances from the target, divided by those of drawings of it; means over worlds.
 
     `patches` are sliced Wasserstein distances of patches, `spectra` distances of oriented power
@@ -51,7 +51,7 @@ class JudgeRow:
     colours: float
 
 
-class TextureJudge:
+class TextureMetric:
     """Distance of pictures of a texture task from its target.
 
     It is computed in float64 with directions from a fixed seed, so that CPU and GPU agree.
@@ -63,8 +63,8 @@ class TextureJudge:
     def __init__(self, task: object) -> None:
         if not isinstance(task, Texture):
             raise NPAError(
-                f"the judge compares textures, got {type(task).__name__}: leave out --judge, or "
-                "give a rule of the task texture"
+                f"the texture metric compares textures, got {type(task).__name__}: leave out "
+                "--judge, or give a rule of the task texture"
             )
         self._task = task
         resolution = task.config.resolution
@@ -108,12 +108,12 @@ class TextureJudge:
         images = _images(pictures.to(self._task.target_picture.device))
         return self._distances(images) / self._units
 
-    def row(self, x: Tensor, s: Tensor, step: int) -> JudgeRow:
+    def row(self, x: Tensor, s: Tensor, step: int) -> TextureRow:
         """Return the row of worlds that are `step` steps after their seed."""
         ratios = self(self._task.picture(x, s))
         each = ratios.mean(1)
         patches, spectra, colours = ratios.mean(0).tolist()
-        return JudgeRow(step, each.mean().item(), each.max().item(), patches, spectra, colours)
+        return TextureRow(step, each.mean().item(), each.max().item(), patches, spectra, colours)
 
     def _distances(self, images: Tensor) -> Tensor:
         distances = []

@@ -20,6 +20,7 @@ from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
 from npa_envs.tasks.damage import PoolDamage, damage_pool
 from npa_envs.tasks.gaussian_outputs import Gaussians
 from npa_envs.tasks.seeds import uniform_ball
+from npa_envs.tasks.train_config import Common
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness
 
@@ -38,22 +39,22 @@ class Frame(NamedTuple):
 class TaskConfig:
     """Settings that all tasks share: sizes of world, rule and picture. Subclasses add their own."""
 
-    particle_count: int = 4096
+    particle_count: Common[int] = 4096
     """Particles in a world, N."""
 
     state_dim: int = 16
     """State channels of a particle, C; the last three are its colour (less 0.5)."""
 
-    hidden_dim: int = 128
+    hidden_dim: Common[int] = 128
     """Width of the rule's hidden layer."""
 
-    eps: float = 0.1
+    eps: Common[float] = 0.1
     """Perception radius ε [length units]; the rule is trained at it, so it is also its ε0."""
 
     update_prob: float = 0.5
     """Probability p that a particle is updated in a step (dimensionless)."""
 
-    resolution: int = 128
+    resolution: Common[int] = 128
     """Pixels on each side of a world's picture, R."""
 
     overflow_weight: float = 100.0

@@ -27,7 +27,7 @@ from npa_envs.tasks.base import GrowthConfig, GrowthTask
 from npa_envs.tasks.damage import damage_pool
 from npa_envs.tasks.targets.images import MAX_POINT_COUNT
 from npa_envs.tasks.targets.picture_points import PointTarget, load_target
-from npa_envs.tasks.train_config import TrainConfig, fast_run, presets_of, tiny_run
+from npa_envs.tasks.train_config import Common, TrainConfig, fast_run, presets_of, tiny_run
 from npa_envs.world.division import living
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness, uniform_draws
@@ -44,10 +44,10 @@ class Morphogenesis2DConfig(GrowthConfig):
     [-1, 1] x [-1, 1].
     """
 
-    target: str = "gecko"
+    target: Common[str] = "gecko"
     """What to grow: a built-in name, an emoji, or the path of a PNG, JPEG or WebP file."""
 
-    targets: tuple[str, ...] = ()
+    targets: Common[tuple[str, ...]] = ()
     """Several things to grow by one rule, in place of `target`: as that, or folders of pictures."""
 
     code_dim: int = 8
@@ -71,7 +71,7 @@ class Morphogenesis2DConfig(GrowthConfig):
     """Radius of the disk whose state is wiped in worlds from the pool [length units]; 0: none. With
     `division`, each particle dies with probability one half instead."""
 
-    resolution: int = 256
+    resolution: Common[int] = 256
     """Pixels on each side of the picture that the loss compares, R."""
 
     sigma: float = 1.0

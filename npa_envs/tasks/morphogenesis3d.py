@@ -33,7 +33,7 @@ from npa_envs.tasks.targets.views import (
     nearest_camera,
     some_views,
 )
-from npa_envs.tasks.train_config import TrainConfig, fast_run, presets_of, tiny_run
+from npa_envs.tasks.train_config import Common, TrainConfig, fast_run, presets_of, tiny_run
 from npa_envs.world.cuda_graph import to_device_async
 from npa_envs.world.particles import Particles
 
@@ -46,13 +46,13 @@ class Morphogenesis3DConfig(GrowthConfig):
     the target lies within 0.85 of the origin.
     """
 
-    target: str = "mushroom"
+    target: Common[str] = "mushroom"
     """What to grow: a built-in mesh, a mesh file, or a folder in the format of NeRF-synthetic."""
 
-    particle_count: int = 16384
+    particle_count: Common[int] = 16384
     """Particles in a world, N."""
 
-    hidden_dim: int = 256
+    hidden_dim: Common[int] = 256
     """Width of the rule's hidden layer."""
 
     readout_hidden_dim: int = 256
@@ -64,7 +64,7 @@ class Morphogenesis3DConfig(GrowthConfig):
     seed_radius: float = 1.0
     """Radius of the ball that the particles start in [length units]."""
 
-    resolution: int = 192
+    resolution: Common[int] = 192
     """Pixels on each side of a view, R."""
 
     training_views: int = 48

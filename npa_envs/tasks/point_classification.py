@@ -17,7 +17,7 @@ from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Frame, ParticleTask, TaskConfig
 from npa_envs.tasks.seeds import drawn_indices, drawn_worlds
 from npa_envs.tasks.targets.digit_clouds import PointClouds, Split, augmented, load_clouds
-from npa_envs.tasks.train_config import TrainConfig, fast_run, presets_of, tiny_run
+from npa_envs.tasks.train_config import Common, TrainConfig, fast_run, presets_of, tiny_run
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness
 
@@ -30,7 +30,7 @@ class PointClassificationConfig(TaskConfig):
     a cloud fills about [0, 1]².
     """
 
-    data: str = "digits"
+    data: Common[str] = "digits"
     """The pictures: "digits" (scikit-learn), "mnist" (torchvision), or a folder of IDX files."""
 
     data_folder: str = "data"
@@ -55,10 +55,10 @@ class PointClassificationConfig(TaskConfig):
     """Probability that a damaged world from the pool gets the positions and class of another cloud
     and keeps its states."""
 
-    particle_count: int = 512
+    particle_count: Common[int] = 512
     """Particles in a world, N: points of a cloud."""
 
-    hidden_dim: int = 256
+    hidden_dim: Common[int] = 256
     """Width of the rule's hidden layer."""
 
     readout_hidden_dim: int = 256

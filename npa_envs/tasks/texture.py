@@ -32,7 +32,7 @@ from npa_envs.tasks.losses.texture import (
 )
 from npa_envs.tasks.seeds import uniform_box
 from npa_envs.tasks.targets.textures import TextureTarget, load_texture
-from npa_envs.tasks.train_config import TrainConfig, presets_of, tiny_run
+from npa_envs.tasks.train_config import Common, TrainConfig, presets_of, tiny_run
 from npa_envs.world.brushes import wipe_state
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness
@@ -46,13 +46,13 @@ class TextureConfig(TaskConfig):
     units.
     """
 
-    target: str = "cells"
+    target: Common[str] = "cells"
     """The texture: a built-in name, or the path of a PNG, JPEG or WebP file."""
 
     target_tiles: bool = False
     """Whether opposite edges of a picture file fit together; those of built-in textures do."""
 
-    loss: str = DEFAULT_LOSS
+    loss: Common[str] = DEFAULT_LOSS
     """Loss between textures: a name of `TEXTURE_LOSSES` such as "patch_ot" or the paper's
     "vgg_ot", or the sum of some, such as "patch_ot+joint_swd"."""
 
@@ -62,7 +62,7 @@ class TextureConfig(TaskConfig):
     vgg_weights: str = ""
     """File of VGG16's weights for "vgg_ot"; empty: torch's usual folder of downloads."""
 
-    eps: float = 0.2
+    eps: Common[float] = 0.2
     """Perception radius ε [length units]; the rule is trained at it, so it is also its ε0."""
 
     see_across: bool = False

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Generic, Literal, TypeVar, get_args
+from typing import Annotated, Any, Generic, Literal, TypeVar, get_args
 
 import torch
 
@@ -28,6 +28,11 @@ from npa_envs.errors import NPAError, shown
 from npa_envs.world.rollout import Memory
 
 TaskConfigT = TypeVar("TaskConfigT")
+FieldT = TypeVar("FieldT")
+
+COMMON = "shown by --help"
+Common = Annotated[FieldT, COMMON]
+"""Type of a field that `npa-envs train TASK --help` shows; `--help-all` shows all fields."""
 
 Schedule = Literal["milestones", "cosine"]
 """Learning-rate schedules."""
@@ -59,7 +64,7 @@ class TrainConfig(Generic[TaskConfigT]):
     task: TaskConfigT
     """The task's own configuration."""
 
-    initial_rule: str = ""
+    initial_rule: Common[str] = ""
     """Rule to start from: a name, a file or a run's folder; '': random weights. The preset `best`
     of morphogenesis2d starts from a heart (`heart-first`), that of morphogenesis3d from
     `rocket-8192`."""
@@ -76,26 +81,26 @@ class TrainConfig(Generic[TaskConfigT]):
     that hardly change come to rest. It replaces that of `initial_rule`, even if it is 0; rules that
     are given for several species keep theirs. Ignored for equivariant rules, which have none."""
 
-    iterations: int = 10_000
+    iterations: Common[int] = 10_000
     """Optimiser steps in one repeat."""
 
-    repeats: int = 3
+    repeats: Common[int] = 3
     """How often the schedule runs. Rule and pool continue; the optimiser is reset."""
 
-    world_count: int = 8
+    world_count: Common[int] = 8
     """Worlds in a batch, B."""
 
-    pool_size: int = 512
+    pool_size: Common[int] = 512
     """Worlds that are stored between batches."""
 
-    steps: tuple[int, int] = (32, 96)
+    steps: Common[tuple[int, int]] = (32, 96)
     """Range [lo, hi) that the number of steps of a rollout is drawn from, uniformly."""
 
     optimiser: OptimiserName = "adamw"
     """"adamw" as in the paper, or "muon": orthogonal steps of the layers' matrices (Jordan et al.
     2024), and AdamW for all else, such as biases."""
 
-    learning_rate: float = 5e-4
+    learning_rate: Common[float] = 5e-4
     """The optimiser's learning rate at the start of each repeat."""
 
     schedule: Schedule = "milestones"
@@ -145,10 +150,10 @@ class TrainConfig(Generic[TaskConfigT]):
     to heal: the first indices, which with `max_age_range` have the shortest lifetimes. All others
     are damaged by `damage_and_keep_share` alone."""
 
-    seed: int = 0
+    seed: Common[int] = 0
     """Seed of every random number of the run, in [0, 2**63)."""
 
-    device: str = "cpu"
+    device: Common[str] = "cpu"
     """Device to train on: "cpu", "cuda", "cuda:1", ..."""
 
     dtype: Literal["float32", "float64"] = "float32"
@@ -161,7 +166,7 @@ class TrainConfig(Generic[TaskConfigT]):
     cuda_graph: bool = True
     """On CUDA, replay rollout and gradients as one CUDA graph for each number of steps."""
 
-    out: Path = Path("runs/morphogenesis2d")
+    out: Common[Path] = Path("runs/morphogenesis2d")
     """Folder that log, pictures, checkpoint and rule are written to; created where missing."""
 
     log_interval: int = 10
@@ -281,10 +286,10 @@ class JointTrainConfig(TrainConfig[TaskConfigT]):
     The field `initial_rule` must be empty.
     """
 
-    initial_rules: tuple[str, ...] = ()
+    initial_rules: Common[tuple[str, ...]] = ()
     """Rules to start from, names of shipped rules or files, one for each species."""
 
-    frozen: tuple[int, ...] = ()
+    frozen: Common[tuple[int, ...]] = ()
     """Indices of the species, from 0, whose initial rules do not learn."""
 
     def __post_init__(self) -> None:

@@ -220,7 +220,7 @@ class RunFolder:
         self.pictures = path / "pictures"
         """Pictures of a batch, named by iteration."""
         self.report = path / "report"
-        """Figures and films of the finished rule (`npa-envs train`)."""
+        """Metrics, films and model cards of the finished rules (`npa-envs train`)."""
         self.tensorboard = path / "tensorboard"
         self.lock = path / ".lock"
         """Locked while a trainer writes to the folder; names the trainer's process and computer."""

@@ -43,6 +43,8 @@ class TaskEntry:
     """Returns the task of a configuration, on a device."""
     targets: Callable[[], tuple[str, ...]]
     """Returns the names of its built-in targets; none where the task has no field `target`."""
+    examples: tuple[str, ...]
+    """Options of `npa-envs train` that the help of the task shows."""
     fast_seconds: float
     """Duration of the preset `fast` on one thread of a CPU [s]."""
     paired_time: float = 0.8
@@ -78,6 +80,11 @@ TASKS: Mapping[str, TaskEntry] = {
             config, device=device
         ),
         targets=builtin_targets,
+        examples=(
+            "--target heart --out runs/heart",
+            "--preset paper --target lizard.png --device cuda",
+            "--preset paper --target lizard.png --gpus 4",
+        ),
         fast_seconds=220.0,
     ),
     "co_morphogenesis2d": TaskEntry(
@@ -86,6 +93,10 @@ TASKS: Mapping[str, TaskEntry] = {
         # Its rules are filmed and evaluated one by one, as rules of morphogenesis2d.
         make=lambda config, device: CoMorphogenesis2D(config, device=device),
         targets=tuple,
+        examples=(
+            "--targets ring heart",
+            "--preset paper --targets gecko heart --device cuda",
+        ),
         fast_seconds=340.0,
         joint=True,
     ),
@@ -94,6 +105,10 @@ TASKS: Mapping[str, TaskEntry] = {
         presets=MORPHOGENESIS3D_PRESETS,
         make=lambda config, device: Morphogenesis3D(config, device=device),
         targets=builtin_meshes,
+        examples=(
+            "--target duck --out runs/duck",
+            "--preset paper --target statue.obj --device cuda",
+        ),
         fast_seconds=290.0,
         space_dim=3,
     ),
@@ -102,6 +117,7 @@ TASKS: Mapping[str, TaskEntry] = {
         presets=TEXTURE_PRESETS,
         make=lambda config, device: Texture(config, device=device),
         targets=builtin_textures,
+        examples=("--target dots --out runs/dots", "--target wall.png --loss filter_swd"),
         fast_seconds=285.0,
         # Each world's loss is most of the work.
         paired_time=0.55,
@@ -111,6 +127,7 @@ TASKS: Mapping[str, TaskEntry] = {
         presets=POINT_CLASSIFICATION_PRESETS,
         make=lambda config, device: PointClassification(config, device=device),
         targets=tuple,
+        examples=("--out runs/digits", "--preset paper --data mnist --device cuda"),
         fast_seconds=200.0,
         static=True,
     ),

@@ -24,10 +24,10 @@ from npa_envs.world.particles import Particles
 def make_environment(
     id: str, policy: str = "zero", *, device: str = "cpu", **keywords: Any
 ) -> tuple[Any, Callable[[Any], Any]]:
-    """Return an environment of this package, and a function from its observations to actions.
+    """Return an environment, and a function from its observations to actions.
 
-    `policy` is "zero", "random", or the source of a rule. Keywords that are None keep their
-    defaults.
+    `id` is one of this package or, as MODULE:ID, of a module that registers it. `policy` is "zero",
+    "random", or the source of a rule. Keywords that are None keep their defaults.
     """
     others = {*GARDEN_IDS, *(environment.id for environment in CODED)}
     if id in others:
@@ -35,9 +35,6 @@ def make_environment(
             f"environments whose actions are updates of particles can be viewed, got {shown(id)}: "
             "view the rule that runs its particles instead"
         )
-    known = [environment.id for environment in ALL if environment.id not in others]
-    if id not in known:
-        raise NPAError(f"unknown environment {shown(id)}: {suggest(id, known)}")
     simple = {"zero": ZeroPolicy, "random": RandomPolicy}
     rule = None if policy in simple else load_rule(policy, device=device).float()
     keywords = {name: value for name, value in keywords.items() if value is not None}
@@ -47,7 +44,17 @@ def make_environment(
         raise NPAError(
             f"max_episode_steps must be a whole number of at least 1, got {shown(limit)}: try 512"
         )
-    env = gymnasium.make(id, disable_env_checker=True, device=device, output="torch", **keywords)
+    options: dict[str, Any] = {"disable_env_checker": True, "device": device, "output": "torch"}
+    try:
+        env = gymnasium.make(id, **options, **keywords)
+    except (gymnasium.error.Error, ModuleNotFoundError) as error:
+        known = [environment.id for environment in ALL if environment.id not in others]
+        raise NPAError(f"unknown environment {shown(id)}: {suggest(id, known)}") from error
+    except TypeError as error:
+        if isinstance(error, NPAError):
+            raise
+        what = f"env must be an environment of npa_envs, got {shown(id)}"
+        raise NPAError(f"{what}: {error}") from error
     return env, simple[policy](env) if rule is None else RulePolicy(rule, env)
 
 

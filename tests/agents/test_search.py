@@ -134,7 +134,7 @@ def test_a_stopped_search_goes_on_as_if_it_had_not_been(method, tmp_path):
     for ours, theirs in zip(again.elites(), whole.elites(), strict=True):
         assert ours.cell == theirs.cell
         assert np.array_equal(ours.solution, theirs.solution)
-    refused("figures of other settings: seed was 3", search, **options | {"seed": 1}, path=path)
+    refused("results of other settings: seed was 3", search, **options | {"seed": 1}, path=path)
     content = json.loads(path.read_text(encoding="utf-8"))
     content["batches"][1]["fingerprint"] += 1
     path.write_text(json.dumps(content), encoding="utf-8")

@@ -16,9 +16,10 @@ import torch
 from PIL import Image
 
 from npa_envs.cli import COMMANDS, demo, doctor, main
-from npa_envs.cli.train import announcement, parse_run, starting_configuration
+from npa_envs.cli.train import announcement
+from npa_envs.cli.train_options import parse_run, starting_configuration
 from npa_envs.errors import NPAError
-from npa_envs.render.world_film import WorldFilm, film_world
+from npa_envs.render.world_film import WorldFilm
 from npa_envs.rule.files import load_rule, save_rule
 from npa_envs.rule.rule import NPARule
 from npa_envs.training import TASKS, preset
@@ -78,7 +79,7 @@ def test_every_command_explains_itself_and_shows_examples_of_its_options(name, c
     assert f"usage: npa-envs {name}" in text
     assert "{None}" not in text
     examples = re.findall(rf"^  npa-envs {name}(.*)$", text, re.MULTILINE)
-    assert examples or name in ("train", "list", "doctor")
+    assert examples or name in ("train", "doctor")
     for option in re.findall("--[a-z-]+", "".join(examples)):
         # Once more, among the options.
         assert re.search(rf"{option}[ ,\n]", text.partition(f"{examples[-1]}\n")[2])
@@ -205,7 +206,7 @@ def test_doctor_says_why_no_card_is_used(built, cards, hidden, mark, cure, monke
         monkeypatch.setenv("CUDA_VISIBLE_DEVICES", hidden)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(torch.version, "cuda", built)
-    finding = doctor._torch_devices()[-1]
+    *_, finding = doctor._torch_devices()
     assert finding.mark == mark
     assert cure in finding.fix
     assert ("A100 is idle" in finding.text) == bool(cards)
@@ -489,48 +490,26 @@ def test_a_rule_without_a_target_grows_without_figures(tmp_path, capsys):
 def test_a_message_of_several_lines_becomes_one_and_an_interruption_has_no_traceback(
     monkeypatch, capsys
 ):
-    monkeypatch.setattr("npa_envs.cli.listing.main", raising(NPAError("x must be\n  positive")))
+    monkeypatch.setattr("npa_envs.cli.list.main", raising(NPAError("x must be\n  positive")))
     assert error_of(capsys, ["list"]) == "npa-envs: error: x must be positive\n"
     for number, hint in ((errno.ENOSPC, "free some space"), (errno.EACCES, "another folder")):
-        monkeypatch.setattr("npa_envs.cli.listing.main", raising(OSError(number, "no", "a.txt")))
+        monkeypatch.setattr("npa_envs.cli.list.main", raising(OSError(number, "no", "a.txt")))
         message = error_of(capsys, ["list"])
         assert message.startswith("npa-envs: error: no 'a.txt': ")
         assert hint in message
-    monkeypatch.setattr("npa_envs.cli.listing.main", raising(KeyboardInterrupt))
+    monkeypatch.setattr("npa_envs.cli.list.main", raising(KeyboardInterrupt))
     assert main(["list"]) == 130
     assert capsys.readouterr().err == "npa-envs: interrupted\n"
 
 
-def test_demo_shows_growth_healing_and_training(tmp_path, rule, capsys):
-    out = tmp_path / "demo"
-    words = ["demo", "--rule", rule, "--out", str(out)]
-    assert main([*words, "--train-seconds", "1", "--no-progress"]) == 0
+def test_demo_shows_growth_healing_and_training(tmp_path, monkeypatch, capsys):
+    for name in ("GROW_STEPS", "HEAL_STEPS"):
+        monkeypatch.setattr(demo, name, 8)
+    words = ["demo", "--out", str(tmp_path), "--train-seconds", "1", "--no-progress"]
+    assert main(words) == 0
     text = capsys.readouterr().out
     assert len(re.findall(r"PSNR +\d+\.\d+ dB", text)) == 4
-    assert (out / "report.txt").read_text(encoding="utf-8") in text
+    assert (tmp_path / "report.txt").read_text(encoding="utf-8") in text
     written = {Path(name) for name in re.findall(r"wrote (\S+)", text)}
     assert {path.suffix for path in written} == {".gif", ".mp4", ".png", ".txt", ".safetensors"}
     assert all(path.is_file() for path in written)
-
-
-@pytest.mark.parametrize("source", ["digits", "seven-pictures"])
-def test_demo_grows_rules_with_goals_and_with_codes(source, tmp_path, monkeypatch, capsys):
-    if source == "digits":
-        pytest.importorskip("sklearn")
-    ends = []
-
-    def watched(*arguments, **options):
-        ends.append(film_world(*arguments, **options))
-        return ends[-1]
-
-    monkeypatch.setattr("npa_envs.render.world_film.film_world", watched)
-    monkeypatch.setattr(demo, "train_small", lambda *_: ())
-    for name in ("GROW_STEPS", "HEAL_STEPS"):
-        monkeypatch.setattr(demo, name, 8)
-    assert main(["demo", "--rule", source, "--out", str(tmp_path), "--no-progress"]) == 0
-    assert "no figures" not in capsys.readouterr().out
-    codes = load_rule(source).codes
-    for worlds, _ in ends if codes is not None else ():
-        # Damage has not taken the code away.
-        code = codes[codes.names[0]].float()
-        assert torch.equal(worlds.s[0, :, :8], code.expand(worlds.s.shape[1], 8))

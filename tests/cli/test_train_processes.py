@@ -9,13 +9,8 @@ from support.training_runs import trainer_of
 
 from npa_envs.cli import main
 from npa_envs.cli.common import torch_threads
-from npa_envs.cli.train import (
-    TrainOptions,
-    process_count,
-    resolve_task,
-    starting_configuration,
-    thread_count,
-)
+from npa_envs.cli.train import process_count, thread_count
+from npa_envs.cli.train_options import TrainOptions, resolve_task, starting_configuration
 from npa_envs.errors import NPAError
 from npa_envs.training import RunFolder, config_to_dict, preset
 from npa_envs.training.checkpoint import load_checkpoint, save_checkpoint

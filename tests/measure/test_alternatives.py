@@ -69,8 +69,7 @@ def test_perception_in_float32_errs_little_and_the_reference_not_at_all():
     assert cut.perception > 1e-3
     short = next(row for row in rows if row.precision == "bf16_storage")
     assert 1e-5 < short.perception < 1e-2
-    left = {entry.what for entry in here.left_out}
-    assert {"tf32", "perception in mixed", "plain, float32, 2D (2, 150)"} <= left
+    assert {"tf32", "perception in mixed", "plain, float32, 2D (2, 150)"} <= {*here.left_out}
 
 
 def stored(tmp_path: Path, **values: float) -> Path:

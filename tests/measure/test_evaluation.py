@@ -1,4 +1,4 @@
-"""The numbers by which a rule is judged."""
+"""The metrics of a rule."""
 
 import math
 from dataclasses import astuple

@@ -14,7 +14,7 @@ from support.clock import Clock
 from npa_envs.cli import main
 from npa_envs.measure.speed import suites
 from npa_envs.measure.speed.explain import explain
-from npa_envs.measure.speed.timing import LeftOut, Timing, TimingSession, Workload, compare
+from npa_envs.measure.speed.timing import Timing, TimingSession, Workload, compare
 
 TINY = Workload(2, 2, 150, 2, hidden_dim=16, eps=0.2)
 FORWARD = 1e-5
@@ -84,15 +84,14 @@ def test_what_does_not_fit_into_memory_or_the_time_is_left_out():
     found = [here.attempt(name, make) for name, make in (("large", large), ("small", lambda: 3))]
     assert found == [[], [3]]
     assert here.attempt("late", lambda: 4) == []
-    left = [("large", "not enough memory"), ("late", "no time was left")]
-    assert here.left_out == [LeftOut(*entry) for entry in left]
+    assert here.left_out == {"large": "not enough memory", "late": "no time was left"}
     assert done == [1, 1]
 
 
 def test_each_skip_is_measured_with_and_without():
     here = session()
     rows = suites.skip_rows(here)
-    assert here.left_out == []
+    assert here.left_out == {}
     assert len({row.condition for row in rows}) == len(rows) == 10
     assert all(row.done_us.median > 0 and row.skipped_us.median > 0 for row in rows)
     assert all(row.saved.endswith("%") for row in rows)
@@ -102,7 +101,7 @@ def test_kernels_are_cudas(device):
     here = TimingSession(device, repeats=1, small=True)
     rows = suites.SUITES["kernels"](here)["kernels"]
     assert any("perceive" in row.kernel for row in rows) == (device.type == "cuda")
-    assert [entry.what for entry in here.left_out] == ([] if rows else ["kernels"])
+    assert [*here.left_out] == ([] if rows else ["kernels"])
 
 
 # One species beside `rollout`

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sys
 
 import pytest
 import torch
@@ -49,11 +50,21 @@ def test_an_environment_gets_the_keywords_that_a_rule_needs():
         make("npa/Texture-v0", policy="dots")
 
 
+def test_environments_of_ones_own_are_viewed(tmp_path, monkeypatch):
+    text = "gymnasium.register('own/Spots-v0', 'npa_envs.envs.texture:TextureEnv')"
+    (tmp_path / "own_envs.py").write_text(f"import gymnasium\n{text}\n", encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.path", [*sys.path])
+    assert type(make("own_envs:own/Spots-v0")) is EnvironmentWorld
+
+
 @pytest.mark.parametrize(
     ("words", "error"),
     [
         (["worm"], "unknown rule 'worm'"),
         (["npa/Worm-v0"], "unknown environment 'npa/Worm-v0'"),
+        (["no_module:Worm-v0"], "unknown environment 'no_module:Worm-v0'"),
+        (["CartPole-v1"], "env must be an environment of npa_envs, got 'CartPole-v1'"),
         (["npa/Texture-v0", "--policy", "duck"], "the environment's space_dim, 2, got 3"),
         (["npa/Texture-v0", "--policy", "digits"], "got one of static particles"),
         (["nowhere.safetensors"], "the file 'nowhere.safetensors' does not exist"),

@@ -12,13 +12,10 @@ from npa_envs.measure.accuracy.hard_cases import scene_checks
 from npa_envs.rule.files import shipped_rules
 
 
-def all_checks(
-    *, quick: bool = False, seed: int = 0, rules: Mapping[str, str] | None = None
-) -> list[Check]:
+def all_checks(*, quick: bool = False, rules: Mapping[str, str] | None = None) -> list[Check]:
     """Return all checks, sorted by `GROUPS`; with `rules`, only the checks of these rules.
 
-    `rules` maps names to shipped rules or files. `quick` checks fewer shipped rules. `seed` is for
-    random positions.
+    `rules` maps names to shipped rules or files. `quick` checks fewer shipped rules.
     """
     # Gradients are checked for one rule of each task.
     few = ("gecko", "dots") if quick else ("gecko", "dots", "digits", "duck")
@@ -33,5 +30,5 @@ def all_checks(
         return of_rules
     by_dimension = sorted(CHECKS, key=lambda one: ("/2d" not in one.name, "/3d" not in one.name))
     groups = list(GROUPS)
-    checks = [*scene_checks(seed), *of_rules, *by_dimension]
+    checks = [*scene_checks(), *of_rules, *by_dimension]
     return sorted(checks, key=lambda one: groups.index(one.group))

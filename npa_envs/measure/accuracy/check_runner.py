@@ -5,17 +5,16 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from pathlib import Path
 from typing import Any, Literal
 
 import torch
 
 from npa_envs.errors import NPAError, suggest
 from npa_envs.measure.benchmark_records import Record, aligned, as_objects, time_limit
-from npa_envs.measure.plots import draw_matrix, new_figure, png
+from npa_envs.measure.plots import heat_map
 from npa_envs.rule.files import load_rule, rule_digest
 
 Verdict = Literal["pass", "fail", "range", "skipped", ""]
@@ -25,12 +24,9 @@ GROUPS = {
     "values": "what states hold: tiny, huge, infinite, no number",
     "time": "every shipped rule for 100 000 steps",
     "gradients": "how gradients grow with the steps; finite differences; float32's errors",
-    "precision": "order, batches, repetitions, recorded graphs",
+    "precision": "order, batches, repetitions, CUDA graphs",
 }
 """Every group of checks with its summary."""
-
-FAR = 1e3
-"""Range of the colour map of heat maps: this times a limit, and its inverse."""
 
 
 class Skipped(Exception):
@@ -39,16 +35,16 @@ class Skipped(Exception):
 
 @dataclass(frozen=True)
 class CheckResult:
-    """Result of a check: measured numbers by name (`figures`), and upper limits of some of them."""
+    """Result of a check: measured numbers by name (`metrics`), and upper limits of some of them."""
 
-    figures: Mapping[str, float] = field(default_factory=dict)
+    metrics: Mapping[str, float] = field(default_factory=dict)
     limits: Mapping[str, float] = field(default_factory=dict)
     holds: str = ""
     """The range in which the library is right, as text, if the check measures one."""
     note: str = ""
     """Why it was skipped, its error, or a remark."""
     verdict: Verdict = ""
-    """By default "fail" if a figure with a limit is above it, missing or NaN, else "range" if
+    """By default "fail" if a metric with a limit is above it, missing or NaN, else "range" if
     `holds` is given, or "pass"."""
     name: str = ""
     """Name of the check; `run_check` sets this field and those below."""
@@ -61,27 +57,27 @@ class CheckResult:
     def __post_init__(self) -> None:
         """Set the verdict from the limits, unless it is given."""
         # Comparisons with NaN are false.
-        within = all(self.figures.get(key, math.nan) <= limit for key, limit in self.limits.items())
+        within = all(self.metrics.get(key, math.nan) <= limit for key, limit in self.limits.items())
         default = "range" if self.holds else "pass"
         object.__setattr__(self, "verdict", self.verdict or (default if within else "fail"))
 
     def fraction(self, name: str) -> float:
-        """Return a figure divided by its limit; if this is above 1 or NaN, it exceeds the limit.
+        """Return a metric divided by its limit; if this is above 1 or NaN, it exceeds the limit.
 
         With a limit of 0 it is 0 or infinite.
         """
-        value, limit = self.figures.get(name, math.nan), self.limits[name]
+        value, limit = self.metrics.get(name, math.nan), self.limits[name]
         if limit == 0.0:
             return value if value == 0.0 or math.isnan(value) else math.inf
         return value / limit
 
     def worst(self) -> str:
-        """Return the figure with the largest `fraction` of its limit, as text."""
+        """Return the metric with the largest `fraction` of its limit, as text."""
         if not self.limits:
             return ""
         fractions = {name: self.fraction(name) for name in self.limits}
         name = max(fractions, key=lambda name: (math.isnan(fractions[name]), fractions[name]))
-        value = self.figures.get(name, math.nan)
+        value = self.metrics.get(name, math.nan)
         return f"{name} {value:.2g} (at most {self.limits[name]:.2g})"
 
 
@@ -91,7 +87,6 @@ class CheckSession:
 
     device: torch.device
     quick: bool = False
-    seed: int = 0
     cache: dict[Any, Any] = field(default_factory=dict)
     """Results that several checks share."""
 
@@ -101,8 +96,8 @@ class CheckSession:
         return self.device.type == "cuda"
 
     def generator(self, number: int = 0) -> torch.Generator:
-        """Return a random generator on the device, seeded by the session's seed and a number."""
-        return torch.Generator(self.device).manual_seed(1000 * self.seed + number)
+        """Return a random generator on the device, seeded by a number."""
+        return torch.Generator(self.device).manual_seed(number)
 
 
 Run = Callable[..., CheckResult]
@@ -152,8 +147,6 @@ def check(
 
     def add(run: Run) -> Run:
         expected = " ".join((run.__doc__ or "").split()).removesuffix(".")
-        if not expected.startswith("NaN"):
-            expected = expected[:1].lower() + expected[1:]
         for case in cases or ((),):
             arguments = case if isinstance(case, tuple) else (case,)
             full_name = "/".join([name, *(LABELS[argument] for argument in arguments)])
@@ -177,31 +170,27 @@ def chosen_checks(checks: Sequence[Check], names: Sequence[str]) -> list[Check]:
 
 
 class StressRecord(Record[CheckResult]):
-    """Results of a run's checks, sorted as the names of the checks in `names`."""
+    """Results of a run's checks; in its file, metrics are called figures."""
 
     command = "stress"
 
-    def __init__(
-        self, facts: Mapping[str, Any], path: Path | None = None, names: Iterable[str] = ()
-    ) -> None:
-        super().__init__(facts, path)
-        self._order = {name: k for k, name in enumerate(names)}
-
     def content(self) -> dict[str, Any]:
         """Return the record file's check results and their counts by verdict; NaN becomes "nan"."""
-        return {"counts": self.counts(), "checks": _json_values(as_objects(self.rows))}
+        checks = as_objects(self.rows)
+        for fields in checks:
+            fields["figures"] = fields.pop("metrics")
+        return {"counts": self.counts(), "checks": _json_values(checks)}
 
     def parse(self, content: dict[str, Any]) -> list[CheckResult]:
         """Return the check results in the content of a record file, to continue a stopped run."""
         for fields in content["checks"]:
-            for name in ("figures", "limits"):
-                fields[name] = {key: float(value) for key, value in fields[name].items()}
+            for name, key in (("metrics", "figures"), ("limits", "limits")):
+                fields[name] = {inner: float(value) for inner, value in fields.pop(key).items()}
         return [CheckResult(**fields) for fields in content["checks"]]
 
     def store(self, result: CheckResult) -> None:
         """Add a result, or replace the one of the same check, and write the file."""
-        self.rows = [row for row in self.rows if row.name != result.name] + [result]
-        self.rows.sort(key=lambda row: self._order.get(row.name, len(self._order)))
+        self.rows = [*({row.name: row for row in self.rows} | {result.name: result}).values()]
         self.write()
 
     def result_of(self, check: Check) -> CheckResult | None:
@@ -218,10 +207,6 @@ class StressRecord(Record[CheckResult]):
         """Return the number of checks with each verdict."""
         counts = Counter(result.verdict for result in self.rows)
         return {verdict: counts[verdict] for verdict in ("pass", "range", "fail", "skipped")}
-
-    def failed(self) -> list[CheckResult]:
-        """Return the results that failed."""
-        return [result for result in self.rows if result.verdict == "fail"]
 
     def by_group(self) -> dict[str, list[CheckResult]]:
         """Return results by the group of their check."""
@@ -244,7 +229,8 @@ class StressRecord(Record[CheckResult]):
         parts += [
             f"{result.name} failed: {result.worst() or result.note}\n  expected: {result.expected}"
             + (f"\n  {result.note}" if result.note and result.worst() else "")
-            for result in self.failed()
+            for result in self.rows
+            if result.verdict == "fail"
         ]
         counts = ", ".join(f"{count} {verdict}" for verdict, count in self.counts().items())
         return "\n\n".join([*parts, counts])
@@ -304,23 +290,16 @@ def run_check(check: Check, session: CheckSession) -> CheckResult:
 
 def heat_maps(record: StressRecord) -> dict[str, bytes]:
     """Return a PNG heat map for each group of checks: measured numbers divided by their limits."""
-    from matplotlib.colors import LogNorm
-
     drawn = {}
     for group, results in record.by_group().items():
-        limited = [result for result in results if result.figures and result.limits]
-        if not limited:
-            continue
+        limited = [result for result in results if result.metrics and result.limits]
         rows = [result.name.partition("/")[2] for result in limited]
         columns = list(dict.fromkeys(name for result in limited for name in result.limits))
         fractions = [
             [result.fraction(name) if name in result.limits else None for name in columns]
             for result in limited
         ]
-        size = 3.0 + 0.6 * len(columns), 1.6 + 0.26 * len(rows)
-        figure, ((panel,),) = new_figure(1, 1, size)
-        norm = LogNorm(1.0 / FAR, FAR)
-        draw_matrix(panel, rows, columns, fractions, colours="RdYlGn_r", norm=norm)
-        panel.set_title(f"{group}: figures over their limits")
-        drawn[group] = png(figure, 110)
+        if limited:
+            matrices = {f"{group}: metrics over their limits": (rows, columns, fractions)}
+            drawn[group] = heat_map(matrices, colours="RdYlGn_r", largest=1e3)
     return drawn

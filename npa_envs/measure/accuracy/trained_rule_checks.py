@@ -100,7 +100,7 @@ BOUNDS = {
     "energy": 4.0,
     "drift": 1.0,
 }
-"""Bounds of figures, which are maxima over the steps after the world has settled.
+"""Bounds of metrics, which are maxima over the steps after the world has settled.
 
 `extent`: longest side of the bounding box, over that of the settled world. `overflow`: mean
 |s − clip(s, −1, 1)|. `largest_state`: the largest |s|. `energy`: mean over particles of |Δx|²/ε² +
@@ -147,7 +147,7 @@ def _run_long(name: str, session: CheckSession) -> CheckResult:
         RuleRunner(start.rule, start.task, session.generator(number)) for number in (1, 2)
     )
     open_space = start.task.box is None and not start.rule.static
-    figures: dict[str, float] = {"steps": float(steps), "particles": float(start.worlds.x.shape[1])}
+    metrics: dict[str, float] = {"steps": float(steps), "particles": float(start.worlds.x.shape[1])}
     limits = {key: limit for key, limit in BOUNDS.items() if key != "drift" or open_space}
     first: dict[str, float] = {}
     centroid = start.worlds.x.mean(1)
@@ -165,13 +165,13 @@ def _run_long(name: str, session: CheckSession) -> CheckResult:
                     # In a world at rest the rest is rounding.
                     current[key] /= max(first[unit], 1e-12)
         for key, value in current.items():
-            figures[key] = max(value, figures.get(key, 0.0))
+            metrics[key] = max(value, metrics.get(key, 0.0))
         over = [key for key, limit in limits.items() if not current.get(key, 0.0) <= limit]
         if over and not note:
             note = f"{', '.join(over)} above the bound at step {step}"
         if current["not_finite"]:
             break
-    return CheckResult(figures, limits, note=note)
+    return CheckResult(metrics, limits, note=note)
 
 
 # The group `gradients`: growth with the steps, errors of float32.
@@ -235,15 +235,15 @@ def _run_norm(name: str, session: CheckSession) -> CheckResult:
     """Gradients of a rollout by weights and by initial states are finite whatever the number of
     steps; their norms are reported."""
     start = _gradient_worlds(session, name)
-    figures: dict[str, float] = {}
+    metrics: dict[str, float] = {}
     not_finite = 0.0
     for steps in powers_of_two(QUICK_GRADIENT_STEPS if session.quick else GRADIENT_STEPS):
         result = outcome(start, session, steps, torch.float32)
-        figures[f"weights_{steps}"] = float(result.by_weights.norm())
-        figures[f"states_{steps}"] = float(result.by_states.norm())
+        metrics[f"weights_{steps}"] = float(result.by_weights.norm())
+        metrics[f"states_{steps}"] = float(result.by_states.norm())
         for gradient in (result.by_weights, result.by_states):
             not_finite = max(not_finite, float((~gradient.isfinite()).double().mean()))
-    return CheckResult(figures | {"not_finite": not_finite}, {"not_finite": 0.0})
+    return CheckResult(metrics | {"not_finite": not_finite}, {"not_finite": 0.0})
 
 
 @check("gradients/float32", registry=RULE_CHECKS)
@@ -254,24 +254,24 @@ def _run_float32(name: str, session: CheckSession) -> CheckResult:
     if start.rule.divides:
         raise Skipped("particles divide by draws that are others in float64")
     counts = powers_of_two(QUICK_GRADIENT_STEPS if session.quick else 128)
-    figures: dict[str, float] = {}
+    metrics: dict[str, float] = {}
     usable = dict.fromkeys(RolloutOutcome._fields, 0)
     for steps in counts:
         single = outcome(start, session, steps, torch.float32)
         exact = outcome(start, session, steps, torch.float64)
         for what, value, right in zip(RolloutOutcome._fields, single, exact, strict=True):
-            figures[f"{what}_{steps}"] = error = relative_error(value, right)
+            metrics[f"{what}_{steps}"] = error = relative_error(value, right)
             if error <= 1e-2 and usable[what] in (0, steps // 2):
                 usable[what] = steps
     limits = {f"{what}_1": 1e-5 for what in RolloutOutcome._fields}
     text = ", ".join(f"{what} {steps}" for what, steps in usable.items())
-    return CheckResult(figures, limits, holds=f"steps within 1e-2, of {counts[-1]}: {text}")
+    return CheckResult(metrics, limits, holds=f"steps within 1e-2, of {counts[-1]}: {text}")
 
 
 @check("precision/graph")
 @torch.no_grad()
 def _run_graph(session: CheckSession) -> CheckResult:
-    """A rollout of 16 steps recorded in a CUDA graph equals an eager one bit for bit."""
+    """A rollout of 16 steps captured in a CUDA graph equals an eager one bit for bit."""
     if not session.cuda:
         raise Skipped("graphs are CUDA's: run it with --device cuda")
     start = rule_worlds(session, "gecko", world_count=3)
@@ -285,12 +285,12 @@ def _run_graph(session: CheckSession) -> CheckResult:
 
     run()
     eager = result.map(torch.clone)
-    figures = {"positions": 0.0, "states": 0.0}
+    metrics = {"positions": 0.0, "states": 0.0}
     graph = capture(run, session.device, warm_up=run)
     for _ in range(2):
         random.steps.zero_()
         result.map(Tensor.zero_)
         graph.replay()
-        figures["positions"] += differing(result.x, eager.x)
-        figures["states"] += differing(result.s, eager.s)
-    return CheckResult(figures, dict.fromkeys(figures, 0.0))
+        metrics["positions"] += differing(result.x, eager.x)
+        metrics["states"] += differing(result.s, eager.s)
+    return CheckResult(metrics, dict.fromkeys(metrics, 0.0))

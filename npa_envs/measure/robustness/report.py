@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import date
 from pathlib import Path
@@ -125,16 +125,12 @@ class RuleRecord(Record[Response]):
 
 
 def measure_rule(
-    record: RuleRecord,
-    trial: RuleTrial,
-    most_particles: int,
-    *,
-    enough: Callable[[], bool] = lambda: False,
+    record: RuleRecord, trial: RuleTrial, *, enough: Callable[[], bool] = lambda: False
 ) -> None:
     """Measure what is missing in a rule's record; save it after each value of a condition.
 
-    Values of conditions that need more than `most_particles` particles are left out. Once `enough`
-    returns True, no further value is measured, and the record stays unfinished.
+    Values that need more than `MAX_PARTICLES` are left out. Once `enough` returns True, no further
+    value is measured, and the record stays unfinished.
     """
     begin = time.perf_counter() - record.about["seconds"]
     grown, trained = grow(trial)
@@ -148,7 +144,7 @@ def measure_rule(
             "done": False,
         }
     record.write()
-    rest = responses(trial, trained, most_particles, done=len(record.rows))
+    rest = responses(trial, trained, done=len(record.rows))
     while not enough():
         response = next(rest, None)
         record.about["seconds"] = round(time.perf_counter() - begin, 2)
@@ -184,9 +180,7 @@ def grow(
 
 
 @torch.no_grad()
-def responses(
-    trial: RuleTrial, trained: Response, most_particles: int, *, done: int = 0
-) -> Iterator[Response]:
+def responses(trial: RuleTrial, trained: Response, *, done: int = 0) -> Iterator[Response]:
     """Yield the response to each value of each condition, without the first `done`."""
     every = [(name, value) for name, values in trial.plan.values.items() for value in values]
     for condition, value in every[done:]:
@@ -195,7 +189,7 @@ def responses(
             continue
         fraction = float(value) if condition == "particles" else 1.0
         total = trial.world_count * trial.particles(fraction)
-        if total > max(most_particles, trial.world_count * trial.particle_count):
+        if total > max(MAX_PARTICLES[trial.device.type], trial.world_count * trial.particle_count):
             yield Response(condition, value, 0, (), note=f"{total} particles in all")
             continue
         try:
@@ -204,7 +198,7 @@ def responses(
             yield Response(condition, value, 0, (), note=f"no memory for {total} particles")
 
 
-# The values at which rules work, as text
+# Tables in Markdown
 
 
 def where_it_works(record: RuleRecord, condition: str) -> str:
@@ -215,106 +209,40 @@ def where_it_works(record: RuleRecord, condition: str) -> str:
     measured = record.responses_to(condition)
     if not measured:
         return ""
-    # The ratio of a value that was left out is NaN, so a range ends before it.
-    ratios = [ratio(response.mean(), record.trained().mean()) for response in measured]
-    trained = trained_value(condition, record.about["update_prob"])
-    if isinstance(trained, str):
-        pairs = zip(measured, ratios, strict=True)
-        works = [str(response.value) for response, value in pairs if value <= WORKS]
-        text = ", ".join(works) or f"not from {trained}"
-    else:
-        text = working_range([float(r.value) for r in measured], ratios, trained)
+    trained = record.trained().mean()
+    # The ratio of a value with a seed that diverged, or that was left out, is NaN.
+    works = [short(r.value) for r in measured if ratio(r.mean(), trained) <= WORKS]
     left_out = [short(response.value) for response in measured if not response.losses]
+    text = ", ".join(works) or "nowhere"
     return text + (f" (not measured: {', '.join(left_out)})" if left_out else "")
 
 
-def working_range(values: Sequence[float], ratios: Sequence[float], trained: float) -> str:
-    """Return, as text, the values around the trained one with a ratio of at most `WORKS`.
-
-    Values increase. A ratio is a value's loss over the trained loss, NaN if a seed has diverged.
-    """
-    works = [value <= WORKS for value in ratios]
-    low = high = min(range(len(values)), key=lambda k: abs(values[k] - trained))
-    if not works[low]:
-        return f"not at {short(values[low])}"
-    while low > 0 and works[low - 1]:
-        low -= 1
-    while high + 1 < len(values) and works[high + 1]:
-        high += 1
-    first, last = short(values[low]), short(values[high])
-    text = f"{first} alone" if low == high else f"{first} … {last}"
-    apart = [short(v) for k, v in enumerate(values) if works[k] and not low <= k <= high]
-    return f"{text}, and {', '.join(apart)}" if apart else text
-
-
-# Tables in Markdown
-
-
-DAMAGE_GROUPS = {
-    "what rules are asked to heal": [name for name, d in DAMAGES.items() if not d.beyond],
-    "what is beyond that": [name for name, d in DAMAGES.items() if d.beyond],
-}
-"""Damages whose recovered seeds are counted together, without the control."""
-
-
-def recovered_counts(
-    records: Iterable[RuleRecord], damages: Collection[str]
-) -> tuple[int, int, int]:
-    """Return how many seeds recovered at any step, how many at the last one, and their number."""
-    curves = [c for record in records for c in record.curves if c.damage in damages]
-    recovered = sum(curve.recovered() for curve in curves)
-    at_end = sum(curve.recovered_at_end() for curve in curves)
-    return recovered, at_end, sum(len(curve.losses) for curve in curves)
-
-
 def tables(records: Sequence[RuleRecord]) -> str:
-    """Return all tables in Markdown and, last, the fractions of recovered seeds."""
+    """Return all tables in Markdown."""
     ranges = [[r.rule, *(where_it_works(r, name) or NONE for name in CONDITIONS)] for r in records]
     works = markdown_table(["rule", *CONDITIONS], ranges)
     parts = [
-        "Where rules work: values around the trained one, without a gap, at which the mean loss is "
-        f"at most {WORKS:g} times that as trained and all seeds are finite; others that work stand "
-        f"behind them:\n\n{works}",
-        f"Recovered seeds, and their median recovery time [steps]:\n\n{_by_damage(records, _time)}",
-        "Loss over the twin's right after the damage → at the end (medians of the seeds; seeds "
-        f"within {RECOVERED:g} at the end):\n\n{_by_damage(records, _size)}",
+        "Where rules work: values at which the mean loss is at most "
+        f"{WORKS:g} times that as trained and all seeds are finite:\n\n{works}",
+        f"Recovered seeds, and their median recovery time [steps]:\n\n{_by_damage(records)}",
     ]
     for condition, summary in CONDITIONS.items():
         if table := _by_value(records, condition):
             parts.append(f"Loss over that as trained, by {summary}:\n\n{table}")
-    for summary, damages in DAMAGE_GROUPS.items():
-        recovered, at_end, total = recovered_counts(records, damages)
-        if total:
-            parts.append(
-                f"Recovered of {summary} ({', '.join(damages)}): {recovered} of {total} "
-                f"rule × damage × seed, {recovered / total:.1%}; within {RECOVERED:g} at the end: "
-                f"{at_end}, {at_end / total:.1%}."
-            )
     return "\n\n".join(parts) + "\n"
 
 
-def _time(curve: LossCurve) -> str:
-    step, recovered = curve.median_step(), f"{curve.recovered()}/{len(curve.losses)}"
-    return recovered if step is None else f"{recovered}, {step:g}"
-
-
-def _size(curve: LossCurve) -> str:
-    first, last = _median(curve.ratios(0)), _median(curve.ratios(-1))
-    return f"{short(first)} → {short(last)} ({curve.recovered_at_end()}/{len(curve.losses)})"
-
-
-def _median(values: Sequence[float]) -> float:
-    """Return the median; NaN counts as infinite."""
-    return median(math.inf if math.isnan(value) else value for value in values)
-
-
-def _by_damage(records: Sequence[RuleRecord], cell: Callable[[LossCurve], str]) -> str:
+def _by_damage(records: Sequence[RuleRecord]) -> str:
     done = {curve.damage for record in records for curve in record.curves}
     names = [name for name in (CONTROL, *DAMAGES) if name in done]
     rows = []
     for record in records:
-        curves = {curve.damage: curve for curve in record.curves}
-        rows.append([record.rule, *(cell(curves[n]) if n in curves else NONE for n in names)])
+        cells = dict.fromkeys(names, NONE)
+        for curve in record.curves:
+            steps = [step for step in curve.recovery_steps() if step is not None]
+            time = f", {median(steps):g}" if steps else ""
+            cells[curve.damage] = f"{len(steps)}/{len(curve.losses)}{time}"
+        rows.append([record.rule, *cells.values()])
     return markdown_table(["rule", *names], rows)
 
 
@@ -325,20 +253,15 @@ def _by_value(records: Sequence[RuleRecord], condition: str) -> str:
     )
     rows = []
     for record in records:
-        responses_by_value = {
-            response.value: response for response in record.responses_to(condition)
-        }
-        if responses_by_value:
-            cells = [_change(record, responses_by_value.get(value)) for value in values]
-            rows.append([record.rule, short(record.trained().mean()), *cells])
+        trained = record.trained().mean()
+        cells = dict.fromkeys(values, NONE)
+        for response in record.responses_to(condition):
+            if response.losses:
+                mean = response.mean()
+                cells[response.value] = short(mean / trained) if trained else short(mean)
+        if record.responses_to(condition):
+            rows.append([record.rule, short(trained), *cells.values()])
     return markdown_table(["rule", "loss as trained", *map(short, values)], rows) if rows else ""
-
-
-def _change(record: RuleRecord, response: Response | None) -> str:
-    if response is None or not response.losses:
-        return NONE
-    mean, trained = response.mean(), record.trained().mean()
-    return short(mean / trained) if trained else short(mean)
 
 
 # Curves with bands over the seeds: a picture for each task, a row for each of its rules.
@@ -362,7 +285,7 @@ def _draw(records: Sequence[RuleRecord]) -> bytes:
     figure, grid = new_figure(len(records), columns, (3.1 * columns, 2.3 * len(records)))
     for record, (damaged, *panels) in zip(records, grid, strict=True):
         damaged.set_title(record.rule, fontsize=9, loc="left")
-        damaged.set(xscale="symlog", xlabel="steps after the damage", ylabel="loss over the twin's")
+        damaged.set(xscale="symlog", xlabel="steps after the damage", ylabel="loss over the copy's")
         damaged.axhline(RECOVERED, color="black", lw=0.7, ls=":")
         for k, curve in enumerate(record.curves):
             colour = "0.5" if curve.damage == CONTROL else f"C{k}"

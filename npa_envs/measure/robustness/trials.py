@@ -10,7 +10,6 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from statistics import median
 from typing import Any, NamedTuple
 
 import torch
@@ -192,7 +191,7 @@ class RuleTrial:
     ) -> None:
         self.rule: NPARule = load_rule(name, device=device).float().requires_grad_(False)
         self.task_name = task_name(name)
-        self.plan, self.seeds, self._device = plan, seeds, device
+        self.plan, self.seeds, self.device = plan, seeds, device
         fields: dict[str, Any] = {"particle_count": particle_count}
         if self.rule.space_dim == 3:
             # Losses are of held-out views, so few training views are enough.
@@ -220,7 +219,7 @@ class RuleTrial:
 
     def random(self, purpose: int) -> WorldRandom:
         """Return new random streams of all worlds, for a purpose, a `StreamId`."""
-        return WorldRandom(self._world_seeds, device=self._device).substream(purpose)
+        return WorldRandom(self._world_seeds, device=self.device).substream(purpose)
 
     def particles(self, fraction: float) -> int:
         """Return a fraction of the trained number of particles."""
@@ -254,7 +253,7 @@ class RuleTrial:
         count = self.particles(fraction)
         random = self.random(StreamId.GROWTH)
         x, s, *_, goal = self.tasks_of(count)[0].seed(
-            self.world_count, generator=random, device=self._device
+            self.world_count, generator=random, device=self.device
         )
         if shape != "trained":
             box = self.task.box
@@ -325,8 +324,6 @@ class Damage(NamedTuple):
     """It also applies to particles that cannot move."""
     halves: bool = False
     """It removes half of the particles."""
-    beyond: bool = False
-    """Rules are not expected to heal it."""
 
 
 def wipe(x: Tensor, s: Tensor, random: WorldRandom, box: Box) -> tuple[Tensor, Tensor]:
@@ -383,9 +380,9 @@ DAMAGES = {
     "wipe": Damage(wipe, static=True),
     "cut": Damage(slit, static=False),
     "clump": Damage(pull_together, static=False),
-    "noise": Damage(add_state_noise, static=True, beyond=True),
+    "noise": Damage(add_state_noise, static=True),
     "half": Damage(remove_half, static=True, halves=True),
-    "side": Damage(remove_side, static=True, halves=True, beyond=True),
+    "side": Damage(remove_side, static=True, halves=True),
 }
 """Kinds of damage by name."""
 
@@ -424,23 +421,10 @@ class LossCurve:
             first.append(next((step for step, a, b in rows if a <= RECOVERED * b), None))
         return first
 
-    def recovered(self) -> int:
-        """Return the number of seeds that have recovered at any step."""
-        return sum(step is not None for step in self.recovery_steps())
-
-    def median_step(self) -> float | None:
-        """Return the median recovery time of the seeds that recovered [steps], or None."""
-        steps = [step for step in self.recovery_steps() if step is not None]
-        return median(steps) if steps else None
-
     def ratios(self, index: int) -> list[float]:
         """Return each seed's loss divided by its undamaged copy's, at `steps[index]`."""
         pairs = zip(self.losses, self.undamaged, strict=True)
         return [ratio(losses[index], undamaged[index]) for losses, undamaged in pairs]
-
-    def recovered_at_end(self) -> int:
-        """Return the number of seeds whose loss at the last step counts as recovered."""
-        return sum(value <= RECOVERED for value in self.ratios(-1))
 
 
 def ratio(loss: float, reference: float) -> float:

@@ -38,7 +38,7 @@ class KernelRow:
 def kernel_rows(session: TimingSession, workloads: Sequence[Workload]) -> list[KernelRow]:
     """Return a row for each kernel of inference and of training; none on a CPU."""
     if not session.cuda:
-        session.leave_out("kernels", "CUDA only")
+        session.left_out["kernels"] = "CUDA only"
         return []
     rows: list[KernelRow] = []
     for workload in workloads:
@@ -146,8 +146,8 @@ def _reasons(
         f"One step of {workload.world_count} x {workload.particle_count} particles in "
         f"{workload.space_dim}D, C {workload.state_dim}, {number} on {x.device}, "
         f"{'open space' if box is None else 'a periodic box'}, gradients: {gradients}",
-        f"  cells       {plan.domain.cell_count} a world, eps / {plan.domain.cells_per_eps} wide: "
-        "a neighbourhood is a few ranges of sorted particles",
+        f"  cells       {plan.domain.cell_count} per world, eps / {plan.domain.cells_per_eps} "
+        "wide: a neighbourhood is a few ranges of sorted particles",
         f"  channels    {plan.group_count} group(s) of {plan.width}, "
         f"{workload.state_dim} used: a kernel is compiled for a group's width",
         f"  neighbours  {neighbours}",

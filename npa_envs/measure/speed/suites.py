@@ -77,7 +77,7 @@ def throughput_rows(session: TimingSession, workloads: Sequence[Workload]) -> li
     for workload in workloads:
         train = workload != PAPER[-1]
         if not train:
-            session.leave_out(f"training of {workload.name}", "a workload of inference only")
+            session.left_out[f"training of {workload.name}"] = "a workload of inference only"
         modes: tuple[Memory, ...] = ("store", "recompute") if train else ("store",)
         for memory in modes:
             row = partial(throughput_row, session, workload, memory, train=train)
@@ -402,8 +402,8 @@ class BenchReport:
         for name, rows in self.tables.items():
             parts.append(f"{name}:\n{table_text(rows, missing=UNMEASURED)}")
         by_reason: dict[str, list[str]] = {}
-        for entry in self.session.left_out:
-            by_reason.setdefault(entry.why, []).append(entry.what)
+        for what, why in self.session.left_out.items():
+            by_reason.setdefault(why, []).append(what)
         if by_reason:
             lines = [f"  {why}: {'; '.join(names)}" for why, names in by_reason.items()]
             parts.append("\n".join(["left out:", *lines]))
@@ -417,7 +417,7 @@ class BenchReport:
             "date": date.today().isoformat(),
             **measured_facts(self.session.device, self.commit, threads=self.threads),
             "tables": {name: as_objects(rows) for name, rows in self.tables.items()},
-            "left_out": as_objects(self.session.left_out),
+            "left_out": [{"what": k, "why": why} for k, why in self.session.left_out.items()],
         }
         return json_text(content)
 

@@ -220,14 +220,6 @@ Tables = dict[str, list[Any]]
 """Rows of a suite, instances of one dataclass each, by the table's name."""
 
 
-@dataclass(frozen=True)
-class LeftOut:
-    """A measurement that was left out, and the reason."""
-
-    what: str
-    why: str
-
-
 NO_TIME = "no time was left"
 """Reason for measurements that had not started at the time limit."""
 
@@ -243,7 +235,8 @@ class TimingSession:
     """Small sizes only."""
     progress: Callable[[int], None] = lambda done: None
     """Called with 1 after each row."""
-    left_out: list[LeftOut] = field(default_factory=list)
+    left_out: dict[str, str] = field(default_factory=dict)
+    """The reason by measurement that was left out."""
     enough: Callable[[], bool] = lambda: False
     """Returns whether the time limit is reached: later rows are left out."""
 
@@ -281,12 +274,12 @@ class TimingSession:
     def attempt(self, what: str, make: Callable[[], Row]) -> list[Row]:
         """Return a list of the row that `make` returns, empty if memory or time is short."""
         if self.enough():
-            self.leave_out(what, NO_TIME)
+            self.left_out[what] = NO_TIME
             return []
         try:
             return [make()]
         except torch.OutOfMemoryError:
-            self.leave_out(what, "not enough memory")
+            self.left_out[what] = "not enough memory"
         finally:
             self.progress(1)
         return []
@@ -294,9 +287,3 @@ class TimingSession:
     def rows(self, calls: Iterable[tuple[str, Callable[[], Row]]]) -> list[Row]:
         """Return the rows of calls with their names, each made by `attempt`."""
         return [row for what, make in calls for row in self.attempt(what, make)]
-
-    def leave_out(self, what: str, why: str) -> None:
-        """Add to `left_out` that something is not measured, and why."""
-        entry = LeftOut(what, why)
-        if entry not in self.left_out:
-            self.left_out.append(entry)

@@ -10,7 +10,11 @@ from npa_envs.cli import common
 
 @dataclass(frozen=True)
 class ListOptions:
-    """List tasks, presets, environments, targets, texture losses, data sets, rules with scores."""
+    """List tasks, presets, environments, targets, texture losses, data sets, rules with scores.
+
+    Examples:
+      npa-envs list
+    """
 
 
 def main(arguments: Sequence[str]) -> int:

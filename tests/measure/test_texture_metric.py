@@ -1,4 +1,4 @@
-"""The judge of textures: the target itself is about 1 at most, and what is wrong is far worse."""
+"""The metric of textures: the target itself is about 1 at most, and what is wrong is far worse."""
 
 import dataclasses
 import json
@@ -9,8 +9,7 @@ import torch.nn.functional as F
 
 from npa_envs.cli import main
 from npa_envs.errors import NPAError
-from npa_envs.measure import texture_metric as judges
-from npa_envs.measure.texture_metric import TextureJudge
+from npa_envs.measure.texture_metric import AXES, DIRECTIONS, DISTANCES, TextureMetric, _images
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 from npa_envs.tasks.targets.textures import TextureTarget, draw_pattern
 from npa_envs.tasks.texture import Texture, TextureConfig
@@ -24,8 +23,8 @@ def task():
 
 
 @pytest.fixture(scope="module")
-def judge(task):
-    return TextureJudge(task)
+def metric(task):
+    return TextureMetric(task)
 
 
 def wrong(picture):
@@ -44,48 +43,48 @@ def wrong(picture):
     }
 
 
-def test_the_target_itself_is_one_at_most(task, judge):
+def test_the_target_itself_is_one_at_most(task, metric):
     for number in range(3):
-        ratios = judge(task.drawing(number))
+        ratios = metric(task.drawing(number))
         assert ratios.shape == (1, 3)
         # 0.55 was the largest seen: grey noise limits what they are divided by.
         assert float(ratios.max()) < 1.1
     # Pixels as sharp as no particles are: 2.1.
-    assert float(judge(task.target_picture[None]).mean()) < 6.0
+    assert float(metric(task.target_picture[None]).mean()) < 6.0
 
 
 @pytest.mark.parametrize(
     "kind", ["shuffled", "blurred", "half as large", "turned", "other colours", "nothing"]
 )
-def test_what_is_wrong_is_far_worse(task, judge, kind):
+def test_what_is_wrong_is_far_worse(task, metric, kind):
     drawn = task.drawing(5)
-    good = float(judge(drawn).mean())
-    assert float(judge(wrong(drawn)[kind]).mean()) > max(3.0, 8.0 * good)
+    good = float(metric(drawn).mean())
+    assert float(metric(wrong(drawn)[kind]).mean()) > max(3.0, 8.0 * good)
 
 
 def test_another_draw_of_scattered_things_is_near(task):
     config = dataclasses.replace(CONFIG, target="droplets")
     picture = torch.tensor(draw_pattern("droplets", 64, seed=7)).float()
     other = Texture(config, target=TextureTarget("droplets", picture, True))
-    judge = TextureJudge(Texture(config))
-    assert float(judge(other.drawing(0)).mean()) < 3.0
-    assert float(judge(task.drawing(0)).mean()) > 6.0
+    metric = TextureMetric(Texture(config))
+    assert float(metric(other.drawing(0)).mean()) < 3.0
+    assert float(metric(task.drawing(0)).mean()) > 6.0
 
 
-def test_a_world_is_judged_alone_and_always_alike(task, judge):
+def test_a_world_is_measured_alone_and_always_alike(task, metric):
     pictures = torch.cat([task.drawing(number) for number in range(2)] + [torch.rand(1, 64, 64, 4)])
-    together = judge(pictures)
-    assert torch.equal(together, TextureJudge(task)(pictures))
+    together = metric(pictures)
+    assert torch.equal(together, TextureMetric(task)(pictures))
     for picture, ratios in zip(pictures, together, strict=True):
-        assert torch.equal(judge(picture[None])[0], ratios)
-    moved = judge(pictures.roll((9, -14), dims=(1, 2)))
+        assert torch.equal(metric(picture[None])[0], ratios)
+    moved = metric(pictures.roll((9, -14), dims=(1, 2)))
     torch.testing.assert_close(moved, together, rtol=1e-6, atol=1e-9)
 
 
-def test_devices_agree(task, judge, device):
+def test_devices_agree(task, metric, device):
     picture = task.drawing(3)
-    there = TextureJudge(Texture(CONFIG, device=device))
-    torch.testing.assert_close(there(picture).cpu(), judge(picture), rtol=1e-3, atol=1e-3)
+    there = TextureMetric(Texture(CONFIG, device=device))
+    torch.testing.assert_close(there(picture).cpu(), metric(picture), rtol=1e-3, atol=1e-3)
 
 
 def test_a_target_with_edges_is_not_read_across_them():
@@ -93,22 +92,22 @@ def test_a_target_with_edges_is_not_read_across_them():
     half[:, :, 3] = 1.0
     half[:, :32, 0] = 1.0
     task = Texture(CONFIG, target=TextureTarget("half", half, False))
-    judge = TextureJudge(task)
-    assert judge._patches.shape == (judges.DIRECTIONS, 64 * 64)
-    tiled = TextureJudge(Texture(CONFIG, target=TextureTarget("half", half, True)))
+    metric = TextureMetric(task)
+    assert metric._patches.shape == (DIRECTIONS, 64 * 64)
+    tiled = TextureMetric(Texture(CONFIG, target=TextureTarget("half", half, True)))
     assert float(tiled(task.drawing(0)).mean()) < 1.1
     # Its left edge is red and its right one black: only a torus has that step twice.
-    pair = judges.DISTANCES.index(9) * len(judges.AXES) + judges.AXES.index((0, 1))
-    image = judges._images(half[None])
-    same = [float(judge._counts(image, wrap)[pair].diagonal().sum()) for wrap in (True, False)]
+    pair = DISTANCES.index(9) * len(AXES) + AXES.index((0, 1))
+    image = _images(half[None])
+    same = [float(metric._counts(image, wrap)[pair].diagonal().sum()) for wrap in (True, False)]
     assert same[0] < same[1] - 0.01
 
 
-def test_only_textures_are_judged(task):
-    with pytest.raises(NPAError, match="judge compares textures, got Morphogenesis2D"):
-        TextureJudge(Morphogenesis2D(Morphogenesis2DConfig(target="ring", resolution=32)))
+def test_only_textures_are_measured(task):
+    with pytest.raises(NPAError, match="texture metric compares textures, got Morphogenesis2D"):
+        TextureMetric(Morphogenesis2D(Morphogenesis2DConfig(target="ring", resolution=32)))
     with pytest.raises(NPAError, match=r"pictures must have shape \[B, R, R, 4\]"):
-        TextureJudge(task)(torch.zeros(1, 32, 32, 4))
+        TextureMetric(task)(torch.zeros(1, 32, 32, 4))
 
 
 def test_the_command_prints_ratios_and_writes_them(tmp_path, capsys):

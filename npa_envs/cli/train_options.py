@@ -1,0 +1,238 @@
+"""Options of `npa-envs train TASK`, and the configuration that they give."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, make_dataclass, replace
+from pathlib import Path
+from typing import Any, Generic, TypeVar, get_type_hints
+
+import tyro
+
+from npa_envs.cli import common
+from npa_envs.errors import NPAError, shown
+from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2DConfig
+from npa_envs.tasks.morphogenesis2d import Morphogenesis2DConfig
+from npa_envs.tasks.train_config import COMMON, Common
+from npa_envs.training import (
+    JointTrainConfig,
+    RunFolder,
+    TrainConfig,
+    config_to_dict,
+    load_config,
+    preset,
+    task_entry,
+)
+from npa_envs.training.checkpoint import check_task, load_checkpoint
+
+HELP = {"-h", "--help", "--help-all"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainOptions(common.SharedRunOptions):
+    """How a run starts and ends."""
+
+    preset: str = ""
+    """Configuration to start from: `paper`, `fast` (minutes on a CPU), `tiny` (seconds), or for
+    pictures and textures `best` (minutes on a GPU); `npa-envs list` prints sizes and times. By
+    default `best` on CUDA if the task has it, else `fast`."""
+    config: Path | None = None
+    """YAML, TOML or JSON file of fields and values, also `preset`; overrides the preset."""
+    max_seconds: float | None = None
+    """Stop after this time [s]; the run can be resumed."""
+    progress: bool = True
+    """Show a progress bar."""
+    report: bool = True
+    """End with a report in the folder `out`: metrics, a film and a model card of the rule."""
+
+
+def resolve_task(task_name: str, arguments: Sequence[str]) -> list[str]:
+    """Return arguments after replacing `--resume auto`, and adding the device of `--gpus`."""
+    return common.resolve_run(arguments, lambda words: parse_run(task_name, words)[1].out)
+
+
+def parse_run(task_name: str, arguments: Sequence[str]) -> tuple[TrainOptions, TrainConfig[Any]]:
+    """Parse arguments to the options of the run and its training configuration.
+
+    Ends the process after `--help`, which shows the most used options, and `--help-all`.
+    """
+    base = starting_configuration(task_name, arguments)
+    if isinstance(base, JointTrainConfig):
+        return parse_joint(task_name, base, arguments)
+    return _parse_over(base, task_name, arguments)
+
+
+def default_preset(task_name: str, device: str) -> str:
+    """Return the default preset: `best` on CUDA if the task has it, else `fast`."""
+    cuda = device.startswith("cuda")
+    return "best" if cuda and "best" in task_entry(task_name).presets else "fast"
+
+
+def starting_configuration(task_name: str, arguments: Sequence[str]) -> TrainConfig[Any]:
+    """Return the configuration of the preset, file or resumed run, before options change it."""
+    first = common.first_options(arguments)
+    device = first.device if first.device and first.config is None else "cpu"
+    base = preset(first.preset or default_preset(task_name, device), task_name)
+    if first.resume and not HELP & set(arguments):
+        folder = RunFolder(first.out or base.out)
+        if not folder.checkpoint.is_file():
+            raise NPAError(
+                f"there is no checkpoint to resume from at {str(folder.checkpoint)!r}: give the "
+                "folder of an earlier run with --out, or leave --resume out to start a new run"
+            )
+        try:
+            base = load_config(folder.config, base)
+        except NPAError:
+            # The run may be of another task, whose fields are unknown: report that instead.
+            check_task(load_checkpoint(folder.checkpoint), task_name, folder.checkpoint)
+            raise
+        if first.preset and first.config is None:
+            _check_preset(first.preset, base, task_name, folder, arguments)
+    if first.config is not None:
+        presets = task_entry(task_name).presets
+        if first.preset or first.resume:
+            # The preset of the command line, or the resumed run, overrides that of the file.
+            presets = dict.fromkeys(presets, base)
+        base = load_config(first.config, base, presets=presets)
+    return base
+
+
+def _check_preset(
+    name: str, run: TrainConfig[Any], task_name: str, folder: RunFolder, arguments: Sequence[str]
+) -> None:
+    """Check that a resumed run has the fields of the preset `name`, except those in `arguments`."""
+    presets = {name: config_to_dict(one) for name, one in task_entry(task_name).presets.items()}
+    values = config_to_dict(run)
+    changed = {word.partition("=")[0].lstrip("-").replace("-", "_") for word in arguments}
+    changed |= {word.removeprefix("no_") for word in changed} | {"out", "device", "task"}
+    others = [
+        f"{key}: {shown(values.get(key))}"
+        for key, value in presets[name].items()
+        if key not in changed
+        and values.get(key) != value
+        and any(one.get(key) != value for one in presets.values())
+    ]
+    if others:
+        raise NPAError(
+            f"preset must be the one that the run in {shown(str(folder.path))} was begun with, "
+            f"but {name!r} differs from it ({', '.join(others)} there): leave --preset out"
+        )
+
+
+ConfigT = TypeVar("ConfigT", bound=TrainConfig[Any])
+
+
+@dataclass(frozen=True)
+class Command(Generic[ConfigT]):
+    """All options of `npa-envs train TASK`, in the groups of its help."""
+
+    run: TrainOptions
+    training: ConfigT
+
+
+def _parse_over(
+    defaults: ConfigT, task_name: str, arguments: Sequence[str]
+) -> tuple[TrainOptions, ConfigT]:
+    """Parse arguments to the options of the run, and to `defaults` with the options' changes."""
+    description = f"Train on {task_name}. Defaults shown are those of the preset."
+    if {"-h", "--help"} & set(arguments):
+        description += f" All options: npa-envs train {task_name} --help-all"
+        defaults = _with_common_fields(defaults)
+    examples = task_entry(task_name).examples
+    lines = "".join(f"\n  npa-envs train {task_name} {words}" for words in examples)
+    cls: Any = type(defaults)
+    command_type: Any = Command
+    command = common.parse_options(
+        command_type[cls[type(defaults.task)] if cls.__parameters__ else cls],
+        f"train {task_name}",
+        ["--help" if word == "--help-all" else word for word in arguments],
+        description=f"{description}\n\nExamples:{lines}",
+        default=Command(TrainOptions(), defaults),
+    )
+    return command.run, command.training
+
+
+def _with_common_fields(config: Any) -> Any:
+    """Return a configuration with equal values whose help shows only the `Common` fields."""
+    cls: Any = type(config)
+    hints = get_type_hints(cls, include_extras=True)
+    suppress: Any = tyro.conf.Suppress
+    types = {
+        name: suppress[hint]
+        for name, hint in hints.items()
+        if COMMON not in getattr(hint, "__metadata__", ())
+    }
+    values = {name: getattr(config, name) for name in types}
+    if "task" in types:
+        values["task"] = _with_common_fields(config.task)
+        types["task"] = type(values["task"])
+        cls = cls[types["task"]] if cls.__parameters__ else cls
+    hidden = [(name, types[name], field(default=value)) for name, value in values.items()]
+    narrow = make_dataclass(type(config).__name__, hidden, bases=(cls,), frozen=True, kw_only=True)
+    return _of_type(narrow, config, **values)
+
+
+# Options of tasks of several species: one level, although their configurations nest.
+
+
+@dataclass(frozen=True, kw_only=True)
+class SpeciesOptions(Morphogenesis2DConfig):
+    """Options of all species together; a --config file can set them for each species."""
+
+    target: tyro.conf.Suppress[str] = "gecko"
+    code_dim: tyro.conf.Suppress[int] = 8
+    encoder: tyro.conf.Suppress[bool] = False
+    switch_share: tyro.conf.Suppress[float] = 0.1
+
+    particle_count: Common[int] = 4096
+    """Particles of each species."""
+    targets: Common[tuple[str, ...]] = ()
+    """What each species grows: built-in names, emoji, or paths of pictures, two or more."""
+    distance: Common[float] = 0.0
+    """Distance between the centres of neighbouring seeds, which lie in a row [length units]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointOptions(JointTrainConfig[SpeciesOptions]):
+    """Options of a training run of several rules in one world, the same for all species."""
+
+    initial_rule: tyro.conf.Suppress[str] = ""
+
+
+def parse_joint(
+    task_name: str, base: JointTrainConfig[CoMorphogenesis2DConfig], arguments: Sequence[str]
+) -> tuple[TrainOptions, JointTrainConfig[CoMorphogenesis2DConfig]]:
+    """Parse arguments of a run of several species, whose configuration `base` they change."""
+    task = base.task
+    shared_fields = {
+        "targets": tuple(one.target for one in task.species),
+        "distance": task.distance,
+    }
+    # Parsed once for each species, so that fields without an option keep each species' value.
+    parsed = []
+    for species in task.species:
+        species_options = _of_type(SpeciesOptions, species, **shared_fields)
+        defaults: JointOptions = _of_type(JointOptions, base, task=species_options)
+        parsed.append(_parse_over(defaults, task_name, arguments))
+    options, first = parsed[0]
+    targets = first.task.targets
+    if len(targets) < 2:
+        raise NPAError(f"targets must be two or more, got {len(targets)}: --targets ring heart")
+    configs = tuple(
+        # Targets without a species take the options of the last one.
+        _of_type(
+            Morphogenesis2DConfig,
+            parsed[min(k, len(parsed) - 1)][1].task,
+            target=target,
+            targets=(),
+        )
+        for k, target in enumerate(targets)
+    )
+    together = replace(task, species=configs, distance=first.task.distance)
+    return options, _of_type(JointTrainConfig, first, task=together)
+
+
+def _of_type(cls: Any, source: Any, **changes: Any) -> Any:
+    """Return a dataclass `cls` with the values of equally named fields of `source`, and changes."""
+    names = {one.name for one in fields(cls)} & {one.name for one in fields(source)}
+    return cls(**{name: getattr(source, name) for name in names} | changes)
