@@ -26,15 +26,6 @@ from npa_envs.world.particles import Particles
 MAX_STEPS = 64
 """Most steps between two frames."""
 
-MIN_PULL = 0.5
-"""Fraction of the pointer's movement by which the brush `pull` of strength 0 moves particles."""
-
-CLUMP_RATE = 0.25
-"""Fraction of a particle's distance that a message of the brush `clump` of strength 1 removes."""
-
-INJECT_RATE = 0.5
-"""Fraction of the new state that a message of the brush `inject` of strength 1 mixes in."""
-
 FARTHEST = 1e4
 """Largest coordinate in a message [length units]."""
 
@@ -42,17 +33,54 @@ MAX_RADIUS = 10.0
 """Largest radius of a brush [length units]."""
 
 
+class Tool(NamedTuple):
+    """A brush: its button on the page, when a stroke of it sends messages, and what it does."""
+
+    changes: str
+    """What a world must let it change, see `LiveWorld._allowed`."""
+    label: str
+    sends: str
+    """When a stroke sends messages: "frame", in each frame; "motion", in frames in which the
+    pointer moves; "position", at each new position; "once", at its start; "line", at its end."""
+    icon: str
+    """An SVG path on a square of side 24."""
+    takes: str | None = None
+    """A further field of its messages: "source" or "rule"."""
+    amounts: tuple[float, float] = (0.0, 1.0)
+    """The amount of its effect at strength 0, and what strength 1 adds to it; 1 at most."""
+
+
 TOOLS = {
-    "remove": "removal",
-    "pull": "moves",
-    "clump": "moves",
-    "cut": "moves",
-    "inject": "states",
-    "graft": "species",
-    "add": "growth",
-}
-"""All brushes, and what a world must allow to offer each. `brushed`, `RuleWorld._brush` and
-`BRUSHES` of page_world.js apply them; `TOOLS` of page.js has their icons."""
+    "remove": Tool("removal", "Remove", "frame", "M4 15l8-9 7 6-7 8H8zM9 20h11"),
+    "push": Tool(
+        "positions", "Push with the pointer", "motion", amounts=(0.5, 1.0),
+        icon="M12 20c-4 0-6-3-7-7 2-1 3 0 4 2V6a1.4 1.4 0 0 1 3 0v5a1.4 1.4 0 0 1 3 0"
+        "v1a1.4 1.4 0 0 1 3 0v3c0 3-2 5-6 5z",
+    ),
+    "clump": Tool(
+        "positions", "Clump", "frame", amounts=(0.0, 0.25),
+        icon="M4 4l5 5M20 4l-5 5M4 20l5-5M20 20l-5-5M9 6v3H6M15 6v3h3M9 18v-3H6M15 18v-3h3",
+    ),
+    "cut": Tool(
+        "positions", "Cut along a line", "line",
+        icon="M5 19L19 5M6 8a2 2 0 1 0 0-.1M16 18a2 2 0 1 0 0-.1M8 9l8 8",
+    ),
+    "inject": Tool(
+        "states", "Inject: the state of where you press spreads to where you drag", "frame",
+        icon="M4 20l3-1 8-8-2-2-8 8zM12 8l4 4M14 10l3-4a1.8 1.8 0 0 1 3 0 1.8 1.8 0 0 1-1 3l-4 2",
+        takes="source", amounts=(0.0, 0.5),
+    ),
+    "graft": Tool(
+        "species", "Graft: particles take another rule", "position", takes="rule",
+        icon="M12 21v-9M12 12c0-5 3-7 8-7 0 5-3 7-8 7zM12 15c0-4-3-6-8-6 0 4 3 6 8 6z",
+    ),
+    "add": Tool(
+        "growth", "Add a seed of another rule", "once", takes="rule", amounts=(0.0, 0.5),
+        icon="M12 4a8 8 0 1 0 .1 0M12 8v8M8 12h8",
+    ),
+}  # fmt: skip
+"""All brushes, in the order of their buttons and keys. `brushed` applies those that change
+positions or states, `RuleWorld._brush` the others, and `BRUSHES` of page_world.js all."""
 
 
 class WorldView(NamedTuple):
@@ -109,7 +137,11 @@ class LiveWorld(ABC):
         """Return the event "world", which describes the world to the page."""
         return {
             "type": "world",
-            "tools": [tool for tool, need in TOOLS.items() if need in self._allowed()],
+            "tools": [
+                {"name": name} | tool._asdict()
+                for name, tool in TOOLS.items()
+                if tool.changes in self._allowed()
+            ],
             "shows": self._shows(),
             "show": self.show,
             "settings": {
@@ -194,7 +226,7 @@ class LiveWorld(ABC):
 
     @abstractmethod
     def _allowed(self) -> set[str]:
-        """Return what brushes may change in this world: some of the values of `TOOLS`."""
+        """Return what brushes may change: some of the values of `Tool.changes`."""
 
     @abstractmethod
     def _shows(self) -> list[str]: ...
@@ -245,8 +277,8 @@ class Touch(NamedTuple):
     """Its movement [length units], shape [1, D]."""
     radius: float
     """Radius of the brush [length units]."""
-    strength: float
-    """From 0 to 1, dimensionless."""
+    amount: float
+    """From 0 to 1, dimensionless, by `Tool.amounts`."""
     source: Tensor
     """Position whose state the brush `inject` spreads [length units], shape [1, D]."""
     view: Tensor | None
@@ -261,12 +293,14 @@ class Touch(NamedTuple):
         if not isinstance(name, str) or name not in TOOLS:
             raise NPAError(f"unknown tool {shown(name)}: {suggest(name, TOOLS)}")
         at, view = message.get("at"), message.get("view")
+        strength = Range(0.0, 1.0).checked("strength", message.get("strength", 1.0))
+        least, added = TOOLS[name].amounts
         return cls(
             name,
             _checked_vector("at", at, x),
             _checked_vector("move", message.get("move", [0.0] * x.shape[2]), x),
             Range(1e-4, MAX_RADIUS).checked("radius", message.get("radius")),
-            Range(0.0, 1.0).checked("strength", message.get("strength", 1.0)),
+            min(1.0, least + added * strength),
             _checked_vector("source", message.get("source", at), x),
             None if view is None else _checked_vector("view", view, x),
             message.get("rule"),
@@ -274,28 +308,26 @@ class Touch(NamedTuple):
 
 
 def brushed(particles: Particles, touch: Touch, box: tuple[float, ...] | None) -> Particles:
-    """Return particles after the brush pull, clump, cut or inject."""
+    """Return particles after the brush push, clump, cut or inject."""
     x, s, *_ = particles
     disk: dict[str, Any] = {"radius": touch.radius, "box": box}
     match touch.tool:
-        case "pull":
-            strength = min(1.0, MIN_PULL + touch.strength)
-            x = push(x, centre=touch.at, move=touch.move, strength=strength, **disk)
+        case "push":
+            x = push(x, centre=touch.at, move=touch.move, strength=touch.amount, **disk)
         case "clump":
-            factor = CLUMP_RATE * touch.strength
-            x, s = clump(x, s, centre=touch.at, factor=factor, **disk)
+            x, s = clump(x, s, centre=touch.at, factor=touch.amount, **disk)
         case "cut":
             half = 0.5 * touch.move
             line: dict[str, Any] = {"centre": touch.at + half, "normal": _normal(touch)}
             x, s = cut(x, s, along=half, gap=touch.radius, box=box, **line)
         case "inject":
             state, exists = state_around(x, s, centre=touch.source, **disk)
-            weight = INJECT_RATE * touch.strength * exists.to(x.dtype)
+            weight = touch.amount * exists.to(x.dtype)
             s = inject(x, s, centre=touch.at, state=state, strength=weight, **disk)
         case _:
             raise NPAError(
                 f"this world keeps its particles, so that the brush {shown(touch.tool)} does "
-                "nothing: take pull, clump, cut or inject"
+                "nothing: take push, clump, cut or inject"
             )
     return particles._replace(x=x, s=s)
 

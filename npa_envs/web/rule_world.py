@@ -33,9 +33,8 @@ from npa_envs.world.species import AGREEMENTS, rollout_species
 MAX_PARTICLES = {"cpu": 16384, "cuda": 131072}
 """Most particles of a world, by device type."""
 
-SEED_FRACTION, MIN_SEED = 0.5, 16
-"""Particles that the brush `add` of strength 1 adds, as a fraction of a fresh world's; the least
-number of them."""
+MIN_SEED = 16
+"""Fewest particles that the brush `add` adds."""
 
 SMALL_VIEWS = {"resolution": 64, "training_views": 1, "held_out_views": 6}
 """Options of 3D tasks for a fast start: targets of full size take many seconds to draw."""
@@ -169,7 +168,7 @@ class RuleWorld(LiveWorld):
         return super().handle(message)
 
     def _allowed(self) -> set[str]:
-        allowed = {"moves", "removal"}
+        allowed = {"positions", "removal"}
         # Rules that divide allow no others in their worlds; their dead particles have no state.
         if not self.main.rule.divides:
             allowed |= {"states", "species"}
@@ -336,7 +335,7 @@ class RuleWorld(LiveWorld):
         self._arrange(self.particles._replace(s=s), species)
 
     def _add(self, touch: Touch, live_rule: LiveRule) -> None:
-        count = max(MIN_SEED, round(touch.strength * SEED_FRACTION * self.count))
+        count = max(MIN_SEED, round(touch.amount * self.count))
         room = MAX_PARTICLES[self._device.type] - self.particles.x.shape[1]
         if count > room:
             raise NPAError(f"the world has room for {max(room, 0)} particles more, got {count}")
