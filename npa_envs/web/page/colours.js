@@ -51,7 +51,7 @@ export class Colouring {
   // 1 is a world whose particles fill [-1, 1]^D, or its box, evenly. Worlds in open space are denser.
   densities({ physics, world, values: { eps }, box, dimension, seedCount }, bytes) {
     physics.sort(world, eps, box);
-    physics.computeDensities(world.count, eps);
+    physics.computeDensities(world.count);
     const volume = box === null ? 2 ** dimension : box.reduce((product, side) => product * side, 1);
     const usual = (seedCount / volume) * (box === null ? 4 : 1);
     for (let k = 0; k < world.count; k++) {
