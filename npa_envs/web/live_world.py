@@ -137,11 +137,7 @@ class LiveWorld(ABC):
         """Return the event "world", which describes the world to the page."""
         return {
             "type": "world",
-            "tools": [
-                {"name": name} | tool._asdict()
-                for name, tool in TOOLS.items()
-                if tool.changes in self._allowed()
-            ],
+            "tools": [{"name": name} | tool._asdict() for name, tool in self.tools.items()],
             "shows": self._shows(),
             "show": self.show,
             "settings": {
@@ -153,12 +149,18 @@ class LiveWorld(ABC):
             "box": None if self.box is None else list(self.box),
         }
 
+    @property
+    def tools(self) -> dict[str, Tool]:
+        """The brushes that the world offers, by name."""
+        allowed = self._allowed()
+        return {name: tool for name, tool in TOOLS.items() if tool.changes in allowed}
+
     def handle(self, message: Mapping[str, Any]) -> bool:
         """Apply a message of the page; return whether `describe` returns something else now."""
         action = message.get("type") if isinstance(message, Mapping) else None
         match action:
             case "play":
-                self.playing = checked_flag("on", message.get("on"))
+                self.playing = bool(message.get("on"))
             case "step":
                 self.playing = False
                 self._run_timed(1)
@@ -169,7 +171,7 @@ class LiveWorld(ABC):
             case "set":
                 return self._set(str(message.get("name")), message.get("value"))
             case "brush":
-                return self._brush(Touch.read(message, self.particles.x))
+                return self._brush(Touch.read(message, self.tools, self.particles.x))
             case "damage":
                 check_damage(name := message.get("name"))
                 self._damage(str(name))
@@ -248,7 +250,7 @@ class LiveWorld(ABC):
                     raise NPAError(f"unknown show {shown(value)}: {suggest(value, self._shows())}")
                 self.show = str(value)
             case "loss":
-                self._loss_wanted = checked_flag("loss", value)
+                self._loss_wanted = bool(value)
             case _ if name in ranges:
                 setattr(self, name, ranges[name].checked(name, value))
             case _:
@@ -281,28 +283,27 @@ class Touch(NamedTuple):
     """From 0 to 1, dimensionless, by `Tool.amounts`."""
     source: Tensor
     """Position whose state the brush `inject` spreads [length units], shape [1, D]."""
-    view: Tensor | None
-    """In 3D the unit vector towards the viewer, shape [1, D], or None."""
+    view: Tensor
+    """The unit vector towards the viewer, shape [1, 3]."""
     rule: Any
     """Name of another rule in the message, unchecked."""
 
     @classmethod
-    def read(cls, message: Mapping[str, Any], x: Tensor) -> Touch:
+    def read(cls, message: Mapping[str, Any], tools: Mapping[str, Tool], x: Tensor) -> Touch:
         """Return the brush of a message to a world with positions x [1, N, D]."""
-        name = message.get("tool")
-        if not isinstance(name, str) or name not in TOOLS:
-            raise NPAError(f"unknown tool {shown(name)}: {suggest(name, TOOLS)}")
-        at, view = message.get("at"), message.get("view")
+        name, at, space_dim = message.get("tool"), message.get("at"), x.shape[2]
+        if not isinstance(name, str) or name not in tools:
+            raise NPAError(f"unknown tool {shown(name)}: {suggest(name, tools)}")
         strength = Range(0.0, 1.0).checked("strength", message.get("strength", 1.0))
-        least, added = TOOLS[name].amounts
+        least, added = tools[name].amounts
         return cls(
             name,
-            _checked_vector("at", at, x),
-            _checked_vector("move", message.get("move", [0.0] * x.shape[2]), x),
+            _checked_vector("at", at, space_dim, x),
+            _checked_vector("move", message.get("move", [0.0] * space_dim), space_dim, x),
             Range(1e-4, MAX_RADIUS).checked("radius", message.get("radius")),
             min(1.0, least + added * strength),
-            _checked_vector("source", message.get("source", at), x),
-            None if view is None else _checked_vector("view", view, x),
+            _checked_vector("source", message.get("source", at), space_dim, x),
+            _checked_vector("view", message.get("view", [0.0, 0.0, 1.0]), 3, x),
             message.get("rule"),
         )
 
@@ -317,37 +318,16 @@ def brushed(particles: Particles, touch: Touch, box: tuple[float, ...] | None) -
         case "clump":
             x, s = clump(x, s, centre=touch.at, factor=touch.amount, **disk)
         case "cut":
-            half = 0.5 * touch.move
-            line: dict[str, Any] = {"centre": touch.at + half, "normal": _normal(touch)}
-            x, s = cut(x, s, along=half, gap=touch.radius, box=box, **line)
+            space_dim, half = x.shape[2], 0.5 * touch.move
+            move = torch.nn.functional.pad(touch.move, (0, 3 - space_dim))
+            normal = torch.linalg.cross(touch.view, move)[:, :space_dim]
+            line: dict[str, Any] = {"centre": touch.at + half, "normal": normal, "along": half}
+            x, s = cut(x, s, gap=touch.radius, box=box, **line)
         case "inject":
             state, exists = state_around(x, s, centre=touch.source, **disk)
             weight = touch.amount * exists.to(x.dtype)
             s = inject(x, s, centre=touch.at, state=state, strength=weight, **disk)
-        case _:
-            raise NPAError(
-                f"this world keeps its particles, so that the brush {shown(touch.tool)} does "
-                "nothing: take push, clump, cut or inject"
-            )
     return particles._replace(x=x, s=s)
-
-
-def _normal(touch: Touch) -> Tensor:
-    """Return the normal [1, D] of a cut along `touch.move` and, in 3D, along `touch.view`."""
-    move, view = touch.move, touch.view
-    if move.shape[1] == 2:
-        return torch.stack((-move[:, 1], move[:, 0]), dim=1)
-    normal: Tensor = torch.linalg.cross(
-        move.new_tensor([[0.0, 0.0, 1.0]]) if view is None else view, move
-    )
-    return normal
-
-
-def checked_flag(name: str, value: Any) -> bool:
-    """Return `value` if it is a bool; raises NPAError."""
-    if not isinstance(value, bool):
-        raise NPAError(f"{name} must be true or false, got {shown(value)}")
-    return value
 
 
 def checked_seed(value: Any) -> int:
@@ -355,12 +335,11 @@ def checked_seed(value: Any) -> int:
     return int(Range(0, 2**53, whole=True).checked("seed", value))
 
 
-def _checked_vector(name: str, value: Any, x: Tensor) -> Tensor:
-    space_dim = x.shape[2]
-    fits = isinstance(value, list) and len(value) == space_dim and all(map(is_real, value))
+def _checked_vector(name: str, value: Any, length: int, like: Tensor) -> Tensor:
+    fits = isinstance(value, list) and len(value) == length and all(map(is_real, value))
     if not fits or max(map(abs, value)) > FARTHEST:
-        raise NPAError(f"{name} must be {space_dim} finite numbers, got {shown(value)}")
-    return x.new_tensor([value])
+        raise NPAError(f"{name} must be {length} finite numbers, got {shown(value)}")
+    return like.new_tensor([value])
 
 
 # Colours of particles by state, density, species, speed or update mask.
@@ -429,12 +408,9 @@ class Colouring:
                 updated = _or_zeros(world.updated, world).bool()[:, None]
                 on, off = (updated.new_tensor(tint, dtype=torch.float32) for tint in MASK_COLOURS)
                 return _bytes(torch.where(updated, on, off))
-            case ["state", number] if number.isdecimal() and int(number) < world.s.shape[2]:
-                return _bytes(signed_colours(world.s[0, :, int(number)]))
-        raise NPAError(
-            f"show must be one of the world's, got {shown(show)}: "
-            f"{suggest(show, shows_of(world.s.shape[2]))}"
-        )
+            case _:
+                channel = int(show.removeprefix("state "))
+                return _bytes(signed_colours(world.s[0, :, channel]))
 
     def _components(self, s: Tensor) -> Tensor:
         """Return the first three principal components as colours, in a slowly changing basis."""

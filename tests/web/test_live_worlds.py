@@ -207,7 +207,7 @@ def test_a_world_that_divides_shows_its_living_particles(tmp_path, device):
     world.advance()
     assert world.particles.x.shape == (1, 64, 2)
     assert len(world.frame().positions) == 0
-    with pytest.raises(NPAError, match="and not divide"):
+    with pytest.raises(NPAError, match="unknown tool 'graft'"):
         world.handle(brush("graft", rule="gecko"))
 
 
@@ -355,7 +355,6 @@ def test_the_loss_is_computed_only_where_it_is_wanted(world, monkeypatch):
         ({}, "unknown message None"),
         ([], "unknown message None"),
         ({"type": "fly"}, "unknown message 'fly'"),
-        ({"type": "play", "on": 1}, "on must be true or false, got 1"),
         ({"type": "reset", "seed": -1}, r"seed must be a whole number in \[0, 9"),
         ({"type": "reset", "seed": 0.5}, "seed must be a whole number"),
         ({"type": "set"}, "unknown setting 'None'"),
@@ -704,7 +703,7 @@ def test_hands_reach_into_environments(episodes):
     episodes.particles = particles
     episodes.handle(brush("inject", source=[0.1, 0.0], radius=0.2, strength=1.0))
     assert not torch.equal(episodes.particles.s, particles.s)
-    with pytest.raises(NPAError, match="keeps its particles, so that the brush 'remove'"):
+    with pytest.raises(NPAError, match="unknown tool 'remove'"):
         episodes.handle(brush("remove"))
     put(episodes, loss=True)
     assert episodes.frame().loss == pytest.approx(episodes._info["loss"])

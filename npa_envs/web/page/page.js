@@ -87,7 +87,6 @@ export async function start(connect, settings) {
   const page = (document.page = new Page());
   try {
     page.engine = await connect(settings, (event) => page.listen(event));
-    for (const message of page.waiting.splice(0)) page.engine.send(message);
   } catch (error) {
     page.showError(error.message);
   }
@@ -98,7 +97,6 @@ export async function start(connect, settings) {
 class Page {
   constructor() {
     this.engine = null;
-    this.waiting = [];
     this.world = { ...BLANK };
     this.described = false; // whether the event "world" has come
     this.frame = null;
@@ -122,8 +120,7 @@ class Page {
   }
 
   send(message) {
-    if (this.engine) this.engine.send(message);
-    else this.waiting.push(message);
+    this.engine?.send(message);
   }
 
   listen(event) {
@@ -462,9 +459,9 @@ class Controls {
 
   showTheme() {
     document.documentElement.dataset.theme = $("theme").value;
-    const style = getComputedStyle(document.documentElement);
-    this.page.background = numbers(style.getPropertyValue("--ground"));
-    this.page.ink = numbers(style.getPropertyValue("--text"));
+    const { backgroundColor, color } = getComputedStyle(document.body);
+    this.page.background = components(backgroundColor);
+    this.page.ink = components(color);
     this.page.dirty = true;
   }
 
@@ -613,8 +610,9 @@ function options(select, names, chosen) {
   if (chosen) select.value = chosen;
 }
 
-function numbers(hex) {
-  return [1, 3, 5].map((k) => parseInt(hex.trim().slice(k, k + 2), 16) / 255);
+// The components from 0 to 1 of a colour such as "rgb(13, 16, 23)".
+function components(colour) {
+  return colour.match(/\d+/g).map((component) => component / 255);
 }
 
 // Returns the stored theme, or stores another one, if the browser allows it.

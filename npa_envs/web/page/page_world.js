@@ -22,7 +22,7 @@ const BRUSHES = {
   clump: ({ world }, { at, radius, amount }) => clump(world, at, radius, amount),
   cut({ world, dimension }, { at, move, radius, view }) {
     const half = move.map((component) => component / 2);
-    const normal = dimension === 2 ? [-move[1], move[0]] : cross(view ?? [0, 0, 1], move);
+    const normal = cross(view ?? [0, 0, 1], [move[0], move[1], move[2] ?? 0]).slice(0, dimension);
     cut(world, at.map((coordinate, d) => coordinate + half[d]), normal, radius, half);
   },
   inject({ world }, { at, radius, amount, source }) {
