@@ -101,7 +101,7 @@ class EnvironmentWorld(LiveWorld):
         }
 
     def _allowed(self) -> set[str]:
-        return {"moves", "states"} if self._physics.moving else {"states"}
+        return {"positions", "states"} if self._physics.moving else {"states"}
 
     def _shows(self) -> list[str]:
         return shows_of(self._physics.state_dim, species=False)

@@ -23,8 +23,8 @@ from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule, check_rule
 from npa_envs.tasks.damage import CLUMP_FACTOR, DAMAGE_SIZES
 from npa_envs.tasks.point_classification import PALETTE, UNDECIDED, PointClassification
-from npa_envs.web.live_world import CLUMP_RATE, INJECT_RATE, MIN_PULL, checked_seed, colour_ramp
-from npa_envs.web.rule_world import MIN_SEED, SEED_FRACTION, RuleWorld, name_of
+from npa_envs.web.live_world import checked_seed, colour_ramp
+from npa_envs.web.rule_world import MIN_SEED, RuleWorld, name_of
 from npa_envs.world.species import AGREEMENTS
 
 PAGE = Path(__file__).resolve().parent / "page"
@@ -48,12 +48,8 @@ POLICY = (
 CONSTANTS = {
     "AGREEMENTS": AGREEMENTS,
     "CLUMP_FACTOR": CLUMP_FACTOR,
-    "CLUMP_RATE": CLUMP_RATE,
     "DAMAGE_SIZES": DAMAGE_SIZES,
-    "INJECT_RATE": INJECT_RATE,
-    "MIN_PULL": MIN_PULL,
     "MIN_SEED": MIN_SEED,
-    "SEED_FRACTION": SEED_FRACTION,
 }
 """Numbers and names of the Python worlds that page_world.js also needs."""
 

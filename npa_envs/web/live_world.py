@@ -26,15 +26,6 @@ from npa_envs.world.particles import Particles
 MAX_STEPS = 64
 """Most steps between two frames."""
 
-MIN_PULL = 0.5
-"""Fraction of the pointer's movement by which the brush `pull` of strength 0 moves particles."""
-
-CLUMP_RATE = 0.25
-"""Fraction of a particle's distance that a message of the brush `clump` of strength 1 removes."""
-
-INJECT_RATE = 0.5
-"""Fraction of the new state that a message of the brush `inject` of strength 1 mixes in."""
-
 FARTHEST = 1e4
 """Largest coordinate in a message [length units]."""
 
@@ -42,17 +33,54 @@ MAX_RADIUS = 10.0
 """Largest radius of a brush [length units]."""
 
 
+class Tool(NamedTuple):
+    """A brush: its button on the page, when a stroke of it sends messages, and what it does."""
+
+    changes: str
+    """What a world must let it change, see `LiveWorld._allowed`."""
+    label: str
+    sends: str
+    """When a stroke sends messages: "frame", in each frame; "motion", in frames in which the
+    pointer moves; "position", at each new position; "once", at its start; "line", at its end."""
+    icon: str
+    """An SVG path on a square of side 24."""
+    takes: str | None = None
+    """A further field of its messages: "source" or "rule"."""
+    amounts: tuple[float, float] = (0.0, 1.0)
+    """The amount of its effect at strength 0, and what strength 1 adds to it; 1 at most."""
+
+
 TOOLS = {
-    "remove": "removal",
-    "pull": "moves",
-    "clump": "moves",
-    "cut": "moves",
-    "inject": "states",
-    "graft": "species",
-    "add": "growth",
-}
-"""All brushes, and what a world must allow to offer each. `brushed`, `RuleWorld._brush` and
-`BRUSHES` of page_world.js apply them; `TOOLS` of page.js has their icons."""
+    "remove": Tool("removal", "Remove", "frame", "M4 15l8-9 7 6-7 8H8zM9 20h11"),
+    "push": Tool(
+        "positions", "Push with the pointer", "motion", amounts=(0.5, 1.0),
+        icon="M12 20c-4 0-6-3-7-7 2-1 3 0 4 2V6a1.4 1.4 0 0 1 3 0v5a1.4 1.4 0 0 1 3 0"
+        "v1a1.4 1.4 0 0 1 3 0v3c0 3-2 5-6 5z",
+    ),
+    "clump": Tool(
+        "positions", "Clump", "frame", amounts=(0.0, 0.25),
+        icon="M4 4l5 5M20 4l-5 5M4 20l5-5M20 20l-5-5M9 6v3H6M15 6v3h3M9 18v-3H6M15 18v-3h3",
+    ),
+    "cut": Tool(
+        "positions", "Cut along a line", "line",
+        icon="M5 19L19 5M6 8a2 2 0 1 0 0-.1M16 18a2 2 0 1 0 0-.1M8 9l8 8",
+    ),
+    "inject": Tool(
+        "states", "Inject: the state of where you press spreads to where you drag", "frame",
+        icon="M4 20l3-1 8-8-2-2-8 8zM12 8l4 4M14 10l3-4a1.8 1.8 0 0 1 3 0 1.8 1.8 0 0 1-1 3l-4 2",
+        takes="source", amounts=(0.0, 0.5),
+    ),
+    "graft": Tool(
+        "species", "Graft: particles take another rule", "position", takes="rule",
+        icon="M12 21v-9M12 12c0-5 3-7 8-7 0 5-3 7-8 7zM12 15c0-4-3-6-8-6 0 4 3 6 8 6z",
+    ),
+    "add": Tool(
+        "growth", "Add a seed of another rule", "once", takes="rule", amounts=(0.0, 0.5),
+        icon="M12 4a8 8 0 1 0 .1 0M12 8v8M8 12h8",
+    ),
+}  # fmt: skip
+"""All brushes, in the order of their buttons and keys. `brushed` applies those that change
+positions or states, `RuleWorld._brush` the others, and `BRUSHES` of page_world.js all."""
 
 
 class WorldView(NamedTuple):
@@ -109,7 +137,7 @@ class LiveWorld(ABC):
         """Return the event "world", which describes the world to the page."""
         return {
             "type": "world",
-            "tools": [tool for tool, need in TOOLS.items() if need in self._allowed()],
+            "tools": [{"name": name} | tool._asdict() for name, tool in self.tools.items()],
             "shows": self._shows(),
             "show": self.show,
             "settings": {
@@ -121,12 +149,18 @@ class LiveWorld(ABC):
             "box": None if self.box is None else list(self.box),
         }
 
+    @property
+    def tools(self) -> dict[str, Tool]:
+        """The brushes that the world offers, by name."""
+        allowed = self._allowed()
+        return {name: tool for name, tool in TOOLS.items() if tool.changes in allowed}
+
     def handle(self, message: Mapping[str, Any]) -> bool:
         """Apply a message of the page; return whether `describe` returns something else now."""
         action = message.get("type") if isinstance(message, Mapping) else None
         match action:
             case "play":
-                self.playing = checked_flag("on", message.get("on"))
+                self.playing = bool(message.get("on"))
             case "step":
                 self.playing = False
                 self._run_timed(1)
@@ -137,7 +171,7 @@ class LiveWorld(ABC):
             case "set":
                 return self._set(str(message.get("name")), message.get("value"))
             case "brush":
-                return self._brush(Touch.read(message, self.particles.x))
+                return self._brush(Touch.read(message, self.tools, self.particles.x))
             case "damage":
                 check_damage(name := message.get("name"))
                 self._damage(str(name))
@@ -194,7 +228,7 @@ class LiveWorld(ABC):
 
     @abstractmethod
     def _allowed(self) -> set[str]:
-        """Return what brushes may change in this world: some of the values of `TOOLS`."""
+        """Return what brushes may change: some of the values of `Tool.changes`."""
 
     @abstractmethod
     def _shows(self) -> list[str]: ...
@@ -215,7 +249,7 @@ class LiveWorld(ABC):
                     raise NPAError(f"unknown show {shown(value)}: {suggest(value, self._shows())}")
                 self.show = str(value)
             case "loss":
-                self._loss_wanted = checked_flag("loss", value)
+                self._loss_wanted = bool(value)
             case _ if name in ranges:
                 setattr(self, name, ranges[name].checked(name, value))
             case _:
@@ -244,77 +278,55 @@ class Touch(NamedTuple):
     """Its movement [length units], shape [1, D]."""
     radius: float
     """Radius of the brush [length units]."""
-    strength: float
-    """From 0 to 1, dimensionless."""
+    amount: float
+    """From 0 to 1, dimensionless, by `Tool.amounts`."""
     source: Tensor
     """Position whose state the brush `inject` spreads [length units], shape [1, D]."""
-    view: Tensor | None
-    """In 3D the unit vector towards the viewer, shape [1, D], or None."""
+    view: Tensor
+    """The unit vector towards the viewer, shape [1, 3]."""
     rule: Any
     """Name of another rule in the message, unchecked."""
 
     @classmethod
-    def read(cls, message: Mapping[str, Any], x: Tensor) -> Touch:
+    def read(cls, message: Mapping[str, Any], tools: Mapping[str, Tool], x: Tensor) -> Touch:
         """Return the brush of a message to a world with positions x [1, N, D]."""
-        name = message.get("tool")
-        if not isinstance(name, str) or name not in TOOLS:
-            raise NPAError(f"unknown tool {shown(name)}: {suggest(name, TOOLS)}")
-        at, view = message.get("at"), message.get("view")
+        name, at, space_dim = message.get("tool"), message.get("at"), x.shape[2]
+        if not isinstance(name, str) or name not in tools:
+            raise NPAError(f"unknown tool {shown(name)}: {suggest(name, tools)}")
+        strength = Range(0.0, 1.0).checked("strength", message.get("strength", 1.0))
+        least, added = tools[name].amounts
         return cls(
             name,
-            _checked_vector("at", at, x),
-            _checked_vector("move", message.get("move", [0.0] * x.shape[2]), x),
+            _checked_vector("at", at, space_dim, x),
+            _checked_vector("move", message.get("move", [0.0] * space_dim), space_dim, x),
             Range(1e-4, MAX_RADIUS).checked("radius", message.get("radius")),
-            Range(0.0, 1.0).checked("strength", message.get("strength", 1.0)),
-            _checked_vector("source", message.get("source", at), x),
-            None if view is None else _checked_vector("view", view, x),
+            min(1.0, least + added * strength),
+            _checked_vector("source", message.get("source", at), space_dim, x),
+            _checked_vector("view", message.get("view", [0.0, 0.0, 1.0]), 3, x),
             message.get("rule"),
         )
 
 
 def brushed(particles: Particles, touch: Touch, box: tuple[float, ...] | None) -> Particles:
-    """Return particles after the brush pull, clump, cut or inject."""
+    """Return particles after the brush push, clump, cut or inject."""
     x, s, *_ = particles
     disk: dict[str, Any] = {"radius": touch.radius, "box": box}
     match touch.tool:
-        case "pull":
-            strength = min(1.0, MIN_PULL + touch.strength)
-            x = push(x, centre=touch.at, move=touch.move, strength=strength, **disk)
+        case "push":
+            x = push(x, centre=touch.at, move=touch.move, strength=touch.amount, **disk)
         case "clump":
-            factor = CLUMP_RATE * touch.strength
-            x, s = clump(x, s, centre=touch.at, factor=factor, **disk)
+            x, s = clump(x, s, centre=touch.at, factor=touch.amount, **disk)
         case "cut":
-            half = 0.5 * touch.move
-            line: dict[str, Any] = {"centre": touch.at + half, "normal": _normal(touch)}
-            x, s = cut(x, s, along=half, gap=touch.radius, box=box, **line)
+            space_dim, half = x.shape[2], 0.5 * touch.move
+            move = torch.nn.functional.pad(touch.move, (0, 3 - space_dim))
+            normal = torch.linalg.cross(touch.view, move)[:, :space_dim]
+            line: dict[str, Any] = {"centre": touch.at + half, "normal": normal, "along": half}
+            x, s = cut(x, s, gap=touch.radius, box=box, **line)
         case "inject":
             state, exists = state_around(x, s, centre=touch.source, **disk)
-            weight = INJECT_RATE * touch.strength * exists.to(x.dtype)
+            weight = touch.amount * exists.to(x.dtype)
             s = inject(x, s, centre=touch.at, state=state, strength=weight, **disk)
-        case _:
-            raise NPAError(
-                f"this world keeps its particles, so that the brush {shown(touch.tool)} does "
-                "nothing: take pull, clump, cut or inject"
-            )
     return particles._replace(x=x, s=s)
-
-
-def _normal(touch: Touch) -> Tensor:
-    """Return the normal [1, D] of a cut along `touch.move` and, in 3D, along `touch.view`."""
-    move, view = touch.move, touch.view
-    if move.shape[1] == 2:
-        return torch.stack((-move[:, 1], move[:, 0]), dim=1)
-    normal: Tensor = torch.linalg.cross(
-        move.new_tensor([[0.0, 0.0, 1.0]]) if view is None else view, move
-    )
-    return normal
-
-
-def checked_flag(name: str, value: Any) -> bool:
-    """Return `value` if it is a bool; raises NPAError."""
-    if not isinstance(value, bool):
-        raise NPAError(f"{name} must be true or false, got {shown(value)}")
-    return value
 
 
 def checked_seed(value: Any) -> int:
@@ -322,12 +334,11 @@ def checked_seed(value: Any) -> int:
     return int(Range(0, 2**53, whole=True).checked("seed", value))
 
 
-def _checked_vector(name: str, value: Any, x: Tensor) -> Tensor:
-    space_dim = x.shape[2]
-    fits = isinstance(value, list) and len(value) == space_dim and all(map(is_real, value))
+def _checked_vector(name: str, value: Any, length: int, like: Tensor) -> Tensor:
+    fits = isinstance(value, list) and len(value) == length and all(map(is_real, value))
     if not fits or max(map(abs, value)) > FARTHEST:
-        raise NPAError(f"{name} must be {space_dim} finite numbers, got {shown(value)}")
-    return x.new_tensor([value])
+        raise NPAError(f"{name} must be {length} finite numbers, got {shown(value)}")
+    return like.new_tensor([value])
 
 
 # Colours of particles by state, density, species, speed or update mask.
@@ -396,12 +407,9 @@ class Colouring:
                 updated = _or_zeros(world.updated, world).bool()[:, None]
                 on, off = (updated.new_tensor(tint, dtype=torch.float32) for tint in MASK_COLOURS)
                 return _bytes(torch.where(updated, on, off))
-            case ["state", number] if number.isdecimal() and int(number) < world.s.shape[2]:
-                return _bytes(signed_colours(world.s[0, :, int(number)]))
-        raise NPAError(
-            f"show must be one of the world's, got {shown(show)}: "
-            f"{suggest(show, shows_of(world.s.shape[2]))}"
-        )
+            case _:
+                channel = int(show.removeprefix("state "))
+                return _bytes(signed_colours(world.s[0, :, channel]))
 
     def _components(self, s: Tensor) -> Tensor:
         """Return the first three principal components as colours, in a slowly changing basis."""

@@ -33,9 +33,8 @@ from npa_envs.world.species import AGREEMENTS, species_particles
 MAX_PARTICLES = {"cpu": 16384, "cuda": 131072}
 """Most particles of a world, by device type."""
 
-SEED_FRACTION, MIN_SEED = 0.5, 16
-"""Particles that the brush `add` of strength 1 adds, as a fraction of a fresh world's; the least
-number of them."""
+MIN_SEED = 16
+"""Fewest particles that the brush `add` adds."""
 
 SMALL_VIEWS = {"resolution": 64, "training_views": 1, "held_out_views": 6}
 """Options of 3D tasks for a fast start: targets of full size take many seconds to draw."""
@@ -169,7 +168,7 @@ class RuleWorld(LiveWorld):
         return super().handle(message)
 
     def _allowed(self) -> set[str]:
-        allowed = {"moves", "removal"}
+        allowed = {"positions", "removal"}
         # Rules that divide allow no others in their worlds; their dead particles have no state.
         if not self.main.rule.divides:
             allowed |= {"states", "species"}
@@ -321,37 +320,38 @@ class RuleWorld(LiveWorld):
                 outside = ~inside_ball(x, box=self.box, **ball)[0]
                 self._arrange(_taken(self.particles, outside), self._species()[outside])
             case "graft":
-                self._graft(touch, self._joining(touch.rule))
-            case "add" if not self.main.rule.static:
-                self._add(touch, self._joining(touch.rule))
+                self._graft(touch)
+            case "add":
+                self._add(touch)
             case _:
                 return super()._brush(touch)
         return before != [live_rule.name for live_rule in self.live_rules]
 
-    def _graft(self, touch: Touch, live_rule: LiveRule) -> None:
+    def _graft(self, touch: Touch) -> None:
         x, s, *_ = self.particles
         inside = inside_ball(x, centre=touch.at, radius=touch.radius, box=self.box)
         # Grafted particles divide densities by the same number as their neighbours.
-        index = self._species_index(live_rule, float(self.count))
-        s = torch.where(inside[..., None], self._coded(live_rule, s), s)
+        index = self._species_index(touch.rule, float(self.count))
+        s = torch.where(inside[..., None], self._coded(self.live_rules[index], s), s)
         species = torch.where(inside[0], index, self._species())
         self._arrange(self.particles._replace(s=s), species)
 
-    def _add(self, touch: Touch, live_rule: LiveRule) -> None:
-        count = max(MIN_SEED, round(touch.strength * SEED_FRACTION * self.count))
+    def _add(self, touch: Touch) -> None:
+        count = max(MIN_SEED, round(touch.amount * self.count))
         room = MAX_PARTICLES[self._device.type] - self.particles.x.shape[1]
         if count > room:
             raise NPAError(f"the world has room for {max(room, 0)} particles more, got {count}")
+        # A new species divides densities by its own number of particles, as in a world alone.
+        index = self._species_index(touch.rule, float(count))
         zeros = self.particles.map(lambda value: value.new_zeros(1, count, *value.shape[2:]))
         ball = uniform_ball(
             1, count, zeros.x.shape[2], touch.radius, generator=self._generator,
             device=self._device, dtype=zeros.x.dtype,
         )  # fmt: skip
-        fresh = zeros._replace(x=ball + touch.at[:, None], s=self._coded(live_rule, zeros.s))
-        # A new species divides densities by its own number of particles, as in a world alone.
-        index = self._species_index(live_rule, float(count))
+        s = self._coded(self.live_rules[index], zeros.s)
+        added = zeros._replace(x=ball + touch.at[:, None], s=s)
         species = torch.nn.functional.pad(self._species(), (0, count), value=index)
-        self._arrange(together([self.particles, fresh]), species)
+        self._arrange(together([self.particles, added]), species)
 
     def _all_coded(self, s: Tensor) -> Tensor:
         """Return states [1, N, C] of all particles with the target codes of their rules."""
@@ -366,22 +366,19 @@ class RuleWorld(LiveWorld):
         task = self.task if is_main else self._trained(live_rule.name, None).task
         return task.with_target_code(s)
 
-    def _joining(self, name: Any) -> LiveRule:
-        live_rule = self._live_rule(name)
-        if not self._may_join(live_rule.name):
-            raise NPAError(
-                f"{live_rule.name} cannot live in a world of {self.main.name}: rules of one world "
-                f"must agree in {', '.join(AGREEMENTS)}, and not divide"
-            )
-        return live_rule
-
-    def _species_index(self, live_rule: LiveRule, divisor: float) -> int:
+    def _species_index(self, name: Any, divisor: float) -> int:
         """Return a rule's index in `live_rules`; a new rule is appended, with this divisor."""
+        live_rule = self._live_rule(name)
+        if not self._may_join(name):
+            raise NPAError(
+                f"{name} cannot live in a world of {self.main.name}: rules of one world must agree "
+                f"in {', '.join(AGREEMENTS)}, and not divide"
+            )
         names = [present.name for present in self.live_rules]
-        if live_rule.name not in names:
-            names.append(live_rule.name)
+        if name not in names:
+            names.append(name)
             self.live_rules.append(replace(live_rule, divisor=divisor))
-        return names.index(live_rule.name)
+        return names.index(name)
 
     def _species(self) -> Tensor:
         """Return the index of each particle's rule in `live_rules`, int64, shape [N]."""

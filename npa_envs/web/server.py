@@ -230,7 +230,7 @@ class ViewerSession:
     def __init__(self, site: Site, page: WebSocket, loop: asyncio.AbstractEventLoop) -> None:
         self._site, self._page, self._loop = site, page, loop
         self._inbox: queue.Queue[dict[str, Any] | bytes] = queue.Queue(MESSAGES_KEPT)
-        self._outbox: asyncio.Queue[bytes | str | None] = asyncio.Queue()
+        self._outbox: asyncio.Queue[bytes | str] = asyncio.Queue(MESSAGES_KEPT)
         self._free_frames = threading.BoundedSemaphore(FRAMES_AHEAD)
         self._stopped = threading.Event()
         self._pictures: list[bytes] | None = None
@@ -243,14 +243,10 @@ class ViewerSession:
         try:
             await self._read()
         finally:
-            self.stop()
+            # The world ends after its present frame.
+            self._stopped.set()
+            self._frame_drawn()
             writing.cancel()
-
-    def stop(self) -> None:
-        """End the world after its present frame."""
-        self._stopped.set()
-        self._frame_drawn()
-        self._post(None)
 
     async def _read(self) -> None:
         while True:
@@ -266,23 +262,19 @@ class ViewerSession:
             elif isinstance(message, dict) and message.get("type") == "drawn":
                 self._frame_drawn()
             else:
-                self._enqueue(message)
-
-    def _enqueue(self, message: dict[str, Any] | bytes) -> None:
-        try:
-            self._inbox.put_nowait(message)
-        except queue.Full:
-            self._send_error("too many messages: some are lost")
+                try:
+                    self._inbox.put_nowait(message)
+                except queue.Full:
+                    self._send_error("too many messages: some are lost")
 
     async def _write(self) -> None:
-        while (data := await self._outbox.get()) is not None:
-            try:
+        with contextlib.suppress(WebSocketDisconnect, RuntimeError):
+            while True:
+                data = await self._outbox.get()
                 if isinstance(data, bytes):
                     await self._page.send_bytes(data)
                 else:
                     await self._page.send_text(data)
-            except (WebSocketDisconnect, RuntimeError):
-                return
 
     def _frame_drawn(self) -> None:
         with contextlib.suppress(ValueError):  # The page reported more frames than were sent.
@@ -294,10 +286,9 @@ class ViewerSession:
     def _send_error(self, message: str) -> None:
         self._send_event({"type": "error", "message": message})
 
-    def _post(self, data: bytes | str | None) -> None:
+    def _post(self, data: bytes | str) -> None:
         def put() -> None:
-            # Events are dropped if the page does not read them; None ends the loop of `_write`.
-            if data is None or self._outbox.qsize() < MESSAGES_KEPT:
+            with contextlib.suppress(asyncio.QueueFull):  # The page does not read.
                 self._outbox.put_nowait(data)
 
         with contextlib.suppress(RuntimeError):  # The loop has ended.

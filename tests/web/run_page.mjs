@@ -25,10 +25,11 @@ const element = (name) => (elements[name] ??= makeElement());
 let waiting = [];
 Object.assign(globalThis, {
   document: {
-    getElementById: element, createElement: makeElement, documentElement: makeElement(), activeElement: null,
+    getElementById: element, createElement: makeElement, documentElement: makeElement(), body: makeElement(),
+    activeElement: null,
   },
   window: globalThis, location: { search: "?painter=canvas" }, innerWidth: 1000, devicePixelRatio: 1,
-  getComputedStyle: () => ({ getPropertyValue: () => "#000000" }), matchMedia: () => ({}), addEventListener() {},
+  getComputedStyle: () => ({ backgroundColor: "rgb(0, 0, 0)", color: "rgb(0, 0, 0)" }), matchMedia: () => ({}), addEventListener() {},
   ResizeObserver: class { observe() {} }, Option: class {},
   requestAnimationFrame: (act) => waiting.push(act),
 });

@@ -9,11 +9,13 @@ from pathlib import Path
 
 import pytest
 
-SETUP = """
-const world = {
-  type: "world", title: "t", dimension: 2, tools: ["inject", "pull", "graft", "add", "cut"],
-  capabilities: ["film"],
-};
+from npa_envs.web.live_world import TOOLS
+
+TOOLS_SENT = json.dumps([{"name": name} | tool._asdict() for name, tool in TOOLS.items()])
+SETUP = (
+    f"const tools = {TOOLS_SENT};"
+    """
+const world = { type: "world", title: "t", dimension: 2, tools, capabilities: ["film"] };
 const frame = (step, places = [0, 0, 1, 1]) => ({
   type: "frame", step, positions: new Float32Array(places), colours: new Uint8Array(6),
   milliseconds: 1,
@@ -23,6 +25,7 @@ listen(world);
 tick();
 sent.length = 0;
 """
+)
 
 
 @pytest.fixture
@@ -57,17 +60,17 @@ def test_each_frame_is_answered_once_it_or_a_later_one_is_drawn(run):
 def test_each_brush_sends_its_messages_at_its_time(run):
     strokes = run("""
         const strokes = {};
-        for (const name of world.tools) {
-          page.choose(name);
+        for (const { name } of tools) {
+          page.tools.choose(name);
           sent.length = 0;
           const event = (type, clientX) =>
             ({ type, clientX, clientY: 40, pointerId: 1, button: 0, pointerType: "mouse" });
-          page.press(event("pointerdown", 40));
+          page.tools.press(event("pointerdown", 40));
           tick();
-          page.move(event("pointermove", 60));
+          page.tools.move(event("pointermove", 60));
           tick();
           tick();
-          page.release(event("pointerup", 60));
+          page.tools.release(event("pointerup", 60));
           strokes[name] = ofType("brush").map(({ at, move, source }) =>
             [at[0], move[0], source?.[0] ?? null].map((x) => x && Math.round(x / 0.275)));
         }
@@ -75,8 +78,10 @@ def test_each_brush_sends_its_messages_at_its_time(run):
     """)
     # In tens of pixels from the middle: position, movement, and where the stroke began.
     assert strokes == {
+        "remove": [[-1, 0, None], [-1, 0, None], [-1, 2, None], [1, 0, None]],
+        "clump": [[-1, 0, None], [-1, 0, None], [-1, 2, None], [1, 0, None]],
         "inject": [[-1, 0, -1], [-1, 0, -1], [-1, 2, -1], [1, 0, -1]],
-        "pull": [[-1, 0, None], [-1, 2, None]],
+        "push": [[-1, 0, None], [-1, 2, None]],
         "graft": [[-1, 0, None], [1, 0, None]],
         "add": [[-1, 0, None]],
         "cut": [[-1, 2, None]],
@@ -87,7 +92,7 @@ def test_the_key_f_shows_the_whole_world(run):
     centre, zoom = run("""
         listen(frame(1, [4, 0, 6, 2]));
         page.camera.zoom = 9;
-        page.key({ key: "f", target: { matches: () => false }, preventDefault() {} });
+        page.controls.key({ key: "f", target: { matches: () => false }, preventDefault() {} });
         return [page.camera.centre, page.camera.zoom];
     """)
     assert centre == [5, 1, 0]
@@ -96,12 +101,12 @@ def test_the_key_f_shows_the_whole_world(run):
 
 def test_a_film_that_is_ready_leaves_the_next_recording_alone(run):
     recording, button, pressed = run("""
-        page.record(true);
-        page.record(false);
-        page.record(true);
+        page.film.record(true);
+        page.film.record(false);
+        page.film.record(true);
         listen({ type: "file", name: "film-1.gif", url: "films/film-1.gif" });
-        const going = page.recording !== null, button = element("record").textContent;
-        page.record(!page.recording);
+        const going = page.film.recording !== null, button = element("record").textContent;
+        page.film.record(!page.film.recording);
         return [going, button, ofType("film").map(({ action }) => action)];
     """)
     assert recording
@@ -111,9 +116,9 @@ def test_a_film_that_is_ready_leaves_the_next_recording_alone(run):
 
 def test_a_recording_ends_where_the_engine_ends_it(run):
     result = run("""
-        page.record(true);
+        page.film.record(true);
         listen({ type: "film", action: "stop" });
-        return [page.recording, element("record").textContent, ofType("film").length];
+        return [page.film.recording, element("record").textContent, ofType("film").length];
     """)
     assert result == [None, "Record", 1]
 
@@ -131,7 +136,7 @@ def test_the_ends_of_a_slider_lie_within_its_range(run, low, high, scale):
     setting = json.dumps({"value": high, "low": low, "high": high, "scale": scale})
     first, last = run(f"""
         const input = element("slider");
-        page.slider(input, "eps", {setting});
+        page.controls.slider(input, "eps", {setting});
         for (const end of ["min", "max"]) {{
           input.value = String(input[end]);
           input.oninput();

@@ -138,7 +138,7 @@ def until(condition) -> None:
 def test_every_tool_and_every_show_works(shown):
     page, _ = shown(count=512)
     page.wait(f"{FRAME}.step > 20")
-    for tool in ("pull", "clump", "cut", "inject", "graft", "add"):
+    for tool in ("push", "clump", "cut", "inject", "graft", "add"):
         take(page, tool)
         page.drag([pixel_of(page, x, 0.0) for x in (-0.2, -0.1, 0.0, 0.1, 0.2)])
         time.sleep(0.3)
@@ -205,7 +205,7 @@ def test_on_a_phone_fingers_brush_and_the_settings_fold(shown):
 @pytest.mark.parametrize("painter", ["canvas", "webgl2"])
 def test_a_3d_world_turns_under_the_pointer(shown, painter, tmp_path):
     page, _ = shown("duck", 1024, query=f"?painter={painter}")
-    assert page.run("document.page.tool") == "look"
+    assert page.run("document.page.tools.chosen.name") == "look"
     page.drag([(400, 400), (450, 400), (500, 400)])
     assert page.run("document.page.camera.azimuth") == pytest.approx(-40.0)
     take(page, "remove")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import io
 import json
-import queue
 import socket
 import struct
 import threading
@@ -455,13 +454,16 @@ def test_wrong_addresses_are_named(host, port, error):
         server.open_port(host, port)
 
 
-def test_more_messages_than_there_is_room_for_are_refused(site):
-    # Without a thread that takes them out.
-    session = server.ViewerSession.__new__(server.ViewerSession)
-    session._inbox = queue.Queue(2)
-    events = []
-    session._send_event = events.append
-    for _ in range(4):
-        session._enqueue({"type": "brush"})
-    assert session._inbox.qsize() == 2
-    assert [event["message"] for event in events] == ["too many messages: some are lost"] * 2
+def test_more_messages_than_there_is_room_for_are_rejected(tmp_path, monkeypatch):
+    monkeypatch.setattr(server, "MESSAGES_KEPT", 4)
+    released = threading.Event()
+
+    class Held(Counter):
+        def handle(self, message):
+            return not released.wait(60)
+
+    with meet(client_of(server.Site(Held, films=tmp_path))) as reader:
+        for _ in range(8):
+            reader.send_json({"type": "brush"})
+        assert next_error(reader) == "too many messages: some are lost"
+        released.set()

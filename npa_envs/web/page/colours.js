@@ -24,7 +24,7 @@ export class Colouring {
     this.basis = null;
   }
 
-  // live: the LiveWorld; show: one of its shows.
+  // live: the RuleWorld; show: one of its shows.
   of(live, show) {
     const { world } = live;
     const bytes = new Uint8ClampedArray(3 * world.count);
@@ -49,11 +49,11 @@ export class Colouring {
   }
 
   // 1 is a world whose particles fill [-1, 1]^D, or its box, evenly. Worlds in open space are denser.
-  densities({ physics, world, values: { eps }, box, dimension, full }, bytes) {
+  densities({ physics, world, values: { eps }, box, dimension, seedCount }, bytes) {
     physics.sort(world, eps, box);
-    physics.computeDensities(world.count, eps);
+    physics.computeDensities(world.count);
     const volume = box === null ? 2 ** dimension : box.reduce((product, side) => product * side, 1);
-    const usual = (full / volume) * (box === null ? 4 : 1);
+    const usual = (seedCount / volume) * (box === null ? 4 : 1);
     for (let k = 0; k < world.count; k++) {
       writeColour(bytes, physics.order[k], this.onRamp(1 - 2 ** (-physics.density[k] / usual)));
     }
@@ -110,7 +110,7 @@ export class Colouring {
 // Colours of one rule's particles by the outputs of its read-out, or their states: the last three, or the
 // colour of the class with the largest output, greyer the smaller it is.
 export class RuleColours {
-  // rule: of LiveWorld; its `classes` are {palette, undecided}, or null.
+  // rule: of RuleWorld; its `classes` are {palette, undecided}, or null.
   constructor(rule, kernels) {
     this.classes = rule.classes;
     this.channels = rule.state_dim;

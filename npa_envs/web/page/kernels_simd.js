@@ -107,13 +107,13 @@ function gatherCode(width, dimension) {
   return { parameters: 9, integers: 2, vectors: 2 + 4 + 2 + 8, code };
 }
 
-// Numbers that `pairs` reads, each of them a word in memory.
+// Numbers that `listNeighbours` reads, each of them a word in memory.
 const PROBE = ["x", "y", "z", "eps", "square", "weight", "slope", "sideX", "sideY", "sideZ", "perX", "perY", "perZ"];
 
-// pairs(probe, order, x, y, z, volume, ranges, rangesEnd, width, stateAt, a, kx, ky, kz, out): as in
+// listNeighbours(probe, order, x, y, z, volume, ranges, rangesEnd, width, stateAt, a, kx, ky, kz, out): as in
 // plainKernels. `order` holds, for each set of lanes, the bytes that bring them to the front; `out` gets
 // the number of neighbours, and from its 16th byte on six vectors, the lanes of the moment matrix.
-function pairsCode(dimension) {
+function listCode(dimension) {
   const names = [
     "probe", "order", "x", "y", "z", "volume", "ranges", "rangesEnd", "width", "stateAt", "a", "kx", "ky", "kz", "out",
     // Local integers.
@@ -277,11 +277,11 @@ export function simdKernels(width, dimension) {
   const memory = new WebAssembly.Memory({ initial: MEMORY_PAGES });
   const code = assemble({
     gather: gatherCode(width, dimension),
-    pairs: pairsCode(dimension),
+    listNeighbours: listCode(dimension),
     product: productCode(),
   });
   const instance = new WebAssembly.Instance(new WebAssembly.Module(code), { page: { memory } });
-  const { gather: gatherAt, pairs: pairsAt, product: multiplyAt } = instance.exports;
+  const { gather: gatherAt, listNeighbours: listAt, product: multiplyAt } = instance.exports;
   let used = 16;
   const reserve = (Kind, length) => {
     const at = used;
@@ -291,10 +291,10 @@ export function simdKernels(width, dimension) {
   };
   const floats = (length) => reserve(Float32Array, length);
 
-  function gather(states, stateWidth, space, own, { count, stateAt, a, slopes }, sums) {
+  function gather({ states, list: { count, stateAt, a, slopes }, sums }, i) {
     const at = states.byteOffset;
     gatherAt(
-      at, at + 4 * own, 4 * count, stateAt.byteOffset, a.byteOffset,
+      at, at + 4 * i * width, 4 * count, stateAt.byteOffset, a.byteOffset,
       slopes[0].byteOffset, slopes[1].byteOffset, slopes[2].byteOffset, sums.byteOffset,
     );
   }
@@ -305,23 +305,22 @@ export function simdKernels(width, dimension) {
   const out = floats(4 + 6 * 4);
   const neighbourCount = new Int32Array(memory.buffer, out.byteOffset, 1);
 
-  function pairs(points, i, ranges, used, { eps, weight, slope, sides, perSide, width: stride }, list, moment) {
-    const { x, y, z, volume } = points;
+  function listNeighbours(physics, i) {
+    const { ranges, rangesEnd, eps, weight, slope, sides, perSide, list } = physics;
+    const { x, y, z, volume } = physics.points;
     const scalars = [x[i], y[i], z[i], eps, eps * eps, weight, slope];
     probe.set(scalars);
-    for (let d = 0; d < 3; d++) {
-      probe[scalars.length + d] = sides[d];
-      probe[scalars.length + 3 + d] = perSide[d];
-    }
+    probe.set(sides, scalars.length);
+    probe.set(perSide, scalars.length + 3);
     const at = ranges.byteOffset;
     const { stateAt, a, slopes } = list;
-    pairsAt(
+    listAt(
       probe.byteOffset, order.byteOffset, x.byteOffset, y.byteOffset, z.byteOffset, volume.byteOffset,
-      at, at + 4 * used, stride, stateAt.byteOffset, a.byteOffset,
+      at, at + 4 * rangesEnd, width, stateAt.byteOffset, a.byteOffset,
       slopes[0].byteOffset, slopes[1].byteOffset, slopes[2].byteOffset, out.byteOffset,
     );
     list.count = neighbourCount[0];
-    for (let k = 0; k < 6; k++) moment[k] = out[4 + 4 * k] + out[5 + 4 * k] + out[6 + 4 * k] + out[7 + 4 * k];
+    for (let k = 0; k < 6; k++) list.moment[k] = out[4 + 4 * k] + out[5 + 4 * k] + out[6 + 4 * k] + out[7 + 4 * k];
   }
 
   // Rows are taken four at a time: arrays have room for a multiple of them.
@@ -338,7 +337,7 @@ export function simdKernels(width, dimension) {
     floats,
     integers: (length) => reserve(Int32Array, length),
     gather,
-    pairs,
+    listNeighbours,
     layer: (...matrix) => tiledLayer(floats, ...matrix),
     product,
   };

@@ -8,11 +8,11 @@
 // Messages:
 //   {type: "play", on}                 run or pause
 //   {type: "step"}                     one step, while paused
-//   {type: "reset", seed}              a fresh world; without seed the next one
+//   {type: "reset", seed}              a new world; without seed the next one
 //   {type: "set", name, value}         name: a key of the world's `settings`, or "rule", "show",
 //                                      "loss" (true while its plot is open: else it is not computed)
 //   {type: "brush", tool, at, move, radius, strength, source?, rule?, view?}
-//                                      tool: one of the world's `tools`; `sends` of TOOLS below says
+//                                      tool: the name of one of the world's `tools`, whose `sends` says
 //                                      when; at, move: [x, y] or [x, y, z] [length units];
 //                                      radius: of cut, whose line leads from `at` to `at + move`,
 //                                      its half-width; strength in [0, 1]; source (inject): where the
@@ -32,7 +32,8 @@
 //       [length units]; rules: choices of `rule`; others: choices of graft and add; species: names of
 //       the rules of the world's particles; settings: {name: {value, low, high, scale: "log" or
 //       null, whole: true or false}}, names: eps, update_prob, noise, count, speed (steps a frame);
-//       tools: names of TOOLS that the world offers; capabilities: some of "film", "loss".
+//       tools: the brushes that the world offers, {name, label, icon, sends, takes, ...} as `Tool` of
+//       npa_envs/web/live_world.py describes them; capabilities: some of "film", "loss".
 //       `BLANK` below has the defaults of missing keys.
 //   {type: "frame", step, positions, colours, milliseconds, loss?}
 //       positions: Float32Array, count * dimension; colours: Uint8Array, count * 3 (red, green, blue);
@@ -58,32 +59,10 @@ const BLANK = {
   capabilities: [], playing: true, seed: 0,
 };
 
-// The tools; "look" is the page's own, and a world offers some of the others. Icons are SVG paths on a square of
-// side 24. sends: when a stroke sends messages: "frame", in each frame; "motion", in frames in which the pointer
-// moves; "position", at each new position; "once", at its start; "line", at its end. takes: a further field of its messages.
-const TOOLS = {
-  look: {
-    label: "Look: drag to move, wheel or pinch to zoom, double click to see all",
-    icon: "M12 5v14M5 12h14M12 5l-2 2M12 5l2 2M12 19l-2-2M12 19l2-2M5 12l2-2M5 12l2 2M19 12l-2-2M19 12l-2 2",
-  },
-  remove: { label: "Remove", sends: "frame", icon: "M4 15l8-9 7 6-7 8H8zM9 20h11" },
-  pull: {
-    label: "Pull with the pointer", sends: "motion",
-    icon: "M12 20c-4 0-6-3-7-7 2-1 3 0 4 2V6a1.4 1.4 0 0 1 3 0v5a1.4 1.4 0 0 1 3 0v1a1.4 1.4 0 0 1 3 0v3c0 3-2 5-6 5z",
-  },
-  clump: {
-    label: "Clump", sends: "frame", icon: "M4 4l5 5M20 4l-5 5M4 20l5-5M20 20l-5-5M9 6v3H6M15 6v3h3M9 18v-3H6M15 18v-3h3",
-  },
-  cut: { label: "Cut along a line", sends: "line", icon: "M5 19L19 5M6 8a2 2 0 1 0 0-.1M16 18a2 2 0 1 0 0-.1M8 9l8 8" },
-  inject: {
-    label: "Inject: the state of where you press spreads to where you drag", sends: "frame", takes: "source",
-    icon: "M4 20l3-1 8-8-2-2-8 8zM12 8l4 4M14 10l3-4a1.8 1.8 0 0 1 3 0 1.8 1.8 0 0 1-1 3l-4 2",
-  },
-  graft: {
-    label: "Graft: particles take another rule", sends: "position", takes: "rule",
-    icon: "M12 21v-9M12 12c0-5 3-7 8-7 0 5-3 7-8 7zM12 15c0-4-3-6-8-6 0 4 3 6 8 6z",
-  },
-  add: { label: "Add a seed of another rule", sends: "once", takes: "rule", icon: "M12 4a8 8 0 1 0 .1 0M12 8v8M8 12h8" },
+// The tool that all worlds have; it sends no messages.
+const LOOK = {
+  name: "look", label: "Look: drag to move, wheel or pinch to zoom, double click to see all",
+  icon: "M12 5v14M5 12h14M12 5l-2 2M12 5l2 2M12 19l-2-2M12 19l2-2M5 12l2-2M5 12l2 2M19 12l-2-2M19 12l-2 2",
 };
 
 const ICONS = {
@@ -108,32 +87,25 @@ export async function start(connect, settings) {
   const page = (document.page = new Page());
   try {
     page.engine = await connect(settings, (event) => page.listen(event));
-    for (const message of page.waiting.splice(0)) page.engine.send(message);
   } catch (error) {
     page.showError(error.message);
   }
   return page;
 }
 
+// The engine's messages and events, and the picture of the world.
 class Page {
   constructor() {
     this.engine = null;
-    this.waiting = [];
     this.world = { ...BLANK };
+    this.described = false; // whether the event "world" has come
     this.frame = null;
     this.undrawn = 0; // frames received since the last drawing
+    this.dirty = true; // whether the picture has changed without a new frame
     this.camera = new Camera(2, BLANK.half_width);
     this.canvas = $("world");
-    const wanted = new URLSearchParams(location.search).get("painter");
-    this.painter = makePainter(this.canvas, wanted ?? "auto");
+    this.painter = makePainter(this.canvas, new URLSearchParams(location.search).get("painter") ?? "auto");
     this.tracers = new Tracers();
-    this.tool = "look"; // a name of TOOLS
-    this.described = false; // whether the event "world" has come
-    this.pointers = new Map();
-    this.looking = false; // whether pressed pointers move the camera
-    this.stroke = null; // that of the pressed brush
-    this.pressing = false; // whether a slider is pressed
-    this.recording = null;
     this.frameTimes = [];
     this.reported = 0; // when the step was last written
     this.plots = {
@@ -141,18 +113,15 @@ class Page {
       milliseconds: new Plot($("plots"), "Time of a step", "ms"),
     };
     this.curves = {}; // plots of the events "curve", by name
-    this.dirty = true;
-    this.buildControls();
-    this.watchPointers();
+    this.tools = new Tools(this);
+    this.film = new Film(this);
+    this.controls = new Controls(this);
     requestAnimationFrame(() => this.drawIfNeeded());
   }
 
   send(message) {
-    if (this.engine) this.engine.send(message);
-    else this.waiting.push(message);
+    this.engine?.send(message);
   }
-
-  // Events of the engine.
 
   listen(event) {
     if (event.type === "frame") {
@@ -161,8 +130,8 @@ class Page {
     } else if (event.type === "world") this.readWorld(event);
     else if (event.type === "curve") this.curve(event);
     else if (event.type === "reordered") this.tracers.clear();
-    else if (event.type === "film" && this.recording?.picture) this.showRecording((this.recording = null));
-    else if (event.type === "file") this.offerFile(event.name, event.url);
+    else if (event.type === "film") this.film.end();
+    else if (event.type === "file") this.film.offer(event.name, event.url);
     else if (event.type === "error") this.showError(event.message);
   }
 
@@ -174,31 +143,17 @@ class Page {
       this.frame = null;
       // Also for undrawn frames of the former world: the engine waits for each.
       this.reportDrawn();
-      const first = world.tools.includes("remove") && world.dimension === 2 ? "remove" : "look";
-      const keeps = before.dimension === world.dimension && world.tools.includes(this.tool);
-      this.choose(keeps ? this.tool : first);
+      const first = world.dimension === 2 ? "remove" : "look", { name: chosen } = this.tools.chosen;
+      const keeps = before.dimension === world.dimension && world.tools.some(({ name }) => name === chosen);
+      this.tools.choose(keeps ? chosen : first);
     }
     if (before.rule !== world.rule || before.seed !== world.seed) {
       this.tracers.clear();
       Object.values(this.plots).forEach((plot) => plot.clear());
     }
     this.described = true;
-    document.title = `${world.title} · npa-envs`;
-    $("title").textContent = world.title;
-    $("note").textContent = world.note;
-    this.showPlaying();
-    options($("rule"), world.rules, world.rule);
-    const other = world.others.includes($("other").value) && before.rule === world.rule
-      ? $("other").value : world.others.find((name) => name !== world.rule);
-    options($("other"), world.others, other);
-    options($("show"), world.shows, world.show);
-    $("rule-field").hidden = world.rules.length < 2;
-    $("other-field").hidden = !world.tools.some((name) => TOOLS[name].takes === "rule");
-    $("brush").hidden = !world.tools.length;
     this.plots.loss.figure.hidden = !world.capabilities.includes("loss");
-    this.showTools();
-    this.showDamages();
-    this.showSettings();
+    this.controls.show(world, before);
     this.dirty = true;
   }
 
@@ -209,14 +164,6 @@ class Page {
     plot.draw();
   }
 
-  offerFile(name, url) {
-    const item = make("li"), link = make("a", { href: url, download: name, textContent: name });
-    item.append(link);
-    $("files").prepend(item);
-    $("film").open = true;
-    return link;
-  }
-
   showError(message) {
     $("message").textContent = message;
     $("message").hidden = false;
@@ -224,155 +171,10 @@ class Page {
     this.messageTimer = setTimeout(() => ($("message").hidden = true), 9000);
   }
 
-  // Controls.
-
-  buildControls() {
-    $("one").innerHTML = icon(ICONS.one);
-    $("reset").innerHTML = icon(ICONS.reset);
-    $("fold").innerHTML = icon(ICONS.fold);
-    $("play").onclick = () => this.play(!this.world.playing);
-    $("one").onclick = () => { this.play(false); this.send({ type: "step" }); };
-    $("reset").onclick = () => this.send({ type: "reset" });
-    $("fold").onclick = () => this.fold(!$("panel").hidden);
-    $("rule").onchange = () => this.send({ type: "set", name: "rule", value: $("rule").value });
-    $("show").onchange = () => this.send({ type: "set", name: "show", value: $("show").value });
-    $("message").onclick = () => ($("message").hidden = true);
-    $("snapshot").onclick = () => this.snapshot();
-    $("record").onclick = () => this.record(!this.recording);
-    $("plots").ontoggle = () => this.send({ type: "set", name: "loss", value: $("plots").open });
-    $("tracers").onchange = () => { this.tracers.clear(); this.dirty = true; };
-    $("style").onchange = () => (this.dirty = true);
-    $("theme").value = storedTheme();
-    $("theme").onchange = () => { storedTheme($("theme").value); this.showTheme(); };
-    matchMedia("(prefers-color-scheme: dark)").onchange = () => this.showTheme();
-    this.showTheme();
-    for (const name of ["radius", "strength", "size"]) {
-      const input = $(name), output = input.parentElement.querySelector("output");
-      input.oninput = () => { output.textContent = short(+input.value); this.dirty = true; };
-      input.oninput();
-    }
-    this.fold(innerWidth <= 760);
-    this.showPlaying();
-    addEventListener("keydown", (event) => this.key(event));
-  }
-
-  fold(away) {
-    $("panel").hidden = away;
-    $("fold").setAttribute("aria-expanded", String(!away));
-  }
-
   play(on) {
     this.world.playing = on;
-    this.showPlaying();
+    this.controls.showPlaying();
     this.send({ type: "play", on });
-  }
-
-  showPlaying() {
-    $("play").innerHTML = icon(this.world.playing ? ICONS.pause : ICONS.play);
-    $("play").setAttribute("aria-pressed", String(this.world.playing));
-  }
-
-  showTheme() {
-    document.documentElement.dataset.theme = $("theme").value;
-    const style = getComputedStyle(document.documentElement);
-    this.background = numbers(style.getPropertyValue("--ground"));
-    this.ink = numbers(style.getPropertyValue("--text"));
-    this.dirty = true;
-  }
-
-  showTools() {
-    const names = ["look", ...this.world.tools];
-    if ($("tools").dataset.names === names.join()) return;
-    $("tools").dataset.names = names.join();
-    $("tools").replaceChildren(...names.map((name, k) => {
-      const { icon: path, label } = TOOLS[name];
-      const button = make("button", {
-        innerHTML: icon(path), title: `${label} (${k + 1})`, onclick: () => this.choose(name),
-      });
-      button.dataset.tool = name;
-      button.setAttribute("role", "radio");
-      button.setAttribute("aria-label", name);
-      return button;
-    }));
-    this.choose(this.tool);
-  }
-
-  choose(name) {
-    this.tool = this.world.tools.includes(name) ? name : "look";
-    for (const button of $("tools").children)
-      button.setAttribute("aria-checked", String(button.dataset.tool === this.tool));
-    if (this.tool === "look") $("cursor").hidden = true;
-    this.canvas.style.cursor = this.tool === "look" ? "grab" : "crosshair";
-  }
-
-  showDamages() {
-    $("damages").hidden = !this.world.damages.length;
-    $("damages").replaceChildren(...this.world.damages.map((name) => make("button", {
-      textContent: name, title: `Damage: ${name}`, onclick: () => this.send({ type: "damage", name }),
-    })));
-  }
-
-  showSettings() {
-    const { settings } = this.world;
-    $("physics").hidden = !PHYSICS.some((name) => name in settings);
-    for (const name of ["speed", ...PHYSICS]) {
-      $(name).parentElement.hidden = !settings[name];
-      if (settings[name]) this.slider($(name), name, settings[name]);
-    }
-  }
-
-  slider(input, name, { value, low, high, scale, whole }) {
-    const bend = scale === "log" ? Math.log : (v) => v, unbend = scale === "log" ? Math.exp : (v) => v;
-    const output = input.parentElement.querySelector("output");
-    // Rounded to three digits, a value may exceed the range.
-    const read = () => Math.min(high, Math.max(low,
-      (whole ? Math.round : (v) => +v.toPrecision(3))(unbend(+input.value))));
-    input.min = bend(low);
-    input.max = bend(high);
-    input.step = whole && scale !== "log" ? 1 : (bend(high) - bend(low)) / 200;
-    if (document.activeElement !== input || !this.pressing) input.value = bend(value);
-    output.textContent = short(value);
-    input.onpointerdown = () => (this.pressing = true);
-    input.onpointerup = () => (this.pressing = false);
-    input.oninput = () => {
-      output.textContent = short(read());
-      clearTimeout(this.countTimer);
-      // Another number of particles restarts the world: sent only once the slider rests.
-      const send = () => this.send({ type: "set", name, value: read() });
-      if (name === "count") this.countTimer = setTimeout(send, 150);
-      else send();
-    };
-  }
-
-  key(event) {
-    if (event.target.matches("select, input[type=text]") || event.ctrlKey || event.metaKey) return;
-    const tools = [...$("tools").children];
-    const acts = {
-      " ": () => this.play(!this.world.playing), s: () => $("one").click(), r: () => $("reset").click(),
-      p: () => $("fold").click(), f: () => this.fit(),
-    };
-    const act = acts[event.key] ?? tools[+event.key - 1]?.onclick;
-    if (!act || (event.key === " " && event.target.matches("button, summary"))) return;
-    event.preventDefault();
-    act();
-  }
-
-  // One pointer uses the tool, two move the camera.
-
-  watchPointers() {
-    const { canvas } = this;
-    canvas.onpointerdown = (event) => this.press(event);
-    canvas.onpointermove = (event) => this.move(event);
-    canvas.onpointerup = canvas.onpointercancel = (event) => this.release(event);
-    canvas.onpointerleave = () => { if (!this.pointers.size) $("cursor").hidden = true; };
-    canvas.ondblclick = () => { if (this.tool === "look") this.fit(); };
-    canvas.oncontextmenu = (event) => event.preventDefault();
-    canvas.addEventListener("wheel", (event) => {
-      event.preventDefault();
-      this.camera.magnify(Math.exp(-event.deltaY * 0.0015));
-      this.dirty = true;
-    }, { passive: false });
-    new ResizeObserver(() => (this.dirty = true)).observe(canvas);
   }
 
   // Shows all of the world.
@@ -381,133 +183,10 @@ class Page {
     this.dirty = true;
   }
 
-  // The position of the pointer on the canvas [pixels].
-  position(event) {
-    const { left, top } = this.canvas.getBoundingClientRect();
-    return [event.clientX - left, event.clientY - top];
-  }
-
-  press(event) {
-    this.canvas.setPointerCapture(event.pointerId);
-    const position = this.position(event);
-    this.pointers.set(event.pointerId, position);
-    this.looking = this.tool === "look" || event.button === 2 || event.shiftKey || this.pointers.size > 1;
-    if (this.looking) {
-      this.stroke = null;
-      return;
-    }
-    const near = this.nearness(position);
-    this.stroke = { near, from: position, at: position, sent: position };
-    if (this.sends !== "line") this.brush(position, [0, 0]);
-    this.showCursor(position);
-  }
-
-  move(event) {
-    const position = this.position(event), before = this.pointers.get(event.pointerId);
-    if (!before) {
-      if (event.pointerType === "mouse") this.showCursor(position);
-      return;
-    }
-    const columns = position[0] - before[0], rows = position[1] - before[1];
-    const others = [...this.pointers].filter(([id]) => id !== event.pointerId).map(([, at]) => at);
-    this.pointers.set(event.pointerId, position);
-    const { clientWidth: width, clientHeight: height } = this.canvas;
-    if (this.looking) {
-      this.camera.drag(columns / this.pointers.size, rows / this.pointers.size, width, height);
-      if (others.length) this.camera.magnify(
-        Math.hypot(position[0] - others[0][0], position[1] - others[0][1]) /
-        Math.max(Math.hypot(before[0] - others[0][0], before[1] - others[0][1]), 1));
-      this.dirty = true;
-    } else if (this.stroke) {
-      this.stroke.at = position;
-      this.showCursor(position);
-    }
-  }
-
-  release(event) {
-    const { stroke } = this;
-    this.pointers.delete(event.pointerId);
-    if (stroke && this.sends === "line" && event.type === "pointerup") {
-      const move = [stroke.at[0] - stroke.from[0], stroke.at[1] - stroke.from[1]];
-      if (Math.hypot(...move) > 4) this.brush(stroke.from, move);
-    }
-    this.stroke = null;
-    $("knife").hidden = true;
-    $("cursor").classList.remove("pressed");
-    if (event.pointerType !== "mouse") $("cursor").hidden = true;
-  }
-
-  // Nearness of the surface under the pointer, where brushes of 3D worlds act.
-  nearness([column, row]) {
-    const { frame, camera, canvas } = this;
-    if (!frame || this.world.dimension !== 3) return 0;
-    const width = canvas.clientWidth, height = canvas.clientHeight;
-    const within = Math.max(8, (0.3 * $("radius").value) / camera.unit(width, height));
-    let nearest = -Infinity;
-    for (let k = 0; k < frame.positions.length; k += 3) {
-      const [x, y, near] = camera.project(frame.positions.subarray(k, k + 3), width, height);
-      if (near > nearest && Math.hypot(x - column, y - row) < within) nearest = near;
-    }
-    return Number.isFinite(nearest) ? nearest : 0;
-  }
-
-  // Sends the brush at a position on the canvas, with its movement, both in pixels.
-  brush(position, pixels) {
-    const { camera, canvas, stroke, tool } = this, { dimension, box } = this.world, { takes } = TOOLS[tool];
-    const width = canvas.clientWidth, height = canvas.clientHeight;
-    const near = stroke?.near ?? 0;
-    const at = camera.position(...position, width, height, near).slice(0, dimension);
-    const move = camera.movement(...pixels, width, height, near).slice(0, dimension);
-    const wrapped = box ? at.map((v, k) => v - box[k] * Math.round(v / box[k])) : at;
-    if (stroke) stroke.source ??= wrapped;
-    const message = {
-      type: "brush", tool, at: wrapped, move,
-      radius: this.radius(), strength: +$("strength").value,
-    };
-    if (takes === "source") message.source = stroke?.source ?? wrapped;
-    if (takes === "rule") message.rule = $("other").value;
-    if (dimension === 3) message.view = camera.axes[2];
-    this.send(message);
-  }
-
-  // When a stroke of the tool sends messages.
-  get sends() {
-    return TOOLS[this.tool].sends;
-  }
-
-  // The brush's radius [length units]; for a line the width of its gap.
-  radius() {
-    return +$("radius").value * (this.sends === "line" ? 0.4 : 1);
-  }
-
-  showCursor([column, row]) {
-    const { canvas, stroke } = this, knife = $("knife"), cursor = $("cursor");
-    const unit = this.camera.unit(canvas.clientWidth, canvas.clientHeight);
-    cursor.hidden = this.tool === "look";
-    const size = (2 * this.radius()) / unit;
-    cursor.style.width = cursor.style.height = `${size}px`;
-    cursor.style.transform = `translate(${column - size / 2}px, ${row - size / 2}px)`;
-    cursor.classList.toggle("pressed", Boolean(stroke));
-    knife.hidden = !(stroke && this.sends === "line");
-    if (!knife.hidden) {
-      const across = column - stroke.from[0], down = row - stroke.from[1];
-      knife.style.width = `${Math.hypot(across, down)}px`;
-      knife.style.transform =
-        `translate(${stroke.from[0]}px, ${stroke.from[1]}px) rotate(${Math.atan2(down, across)}rad)`;
-    }
-  }
-
   // In each frame of the screen: the brush acts, and new frames of the world are drawn.
-
   drawIfNeeded() {
     requestAnimationFrame(() => this.drawIfNeeded());
-    const { stroke, sends } = this;
-    if (stroke) {
-      const move = [stroke.at[0] - stroke.sent[0], stroke.at[1] - stroke.sent[1]], moved = Math.hypot(...move) > 0;
-      if (sends === "frame" || (sends === "motion" && moved)) this.brush(stroke.sent, move);
-      if (sends === "position" && moved) this.brush(stroke.at, [0, 0]);
-      stroke.sent = stroke.at;
-    }
+    this.tools.act();
     if (!this.undrawn && !this.dirty) return;
     if (this.undrawn) this.readFrame();
     this.draw();
@@ -551,19 +230,329 @@ class Page {
       positions: frame?.positions ?? new Float32Array(), colours: frame?.colours ?? new Uint8Array(),
       dimension: world.dimension, box: world.box, spot: world.spot * $("size").value, camera,
       background: this.background, look: $("style").value, ink: this.ink,
-      still: still || (!world.playing && !this.stroke),
+      still: still || (!world.playing && !this.tools.stroke),
       trails: $("tracers").checked ? this.tracers.lines(world.box) : null,
     });
-    this.film();
+    this.film.add();
+  }
+}
+
+// The chosen tool and the pointers on the canvas: one pointer uses the tool, two move the camera.
+class Tools {
+  constructor(page) {
+    this.page = page;
+    this.chosen = LOOK;
+    this.pointers = new Map();
+    this.looking = false; // whether pressed pointers move the camera
+    this.stroke = null; // that of the pressed brush
+    const canvas = (this.canvas = page.canvas);
+    canvas.onpointerdown = (event) => this.press(event);
+    canvas.onpointermove = (event) => this.move(event);
+    canvas.onpointerup = canvas.onpointercancel = (event) => this.release(event);
+    canvas.onpointerleave = () => { if (!this.pointers.size) $("cursor").hidden = true; };
+    canvas.ondblclick = () => { if (this.chosen === LOOK) page.fit(); };
+    canvas.oncontextmenu = (event) => event.preventDefault();
+    canvas.addEventListener("wheel", (event) => {
+      event.preventDefault();
+      page.camera.magnify(Math.exp(-event.deltaY * 0.0015));
+      page.dirty = true;
+    }, { passive: false });
+    new ResizeObserver(() => (page.dirty = true)).observe(canvas);
   }
 
-  // Pictures and films.
+  get offered() {
+    return [LOOK, ...this.page.world.tools];
+  }
+
+  // Takes the tool of a name, or "look" if the world does not offer it.
+  choose(name) {
+    this.chosen = this.offered.find((tool) => tool.name === name) ?? LOOK;
+    for (const button of $("tools").children)
+      button.setAttribute("aria-checked", String(button.dataset.tool === this.chosen.name));
+    if (this.chosen === LOOK) $("cursor").hidden = true;
+    this.canvas.style.cursor = this.chosen === LOOK ? "grab" : "crosshair";
+  }
+
+  // The position of the pointer on the canvas [pixels].
+  position(event) {
+    const { left, top } = this.canvas.getBoundingClientRect();
+    return [event.clientX - left, event.clientY - top];
+  }
+
+  press(event) {
+    this.canvas.setPointerCapture(event.pointerId);
+    const position = this.position(event);
+    this.pointers.set(event.pointerId, position);
+    this.looking = this.chosen === LOOK || event.button === 2 || event.shiftKey || this.pointers.size > 1;
+    if (this.looking) {
+      this.stroke = null;
+      return;
+    }
+    const near = this.nearness(position);
+    this.stroke = { near, from: position, at: position, sent: position };
+    if (this.chosen.sends !== "line") this.brush(position, [0, 0]);
+    this.showCursor(position);
+  }
+
+  move(event) {
+    const position = this.position(event), before = this.pointers.get(event.pointerId);
+    if (!before) {
+      if (event.pointerType === "mouse") this.showCursor(position);
+      return;
+    }
+    const columns = position[0] - before[0], rows = position[1] - before[1];
+    const others = [...this.pointers].filter(([id]) => id !== event.pointerId).map(([, at]) => at);
+    this.pointers.set(event.pointerId, position);
+    const { clientWidth: width, clientHeight: height } = this.canvas;
+    if (this.looking) {
+      this.page.camera.drag(columns / this.pointers.size, rows / this.pointers.size, width, height);
+      if (others.length) this.page.camera.magnify(
+        Math.hypot(position[0] - others[0][0], position[1] - others[0][1]) /
+        Math.max(Math.hypot(before[0] - others[0][0], before[1] - others[0][1]), 1));
+      this.page.dirty = true;
+    } else if (this.stroke) {
+      this.stroke.at = position;
+      this.showCursor(position);
+    }
+  }
+
+  release(event) {
+    const { stroke } = this;
+    this.pointers.delete(event.pointerId);
+    if (stroke && this.chosen.sends === "line" && event.type === "pointerup") {
+      const move = [stroke.at[0] - stroke.from[0], stroke.at[1] - stroke.from[1]];
+      if (Math.hypot(...move) > 4) this.brush(stroke.from, move);
+    }
+    this.stroke = null;
+    $("knife").hidden = true;
+    $("cursor").classList.remove("pressed");
+    if (event.pointerType !== "mouse") $("cursor").hidden = true;
+  }
+
+  // Nearness of the surface under the pointer, where brushes of 3D worlds act.
+  nearness([column, row]) {
+    const { canvas, page: { frame, camera, world } } = this;
+    if (!frame || world.dimension !== 3) return 0;
+    const width = canvas.clientWidth, height = canvas.clientHeight;
+    const within = Math.max(8, (0.3 * $("radius").value) / camera.unit(width, height));
+    let nearest = -Infinity;
+    for (let k = 0; k < frame.positions.length; k += 3) {
+      const [x, y, near] = camera.project(frame.positions.subarray(k, k + 3), width, height);
+      if (near > nearest && Math.hypot(x - column, y - row) < within) nearest = near;
+    }
+    return Number.isFinite(nearest) ? nearest : 0;
+  }
+
+  // Sends the brush at a position on the canvas, with its movement, both in pixels.
+  brush(position, pixels) {
+    const { canvas, stroke, chosen: tool, page: { camera, world: { dimension, box } } } = this;
+    const width = canvas.clientWidth, height = canvas.clientHeight;
+    const near = stroke?.near ?? 0;
+    const at = camera.position(...position, width, height, near).slice(0, dimension);
+    const move = camera.movement(...pixels, width, height, near).slice(0, dimension);
+    const wrapped = box ? at.map((v, k) => v - box[k] * Math.round(v / box[k])) : at;
+    if (stroke) stroke.source ??= wrapped;
+    const message = {
+      type: "brush", tool: tool.name, at: wrapped, move,
+      radius: this.radius(), strength: +$("strength").value,
+    };
+    if (tool.takes === "source") message.source = stroke?.source ?? wrapped;
+    if (tool.takes === "rule") message.rule = $("other").value;
+    if (dimension === 3) message.view = camera.axes[2];
+    this.page.send(message);
+  }
+
+  // The brush's radius [length units]; for a line the width of its gap.
+  radius() {
+    return +$("radius").value * (this.chosen.sends === "line" ? 0.4 : 1);
+  }
+
+  showCursor([column, row]) {
+    const { canvas, stroke } = this, knife = $("knife"), cursor = $("cursor");
+    const unit = this.page.camera.unit(canvas.clientWidth, canvas.clientHeight);
+    cursor.hidden = this.chosen === LOOK;
+    const size = (2 * this.radius()) / unit;
+    cursor.style.width = cursor.style.height = `${size}px`;
+    cursor.style.transform = `translate(${column - size / 2}px, ${row - size / 2}px)`;
+    cursor.classList.toggle("pressed", Boolean(stroke));
+    knife.hidden = !(stroke && this.chosen.sends === "line");
+    if (!knife.hidden) {
+      const across = column - stroke.from[0], down = row - stroke.from[1];
+      knife.style.width = `${Math.hypot(across, down)}px`;
+      knife.style.transform =
+        `translate(${stroke.from[0]}px, ${stroke.from[1]}px) rotate(${Math.atan2(down, across)}rad)`;
+    }
+  }
+
+  // Sends what the brush does in a frame of the screen.
+  act() {
+    const { stroke, chosen: { sends } } = this;
+    if (!stroke) return;
+    const move = [stroke.at[0] - stroke.sent[0], stroke.at[1] - stroke.sent[1]], moved = Math.hypot(...move) > 0;
+    if (sends === "frame" || (sends === "motion" && moved)) this.brush(stroke.sent, move);
+    if (sends === "position" && moved) this.brush(stroke.at, [0, 0]);
+    stroke.sent = stroke.at;
+  }
+}
+
+// The bar below the canvas, the panel beside it, and the keyboard.
+class Controls {
+  constructor(page) {
+    this.page = page;
+    this.pressing = false; // whether a slider is pressed
+    $("one").innerHTML = icon(ICONS.one);
+    $("reset").innerHTML = icon(ICONS.reset);
+    $("fold").innerHTML = icon(ICONS.fold);
+    $("play").onclick = () => page.play(!page.world.playing);
+    $("one").onclick = () => { page.play(false); page.send({ type: "step" }); };
+    $("reset").onclick = () => page.send({ type: "reset" });
+    $("fold").onclick = () => this.fold(!$("panel").hidden);
+    $("rule").onchange = () => page.send({ type: "set", name: "rule", value: $("rule").value });
+    $("show").onchange = () => page.send({ type: "set", name: "show", value: $("show").value });
+    $("message").onclick = () => ($("message").hidden = true);
+    $("snapshot").onclick = () => page.film.snapshot();
+    $("record").onclick = () => page.film.record(!page.film.recording);
+    $("plots").ontoggle = () => page.send({ type: "set", name: "loss", value: $("plots").open });
+    $("tracers").onchange = () => { page.tracers.clear(); page.dirty = true; };
+    $("style").onchange = () => (page.dirty = true);
+    $("theme").value = storedTheme();
+    $("theme").onchange = () => { storedTheme($("theme").value); this.showTheme(); };
+    matchMedia("(prefers-color-scheme: dark)").onchange = () => this.showTheme();
+    this.showTheme();
+    for (const name of ["radius", "strength", "size"]) {
+      const input = $(name), output = input.parentElement.querySelector("output");
+      input.oninput = () => { output.textContent = short(+input.value); page.dirty = true; };
+      input.oninput();
+    }
+    this.fold(innerWidth <= 760);
+    this.showPlaying();
+    addEventListener("keydown", (event) => this.key(event));
+  }
+
+  show(world, before) {
+    document.title = `${world.title} · npa-envs`;
+    $("title").textContent = world.title;
+    $("note").textContent = world.note;
+    this.showPlaying();
+    options($("rule"), world.rules, world.rule);
+    const other = world.others.includes($("other").value) && before.rule === world.rule
+      ? $("other").value : world.others.find((name) => name !== world.rule);
+    options($("other"), world.others, other);
+    options($("show"), world.shows, world.show);
+    $("rule-field").hidden = world.rules.length < 2;
+    $("other-field").hidden = !world.tools.some(({ takes }) => takes === "rule");
+    $("brush").hidden = !world.tools.length;
+    this.showTools();
+    this.showDamages();
+    this.showSettings();
+  }
+
+  fold(away) {
+    $("panel").hidden = away;
+    $("fold").setAttribute("aria-expanded", String(!away));
+  }
+
+  showPlaying() {
+    $("play").innerHTML = icon(this.page.world.playing ? ICONS.pause : ICONS.play);
+    $("play").setAttribute("aria-pressed", String(this.page.world.playing));
+  }
+
+  showTheme() {
+    document.documentElement.dataset.theme = $("theme").value;
+    const { backgroundColor, color } = getComputedStyle(document.body);
+    this.page.background = components(backgroundColor);
+    this.page.ink = components(color);
+    this.page.dirty = true;
+  }
+
+  showTools() {
+    const { tools } = this.page, names = tools.offered.map(({ name }) => name).join();
+    if ($("tools").dataset.names === names) return;
+    $("tools").dataset.names = names;
+    $("tools").replaceChildren(...tools.offered.map(({ name, icon: path, label }, k) => {
+      const button = make("button", {
+        innerHTML: icon(path), title: `${label} (${k + 1})`, onclick: () => tools.choose(name),
+      });
+      button.dataset.tool = name;
+      button.setAttribute("role", "radio");
+      button.setAttribute("aria-label", name);
+      return button;
+    }));
+    tools.choose(tools.chosen.name);
+  }
+
+  showDamages() {
+    $("damages").hidden = !this.page.world.damages.length;
+    $("damages").replaceChildren(...this.page.world.damages.map((name) => make("button", {
+      textContent: name, title: `Damage: ${name}`, onclick: () => this.page.send({ type: "damage", name }),
+    })));
+  }
+
+  showSettings() {
+    const { settings } = this.page.world;
+    $("physics").hidden = !PHYSICS.some((name) => name in settings);
+    for (const name of ["speed", ...PHYSICS]) {
+      $(name).parentElement.hidden = !settings[name];
+      if (settings[name]) this.slider($(name), name, settings[name]);
+    }
+  }
+
+  slider(input, name, { value, low, high, scale, whole }) {
+    const bend = scale === "log" ? Math.log : (v) => v, unbend = scale === "log" ? Math.exp : (v) => v;
+    const output = input.parentElement.querySelector("output");
+    // Rounded to three digits, a value may exceed the range.
+    const read = () => Math.min(high, Math.max(low,
+      (whole ? Math.round : (v) => +v.toPrecision(3))(unbend(+input.value))));
+    input.min = bend(low);
+    input.max = bend(high);
+    input.step = whole && scale !== "log" ? 1 : (bend(high) - bend(low)) / 200;
+    if (document.activeElement !== input || !this.pressing) input.value = bend(value);
+    output.textContent = short(value);
+    input.onpointerdown = () => (this.pressing = true);
+    input.onpointerup = () => (this.pressing = false);
+    input.oninput = () => {
+      output.textContent = short(read());
+      clearTimeout(this.countTimer);
+      // Another number of particles restarts the world: sent only once the slider rests.
+      const send = () => this.page.send({ type: "set", name, value: read() });
+      if (name === "count") this.countTimer = setTimeout(send, 150);
+      else send();
+    };
+  }
+
+  key(event) {
+    if (event.target.matches("select, input[type=text]") || event.ctrlKey || event.metaKey) return;
+    const acts = {
+      " ": () => this.page.play(!this.page.world.playing), s: () => $("one").click(), r: () => $("reset").click(),
+      p: () => $("fold").click(), f: () => this.page.fit(),
+    };
+    const act = acts[event.key] ?? $("tools").children[+event.key - 1]?.onclick;
+    if (!act || (event.key === " " && event.target.matches("button, summary"))) return;
+    event.preventDefault();
+    act();
+  }
+}
+
+// Pictures and films of the canvas.
+class Film {
+  constructor(page) {
+    this.page = page;
+    this.recording = null;
+  }
+
+  offer(name, url) {
+    const item = make("li"), link = make("a", { href: url, download: name, textContent: name });
+    item.append(link);
+    $("files").prepend(item);
+    $("film").open = true;
+    return link;
+  }
 
   snapshot() {
-    this.draw({ still: true });
-    this.canvas.toBlob((blob) => {
-      const name = `${this.world.title}-${this.frame?.step ?? 0}.png`.replace(/[^\w.-]+/g, "-");
-      this.offerFile(name, URL.createObjectURL(blob)).click();
+    this.page.draw({ still: true });
+    this.page.canvas.toBlob((blob) => {
+      const name = `${this.page.world.title}-${this.page.frame?.step ?? 0}.png`.replace(/[^\w.-]+/g, "-");
+      this.offer(name, URL.createObjectURL(blob)).click();
     }, "image/png");
   }
 
@@ -573,12 +562,12 @@ class Page {
     if (!on) {
       this.recording.stop();
       this.recording = null;
-    } else if (this.world.capabilities.includes("film")) {
+    } else if (this.page.world.capabilities.includes("film")) {
       const picture = make("canvas", { width: FILM_SIZE, height: FILM_SIZE });
-      this.recording = { picture, last: 0, stop: () => this.send({ type: "film", action: "stop" }) };
-      this.send({ type: "film", action: "start" });
-      this.dirty = true;
-    } else this.recording = recorder(this.canvas, (name, url) => this.offerFile(name, url));
+      this.recording = { picture, last: 0, stop: () => this.page.send({ type: "film", action: "stop" }) };
+      this.page.send({ type: "film", action: "start" });
+      this.page.dirty = true;
+    } else this.recording = recorder(this.page.canvas, (name, url) => this.offer(name, url));
   }
 
   showRecording(on) {
@@ -586,15 +575,21 @@ class Page {
     $("record").textContent = on ? "Stop" : "Record";
   }
 
-  film() {
-    const { recording, canvas } = this, now = performance.now();
+  // Ends a recording whose film the engine has ended.
+  end() {
+    if (this.recording?.picture) this.showRecording((this.recording = null));
+  }
+
+  // Adds the canvas to the film, if one is being recorded for the engine.
+  add() {
+    const { recording, page: { canvas, camera } } = this, now = performance.now();
     if (!recording?.picture || now - recording.last < FILM_PAUSE) return;
     recording.last = now;
-    const { picture } = recording, height = this.camera.open(canvas.height);
+    const { picture } = recording, height = camera.open(canvas.height);
     const side = Math.min(canvas.width, height);
     picture.getContext("2d").drawImage(
       canvas, (canvas.width - side) / 2, (height - side) / 2, side, side, 0, 0, FILM_SIZE, FILM_SIZE);
-    picture.toBlob((blob) => { if (blob) this.send(blob); }, "image/jpeg", QUALITY);
+    picture.toBlob((blob) => { if (blob) this.page.send(blob); }, "image/jpeg", QUALITY);
   }
 }
 
@@ -615,8 +610,9 @@ function options(select, names, chosen) {
   if (chosen) select.value = chosen;
 }
 
-function numbers(hex) {
-  return [1, 3, 5].map((k) => parseInt(hex.trim().slice(k, k + 2), 16) / 255);
+// The components from 0 to 1 of a colour such as "rgb(13, 16, 23)".
+function components(colour) {
+  return colour.match(/\d+/g).map((component) => component / 255);
 }
 
 // Returns the stored theme, or stores another one, if the browser allows it.

@@ -14,28 +14,27 @@ const FRAMES_AHEAD = 2;
 const TRIAL_STEPS = 4;
 const TRIAL_TOLERANCE = 1e-3;
 
-// Brushes by name. Each applies a message of page.js to a LiveWorld.
+// Brushes by the names of `TOOLS` of npa_envs/web/live_world.py. Each applies a message of page.js, whose
+// strength has become an `amount`, to a RuleWorld.
 const BRUSHES = {
   remove: (live, { at, radius }) => live.remove(new Set(insideBall(live.world, at, radius))),
-  pull: ({ world, constants }, { at, move, radius, strength }) =>
-    push(world, at, move, radius, Math.min(1, constants.MIN_PULL + strength)),
-  clump: ({ world, constants }, { at, radius, strength }) => clump(world, at, radius, constants.CLUMP_RATE * strength),
+  push: ({ world }, { at, move, radius, amount }) => push(world, at, move, radius, amount),
+  clump: ({ world }, { at, radius, amount }) => clump(world, at, radius, amount),
   cut({ world, dimension }, { at, move, radius, view }) {
     const half = move.map((component) => component / 2);
-    const normal = dimension === 2 ? [-move[1], move[0]] : cross(view ?? [0, 0, 1], move);
+    const normal = cross(view ?? [0, 0, 1], [move[0], move[1], move[2] ?? 0]).slice(0, dimension);
     cut(world, at.map((coordinate, d) => coordinate + half[d]), normal, radius, half);
   },
-  inject({ world, constants }, { at, radius, strength, source }) {
+  inject({ world }, { at, radius, amount, source }) {
     const state = stateAround(world, source ?? at, radius);
-    if (state !== null) inject(world, at, radius, state, constants.INJECT_RATE * strength);
+    if (state !== null) inject(world, at, radius, state, amount);
   },
   graft(live, { at, radius, rule }) {
-    const index = live.speciesOf(rule, live.full);
+    const index = live.speciesOf(rule, live.seedCount);
     for (const i of insideBall(live.world, at, radius)) live.world.species[i] = index;
   },
-  add(live, { at, radius, strength, rule }) {
-    const { MIN_SEED, SEED_FRACTION } = live.constants;
-    live.add(at, radius, Math.max(MIN_SEED, Math.round(strength * SEED_FRACTION * live.full)), rule);
+  add(live, { at, radius, amount, rule }) {
+    live.add(at, radius, Math.max(live.constants.MIN_SEED, Math.round(amount * live.seedCount)), rule);
   },
 };
 
@@ -47,7 +46,7 @@ const DAMAGES = {
   noise: ({ world: { x }, random }, size) => random.normals(x.length, size).forEach((offset, k) => (x[k] += offset)),
 };
 
-export class LiveWorld {
+export class RuleWorld {
   // settings: {rules, seed, ramp, constants} as npa_envs/web/export.py writes them; the first rule is shown
   // first. send(event, transferred) sends an event to the page; device: a GPU, or null.
   // settings.engine: "auto" uses the GPU if it is faster, "gpu" always.
@@ -90,10 +89,10 @@ export class LiveWorld {
     this.species = [this.rule];
     // Each species divides densities by the particles of a fresh world: particles that a brush adds or
     // removes change only the densities around them.
-    this.full = this.values.count;
-    this.divisors = [this.full];
+    this.seedCount = this.values.count;
+    this.divisors = [this.seedCount];
     this.colouring = new Colouring(this.ramp);
-    this.setParticles(this.seedPositions(), new Float32Array(this.full * this.channels), new Uint8Array(this.full));
+    this.setParticles(this.seedPositions(), new Float32Array(this.seedCount * this.channels), new Uint8Array(this.seedCount));
     this.prepare();
     this.announce();
   }
@@ -113,8 +112,8 @@ export class LiveWorld {
   // Returns positions of a fresh world [length units].
   seedPositions() {
     const { seed } = this.rule.world;
-    if (seed.kind === "ball") return this.random.ball(this.full, this.dimension, seed.radius);
-    if (seed.kind === "box") return this.random.box(this.full, this.box);
+    if (seed.kind === "ball") return this.random.ball(this.seedCount, this.dimension, seed.radius);
+    if (seed.kind === "box") return this.random.box(this.seedCount, this.box);
     return seed.clouds[this.random.below(seed.clouds.length)].slice();
   }
 
@@ -230,7 +229,10 @@ export class LiveWorld {
 
   // Applies a brush; page.js describes the message.
   brush(message) {
-    entry(BRUSHES, message.tool, "brush")(this, message);
+    const tool = this.rule.world.tools.find(({ name }) => name === message.tool);
+    if (tool === undefined) throw Error(`no brush is called ${message.tool}`);
+    const [least, added] = tool.amounts;
+    BRUSHES[tool.name](this, { ...message, amount: Math.min(1, least + added * message.strength) });
     this.wrapPositions();
   }
 
@@ -245,7 +247,7 @@ export class LiveWorld {
   // Adds particles of a rule, with states 0, in a ball.
   add(at, radius, count, name) {
     const { x, s, species } = this.world;
-    const room = (this.rule.world.settings.count?.high ?? this.full) - this.world.count;
+    const room = (this.rule.world.settings.count?.high ?? this.seedCount) - this.world.count;
     if (count > room) throw Error(`the world has room for ${Math.max(0, room)} particles more, got ${count}`);
     // A new species divides densities by its own number of particles, as in a world alone.
     const index = this.speciesOf(name, count);
@@ -381,7 +383,7 @@ export function serve(scope) {
   const apply = async ({ type, settings, ...rest }) => {
     if (type !== "begin") return live.receive({ type, ...rest });
     const device = settings.engine === "processor" ? null : await openDevice().catch(() => null);
-    live = new LiveWorld(settings, send, device);
+    live = new RuleWorld(settings, send, device);
   };
 
   // One message, or one frame where there is none, never two at a time.

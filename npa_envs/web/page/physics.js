@@ -42,38 +42,39 @@ export function prepareRule(description, kernels) {
 
 // The kernels in plain JavaScript. `floats` and `integers` return zeroed arrays for them.
 export function plainKernels() {
-  // Sums over the neighbours of a particle whose state begins at `own`, into `sums` [1 + D, width]:
-  // Σ a s_j, and Σ k (s_j - s_i) for each axis. `stateAt` has the indices of neighbours' first channels.
-  function gather(states, width, dimension, own, { count, stateAt, a, slopes }, sums) {
-    const [kx, ky, kz] = slopes;
+  // Sums over the neighbours of sorted particle i, which `listNeighbours` has listed, into `sums` [1 + D, width]
+  // of a Physics: Σ a s_j, and Σ k (s_j - s_i) for each axis.
+  function gather(physics, i) {
+    const { states, width, sums, dimension, list: { count, stateAt, a, slopes: [kx, ky, kz] } } = physics;
     for (let c = 0; c < width; c++) {
-      const mine = states[own + c];
-      let blur = 0, x = 0, y = 0, z = 0;
+      const mine = states[i * width + c];
+      let smoothed = 0, x = 0, y = 0, z = 0;
       for (let n = 0; n < count; n++) {
         const other = states[stateAt[n] + c], offset = other - mine;
-        blur += a[n] * other;
+        smoothed += a[n] * other;
         x += kx[n] * offset;
         y += ky[n] * offset;
         if (dimension === 3) z += kz[n] * offset;
       }
-      sums[c] = blur;
+      sums[c] = smoothed;
       sums[width + c] = x;
       sums[2 * width + c] = y;
       if (dimension === 3) sums[3 * width + c] = z;
     }
   }
 
-  // Lists the neighbours of sorted particle i among runs of particles, with their factors in `gather`,
-  // and adds up their moment matrix: xx, xy, xz, yy, yz, zz.
-  function pairs({ x, y, z, volume }, i, ranges, used, { eps, weight, slope, sides, perSide, width }, list, moment) {
+  // Fills `list` of a Physics with the neighbours of sorted particle i among the particles of `ranges`.
+  function listNeighbours(physics, i) {
+    const { ranges, rangesEnd, eps, weight, slope, width, list } = physics;
+    const { x, y, z, volume } = physics.points;
     const { stateAt, a, slopes: [kx, ky, kz] } = list;
-    const [sideX, sideY, sideZ] = sides;
-    const halfX = 0.5 / perSide[0], halfY = 0.5 / perSide[1], halfZ = 0.5 / perSide[2];
+    const [sideX, sideY, sideZ] = physics.sides;
+    const [halfX, halfY, halfZ] = physics.halfSides;
     const squaredRadius = eps * eps;
     const ownX = x[i], ownY = y[i], ownZ = z[i];
     let xx = 0, xy = 0, xz = 0, yy = 0, yz = 0, zz = 0;
     let count = 0;
-    for (let r = 0; r < used; r += 2) {
+    for (let r = 0; r < rangesEnd; r += 2) {
       const last = ranges[r + 1];
       for (let j = ranges[r]; j < last; j++) {
         let dx = x[j] - ownX, dy = y[j] - ownY, dz = z[j] - ownZ;
@@ -104,7 +105,7 @@ export function plainKernels() {
       }
     }
     list.count = count;
-    moment.set([xx, xy, xz, yy, yz, zz]);
+    list.moment.set([xx, xy, xz, yy, yz, zz]);
   }
 
   // Writes W row + b for `count` rows to `out`; max(., 0) of it where `rectified`.
@@ -147,7 +148,7 @@ export function plainKernels() {
     floats,
     integers: (length) => new Int32Array(length),
     gather,
-    pairs,
+    listNeighbours,
     layer: (...matrix) => tiledLayer(floats, ...matrix),
     product,
   };
@@ -192,14 +193,15 @@ export class Physics {
     this.cellOf = new Int32Array(capacity);
     this.starts = new Int32Array(1);
     this.states = kernels.floats(capacity * this.width);
-    // The neighbours of one particle: indices of their first channels, and their factors in the sums.
+    // The neighbours of one particle: indices of their first channels, their factors in the sums of `gather`, and
+    // their moment matrix: xx, xy, xz, yy, yz, zz.
     this.list = {
       count: 0,
       stateAt: kernels.integers(room),
       a: floats(),
       slopes: [floats(), floats(), floats()],
+      moment: new Float64Array(6),
     };
-    this.moment = new Float64Array(6);
     this.sums = kernels.floats((1 + this.dimension) * this.width);
     const widest = (width) => kernels.floats(BLOCK_ROWS * Math.max(...rules.map(width)));
     this.rowWidth = Math.max(...rules.map((rule) => rule.inputs));
@@ -207,7 +209,9 @@ export class Physics {
     this.hidden = widest((rule) => rule.hidden.width);
     this.updates = widest((rule) => rule.output.width);
     this.blockRows = new Int32Array(BLOCK_ROWS);
+    // Runs of sorted particles, each as its first index and the one after its last, and where the runs end.
     this.ranges = kernels.integers(4 * 25);
+    this.rangesEnd = 0;
   }
 
   // Advances a world {count, x, s, species} by one step, in place.
@@ -217,10 +221,10 @@ export class Physics {
   // rule's densities, by default the particles of the world.
   step(world, { eps, box = null, mask = null, noise = null, densityCounts = null }) {
     this.sort(world, eps, box);
-    this.computeDensities(world.count, eps);
+    this.computeDensities(world.count);
     for (let number = 0; number < this.rules.length; number++) {
       const divisor = densityCounts === null ? world.count : densityCounts[number];
-      this.advance(world, number, eps, divisor, mask);
+      this.advance(world, number, divisor, mask);
     }
     this.finish(world, noise, box);
   }
@@ -233,10 +237,14 @@ export class Physics {
     if (box !== null) wrap(world.x, world.count, box);
   }
 
+  // Sorts a world's particles by cell, and sets what a step with a perception radius in a box needs.
   sort({ count, x, s }, eps, box) {
     const { dimension, channels, width, order, cellOf, states, points } = this;
     const three = dimension === 3;
     const cells = [1, 1, 1], inverse = [0, 0, 0];
+    this.eps = eps;
+    this.weight = smoothingNorm(eps, dimension);
+    this.slope = spikyNorm(eps, dimension);
     // In open space both are 0: there are no images.
     this.sides = new Float64Array(3);
     this.perSide = new Float64Array(3);
@@ -258,6 +266,7 @@ export class Physics {
         cells[d] = Math.min(MAX_CELLS[dimension], Number.isFinite(fitting) ? fitting : MAX_CELLS[dimension]);
       }
     }
+    this.halfSides = this.perSide.map((per) => 0.5 / per);
     const [nx, ny, nz] = cells;
     this.cells = cells;
     const total = nx * ny * nz;
@@ -317,15 +326,14 @@ export class Physics {
         if (before < countX) add(starts[row], starts[row + countX - before]);
       }
     }
-    return used;
+    this.rangesEnd = used;
   }
 
-  computeDensities(count, eps) {
+  computeDensities(count) {
     const { x: px, y: py, z: pz, volume } = this.points;
-    const { density, gradientX, gradientY, gradientZ, ranges, starts, dimension } = this;
+    const { density, gradientX, gradientY, gradientZ, ranges, starts, eps, weight, slope } = this;
     const [sideX, sideY, sideZ] = this.sides;
-    const [halfX, halfY, halfZ] = this.perSide.map((per) => 0.5 / per);
-    const weight = smoothingNorm(eps, dimension), slope = spikyNorm(eps, dimension);
+    const [halfX, halfY, halfZ] = this.halfSides;
     const squaredRadius = eps * eps;
     gradientX.fill(0, 0, count);
     gradientY.fill(0, 0, count);
@@ -336,11 +344,12 @@ export class Physics {
     for (let cell = 0; cell < total; cell++) {
       const end = starts[cell + 1];
       if (starts[cell] === end) continue;
-      const used = this.rangesAround(cell);
+      this.rangesAround(cell);
+      const { rangesEnd } = this;
       for (let i = starts[cell]; i < end; i++) {
         const x = px[i], y = py[i], z = pz[i];
         let sum = 0, sumX = 0, sumY = 0, sumZ = 0;
-        for (let r = 0; r < used; r += 2) {
+        for (let r = 0; r < rangesEnd; r += 2) {
           const last = ranges[r + 1];
           // Each pair once: i and j add the same to each other, the gradient with opposite sign.
           for (let j = Math.max(ranges[r], i + 1); j < last; j++) {
@@ -378,7 +387,7 @@ export class Physics {
   }
 
   // Perceives the active particles of one rule, runs its network, and updates them.
-  advance(world, number, eps, divisor, mask) {
+  advance(world, number, divisor, mask) {
     const { order, starts, blockRows, kernels, rows, rowWidth, hidden, updates } = this;
     const rule = this.rules[number];
     const total = this.cells[0] * this.cells[1] * this.cells[2];
@@ -388,17 +397,18 @@ export class Physics {
       kernels.product(rule.hidden, filled, rows, rowWidth, hidden, true);
       kernels.product(rule.output, filled, hidden, rule.hidden.width, updates, false);
       for (let row = 0; row < filled; row++) {
-        this.update(world, rule, order[blockRows[row]], updates, row * rule.output.width, eps);
+        this.update(world, rule, order[blockRows[row]], updates, row * rule.output.width);
       }
       filled = 0;
     };
     for (let cell = 0; cell < total; cell++) {
-      let used = -1;
+      let found = false;
       for (let i = starts[cell]; i < starts[cell + 1]; i++) {
         const particle = order[i];
         if (world.species[particle] !== number || (mask !== null && mask[particle] === 0)) continue;
-        if (used < 0) used = this.rangesAround(cell);
-        this.perceive(world, rule, i, used, filled * rowWidth, eps, divisor);
+        if (!found) this.rangesAround(cell);
+        found = true;
+        this.perceive(rule, i, filled * rowWidth, divisor);
         blockRows[filled++] = i;
         if (filled === BLOCK_ROWS) flush();
       }
@@ -407,18 +417,17 @@ export class Physics {
   }
 
   // Writes the perception vector of sorted particle i into `rows` at `at`.
-  perceive(world, rule, i, used, at, eps, divisor) {
-    const { points, list, moment, ranges, width, dimension, channels, rows, sums, states, kernels } = this;
-    const weight = smoothingNorm(eps, dimension), slope = spikyNorm(eps, dimension);
-    kernels.pairs(points, i, ranges, used, { eps, weight, slope, sides: this.sides, perSide: this.perSide, width }, list, moment);
-    kernels.gather(states, width, dimension, i * width, list, sums);
+  perceive(rule, i, at, divisor) {
+    const { width, dimension, channels, rows, sums, states, kernels } = this;
+    kernels.listNeighbours(this, i);
+    kernels.gather(this, i);
 
     let to = at;
     for (let c = 0; c < channels; c++) rows[to++] = states[i * width + c];
     for (let c = 0; c < channels; c++) rows[to++] = sums[c];
-    const scale = eps / rule.eps0;
+    const scale = this.eps / rule.eps0;
     if (rule.state_gradient) {
-      const m = rule.moment_correction ? momentInverse(dimension, moment, rule.moment_inverse) : IDENTITY;
+      const m = rule.moment_correction ? momentInverse(dimension, this.list.moment, rule.moment_inverse) : IDENTITY;
       for (let c = 0; c < channels; c++) {
         const gx = sums[width + c], gy = sums[2 * width + c], gz = dimension === 3 ? sums[3 * width + c] : 0;
         to = logScaled(
@@ -442,7 +451,7 @@ export class Physics {
 
   // x ← x + α ε δ / (1 + |δ|), s ← s + Δs for one particle, whose δ and Δs begin at `from`; numbers
   // in the rule's dead zone count as 0.
-  update({ x, s }, rule, particle, updates, from, eps) {
+  update({ x, s }, rule, particle, updates, from) {
     const { dimension, channels } = this;
     if (rule.dead_zone > 0) {
       for (let a = from; a < from + rule.outputs; a++) {
@@ -452,7 +461,7 @@ export class Physics {
     if (!rule.static) {
       let squared = 0;
       for (let d = 0; d < dimension; d++) squared += updates[from + d] ** 2;
-      const scale = (rule.alpha * eps) / (1 + Math.sqrt(squared));
+      const scale = (rule.alpha * this.eps) / (1 + Math.sqrt(squared));
       for (let d = 0; d < dimension; d++) x[particle * dimension + d] += scale * updates[from + d];
       from += dimension;
     }
@@ -469,11 +478,11 @@ export function wrap(x, count, box) {
   }
 }
 
-export function smoothingNorm(eps, dimension) {
+function smoothingNorm(eps, dimension) {
   return dimension === 2 ? 4 / (Math.PI * eps ** 8) : 315 / (64 * Math.PI * eps ** 9);
 }
 
-export function spikyNorm(eps, dimension) {
+function spikyNorm(eps, dimension) {
   return dimension === 2 ? 30 / (Math.PI * eps ** 5) : 45 / (Math.PI * eps ** 6);
 }
 

@@ -2,9 +2,7 @@
 // particles before, and moves them after; both are a small part of the time. The shaders follow
 // `computeDensities`, `perceive` and the kernels of physics.js, whose changes are made here as well.
 
-import {
-  CELLS_PER_RADIUS, MAX_CELLS, MOMENT_SOFTENING, MOMENT_THRESHOLD, smoothingNorm, spikyNorm,
-} from "./physics.js";
+import { CELLS_PER_RADIUS, MAX_CELLS, MOMENT_SOFTENING, MOMENT_THRESHOLD } from "./physics.js";
 
 const GROUP = 64;
 const UNIFORM_BYTES = 96;
@@ -113,7 +111,7 @@ function shaders(rule) {
     if (row >= world.rows) { return; }
     let i = chosen[row];
     var z: array<f32, ${inputs}>;
-    var blur: array<f32, ${channels}>;
+    var smoothed: array<f32, ${channels}>;
     var slopes: array<vec3f, ${channels}>;
     var xx = 0.0; var xy = 0.0; var xz = 0.0; var yy = 0.0; var yz = 0.0; var zz = 0.0;
     ${around(`
@@ -122,12 +120,12 @@ function shaders(rule) {
             xx += s.x * d.x; xy += s.x * d.y; xz += s.x * d.z; yy += s.y * d.y; yz += s.y * d.z; zz += s.z * d.z;
             for (var c = 0u; c < CHANNELS; c++) {
               let other = states[j * WIDTH + c];
-              blur[c] += w * volume * other;
+              smoothed[c] += w * volume * other;
               slopes[c] += (other - states[i * WIDTH + c]) * s;
             }`)}
     var to = 0u;
     for (var c = 0u; c < CHANNELS; c++) { z[to] = states[i * WIDTH + c]; to++; }
-    for (var c = 0u; c < CHANNELS; c++) { z[to] = blur[c]; to++; }
+    for (var c = 0u; c < CHANNELS; c++) { z[to] = smoothed[c]; to++; }
     ${rule.state_gradient ? stateGradient : ""}
     ${rule.density_gradient ? `{
       let v = logScaled(world.densityScale * fields[i].xyz);
@@ -226,7 +224,7 @@ export class GpuPhysics {
         if (world.species[order[k]] === number && (mask === null || mask[order[k]] !== 0)) active.push(k);
       }
       const divisor = densityCounts === null ? count : densityCounts[number];
-      write(entry.world, uniforms(physics, entry.rule, eps, count, active.length, divisor));
+      write(entry.world, uniforms(physics, entry.rule, count, active.length, divisor));
       write(entry.active, Uint32Array.from(active));
       pass.setBindGroup(0, entry.group);
       if (number === 0) {
@@ -248,7 +246,7 @@ export class GpuPhysics {
       const size = 4 * rule.outputs * active.length;
       await mapped.mapAsync(GPUMapMode.READ, 0, size);
       const updates = new Float32Array(mapped.getMappedRange(0, size));
-      active.forEach((k, row) => physics.update(world, rule, order[k], updates, row * rule.outputs, eps));
+      active.forEach((k, row) => physics.update(world, rule, order[k], updates, row * rule.outputs));
       mapped.unmap();
     }));
     physics.finish(world, noise, box);
@@ -259,14 +257,14 @@ export class GpuPhysics {
   }
 }
 
-function uniforms({ sides, perSide, cells, dimension }, rule, eps, count, rows, divisor) {
+function uniforms({ sides, perSide, cells, dimension, eps, weight, slope }, rule, count, rows, divisor) {
   const bytes = new ArrayBuffer(UNIFORM_BYTES);
   const floats = new Float32Array(bytes), integers = new Uint32Array(bytes);
   floats.set(sides);
   floats.set(perSide, 4);
   integers.set(cells, 8);
   const scale = eps / rule.eps0;
-  floats.set([eps, smoothingNorm(eps, dimension), spikyNorm(eps, dimension), scale, scale ** (1 + dimension) / divisor], 12);
+  floats.set([eps, weight, slope, scale, scale ** (1 + dimension) / divisor], 12);
   integers.set([count, rows], 18);
   return floats;
 }

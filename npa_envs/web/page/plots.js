@@ -40,7 +40,7 @@ export class Plot {
     const width = Math.round(canvas.clientWidth * ratio), height = Math.round(canvas.clientHeight * ratio);
     if (!width || !height) return;
     if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
-    const context = canvas.getContext("2d"), style = getComputedStyle(canvas);
+    const context = canvas.getContext("2d");
     context.clearRect(0, 0, width, height);
     if (points.length < 2) return;
     const level = (y) => (this.log ? Math.log10(Math.max(y, 1e-12)) : y);
@@ -54,7 +54,7 @@ export class Plot {
       height - 2 - ((levels[k] - low) / span) * (height - 4)));
     context.lineJoin = "round";
     context.lineWidth = 1.5 * ratio;
-    context.strokeStyle = style.getPropertyValue("--accent") || "#888";
+    context.strokeStyle = getComputedStyle(canvas).color;
     context.stroke();
   }
 }

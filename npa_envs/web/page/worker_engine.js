@@ -1,10 +1,10 @@
 // The engine of an exported page, and the gallery to choose a rule. An engine runs the world that a page shows: it
 // takes the page's messages and sends it frames and other events, which page.js lists. This one is a worker in the
-// page, which runs the LiveWorld of page_world.js.
+// page, which runs the RuleWorld of page_world.js.
 
 import { start } from "./page.js";
 
-// Starts the worker with the code in the element `worker`; the settings are those of LiveWorld.
+// Starts the worker with the code in the element `worker`; the settings are those of RuleWorld.
 async function connect(settings, listener) {
   const text = document.getElementById("worker").textContent;
   const worker = new Worker(URL.createObjectURL(new Blob([text], { type: "text/javascript" })));
