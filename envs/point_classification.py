@@ -15,7 +15,7 @@ from npa_envs import world_mean
 from npa_envs.checks import check_field, check_positive
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
-from npa_envs.envs.core.task import Start, TargetEnvTask
+from npa_envs.envs.core.task import TargetEnvTask
 from npa_envs.envs.core.vector import vector_class
 from npa_envs.envs.grown_worlds import load_readout_rule
 from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
@@ -27,7 +27,6 @@ from npa_envs.tasks.point_classification import (
 )
 from npa_envs.tasks.targets.digit_clouds import Split
 from npa_envs.world.particles import Particles
-from npa_envs.world.randomness import WorldRandom
 
 Score = Literal["error", "cross_entropy", "accuracy"]
 
@@ -98,11 +97,6 @@ class PointClassificationTask(TargetEnvTask[PointClassificationEnvConfig]):
         rule = _WorldByWorld(**loaded.hyper_parameters()).to(device)
         rule.load_state_dict(loaded.state_dict())
         return task.for_rule(rule.requires_grad_(False))
-
-    def fresh(self, random: WorldRandom) -> Start:
-        """Return random clouds with all states zero, and their classes."""
-        x, s, *_, label = self.task.seed(random.world_count, generator=random, device=self.device)
-        return Start(x, s, goal=label)
 
     def losses(self, x: Tensor, s: Tensor) -> Mapping[str, Tensor]:
         """Return each world's mean score and weighted overflow of states, by name, [B] each."""

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from npa_envs.checks import check_flag, check_fraction, check_positive
-from npa_envs.envs.core.rewards_and_ends import total
 from npa_envs.envs.core.single import NPAEnv
+from npa_envs.envs.core.step_report import total
 from npa_envs.envs.core.task import Start
 from npa_envs.envs.core.vector import vector_class
 from npa_envs.envs.grown_worlds import GrownConfig, GrownTask
@@ -17,7 +17,6 @@ from npa_envs.envs.morphogenesis2d import PictureEnvTask
 from npa_envs.errors import shown
 from npa_envs.rule.rule import COLOUR_OFFSET
 from npa_envs.tasks.damage import damage_worlds
-from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import StreamId, WorldRandom
 
 RANDOM_DAMAGE = "random"
@@ -85,16 +84,17 @@ class RegenerationTask(GrownTask[Regeneration2DEnvConfig]):
         if not self._drawn:
             _ = self.rule
 
-    def seed(self, random: WorldRandom) -> tuple[Tensor, Tensor]:
+    def fresh(self, random: WorldRandom) -> Start:
         """Return grown worlds without damage; if `rule` is "picture", the target's points."""
         if not self._drawn:
-            return super().seed(random)
-        x, s = PictureEnvTask.seed(self, random)
+            return super().fresh(random)
+        blank = PictureEnvTask.fresh(self, random)
         points, colours = self.task.target.points, self.task.target.colours
         # The numbers of points and particles differ a little: some points repeat or are skipped.
-        chosen = torch.linspace(0, len(points) - 1, x.shape[1], device=x.device).round().long()
-        s[..., -3:] = colours[chosen] - COLOUR_OFFSET
-        return points[chosen].expand_as(x).clone(), s
+        chosen = torch.linspace(0, len(points) - 1, blank.x.shape[1], device=self.device)
+        chosen = chosen.round().long()
+        blank.s[..., -3:] = colours[chosen] - COLOUR_OFFSET
+        return blank._replace(x=points[chosen].expand_as(blank.x).clone())
 
     @property
     def start_is_short(self) -> bool:
@@ -103,31 +103,27 @@ class RegenerationTask(GrownTask[Regeneration2DEnvConfig]):
 
     def start(self, random: WorldRandom) -> Start:
         """Return damaged worlds, with the loss at which each counts as healed."""
-        x, s, threshold, _ = super().start(random)
+        start = super().start(random)
         if self.config.split_damage and self.config.split == "test":
             random = random.substream(StreamId.TEST)
         kinds = RANDOM_KINDS if self.config.damage == RANDOM_DAMAGE else (self.config.damage,)
-        chosen = random.integers(len(kinds), 1, 1)
-        intact = damaged = Particles(x, s)
+        chosen, box = random.integers(len(kinds), 1, 1), self.periodic_sides
+        damaged = start
         for k, kind in enumerate(kinds):
             size = SIZES[kind] if self.config.damage_size is None else self.config.damage_size
-            new_x, new_s = damage_worlds(
-                x, s, kind=kind, size=size, box=self.periodic_sides, generator=random
+            x, s = damage_worlds(start.x, start.s, kind=kind, size=size, box=box, generator=random)
+            damaged = damaged._replace(
+                x=torch.where(chosen == k, x, damaged.x), s=torch.where(chosen == k, s, damaged.s)
             )
-            # Each kind changes either positions or states.
-            if new_x is not x:
-                damaged = damaged._replace(x=torch.where(chosen == k, new_x, damaged.x))
-            if new_s is not s:
-                damaged = damaged._replace(s=torch.where(chosen == k, new_s, damaged.s))
-        if threshold is None:
-            least, loss = self._loss(intact), self._loss(damaged)
-            healed = least + (1.0 - self.config.healed_share) * (loss - least)
-            never = torch.full_like(least, -torch.inf)
-            threshold = torch.where(loss - least >= MIN_RISE * least, healed, never)
-        return Start(damaged.x, damaged.s, threshold)
+        if start.success_loss is not None:
+            return damaged
+        intact, loss = (self._loss(worlds) for worlds in (start, damaged))
+        healed = intact + (1.0 - self.config.healed_share) * (loss - intact)
+        is_damaged = loss - intact >= MIN_RISE * intact
+        return damaged._replace(success_loss=torch.where(is_damaged, healed, -torch.inf))
 
-    def _loss(self, particles: Particles) -> Tensor:
-        return total(torch.stack(list(self.losses(particles.x, particles.s).values())))
+    def _loss(self, worlds: Start) -> Tensor:
+        return total(torch.stack(list(self.losses(worlds.x, worlds.s).values())))
 
 
 class Regeneration2DEnv(NPAEnv):

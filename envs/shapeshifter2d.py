@@ -8,7 +8,6 @@ from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from gymnasium.spaces import Box, Discrete, Space
 from torch import Tensor
 
@@ -18,10 +17,10 @@ from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import Start
 from npa_envs.envs.core.vector import vector_class
-from npa_envs.envs.garden.base import RuleDriven
+from npa_envs.envs.garden.base import RuleDrivenTask, coarse
 from npa_envs.envs.garden.brushes import OBSERVATION_LIMIT, GardenReward
 from npa_envs.envs.grown_worlds import check_matches_rule, check_rule_driven, grow, run_rule
-from npa_envs.envs.morphogenesis2d import PictureConfig, PictureEnvTask
+from npa_envs.envs.morphogenesis2d import PictureConfig
 from npa_envs.errors import NPAError
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.picture_codes import Codes
@@ -140,7 +139,7 @@ class PictureGoals(NamedTuple):
     """All goals of the episode in their order, shape [B, G]."""
 
 
-class ShapeshifterTask(RuleDriven, PictureEnvTask[Shapeshifter2DEnvConfig]):
+class ShapeshifterTask(RuleDrivenTask[Shapeshifter2DEnvConfig]):
     """A picture that a rule has grown has to become others."""
 
     config_type = Shapeshifter2DEnvConfig
@@ -226,9 +225,7 @@ class ShapeshifterTask(RuleDriven, PictureEnvTask[Shapeshifter2DEnvConfig]):
         goal_task = self.task.with_goal(context.goal)
         picture = goal_task.picture(particles.x, particles.s)
         both = torch.cat((picture, goal_task.target_picture), dim=-1)
-        pixels = self.config.resolution // self.config.picture_size
-        coarse = F.avg_pool2d(both.permute(0, 3, 1, 2), pixels).flatten(1)
-        return coarse.clamp(-OBSERVATION_LIMIT, OBSERVATION_LIMIT)
+        return coarse(both, self.config.picture_size)
 
 
 class Shapeshifter2DEnv(NPAEnv):

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from npa_envs.checks import number_tensor
 from npa_envs.envs.core.config import EnvConfig
-from npa_envs.envs.core.rewards_and_ends import named_terms
+from npa_envs.envs.core.step_report import StepNumbers, named_terms
 from npa_envs.envs.core.task import EnvTask
 from npa_envs.envs.core.worlds import BatchedWorlds
 from npa_envs.errors import NPAError
@@ -221,12 +221,12 @@ class WorldsEnv(ShownEnv):
 
     def losses_of(self, numbers: Any) -> dict[str, Any]:
         """Return the loss and its terms by their names in infos, from `StepReport.numbers`."""
-        names = self.worlds.term_names
-        return {"loss": numbers[1]} | named_terms("loss", names, numbers[2 : 2 + len(names)])
+        named = StepNumbers.from_rows(numbers)
+        return {"loss": named.loss} | named_terms("loss", self.worlds.term_names, named.terms)
 
     def _improvements(self, numbers: Any) -> dict[str, Any]:
-        names = self.worlds.term_names
-        return named_terms("reward", names, numbers[2 + len(names) :])
+        improvements = StepNumbers.from_rows(numbers).improvements
+        return named_terms("reward", self.worlds.term_names, improvements)
 
     def _show(self) -> None:
         self._show_in_window(self.spec.id if self.spec is not None else type(self).__name__)

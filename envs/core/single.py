@@ -14,7 +14,7 @@ from torch import Tensor
 from npa_envs.checks import number_tensor
 from npa_envs.envs.core.base import WorldsEnv
 from npa_envs.envs.core.config import plain
-from npa_envs.envs.core.rewards_and_ends import reason
+from npa_envs.envs.core.step_report import reason
 from npa_envs.envs.core.vector import check_options, rng_keys
 from npa_envs.errors import NPAError
 from npa_envs.world.environment_steps import DIVERGED, SUCCESS, TIME_LIMIT

@@ -219,7 +219,7 @@ class EnvTask(WorldTask[Config]):
 
     @property
     def start_is_short(self) -> bool:
-        """Whether `start` takes few operations, so that on CUDA it is recorded as a graph."""
+        """Whether `start` takes few operations, so that on CUDA it is captured as a graph."""
         return not self.grows or self.config.seed_pool > 0
 
     def start(self, random: WorldRandom) -> Start:
@@ -315,10 +315,12 @@ class TargetEnvTask(EnvTask[Config]):
         size: float = self.task.pixel_size
         return size
 
-    def seed(self, random: WorldRandom) -> tuple[Tensor, Tensor]:
-        """Draw initial worlds as the training task does; return positions and states."""
-        x, s, *_ = self.task.seed(random.world_count, generator=random, device=self.device)
-        return x, s
+    def fresh(self, random: WorldRandom) -> Start:
+        """Return the training task's initial worlds, with their goals if it has several."""
+        worlds = self.task.seed(random.world_count, generator=random, device=self.device)
+        # Leaves out the channels of codes, which only rules of many pictures use.
+        s = worlds.s[..., -self.config.state_dim :].contiguous()
+        return Start(worlds.x, s, goal=worlds.goal)
 
     def with_goal(self, goal: Tensor) -> Self:
         """Return a task whose losses are for worlds of these goals."""

@@ -18,7 +18,7 @@ from torch import Tensor
 from npa_envs.checks import check_count, number_tensor
 from npa_envs.envs.core.base import WorldsEnv
 from npa_envs.envs.core.config import plain
-from npa_envs.envs.core.rewards_and_ends import FLAGS, StepReport, reason
+from npa_envs.envs.core.step_report import StepReport, reason
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.world.cuda_graph import to_device_async
 from npa_envs.world.environment_steps import TIME_LIMIT
@@ -162,7 +162,7 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
         ended = endings != 0
         final = self.autoreset_mode is AutoresetMode.SAME_STEP and bool(ended.any())
         # A restart overwrites the report, so it is copied first.
-        rows, flags, infos = self._report(stepped, copy=self.copies or final)
+        *results, infos = self._report(stepped, copy=self.copies or final)
         if final:
             which = self._mask(ended)
             final_infos = {n: which if n.startswith("_") else v for n, v in infos.items()}
@@ -173,7 +173,7 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
             else:
                 final_observation = observation.clone()
             self.worlds.restart(np.flatnonzero(ended), observation)
-            _, _, infos = self._report(~ended, copy=self.copies)
+            *_, infos = self._report(~ended, copy=self.copies)
             infos |= {
                 "final_obs": self.spaces.final_observation_output(final_observation, ended),
                 "_final_obs": which,
@@ -184,7 +184,7 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
             if ended.any():
                 infos |= {"reason": REASONS[endings], "_reason": self._mask(ended)}
         self._show()
-        return self.spaces.observation_output(observation), rows[0], flags[0], flags[1], infos
+        return self.spaces.observation_output(observation), *results, infos
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Return a picture of each world, shape [R, R, 3], with the render mode "rgb_array"."""
@@ -220,17 +220,19 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
 
     def _report(
         self, stepped: NDArray[np.bool_] | None, *, copy: bool
-    ) -> tuple[list[Any], list[Any], dict[str, Any]]:
-        """Return the report's numbers, its flags, and infos; `stepped`: worlds that acted."""
+    ) -> tuple[Any, Any, Any, dict[str, Any]]:
+        """Return rewards, terminations, truncations and infos; `stepped`: worlds that acted."""
         worlds = self.worlds
         report = worlds.report.copy() if copy else worlds.report
-        rows, flags = self._report_rows(report), list(self._out(report.endings))
+        rows = self._report_rows(report)
+        terminated, truncated, success, diverged = self._out(report.endings)
         all_worlds = self._out(report.all_worlds if copy else report.all_worlds.clone())
         which = all_worlds if stepped is None else self._mask(stepped)
         of_all = self.losses_of(rows) | self._returned_values(worlds.extra_info(), copy=copy)
-        of_step = self._improvements(rows) | dict(zip(FLAGS, flags[2:], strict=True))
+        of_step = self._improvements(rows) | {"success": success, "diverged": diverged}
         of_step |= self._returned_values(worlds.step_info(), copy=copy)
-        return rows, flags, with_masks(of_all, all_worlds) | with_masks(of_step, which)
+        infos = with_masks(of_all, all_worlds) | with_masks(of_step, which)
+        return rows[0], terminated, truncated, infos
 
     def _returned_values(self, values: dict[str, Tensor], *, copy: bool = True) -> dict[str, Any]:
         return {n: self._out(v.clone() if copy else v) for n, v in values.items()}

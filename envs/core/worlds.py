@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.envs.core.config import EnvConfig
-from npa_envs.envs.core.rewards_and_ends import ParticleRewards, StepReport, total
+from npa_envs.envs.core.step_report import ParticleRewards, StepReport, total
 from npa_envs.envs.core.task import (
     EnvTask,
     Start,
@@ -45,7 +45,6 @@ from npa_envs.world.environment_steps import (
     EpisodeUpdate,
     NeighbourState,
     build_neighbours,
-    with_mean_reward,
 )
 from npa_envs.world.particles import Particles
 
@@ -72,7 +71,13 @@ class BatchedWorlds(WorldState):
         # Memory is checked before the task is made, which may make a target of as many points.
         extra, count = task_type.extra_bytes(config, world_count), config.particle_count
         super().__init__(config, task_type, world_count, count, extra)
-        self.task: Any = task_type(config, self.device)
+        device = self.device
+        self.task: EnvTask[Any] = task_type(config, device)
+        self.goal = torch.zeros(world_count, dtype=torch.int64, device=device)
+        """Index of each world's goal, shape [B]; zeros where the task has one goal."""
+        self.goal_task: EnvTask[Any] = self.task.with_goal(self.goal)
+        """The task with losses for the worlds' goals."""
+
         limits = [steps for steps in (episode_steps, config.episode_steps) if steps is not None]
         self.episode_steps = min(limits, default=None)
         """Steps after which an episode is truncated; None: never."""
@@ -82,54 +87,46 @@ class BatchedWorlds(WorldState):
                 "None: for example episode_steps=64, and the same number as max_episode_steps of "
                 "gymnasium.make"
             )
-
-        def zeros(dtype: torch.dtype = torch.float32) -> Tensor:
-            return torch.zeros(world_count, dtype=dtype, device=self.device)
-
-        self.elapsed = zeros(torch.int32)
+        self.elapsed = torch.zeros(world_count, dtype=torch.int32, device=device)
         """Steps since the start of each episode, shape [B]."""
-        self.particle_rewards: ParticleRewards | None = None
-        """Rewards of single particles, where they have any."""
-        if config.per_particle_reward:
-            by_loss = config.reward == "particle"
-            self.particle_rewards = ParticleRewards(self.particles, by_loss=by_loss)
-        self.goal = zeros(torch.int64)
-        """Index of each world's goal, shape [B]; zeros where the task has one goal."""
-        self.goal_task: EnvTask[Any] = self.task.with_goal(self.goal)
-        """The task with losses for the worlds' goals."""
-        self._start_loss = zeros()
-        self._success_loss = zeros()
-        self.diverged = zeros(torch.uint8)
-        """1 where a position or state of the world left its bounds in the last step, shape [B]."""
-        self.enabled = torch.ones(1, dtype=torch.uint8, device=self.device)
+        self._start_loss = torch.zeros(world_count, device=device)
+        self._success_loss = torch.zeros_like(self._start_loss)
+
+        self.enabled = torch.ones(1, dtype=torch.uint8, device=device)
         """0 if the last actions were not finite and so not applied, shape [1]."""
-        self.term_names: tuple[str, ...] = ()
-        """Names of the terms of the loss, known once worlds have been placed."""
-        self.report = StepReport.empty(world_count, 0, self.device)
-        """What a step returns apart from the observation."""
-        # Each world's ending, then whether the actions were finite.
-        self._endings = torch.zeros(world_count + 1, dtype=torch.uint8, device=self.device)
-        self._target: Tensor | None = self.task.target_rows
+        self.diverged = torch.zeros(world_count, dtype=torch.uint8, device=device)
+        """1 where a position or state of the world left its bounds in the last step, shape [B]."""
+        self._actions = Actions(
+            self.x, self.s, self.physics, self.random, enabled=self.enabled, diverged=self.diverged
+        )
+        self._neighbours: NeighbourState | None = None
         self._perceived: Tensor | None = None
         """Perception, shape [B, N, P], that the graph of a step writes; None without one."""
         self._host_perceived: Tensor | None = None
         """Its copy in pinned memory, for a single world with NumPy output."""
         self._host_is_current = False
         """Whether the copy belongs to the last step, and no world restarted since."""
-        self._neighbours: NeighbourState | None = None
-        self._prepare_actions()
-        self._evaluate_graph = GraphedCallable(self._evaluate_and_sort, self.device)
-        self._step_graph = GraphedCallable(self._act_and_evaluate, self.device)
-        self._resets = GraphedResets(
-            self._start_and_sort, world_count, self.device, recorded=self.task.start_is_short
-        )
-        self._side_stream = SideStream(self.device) if self.device.type == "cuda" else None
+
+        self.particle_rewards: ParticleRewards | None = None
+        """Rewards of single particles, where they have any."""
+        if config.per_particle_reward:
+            by_loss = config.reward == "particle"
+            self.particle_rewards = ParticleRewards(self.particles, by_loss=by_loss)
+        self.term_names: tuple[str, ...] = ()
+        """Names of the terms of the loss, known once worlds have been placed."""
+        self.report = StepReport.empty(world_count, 0, device)
+        """What a step returns apart from the observation."""
+        # Each world's ending, then whether the actions were finite.
+        self._endings = torch.zeros(world_count + 1, dtype=torch.uint8, device=device)
         self._prepare_report()
 
-    def _prepare_actions(self) -> None:
-        flags = {"enabled": self.enabled, "diverged": self.diverged}
-        self._actions = Actions(self.x, self.s, self.physics, self.random, **flags)
-        self._draw = GraphedCallable(self._actions.draw, self.device)
+        self._draw = GraphedCallable(self._actions.draw, device)
+        self._evaluate_graph = GraphedCallable(self._evaluate_and_sort, device)
+        self._step_graph = GraphedCallable(self._act_and_evaluate, device)
+        self._resets = GraphedResets(
+            self._start_and_sort, world_count, device, captured=self.task.start_is_short
+        )
+        self._side_stream = SideStream(device) if device.type == "cuda" else None
 
     def __getstate__(self) -> dict[str, Any]:
         # The next step makes these again.
@@ -146,10 +143,9 @@ class BatchedWorlds(WorldState):
         """Make what writes the report, and the tensors that the host reads, on CUDA pinned."""
         read = (self._endings, self.report.numbers)
         self.host_endings, self.host_numbers = map(pinned_like, read) if self.x.is_cuda else read
-        config = self.task.config
         rewarded_step = self.episode_steps if self.rewards_last_step_only else None
         self._evaluation = EpisodeUpdate(
-            EpisodeRules(self.episode_steps, rewarded_step, config.on_divergence),
+            EpisodeRules(self.episode_steps, rewarded_step, self.task.config.on_divergence),
             enabled=self.enabled,
             diverged=self.diverged,
             first_loss=self._start_loss,
@@ -171,11 +167,11 @@ class BatchedWorlds(WorldState):
         """Start episodes of worlds, int64 indices [M]; return `Start`; keys: see `next_streams`."""
         random = self.next_streams(worlds, keys)
         check_default_dtype()
-        # The first start is not recorded as a graph, so that it can synchronise for checks.
+        # The first start is not captured as a graph, so that it can synchronise for checks.
         task, first = self.task, not self.term_names
         draws = global_rng_states(self.device) if first else {}
         check = first or not self.x.is_cuda
-        start: Start = task.start(random)
+        start = task.start(random)
         check_start(task, start, len(worlds), (self.x.shape, self.s.shape))
         if first:
             check_no_draws(task, start_method(task), draws)
@@ -235,7 +231,7 @@ class BatchedWorlds(WorldState):
 
     def restart(self, worlds: NDArray[np.int64], observation: Tensor) -> None:
         """Start the next episodes of worlds, indices [M]; write their rows of `observation`."""
-        if self._target is None:
+        if self.task.target_rows is None:
             self._resets(worlds, observation)
             return
         index = to_device_async(worlds, self.device)
@@ -250,15 +246,15 @@ class BatchedWorlds(WorldState):
         return self._observed(build_neighbours(self.x, self.s, self.physics), out)
 
     def _observed(self, neighbours: NeighbourState, out: Tensor | None) -> Tensor:
-        if self._target is None:
+        if self.task.target_rows is None:
             return neighbours.perceive(out)
         rows = self._with_target(neighbours.perceive(), self.goal)
         return rows if out is None else out.copy_(rows)
 
     def _with_target(self, rows: Tensor, goal: Tensor) -> Tensor:
-        if self._target is None:
+        if self.task.target_rows is None:
             return rows
-        columns = self._target[goal][:, None].expand(-1, rows.shape[1], -1)
+        columns = self.task.target_rows[goal][:, None].expand(-1, rows.shape[1], -1)
         return torch.cat((rows, columns), dim=-1)
 
     @torch.no_grad()
@@ -287,7 +283,7 @@ class BatchedWorlds(WorldState):
     def step(self, action: Tensor, out: Tensor | None = None) -> tuple[NDArray[np.uint8], Tensor]:
         """Apply actions to all worlds; return their endings, [B], and observations, [B, ...].
 
-        The host reads the endings, one byte a world, and the report of a single world. On CUDA
+        The host reads the endings, one byte per world, and the report of a single world. On CUDA
         evaluation and neighbour search overlap, and the device perceives while the host reads.
 
         Args:
@@ -310,7 +306,7 @@ class BatchedWorlds(WorldState):
             self.check_losses(torch.arange(self.world_count, device=self.device))
             raise NPAError(
                 f"losses of {type(self.task).__name__} must be finite before and after a step: "
-                "mend them, then reset"
+                "correct them, then reset"
             )
         return endings, observation
 
@@ -349,7 +345,7 @@ class BatchedWorlds(WorldState):
             if self._perceived is None:
                 self._perceived = self.x.new_empty(*self.x.shape[:2], self.physics.perception_dim)
                 returns_arrays = self.world_count == 1 and self.task.config.output == "numpy"
-                if returns_arrays and self._target is None:
+                if returns_arrays and self.task.target_rows is None:
                     self._host_perceived = pinned_like(self._perceived)
             build_neighbours(self.x, self.s, self.physics).perceive(self._perceived)
             if self._host_perceived is not None:
@@ -371,37 +367,27 @@ class BatchedWorlds(WorldState):
 
     def evaluate(self) -> None:
         """Write rewards, losses and endings for the current particles into `report`."""
-        task, particle_rewards = self.goal_task, self.particle_rewards
-        losses = task.losses(self.x, self.s)
-        terms = torch.stack(checked_losses(task, losses, len(self.x), self.term_names))
-        if particle_rewards is None:
-            self._evaluation(terms)
-        else:
-            gains = particle_rewards.step_rewards(task, self.particles)
-            self._evaluation(terms, (~torch.isfinite(gains).all(dim=1)).byte())
-            reward = self.report.reward
-            if task.config.reward == "marginal":
-                gains = with_mean_reward(gains, reward)
-            # In worlds that left their bounds each particle gets the world's reward.
-            by_world = self.diverged.bool() & (task.config.on_divergence != "ignore")
-            gains = torch.where(by_world[:, None], reward[:, None], gains)
-            gains = torch.where(self.enabled.bool(), gains, particle_rewards.reward)
-            particle_rewards.reward.copy_(gains)
-        rewards = self.task_rewards()
-        if rewards is not None:
-            if self.rewards_last_step_only:
-                terminated, truncated = self.report.endings[:2]
-                rewards = torch.where(terminated | truncated, rewards, 0.0)
-            self.report.reward.copy_(rewards)
+        losses = self.goal_task.losses(self.x, self.s)
+        self.write_rewards(
+            torch.stack(checked_losses(self.task, losses, len(self.x), self.term_names))
+        )
         if self.x.is_cuda:
             self.host_endings.copy_(self._endings, non_blocking=True)
             if self.world_count == 1:
                 self.host_numbers.copy_(self.report.numbers, non_blocking=True)
         self.enabled.fill_(1)
 
-    def task_rewards(self) -> Tensor | None:
-        """Return the task's own rewards of a step, [B]; None: they are the loss's decrease."""
-        return None
+    def write_rewards(self, terms: Tensor) -> None:
+        """Write rewards and endings of worlds, and of particles; `terms`: losses, [terms, B]."""
+        rewards = self.particle_rewards
+        if rewards is None:
+            self._evaluation(terms)
+            return
+        gains = rewards.gains(self.goal_task, self.particles)
+        self._evaluation(terms, (~torch.isfinite(gains).all(dim=1)).byte())
+        # In worlds that left their bounds each particle gets the world's reward.
+        by_world = self.diverged.bool() & (self.task.config.on_divergence != "ignore")
+        rewards.write(gains, self.report.reward, by_world, self.enabled)
 
     def check_losses(self, worlds: Tensor) -> None:
         """Check that the losses of the worlds of indices `worlds`, int64 [M], are finite."""
@@ -459,8 +445,7 @@ class BatchedWorlds(WorldState):
     def pictures(self, count: int) -> NDArray[np.uint8]:
         """Return pictures of the first worlds, uint8, shape [count, R, R, 3]."""
         first = self.particles.map(lambda value: value[:count])
-        pictures: NDArray[np.uint8] = self.task.draw(first, self.elapsed[:count].cpu().numpy())
-        return pictures
+        return self.task.draw(first, self.elapsed[:count].cpu().numpy())
 
     def _divergence_message(self, diverged: NDArray[np.int64]) -> str:
         """Return the message of the error for `on_divergence="raise"`."""
@@ -488,7 +473,7 @@ class BatchedWorlds(WorldState):
 
 
 GROWTH = 4
-"""Factor between the numbers of worlds that recorded restarts serve."""
+"""Factor between the numbers of worlds that captured restarts serve."""
 
 
 class GraphedResets:
@@ -504,12 +489,12 @@ class GraphedResets:
         world_count: int,
         device: torch.device,
         *,
-        recorded: bool,
+        captured: bool,
     ) -> None:
         self._start = WeakFunction(start)
         self._world_count = world_count
         self._device = device
-        self._recorded = recorded and device.type == "cuda"
+        self._captured = captured and device.type == "cuda"
         self._graphs: dict[int, _GraphedReset] = {}
 
     def __getstate__(self) -> dict[str, Any]:
@@ -519,7 +504,7 @@ class GraphedResets:
     @makes_plain_tensors
     def __call__(self, worlds: NDArray[np.int64], observation: Tensor) -> None:
         """Start the next episodes of worlds, indices [M]; write what they perceive, [B, N, P]."""
-        if not self._recorded:
+        if not self._captured:
             self._start()(to_device_async(worlds, self._device)).perceive(observation)
             return
         size = 1

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from npa_envs import world_mean
 from npa_envs.checks import number_tensor
-from npa_envs.envs.core.rewards_and_ends import named_terms, total
+from npa_envs.envs.core.step_report import named_terms, total
 from npa_envs.envs.core.world_state import OBSERVATION_COPIES, WorldState
 from npa_envs.envs.multi.base import Population, SpeciesTask
 from npa_envs.envs.multi.tasks import task_type
