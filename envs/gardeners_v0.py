@@ -26,7 +26,7 @@ class _BothSpaces(BrushSpaces):
     """Spaces of one gardener, and conversion of both gardeners' actions."""
 
     def action(self, action: Any, world_count: int | None) -> Tensor:
-        """Return the rows of both gardeners' brushes, shape [B, 2 K, W]."""
+        """Return the rows of both gardeners' brushes, shape [B, 2 J, W]."""
         both = [super(_BothSpaces, self).action(action[agent], world_count) for agent in AGENTS]
         return torch.cat(both, dim=1)
 

@@ -21,7 +21,7 @@ class MultiSpeciesEnv(CrowdEnv):
 
     ## Description
 
-    A world has particles of K species in the plane, sorted by species. Each particle has a
+    A world has particles of S species in the plane, sorted by species. Each particle has a
     position and a state of C numbers. The last three numbers, plus 0.5, are its colour. In every
     step each agent moves all of its particles and changes their states.
 
@@ -62,7 +62,7 @@ class MultiSpeciesEnv(CrowdEnv):
     particles, always in the same order. The columns are those of
     [`npa/Morphogenesis2D-v0`](Morphogenesis2D.md#observation-space). They do not include species.
 
-    With `perception="per_species"` K (1 + D) more columns follow: the density c² ρ_k / N of each
+    With `perception="per_species"` S (1 + D) more columns follow: the density c² ρ_k / N of each
     species k = 0, 1, ..., and then, species after species, its density gradient, scaled like that
     of all particles. A species that is gone has zeros there. This takes a second pass over the
     world. See [several rules in one world](../species.md#telling-species-apart).
@@ -83,12 +83,12 @@ class MultiSpeciesEnv(CrowdEnv):
     | mixing | 1 minus the mean entropy around its particles | `separation` |
     | segregation | the mean entropy around its particles | `mixture` |
     | co_morphogenesis | its particles' splat loss against `targets[k]` | `density`, `colour` |
-    | invasion | L_0: the splat loss of species 0; L_k: -L_0 / (K - 1) | `density`, `colour` |
+    | invasion | L_0: the splat loss of species 0; L_k: -L_0 / (S - 1) | `density`, `colour` |
     | symbiosis | for all: the splat loss of all particles | `density`, `colour` |
 
-    The entropy around a particle is -Σ f_k ln f_k / ln K, where f_k is the fraction of species k
+    The entropy around a particle is -Σ f_k ln f_k / ln S, where f_k is the fraction of species k
     among the SPH-weighted neighbours within ε, itself included. It is 0 with one species within ε,
-    and 1 with equal parts of all. K is the number of species at the start. The splat loss is that
+    and 1 with equal parts of all. S is the number of species at the start. The splat loss is that
     of [`npa/Morphogenesis2D-v0`](Morphogenesis2D.md#reward). It moves a picture's middle onto the
     target's, so the picture's position does not count.
 
@@ -172,7 +172,7 @@ def parallel_env(
     Args:
         task: "mixing", "segregation", "co_morphogenesis", "invasion" or "symbiosis"; or an id, such
             as "npa/MixingSmall-v0".
-        species_count: Species K: agents `species_0` to `species_{K-1}`; None: 2.
+        species_count: Species S: agents `species_0` to `species_{S-1}`; None: 2.
         config: Fields of the task's configuration; docs/environments/MultiSpecies.md lists them.
 
     Raises:

@@ -112,7 +112,7 @@ def parallel_env(task: str = "mixing", species_count: int = 2, **config: Any) ->
 
     Args:
         task: "mixing", "segregation", "co_morphogenesis", "invasion" or "symbiosis".
-        species_count: Species K; `info["species"]` is each particle's.
+        species_count: Species S; `info["species"]` is each particle's.
         config: Fields of the task's configuration; `particle_count` is 64 unless given, and 512 at
             most.
 

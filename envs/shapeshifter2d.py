@@ -114,10 +114,10 @@ class CodeSpaces(ParticleSpaces):
         )
 
     def action(self, action: Any, world_count: int | None) -> Tensor:
-        """Return the codes for checked actions, float32, shape [B, 1, K]."""
+        """Return the codes for checked actions, float32, shape [B, 1, code_dim]."""
         count, dim = self._table.shape
         if not self._chosen:
-            code = batch_tensor(action, world_count, (dim,), "K")
+            code = batch_tensor(action, world_count, (dim,), "code_dim")
             return self._limit * code[:, None].clamp(-1.0, 1.0)
         chosen = batch_choices(action, world_count, (), "")
         if not bool(((chosen >= 0) & (chosen < count)).all()):
@@ -125,7 +125,7 @@ class CodeSpaces(ParticleSpaces):
         return self._table.to(chosen.device)[chosen[:, None]]
 
     def actions_of_codes(self) -> Tensor:
-        """Return the action that gives each of the rule's codes with actions="code", [T, K]."""
+        """Return actions="code" that give each of the rule's codes, [codes, code_dim]."""
         return self._table / self._limit
 
 
@@ -200,7 +200,7 @@ class ShapeshifterTask(RuleDrivenTask[Shapeshifter2DEnvConfig]):
     def step(
         self, x: Tensor, s: Tensor, action: Tensor, random: WorldRandom
     ) -> tuple[Tensor, Tensor]:
-        """Write an action's codes, [B, 1, K], into all states, run the rule, and return x and s."""
+        """Write codes, [B, 1, code_dim], into all states and run the rule; return x and s."""
         coded = Particles(x, self.rule.with_code(s, action))
         x, s, *_ = run_rule(self.rule, self.config, coded, self.config.rule_steps, random)
         return x, s
@@ -233,9 +233,9 @@ class Shapeshifter2DEnv(NPAEnv):
 
     ## Description
 
-    A rule of many pictures steps N particles. A code of K numbers, part of each particle's state,
-    determines the picture that they grow ([one rule, many pictures](../beyond.md)). The agent
-    chooses the code. It observes the current picture and the goal's, both coarse, and after
+    A rule of many pictures steps N particles. A code of `code_dim` numbers, part of each particle's
+    state, determines the picture that they grow ([one rule, many pictures](../beyond.md)). The
+    agent chooses the code. It observes the current picture and the goal's, both coarse, and after
     `hold_steps` steps the goal becomes another picture. Observations do not say which code grows
     which picture, and particles need time to rearrange.
 
@@ -258,10 +258,10 @@ class Shapeshifter2DEnv(NPAEnv):
 
     ## Action space
 
-    With `actions="code"`, `Box(-1, 1, (K,), float32)`: the code, in units of the largest absolute
-    value in the rule's codes, or of 1 if that is larger. With `actions="choice"`, `Discrete(T)`:
-    the index of one of the rule's T codes. All particles get this code, and the rule makes
-    `rule_steps` steps. An action that is not finite raises `NPAError` and does not change the
+    With `actions="code"`, `Box(-1, 1, (code_dim,), float32)`: the code, in units of the largest
+    absolute value in the rule's codes, or of 1 if that is larger. With `actions="choice"`,
+    `Discrete(T)`: the index of one of the rule's T codes. All particles get this code, and the rule
+    makes `rule_steps` steps. An action that is not finite raises `NPAError` and does not change the
     world.
 
     ## Reward

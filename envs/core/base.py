@@ -207,7 +207,7 @@ class WorldsEnv(ShownEnv):
     def _change_worlds(
         self, change: Callable[..., Any], worlds: Tensor, values: Any, buffer: Tensor | None = None
     ) -> Tensor:
-        """Call `change(worlds, values)`, which starts or replaces M worlds, of int64 indices [M].
+        """Call `change(worlds, values)`, which starts or replaces worlds, of int64 indices [B'].
 
         Returns:
             New observations of all B worlds, written to `buffer` if it is given, shape [B, ...].

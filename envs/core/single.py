@@ -50,7 +50,7 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
     ## Starting state
 
     `reset(seed=k)` begins the sequence of episodes that belongs to k, and `reset()` goes on with
-    the next one. With `seed_pool=K` there are only K different starts.
+    the next one. With `seed_pool=9` there are only nine different starts.
 
     ## Episode end
 

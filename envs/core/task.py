@@ -134,7 +134,7 @@ class EnvTask(WorldTask[Config]):
         self._pool: Particles | None = None
         self._pooled: set[int] = set()
         self.target_rows: Tensor | None = None
-        """Columns that follow perception in each row, by the world's goal, [K, T]; None: none."""
+        """Columns after perception in each row, for each goal, [goals, T]; None: there are none."""
 
     @classmethod
     def extra_bytes(cls, config: Any, world_count: int) -> int:
@@ -344,7 +344,7 @@ def start_method(task: EnvTask[Any]) -> str:
 
 
 def check_start(task: EnvTask[Any], start: Start, world_count: int, shapes: Any) -> None:
-    """Check starts of M worlds without synchronising; `shapes`: [B, N, D] and [B, N, C]."""
+    """Check starts of some worlds without synchronising; `shapes`: [B, N, D] and [B, N, C]."""
     name = start_method(task)
     if not isinstance(start, Start):
         raise NPAError(

@@ -206,8 +206,8 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
     def place_particles(self, x: Any, s: Any, worlds: Any = None) -> Any:
         """Replace particles, without a reward, and return the new observations of all worlds.
 
-        Positions have shape [M, N, D], states [M, N, C]; `worlds` are the indices of the M worlds,
-        each once, or None for all of them. Errors are those of `NPAEnv.place_particles`.
+        Positions have shape [B', N, D], states [B', N, C]; `worlds` are the worlds' indices, each
+        once, or None for all of them. Errors are those of `NPAEnv.place_particles`.
         """
         if not self._started:
             raise NPAError("particles need worlds: call reset first")
@@ -324,7 +324,7 @@ def worlds_to_reset(
 
 
 def checked_worlds(worlds: Any, world_count: int) -> Tensor:
-    """Return checked indices of worlds, without repetition, on the CPU, int64, shape [M]."""
+    """Return checked indices of worlds, without repetition, on the CPU, int64, shape [B']."""
     indices = number_tensor("worlds", worlds).cpu()
     # A mask is refused: it would be read as the indices 0 and 1.
     whole = not indices.is_floating_point() and indices.dtype != torch.bool

@@ -120,9 +120,9 @@ class WorldState:
         """One random stream for each world."""
 
     def next_streams(self, worlds: Tensor, keys: Tensor | None) -> WorldRandom:
-        """Return the random streams for the next episodes of worlds, by their indices, [M].
+        """Return the random streams for the next episodes of worlds, by their indices, [B'].
 
-        Keys, int64, shape [M], start new sequences of episodes; None: each world's next episode.
+        Keys, int64, shape [B'], start new sequences of episodes; None: each world's next episode.
         """
         if keys is not None:
             return WorldRandom.from_keys(keys.to(self.device))
@@ -161,7 +161,7 @@ class WorldState:
 
 
 def not_finite(action: Tensor) -> DivergedError:
-    """Return the error for actions, shape [B, K, W], with a value that is not finite."""
+    """Return the error for actions, shape [B, rows, W], with a value that is not finite."""
     bad = ~torch.isfinite(action)
     world, particle, entry = (int(k) for k in bad.nonzero()[0])
     return DivergedError(

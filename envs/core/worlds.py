@@ -164,7 +164,7 @@ class BatchedWorlds(WorldState):
     @torch.no_grad()
     @makes_plain_tensors
     def start(self, worlds: Tensor, keys: Tensor | None = None) -> Start:
-        """Start episodes of worlds, int64 indices [M]; return `Start`; keys: see `next_streams`."""
+        """Start episodes in worlds of int64 indices [B']; keys are those of `next_streams`."""
         random = self.next_streams(worlds, keys)
         check_default_dtype()
         # The first start is not captured as a graph, so that it can synchronise for checks.
@@ -184,7 +184,7 @@ class BatchedWorlds(WorldState):
         return start
 
     def begin(self, worlds: Tensor, start: Start, *, check: bool) -> None:
-        """Begin episodes with `start` in the worlds of indices `worlds`, int64 [M].
+        """Begin episodes with `start` in the worlds of indices `worlds`, int64 [B'].
 
         `check` raises an error unless all losses are finite, which synchronises with the device.
         """
@@ -201,7 +201,7 @@ class BatchedWorlds(WorldState):
     @torch.no_grad()
     @makes_plain_tensors
     def place(self, worlds: Tensor, placed: Particles) -> None:
-        """Replace the particles of the worlds of indices `worlds`, int64 [M], without a reward.
+        """Replace the particles of the worlds of indices `worlds`, int64 [B'], without a reward.
 
         Worlds keep their goals if `placed` has none.
         """
@@ -230,7 +230,7 @@ class BatchedWorlds(WorldState):
         return build_neighbours(start.x, start.s, self.physics, world_indices=worlds)
 
     def restart(self, worlds: NDArray[np.int64], observation: Tensor) -> None:
-        """Start the next episodes of worlds, indices [M]; write their rows of `observation`."""
+        """Start the next episodes of worlds, indices [B']; write their rows of `observation`."""
         if self.task.target_rows is None:
             self._resets(worlds, observation)
             return
@@ -260,7 +260,7 @@ class BatchedWorlds(WorldState):
     @torch.no_grad()
     @makes_plain_tensors
     def reseed(self, worlds: NDArray[np.int64], observation: Tensor) -> None:
-        """Restart the particles of worlds, indices [M], within their episodes.
+        """Restart the particles of worlds, indices [B'], within their episodes.
 
         Rewards, flags and step counts stay. The worlds' rows of the observation, [B, ...], are
         overwritten.
@@ -390,7 +390,7 @@ class BatchedWorlds(WorldState):
         rewards.write(gains, self.report.reward, by_world, self.enabled)
 
     def check_losses(self, worlds: Tensor) -> None:
-        """Check that the losses of the worlds of indices `worlds`, int64 [M], are finite."""
+        """Check that the losses of the worlds of indices `worlds`, int64 [B'], are finite."""
         terms = zip(self.term_names, self.report.terms[:, worlds], strict=True)
         check_finite(self.task, "losses", {f"term {shown(name)}": term for name, term in terms})
         if self.particle_rewards is not None and self.particle_rewards.loss is not None:
@@ -503,7 +503,7 @@ class GraphedResets:
 
     @makes_plain_tensors
     def __call__(self, worlds: NDArray[np.int64], observation: Tensor) -> None:
-        """Start the next episodes of worlds, indices [M]; write what they perceive, [B, N, P]."""
+        """Start the next episodes of worlds, indices [B']; write what they perceive, [B, N, P]."""
         if not self._captured:
             self._start()(to_device_async(worlds, self._device)).perceive(observation)
             return

@@ -106,7 +106,7 @@ class RuleDrivenWorlds(BatchedWorlds):
         return observed if out is None else out.copy_(observed)
 
     def restart(self, worlds: NDArray[np.int64], observation: Tensor) -> None:
-        """Start the next episodes of worlds, indices [M]; write their rows of `observation`."""
+        """Start the next episodes of worlds, indices [B']; write their rows of `observation`."""
         index = to_device_async(worlds, self.device)
         self.start(index)
         observation[index] = self.perceive()[index]
@@ -157,7 +157,7 @@ class TargetDeficit:
         self._target_sums = self._scale * target_sums
 
     def __call__(self, particles: Particles, middle: Tensor) -> Tensor:
-        """Return the target's sums minus the worlds' own, for brushes at K places, [B, K, 6].
+        """Return the target's sums minus the worlds' own at each place, [B, places, 6].
 
         Sums are over particles, dimensionless: of 1, of x and y from the place in brush radii, and
         of red, green and blue. They are multiples of the target's mean sum of 1 over all places,
@@ -375,10 +375,10 @@ class GardenEnv(NPAEnv):
     is differentiable in positions, states and actions, except that the moment correction of
     [perception](../mathematics.md#perception) counts as constant.
 
-    With `actions="free"`, `Box(-1, 1, (K, 2 + W), float32)`: there are K = `brush_count` brushes,
+    With `actions="free"`, `Box(-1, 1, (J, 2 + W), float32)`: there are J = `brush_count` brushes,
     and the first two columns are the position of each, along x and y [length units].
 
-    With `actions="discrete"`, `MultiDiscrete` with four choices for each of K brushes: its place on
+    With `actions="discrete"`, `MultiDiscrete` with four choices for each of J brushes: its place on
     the grid along x and along y; its tool (nothing, a push in one of eight directions, wipe, each
     channel up or down, rate 0, rate 2, as far as `tools` has them); and its strength, one of
     `strength_count`.

@@ -11,7 +11,7 @@ from gymnasium.spaces import Box
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.envs.multi.vector import AgentsEnv, joined_actions
+from npa_envs.envs.multi.agents_env import AgentsEnv, joined_actions
 from npa_envs.errors import MissingDependencyError, NPAError, shown, suggest
 
 try:
@@ -152,7 +152,7 @@ class CrowdEnv(AgentsEnv, KnownAgents):
         return all_rows
 
     def _infos(self, numbers: dict[str, Tensor]) -> Infos:
-        """Return the infos of live agents, with their species and `numbers`, [1, A] each."""
+        """Return the infos of live agents, with their species and `numbers`, [1, M] each."""
         rows = torch.stack(list(numbers.values()))[:, 0].tolist()
         columns = dict(zip(numbers, rows, strict=True))
         species = self.worlds.agent_species

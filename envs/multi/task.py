@@ -53,7 +53,7 @@ class SpeciesConfig(WorldConfig):
     }
 
     species_count: int = 2
-    """Species K."""
+    """Species S."""
 
     particle_count: int = 1024
     """Particles of all species together, N, divided evenly."""
@@ -227,7 +227,7 @@ class SpeciesTask(WorldTask[Any]):
         return x, x.new_zeros(*shape, config.state_dim)
 
     def losses(self, population: Population) -> Mapping[str, Tensor]:
-        """Return the terms of each species' loss by name, shape [B, K] each; their sum is its loss.
+        """Return the terms of each species' loss by name, shape [B, S] each; their sum is its loss.
 
         The losses of a world must not depend on the others, and nothing may synchronise. Losses of
         removed species are not read.
@@ -243,7 +243,7 @@ class SpeciesTask(WorldTask[Any]):
         return action
 
     def final_rewards(self, rewards: Tensor, live: Tensor, species: Tensor) -> Tensor:
-        """Return `rewards`, [B, A], which a task may change; by default unchanged."""
+        """Return `rewards`, [B, M], which a task may change; by default unchanged."""
         return rewards
 
     def is_over(self, counts: tuple[int, ...]) -> bool:
