@@ -1,4 +1,4 @@
-"""`npa/Gardener2D-v0`: an agent with brushes keeps a picture intact against disturbances."""
+"""`npa/Gardener2D-v0`, an environment with brushes: an agent keeps a grown picture intact."""
 
 from __future__ import annotations
 
@@ -108,10 +108,6 @@ class Gardener2DEnv(GardenEnv):
     The rule has grown an intact picture in `grow_steps` steps from a disk of blank particles. With
     the default `seed_pool=16` there are sixteen grown worlds, made at the first reset, which takes
     some seconds on a CPU. Disturbances differ between episodes.
-
-    ## Episode end
-
-    `success_loss` is None by default: the picture has to be kept for the whole episode.
     """
 
     task_type = GardenerTask

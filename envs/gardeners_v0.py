@@ -1,4 +1,4 @@
-"""Two gardeners with opposed aims, as PettingZoo's functions: `parallel_env`, `env`, `raw_env`.
+"""Two agents with brushes and opposed aims, as PettingZoo's `parallel_env`, `env` and `raw_env`.
 
 Importing this module registers `npa/Gardeners-v0` with PettingZoo (1.27 or newer).
 """
@@ -63,8 +63,7 @@ class GardenersEnv(KnownAgents):
 
     ## Action space
 
-    As that of `npa/Gardener2D-v0`, for each agent. Every agent has to give an action. One that is
-    missing, of another shape or not finite raises `NPAError` and does not change the world.
+    As that of `npa/Gardener2D-v0`, for each agent. Every agent has to give an action.
 
     ## Reward
 
@@ -73,8 +72,7 @@ class GardenersEnv(KnownAgents):
 
     ## Starting state
 
-    As that of `npa/Gardener2D-v0`. `reset(seed=k)` begins the sequence of episodes that belongs to
-    k, and `reset()` goes on with the next one.
+    As that of `npa/Gardener2D-v0`.
 
     ## Episode end
 
@@ -87,8 +85,7 @@ class GardenersEnv(KnownAgents):
     ## Arguments
 
     `max_cycles`, the steps of an episode, and all arguments of `npa/Gardener2D-v0`. Chances of
-    gusts and blights are 0 by default. An unknown name, or a value out of range, raises an
-    `NPAError` that says what would be right.
+    gusts and blights are 0 by default.
 
     ## Version history
 

@@ -1,6 +1,6 @@
 """Species as agents, as PettingZoo's functions (`parallel_env`, `env`, `raw_env`) and `batched`.
 
-Importing this module registers `npa/Mixing-v0` and its like with PettingZoo (1.27 or newer).
+Importing this module registers the ids of `ENVIRONMENTS` with PettingZoo (1.27 or newer).
 """
 
 from __future__ import annotations
@@ -47,14 +47,14 @@ class MultiSpeciesEnv(CrowdEnv):
     In `parallel_env` all agents act at once. In `env` and `raw_env` they act in turn, by
     PettingZoo's own conversion, and the world moves on after the last one. `env` also clips actions
     into their space. `pettingzoo.make`, of PettingZoo 1.27 or newer, takes the ids once
-    `npa_envs.envs.multispecies_v0` is imported, as `"parallel"` and `"aec"`. `batched` steps
+    `npa_envs.envs.multispecies_v0` is imported. `batched` steps
     [many worlds at once](../species.md#many-worlds-at-once), to train on.
 
     A trained rule is a policy for one species:
-    `npa_envs.agents.RulePolicy(npa_envs.load_rule("gecko"))`. If all species follow the same rule,
-    the episode is a rollout of it. Species disturb each other: after 150 steps of this rule in an
-    invasion with the defaults, the loss of species 0 was 0.66 with invaders that did nothing, 0.85
-    with invaders of the same rule, and 0.94 with random ones (means of three seeds).
+    `npa_envs.agents.RulePolicy(npa_envs.load_rule("gecko"))`. Species disturb each other: after 150
+    steps of this rule in an invasion with the defaults, the loss of species 0 was 0.66 with
+    invaders that did nothing, 0.85 with invaders of the same rule, and 0.94 with random ones (means
+    of three seeds).
 
     ## Observation space
 
@@ -71,8 +71,8 @@ class MultiSpeciesEnv(CrowdEnv):
 
     `Box(-1, 1, (N_k, A), float32)` with A = 2 + C, for species k. The columns, and what they do,
     are those of [`npa/Morphogenesis2D-v0`](Morphogenesis2D.md#action-space). Every live agent has
-    to give an action, and no other agent may: see `agents`. An action that is missing, superfluous,
-    of another shape or not finite raises `NPAError` and does not change the world.
+    to give an action, and no other agent may: see `agents`. A wrong action, or one that is not
+    finite, raises `NPAError` and does not change the world.
 
     ## Reward
 
@@ -92,17 +92,15 @@ class MultiSpeciesEnv(CrowdEnv):
     of [`npa/Morphogenesis2D-v0`](Morphogenesis2D.md#reward). It moves a picture's middle onto the
     target's, so the picture's position does not count.
 
-    There is one reward for each species. Rewards of single particles (`reward="particle"` and
-    `"marginal"`), and `tell_updated`, are for environments of one species, and are refused.
-
-    With `reward="team"` every live agent gets the mean of all rewards; the terms in `info` stay its
-    own. In an invasion rewards sum to zero: species 0 gains as much as the live invaders lose, in
-    equal parts. There "team" is refused.
+    There is one reward for each species: `reward="particle"`, `"marginal"` and `tell_updated` are
+    for environments of one species. With `reward="team"` every live agent gets the mean of all
+    rewards; the terms in `info` stay its own. In an invasion, which has no "team", species 0 gains
+    as much as the live invaders lose, in equal parts.
 
     Rewards of an episode sum to its decrease of L_k, except at deaths: taking particles out changes
     the losses of others, and this change is not rewarded. In the step in which a species leaves the
-    world, L_k counts as at least its value at the start plus what deaths added to it, so that
-    leaving is never rewarded. The terms in `info` are not changed by this.
+    world, L_k counts as at least its value at the start plus what deaths added to it; the terms in
+    `info` are not changed by this.
 
     ## Starting state
 
@@ -151,9 +149,9 @@ class MultiSpeciesEnv(CrowdEnv):
 
     ## Arguments
 
-    `task` and `species_count` are positional, all others are keywords. This applies to
-    `parallel_env`, `env`, `raw_env` and `pettingzoo.make`. An unknown name, or a value out of
-    range, raises an `NPAError` that says which values are valid.
+    `task` and `species_count` are positional, all others are keywords of `parallel_env`, `env`,
+    `raw_env` and `pettingzoo.make`. An unknown name, or a value out of range, raises an `NPAError`
+    that says which values are valid.
 
     ## Version history
 

@@ -1,7 +1,6 @@
 """Particles as agents, as PettingZoo's functions: `parallel_env`, `env` and `raw_env`.
 
-Importing this module registers `npa/MixingParticles-v0` and its like with PettingZoo (1.27 or
-newer).
+Importing this module registers the ids of `ENVIRONMENTS` with PettingZoo (1.27 or newer).
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ PARTICLE_COUNT = 64
 """Default number of particles."""
 
 MAX_CROWD = 512
-"""Largest number of agents: each has an entry in five dicts a step."""
+"""Largest number of agents: each has an entry in five dicts per step."""
 
 
 class ParticlesEnv(CrowdEnv):
@@ -31,8 +30,8 @@ class ParticlesEnv(CrowdEnv):
 
     These are the worlds and tasks of [several species](MultiSpecies.md), with the same seeds and
     the same physics. But every particle is an agent: `particle_0`, `particle_1`, ... in the order
-    of their species. `info["species"]` is a particle's species. Each agent has an entry in five
-    dicts a step, so there are at most 512. For more particles, let species be the agents.
+    of their species. Each has an entry in five dicts per step, so there are at most 512. For more
+    particles, let species be the agents.
 
     | `task` | Id |
     |---|---|
@@ -113,8 +112,7 @@ def parallel_env(task: str = "mixing", species_count: int = 2, **config: Any) ->
     Args:
         task: "mixing", "segregation", "co_morphogenesis", "invasion" or "symbiosis".
         species_count: Species S; `info["species"]` is each particle's.
-        config: Fields of the task's configuration; `particle_count` is 64 unless given, and 512 at
-            most.
+        config: Fields of the task's configuration.
 
     Raises:
         NPAError: A name is unknown, or a value wrong.

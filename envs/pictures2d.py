@@ -145,10 +145,6 @@ class Pictures2DEnv(NPAEnv):
     The picture is drawn uniformly from those of the split. After `place_particles` a world keeps
     its picture.
 
-    ## Episode end
-
-    `success_loss` is None by default: growth has no natural end, and the picture should last.
-
     ## Info
 
     | Key | In | Value |

@@ -1,4 +1,7 @@
-"""`npa/Shapeshifter2D-v0`: choose the code of a rule of many pictures as goals change."""
+"""`npa/Shapeshifter2D-v0`: a rule moves the particles, and the agent chooses its code.
+
+The rule has a code for each of many pictures; the goal picture changes from time to time.
+"""
 
 from __future__ import annotations
 
@@ -267,9 +270,8 @@ class Shapeshifter2DEnv(NPAEnv):
     ## Reward
 
     Worlds are compared with the goal as in `npa/Morphogenesis2D-v0`, by a loss L. The reward is
-    1 − L / L₁, and at least -1; L₁ is the loss of an empty picture. So 1 is the goal itself.
-
-    The reward of a step is for the goal that was observed before it.
+    1 − L / L₁, and at least -1; L₁ is the loss of an empty picture. So 1 is the goal itself. It is
+    for the goal that was observed before the step.
 
     ## Starting state
 

@@ -1,4 +1,7 @@
-"""`npa/Shepherd2D-v0`: move, turn or reshape a grown picture to a goal while it stays intact."""
+"""`npa/Shepherd2D-v0`, an environment with brushes: an agent moves a grown picture to a goal.
+
+A trained rule moves the particles; the picture may also have to be turned or reshaped.
+"""
 
 from __future__ import annotations
 

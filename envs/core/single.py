@@ -23,9 +23,8 @@ from npa_envs.world.environment_steps import DIVERGED, SUCCESS, TIME_LIMIT
 class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
     """One world of a task as a Gymnasium environment; subclasses set `task_type`.
 
-    Keywords are the fields of the task's configuration. An unknown or wrong one, or a world that
-    does not fit into memory, raises `NPAError`. The page of each subclass ends with the sections
-    below, each after the subclass's own section of the same name.
+    Keywords are the fields of the task's configuration. The page of each subclass ends with the
+    sections below, each after the subclass's own section of the same name.
 
     ## Reward
 
@@ -45,11 +44,11 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
     L in the middle of the step: to second order, N times what its action contributed to the
     decrease of L, averaged over being the first and the last to act. The remainder of the dense
     reward is spread equally. So a particle is rewarded for its own action alone; with `"particle"`
-    it is also rewarded for what the actions of others do to its pixels.
+    also for what the actions of others do to its pixels.
 
     ## Starting state
 
-    `reset(seed=k)` begins the sequence of episodes that belongs to k, and `reset()` goes on with
+    `reset(seed=k)` begins the sequence of episodes that belongs to k, and `reset()` continues with
     the next one. With `seed_pool=9` there are only nine different starts.
 
     ## Episode end
@@ -79,7 +78,7 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
     `render_mode="rgb_array"` makes uint8 pictures of shape [R, R, 3], R = `render_size`, that show
     [-1, 1] × [-1, 1] with y up. `render_mode="human"` shows them in a window; it needs
     `pip install 'npa-envs[human]'`, and without a screen it warns once. `render_style` chooses
-    between the particles' colours, their density, and their hidden channels.
+    between the particles' colours, density, and hidden channels.
 
     ## Arguments
 

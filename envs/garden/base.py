@@ -372,7 +372,7 @@ class GardenEnv(NPAEnv):
     of `inject_channels`. w = (1 − r²)² at r brush radii from the brush, and 0 outside. The wiped
     fraction is clipped to [0, 1], rates to [0, 2], actions to [-1, 1]. An action that is not finite
     raises `NPAError` and does not change the world. `env.unwrapped.task.step(x, s, action, random)`
-    is differentiable in positions, states and actions, except that the moment correction of
+    is differentiable, except that the moment correction of
     [perception](../mathematics.md#perception) counts as constant.
 
     With `actions="free"`, `Box(-1, 1, (J, 2 + W), float32)`: there are J = `brush_count` brushes,
@@ -396,5 +396,5 @@ class GardenEnv(NPAEnv):
     ## Vectorized environment
 
     As in [every environment](Morphogenesis2D.md#vectorized-environment), but on a CPU worlds are
-    stepped one after the other: a batch saves no time there.
+    stepped one by one: a batch saves no time there.
     """
