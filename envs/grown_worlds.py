@@ -32,7 +32,7 @@ FIRST_TEST_SEED = 1_000_000
 class GrownConfig(Morphogenesis2DEnvConfig):
     """`Morphogenesis2DEnvConfig` with the rule that grows worlds, and the pool of worlds."""
 
-    words = EnvConfig.words | {"split": get_args(Split)}
+    choices = EnvConfig.choices | {"split": get_args(Split)}
 
     without_rule: ClassVar[str] = ""
     """Alternative to a rule, as the end of an error's message."""

@@ -172,9 +172,6 @@ def parallel_env(
             as "npa/MixingSmall-v0".
         species_count: Species S: agents `species_0` to `species_{S-1}`; None: 2.
         config: Fields of the task's configuration; docs/environments/MultiSpecies.md lists them.
-
-    Raises:
-        NPAError: A name is unknown, or a value wrong.
     """
     return MultiSpeciesEnv(**settings(task, species_count, config))
 
@@ -189,8 +186,7 @@ def batched(
 ) -> MultiSpeciesVectorEnv:
     """Return many worlds, stepped together on one device; world k is `parallel_env` by itself.
 
-    Arguments and errors are those of `parallel_env` and `MultiSpeciesVectorEnv`. `device="cuda"`
-    and `output="torch"` keep all arrays on a GPU.
+    Arguments are those of `parallel_env` and `MultiSpeciesVectorEnv`.
     """
     return MultiSpeciesVectorEnv(
         world_count=world_count,

@@ -113,9 +113,6 @@ def parallel_env(task: str = "mixing", species_count: int = 2, **config: Any) ->
         task: "mixing", "segregation", "co_morphogenesis", "invasion" or "symbiosis".
         species_count: Species S; `info["species"]` is each particle's.
         config: Fields of the task's configuration.
-
-    Raises:
-        NPAError: A name is unknown, or a value wrong.
     """
     if not plain(config.get("particle_counts")):
         config.setdefault("particle_count", PARTICLE_COUNT)

@@ -28,7 +28,7 @@ CHANNELS = 4
 class Pictures2DEnvConfig(PictureConfig):
     """`PictureConfig` with several targets, and whether observations show them."""
 
-    words = EnvConfig.words | {"split": get_args(Split)}
+    choices = EnvConfig.choices | {"split": get_args(Split)}
 
     targets: tuple[str, ...] = ("butterfly", "flower", "gecko", "heart", "octopus")
     """Pictures of the split "train": built-in names, emoji, picture files, or folders of such."""

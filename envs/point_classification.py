@@ -37,7 +37,7 @@ class PointClassificationEnvConfig(EnvConfig):
 
     task_config_type = PointClassificationConfig
 
-    words = EnvConfig.words | {"score": get_args(Score), "split": get_args(Split)}
+    choices = EnvConfig.choices | {"score": get_args(Score), "split": get_args(Split)}
 
     particle_count: int = PointClassificationConfig.particle_count
     data: str = PointClassificationConfig.data

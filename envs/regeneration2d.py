@@ -39,7 +39,7 @@ PICTURE = "picture"
 class Regeneration2DEnvConfig(GrownConfig):
     """`GrownConfig` with the damage."""
 
-    words = GrownConfig.words | {"damage": (*SIZES, RANDOM_DAMAGE)}
+    choices = GrownConfig.choices | {"damage": (*SIZES, RANDOM_DAMAGE)}
 
     without_rule = f", or rule={shown(PICTURE)} to start from the target's own points"
 
@@ -80,13 +80,13 @@ class RegenerationTask(GrownTask[Regeneration2DEnvConfig]):
 
     def __init__(self, config: Regeneration2DEnvConfig, device: torch.device) -> None:
         super().__init__(config, device)
-        self._drawn = config.rule == PICTURE
-        if not self._drawn:
+        self.grows = config.rule != PICTURE
+        if self.grows:
             _ = self.rule
 
     def fresh(self, random: WorldRandom) -> Start:
         """Return grown worlds without damage; if `rule` is "picture", the target's points."""
-        if not self._drawn:
+        if self.grows:
             return super().fresh(random)
         blank = PictureEnvTask.fresh(self, random)
         points, colours = self.task.target.points, self.task.target.colours
@@ -95,11 +95,6 @@ class RegenerationTask(GrownTask[Regeneration2DEnvConfig]):
         chosen = chosen.round().long()
         blank.s[..., -3:] = colours[chosen] - COLOUR_OFFSET
         return blank._replace(x=points[chosen].expand_as(blank.x).clone())
-
-    @property
-    def start_is_short(self) -> bool:
-        """Whether a start takes few operations: not if it grows a world."""
-        return self._drawn or super().start_is_short
 
     def start(self, random: WorldRandom) -> Start:
         """Return damaged worlds, with the loss at which each counts as healed."""

@@ -45,7 +45,10 @@ CodeActions = Literal["code", "choice"]
 class Shapeshifter2DEnvConfig(PictureConfig):
     """`PictureConfig` with the rule of many pictures, and how its goals change."""
 
-    words = EnvConfig.words | {"reward": get_args(GardenReward), "actions": get_args(CodeActions)}
+    choices = EnvConfig.choices | {
+        "reward": get_args(GardenReward),
+        "actions": get_args(CodeActions),
+    }
 
     reward: GardenReward = "dense"
     """"dense": the closeness to the goal in each step; "sparse": that of the last step only."""

@@ -207,10 +207,9 @@ class WorldsEnv(ShownEnv):
     def _change_worlds(
         self, change: Callable[..., Any], worlds: Tensor, values: Any, buffer: Tensor | None = None
     ) -> Tensor:
-        """Call `change(worlds, values)`, which starts or replaces worlds, of int64 indices [B'].
+        """Call `change(worlds, values)`, values of worlds of indices [B']; return all observations.
 
-        Returns:
-            New observations of all B worlds, written to `buffer` if it is given, shape [B, ...].
+        They are written to `buffer` if it is given, [B, ...].
         """
         with self.worlds.device_context():
             change(worlds, values)

@@ -46,7 +46,7 @@ class WorldConfig:
     Lengths are in length units: pictures show [-1, 1] x [-1, 1].
     """
 
-    words: ClassVar[dict[str, tuple[str | None, ...]]] = {
+    choices: ClassVar[dict[str, tuple[str | None, ...]]] = {
         "moment_inverse": get_args(MomentInverse),
         "boundary": get_args(Boundary),
         "output": get_args(Output),
@@ -130,8 +130,8 @@ class WorldConfig:
         check_positive(self, float, "observation_limit", "position_limit")
         check_fraction(self, "update_prob")
         check_non_negative(self, "position_noise")
-        for name, words in self.words.items():
-            check_word(self, name, words)
+        for name, choices in self.choices.items():
+            check_word(self, name, choices)
         fits = self.boundary != "periodic" or self.box_size >= 2.0 * self.eps
         rule = f"be at least 2 eps = {2.0 * self.eps:g}"
         check_field(self, "box_size", fits, rule, "enlarge the box or perceive at a smaller eps")
@@ -226,7 +226,7 @@ class WorldConfig:
 class EnvConfig(WorldConfig):
     """Fields of all environments of one species; a task adds its own."""
 
-    words = WorldConfig.words | {
+    choices = WorldConfig.choices | {
         "reward": get_args(Reward),
         "on_divergence": get_args(OnDivergence),
         "render_style": STYLES,

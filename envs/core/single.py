@@ -133,10 +133,6 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
 
         A seed begins its sequence of episodes; None starts the next episode of the current
         sequence. There are no options.
-
-        Raises:
-            gymnasium.error.Error: The seed is no integer of at least 0.
-            NPAError: An option is given.
         """
         seed = plain(seed)
         check_options(options, ())
@@ -160,11 +156,7 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
         return self.spaces.observation_output(observation[0]), info
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Apply an action, shape [N, A], in [-1, 1].
-
-        Returns:
-            Observation, reward, terminated, truncated (by the step limit of `gymnasium.make`), and
-            the info that the docstring of the environment lists.
+        """Apply an action, shape [N, A]; return what Gymnasium's environments return.
 
         Raises:
             NPAError: The action has another shape; the world is not changed.
@@ -203,10 +195,7 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
     def place_particles(self, x: Any, s: Any) -> Any:
         """Replace the particles, without a reward, and return the new observation, shape [N, P].
 
-        Positions have shape [N, D], states [N, C], as those that `particles` returns.
-
-        Raises:
-            NPAError: A shape is wrong, or a value is not finite or beyond its limit.
+        Positions, [N, D], and states, [N, C], must be finite and within their limits.
         """
         if not self._started:
             raise NPAError("particles need a world: call reset first")

@@ -126,7 +126,7 @@ class EnvTask(WorldTask[Config]):
     spaces_type: ClassVar[type[ParticleSpaces] | None] = None
     """Class of the spaces; None: `ParticleSpaces`, a row for each particle."""
 
-    grows: ClassVar[bool] = False
+    grows: bool = False
     """Whether a rule grows fresh worlds, step by step."""
 
     def __init__(self, config: Config, device: torch.device) -> None:
@@ -183,11 +183,7 @@ class EnvTask(WorldTask[Config]):
         return {}
 
     def particle_losses(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return a loss for each particle, shape [B, N], whose mean is the world's loss.
-
-        Raises:
-            NPAError: The task does not define it.
-        """
+        """Return a loss for each particle, shape [B, N], whose mean is the world's loss."""
         raise NPAError(
             f"{type(self).__name__} has no losses of single particles: choose reward='dense' or "
             "'sparse', or give it a particle_losses method"
@@ -198,9 +194,6 @@ class EnvTask(WorldTask[Config]):
 
         `before` and `after` are positions and states around a step. The default estimates it from
         the gradient of `losses` by `marginal_gains`.
-
-        Raises:
-            NPAError: The losses have no gradient.
         """
         gains = marginal_gains(self.losses, before, after, self.periodic_sides)
         if gains is None:

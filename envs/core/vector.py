@@ -107,9 +107,6 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
                 list; None: each world starts the next episode of its sequence.
             options: `{"reset_mask": mask}` resets only the worlds where the mask, bool, shape [B],
                 is True; the others do not change.
-
-        Raises:
-            NPAError: The mask or the seeds have a wrong shape.
         """
         seed = plain(seed)
         super().reset(seed=seed if isinstance(seed, int) else None)
@@ -130,11 +127,7 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
         return self.spaces.observation_output(observation), infos
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """Apply actions, shape [B, N, A], in [-1, 1]; errors are those of `NPAEnv.step`.
-
-        Returns:
-            Observations [B, N, P], rewards [B], terminations [B], truncations [B], and infos.
-        """
+        """Apply actions, shape [B, N, A]; return a batch [B, ...] of what `NPAEnv.step` returns."""
         if not self._started:
             raise NPAError("step needs worlds: call reset first")
         action = self.spaces.action(actions, self.num_envs)

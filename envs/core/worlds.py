@@ -1,6 +1,6 @@
 """The batch of worlds of an environment: actions, observations, rewards, restarts.
 
-A single environment is a batch of one. World k of a batch is the same as alone, bit for bit.
+A single environment is a batch of one. Results of a world do not depend on the others, bit for bit.
 """
 
 from __future__ import annotations
@@ -50,6 +50,9 @@ from npa_envs.world.particles import Particles
 
 FEW_PARTICLES = 8192
 """Particles of all worlds up to which a step on CUDA is one graph; larger steps hide launches."""
+
+GROWTH = 4
+"""Factor between the numbers of worlds that captured starts serve."""
 
 
 class BatchedWorlds(WorldState):
@@ -123,16 +126,15 @@ class BatchedWorlds(WorldState):
         self._draw = GraphedCallable(self._actions.draw, device)
         self._evaluate_graph = GraphedCallable(self._evaluate_and_sort, device)
         self._step_graph = GraphedCallable(self._act_and_evaluate, device)
-        self._resets = GraphedResets(
-            self._start_and_sort, world_count, device, captured=self.task.start_is_short
-        )
+        self._graphed_starts: dict[int, GraphedStart] = {}
+        """By their numbers of worlds; empty on a CPU."""
         self._side_stream = SideStream(device) if device.type == "cuda" else None
 
     def __getstate__(self) -> dict[str, Any]:
         # The next step makes these again.
         none = dict.fromkeys(("_neighbours", "_evaluation", "host_endings", "host_numbers"))
         none |= dict.fromkeys(("_perceived", "_host_perceived"))
-        return self.__dict__ | none | {"_host_is_current": False}
+        return self.__dict__ | none | {"_host_is_current": False, "_graphed_starts": {}}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
@@ -229,15 +231,29 @@ class BatchedWorlds(WorldState):
         start = self.start(worlds)
         return build_neighbours(start.x, start.s, self.physics, world_indices=worlds)
 
+    @makes_plain_tensors
     def restart(self, worlds: NDArray[np.int64], observation: Tensor) -> None:
         """Start the next episodes of worlds, indices [B']; write their rows of `observation`."""
-        if self.task.target_rows is None:
-            self._resets(worlds, observation)
-            return
-        index = to_device_async(worlds, self.device)
-        start = self.start(index)
-        rows = build_neighbours(start.x, start.s, self.physics).perceive()
-        observation[index] = self._with_target(rows, self.goal[index])
+        if self.task.target_rows is not None:
+            index = to_device_async(worlds, self.device)
+            start = self.start(index)
+            rows = build_neighbours(start.x, start.s, self.physics).perceive()
+            observation[index] = self._with_target(rows, self.goal[index])
+        elif not (self.x.is_cuda and self.task.start_is_short):
+            index = to_device_async(worlds, self.device)
+            self._start_and_sort(index).perceive(observation)
+        else:
+            self._graphed_start(len(worlds))(worlds, observation)
+
+    def _graphed_start(self, count: int) -> GraphedStart:
+        """Return a graph for at least `count` worlds; few sizes serve all counts."""
+        size = 1
+        while size < count:
+            size = min(size * GROWTH, self.world_count)
+        if size not in self._graphed_starts:
+            graph = GraphedStart(self._start_and_sort, size, self.device)
+            self._graphed_starts[size] = graph
+        return self._graphed_starts[size]
 
     @torch.no_grad()
     @makes_plain_tensors
@@ -260,11 +276,7 @@ class BatchedWorlds(WorldState):
     @torch.no_grad()
     @makes_plain_tensors
     def reseed(self, worlds: NDArray[np.int64], observation: Tensor) -> None:
-        """Restart the particles of worlds, indices [B'], within their episodes.
-
-        Rewards, flags and step counts stay. The worlds' rows of the observation, [B, ...], are
-        overwritten.
-        """
+        """Restart the particles of worlds, indices [B'], within their episodes, unrewarded."""
         self._host_is_current = False
         index, rewards = to_device_async(worlds, self.device), self.particle_rewards
         before, elapsed = self.report.copy(), self.elapsed.clone()
@@ -281,14 +293,10 @@ class BatchedWorlds(WorldState):
             self.host_numbers.copy_(self.report.numbers)
 
     def step(self, action: Tensor, out: Tensor | None = None) -> tuple[NDArray[np.uint8], Tensor]:
-        """Apply actions to all worlds; return their endings, [B], and observations, [B, ...].
+        """Apply actions; return endings, [B], and observations, [B, ...], in `out` if it is given.
 
         The host reads the endings, one byte per world, and the report of a single world. On CUDA
         evaluation and neighbour search overlap, and the device perceives while the host reads.
-
-        Args:
-            action: Float32, shape [B, ...], on any device.
-            out: Where to write the observations; None: a new tensor.
 
         Raises:
             DivergedError: An action is not finite; worlds and report are not changed.
@@ -424,11 +432,7 @@ class BatchedWorlds(WorldState):
         return torch.from_numpy(self._host_perceived.numpy().copy())
 
     def handle_diverged(self, endings: NDArray[np.uint8], observation: Tensor) -> NDArray[np.uint8]:
-        """Apply `on_divergence` to worlds that diverged; costs nothing if none did.
-
-        Returns:
-            Flags of endings, [B], without DIVERGED where a divergence ends no episode.
-        """
+        """Apply `on_divergence` to worlds that diverged; return the endings, [B], that remain."""
         on_divergence = self.task.config.on_divergence
         diverged = endings & DIVERGED != 0
         if on_divergence == "terminate" or not diverged.any():
@@ -472,61 +476,26 @@ class BatchedWorlds(WorldState):
         )
 
 
-GROWTH = 4
-"""Factor between the numbers of worlds that captured restarts serve."""
+class GraphedStart:
+    """Starts the next episodes of worlds by one CUDA graph, instead of some hundred launches.
 
-
-class GraphedResets:
-    """Starts the next episodes of worlds, on CUDA by one graph launch instead of some hundred.
-
-    A graph serves a fixed number of worlds. If fewer restart, the last index is repeated, and that
-    world is started in the same way several times. Only a weak reference to `start` is kept.
+    It serves a fixed number of worlds. If fewer restart, the last index is repeated, and that world
+    is started in the same way several times. Only a weak reference to `start` is kept.
     """
 
     def __init__(
-        self,
-        start: Callable[[Tensor], NeighbourState],
-        world_count: int,
-        device: torch.device,
-        *,
-        captured: bool,
+        self, start: Callable[[Tensor], NeighbourState], size: int, device: torch.device
     ) -> None:
         self._start = WeakFunction(start)
-        self._world_count = world_count
-        self._device = device
-        self._captured = captured and device.type == "cuda"
-        self._graphs: dict[int, _GraphedReset] = {}
+        self._worlds = torch.zeros(size, dtype=torch.int64, device=device)
+        self._replay = GraphedCallable(self._run, device)
 
-    def __getstate__(self) -> dict[str, Any]:
-        # Graphs cannot be pickled.
-        return self.__dict__ | {"_graphs": {}}
-
-    @makes_plain_tensors
     def __call__(self, worlds: NDArray[np.int64], observation: Tensor) -> None:
         """Start the next episodes of worlds, indices [B']; write what they perceive, [B, N, P]."""
-        if not self._captured:
-            self._start()(to_device_async(worlds, self._device)).perceive(observation)
-            return
-        size = 1
-        while size < len(worlds):
-            size = min(size * GROWTH, self._world_count)
-        if size not in self._graphs:
-            self._graphs[size] = _GraphedReset(self._start, size, self._device)
-        graph, filled = self._graphs[size], np.pad(worlds, (0, size - len(worlds)), mode="edge")
-        graph.worlds.copy_(to_device_async(filled, self._device))
-        graph.replay()
-        graph.neighbours.perceive(observation)
-
-
-class _GraphedReset:
-    """A CUDA graph that starts episodes in a fixed number of worlds."""
-
-    neighbours: NeighbourState
-
-    def __init__(self, start: WeakFunction, size: int, device: torch.device) -> None:
-        self._start = start
-        self.worlds = torch.zeros(size, dtype=torch.int64, device=device)
-        self.replay = GraphedCallable(self._run, device)
+        filled = np.pad(worlds, (0, len(self._worlds) - len(worlds)), mode="edge")
+        self._worlds.copy_(to_device_async(filled, self._worlds.device))
+        self._replay()
+        self._neighbours.perceive(observation)
 
     def _run(self) -> None:
-        self.neighbours = self._start()(self.worlds)
+        self._neighbours: NeighbourState = self._start()(self._worlds)

@@ -195,7 +195,7 @@ class RuleDrivenTask(PictureEnvTask[AnyPicture]):
         raise NotImplementedError
 
     def episode_context(self, start: Start, loss: Tensor, random: WorldRandom) -> Any:
-        """Return what later observations and rewards need to know of B episodes' starts.
+        """Return what observations and rewards need of the starts of B episodes.
 
         It is a named tuple of tensors, [B, ...]; `loss` are the losses at the starts, [B].
         """
@@ -281,7 +281,7 @@ class GardenTask(RuleDrivenTask[Config], GrownTask[Config]):
         return particles
 
     def episode_context(self, start: Start, loss: Tensor, random: WorldRandom) -> Any:
-        """Return each grown picture's loss [B], and its rise [B] if all states became 0 (grey)."""
+        """Return the loss of each grown picture, and its rise if all states became 0: grey."""
         blank = torch.zeros_like(start.s)
         grey = sum(self.losses(start.x, blank).values(), torch.zeros_like(loss))
         # The loss of a picture that did not grow may not rise at all.
@@ -307,9 +307,7 @@ class GardenTask(RuleDrivenTask[Config], GrownTask[Config]):
         return observed.clamp(-OBSERVATION_LIMIT, OBSERVATION_LIMIT)
 
     def observed_picture(self, particles: Particles) -> Tensor:
-        """Return the picture that the loss compares, [B, R, R, 4]; with `observe_error` also the
-        target's picture minus it.
-        """
+        """Return pictures, [B, R, R, 4]; with `observe_error` also the target's minus them."""
         picture = self.task.picture(particles.x, particles.s)
         if not self.config.observe_error:
             return picture
@@ -318,15 +316,21 @@ class GardenTask(RuleDrivenTask[Config], GrownTask[Config]):
     def moments(self, particles: Particles) -> Tensor:
         """Return first and second moments of positions and states, [B, 5 + 3 C].
 
-        The mean x, y; then, relative to it, the means of x², x y, y², and of s, x s, y s for each
-        channel.
+        `moments_of` the positions; then, relative to their mean, the means of s, x s and y s for
+        each channel.
         """
-        s, mean = particles.s, world_mean(particles.x)
-        away = particles.x - mean[:, None]
-        across, up = away[..., :1], away[..., 1:]
-        seconds = torch.cat((across * across, across * up, up * up), dim=-1)
-        values = torch.cat((seconds, s, across * s, up * s), dim=-1)
-        return torch.cat((mean, world_mean(values)), dim=-1)
+        x, s, *_ = particles
+        away = x - world_mean(x)[:, None]
+        values = torch.cat((s, away[..., :1] * s, away[..., 1:] * s), dim=-1)
+        return torch.cat((moments_of(x), world_mean(values)), dim=-1)
+
+
+def moments_of(x: Tensor) -> Tensor:
+    """Return mean x, y and, relative to it, the means of x², x y, y², shape [B, 5]."""
+    mean = world_mean(x)
+    across, up = (x - mean[:, None]).unbind(dim=-1)
+    seconds = torch.stack((across * across, across * up, up * up), dim=-1)
+    return torch.cat((mean, world_mean(seconds)), dim=-1)
 
 
 class GardenEnv(NPAEnv):

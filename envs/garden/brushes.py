@@ -37,7 +37,7 @@ TOOLS = ("push", "wipe", "inject", "rate")
 class GardenConfig(GrownConfig):
     """`GrownConfig` with the brushes and the form of observations."""
 
-    words = GrownConfig.words | {
+    choices = GrownConfig.choices | {
         "reward": get_args(GardenReward),
         "actions": get_args(BrushActions),
         "observe": get_args(Observe),

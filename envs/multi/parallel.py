@@ -63,22 +63,15 @@ class CrowdEnv(AgentsEnv, KnownAgents):
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], Infos]:
-        """Start an episode with all agents; return observations, and losses with their terms.
-
-        A seed begins its sequence of episodes; None starts the next episode of the current
-        sequence. There are no options.
-        """
+        """Start an episode as `NPAEnv.reset` does; return all agents' observations and infos."""
         observation = self._start(np.arange(1), seed, seed)
         self._update_agents()
         infos = self._infos(self.worlds.agent_returns.loss_infos())
         return self._by_agent(observation), infos
 
     def step(self, actions: Mapping[str, Any]) -> Outcome:
-        """Apply an action of each live agent, and remove agents that ended from the world.
-
-        Returns:
-            Observations, rewards, terminations, truncations and infos, by the names of the agents
-            that acted.
+        """Apply an action of each live agent; return results of these agents, and remove those that
+        ended from the world.
 
         Raises:
             NPAError: There is no world yet, or an action is missing, superfluous, or of another

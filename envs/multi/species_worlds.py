@@ -1,6 +1,6 @@
 """Worlds of several species: episodes, rewards, and removal of agents' particles.
 
-A single world is a batch of one. World k of a batch is the same as alone, bit for bit.
+A single world is a batch of one. Results of a world do not depend on the others, bit for bit.
 """
 
 from __future__ import annotations
@@ -142,10 +142,6 @@ class SpeciesWorlds(WorldState):
     Removed particles are not computed. Worlds with the same remaining particles are stepped
     together, as a `Cohort`: the whole batch as long as no agent has been removed. Agents are
     species, or particles with `by_particle`.
-
-    Raises:
-        NPAError: There is no such task, a keyword is unknown or wrong, or the worlds do not fit
-            into memory.
     """
 
     @makes_plain_tensors
@@ -228,12 +224,9 @@ class SpeciesWorlds(WorldState):
     @torch.no_grad()
     @makes_plain_tensors
     def step(self, action: Tensor) -> AgentOutcome:
-        """Apply actions, compute rewards, and remove agents that ended from their worlds.
+        """Apply finite actions, [B, N, A], compute rewards, and remove agents that ended.
 
-        The host reads whether each agent is out of bounds, one byte an agent.
-
-        Args:
-            action: Finite, on the device, shape [B, N, A]; ignored for agents that ended.
+        The host reads whether each agent is out of bounds, one byte per agent.
 
         Raises:
             DivergedError: An agent is out of bounds, and `on_divergence` is "raise".
@@ -304,10 +297,9 @@ class SpeciesWorlds(WorldState):
         return self._measure_unrewarded()
 
     def _measure_unrewarded(self) -> Tensor:
-        """Measure the losses anew, without a reward; return what particles perceive."""
+        """Measure the losses again, without a reward; return what particles perceive."""
         self.agent_returns.replace(self.loss_terms())
-        perceived: Tensor = self.perception()
-        return perceived
+        return self.perception()
 
     def population(self, world: int) -> Population:
         """Return the remaining particles of the world of this index."""
@@ -404,7 +396,7 @@ class SpeciesWorlds(WorldState):
         return cohorts
 
     def _disband(self) -> None:
-        """Copy the cohorts' particles to the batch; group the worlds anew at the next use."""
+        """Copy the cohorts' particles to the batch; group the worlds again at the next use."""
         self._collect()
         self._cohorts = None
 

@@ -41,7 +41,7 @@ MAX_COUNT = 64
 class SpeciesConfig(WorldConfig):
     """Fields of all tasks of several species; a task adds its own."""
 
-    words = WorldConfig.words | {
+    choices = WorldConfig.choices | {
         "perception": get_args(Perception),
         "reward": get_args(SpeciesReward),
         "on_divergence": get_args(SpeciesOnDivergence),

@@ -206,7 +206,7 @@ class CoMorphogenesisTask(PictureLossTask):
 class InvasionConfig(OnePictureConfig):
     """`OnePictureConfig` with `opponent`, who plays the invaders; refuses reward="team"."""
 
-    words = OnePictureConfig.words | {"opponent": (None, "random")}
+    choices = OnePictureConfig.choices | {"opponent": (None, "random")}
 
     opponent: str | None = None
     """Who plays the invaders: None: agents; "random": the environment, with actions uniform in

@@ -62,9 +62,6 @@ class MultiSpeciesVectorEnv(AgentsEnv):
             first observation, and the last one is in `infos[species]["final_obs"]`; "disabled":
             `reset(options={"reset_mask": ...})` starts it.
         config: Fields of the task's configuration.
-
-    Raises:
-        NPAError: A name is unknown, a value wrong, or the worlds do not fit into memory.
     """
 
     def __init__(
@@ -107,26 +104,17 @@ class MultiSpeciesVectorEnv(AgentsEnv):
     def reset(
         self, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[ByAgent, Infos]:
-        """Start episodes with all species; return observations and infos of all worlds.
-
-        Arguments are those of `NPAVectorEnv.reset`.
-        """
+        """Start episodes as `NPAVectorEnv.reset` does; return all observations and infos."""
         chosen = worlds_to_reset(options, self.world_count, started=self._started)
         first = int(seed) if isinstance(seed, int | np.integer) else None
         observation, worlds = self._start(chosen, seed, first), self.worlds
         return self._rows(observation), self._infos(worlds.agent_returns.loss_infos(), worlds.live)
 
     def step(self, actions: Mapping[str, Any]) -> BatchOutcome:
-        """Apply every species' actions, shape [B, N_k, A], in [-1, 1], in all worlds.
+        """Apply every species' actions, shape [B, N_k, A]; errors are those of `CrowdEnv.step`.
 
         Returns:
             Observations, rewards (float32), terminations, truncations and infos.
-
-        Raises:
-            NPAError: An action is missing, superfluous or of another shape, or with
-                autoreset_mode="disabled" a world's episode is over; the worlds are not changed.
-            DivergedError: An action is not finite, and the worlds are not changed; or an agent is
-                out of bounds, and `on_divergence` is "raise".
         """
         if not self._started:
             raise NPAError("step needs worlds: call reset first")
