@@ -58,7 +58,7 @@ class GardenerTask(GardenTask[Gardener2DEnvConfig]):
     config_type = Gardener2DEnvConfig
 
     def disturb(self, particles: Particles, random: WorldRandom) -> Particles:
-        """Return worlds after a gust and a blight, drawn from a random stream of their own."""
+        """Return worlds after a gust and a blight, drawn from a separate random stream."""
         x, s, *_ = particles
         config, draws = self.config, random.substream(StreamId.DAMAGE)
         chance, angle = draws.uniform(2), 2.0 * math.pi * draws.uniform(1)

@@ -38,8 +38,6 @@ class GrownConfig(Morphogenesis2DEnvConfig):
     """Alternative to a rule, as the end of an error's message."""
 
     seed_pool: int = 4
-    """Number of grown worlds, each made once, that episodes start from; 0: each start grows a new
-    one in `grow_steps` steps of the rule."""
 
     rule: str | None = None
     """Name or file of the rule that grows the worlds; None: `heart-first` for the target "heart",

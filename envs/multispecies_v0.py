@@ -145,7 +145,7 @@ class MultiSpeciesEnv(CrowdEnv):
     ## Rendering
 
     As in [`npa/Morphogenesis2D-v0`](Morphogenesis2D.md#rendering). With `render_style="species"`
-    each species has a colour of its own.
+    each species has another colour.
 
     ## Arguments
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from npa_envs.envs.core.config import plain
+from npa_envs.envs.core.config import as_python
 from npa_envs.envs.multi.parallel import CrowdEnv, in_turns, register
 from npa_envs.envs.multi.tasks import task_type
 from npa_envs.errors import NPAError
@@ -60,12 +60,12 @@ class ParticlesEnv(CrowdEnv):
     |---|---|---|
     | mixing | 1 minus the entropy around it | `separation` |
     | segregation | the entropy around it | `mixture` |
-    | co_morphogenesis | its share of its species' splat loss | `picture` |
-    | invasion | species 0: its share of the splat loss; others: -Σ / their number | `picture` |
-    | symbiosis | its share of the splat loss of all particles | `picture` |
+    | co_morphogenesis | its part of its species' splat loss | `picture` |
+    | invasion | species 0: its part of the splat loss; others: -Σ / their number | `picture` |
+    | symbiosis | its part of the splat loss of all particles | `picture` |
 
-    A share comes from the errors of the pixels that a particle covers. Errors of pixels that no
-    particle covers are shared equally. The mean of all shares is the splat loss, up to rounding,
+    A part comes from the errors of the pixels that a particle covers. Errors of pixels that no
+    particle covers are divided equally. The mean of all parts is the splat loss, up to rounding,
     and Σ is their sum. With `reward="team"` every particle gets the mean of all rewards. In an
     invasion rewards sum to zero.
 
@@ -114,7 +114,7 @@ def parallel_env(task: str = "mixing", species_count: int = 2, **config: Any) ->
         species_count: Species S; `info["species"]` is each particle's.
         config: Fields of the task's configuration.
     """
-    if not plain(config.get("particle_counts")):
+    if not as_python(config.get("particle_counts")):
         config.setdefault("particle_count", PARTICLE_COUNT)
     return ParticlesEnv(task, species_count=species_count, **config)
 

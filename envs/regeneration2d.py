@@ -56,7 +56,6 @@ class Regeneration2DEnvConfig(GrownConfig):
     "picture" starts from the target's own points instead, with blank hidden states."""
 
     seed_pool: int = 256
-    """Number of grown worlds, each made once, that episodes start from; 0: each grows a new one."""
 
     split_damage: bool = True
     """Whether split="test" draws other damage than "train", also with the same seeds of `reset`."""

@@ -73,16 +73,11 @@ class Shapeshifter2DEnvConfig(PictureConfig):
     grow_steps: int = 64
     """Steps of the rule from the seed to the start of an episode."""
 
-    seed_pool: int = 16
-    """Number of grown worlds, made once, that episodes start from; 0: each start grows a new one in
-    `grow_steps` steps of the rule."""
-
-    resolution: int = 32
-    """Pixels on each side of the picture that the loss compares, R."""
-
     picture_size: int = 8
     """Pixels on each side of the observed pictures, G; a divisor of `resolution`."""
 
+    seed_pool: int = 16
+    resolution: int = 32
     seed_radius: float = 0.4
 
     def __post_init__(self) -> None:
@@ -250,10 +245,9 @@ class Shapeshifter2DEnv(NPAEnv):
 
     The default rule, `seven-pictures`, was trained on the package's seven drawings in small worlds
     on a CPU. It recolours a grown picture at once, but hardly changes its shape.
-    `npa_envs.agents.shapeshifting.RecognisingShapeshifter` gives the goal's code and gets −0.03 a
-    step, random actions get −0.37 (means of 8 episodes). For other rules: `npa-envs train
-    morphogenesis2d --targets ...`, then `rule="PATH"` with the rule's own `state_dim`, `eps` and
-    `eps0`, and `particle_count` as it was trained.
+    `npa_envs.agents.shapeshifting.RecognisingShapeshifter` gives the goal's code and gets −0.03 per
+    step, random actions get −0.37 (means of 8 episodes). Other rules, of `npa-envs train
+    morphogenesis2d --targets ...`, need their own `state_dim`, `eps`, `eps0` and `particle_count`.
 
     ## Observation space
 
@@ -281,10 +275,6 @@ class Shapeshifter2DEnv(NPAEnv):
     The rule has grown one of its pictures, drawn at random, for `grow_steps` steps from a disk of
     blank particles. The first goal is another one. With the default `seed_pool=16` there are
     sixteen such worlds, made at the first reset.
-
-    ## Episode end
-
-    `success_loss` is None by default: there is always another goal.
 
     ## Info
 

@@ -222,7 +222,7 @@ class _GoalReward:
     def compute_reward(
         self, achieved_goal: Any, desired_goal: Any, info: Mapping[str, Any] | Any
     ) -> NDArray[np.float64] | Any:
-        """Return the rewards for achieved and desired goals, [3] or [..., 3], also of no episode."""
+        """Return the rewards for any achieved and desired goals, shape [3] or [..., 3]."""
         # By torch, as in steps: NumPy's square roots round differently on some processors.
         achieved = torch.tensor(np.asarray(achieved_goal))
         desired = torch.tensor(np.asarray(desired_goal))
@@ -237,10 +237,9 @@ class Shepherd2DEnv(_GoalReward, GardenEnv):
 
     A trained rule has grown a picture, the creature, from N particles and keeps stepping them. The
     agent brings it to a goal by brushes on a grid that moves with the creature; they push, or have
-    the effects of other `tools`. Too hard a push tears it; the rule heals what it can.
-
-    Observations are those of goal-conditioned environments, with `compute_reward` for other goals,
-    so Hindsight Experience Replay works, for example Stable-Baselines3's `HerReplayBuffer`.
+    the effects of other `tools`. Too hard a push tears it; the rule heals what it can. Observations
+    are those of goal-conditioned environments, with `compute_reward` for other goals, so Hindsight
+    Experience Replay works, for example Stable-Baselines3's `HerReplayBuffer`.
 
     ## Observation space
 

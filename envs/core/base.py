@@ -140,6 +140,8 @@ class ShownEnv:
 
     def _pictures(self) -> NDArray[np.uint8] | None:
         """Return a picture of each world, uint8, [B, R, R, 3], if `render_mode` is "rgb_array"."""
+        if not self._started:
+            raise NPAError("render needs worlds: call reset first")
         if self.config.render_mode is None:
             gymnasium.logger.warn(
                 "render() draws nothing without a render_mode: make the environment with "

@@ -207,7 +207,7 @@ class WorldConfig:
             if name not in known:
                 hint = cls.elsewhere.get(name) or suggest(name, [*known, *cls.taken_by_make])
                 raise UnknownKeywordError(f"got an unexpected keyword argument {name!r}: {hint}")
-        return cls(**{name: plain(value) for name, value in keywords.items()})
+        return cls(**{name: as_python(value) for name, value in keywords.items()})
 
     def as_config(self, config_type: type[TaskConfig], **changes: Any) -> TaskConfig:
         """Return a training task's configuration: the fields that both have, and `changes`."""
@@ -303,10 +303,10 @@ def check_picture_size(config: Any) -> None:
     check_field(config, "picture_size", config.resolution % config.picture_size == 0, rule, hint)
 
 
-def plain(value: Any) -> Any:
+def as_python(value: Any) -> Any:
     """Return a keyword's value with NumPy numbers as Python's, lists and arrays as tuples."""
     if isinstance(value, np.generic | np.ndarray | Tensor):
         value = value.tolist()
     if isinstance(value, Sequence) and not isinstance(value, str):
-        return tuple(plain(entry) for entry in value)
+        return tuple(as_python(entry) for entry in value)
     return value

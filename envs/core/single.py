@@ -13,7 +13,7 @@ from torch import Tensor
 
 from npa_envs.checks import number_tensor
 from npa_envs.envs.core.base import WorldsEnv
-from npa_envs.envs.core.config import plain
+from npa_envs.envs.core.config import as_python
 from npa_envs.envs.core.step_report import reason
 from npa_envs.envs.core.vector import check_options, rng_keys
 from npa_envs.errors import NPAError
@@ -134,7 +134,7 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
         A seed begins its sequence of episodes; None starts the next episode of the current
         sequence. There are no options.
         """
-        seed = plain(seed)
+        seed = as_python(seed)
         check_options(options, ())
         super().reset(seed=seed)
         if self._is_unrewarded:

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from npa_envs.checks import check_count, number_tensor
 from npa_envs.envs.core.base import WorldsEnv
-from npa_envs.envs.core.config import plain
+from npa_envs.envs.core.config import as_python
 from npa_envs.envs.core.step_report import StepReport, reason
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.world.cuda_graph import to_device_async
@@ -108,7 +108,7 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
             options: `{"reset_mask": mask}` resets only the worlds where the mask, bool, shape [B],
                 is True; the others do not change.
         """
-        seed = plain(seed)
+        seed = as_python(seed)
         super().reset(seed=seed if isinstance(seed, int) else None)
         chosen = worlds_to_reset(options, self.num_envs, started=self._started)
         keys = None
@@ -181,8 +181,6 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Return a picture of each world, shape [R, R, 3], with the render mode "rgb_array"."""
-        if not self._started:
-            raise NPAError("render needs worlds: call reset first")
         pictures = self._pictures()
         return None if pictures is None else tuple(pictures)
 
@@ -264,7 +262,7 @@ def vector_class(env_type: type[WorldsEnv], *mixins: type[Any]) -> type[NPAVecto
 
 def checked_count(name: str, value: Any) -> int:
     """Return the argument of this name, checked: a whole number of at least 1."""
-    count = plain(value)
+    count = as_python(value)
     check_count(name, count, f": for example {name}=8")
     return int(count)
 

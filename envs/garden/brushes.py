@@ -50,8 +50,6 @@ class GardenConfig(GrownConfig):
     particle_count: int = 512
 
     resolution: int = 32
-    """Pixels on each side of the pictures that the loss compares, R."""
-
     seed_pool: int = 16
 
     state_scale: float = 0.5
@@ -107,10 +105,9 @@ class GardenConfig(GrownConfig):
         check_rule_driven(self)
         check_flag(self, "observe_error")
         tools, channels, count = self.tools, self.inject_channels, self.state_dim
-        some = isinstance(tools, tuple) and bool(tools) and all(tool in TOOLS for tool in tools)
-        check_field(self, "tools", some, f"be some of {TOOLS}", "try ('push',)")
-        is_sorted = tools == tuple(tool for tool in TOOLS if tool in tools)
-        check_field(self, "tools", is_sorted, f"be in the order of {TOOLS}, each once", "sort them")
+        known = isinstance(tools, tuple) and tools == tuple(t for t in TOOLS if t in tools)
+        rule = f"be some of {TOOLS}, in this order"
+        check_field(self, "tools", known and bool(tools), rule, "try ('push',)")
         whole = isinstance(channels, tuple) and bool(channels) and all(map(is_whole, channels))
         differ = whole and len({channel % count for channel in channels}) == len(channels)
         check_field(self, "inject_channels", differ, "be different whole numbers", "try (-1,)")

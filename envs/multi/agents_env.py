@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.envs.core.base import ShownEnv, action_tensor
-from npa_envs.envs.core.config import plain
+from npa_envs.envs.core.config import as_python
 from npa_envs.envs.core.vector import rng_keys
 from npa_envs.envs.multi.species_worlds import SpeciesWorlds
 from npa_envs.errors import DivergedError, NPAError, shown
@@ -28,12 +28,12 @@ class AgentsEnv(ShownEnv):
         "render_fps": 25,
         "is_parallelizable": True,
     }
+    worlds: SpeciesWorlds
 
     def __init__(
         self, task: str, keywords: dict[str, Any], world_count: int, *, by_particle: bool
     ) -> None:
         self.worlds = worlds = SpeciesWorlds(task, keywords, world_count, by_particle=by_particle)
-        """The batch of worlds."""
         self._task_name = task
         self.config = worlds.config
         self.render_mode = self.config.render_mode
@@ -44,17 +44,21 @@ class AgentsEnv(ShownEnv):
         self.possible_agents = [f"{word}_{k}" for k in range(count)]
         """Names of the agents."""
         physics, limits = worlds.physics, worlds.physics.limits
-        self._observation_spaces: dict[str, Box] = {}
-        self._action_spaces: dict[str, Box] = {}
+        self.single_observation_spaces: dict[str, Box] = {}
+        self.single_action_spaces: dict[str, Box] = {}
         for agent, span in zip(self.possible_agents, worlds.spans[:count], strict=True):
             rows = () if by_particle else (span.stop - span.start,)
             limit, observed = limits.perception, (*rows, worlds.perception_dim)
-            self._observation_spaces[agent] = Box(-limit, limit, observed, np.float32)
-            self._action_spaces[agent] = Box(-1.0, 1.0, (*rows, physics.action_dim), np.float32)
+            self.single_observation_spaces[agent] = Box(-limit, limit, observed, np.float32)
+            self.single_action_spaces[agent] = Box(
+                -1.0, 1.0, (*rows, physics.action_dim), np.float32
+            )
         # Position, state, present.
         high = [limits.position] * physics.space_dim + [limits.state] * physics.state_dim
         upper = np.tile(np.array([*high, 1.0], np.float32), (worlds.particle_count, 1))
-        self._state_space = Box(upper * np.array([-1.0] * len(high) + [0.0], np.float32), upper)
+        lower = upper * np.array([-1.0] * len(high) + [0.0], np.float32)
+        self.single_state_space = Box(lower, upper)
+        """Space of one world's `state`: float32, shape [N, 2 + C + 1]."""
         self.np_random: np.random.Generator | None = None
 
     def _start(self, worlds: NDArray[np.int64], seed: Any, key_seed: Any) -> Tensor:
@@ -65,10 +69,10 @@ class AgentsEnv(ShownEnv):
         keys, batch = None, self.worlds
         # The first reset may have failed, so that there are no sequences of episodes yet.
         if seed is not None or not self._started:
-            self.np_random, _ = seeding.np_random(plain(key_seed))
+            self.np_random, _ = seeding.np_random(as_python(key_seed))
             keys = rng_keys(seed, batch.world_count, self.np_random)[worlds]
         with batch.device_context():
-            observation: Tensor = batch.start(worlds, keys)
+            observation = batch.start(worlds, keys)
             if len(worlds) < batch.world_count:
                 observation = batch.perception()
         self._started = True
@@ -78,13 +82,7 @@ class AgentsEnv(ShownEnv):
     def _state(self) -> Tensor:
         if not self._started:
             raise NPAError("state needs a world: call reset first")
-        state: Tensor = self.worlds.state()
-        return state
-
-    def _pictures(self) -> NDArray[np.uint8] | None:
-        if not self._started:
-            raise NPAError("render needs a world: call reset first")
-        return super()._pictures()
+        return self.worlds.state()
 
     def _show(self) -> None:
         self._show_in_window(f"{self.metadata['name']}: {self._task_name}")

@@ -54,9 +54,9 @@ class CrowdEnv(AgentsEnv, KnownAgents):
 
     def __init__(self, task: str, keywords: dict[str, Any], *, by_particle: bool) -> None:
         super().__init__(task, keywords, 1, by_particle=by_particle)
-        self.observation_spaces, self.action_spaces = self._observation_spaces, self._action_spaces
-        self.state_space = self._state_space
-        """Space of `state`: float32, shape [N, 2 + C + 1]."""
+        self.observation_spaces = self.single_observation_spaces
+        self.action_spaces = self.single_action_spaces
+        self.state_space = self.single_state_space
         self.agents: list[str] = []
         self._live: list[int] = []
 
@@ -70,8 +70,7 @@ class CrowdEnv(AgentsEnv, KnownAgents):
         return self._by_agent(observation), infos
 
     def step(self, actions: Mapping[str, Any]) -> Outcome:
-        """Apply an action of each live agent; return results of these agents, and remove those that
-        ended from the world.
+        """Apply an action of each live agent; return the results of these agents.
 
         Raises:
             NPAError: There is no world yet, or an action is missing, superfluous, or of another

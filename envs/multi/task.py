@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.checks import check_field, check_non_negative, check_positive, is_whole
-from npa_envs.envs.core.config import WorldConfig, plain
+from npa_envs.envs.core.config import WorldConfig, as_python
 from npa_envs.envs.core.interface import Interface
 from npa_envs.envs.core.task import WorldTask
 from npa_envs.errors import NPAError
@@ -130,7 +130,7 @@ class SpeciesConfig(WorldConfig):
     @classmethod
     def from_keywords(cls, keywords: dict[str, Any]) -> Self:
         """As `WorldConfig.from_keywords`; refuse `particle_count` next to `particle_counts`."""
-        if "particle_count" in keywords and plain(keywords.get("particle_counts")):
+        if "particle_count" in keywords and as_python(keywords.get("particle_counts")):
             raise NPAError(
                 "particle_count and particle_counts exclude each other: "
                 "particle_counts gives the number of each species"
@@ -141,10 +141,7 @@ class SpeciesConfig(WorldConfig):
         counts, species_count = self.particle_counts, self.species_count
         whole = isinstance(counts, tuple) and all(is_whole(count) for count in counts)
         fits = not counts or (whole and len(counts) == species_count and min(counts) >= 1)
-        rule = (
-            f"be {species_count} whole numbers of at least 1, one for each of species_count = "
-            f"{species_count}"
-        )
+        rule = f"be {species_count} whole numbers of at least 1, one for each species"
         hint = f"for example particle_counts={(64,) * species_count}"
         check_field(self, "particle_counts", fits, rule, hint)
         enough = bool(counts) or self.particle_count >= species_count

@@ -83,10 +83,6 @@ class MultiSpeciesVectorEnv(AgentsEnv):
         super().__init__(task, config, self.world_count, by_particle=False)
         self.agents = self.possible_agents
         """All agents, as every species always has arrays."""
-        self.single_observation_spaces = self._observation_spaces
-        self.single_action_spaces = self._action_spaces
-        self.single_state_space = self._state_space
-        """Space of one world's `state`: float32, shape [N, 2 + C + 1]."""
 
     @cached_property
     def observation_spaces(self) -> dict[str, Space[Any]]:

@@ -93,7 +93,7 @@ OF_ONE = {
     functools.partial(make, GARDENER): [
         ({"tell_updated": True}, "actions do not belong to particles"),
         ({"tools": ("pull",)}, "tools must be some of"),
-        ({"tools": ("rate", "push")}, "in the order of"),
+        ({"tools": ("rate", "push")}, "in this order"),
         ({"inject_channels": (16,)}, r"inject_channels must lie in \[-16, 15\]"),
         ({"inject_channels": (-1, 15)}, "inject_channels must be different"),
         ({"picture_size": 7}, "picture_size must divide resolution = 16"),

@@ -12,7 +12,6 @@ from support.refusals import refused
 from support.small_envs import begun, make, make_vec, small
 
 import npa_envs
-from npa_envs.agents.gardening import ScriptedGardener
 from npa_envs.agents.shapeshifting import RecognisingShapeshifter
 from npa_envs.envs import gardeners_v0
 from npa_envs.envs.garden.base import GardenContext
@@ -284,15 +283,6 @@ def test_pettingzoo_finds_nothing_to_complain_of(form):
     parallel_api_test(gardeners_v0.parallel_env(max_cycles=5, **GARDEN, **form), num_cycles=12)
     parallel_seed_test(lambda: gardeners_v0.parallel_env(max_cycles=5, **GARDEN, **form), 2)
     api_test(gardeners_v0.env(max_cycles=5, **GARDEN, **form), num_cycles=12)
-
-
-def test_policies_of_gardens_act_for_either_agent():
-    env = gardeners_v0.parallel_env(**GARDEN)
-    seen, _ = env.reset(seed=0)
-    script = ScriptedGardener(env.garden)
-    left, right = (script(seen[agent]) for agent in env.agents)
-    assert np.array_equal(left, right)
-    assert np.abs(left).max() > 0.0
 
 
 @pytest.mark.skipif(not hasattr(pettingzoo, "make"), reason="PettingZoo has no registry yet")
