@@ -57,30 +57,18 @@ class GardenersEnv(KnownAgents):
     `garden` is the world as a Gymnasium environment. Policies of `npa_envs.agents.gardening` take
     it, and their actions fit either agent: `ScriptedGardener(env.garden)`.
 
-    ## Observation space
+    ## Spaces, starting state and info
 
-    As that of `npa/Gardener2D-v0`, for both agents.
-
-    ## Action space
-
-    As that of `npa/Gardener2D-v0`, for each agent. Every agent has to give an action.
+    As those of `npa/Gardener2D-v0`, for each agent. Every agent has to give an action.
 
     ## Reward
 
     The keeper gets a gardener's reward: 1 for a picture as good as at the start, 0 for one as bad
     as a grey one, and at least −1. The raider gets minus that, so rewards sum to zero.
 
-    ## Starting state
-
-    As that of `npa/Gardener2D-v0`.
-
     ## Episode end
 
     After `max_cycles` steps both agents are truncated. A world that diverges terminates both.
-
-    ## Info
-
-    As that of `npa/Gardener2D-v0`, the same for both agents.
 
     ## Arguments
 

@@ -42,7 +42,7 @@ class MultiSpeciesEnv(CrowdEnv):
     `npa_envs.registration.SPECIES_SIZES` has their keywords. All functions take ids for tasks.
 
     With `opponent="random"` the environment plays the invaders, by actions uniform in [-1, 1], and
-    `species_0` is the only agent. The invaders are perceived and drawn, and are in `state()`.
+    `species_0` is the only agent.
 
     In `parallel_env` all agents act at once. In `env` and `raw_env` they act in turn, by
     PettingZoo's own conversion, and the world moves on after the last one. `env` also clips actions

@@ -305,8 +305,7 @@ class TargetEnvTask(EnvTask[Config]):
     @property
     def pixel_size(self) -> float:
         """Size of a particle in pictures [length units], from the training task."""
-        size: float = self.task.pixel_size
-        return size
+        return float(self.task.pixel_size)
 
     def fresh(self, random: WorldRandom) -> Start:
         """Return the training task's initial worlds, with their goals if it has several."""

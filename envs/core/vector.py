@@ -121,10 +121,9 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
         self._ended[chosen] = False
         which = np.zeros(self.num_envs, dtype=bool)
         which[chosen] = True
-        losses = self.losses_of(self._report_rows(self.worlds.report.copy()))
-        extra = self._returned_values(self.worlds.extra_info())
-        infos = with_masks(losses, self._mask(which)) | with_masks(extra, self._mask(which))
-        return self.spaces.observation_output(observation), infos
+        values = self.losses_of(self._report_rows(self.worlds.report.copy()))
+        values |= self._returned_values(self.worlds.extra_info())
+        return self.spaces.observation_output(observation), with_masks(values, self._mask(which))
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Apply actions, shape [B, N, A]; return a batch [B, ...] of what `NPAEnv.step` returns."""

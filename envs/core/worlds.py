@@ -81,6 +81,7 @@ class BatchedWorlds(WorldState):
         self.goal_task: EnvTask[Any] = self.task.with_goal(self.goal)
         """The task with losses for the worlds' goals."""
 
+        # Episodes.
         limits = [steps for steps in (episode_steps, config.episode_steps) if steps is not None]
         self.episode_steps = min(limits, default=None)
         """Steps after which an episode is truncated; None: never."""
@@ -95,6 +96,7 @@ class BatchedWorlds(WorldState):
         self._start_loss = torch.zeros(world_count, device=device)
         self._success_loss = torch.zeros_like(self._start_loss)
 
+        # Actions and observations.
         self.enabled = torch.ones(1, dtype=torch.uint8, device=device)
         """0 if the last actions were not finite and so not applied, shape [1]."""
         self.diverged = torch.zeros(world_count, dtype=torch.uint8, device=device)
@@ -110,6 +112,7 @@ class BatchedWorlds(WorldState):
         self._host_is_current = False
         """Whether the copy belongs to the last step, and no world restarted since."""
 
+        # Rewards, and what a step reports.
         self.particle_rewards: ParticleRewards | None = None
         """Rewards of single particles, where they have any."""
         if config.per_particle_reward:
@@ -123,6 +126,7 @@ class BatchedWorlds(WorldState):
         self._endings = torch.zeros(world_count + 1, dtype=torch.uint8, device=device)
         self._prepare_report()
 
+        # CUDA graphs of a step and of starts, and a stream beside them.
         self._draw = GraphedCallable(self._actions.draw, device)
         self._evaluate_graph = GraphedCallable(self._evaluate_and_sort, device)
         self._step_graph = GraphedCallable(self._act_and_evaluate, device)
@@ -376,9 +380,8 @@ class BatchedWorlds(WorldState):
     def evaluate(self) -> None:
         """Write rewards, losses and endings for the current particles into `report`."""
         losses = self.goal_task.losses(self.x, self.s)
-        self.write_rewards(
-            torch.stack(checked_losses(self.task, losses, len(self.x), self.term_names))
-        )
+        terms = checked_losses(self.task, losses, len(self.x), self.term_names)
+        self.write_rewards(torch.stack(terms))
         if self.x.is_cuda:
             self.host_endings.copy_(self._endings, non_blocking=True)
             if self.world_count == 1:
