@@ -33,9 +33,16 @@ class ParticlesEnv(CrowdEnv):
     of their species. Each has an entry in five dicts per step, so there are at most 512. For more
     particles, let species be the agents.
 
-    `npa/MixingParticles-v0`, `npa/SegregationParticles-v0`, `npa/CoMorphogenesisParticles-v0`,
-    `npa/InvasionParticles-v0` and `npa/SymbiosisParticles-v0` are ids for `pettingzoo.make`, of
-    PettingZoo 1.27 or newer, once `npa_envs.envs.particles_v0` is imported.
+    | `task` | Id |
+    |---|---|
+    | `"mixing"` | `npa/MixingParticles-v0` |
+    | `"segregation"` | `npa/SegregationParticles-v0` |
+    | `"co_morphogenesis"` | `npa/CoMorphogenesisParticles-v0` |
+    | `"invasion"` | `npa/InvasionParticles-v0` |
+    | `"symbiosis"` | `npa/SymbiosisParticles-v0` |
+
+    The ids are for `pettingzoo.make`, of PettingZoo 1.27 or newer, once
+    `npa_envs.envs.particles_v0` is imported.
 
     ## Observation space
 
@@ -66,6 +73,16 @@ class ParticlesEnv(CrowdEnv):
 
     As for [several species](MultiSpecies.md#episode-end), particle by particle: one that is out of
     bounds leaves the world by itself; all those of a species that `deaths` names end together.
+
+    ## Info
+
+    | Key | In | Value |
+    |---|---|---|
+    | `species` | reset, step | the particle's species, from 0 on |
+    | `loss` | reset, step | its current loss |
+    | `loss_separation`, ... | reset, step | the same by the name of its term, see above |
+    | `reward_separation`, ... | step | its decrease in this step |
+    | `reason` | last step | why the particle's episode ended |
 
     ## Arguments
 

@@ -113,8 +113,9 @@ class RegenerationTask(GrownTask[Regeneration2DEnvConfig]):
             return damaged
         intact, loss = (self._loss(worlds) for worlds in (start, damaged))
         healed = intact + (1.0 - self.config.healed_share) * (loss - intact)
+        never = torch.full_like(intact, -torch.inf)
         is_damaged = loss - intact >= MIN_RISE * intact
-        return damaged._replace(success_loss=torch.where(is_damaged, healed, -torch.inf))
+        return damaged._replace(success_loss=torch.where(is_damaged, healed, never))
 
     def _loss(self, worlds: Start) -> Tensor:
         return total(torch.stack(list(self.losses(worlds.x, worlds.s).values())))

@@ -151,7 +151,7 @@ class SpeciesConfig(WorldConfig):
     def _check_deaths(self) -> None:
         deaths, last = self.deaths, self.species_count - 1
         pairs = isinstance(deaths, tuple) and all(
-            isinstance(pair, tuple) and len(pair) == 2 and all(is_whole(k) for k in pair)
+            isinstance(pair, tuple) and len(pair) == 2 and all(map(is_whole, pair))
             for pair in deaths
         )
         fits = pairs and all(0 <= k <= last and step > 0 for k, step in deaths)

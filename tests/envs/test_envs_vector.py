@@ -165,7 +165,7 @@ SPECIES = {"particle_count": 40, "state_dim": 4, "observation_limit": LIMIT, "up
 
 
 @pytest.mark.parametrize("way", ["terminate", "ignore", "raise"])
-def test_species_that_diverge_are_terminated_named_or_let_be(way, device):
+def test_species_that_diverge_are_terminated_named_or_continue(way, device):
     keywords = SPECIES | {"on_divergence": way, "device": str(device)}
     envs = begun(multispecies_v0.batched("mixing", world_count=2, **keywords))
     action = still(envs)
