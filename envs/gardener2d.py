@@ -1,4 +1,4 @@
-"""`npa/Gardener2D-v0`: an agent with brushes keeps a picture intact against disturbances."""
+"""`npa/Gardener2D-v0`, an environment with brushes: an agent keeps a grown picture intact."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class GardenerTask(GardenTask[Gardener2DEnvConfig]):
     config_type = Gardener2DEnvConfig
 
     def disturb(self, particles: Particles, random: WorldRandom) -> Particles:
-        """Return worlds after a gust and a blight, drawn from a random stream of their own."""
+        """Return worlds after a gust and a blight, drawn from a separate random stream."""
         x, s, *_ = particles
         config, draws = self.config, random.substream(StreamId.DAMAGE)
         chance, angle = draws.uniform(2), 2.0 * math.pi * draws.uniform(1)
@@ -108,10 +108,6 @@ class Gardener2DEnv(GardenEnv):
     The rule has grown an intact picture in `grow_steps` steps from a disk of blank particles. With
     the default `seed_pool=16` there are sixteen grown worlds, made at the first reset, which takes
     some seconds on a CPU. Disturbances differ between episodes.
-
-    ## Episode end
-
-    `success_loss` is None by default: the picture has to be kept for the whole episode.
     """
 
     task_type = GardenerTask

@@ -1,4 +1,4 @@
-"""Two gardeners with opposed aims, as PettingZoo's functions: `parallel_env`, `env`, `raw_env`.
+"""Two agents with brushes and opposed aims, as PettingZoo's `parallel_env`, `env` and `raw_env`.
 
 Importing this module registers `npa/Gardeners-v0` with PettingZoo (1.27 or newer).
 """
@@ -26,7 +26,7 @@ class _BothSpaces(BrushSpaces):
     """Spaces of one gardener, and conversion of both gardeners' actions."""
 
     def action(self, action: Any, world_count: int | None) -> Tensor:
-        """Return the rows of both gardeners' brushes, shape [B, 2 K, W]."""
+        """Return the rows of both gardeners' brushes, shape [B, 2 J, W]."""
         both = [super(_BothSpaces, self).action(action[agent], world_count) for agent in AGENTS]
         return torch.cat(both, dim=1)
 
@@ -57,38 +57,23 @@ class GardenersEnv(KnownAgents):
     `garden` is the world as a Gymnasium environment. Policies of `npa_envs.agents.gardening` take
     it, and their actions fit either agent: `ScriptedGardener(env.garden)`.
 
-    ## Observation space
+    ## Spaces, starting state and info
 
-    As that of `npa/Gardener2D-v0`, for both agents.
-
-    ## Action space
-
-    As that of `npa/Gardener2D-v0`, for each agent. Every agent has to give an action. One that is
-    missing, of another shape or not finite raises `NPAError` and does not change the world.
+    As those of `npa/Gardener2D-v0`, for each agent. Every agent has to give an action.
 
     ## Reward
 
     The keeper gets a gardener's reward: 1 for a picture as good as at the start, 0 for one as bad
     as a grey one, and at least −1. The raider gets minus that, so rewards sum to zero.
 
-    ## Starting state
-
-    As that of `npa/Gardener2D-v0`. `reset(seed=k)` begins the sequence of episodes that belongs to
-    k, and `reset()` goes on with the next one.
-
     ## Episode end
 
     After `max_cycles` steps both agents are truncated. A world that diverges terminates both.
 
-    ## Info
-
-    As that of `npa/Gardener2D-v0`, the same for both agents.
-
     ## Arguments
 
     `max_cycles`, the steps of an episode, and all arguments of `npa/Gardener2D-v0`. Chances of
-    gusts and blights are 0 by default. An unknown name, or a value out of range, raises an
-    `NPAError` that says what would be right.
+    gusts and blights are 0 by default.
 
     ## Version history
 

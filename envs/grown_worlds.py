@@ -7,10 +7,10 @@ from functools import cached_property
 from typing import Any, ClassVar, TypeVar, get_args
 
 import torch
-from torch import Tensor
 
 from npa_envs.checks import check_field, check_positive
 from npa_envs.envs.core.config import EnvConfig, check_picture_size
+from npa_envs.envs.core.task import Start
 from npa_envs.envs.morphogenesis2d import Morphogenesis2DEnvConfig, PictureEnvTask
 from npa_envs.errors import NPAError, shown
 from npa_envs.rule.files import load_rule, shipped_rules
@@ -32,14 +32,12 @@ FIRST_TEST_SEED = 1_000_000
 class GrownConfig(Morphogenesis2DEnvConfig):
     """`Morphogenesis2DEnvConfig` with the rule that grows worlds, and the pool of worlds."""
 
-    words = EnvConfig.words | {"split": get_args(Split)}
+    choices = EnvConfig.choices | {"split": get_args(Split)}
 
     without_rule: ClassVar[str] = ""
     """Alternative to a rule, as the end of an error's message."""
 
     seed_pool: int = 4
-    """Number of grown worlds, each made once, that episodes start from; 0: each start grows a new
-    one in `grow_steps` steps of the rule."""
 
     rule: str | None = None
     """Name or file of the rule that grows the worlds; None: `heart-first` for the target "heart",
@@ -96,11 +94,11 @@ class GrownTask(PictureEnvTask[Config]):
         """Seed of world 0 of the pool: 0 for split="train", `FIRST_TEST_SEED` for "test"."""
         return 0 if self.config.split == "train" else FIRST_TEST_SEED
 
-    def seed(self, random: WorldRandom) -> tuple[Tensor, Tensor]:
-        """Return worlds that `rule` has grown from seeds: x [B, N, D] and s [B, N, C]."""
-        seeds = Particles(*super().seed(random))
-        x, s, *_ = grow(self.rule, self.config, seeds, random, dt=1.0, position_noise=0.0)
-        return x, s
+    def fresh(self, random: WorldRandom) -> Start:
+        """Return worlds that `rule` has grown from the training task's initial worlds."""
+        x, s, *_ = super().fresh(random)
+        grown = grow(self.rule, self.config, Particles(x, s), random, dt=1.0, position_noise=0.0)
+        return Start(grown.x, grown.s)
 
 
 def run_rule(

@@ -77,11 +77,9 @@ class Morphogenesis2DEnv(NPAEnv):
     A row of the observation is what one particle perceives within the radius ε around it, as
     averages that smoothed particle hydrodynamics (SPH) defines. It does not depend on where the
     particle is, which one it is, or how many steps have passed. So a policy is usually one small
-    network that is applied to every row.
-
-    The task can be solved: update rules trained by gradient do it, and some are shipped.
-    `npa_envs.agents.RulePolicy(npa_envs.load_rule("gecko"), env)` makes a policy of one. The task
-    is 2D morphogenesis of Neural Particle Automata, section 4.1 of the paper below.
+    network that is applied to every row. Update rules trained by gradient solve the task, and some
+    are shipped: `npa_envs.agents.RulePolicy(npa_envs.load_rule("gecko"), env)` makes a policy of
+    one. The task is 2D morphogenesis, section 4.1 of the paper below.
 
     ## Observation space
 
@@ -110,11 +108,11 @@ class Morphogenesis2DEnv(NPAEnv):
     | `2 : 2 + C` | change of the state | `state_scale`, no unit | s ← s + dt `state_scale` a |
 
     In every step each particle is updated with probability `update_prob`, independently of the
-    others. The rows of particles that are not updated are ignored in this step. A displacement
-    longer than 1 is shortened to length 1, and state entries are clipped to [-1, 1]. An action that
-    is not finite raises `NPAError` and does not change the world. An update rule's output [δ; Δs]
-    is the action [δ / (1 + |δ|); Δs / `state_scale`]; see [one step](../mathematics.md#one-step). A
-    policy that explores does better with `state_scale=0.1`: see [training](../training.md).
+    others; the rows of the others are ignored. A displacement longer than 1 is shortened to length
+    1, and state entries are clipped to [-1, 1]. An action that is not finite raises `NPAError` and
+    does not change the world. An update rule's output [δ; Δs] is the action
+    [δ / (1 + |δ|); Δs / `state_scale`]; see [one step](../mathematics.md#one-step). A policy that
+    explores does better with `state_scale=0.1`: see [training](../training.md).
 
     ## Reward
 

@@ -123,17 +123,15 @@ class Morphogenesis3DEnv(NPAEnv):
     ball. At its end they should look like the target: a mushroom, a duck, a rocket, a doughnut, any
     mesh, or a scene given by pictures. Particles are drawn as 3D Gaussians.
 
-    As in `npa/Morphogenesis2D-v0` a particle perceives its neighbourhood within the radius ε, and
-    not its position. The usual policy is one small network that is applied to
-    every row of the observation. Rules are trained by gradient with `npa-envs train
-    morphogenesis3d`; `npa_envs.agents.RulePolicy(npa_envs.load_rule("rule.safetensors"), env)`
-    makes a policy of one. Such a rule also has a network that maps states to the particles' shapes
-    and colours, so give it as `readout` too. Shipped rules need the worlds that they were trained
-    in: `particle_count=16384`, `state_dim=24`, `eps` and `eps0` 0.1, `alpha=1.0`, `seed_radius` 0.7
-    (the mushroom's 0.5), `sigma=0.02`, `opacity=0.15`. The duck needs `particle_count=8192`,
-    `eps` and `eps0` 0.126, `sigma=0.014`, `opacity=0.6`, and views of `resolution=192`: its finer
-    particles are worse than those of the rule `duck-v0` in views of 48 pixels. `duck-v0` needs
-    the same values as the other rules.
+    Particles perceive and policies act as in `npa/Morphogenesis2D-v0`. Rules are trained by
+    gradient with `npa-envs train morphogenesis3d`;
+    `npa_envs.agents.RulePolicy(npa_envs.load_rule("rule.safetensors"), env)` makes a policy of one.
+    Such a rule also has a network that maps states to the particles' shapes and colours, so give it
+    as `readout` too. Shipped rules need the worlds that they were trained in:
+    `particle_count=16384`, `state_dim=24`, `eps` and `eps0` 0.1, `alpha=1.0`, `seed_radius` 0.7
+    (the mushroom's 0.5), `sigma=0.02`, `opacity=0.15`. The duck, other than the older rule
+    `duck-v0`, needs `particle_count=8192`, `eps` and `eps0` 0.126, `sigma=0.014`, `opacity=0.6`,
+    and views of `resolution=192`.
 
     ## Observation space
 
@@ -159,16 +157,14 @@ class Morphogenesis3DEnv(NPAEnv):
     | `0 : 3` | displacement along x, y and z | α ε, a length | x ← x + dt α ε a |
     | `3 : 3 + C` | change of the state | `state_scale`, no unit | s ← s + dt `state_scale` a |
 
-    The rest is as in `npa/Morphogenesis2D-v0`: only particles that are updated act, and
-    displacements longer than 1 are shortened to length 1.
+    The rest is as in `npa/Morphogenesis2D-v0`.
 
     ## Reward
 
     The particles are rendered in front of grey by `view_count` cameras, spread over a sphere. The
     loss L is the mean absolute difference from the target's views, over red, green, blue and alpha.
-    0 is the target. Formulas: [3D morphogenesis](../mathematics.md#3d-morphogenesis).
-
-    A particle's own loss is what its opacity adds to the difference of the views, to first order.
+    0 is the target. A particle's own loss is what its opacity adds to the difference of the views,
+    to first order. Formulas: [3D morphogenesis](../mathematics.md#3d-morphogenesis).
 
     ## Starting state
 

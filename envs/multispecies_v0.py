@@ -1,6 +1,6 @@
 """Species as agents, as PettingZoo's functions (`parallel_env`, `env`, `raw_env`) and `batched`.
 
-Importing this module registers `npa/Mixing-v0` and its like with PettingZoo (1.27 or newer).
+Importing this module registers the ids of `ENVIRONMENTS` with PettingZoo (1.27 or newer).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ class MultiSpeciesEnv(CrowdEnv):
 
     ## Description
 
-    A world has particles of K species in the plane, sorted by species. Each particle has a
+    A world has particles of S species in the plane, sorted by species. Each particle has a
     position and a state of C numbers. The last three numbers, plus 0.5, are its colour. In every
     step each agent moves all of its particles and changes their states.
 
@@ -42,19 +42,19 @@ class MultiSpeciesEnv(CrowdEnv):
     `npa_envs.registration.SPECIES_SIZES` has their keywords. All functions take ids for tasks.
 
     With `opponent="random"` the environment plays the invaders, by actions uniform in [-1, 1], and
-    `species_0` is the only agent. The invaders are perceived and drawn, and are in `state()`.
+    `species_0` is the only agent.
 
     In `parallel_env` all agents act at once. In `env` and `raw_env` they act in turn, by
     PettingZoo's own conversion, and the world moves on after the last one. `env` also clips actions
     into their space. `pettingzoo.make`, of PettingZoo 1.27 or newer, takes the ids once
-    `npa_envs.envs.multispecies_v0` is imported, as `"parallel"` and `"aec"`. `batched` steps
+    `npa_envs.envs.multispecies_v0` is imported. `batched` steps
     [many worlds at once](../species.md#many-worlds-at-once), to train on.
 
     A trained rule is a policy for one species:
-    `npa_envs.agents.RulePolicy(npa_envs.load_rule("gecko"))`. If all species follow the same rule,
-    the episode is a rollout of it. Species disturb each other: after 150 steps of this rule in an
-    invasion with the defaults, the loss of species 0 was 0.66 with invaders that did nothing, 0.85
-    with invaders of the same rule, and 0.94 with random ones (means of three seeds).
+    `npa_envs.agents.RulePolicy(npa_envs.load_rule("gecko"))`. Species disturb each other: after 150
+    steps of this rule in an invasion with the defaults, the loss of species 0 was 0.66 with
+    invaders that did nothing, 0.85 with invaders of the same rule, and 0.94 with random ones (means
+    of three seeds).
 
     ## Observation space
 
@@ -62,7 +62,7 @@ class MultiSpeciesEnv(CrowdEnv):
     particles, always in the same order. The columns are those of
     [`npa/Morphogenesis2D-v0`](Morphogenesis2D.md#observation-space). They do not include species.
 
-    With `perception="per_species"` K (1 + D) more columns follow: the density c² ρ_k / N of each
+    With `perception="per_species"` S (1 + D) more columns follow: the density c² ρ_k / N of each
     species k = 0, 1, ..., and then, species after species, its density gradient, scaled like that
     of all particles. A species that is gone has zeros there. This takes a second pass over the
     world. See [several rules in one world](../species.md#telling-species-apart).
@@ -71,8 +71,8 @@ class MultiSpeciesEnv(CrowdEnv):
 
     `Box(-1, 1, (N_k, A), float32)` with A = 2 + C, for species k. The columns, and what they do,
     are those of [`npa/Morphogenesis2D-v0`](Morphogenesis2D.md#action-space). Every live agent has
-    to give an action, and no other agent may: see `agents`. An action that is missing, superfluous,
-    of another shape or not finite raises `NPAError` and does not change the world.
+    to give an action, and no other agent may: see `agents`. A wrong action, or one that is not
+    finite, raises `NPAError` and does not change the world.
 
     ## Reward
 
@@ -83,26 +83,24 @@ class MultiSpeciesEnv(CrowdEnv):
     | mixing | 1 minus the mean entropy around its particles | `separation` |
     | segregation | the mean entropy around its particles | `mixture` |
     | co_morphogenesis | its particles' splat loss against `targets[k]` | `density`, `colour` |
-    | invasion | L_0: the splat loss of species 0; L_k: -L_0 / (K - 1) | `density`, `colour` |
+    | invasion | L_0: the splat loss of species 0; L_k: -L_0 / (S - 1) | `density`, `colour` |
     | symbiosis | for all: the splat loss of all particles | `density`, `colour` |
 
-    The entropy around a particle is -Σ f_k ln f_k / ln K, where f_k is the fraction of species k
+    The entropy around a particle is -Σ f_k ln f_k / ln S, where f_k is the fraction of species k
     among the SPH-weighted neighbours within ε, itself included. It is 0 with one species within ε,
-    and 1 with equal parts of all. K is the number of species at the start. The splat loss is that
+    and 1 with equal parts of all. S is the number of species at the start. The splat loss is that
     of [`npa/Morphogenesis2D-v0`](Morphogenesis2D.md#reward). It moves a picture's middle onto the
     target's, so the picture's position does not count.
 
-    There is one reward for each species. Rewards of single particles (`reward="particle"` and
-    `"marginal"`), and `tell_updated`, are for environments of one species, and are refused.
-
-    With `reward="team"` every live agent gets the mean of all rewards; the terms in `info` stay its
-    own. In an invasion rewards sum to zero: species 0 gains as much as the live invaders lose, in
-    equal parts. There "team" is refused.
+    There is one reward for each species: `reward="particle"`, `"marginal"` and `tell_updated` are
+    for environments of one species. With `reward="team"` every live agent gets the mean of all
+    rewards; the terms in `info` stay its own. In an invasion, which has no "team", species 0 gains
+    as much as the live invaders lose, in equal parts.
 
     Rewards of an episode sum to its decrease of L_k, except at deaths: taking particles out changes
     the losses of others, and this change is not rewarded. In the step in which a species leaves the
-    world, L_k counts as at least its value at the start plus what deaths added to it, so that
-    leaving is never rewarded. The terms in `info` are not changed by this.
+    world, L_k counts as at least its value at the start plus what deaths added to it; the terms in
+    `info` are not changed by this.
 
     ## Starting state
 
@@ -147,13 +145,13 @@ class MultiSpeciesEnv(CrowdEnv):
     ## Rendering
 
     As in [`npa/Morphogenesis2D-v0`](Morphogenesis2D.md#rendering). With `render_style="species"`
-    each species has a colour of its own.
+    each species has another colour.
 
     ## Arguments
 
-    `task` and `species_count` are positional, all others are keywords. This applies to
-    `parallel_env`, `env`, `raw_env` and `pettingzoo.make`. An unknown name, or a value out of
-    range, raises an `NPAError` that says which values are valid.
+    `task` and `species_count` are positional, all others are keywords of `parallel_env`, `env`,
+    `raw_env` and `pettingzoo.make`. An unknown name, or a value out of range, raises an `NPAError`
+    that says which values are valid.
 
     ## Version history
 
@@ -172,11 +170,8 @@ def parallel_env(
     Args:
         task: "mixing", "segregation", "co_morphogenesis", "invasion" or "symbiosis"; or an id, such
             as "npa/MixingSmall-v0".
-        species_count: Species K: agents `species_0` to `species_{K-1}`; None: 2.
+        species_count: Species S: agents `species_0` to `species_{S-1}`; None: 2.
         config: Fields of the task's configuration; docs/environments/MultiSpecies.md lists them.
-
-    Raises:
-        NPAError: A name is unknown, or a value wrong.
     """
     return MultiSpeciesEnv(**settings(task, species_count, config))
 
@@ -191,8 +186,7 @@ def batched(
 ) -> MultiSpeciesVectorEnv:
     """Return many worlds, stepped together on one device; world k is `parallel_env` by itself.
 
-    Arguments and errors are those of `parallel_env` and `MultiSpeciesVectorEnv`. `device="cuda"`
-    and `output="torch"` keep all arrays on a GPU.
+    Arguments are those of `parallel_env` and `MultiSpeciesVectorEnv`.
     """
     return MultiSpeciesVectorEnv(
         world_count=world_count,

@@ -1,14 +1,13 @@
 """Particles as agents, as PettingZoo's functions: `parallel_env`, `env` and `raw_env`.
 
-Importing this module registers `npa/MixingParticles-v0` and its like with PettingZoo (1.27 or
-newer).
+Importing this module registers the ids of `ENVIRONMENTS` with PettingZoo (1.27 or newer).
 """
 
 from __future__ import annotations
 
 from typing import Any
 
-from npa_envs.envs.core.config import plain
+from npa_envs.envs.core.config import as_python
 from npa_envs.envs.multi.parallel import CrowdEnv, in_turns, register
 from npa_envs.envs.multi.tasks import task_type
 from npa_envs.errors import NPAError
@@ -21,7 +20,7 @@ PARTICLE_COUNT = 64
 """Default number of particles."""
 
 MAX_CROWD = 512
-"""Largest number of agents: each has an entry in five dicts a step."""
+"""Largest number of agents: each has an entry in five dicts per step."""
 
 
 class ParticlesEnv(CrowdEnv):
@@ -31,8 +30,8 @@ class ParticlesEnv(CrowdEnv):
 
     These are the worlds and tasks of [several species](MultiSpecies.md), with the same seeds and
     the same physics. But every particle is an agent: `particle_0`, `particle_1`, ... in the order
-    of their species. `info["species"]` is a particle's species. Each agent has an entry in five
-    dicts a step, so there are at most 512. For more particles, let species be the agents.
+    of their species. Each has an entry in five dicts per step, so there are at most 512. For more
+    particles, let species be the agents.
 
     | `task` | Id |
     |---|---|
@@ -61,12 +60,12 @@ class ParticlesEnv(CrowdEnv):
     |---|---|---|
     | mixing | 1 minus the entropy around it | `separation` |
     | segregation | the entropy around it | `mixture` |
-    | co_morphogenesis | its share of its species' splat loss | `picture` |
-    | invasion | species 0: its share of the splat loss; others: -Σ / their number | `picture` |
-    | symbiosis | its share of the splat loss of all particles | `picture` |
+    | co_morphogenesis | its part of its species' splat loss | `picture` |
+    | invasion | species 0: its part of the splat loss; others: -Σ / their number | `picture` |
+    | symbiosis | its part of the splat loss of all particles | `picture` |
 
-    A share comes from the errors of the pixels that a particle covers. Errors of pixels that no
-    particle covers are shared equally. The mean of all shares is the splat loss, up to rounding,
+    A part comes from the errors of the pixels that a particle covers. Errors of pixels that no
+    particle covers are divided equally. The mean of all parts is the splat loss, up to rounding,
     and Σ is their sum. With `reward="team"` every particle gets the mean of all rewards. In an
     invasion rewards sum to zero.
 
@@ -89,10 +88,6 @@ class ParticlesEnv(CrowdEnv):
 
     Those of [several species](MultiSpecies.md#arguments), of `npa_envs.envs.particles_v0` instead;
     `particle_count` is 64 by default and 512 at most.
-
-    ## Version history
-
-    - v0: first version.
     """
 
     metadata: Any = CrowdEnv.metadata | {"name": "npa_particles_v0"}
@@ -112,14 +107,10 @@ def parallel_env(task: str = "mixing", species_count: int = 2, **config: Any) ->
 
     Args:
         task: "mixing", "segregation", "co_morphogenesis", "invasion" or "symbiosis".
-        species_count: Species K; `info["species"]` is each particle's.
-        config: Fields of the task's configuration; `particle_count` is 64 unless given, and 512 at
-            most.
-
-    Raises:
-        NPAError: A name is unknown, or a value wrong.
+        species_count: Species S; `info["species"]` is each particle's.
+        config: Fields of the task's configuration.
     """
-    if not plain(config.get("particle_counts")):
+    if not as_python(config.get("particle_counts")):
         config.setdefault("particle_count", PARTICLE_COUNT)
     return ParticlesEnv(task, species_count=species_count, **config)
 

@@ -12,7 +12,6 @@ from torch import Tensor
 from npa_envs.checks import check_flag, check_positive
 from npa_envs.envs.core.config import EnvConfig, check_picture_size
 from npa_envs.envs.core.single import NPAEnv
-from npa_envs.envs.core.task import Start
 from npa_envs.envs.core.vector import vector_class
 from npa_envs.envs.core.world_state import OBSERVATION_COPIES
 from npa_envs.envs.morphogenesis2d import PictureConfig, PictureEnvTask
@@ -20,7 +19,6 @@ from npa_envs.errors import NPAError, shown
 from npa_envs.tasks.many_pictures import ManyPictures, named_targets
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2DConfig
 from npa_envs.tasks.targets.digit_clouds import Split
-from npa_envs.world.randomness import WorldRandom
 
 CHANNELS = 4
 """Channels of a pixel: red, green, blue and density."""
@@ -30,7 +28,7 @@ CHANNELS = 4
 class Pictures2DEnvConfig(PictureConfig):
     """`PictureConfig` with several targets, and whether observations show them."""
 
-    words = EnvConfig.words | {"split": get_args(Split)}
+    choices = EnvConfig.choices | {"split": get_args(Split)}
 
     targets: tuple[str, ...] = ("butterfly", "flower", "gecko", "heart", "octopus")
     """Pictures of the split "train": built-in names, emoji, picture files, or folders of such."""
@@ -105,12 +103,6 @@ class PicturesTask(PictureEnvTask[Pictures2DEnvConfig]):
         numbers = OBSERVATION_COPIES * config.particle_count * config.target_dim
         return super().bytes_per_world(config) + 4 * int(numbers)
 
-    def fresh(self, random: WorldRandom) -> Start:
-        """Return the training task's initial worlds, and the indices of their pictures."""
-        x, s, *_, number = self.task.seed(random.world_count, generator=random, device=self.device)
-        # Drops the channels of codes, which only rules of many pictures use.
-        return Start(x, s[..., -self.config.state_dim :].contiguous(), goal=number)
-
     @property
     def pixel_size(self) -> float:
         """Size of a particle in pictures: the spacing of the first target's points."""
@@ -152,10 +144,6 @@ class Pictures2DEnv(NPAEnv):
     Particles are uniform in a disk of radius `seed_radius` around the origin, all states are zero.
     The picture is drawn uniformly from those of the split. After `place_particles` a world keeps
     its picture.
-
-    ## Episode end
-
-    `success_loss` is None by default: growth has no natural end, and the picture should last.
 
     ## Info
 

@@ -15,7 +15,7 @@ from npa_envs import world_mean
 from npa_envs.checks import check_field, check_positive
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
-from npa_envs.envs.core.task import Start, TargetEnvTask
+from npa_envs.envs.core.task import TargetEnvTask
 from npa_envs.envs.core.vector import vector_class
 from npa_envs.envs.grown_worlds import load_readout_rule
 from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
@@ -27,7 +27,6 @@ from npa_envs.tasks.point_classification import (
 )
 from npa_envs.tasks.targets.digit_clouds import Split
 from npa_envs.world.particles import Particles
-from npa_envs.world.randomness import WorldRandom
 
 Score = Literal["error", "cross_entropy", "accuracy"]
 
@@ -38,7 +37,7 @@ class PointClassificationEnvConfig(EnvConfig):
 
     task_config_type = PointClassificationConfig
 
-    words = EnvConfig.words | {"score": get_args(Score), "split": get_args(Split)}
+    choices = EnvConfig.choices | {"score": get_args(Score), "split": get_args(Split)}
 
     particle_count: int = PointClassificationConfig.particle_count
     data: str = PointClassificationConfig.data
@@ -99,11 +98,6 @@ class PointClassificationTask(TargetEnvTask[PointClassificationEnvConfig]):
         rule.load_state_dict(loaded.state_dict())
         return task.for_rule(rule.requires_grad_(False))
 
-    def fresh(self, random: WorldRandom) -> Start:
-        """Return random clouds with all states zero, and their classes."""
-        x, s, *_, label = self.task.seed(random.world_count, generator=random, device=self.device)
-        return Start(x, s, goal=label)
-
     def losses(self, x: Tensor, s: Tensor) -> Mapping[str, Tensor]:
         """Return each world's mean score and weighted overflow of states, by name, [B] each."""
         overflow = self.config.overflow_weight * world_mean(self.task.overflows(s)[..., None])[:, 0]
@@ -155,18 +149,15 @@ class PointClassificationEnv(NPAEnv):
     each of them has to output it. The last `class_count` channels of a state are the particle's
     outputs for class 0, 1, ...: they should be 1 for the digit's own class and 0 for all others.
 
-    A particle perceives its neighbourhood within the radius ε, and the digit is ten times as large,
-    so information has to travel. As in `npa/Morphogenesis2D-v0` the usual policy is one small
-    network that is applied to every row of the observation. Rules are trained by gradient with
-    `npa-envs train point_classification`. Their outputs come from a read-out network. So to
-    run one as a policy, give its file to the environment as well: `gym.make(id,
-    rule="rule.safetensors")` with
-    `npa_envs.agents.RulePolicy(npa_envs.load_rule("rule.safetensors"), env)`. The task is that of
-    Neural Particle Automata, "self-classifying point clouds".
+    The digit is ten times as large as the radius ε of perception, so information has to travel. As
+    in `npa/Morphogenesis2D-v0` the usual policy is one small network that is applied to every row
+    of the observation. Rules are trained by gradient with `npa-envs train point_classification`.
+    Their outputs come from a read-out network, so give a rule's file to the environment as well, to
+    run it as a policy: `gym.make(id, rule="rule.safetensors")` with
+    `npa_envs.agents.RulePolicy(npa_envs.load_rule("rule.safetensors"), env)`.
 
     `data="digits"` needs `pip install 'npa-envs[points]'`; see [point
-    clouds](../point_classification.md) for MNIST and data of your own. The observation space is
-    that of `Morphogenesis2DEnv`.
+    clouds](../point_classification.md) for MNIST and data of your own.
 
     ## Action space
 
@@ -176,8 +167,7 @@ class PointClassificationEnv(NPAEnv):
     |---|---|---|---|
     | `0 : C` | change of the state | `state_scale`, no unit | s ← s + dt `state_scale` a |
 
-    The rest is as in `npa/Morphogenesis2D-v0`: only particles that are updated act, and entries are
-    clipped to [-1, 1].
+    The rest is as in `npa/Morphogenesis2D-v0`.
 
     ## Reward
 
@@ -185,9 +175,8 @@ class PointClassificationEnv(NPAEnv):
     `overflow_weight` times the mean of |s − clip(s, −1, 1)|. Blank states have
     L = 1 / `class_count`. With `score="cross_entropy"` or `"accuracy"` the first term is the mean
     cross-entropy of softmax(`sharpness` × outputs), or the fraction of particles whose largest
-    output is of another class; ties go to the first class.
-
-    A particle's reward is the decrease of its own loss.
+    output is of another class; ties go to the first class. A particle's reward is the decrease of
+    its own loss.
 
     ## Starting state
 

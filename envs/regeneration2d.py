@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from npa_envs.checks import check_flag, check_fraction, check_positive
-from npa_envs.envs.core.rewards_and_ends import total
 from npa_envs.envs.core.single import NPAEnv
+from npa_envs.envs.core.step_report import total
 from npa_envs.envs.core.task import Start
 from npa_envs.envs.core.vector import vector_class
 from npa_envs.envs.grown_worlds import GrownConfig, GrownTask
@@ -17,7 +17,6 @@ from npa_envs.envs.morphogenesis2d import PictureEnvTask
 from npa_envs.errors import shown
 from npa_envs.rule.rule import COLOUR_OFFSET
 from npa_envs.tasks.damage import damage_worlds
-from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import StreamId, WorldRandom
 
 RANDOM_DAMAGE = "random"
@@ -40,7 +39,7 @@ PICTURE = "picture"
 class Regeneration2DEnvConfig(GrownConfig):
     """`GrownConfig` with the damage."""
 
-    words = GrownConfig.words | {"damage": (*SIZES, RANDOM_DAMAGE)}
+    choices = GrownConfig.choices | {"damage": (*SIZES, RANDOM_DAMAGE)}
 
     without_rule = f", or rule={shown(PICTURE)} to start from the target's own points"
 
@@ -57,7 +56,6 @@ class Regeneration2DEnvConfig(GrownConfig):
     "picture" starts from the target's own points instead, with blank hidden states."""
 
     seed_pool: int = 256
-    """Number of grown worlds, each made once, that episodes start from; 0: each grows a new one."""
 
     split_damage: bool = True
     """Whether split="test" draws other damage than "train", also with the same seeds of `reset`."""
@@ -81,49 +79,47 @@ class RegenerationTask(GrownTask[Regeneration2DEnvConfig]):
 
     def __init__(self, config: Regeneration2DEnvConfig, device: torch.device) -> None:
         super().__init__(config, device)
-        self._drawn = config.rule == PICTURE
-        if not self._drawn:
+        self.grows = config.rule != PICTURE
+        if self.grows:
             _ = self.rule
 
-    def seed(self, random: WorldRandom) -> tuple[Tensor, Tensor]:
+    def fresh(self, random: WorldRandom) -> Start:
         """Return grown worlds without damage; if `rule` is "picture", the target's points."""
-        if not self._drawn:
-            return super().seed(random)
-        x, s = PictureEnvTask.seed(self, random)
+        if self.grows:
+            return super().fresh(random)
+        blank = PictureEnvTask.fresh(self, random)
         points, colours = self.task.target.points, self.task.target.colours
         # The numbers of points and particles differ a little: some points repeat or are skipped.
-        chosen = torch.linspace(0, len(points) - 1, x.shape[1], device=x.device).round().long()
-        s[..., -3:] = colours[chosen] - COLOUR_OFFSET
-        return points[chosen].expand_as(x).clone(), s
-
-    @property
-    def start_is_short(self) -> bool:
-        """Whether a start takes few operations: not if it grows a world."""
-        return self._drawn or super().start_is_short
+        chosen = torch.linspace(0, len(points) - 1, blank.x.shape[1], device=self.device)
+        chosen = chosen.round().long()
+        blank.s[..., -3:] = colours[chosen] - COLOUR_OFFSET
+        return blank._replace(x=points[chosen].expand_as(blank.x).clone())
 
     def start(self, random: WorldRandom) -> Start:
         """Return damaged worlds, with the loss at which each counts as healed."""
-        x, s, threshold, _ = super().start(random)
+        start = super().start(random)
         if self.config.split_damage and self.config.split == "test":
             random = random.substream(StreamId.TEST)
         kinds = RANDOM_KINDS if self.config.damage == RANDOM_DAMAGE else (self.config.damage,)
-        chosen = random.integers(len(kinds), 1, 1)
-        intact = damaged = Particles(x, s)
+        chosen, box = random.integers(len(kinds), 1, 1), self.periodic_sides
+        damaged, intact = start, Particles(start.x, start.s)
         for k, kind in enumerate(kinds):
             size = SIZES[kind] if self.config.damage_size is None else self.config.damage_size
-            hurt = damage_worlds(
-                intact, kind=kind, size=size, box=self.periodic_sides, generator=random
+            hurt = damage_worlds(intact, kind=kind, size=size, box=box, generator=random)
+            damaged = damaged._replace(
+                x=torch.where(chosen == k, hurt.x, damaged.x),
+                s=torch.where(chosen == k, hurt.s, damaged.s),
             )
-            damaged = hurt.where(chosen[:, 0, 0] == k, damaged)
-        if threshold is None:
-            least, loss = self._loss(intact), self._loss(damaged)
-            healed = least + (1.0 - self.config.healed_share) * (loss - least)
-            never = torch.full_like(least, -torch.inf)
-            threshold = torch.where(loss - least >= MIN_RISE * least, healed, never)
-        return Start(damaged.x, damaged.s, threshold)
+        if start.success_loss is not None:
+            return damaged
+        before, after = (self._loss(worlds) for worlds in (start, damaged))
+        healed = before + (1.0 - self.config.healed_share) * (after - before)
+        never = torch.full_like(before, -torch.inf)
+        is_damaged = after - before >= MIN_RISE * before
+        return damaged._replace(success_loss=torch.where(is_damaged, healed, never))
 
-    def _loss(self, particles: Particles) -> Tensor:
-        return total(torch.stack(list(self.losses(particles.x, particles.s).values())))
+    def _loss(self, worlds: Start) -> Tensor:
+        return total(torch.stack(list(self.losses(worlds.x, worlds.s).values())))
 
 
 class Regeneration2DEnv(NPAEnv):

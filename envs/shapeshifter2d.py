@@ -1,4 +1,7 @@
-"""`npa/Shapeshifter2D-v0`: choose the code of a rule of many pictures as goals change."""
+"""`npa/Shapeshifter2D-v0`: a rule moves the particles, and the agent chooses its code.
+
+The rule has a code for each of many pictures; the goal picture changes from time to time.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,6 @@ from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from gymnasium.spaces import Box, Discrete, Space
 from torch import Tensor
 
@@ -18,10 +20,10 @@ from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import Start
 from npa_envs.envs.core.vector import vector_class
-from npa_envs.envs.garden.base import RuleDriven
+from npa_envs.envs.garden.base import RuleDrivenTask, coarse
 from npa_envs.envs.garden.brushes import OBSERVATION_LIMIT, GardenReward
 from npa_envs.envs.grown_worlds import check_matches_rule, check_rule_driven, grow, run_rule
-from npa_envs.envs.morphogenesis2d import PictureConfig, PictureEnvTask
+from npa_envs.envs.morphogenesis2d import PictureConfig
 from npa_envs.errors import NPAError
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.picture_codes import Codes
@@ -43,7 +45,10 @@ CodeActions = Literal["code", "choice"]
 class Shapeshifter2DEnvConfig(PictureConfig):
     """`PictureConfig` with the rule of many pictures, and how its goals change."""
 
-    words = EnvConfig.words | {"reward": get_args(GardenReward), "actions": get_args(CodeActions)}
+    choices = EnvConfig.choices | {
+        "reward": get_args(GardenReward),
+        "actions": get_args(CodeActions),
+    }
 
     reward: GardenReward = "dense"
     """"dense": the closeness to the goal in each step; "sparse": that of the last step only."""
@@ -68,16 +73,11 @@ class Shapeshifter2DEnvConfig(PictureConfig):
     grow_steps: int = 64
     """Steps of the rule from the seed to the start of an episode."""
 
-    seed_pool: int = 16
-    """Number of grown worlds, made once, that episodes start from; 0: each start grows a new one in
-    `grow_steps` steps of the rule."""
-
-    resolution: int = 32
-    """Pixels on each side of the picture that the loss compares, R."""
-
     picture_size: int = 8
     """Pixels on each side of the observed pictures, G; a divisor of `resolution`."""
 
+    seed_pool: int = 16
+    resolution: int = 32
     seed_radius: float = 0.4
 
     def __post_init__(self) -> None:
@@ -115,10 +115,10 @@ class CodeSpaces(ParticleSpaces):
         )
 
     def action(self, action: Any, world_count: int | None) -> Tensor:
-        """Return the codes for checked actions, float32, shape [B, 1, K]."""
+        """Return the codes for checked actions, float32, shape [B, 1, code_dim]."""
         count, dim = self._table.shape
         if not self._chosen:
-            code = batch_tensor(action, world_count, (dim,), "K")
+            code = batch_tensor(action, world_count, (dim,), "code_dim")
             return self._limit * code[:, None].clamp(-1.0, 1.0)
         chosen = batch_choices(action, world_count, (), "")
         if not bool(((chosen >= 0) & (chosen < count)).all()):
@@ -126,7 +126,7 @@ class CodeSpaces(ParticleSpaces):
         return self._table.to(chosen.device)[chosen[:, None]]
 
     def actions_of_codes(self) -> Tensor:
-        """Return the action that gives each of the rule's codes with actions="code", [T, K]."""
+        """Return actions="code" that give each of the rule's codes, [codes, code_dim]."""
         return self._table / self._limit
 
 
@@ -140,7 +140,7 @@ class PictureGoals(NamedTuple):
     """All goals of the episode in their order, shape [B, G]."""
 
 
-class ShapeshifterTask(RuleDriven, PictureEnvTask[Shapeshifter2DEnvConfig]):
+class ShapeshifterTask(RuleDrivenTask[Shapeshifter2DEnvConfig]):
     """A picture that a rule has grown has to become others."""
 
     config_type = Shapeshifter2DEnvConfig
@@ -201,7 +201,7 @@ class ShapeshifterTask(RuleDriven, PictureEnvTask[Shapeshifter2DEnvConfig]):
     def step(
         self, x: Tensor, s: Tensor, action: Tensor, random: WorldRandom
     ) -> tuple[Tensor, Tensor]:
-        """Write an action's codes, [B, 1, K], into all states, run the rule, and return x and s."""
+        """Write codes, [B, 1, code_dim], into all states and run the rule; return x and s."""
         coded = Particles(x, self.rule.with_code(s, action))
         x, s, *_ = run_rule(self.rule, self.config, coded, self.config.rule_steps, random)
         return x, s
@@ -226,9 +226,7 @@ class ShapeshifterTask(RuleDriven, PictureEnvTask[Shapeshifter2DEnvConfig]):
         goal_task = self.task.with_goal(context.goal)
         picture = goal_task.picture(particles.x, particles.s)
         both = torch.cat((picture, goal_task.target_picture), dim=-1)
-        pixels = self.config.resolution // self.config.picture_size
-        coarse = F.avg_pool2d(both.permute(0, 3, 1, 2), pixels).flatten(1)
-        return coarse.clamp(-OBSERVATION_LIMIT, OBSERVATION_LIMIT)
+        return coarse(both, self.config.picture_size)
 
 
 class Shapeshifter2DEnv(NPAEnv):
@@ -236,9 +234,9 @@ class Shapeshifter2DEnv(NPAEnv):
 
     ## Description
 
-    A rule of many pictures steps N particles. A code of K numbers, part of each particle's state,
-    determines the picture that they grow ([one rule, many pictures](../beyond.md)). The agent
-    chooses the code. It observes the current picture and the goal's, both coarse, and after
+    A rule of many pictures steps N particles. A code of `code_dim` numbers, part of each particle's
+    state, determines the picture that they grow ([one rule, many pictures](../beyond.md)). The
+    agent chooses the code. It observes the current picture and the goal's, both coarse, and after
     `hold_steps` steps the goal becomes another picture. Observations do not say which code grows
     which picture, and particles need time to rearrange.
 
@@ -247,10 +245,9 @@ class Shapeshifter2DEnv(NPAEnv):
 
     The default rule, `seven-pictures`, was trained on the package's seven drawings in small worlds
     on a CPU. It recolours a grown picture at once, but hardly changes its shape.
-    `npa_envs.agents.shapeshifting.RecognisingShapeshifter` gives the goal's code and gets −0.03 a
-    step, random actions get −0.37 (means of 8 episodes). For other rules: `npa-envs train
-    morphogenesis2d --targets ...`, then `rule="PATH"` with the rule's own `state_dim`, `eps` and
-    `eps0`, and `particle_count` as it was trained.
+    `npa_envs.agents.shapeshifting.RecognisingShapeshifter` gives the goal's code and gets −0.03 per
+    step, random actions get −0.37 (means of 8 episodes). Other rules, of `npa-envs train
+    morphogenesis2d --targets ...`, need their own `state_dim`, `eps`, `eps0` and `particle_count`.
 
     ## Observation space
 
@@ -261,28 +258,23 @@ class Shapeshifter2DEnv(NPAEnv):
 
     ## Action space
 
-    With `actions="code"`, `Box(-1, 1, (K,), float32)`: the code, in units of the largest absolute
-    value in the rule's codes, or of 1 if that is larger. With `actions="choice"`, `Discrete(T)`:
-    the index of one of the rule's T codes. All particles get this code, and the rule makes
-    `rule_steps` steps. An action that is not finite raises `NPAError` and does not change the
+    With `actions="code"`, `Box(-1, 1, (code_dim,), float32)`: the code, in units of the largest
+    absolute value in the rule's codes, or of 1 if that is larger. With `actions="choice"`,
+    `Discrete(T)`: the index of one of the rule's T codes. All particles get this code, and the rule
+    makes `rule_steps` steps. An action that is not finite raises `NPAError` and does not change the
     world.
 
     ## Reward
 
     Worlds are compared with the goal as in `npa/Morphogenesis2D-v0`, by a loss L. The reward is
-    1 − L / L₁, and at least -1; L₁ is the loss of an empty picture. So 1 is the goal itself.
-
-    The reward of a step is for the goal that was observed before it.
+    1 − L / L₁, and at least -1; L₁ is the loss of an empty picture. So 1 is the goal itself. It is
+    for the goal that was observed before the step.
 
     ## Starting state
 
     The rule has grown one of its pictures, drawn at random, for `grow_steps` steps from a disk of
     blank particles. The first goal is another one. With the default `seed_pool=16` there are
     sixteen such worlds, made at the first reset.
-
-    ## Episode end
-
-    `success_loss` is None by default: there is always another goal.
 
     ## Info
 

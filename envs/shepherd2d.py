@@ -1,4 +1,7 @@
-"""`npa/Shepherd2D-v0`: move, turn or reshape a grown picture to a goal while it stays intact."""
+"""`npa/Shepherd2D-v0`, an environment with brushes: an agent moves a grown picture to a goal.
+
+A trained rule moves the particles; the picture may also have to be turned or reshaped.
+"""
 
 from __future__ import annotations
 
@@ -12,12 +15,11 @@ from gymnasium.spaces import Box, Dict
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs import world_mean
 from npa_envs.checks import check_field, check_non_negative, check_positive
 from npa_envs.envs.core.base import to_output
 from npa_envs.envs.core.task import Start
 from npa_envs.envs.core.vector import vector_class
-from npa_envs.envs.garden.base import GardenEnv, GardenTask
+from npa_envs.envs.garden.base import GardenEnv, GardenTask, moments_of
 from npa_envs.envs.garden.brushes import OBSERVATION_LIMIT, BrushSpaces, GardenConfig, GardenReward
 from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.world.environment_steps import Physics
@@ -31,7 +33,7 @@ Aim = Literal["move", "turn", "reshape"]
 class Shepherd2DEnvConfig(GardenConfig):
     """`GardenConfig` with the goals."""
 
-    words = GardenConfig.words | {"aim": get_args(Aim)}
+    choices = GardenConfig.choices | {"aim": get_args(Aim)}
 
     reward: GardenReward = "dense"
     """"dense": minus the distance to the goal; "sparse": 0 at the goal and -1 elsewhere."""
@@ -183,14 +185,6 @@ class ShepherdTask(GardenTask[Shepherd2DEnvConfig]):
         return torch.cat((observed, goals.clamp(-OBSERVATION_LIMIT, OBSERVATION_LIMIT)), dim=1)
 
 
-def moments_of(x: Tensor) -> Tensor:
-    """Return mean x, y and, relative to it, the means of x², x y, y², shape [B, 5]."""
-    mean = world_mean(x)
-    across, up = (x - mean[:, None]).unbind(dim=-1)
-    seconds = torch.stack((across * across, across * up, up * up), dim=-1)
-    return torch.cat((mean, world_mean(seconds)), dim=1)
-
-
 def double_angle(tangent: Tensor) -> Tensor:
     """Return (cos 2φ, sin 2φ), [B, 2], of the angles φ with these tangents, [B, 1]."""
     # Without library functions, whose last bit changes with the number of worlds.
@@ -228,13 +222,7 @@ class _GoalReward:
     def compute_reward(
         self, achieved_goal: Any, desired_goal: Any, info: Mapping[str, Any] | Any
     ) -> NDArray[np.float64] | Any:
-        """Return the rewards for achieved and desired goals, also for goals of no episode.
-
-        Args:
-            achieved_goal: Shape [3] or [..., 3].
-            desired_goal: In the same shape.
-            info: Not used.
-        """
+        """Return the rewards for any achieved and desired goals, shape [3] or [..., 3]."""
         # By torch, as in steps: NumPy's square roots round differently on some processors.
         achieved = torch.tensor(np.asarray(achieved_goal))
         desired = torch.tensor(np.asarray(desired_goal))
@@ -249,10 +237,9 @@ class Shepherd2DEnv(_GoalReward, GardenEnv):
 
     A trained rule has grown a picture, the creature, from N particles and keeps stepping them. The
     agent brings it to a goal by brushes on a grid that moves with the creature; they push, or have
-    the effects of other `tools`. Too hard a push tears it; the rule heals what it can.
-
-    Observations are those of goal-conditioned environments, with `compute_reward` for other goals,
-    so Hindsight Experience Replay works, for example Stable-Baselines3's `HerReplayBuffer`.
+    the effects of other `tools`. Too hard a push tears it; the rule heals what it can. Observations
+    are those of goal-conditioned environments, with `compute_reward` for other goals, so Hindsight
+    Experience Replay works, for example Stable-Baselines3's `HerReplayBuffer`.
 
     ## Observation space
 

@@ -67,11 +67,9 @@ class TextureEnv(NPAEnv):
     look like the target. It does not matter where the parts of the pattern lie. For dots, bubbles
     and meshes particles gather and leave places empty; cells and stripes are made of colours alone.
 
-    As in `npa/Morphogenesis2D-v0` a particle perceives its neighbourhood within the radius ε, and
-    not its position. The usual policy is one small network that is applied to
-    every row of the observation. Rules for textures are trained by gradient with `npa-envs train
-    texture`; `npa_envs.agents.RulePolicy(npa_envs.load_rule("rule.safetensors"), env)` makes a
-    policy of one. Spaces are those of `Morphogenesis2DEnv`.
+    Particles perceive and policies act as in `npa/Morphogenesis2D-v0`. Rules for textures are
+    trained by gradient with `npa-envs train texture`;
+    `npa_envs.agents.RulePolicy(npa_envs.load_rule("rule.safetensors"), env)` makes a policy of one.
 
     ## Reward
 
@@ -92,13 +90,6 @@ class TextureEnv(NPAEnv):
     ## Episode end
 
     `success_loss` is None by default. No particle can leave a periodic box.
-
-    ## Info
-
-    | Key | In | Value |
-    |---|---|---|
-    | `loss_colour`, `loss_density` | reset, step | the terms of the loss |
-    | `reward_colour`, `reward_density` | step | decrease of each term in this step |
 
     ## Vectorized environment
 

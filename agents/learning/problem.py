@@ -21,7 +21,7 @@ from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.interface import Interface
 from npa_envs.envs.core.task import Controls, EnvTask
 from npa_envs.envs.core.vector import NPAVectorEnv
-from npa_envs.envs.multi.base import SpeciesConfig, SpeciesTask
+from npa_envs.envs.multi.task import SpeciesConfig, SpeciesTask
 from npa_envs.envs.multi.tasks import task_settings
 from npa_envs.envs.multi.tasks import task_type as species_task_type
 from npa_envs.errors import NPAError, shown, suggest

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from npa_envs.checks import number_tensor
 from npa_envs.envs.core.config import EnvConfig
-from npa_envs.envs.core.rewards_and_ends import named_terms
+from npa_envs.envs.core.step_report import StepNumbers, named_terms
 from npa_envs.envs.core.task import EnvTask
 from npa_envs.envs.core.worlds import BatchedWorlds
 from npa_envs.errors import NPAError
@@ -140,6 +140,8 @@ class ShownEnv:
 
     def _pictures(self) -> NDArray[np.uint8] | None:
         """Return a picture of each world, uint8, [B, R, R, 3], if `render_mode` is "rgb_array"."""
+        if not self._started:
+            raise NPAError("render needs worlds: call reset first")
         if self.config.render_mode is None:
             gymnasium.logger.warn(
                 "render() draws nothing without a render_mode: make the environment with "
@@ -207,10 +209,9 @@ class WorldsEnv(ShownEnv):
     def _change_worlds(
         self, change: Callable[..., Any], worlds: Tensor, values: Any, buffer: Tensor | None = None
     ) -> Tensor:
-        """Call `change(worlds, values)`, which starts or replaces M worlds, of int64 indices [M].
+        """Call `change(worlds, values)`, values of worlds of indices [B']; return all observations.
 
-        Returns:
-            New observations of all B worlds, written to `buffer` if it is given, shape [B, ...].
+        They are written to `buffer` if it is given, [B, ...].
         """
         with self.worlds.device_context():
             change(worlds, values)
@@ -221,12 +222,12 @@ class WorldsEnv(ShownEnv):
 
     def losses_of(self, numbers: Any) -> dict[str, Any]:
         """Return the loss and its terms by their names in infos, from `StepReport.numbers`."""
-        names = self.worlds.term_names
-        return {"loss": numbers[1]} | named_terms("loss", names, numbers[2 : 2 + len(names)])
+        named = StepNumbers.from_rows(numbers)
+        return {"loss": named.loss} | named_terms("loss", self.worlds.term_names, named.terms)
 
     def _improvements(self, numbers: Any) -> dict[str, Any]:
-        names = self.worlds.term_names
-        return named_terms("reward", names, numbers[2 + len(names) :])
+        improvements = StepNumbers.from_rows(numbers).improvements
+        return named_terms("reward", self.worlds.term_names, improvements)
 
     def _show(self) -> None:
         self._show_in_window(self.spec.id if self.spec is not None else type(self).__name__)

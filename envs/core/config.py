@@ -46,7 +46,7 @@ class WorldConfig:
     Lengths are in length units: pictures show [-1, 1] x [-1, 1].
     """
 
-    words: ClassVar[dict[str, tuple[str | None, ...]]] = {
+    choices: ClassVar[dict[str, tuple[str | None, ...]]] = {
         "moment_inverse": get_args(MomentInverse),
         "boundary": get_args(Boundary),
         "output": get_args(Output),
@@ -130,8 +130,8 @@ class WorldConfig:
         check_positive(self, float, "observation_limit", "position_limit")
         check_fraction(self, "update_prob")
         check_non_negative(self, "position_noise")
-        for name, words in self.words.items():
-            check_word(self, name, words)
+        for name, choices in self.choices.items():
+            check_word(self, name, choices)
         fits = self.boundary != "periodic" or self.box_size >= 2.0 * self.eps
         rule = f"be at least 2 eps = {2.0 * self.eps:g}"
         check_field(self, "box_size", fits, rule, "enlarge the box or perceive at a smaller eps")
@@ -205,7 +205,7 @@ class WorldConfig:
             if name not in known:
                 hint = cls.elsewhere.get(name) or suggest(name, [*known, *cls.taken_by_make])
                 raise UnknownKeywordError(f"got an unexpected keyword argument {name!r}: {hint}")
-        return cls(**{name: plain(value) for name, value in keywords.items()})
+        return cls(**{name: as_python(value) for name, value in keywords.items()})
 
     def as_config(self, config_type: type[TaskConfig], **changes: Any) -> TaskConfig:
         """Return a training task's configuration: the fields that both have, and `changes`."""
@@ -224,7 +224,7 @@ class WorldConfig:
 class EnvConfig(WorldConfig):
     """Fields of all environments of one species; a task adds its own."""
 
-    words = WorldConfig.words | {
+    choices = WorldConfig.choices | {
         "reward": get_args(Reward),
         "on_divergence": get_args(OnDivergence),
         "render_style": STYLES,
@@ -301,10 +301,10 @@ def check_picture_size(config: Any) -> None:
     check_field(config, "picture_size", config.resolution % config.picture_size == 0, rule, hint)
 
 
-def plain(value: Any) -> Any:
+def as_python(value: Any) -> Any:
     """Return a keyword's value with NumPy numbers as Python's, lists and arrays as tuples."""
     if isinstance(value, np.generic | np.ndarray | Tensor):
         value = value.tolist()
     if isinstance(value, Sequence) and not isinstance(value, str):
-        return tuple(plain(entry) for entry in value)
+        return tuple(as_python(entry) for entry in value)
     return value

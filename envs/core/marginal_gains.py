@@ -16,12 +16,12 @@ def marginal_gains(
     after: tuple[Tensor, Tensor],
     box: tuple[float, ...] | None,
 ) -> Tensor | None:
-    """Return marginal credit: how much each particle's action lowered the loss, times N; [B, N].
+    """Return marginal rewards: how much each particle's action lowered the loss, times N; [B, N].
 
-    A particle's credit is the change that it made in the step, times the gradient of the loss in
-    the middle of the step. The mean over the particles is the decrease of the loss, and the credit
-    is the particle's Shapley value: exactly for losses that are quadratic in the changes, and up to
-    third order for others. Detached parts of the loss get no credit.
+    It is the change that the particle made in the step, times the gradient of the loss in the
+    middle of the step. The mean over the particles is the decrease of the loss, and the reward is
+    the particle's Shapley value: exactly for losses that are quadratic in the changes, and up to
+    third order for others. Detached parts of the loss do not count.
 
     `losses` maps positions and states to the named parts of each world's loss, shape [B] each. The
     result is None if no gradient flows from them to positions or states.

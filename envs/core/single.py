@@ -13,8 +13,8 @@ from torch import Tensor
 
 from npa_envs.checks import number_tensor
 from npa_envs.envs.core.base import WorldsEnv
-from npa_envs.envs.core.config import plain
-from npa_envs.envs.core.rewards_and_ends import reason
+from npa_envs.envs.core.config import as_python
+from npa_envs.envs.core.step_report import reason
 from npa_envs.envs.core.vector import check_options, rng_keys
 from npa_envs.errors import NPAError
 from npa_envs.world.environment_steps import DIVERGED, SUCCESS, TIME_LIMIT
@@ -23,9 +23,8 @@ from npa_envs.world.environment_steps import DIVERGED, SUCCESS, TIME_LIMIT
 class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
     """One world of a task as a Gymnasium environment; subclasses set `task_type`.
 
-    Keywords are the fields of the task's configuration. An unknown or wrong one, or a world that
-    does not fit into memory, raises `NPAError`. The page of each subclass ends with the sections
-    below, each after the subclass's own section of the same name.
+    Keywords are the fields of the task's configuration. The page of each subclass ends with the
+    sections below, each after the subclass's own section of the same name.
 
     ## Reward
 
@@ -45,12 +44,12 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
     L in the middle of the step: to second order, N times what its action contributed to the
     decrease of L, averaged over being the first and the last to act. The remainder of the dense
     reward is spread equally. So a particle is rewarded for its own action alone; with `"particle"`
-    it is also rewarded for what the actions of others do to its pixels.
+    also for what the actions of others do to its pixels.
 
     ## Starting state
 
-    `reset(seed=k)` begins the sequence of episodes that belongs to k, and `reset()` goes on with
-    the next one. With `seed_pool=K` there are only K different starts.
+    `reset(seed=k)` begins the sequence of episodes that belongs to k, and `reset()` continues with
+    the next one. With `seed_pool=9` there are only nine different starts.
 
     ## Episode end
 
@@ -79,7 +78,7 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
     `render_mode="rgb_array"` makes uint8 pictures of shape [R, R, 3], R = `render_size`, that show
     [-1, 1] × [-1, 1] with y up. `render_mode="human"` shows them in a window; it needs
     `pip install 'npa-envs[human]'`, and without a screen it warns once. `render_style` chooses
-    between the particles' colours, their density, and their hidden channels.
+    between the particles' colours, density, and hidden channels.
 
     ## Arguments
 
@@ -134,12 +133,8 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
 
         A seed begins its sequence of episodes; None starts the next episode of the current
         sequence. There are no options.
-
-        Raises:
-            gymnasium.error.Error: The seed is no integer of at least 0.
-            NPAError: An option is given.
         """
-        seed = plain(seed)
+        seed = as_python(seed)
         check_options(options, ())
         super().reset(seed=seed)
         if self._is_unrewarded:
@@ -161,11 +156,7 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
         return self.spaces.observation_output(observation[0]), info
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Apply an action, shape [N, A], in [-1, 1].
-
-        Returns:
-            Observation, reward, terminated, truncated (by the step limit of `gymnasium.make`), and
-            the info that the docstring of the environment lists.
+        """Apply an action, shape [N, A]; return what Gymnasium's environments return.
 
         Raises:
             NPAError: The action has another shape; the world is not changed.
@@ -204,10 +195,7 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
     def place_particles(self, x: Any, s: Any) -> Any:
         """Replace the particles, without a reward, and return the new observation, shape [N, P].
 
-        Positions have shape [N, D], states [N, C], as those that `particles` returns.
-
-        Raises:
-            NPAError: A shape is wrong, or a value is not finite or beyond its limit.
+        Positions, [N, D], and states, [N, C], must be finite and within their limits.
         """
         if not self._started:
             raise NPAError("particles need a world: call reset first")

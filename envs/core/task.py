@@ -126,7 +126,7 @@ class EnvTask(WorldTask[Config]):
     spaces_type: ClassVar[type[ParticleSpaces] | None] = None
     """Class of the spaces; None: `ParticleSpaces`, a row for each particle."""
 
-    grows: ClassVar[bool] = False
+    grows: bool = False
     """Whether a rule grows fresh worlds, step by step."""
 
     def __init__(self, config: Config, device: torch.device) -> None:
@@ -134,7 +134,7 @@ class EnvTask(WorldTask[Config]):
         self._pool: Particles | None = None
         self._pooled: set[int] = set()
         self.target_rows: Tensor | None = None
-        """Columns that follow perception in each row, by the world's goal, [K, T]; None: none."""
+        """Columns after perception in each row, for each goal, [goals, T]; None: there are none."""
 
     @classmethod
     def extra_bytes(cls, config: Any, world_count: int) -> int:
@@ -183,11 +183,7 @@ class EnvTask(WorldTask[Config]):
         return {}
 
     def particle_losses(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return a loss for each particle, shape [B, N], whose mean is the world's loss.
-
-        Raises:
-            NPAError: The task does not define it.
-        """
+        """Return a loss for each particle, shape [B, N], whose mean is the world's loss."""
         raise NPAError(
             f"{type(self).__name__} has no losses of single particles: choose reward='dense' or "
             "'sparse', or give it a particle_losses method"
@@ -198,9 +194,6 @@ class EnvTask(WorldTask[Config]):
 
         `before` and `after` are positions and states around a step. The default estimates it from
         the gradient of `losses` by `marginal_gains`.
-
-        Raises:
-            NPAError: The losses have no gradient.
         """
         gains = marginal_gains(self.losses, before, after, self.periodic_sides)
         if gains is None:
@@ -219,7 +212,7 @@ class EnvTask(WorldTask[Config]):
 
     @property
     def start_is_short(self) -> bool:
-        """Whether `start` takes few operations, so that on CUDA it is recorded as a graph."""
+        """Whether `start` takes few operations, so that on CUDA it is captured as a graph."""
         return not self.grows or self.config.seed_pool > 0
 
     def start(self, random: WorldRandom) -> Start:
@@ -312,13 +305,14 @@ class TargetEnvTask(EnvTask[Config]):
     @property
     def pixel_size(self) -> float:
         """Size of a particle in pictures [length units], from the training task."""
-        size: float = self.task.pixel_size
-        return size
+        return float(self.task.pixel_size)
 
-    def seed(self, random: WorldRandom) -> tuple[Tensor, Tensor]:
-        """Draw initial worlds as the training task does; return positions and states."""
-        x, s, *_ = self.task.seed(random.world_count, generator=random, device=self.device)
-        return x, s
+    def fresh(self, random: WorldRandom) -> Start:
+        """Return the training task's initial worlds, with their goals if it has several."""
+        worlds = self.task.seed(random.world_count, generator=random, device=self.device)
+        # Leaves out the channels of codes, which only rules of many pictures use.
+        s = worlds.s[..., -self.config.state_dim :].contiguous()
+        return Start(worlds.x, s, goal=worlds.goal)
 
     def with_goal(self, goal: Tensor) -> Self:
         """Return a task whose losses are for worlds of these goals."""
@@ -342,7 +336,7 @@ def start_method(task: EnvTask[Any]) -> str:
 
 
 def check_start(task: EnvTask[Any], start: Start, world_count: int, shapes: Any) -> None:
-    """Check starts of M worlds without synchronising; `shapes`: [B, N, D] and [B, N, C]."""
+    """Check starts of some worlds without synchronising; `shapes`: [B, N, D] and [B, N, C]."""
     name = start_method(task)
     if not isinstance(start, Start):
         raise NPAError(

@@ -17,8 +17,8 @@ from torch import Tensor
 
 from npa_envs.checks import check_count, number_tensor
 from npa_envs.envs.core.base import WorldsEnv
-from npa_envs.envs.core.config import plain
-from npa_envs.envs.core.rewards_and_ends import FLAGS, StepReport, reason
+from npa_envs.envs.core.config import as_python
+from npa_envs.envs.core.step_report import StepReport, reason
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.world.cuda_graph import to_device_async
 from npa_envs.world.environment_steps import TIME_LIMIT
@@ -107,11 +107,8 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
                 list; None: each world starts the next episode of its sequence.
             options: `{"reset_mask": mask}` resets only the worlds where the mask, bool, shape [B],
                 is True; the others do not change.
-
-        Raises:
-            NPAError: The mask or the seeds have a wrong shape.
         """
-        seed = plain(seed)
+        seed = as_python(seed)
         super().reset(seed=seed if isinstance(seed, int) else None)
         chosen = worlds_to_reset(options, self.num_envs, started=self._started)
         keys = None
@@ -124,17 +121,12 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
         self._ended[chosen] = False
         which = np.zeros(self.num_envs, dtype=bool)
         which[chosen] = True
-        losses = self.losses_of(self._report_rows(self.worlds.report.copy()))
-        extra = self._returned_values(self.worlds.extra_info())
-        infos = with_masks(losses, self._mask(which)) | with_masks(extra, self._mask(which))
-        return self.spaces.observation_output(observation), infos
+        values = self.losses_of(self._report_rows(self.worlds.report.copy()))
+        values |= self._returned_values(self.worlds.extra_info())
+        return self.spaces.observation_output(observation), with_masks(values, self._mask(which))
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """Apply actions, shape [B, N, A], in [-1, 1]; errors are those of `NPAEnv.step`.
-
-        Returns:
-            Observations [B, N, P], rewards [B], terminations [B], truncations [B], and infos.
-        """
+        """Apply actions, shape [B, N, A]; return a batch [B, ...] of what `NPAEnv.step` returns."""
         if not self._started:
             raise NPAError("step needs worlds: call reset first")
         action = self.spaces.action(actions, self.num_envs)
@@ -162,7 +154,7 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
         ended = endings != 0
         final = self.autoreset_mode is AutoresetMode.SAME_STEP and bool(ended.any())
         # A restart overwrites the report, so it is copied first.
-        rows, flags, infos = self._report(stepped, copy=self.copies or final)
+        *results, infos = self._report(stepped, copy=self.copies or final)
         if final:
             which = self._mask(ended)
             final_infos = {n: which if n.startswith("_") else v for n, v in infos.items()}
@@ -173,7 +165,7 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
             else:
                 final_observation = observation.clone()
             self.worlds.restart(np.flatnonzero(ended), observation)
-            _, _, infos = self._report(~ended, copy=self.copies)
+            *_, infos = self._report(~ended, copy=self.copies)
             infos |= {
                 "final_obs": self.spaces.final_observation_output(final_observation, ended),
                 "_final_obs": which,
@@ -184,12 +176,10 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
             if ended.any():
                 infos |= {"reason": REASONS[endings], "_reason": self._mask(ended)}
         self._show()
-        return self.spaces.observation_output(observation), rows[0], flags[0], flags[1], infos
+        return self.spaces.observation_output(observation), *results, infos
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Return a picture of each world, shape [R, R, 3], with the render mode "rgb_array"."""
-        if not self._started:
-            raise NPAError("render needs worlds: call reset first")
         pictures = self._pictures()
         return None if pictures is None else tuple(pictures)
 
@@ -206,8 +196,8 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
     def place_particles(self, x: Any, s: Any, worlds: Any = None) -> Any:
         """Replace particles, without a reward, and return the new observations of all worlds.
 
-        Positions have shape [M, N, D], states [M, N, C]; `worlds` are the indices of the M worlds,
-        each once, or None for all of them. Errors are those of `NPAEnv.place_particles`.
+        Positions have shape [B', N, D], states [B', N, C]; `worlds` are the worlds' indices, each
+        once, or None for all of them. Errors are those of `NPAEnv.place_particles`.
         """
         if not self._started:
             raise NPAError("particles need worlds: call reset first")
@@ -220,17 +210,19 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
 
     def _report(
         self, stepped: NDArray[np.bool_] | None, *, copy: bool
-    ) -> tuple[list[Any], list[Any], dict[str, Any]]:
-        """Return the report's numbers, its flags, and infos; `stepped`: worlds that acted."""
+    ) -> tuple[Any, Any, Any, dict[str, Any]]:
+        """Return rewards, terminations, truncations and infos; `stepped`: worlds that acted."""
         worlds = self.worlds
         report = worlds.report.copy() if copy else worlds.report
-        rows, flags = self._report_rows(report), list(self._out(report.endings))
+        rows = self._report_rows(report)
+        terminated, truncated, success, diverged = self._out(report.endings)
         all_worlds = self._out(report.all_worlds if copy else report.all_worlds.clone())
         which = all_worlds if stepped is None else self._mask(stepped)
         of_all = self.losses_of(rows) | self._returned_values(worlds.extra_info(), copy=copy)
-        of_step = self._improvements(rows) | dict(zip(FLAGS, flags[2:], strict=True))
+        of_step = self._improvements(rows) | {"success": success, "diverged": diverged}
         of_step |= self._returned_values(worlds.step_info(), copy=copy)
-        return rows, flags, with_masks(of_all, all_worlds) | with_masks(of_step, which)
+        infos = with_masks(of_all, all_worlds) | with_masks(of_step, which)
+        return rows[0], terminated, truncated, infos
 
     def _returned_values(self, values: dict[str, Tensor], *, copy: bool = True) -> dict[str, Any]:
         return {n: self._out(v.clone() if copy else v) for n, v in values.items()}
@@ -269,7 +261,7 @@ def vector_class(env_type: type[WorldsEnv], *mixins: type[Any]) -> type[NPAVecto
 
 def checked_count(name: str, value: Any) -> int:
     """Return the argument of this name, checked: a whole number of at least 1."""
-    count = plain(value)
+    count = as_python(value)
     check_count(name, count, f": for example {name}=8")
     return int(count)
 
@@ -322,7 +314,7 @@ def worlds_to_reset(
 
 
 def checked_worlds(worlds: Any, world_count: int) -> Tensor:
-    """Return checked indices of worlds, without repetition, on the CPU, int64, shape [M]."""
+    """Return checked indices of worlds, without repetition, on the CPU, int64, shape [B']."""
     indices = number_tensor("worlds", worlds).cpu()
     # A mask is refused: it would be read as the indices 0 and 1.
     whole = not indices.is_floating_point() and indices.dtype != torch.bool

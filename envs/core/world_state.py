@@ -27,8 +27,8 @@ MAX_INDEX = 2**31 - 1
 LISTED_BYTES = 320
 """Bytes on CUDA for a particle's neighbours, at most: a list of 128, and sorted copies."""
 
-RECORDED_STARTS = 4 / 3
-"""Particles of all recorded restarts, which have their own lists, as a multiple of a batch:
+CAPTURED_STARTS = 4 / 3
+"""Particles of all captured starts, which have their own lists, as a multiple of a batch:
 1 + 1/4 + 1/16 + ..."""
 
 
@@ -39,7 +39,7 @@ def needed_bytes(
     particles = world_count * particle_count
     worlds = 6 * (physics.space_dim + physics.state_dim)
     floats = OBSERVATION_COPIES * physics.perception_dim + 2 * physics.action_dim + worlds + 16
-    listed = LISTED_BYTES * (1.0 + RECORDED_STARTS) if device.type == "cuda" else 0.0
+    listed = LISTED_BYTES * (1.0 + CAPTURED_STARTS) if device.type == "cuda" else 0.0
     return int(particles * (4 * floats + listed))
 
 
@@ -62,11 +62,7 @@ def free_bytes(device: torch.device) -> int | None:
 
 
 def check_memory(
-    world_count: int,
-    particle_count: int,
-    physics: Physics,
-    device: torch.device,
-    extra_bytes: int = 0,
+    world_count: int, particle_count: int, physics: Physics, device: torch.device, extra_bytes: int
 ) -> None:
     """Check that B worlds fit into a device's memory and into the kernels' indices."""
     what = f"{world_count} world(s) of {particle_count} particles"
@@ -120,9 +116,9 @@ class WorldState:
         """One random stream for each world."""
 
     def next_streams(self, worlds: Tensor, keys: Tensor | None) -> WorldRandom:
-        """Return the random streams for the next episodes of worlds, by their indices, [M].
+        """Return the random streams for the next episodes of worlds, by their indices, [B'].
 
-        Keys, int64, shape [M], start new sequences of episodes; None: each world's next episode.
+        Keys, int64, shape [B'], start new sequences of episodes; None: each world's next episode.
         """
         if keys is not None:
             return WorldRandom.from_keys(keys.to(self.device))
@@ -161,7 +157,7 @@ class WorldState:
 
 
 def not_finite(action: Tensor) -> DivergedError:
-    """Return the error for actions, shape [B, K, W], with a value that is not finite."""
+    """Return the error for actions, shape [B, rows, W], with a value that is not finite."""
     bad = ~torch.isfinite(action)
     world, particle, entry = (int(k) for k in bad.nonzero()[0])
     return DivergedError(

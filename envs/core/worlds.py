@@ -1,6 +1,6 @@
 """The batch of worlds of an environment: actions, observations, rewards, restarts.
 
-A single environment is a batch of one. World k of a batch is the same as alone, bit for bit.
+A single environment is a batch of one. Results of a world do not depend on the others, bit for bit.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from torch import Tensor
 
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.marginal_gains import with_mean_reward
-from npa_envs.envs.core.rewards_and_ends import ParticleRewards, StepReport, total
+from npa_envs.envs.core.step_report import ParticleRewards, StepReport, total
 from npa_envs.envs.core.task import (
     EnvTask,
     Start,
@@ -52,6 +52,9 @@ from npa_envs.world.particles import Particles
 FEW_PARTICLES = 8192
 """Particles of all worlds up to which a step on CUDA is one graph; larger steps hide launches."""
 
+GROWTH = 4
+"""Factor between the numbers of worlds that captured starts serve."""
+
 
 class BatchedWorlds(WorldState):
     """B worlds of one task, stepped together, with their losses, rewards and episode ends.
@@ -72,7 +75,14 @@ class BatchedWorlds(WorldState):
         # Memory is checked before the task is made, which may make a target of as many points.
         extra, count = task_type.extra_bytes(config, world_count), config.particle_count
         super().__init__(config, task_type, world_count, count, extra)
-        self.task: Any = task_type(config, self.device)
+        device = self.device
+        self.task: EnvTask[Any] = task_type(config, device)
+        self.goal = torch.zeros(world_count, dtype=torch.int64, device=device)
+        """Index of each world's goal, shape [B]; zeros where the task has one goal."""
+        self.goal_task: EnvTask[Any] = self.task.with_goal(self.goal)
+        """The task with losses for the worlds' goals."""
+
+        # Episodes.
         limits = [steps for steps in (episode_steps, config.episode_steps) if steps is not None]
         self.episode_steps = min(limits, default=None)
         """Steps after which an episode is truncated; None: never."""
@@ -82,60 +92,54 @@ class BatchedWorlds(WorldState):
                 "None: for example episode_steps=64, and the same number as max_episode_steps of "
                 "gymnasium.make"
             )
-
-        def zeros(dtype: torch.dtype = torch.float32) -> Tensor:
-            return torch.zeros(world_count, dtype=dtype, device=self.device)
-
-        self.elapsed = zeros(torch.int32)
+        self.elapsed = torch.zeros(world_count, dtype=torch.int32, device=device)
         """Steps since the start of each episode, shape [B]."""
-        self.particle_rewards: ParticleRewards | None = None
-        """Rewards of single particles, where they have any."""
-        if config.per_particle_reward:
-            by_loss = config.reward == "particle"
-            self.particle_rewards = ParticleRewards(self.particles, by_loss=by_loss)
-        self.goal = zeros(torch.int64)
-        """Index of each world's goal, shape [B]; zeros where the task has one goal."""
-        self.goal_task: EnvTask[Any] = self.task.with_goal(self.goal)
-        """The task with losses for the worlds' goals."""
-        self._start_loss = zeros()
-        self._success_loss = zeros()
-        self.diverged = zeros(torch.uint8)
-        """1 where a position or state of the world left its bounds in the last step, shape [B]."""
-        self.enabled = torch.ones(1, dtype=torch.uint8, device=self.device)
+        self._start_loss = torch.zeros(world_count, device=device)
+        self._success_loss = torch.zeros_like(self._start_loss)
+
+        # Actions and observations.
+        self.enabled = torch.ones(1, dtype=torch.uint8, device=device)
         """0 if the last actions were not finite and so not applied, shape [1]."""
-        self.term_names: tuple[str, ...] = ()
-        """Names of the terms of the loss, known once worlds have been placed."""
-        self.report = StepReport.empty(world_count, 0, self.device)
-        """What a step returns apart from the observation."""
-        # Each world's ending, then whether the actions were finite.
-        self._endings = torch.zeros(world_count + 1, dtype=torch.uint8, device=self.device)
-        self._target: Tensor | None = self.task.target_rows
+        self.diverged = torch.zeros(world_count, dtype=torch.uint8, device=device)
+        """1 where a position or state of the world left its bounds in the last step, shape [B]."""
+        self._actions = Actions(
+            self.x, self.s, self.physics, self.random, enabled=self.enabled, diverged=self.diverged
+        )
+        self._neighbours: NeighbourState | None = None
         self._perceived: Tensor | None = None
         """Perception, shape [B, N, P], that the graph of a step writes; None without one."""
         self._host_perceived: Tensor | None = None
         """Its copy in pinned memory, for a single world with NumPy output."""
         self._host_is_current = False
         """Whether the copy belongs to the last step, and no world restarted since."""
-        self._neighbours: NeighbourState | None = None
-        self._prepare_actions()
-        self._evaluate_graph = GraphedCallable(self._evaluate_and_sort, self.device)
-        self._step_graph = GraphedCallable(self._act_and_evaluate, self.device)
-        self._resets = GraphedResets(
-            self._start_and_sort, world_count, self.device, recorded=self.task.start_is_short
-        )
-        self._side_stream = SideStream(self.device) if self.device.type == "cuda" else None
+
+        # Rewards, and what a step reports.
+        self.particle_rewards: ParticleRewards | None = None
+        """Rewards of single particles, where they have any."""
+        if config.per_particle_reward:
+            by_loss = config.reward == "particle"
+            self.particle_rewards = ParticleRewards(self.particles, by_loss=by_loss)
+        self.term_names: tuple[str, ...] = ()
+        """Names of the terms of the loss, known once worlds have been placed."""
+        self.report = StepReport.empty(world_count, 0, device)
+        """What a step returns apart from the observation."""
+        # Each world's ending, then whether the actions were finite.
+        self._endings = torch.zeros(world_count + 1, dtype=torch.uint8, device=device)
         self._prepare_report()
 
-    def _prepare_actions(self) -> None:
-        flags = {"enabled": self.enabled, "diverged": self.diverged}
-        self._actions = Actions(self.x, self.s, self.physics, self.random, **flags)
-        self._draw = GraphedCallable(self._actions.draw, self.device)
+        # CUDA graphs of a step and of starts, and a stream beside them.
+        self._draw = GraphedCallable(self._actions.draw, device)
+        self._evaluate_graph = GraphedCallable(self._evaluate_and_sort, device)
+        self._step_graph = GraphedCallable(self._act_and_evaluate, device)
+        self._graphed_starts: dict[int, GraphedStart] = {}
+        """By their numbers of worlds; empty on a CPU."""
+        self._side_stream = SideStream(device) if device.type == "cuda" else None
 
     def __getstate__(self) -> dict[str, Any]:
         # The next step makes these again.
         none = dict.fromkeys(("_neighbours", "_evaluation", "host_endings", "host_numbers"))
         none |= dict.fromkeys(("_perceived", "_host_perceived"))
-        return self.__dict__ | none | {"_host_is_current": False}
+        return self.__dict__ | none | {"_host_is_current": False, "_graphed_starts": {}}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
@@ -146,10 +150,9 @@ class BatchedWorlds(WorldState):
         """Make what writes the report, and the tensors that the host reads, on CUDA pinned."""
         read = (self._endings, self.report.numbers)
         self.host_endings, self.host_numbers = map(pinned_like, read) if self.x.is_cuda else read
-        config = self.task.config
         rewarded_step = self.episode_steps if self.rewards_last_step_only else None
         self._evaluation = EpisodeUpdate(
-            EpisodeRules(self.episode_steps, rewarded_step, config.on_divergence),
+            EpisodeRules(self.episode_steps, rewarded_step, self.task.config.on_divergence),
             enabled=self.enabled,
             diverged=self.diverged,
             first_loss=self._start_loss,
@@ -168,14 +171,14 @@ class BatchedWorlds(WorldState):
     @torch.no_grad()
     @makes_plain_tensors
     def start(self, worlds: Tensor, keys: Tensor | None = None) -> Start:
-        """Start episodes of worlds, int64 indices [M]; return `Start`; keys: see `next_streams`."""
+        """Start episodes in worlds of int64 indices [B']; keys are those of `next_streams`."""
         random = self.next_streams(worlds, keys)
         check_default_dtype()
-        # The first start is not recorded as a graph, so that it can synchronise for checks.
+        # The first start is not captured as a graph, so that it can synchronise for checks.
         task, first = self.task, not self.term_names
         draws = global_rng_states(self.device) if first else {}
         check = first or not self.x.is_cuda
-        start: Start = task.start(random)
+        start = task.start(random)
         check_start(task, start, len(worlds), (self.x.shape, self.s.shape))
         if first:
             check_no_draws(task, start_method(task), draws)
@@ -188,7 +191,7 @@ class BatchedWorlds(WorldState):
         return start
 
     def begin(self, worlds: Tensor, start: Start, *, check: bool) -> None:
-        """Begin episodes with `start` in the worlds of indices `worlds`, int64 [M].
+        """Begin episodes with `start` in the worlds of indices `worlds`, int64 [B'].
 
         `check` raises an error unless all losses are finite, which synchronises with the device.
         """
@@ -205,7 +208,7 @@ class BatchedWorlds(WorldState):
     @torch.no_grad()
     @makes_plain_tensors
     def place(self, worlds: Tensor, placed: Particles) -> None:
-        """Replace the particles of the worlds of indices `worlds`, int64 [M], without a reward.
+        """Replace the particles of the worlds of indices `worlds`, int64 [B'], without a reward.
 
         Worlds keep their goals if `placed` has none.
         """
@@ -233,15 +236,29 @@ class BatchedWorlds(WorldState):
         start = self.start(worlds)
         return build_neighbours(start.x, start.s, self.physics, world_indices=worlds)
 
+    @makes_plain_tensors
     def restart(self, worlds: NDArray[np.int64], observation: Tensor) -> None:
-        """Start the next episodes of worlds, indices [M]; write their rows of `observation`."""
-        if self._target is None:
-            self._resets(worlds, observation)
-            return
-        index = to_device_async(worlds, self.device)
-        start = self.start(index)
-        rows = build_neighbours(start.x, start.s, self.physics).perceive()
-        observation[index] = self._with_target(rows, self.goal[index])
+        """Start the next episodes of worlds, indices [B']; write their rows of `observation`."""
+        if self.task.target_rows is not None:
+            index = to_device_async(worlds, self.device)
+            start = self.start(index)
+            rows = build_neighbours(start.x, start.s, self.physics).perceive()
+            observation[index] = self._with_target(rows, self.goal[index])
+        elif not (self.x.is_cuda and self.task.start_is_short):
+            index = to_device_async(worlds, self.device)
+            self._start_and_sort(index).perceive(observation)
+        else:
+            self._graphed_start(len(worlds))(worlds, observation)
+
+    def _graphed_start(self, count: int) -> GraphedStart:
+        """Return a graph for at least `count` worlds; few sizes serve all counts."""
+        size = 1
+        while size < count:
+            size = min(size * GROWTH, self.world_count)
+        if size not in self._graphed_starts:
+            graph = GraphedStart(self._start_and_sort, size, self.device)
+            self._graphed_starts[size] = graph
+        return self._graphed_starts[size]
 
     @torch.no_grad()
     @makes_plain_tensors
@@ -250,25 +267,21 @@ class BatchedWorlds(WorldState):
         return self._observed(build_neighbours(self.x, self.s, self.physics), out)
 
     def _observed(self, neighbours: NeighbourState, out: Tensor | None) -> Tensor:
-        if self._target is None:
+        if self.task.target_rows is None:
             return neighbours.perceive(out)
         rows = self._with_target(neighbours.perceive(), self.goal)
         return rows if out is None else out.copy_(rows)
 
     def _with_target(self, rows: Tensor, goal: Tensor) -> Tensor:
-        if self._target is None:
+        if self.task.target_rows is None:
             return rows
-        columns = self._target[goal][:, None].expand(-1, rows.shape[1], -1)
+        columns = self.task.target_rows[goal][:, None].expand(-1, rows.shape[1], -1)
         return torch.cat((rows, columns), dim=-1)
 
     @torch.no_grad()
     @makes_plain_tensors
     def reseed(self, worlds: NDArray[np.int64], observation: Tensor) -> None:
-        """Restart the particles of worlds, indices [M], within their episodes.
-
-        Rewards, flags and step counts stay. The worlds' rows of the observation, [B, ...], are
-        overwritten.
-        """
+        """Restart the particles of worlds, indices [B'], within their episodes, unrewarded."""
         self._host_is_current = False
         index, rewards = to_device_async(worlds, self.device), self.particle_rewards
         before, elapsed = self.report.copy(), self.elapsed.clone()
@@ -285,14 +298,10 @@ class BatchedWorlds(WorldState):
             self.host_numbers.copy_(self.report.numbers)
 
     def step(self, action: Tensor, out: Tensor | None = None) -> tuple[NDArray[np.uint8], Tensor]:
-        """Apply actions to all worlds; return their endings, [B], and observations, [B, ...].
+        """Apply actions; return endings, [B], and observations, [B, ...], in `out` if it is given.
 
-        The host reads the endings, one byte a world, and the report of a single world. On CUDA
+        The host reads the endings, one byte per world, and the report of a single world. On CUDA
         evaluation and neighbour search overlap, and the device perceives while the host reads.
-
-        Args:
-            action: Float32, shape [B, ...], on any device.
-            out: Where to write the observations; None: a new tensor.
 
         Raises:
             DivergedError: An action is not finite; worlds and report are not changed.
@@ -310,7 +319,7 @@ class BatchedWorlds(WorldState):
             self.check_losses(torch.arange(self.world_count, device=self.device))
             raise NPAError(
                 f"losses of {type(self.task).__name__} must be finite before and after a step: "
-                "mend them, then reset"
+                "correct them, then reset"
             )
         return endings, observation
 
@@ -349,7 +358,7 @@ class BatchedWorlds(WorldState):
             if self._perceived is None:
                 self._perceived = self.x.new_empty(*self.x.shape[:2], self.physics.perception_dim)
                 returns_arrays = self.world_count == 1 and self.task.config.output == "numpy"
-                if returns_arrays and self._target is None:
+                if returns_arrays and self.task.target_rows is None:
                     self._host_perceived = pinned_like(self._perceived)
             build_neighbours(self.x, self.s, self.physics).perceive(self._perceived)
             if self._host_perceived is not None:
@@ -371,40 +380,29 @@ class BatchedWorlds(WorldState):
 
     def evaluate(self) -> None:
         """Write rewards, losses and endings for the current particles into `report`."""
-        task, particle_rewards = self.goal_task, self.particle_rewards
-        losses = task.losses(self.x, self.s)
-        terms = torch.stack(checked_losses(task, losses, len(self.x), self.term_names))
-        if particle_rewards is None:
-            self._evaluation(terms)
-        else:
-            gains = particle_rewards.step_rewards(task, self.particles)
-            self._evaluation(terms, (~torch.isfinite(gains).all(dim=1)).byte())
-            reward = self.report.reward
-            if task.config.reward == "marginal":
-                gains = with_mean_reward(gains, reward)
-            # In worlds that left their bounds each particle gets the world's reward.
-            by_world = self.diverged.bool() & (task.config.on_divergence != "ignore")
-            gains = torch.where(by_world[:, None], reward[:, None], gains)
-            gains = torch.where(self.enabled.bool(), gains, particle_rewards.reward)
-            particle_rewards.reward.copy_(gains)
-        rewards = self.task_rewards()
-        if rewards is not None:
-            if self.rewards_last_step_only:
-                terminated, truncated = self.report.endings[:2]
-                rewards = torch.where(terminated | truncated, rewards, 0.0)
-            self.report.reward.copy_(rewards)
+        losses = self.goal_task.losses(self.x, self.s)
+        terms = checked_losses(self.task, losses, len(self.x), self.term_names)
+        self.write_rewards(torch.stack(terms))
         if self.x.is_cuda:
             self.host_endings.copy_(self._endings, non_blocking=True)
             if self.world_count == 1:
                 self.host_numbers.copy_(self.report.numbers, non_blocking=True)
         self.enabled.fill_(1)
 
-    def task_rewards(self) -> Tensor | None:
-        """Return the task's own rewards of a step, [B]; None: they are the loss's decrease."""
-        return None
+    def write_rewards(self, terms: Tensor) -> None:
+        """Write rewards and endings of worlds, and of particles; `terms`: losses, [terms, B]."""
+        rewards = self.particle_rewards
+        if rewards is None:
+            self._evaluation(terms)
+            return
+        gains = rewards.gains(self.goal_task, self.particles)
+        self._evaluation(terms, (~torch.isfinite(gains).all(dim=1)).byte())
+        # In worlds that left their bounds each particle gets the world's reward.
+        by_world = self.diverged.bool() & (self.task.config.on_divergence != "ignore")
+        rewards.write(gains, self.report.reward, by_world, self.enabled)
 
     def check_losses(self, worlds: Tensor) -> None:
-        """Check that the losses of the worlds of indices `worlds`, int64 [M], are finite."""
+        """Check that the losses of the worlds of indices `worlds`, int64 [B'], are finite."""
         terms = zip(self.term_names, self.report.terms[:, worlds], strict=True)
         check_finite(self.task, "losses", {f"term {shown(name)}": term for name, term in terms})
         if self.particle_rewards is not None and self.particle_rewards.loss is not None:
@@ -438,11 +436,7 @@ class BatchedWorlds(WorldState):
         return torch.from_numpy(self._host_perceived.numpy().copy())
 
     def handle_diverged(self, endings: NDArray[np.uint8], observation: Tensor) -> NDArray[np.uint8]:
-        """Apply `on_divergence` to worlds that diverged; costs nothing if none did.
-
-        Returns:
-            Flags of endings, [B], without DIVERGED where a divergence ends no episode.
-        """
+        """Apply `on_divergence` to worlds that diverged; return the endings, [B], that remain."""
         on_divergence = self.task.config.on_divergence
         diverged = endings & DIVERGED != 0
         if on_divergence == "terminate" or not diverged.any():
@@ -459,8 +453,7 @@ class BatchedWorlds(WorldState):
     def pictures(self, count: int) -> NDArray[np.uint8]:
         """Return pictures of the first worlds, uint8, shape [count, R, R, 3]."""
         first = self.particles.map(lambda value: value[:count])
-        pictures: NDArray[np.uint8] = self.task.draw(first, self.elapsed[:count].cpu().numpy())
-        return pictures
+        return self.task.draw(first, self.elapsed[:count].cpu().numpy())
 
     def _divergence_message(self, diverged: NDArray[np.int64]) -> str:
         """Return the message of the error for `on_divergence="raise"`."""
@@ -487,61 +480,26 @@ class BatchedWorlds(WorldState):
         )
 
 
-GROWTH = 4
-"""Factor between the numbers of worlds that recorded restarts serve."""
+class GraphedStart:
+    """Starts the next episodes of worlds by one CUDA graph, instead of some hundred launches.
 
-
-class GraphedResets:
-    """Starts the next episodes of worlds, on CUDA by one graph launch instead of some hundred.
-
-    A graph serves a fixed number of worlds. If fewer restart, the last index is repeated, and that
-    world is started in the same way several times. Only a weak reference to `start` is kept.
+    It serves a fixed number of worlds. If fewer restart, the last index is repeated, and that world
+    is started in the same way several times. Only a weak reference to `start` is kept.
     """
 
     def __init__(
-        self,
-        start: Callable[[Tensor], NeighbourState],
-        world_count: int,
-        device: torch.device,
-        *,
-        recorded: bool,
+        self, start: Callable[[Tensor], NeighbourState], size: int, device: torch.device
     ) -> None:
         self._start = WeakFunction(start)
-        self._world_count = world_count
-        self._device = device
-        self._recorded = recorded and device.type == "cuda"
-        self._graphs: dict[int, _GraphedReset] = {}
+        self._worlds = torch.zeros(size, dtype=torch.int64, device=device)
+        self._replay = GraphedCallable(self._run, device)
 
-    def __getstate__(self) -> dict[str, Any]:
-        # Graphs cannot be pickled.
-        return self.__dict__ | {"_graphs": {}}
-
-    @makes_plain_tensors
     def __call__(self, worlds: NDArray[np.int64], observation: Tensor) -> None:
-        """Start the next episodes of worlds, indices [M]; write what they perceive, [B, N, P]."""
-        if not self._recorded:
-            self._start()(to_device_async(worlds, self._device)).perceive(observation)
-            return
-        size = 1
-        while size < len(worlds):
-            size = min(size * GROWTH, self._world_count)
-        if size not in self._graphs:
-            self._graphs[size] = _GraphedReset(self._start, size, self._device)
-        graph, filled = self._graphs[size], np.pad(worlds, (0, size - len(worlds)), mode="edge")
-        graph.worlds.copy_(to_device_async(filled, self._device))
-        graph.replay()
-        graph.neighbours.perceive(observation)
-
-
-class _GraphedReset:
-    """A CUDA graph that starts episodes in a fixed number of worlds."""
-
-    neighbours: NeighbourState
-
-    def __init__(self, start: WeakFunction, size: int, device: torch.device) -> None:
-        self._start = start
-        self.worlds = torch.zeros(size, dtype=torch.int64, device=device)
-        self.replay = GraphedCallable(self._run, device)
+        """Start the next episodes of worlds, indices [B']; write what they perceive, [B, N, P]."""
+        filled = np.pad(worlds, (0, len(self._worlds) - len(worlds)), mode="edge")
+        self._worlds.copy_(to_device_async(filled, self._worlds.device))
+        self._replay()
+        self._neighbours.perceive(observation)
 
     def _run(self) -> None:
-        self.neighbours = self._start()(self.worlds)
+        self._neighbours: NeighbourState = self._start()(self._worlds)

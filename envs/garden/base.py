@@ -1,4 +1,7 @@
-"""Worlds that a rule steps while an agent acts on them by brushes: worlds, task, environment."""
+"""Environments with brushes: a trained rule moves the particles, and agents brush over them.
+
+Also the worlds and the base class of all tasks whose particles a rule moves.
+"""
 
 from __future__ import annotations
 
@@ -27,6 +30,7 @@ from npa_envs.envs.garden.brushes import (
     offsets,
 )
 from npa_envs.envs.grown_worlds import GrownTask, check_matches_rule, run_rule
+from npa_envs.envs.morphogenesis2d import PictureConfig, PictureEnvTask
 from npa_envs.rule.rule import COLOUR_OFFSET
 from npa_envs.tasks.targets.picture_points import PointTarget
 from npa_envs.world.brushes import nearest_image
@@ -40,27 +44,33 @@ DEFICIT_SCALES = (2.0, 4.0, 4.0, 4.0, 4.0, 4.0)
 MIN_RISE = 0.1
 """Smallest rise of the loss by turning grey, as a fraction of the loss (dimensionless)."""
 
+AnyPicture = TypeVar("AnyPicture", bound=PictureConfig)
 Config = TypeVar("Config", bound=GardenConfig)
 
 
 class RuleDrivenWorlds(BatchedWorlds):
     """Worlds whose particles a rule steps; the task applies actions, observes and rewards.
 
-    On a CPU worlds are stepped one after the other, as a rule's matrix products depend in the last
-    bit on the number of worlds.
+    On a CPU worlds are stepped one by one, as a rule's matrix products depend in the last bit on
+    the number of worlds.
     """
 
-    def _prepare_actions(self) -> None:
-        self.context: Any = None
-        """What the task's `episode_context` returned at the start of each world's episode."""
+    task: RuleDrivenTask[Any]
+
+    context: Any = None
+    """What the task's `episode_context` returned at the start of each world's episode."""
+
+    def step(self, action: Tensor, out: Tensor | None = None) -> tuple[NDArray[np.uint8], Tensor]:
+        """Apply actions that are finite, which is checked first; else as the base class."""
+        if not bool(torch.isfinite(action).all()):
+            raise not_finite(action)
+        return super().step(action, out)
 
     @torch.no_grad()
     @makes_plain_tensors
     def queue(self, action: Tensor, out: Tensor | None = None) -> Tensor:
-        """Step the worlds; return observations [B, ...]. Synchronises to check the actions."""
+        """Step the worlds without synchronising; return observations, [B, ...]."""
         action = action.to(self.device)
-        if not bool(torch.isfinite(action).all()):
-            raise not_finite(action)
         diverged = torch.zeros_like(self.diverged, dtype=torch.bool)
         limits = self.physics.limits.position, self.physics.limits.state
         for value, new, limit in zip((self.x, self.s), self._stepped(action), limits, strict=True):
@@ -76,8 +86,7 @@ class RuleDrivenWorlds(BatchedWorlds):
     def _stepped(self, action: Tensor) -> tuple[Tensor, Tensor]:
         x, s = self.x, self.s
         if x.is_cuda or len(x) == 1:
-            stepped: tuple[Tensor, Tensor] = self.task.step(x, s, action, self.random)
-            return stepped
+            return self.task.step(x, s, action, self.random)
         each = [slice(k, k + 1) for k in range(len(x))]
         streams = [self.random.take(one) for one in each]
         worlds = [
@@ -93,11 +102,11 @@ class RuleDrivenWorlds(BatchedWorlds):
     @makes_plain_tensors
     def perceive(self, out: Tensor | None = None) -> Tensor:
         """Return all worlds' current observations, shape [B, O], in `out` if it is given."""
-        observed: Tensor = self.task.observe(self.particles, self.loss, self.context)
+        observed = self.task.observe(self.particles, self.loss, self.context)
         return observed if out is None else out.copy_(observed)
 
     def restart(self, worlds: NDArray[np.int64], observation: Tensor) -> None:
-        """Start the next episodes of worlds, indices [M]; write their rows of `observation`."""
+        """Start the next episodes of worlds, indices [B']; write their rows of `observation`."""
         index = to_device_async(worlds, self.device)
         self.start(index)
         observation[index] = self.perceive()[index]
@@ -118,16 +127,19 @@ class RuleDrivenWorlds(BatchedWorlds):
         for stored, value in zip(self.context, context, strict=True):
             stored[worlds] = value
 
-    def task_rewards(self) -> Tensor:
-        """Return the task's rewards of a step, [B]; then let the task change the goals."""
-        rewards: Tensor = self.task.reward(self.particles, self.loss, self.context)
+    def write_rewards(self, terms: Tensor) -> None:
+        """Write the task's own rewards and the endings; then let the task change the goals."""
+        super().write_rewards(terms)
+        rewards = self.task.reward(self.particles, self.loss, self.context)
+        if self.rewards_last_step_only:
+            terminated, truncated, *_ = self.report.endings
+            rewards = torch.where(terminated | truncated, rewards, 0.0)
+        self.report.reward.copy_(rewards)
         self.task.next_goals(self.elapsed, self.context, self.goal)
-        return rewards
 
     def extra_info(self) -> dict[str, Tensor]:
         """Return what the task's `context_info` adds to infos, by name, [B, ...] each."""
-        infos: dict[str, Tensor] = self.task.context_info(self.particles, self.context)
-        return infos
+        return self.task.context_info(self.particles, self.context)
 
 
 class TargetDeficit:
@@ -145,7 +157,7 @@ class TargetDeficit:
         self._target_sums = self._scale * target_sums
 
     def __call__(self, particles: Particles, middle: Tensor) -> Tensor:
-        """Return the target's sums minus the worlds' own, for brushes at K places, [B, K, 6].
+        """Return the target's sums minus the worlds' own at each place, [B, places, 6].
 
         Sums are over particles, dimensionless: of 1, of x and y from the place in brush radii, and
         of red, green and blue. They are multiples of the target's mean sum of 1 over all places,
@@ -164,16 +176,26 @@ class TargetDeficit:
         return self._scale * mean.view(len(x), len(self.places), VALUES_PER_PLACE)
 
 
-class RuleDriven:
-    """Mixin of tasks whose worlds a rule steps while an agent acts on them."""
+class RuleDrivenTask(PictureEnvTask[AnyPicture]):
+    """Base class of tasks whose worlds a rule steps while an agent acts on them."""
 
     worlds_type: ClassVar[type[BatchedWorlds] | None] = RuleDrivenWorlds
 
     rewards_each_step: ClassVar[bool] = False
     """Whether `reward="sparse"` also rewards each step."""
 
+    def step(
+        self, x: Tensor, s: Tensor, action: Tensor, random: WorldRandom
+    ) -> tuple[Tensor, Tensor]:
+        """Return positions and states after the action and the steps of the rule."""
+        raise NotImplementedError
+
+    def observe(self, particles: Particles, loss: Tensor, context: Any) -> Tensor:
+        """Return observations, [B, O]; `loss`, [B], is that of the particles."""
+        raise NotImplementedError
+
     def episode_context(self, start: Start, loss: Tensor, random: WorldRandom) -> Any:
-        """Return what later observations and rewards need to know of B episodes' starts.
+        """Return what observations and rewards need of the starts of B episodes.
 
         It is a named tuple of tensors, [B, ...]; `loss` are the losses at the starts, [B].
         """
@@ -191,6 +213,13 @@ class RuleDriven:
         return {}
 
 
+def coarse(pictures: Tensor, size: int) -> Tensor:
+    """Return pictures, [B, R, R, channels], as observations: means over squares of pixels."""
+    pixels = pictures.shape[1] // size
+    observed = F.avg_pool2d(pictures.permute(0, 3, 1, 2), pixels).flatten(1)
+    return observed.clamp(-OBSERVATION_LIMIT, OBSERVATION_LIMIT)
+
+
 class GardenContext(NamedTuple):
     """Losses of the picture at the start of B episodes."""
 
@@ -201,7 +230,7 @@ class GardenContext(NamedTuple):
     """Rise of this loss if the picture turns grey, shape [B]."""
 
 
-class GardenTask(RuleDriven, GrownTask[Config]):
+class GardenTask(RuleDrivenTask[Config], GrownTask[Config]):
     """A grown picture that its rule keeps stepping; `step` is differentiable in the action."""
 
     config_type: ClassVar[type[GardenConfig]] = GardenConfig
@@ -252,7 +281,7 @@ class GardenTask(RuleDriven, GrownTask[Config]):
         return particles
 
     def episode_context(self, start: Start, loss: Tensor, random: WorldRandom) -> Any:
-        """Return each grown picture's loss [B], and its rise [B] if all states became 0 (grey)."""
+        """Return the loss of each grown picture, and its rise if all states became 0: grey."""
         blank = torch.zeros_like(start.s)
         grey = sum(self.losses(start.x, blank).values(), torch.zeros_like(loss))
         # The loss of a picture that did not grow may not rise at all.
@@ -269,38 +298,39 @@ class GardenTask(RuleDriven, GrownTask[Config]):
 
     def observe(self, particles: Particles, loss: Tensor, context: Any) -> Tensor:
         """Return observations [B, O] in the form of `config.observe`: grid, moments or picture."""
+        if self.config.observe == "picture":
+            return coarse(self.observed_picture(particles), self.config.picture_size)
         if self.config.observe == "grid":
-            observed = self.deficit(particles, self.middle(particles.x))
-        elif self.config.observe == "moments":
-            observed = self.moments(particles)
+            observed = self.deficit(particles, self.middle(particles.x)).flatten(1)
         else:
-            observed = self.coarse(particles)
-        return observed.flatten(1).clamp(-OBSERVATION_LIMIT, OBSERVATION_LIMIT)
+            observed = self.moments(particles)
+        return observed.clamp(-OBSERVATION_LIMIT, OBSERVATION_LIMIT)
 
-    def coarse(self, particles: Particles) -> Tensor:
-        """Return coarse pictures, red, green, blue, density, shape [B, 4, G, G].
-
-        A coarse pixel is the mean of pixels of the picture that the loss compares. `observe_error`
-        adds four channels: the target's picture minus this one.
-        """
-        picture, target = self.task.picture(particles.x, particles.s), self.task.target_picture
-        if self.config.observe_error:
-            picture = torch.cat((picture, target - picture), dim=-1)
-        pixels = self.config.resolution // self.config.picture_size
-        return F.avg_pool2d(picture.permute(0, 3, 1, 2), pixels)
+    def observed_picture(self, particles: Particles) -> Tensor:
+        """Return pictures, [B, R, R, 4]; with `observe_error` also the target's minus them."""
+        picture = self.task.picture(particles.x, particles.s)
+        if not self.config.observe_error:
+            return picture
+        return torch.cat((picture, self.task.target_picture - picture), dim=-1)
 
     def moments(self, particles: Particles) -> Tensor:
         """Return first and second moments of positions and states, [B, 5 + 3 C].
 
-        The mean x, y; then, relative to it, the means of x², x y, y², and of s, x s, y s for each
-        channel.
+        `moments_of` the positions; then, relative to their mean, the means of s, x s and y s for
+        each channel.
         """
-        s, mean = particles.s, world_mean(particles.x)
-        away = particles.x - mean[:, None]
-        across, up = away[..., :1], away[..., 1:]
-        seconds = torch.cat((across * across, across * up, up * up), dim=-1)
-        values = torch.cat((seconds, s, across * s, up * s), dim=-1)
-        return torch.cat((mean, world_mean(values)), dim=-1)
+        x, s, *_ = particles
+        away = x - world_mean(x)[:, None]
+        values = torch.cat((s, away[..., :1] * s, away[..., 1:] * s), dim=-1)
+        return torch.cat((moments_of(x), world_mean(values)), dim=-1)
+
+
+def moments_of(x: Tensor) -> Tensor:
+    """Return mean x, y and, relative to it, the means of x², x y, y², shape [B, 5]."""
+    mean = world_mean(x)
+    across, up = (x - mean[:, None]).unbind(dim=-1)
+    seconds = torch.stack((across * across, across * up, up * up), dim=-1)
+    return torch.cat((mean, world_mean(seconds)), dim=-1)
 
 
 class GardenEnv(NPAEnv):
@@ -346,13 +376,13 @@ class GardenEnv(NPAEnv):
     of `inject_channels`. w = (1 − r²)² at r brush radii from the brush, and 0 outside. The wiped
     fraction is clipped to [0, 1], rates to [0, 2], actions to [-1, 1]. An action that is not finite
     raises `NPAError` and does not change the world. `env.unwrapped.task.step(x, s, action, random)`
-    is differentiable in positions, states and actions, except that the moment correction of
+    is differentiable, except that the moment correction of
     [perception](../mathematics.md#perception) counts as constant.
 
-    With `actions="free"`, `Box(-1, 1, (K, 2 + W), float32)`: there are K = `brush_count` brushes,
+    With `actions="free"`, `Box(-1, 1, (J, 2 + W), float32)`: there are J = `brush_count` brushes,
     and the first two columns are the position of each, along x and y [length units].
 
-    With `actions="discrete"`, `MultiDiscrete` with four choices for each of K brushes: its place on
+    With `actions="discrete"`, `MultiDiscrete` with four choices for each of J brushes: its place on
     the grid along x and along y; its tool (nothing, a push in one of eight directions, wipe, each
     channel up or down, rate 0, rate 2, as far as `tools` has them); and its strength, one of
     `strength_count`.
@@ -370,5 +400,5 @@ class GardenEnv(NPAEnv):
     ## Vectorized environment
 
     As in [every environment](Morphogenesis2D.md#vectorized-environment), but on a CPU worlds are
-    stepped one after the other: a batch saves no time there.
+    stepped one by one: a batch saves no time there.
     """

@@ -37,7 +37,7 @@ TOOLS = ("push", "wipe", "inject", "rate")
 class GardenConfig(GrownConfig):
     """`GrownConfig` with the brushes and the form of observations."""
 
-    words = GrownConfig.words | {
+    choices = GrownConfig.choices | {
         "reward": get_args(GardenReward),
         "actions": get_args(BrushActions),
         "observe": get_args(Observe),
@@ -50,8 +50,6 @@ class GardenConfig(GrownConfig):
     particle_count: int = 512
 
     resolution: int = 32
-    """Pixels on each side of the pictures that the loss compares, R."""
-
     seed_pool: int = 16
 
     state_scale: float = 0.5
@@ -84,7 +82,7 @@ class GardenConfig(GrownConfig):
     """Half of the grid's extent along x and y [length units]."""
 
     brush_count: int = 1
-    """Brushes K where actions are "free" or "discrete"; all of them are used in each step."""
+    """Brushes J where actions are "free" or "discrete"; all of them are used in each step."""
 
     strength_count: int = 3
     """Number of strengths, where actions are "discrete"."""
@@ -107,10 +105,9 @@ class GardenConfig(GrownConfig):
         check_rule_driven(self)
         check_flag(self, "observe_error")
         tools, channels, count = self.tools, self.inject_channels, self.state_dim
-        some = isinstance(tools, tuple) and bool(tools) and all(tool in TOOLS for tool in tools)
-        check_field(self, "tools", some, f"be some of {TOOLS}", "try ('push',)")
-        is_sorted = tools == tuple(tool for tool in TOOLS if tool in tools)
-        check_field(self, "tools", is_sorted, f"be in the order of {TOOLS}, each once", "sort them")
+        known = isinstance(tools, tuple) and tools == tuple(t for t in TOOLS if t in tools)
+        rule = f"be some of {TOOLS}, in this order"
+        check_field(self, "tools", known and bool(tools), rule, "try ('push',)")
         whole = isinstance(channels, tuple) and bool(channels) and all(map(is_whole, channels))
         differ = whole and len({channel % count for channel in channels}) == len(channels)
         check_field(self, "inject_channels", differ, "be different whole numbers", "try (-1,)")
@@ -154,14 +151,14 @@ def grid_places(config: GardenConfig, device: torch.device | None = None) -> Ten
 
 
 def offsets(x: Tensor, places: Tensor, config: GardenConfig) -> Tensor:
-    """Return the vector from each place to each particle [length units], shape [B, K, N, 2]."""
+    """Return the vector from each place to each particle [length units], shape [B, J, N, 2]."""
     spread = x[:, None].expand(-1, places.shape[1], -1, -1)
     box = None if config.periodic_box is None else (config.periodic_box, config.periodic_box)
     return offsets_from(spread.flatten(0, 1), places.flatten(0, 1), box).view(spread.shape)
 
 
 def brush_weights(away: Tensor, config: GardenConfig) -> Tensor:
-    """Return each brush's weight in [0, 1] at particles `away` from it, shape [B, K, N]."""
+    """Return each brush's weight in [0, 1] at particles `away` from it, shape [B, J, N]."""
     origin = away.new_zeros(away.shape[0] * away.shape[1], 2)
     weights = softness(away.flatten(0, 1), centre=origin, radius=config.brush_radius)
     return weights.view(away.shape[:3])
@@ -200,7 +197,7 @@ def apply_brushes(
 
 
 def tool_table(config: GardenConfig) -> Tensor:
-    """Return the actions of M choices of a "discrete" brush at full strength, [M, W - 2].
+    """Return the actions of all choices of a "discrete" brush at full strength, [choices, W - 2].
 
     Choices: nothing; pushes in eight directions; wipe; each channel up, down; rates 0 and 2.
     """
@@ -238,7 +235,7 @@ class BrushSpaces(ParticleSpaces):
         on_grid = config.actions == "grid"
         count = config.place_count**2 if on_grid else config.brush_count
         self.rows_shape = (count, BrushLayout.for_config(config).width)
-        """Shape (K, W) of a world's rows of brushes."""
+        """Shape (J, W) of a world's rows of brushes."""
         self._tools = tool_table(config)
         self._choices = [config.place_count] * 2 + [len(self._tools), config.strength_count]
         self.action_space: Space[Any] = Box(-1.0, 1.0, self.rows_shape, np.float32)
@@ -246,11 +243,11 @@ class BrushSpaces(ParticleSpaces):
             self.action_space = MultiDiscrete(self._choices * config.brush_count)
 
     def action(self, action: Any, world_count: int | None) -> Tensor:
-        """Return checked actions as rows of brushes, float32, shape [B, K, W]."""
+        """Return checked actions as rows of brushes, float32, shape [B, J, W]."""
         if self._config.actions != "discrete":
-            return batch_tensor(action, world_count, self.rows_shape, "K, W")
+            return batch_tensor(action, world_count, self.rows_shape, "J, W")
         brushes = self._config.brush_count
-        chosen = batch_choices(action, world_count, (4 * brushes,), "4 K").view(-1, brushes, 4)
+        chosen = batch_choices(action, world_count, (4 * brushes,), "4 J").view(-1, brushes, 4)
         highest = torch.tensor(self._choices, device=chosen.device)
         if not bool(((chosen >= 0) & (chosen < highest)).all()):
             raise NPAError(

@@ -11,7 +11,7 @@ from gymnasium.spaces import Box
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.envs.multi.vector import AgentsEnv, joined_actions
+from npa_envs.envs.multi.agents_env import AgentsEnv, joined_actions
 from npa_envs.errors import MissingDependencyError, NPAError, shown, suggest
 
 try:
@@ -54,31 +54,23 @@ class CrowdEnv(AgentsEnv, KnownAgents):
 
     def __init__(self, task: str, keywords: dict[str, Any], *, by_particle: bool) -> None:
         super().__init__(task, keywords, 1, by_particle=by_particle)
-        self.observation_spaces, self.action_spaces = self._observation_spaces, self._action_spaces
-        self.state_space = self._state_space
-        """Space of `state`: float32, shape [N, 2 + C + 1]."""
+        self.observation_spaces = self.single_observation_spaces
+        self.action_spaces = self.single_action_spaces
+        self.state_space = self.single_state_space
         self.agents: list[str] = []
         self._live: list[int] = []
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], Infos]:
-        """Start an episode with all agents; return observations, and losses with their terms.
-
-        A seed begins its sequence of episodes; None starts the next episode of the current
-        sequence. There are no options.
-        """
+        """Start an episode as `NPAEnv.reset` does; return all agents' observations and infos."""
         observation = self._start(np.arange(1), seed, seed)
         self._update_agents()
         infos = self._infos(self.worlds.agent_returns.loss_infos())
         return self._by_agent(observation), infos
 
     def step(self, actions: Mapping[str, Any]) -> Outcome:
-        """Apply an action of each live agent, and remove agents that ended from the world.
-
-        Returns:
-            Observations, rewards, terminations, truncations and infos, by the names of the agents
-            that acted.
+        """Apply an action of each live agent; return the results of these agents.
 
         Raises:
             NPAError: There is no world yet, or an action is missing, superfluous, or of another
@@ -152,7 +144,7 @@ class CrowdEnv(AgentsEnv, KnownAgents):
         return all_rows
 
     def _infos(self, numbers: dict[str, Tensor]) -> Infos:
-        """Return the infos of live agents, with their species and `numbers`, [1, A] each."""
+        """Return the infos of live agents, with their species and `numbers`, [1, M] each."""
         rows = torch.stack(list(numbers.values()))[:, 0].tolist()
         columns = dict(zip(numbers, rows, strict=True))
         species = self.worlds.agent_species

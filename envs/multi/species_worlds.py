@@ -1,6 +1,6 @@
 """Worlds of several species: episodes, rewards, and removal of agents' particles.
 
-A single world is a batch of one. World k of a batch is the same as alone, bit for bit.
+A single world is a batch of one. Results of a world do not depend on the others, bit for bit.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from torch import Tensor
 
 from npa_envs import world_mean
 from npa_envs.checks import number_tensor
-from npa_envs.envs.core.rewards_and_ends import named_terms, total
+from npa_envs.envs.core.step_report import named_terms, total
 from npa_envs.envs.core.world_state import OBSERVATION_COPIES, WorldState
-from npa_envs.envs.multi.base import Population, SpeciesTask
+from npa_envs.envs.multi.task import Population, SpeciesTask
 from npa_envs.envs.multi.tasks import task_type
 from npa_envs.errors import DivergedError
 from npa_envs.world.cuda_graph import (
@@ -36,7 +36,7 @@ from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import WorldRandom
 
 LossTerms = dict[str, Tensor]
-"""Terms of every agent's loss by name, shape [B, A] each."""
+"""Terms of every agent's loss by name, shape [B, M] each."""
 
 REMOVED, LEFT, ALONE = 1, 2, 3
 """Causes that terminate an agent's episode; 0: none."""
@@ -51,23 +51,23 @@ class AgentOutcome(NamedTuple):
     """Perception of all particles, [B, N, P]; the last one of agents that ended."""
 
     rewards: Tensor
-    """Rewards, 0 for agents that did not act, float64, shape [B, A]."""
+    """Rewards, 0 for agents that did not act, float64, shape [B, M]."""
 
     numbers: dict[str, Tensor]
-    """Losses, their terms, and the decrease of each term, float64, shape [B, A] each."""
+    """Losses, their terms, and the decrease of each term, float64, shape [B, M] each."""
 
     acted: NDArray[np.bool_]
-    """Whether each agent acted in this step, shape [B, A]."""
+    """Whether each agent acted in this step, shape [B, M]."""
 
     endings: NDArray[np.uint8]
-    """Cause that terminated each agent's episode, 0 for none, shape [B, A]."""
+    """Cause that terminated each agent's episode, 0 for none, shape [B, M]."""
 
     truncated: NDArray[np.bool_]
     """Whether each world is truncated, shape [B]."""
 
     @property
     def reasons(self) -> NDArray[Any]:
-        """`info["reason"]` of agents whose episodes ended in this step, else None, [B, A]."""
+        """`info["reason"]` of agents whose episodes ended in this step, else None, [B, M]."""
         truncated = np.where(self.acted & self.truncated[:, None], len(REASONS) - 1, 0)
         return REASONS[np.where(self.endings > 0, self.endings, truncated)]
 
@@ -84,12 +84,12 @@ class AgentReturns:
         shape = world_count, len(species)
         zeros = torch.zeros(shape, dtype=torch.float64, device=species.device)
         self.loss = zeros
-        """Every agent's loss, float64, shape [B, A]."""
+        """Every agent's loss, float64, shape [B, M]."""
         self._terms = self._before = zeros[None]
         self._at_start = self._carried = zeros
 
     def begin(self, terms: LossTerms, worlds: Tensor) -> None:
-        """Begin episodes in worlds of int64 indices [M]; `terms`: of the first losses, [M, A]."""
+        """Begin episodes in worlds of int64 indices [B']; `terms`: of the first losses, [B', M]."""
         first = _stacked(terms)
         if not self.term_names:
             self.term_names = tuple(terms)
@@ -109,7 +109,7 @@ class AgentReturns:
         self.loss = loss
 
     def step_rewards(self, terms: LossTerms, live: Tensor, diverged: Tensor) -> Tensor:
-        """Store the losses after a step; return rewards, float64, [B, A], 0 for ended agents."""
+        """Store the losses after a step; return rewards, float64, [B, M], 0 for ended agents."""
         now = _stacked(terms)
         loss = total(now)
         # Leaving the world must not be rewarded, even if an empty picture is better than the start;
@@ -125,7 +125,7 @@ class AgentReturns:
         return self._task.final_rewards(rewards, live, self._species)
 
     def loss_infos(self, *, stepped: bool = False) -> dict[str, Tensor]:
-        """Return losses and terms, and after a step their decrease, as in `info`, [B, A]."""
+        """Return losses and terms, and after a step their decrease, as in `info`, [B, M]."""
         numbers = {"loss": self.loss} | named_terms("loss", self.term_names, self._terms)
         if stepped:
             numbers |= named_terms("reward", self.term_names, self._before - self._terms)
@@ -142,10 +142,6 @@ class SpeciesWorlds(WorldState):
     Removed particles are not computed. Worlds with the same remaining particles are stepped
     together, as a `Cohort`: the whole batch as long as no agent has been removed. Agents are
     species, or particles with `by_particle`.
-
-    Raises:
-        NPAError: There is no such task, a keyword is unknown or wrong, or the worlds do not fit
-            into memory.
     """
 
     @makes_plain_tensors
@@ -161,7 +157,7 @@ class SpeciesWorlds(WorldState):
         by_species = 4 * OBSERVATION_COPIES * world_count * count * appended
         super().__init__(config, task_class, world_count, count, by_species)
         self.perception_dim = self.physics.perception_dim + appended
-        """Columns of perception: P, and K (1 + D) more with per-species perception."""
+        """Columns of perception: P, and S (1 + D) more with per-species perception."""
         self.task = task_class(config, self.device)
         self.by_particle = by_particle
         self.species = np.repeat(np.arange(config.species_count), config.counts)
@@ -173,11 +169,11 @@ class SpeciesWorlds(WorldState):
         self.spans = [slice(int(e - n), int(e)) for e, n in zip(ends, sizes, strict=True)]
         """Slice of each agent's particles."""
         self.agent_species = self.species[ends - 1]
-        """Species of each agent, int64, shape [A]."""
+        """Species of each agent, int64, shape [M]."""
         self.live = np.zeros((world_count, len(sizes)), dtype=bool)
-        """Whether each agent acts in the next step, shape [B, A]."""
+        """Whether each agent acts in the next step, shape [B, M]."""
         self.present = np.zeros_like(self.live)
-        """Whether each agent's particles are in its world, shape [B, A]."""
+        """Whether each agent's particles are in its world, shape [B, M]."""
         self.running = np.zeros(world_count, dtype=bool)
         """Whether each world's episode goes on; the others are not stepped, shape [B]."""
         self.elapsed = np.zeros(world_count, dtype=np.int64)
@@ -208,7 +204,7 @@ class SpeciesWorlds(WorldState):
     @torch.no_grad()
     @makes_plain_tensors
     def start(self, worlds: NDArray[np.int64], keys: Tensor | None = None) -> Tensor:
-        """Start episodes in the worlds of indices [M]; return their perception, [M, N, P].
+        """Start episodes in the worlds of indices [B']; return their perception, [B', N, P].
 
         Keys are those of `next_streams`.
         """
@@ -228,12 +224,9 @@ class SpeciesWorlds(WorldState):
     @torch.no_grad()
     @makes_plain_tensors
     def step(self, action: Tensor) -> AgentOutcome:
-        """Apply actions, compute rewards, and remove agents that ended from their worlds.
+        """Apply finite actions, [B, N, A], compute rewards, and remove agents that ended.
 
-        The host reads whether each agent is out of bounds, one byte an agent.
-
-        Args:
-            action: Finite, on the device, shape [B, N, A]; ignored for agents that ended.
+        The host reads whether each agent is out of bounds, one byte per agent.
 
         Raises:
             DivergedError: An agent is out of bounds, and `on_divergence` is "raise".
@@ -282,7 +275,7 @@ class SpeciesWorlds(WorldState):
         return perceived
 
     def loss_terms(self, *, stepped: bool = False) -> LossTerms:
-        """Return the terms of every agent's loss, float32, [B, A] each; 0 for ended agents."""
+        """Return the terms of every agent's loss, float32, [B, M] each; 0 for ended agents."""
         terms: LossTerms = {}
         for cohort in self.cohorts:
             for name, term in (cohort.terms if stepped else cohort.loss_terms()).items():
@@ -304,10 +297,9 @@ class SpeciesWorlds(WorldState):
         return self._measure_unrewarded()
 
     def _measure_unrewarded(self) -> Tensor:
-        """Measure the losses anew, without a reward; return what particles perceive."""
+        """Measure the losses again, without a reward; return what particles perceive."""
         self.agent_returns.replace(self.loss_terms())
-        perceived: Tensor = self.perception()
-        return perceived
+        return self.perception()
 
     def population(self, world: int) -> Population:
         """Return the remaining particles of the world of this index."""
@@ -338,7 +330,7 @@ class SpeciesWorlds(WorldState):
             self.running &= ~deserted
 
     def _endings(self, diverged: NDArray[np.bool_]) -> NDArray[np.uint8]:
-        """Return the cause that terminates each agent's episode in this step, 0: none, [B, A]."""
+        """Return the cause that terminates each agent's episode in this step, 0: none, [B, M]."""
         live = self.live
         endings = np.zeros(live.shape, dtype=np.uint8)
         endings[live & (self._last_step == self.elapsed[:, None])] = REMOVED
@@ -352,7 +344,7 @@ class SpeciesWorlds(WorldState):
         return endings
 
     def _divergence_message(self, diverged: NDArray[np.bool_]) -> str:
-        """Return the message of the error for agents out of bounds, shape [B, A]."""
+        """Return the message of the error for agents out of bounds, shape [B, M]."""
         limits, word = self.physics.limits, "particle" if self.by_particle else "species"
         indices = np.argwhere(diverged)
         names = [f"{word}_{agent} of world {world}" for world, agent in indices[:MAX_REPORT]]
@@ -404,7 +396,7 @@ class SpeciesWorlds(WorldState):
         return cohorts
 
     def _disband(self) -> None:
-        """Copy the cohorts' particles to the batch; group the worlds anew at the next use."""
+        """Copy the cohorts' particles to the batch; group the worlds again at the next use."""
         self._collect()
         self._cohorts = None
 
@@ -442,10 +434,10 @@ class Cohort:
         self.population = population_of(particles, batch.species[columns], species_count)
         """The particles."""
         self.terms: LossTerms = {}
-        """Terms of every agent's loss after the last step, shape [M, A] each."""
+        """Terms of every agent's loss after the last step, shape [B', M] each."""
         self._agent_count = len(batch.agent_species)
         self.diverged = torch.zeros(len(worlds), self._agent_count, dtype=torch.bool, device=device)
-        """Which agents have no particle within bounds after the last step, shape [M, A]."""
+        """Which agents have no particle within bounds after the last step, shape [B', M]."""
         self._owners = to_device_async(batch.owner[columns], device)
         self._neighbours: NeighbourState | None = None
         enabled = torch.ones(1, dtype=torch.uint8, device=device)
@@ -461,14 +453,14 @@ class Cohort:
         return self.__dict__ | {"_neighbours": None}
 
     def act(self, action: Tensor) -> None:
-        """Apply finite actions, [M, N', A]; compute losses and neighbours, without waiting."""
+        """Apply finite actions, [B', N', A]; compute losses and neighbours, without waiting."""
         action = self._task.with_opponent(action, self.population, self.random)
         self._draw()
         self._actions.apply(action)
         self._evaluate_graph()
 
     def loss_terms(self, population: Population | None = None) -> LossTerms:
-        """Return the terms of every agent's loss, float32, [M, A] each; 0 for removed agents.
+        """Return the terms of every agent's loss, float32, [B', M] each; 0 for removed agents.
 
         `population`: other positions and states of the same particles; None: the current ones.
         """
@@ -483,7 +475,7 @@ class Cohort:
         }
 
     def perception(self, population: Population | None = None, *, stepped: bool = False) -> Tensor:
-        """Return what the N' particles of each world perceive, shape [M, N', P].
+        """Return what the N' particles of each world perceive, shape [B', N', P].
 
         `stepped`: particles are as the last step left them, so its neighbour search is reused.
         """

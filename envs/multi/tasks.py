@@ -12,7 +12,7 @@ from torch import Tensor
 
 from npa_envs import perceive, world_mean
 from npa_envs.checks import check_field
-from npa_envs.envs.multi.base import Population, SpeciesConfig, SpeciesTask
+from npa_envs.envs.multi.task import Population, SpeciesConfig, SpeciesTask
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.registration import SPECIES, SPECIES_SIZES
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
@@ -23,7 +23,7 @@ class MixingTask(SpeciesTask):
     """Mix the species: a particle's loss is 1 minus the entropy of species around it."""
 
     def losses(self, population: Population) -> Mapping[str, Tensor]:
-        """Return each species' mean of its particles' losses, by name, shape [B, K]."""
+        """Return each species' mean of its particles' losses, by name, shape [B, S]."""
         spans = [population.spans[k] for k in _present(population)]
         return {
             name: by_species([world_mean(loss[:, span, None])[:, 0] for span in spans], population)
@@ -38,8 +38,8 @@ class MixingTask(SpeciesTask):
         """Return the entropy of species around each particle, in [0, 1], shape [B, N].
 
         The fraction of species k around a particle is f_k = b_k / Σ b, where b are SPH-smoothed
-        tags (1 for a particle of species k, else 0). The entropy is −Σ f_k ln f_k / ln K: 0 with
-        one species in the neighbourhood, 1 with equal parts of all K.
+        tags (1 for a particle of species k, else 0). The entropy is −Σ f_k ln f_k / ln S: 0 with
+        one species in the neighbourhood, 1 with equal parts of all S.
         """
         species_count = len(population.counts)
         indices = torch.arange(species_count, device=population.x.device)
@@ -190,7 +190,7 @@ class CoMorphogenesisTask(PictureLossTask):
         super().__init__(config, device, *zip(config.target_names, config.counts, strict=True))
 
     def losses(self, population: Population) -> Mapping[str, Tensor]:
-        """Return density error and weighted colour error of each species, by name, [B, K]."""
+        """Return density error and weighted colour error of each species, by name, [B, S]."""
         terms = [self.picture_terms(k, *population.of(k)) for k in _present(population)]
         return {name: by_species([term[name] for term in terms], population) for name in terms[0]}
 
@@ -206,7 +206,7 @@ class CoMorphogenesisTask(PictureLossTask):
 class InvasionConfig(OnePictureConfig):
     """`OnePictureConfig` with `opponent`, who plays the invaders; refuses reward="team"."""
 
-    words = OnePictureConfig.words | {"opponent": (None, "random")}
+    choices = OnePictureConfig.choices | {"opponent": (None, "random")}
 
     opponent: str | None = None
     """Who plays the invaders: None: agents; "random": the environment, with actions uniform in
@@ -233,7 +233,7 @@ class InvasionTask(PictureLossTask):
         super().__init__(config, device, (config.target, config.counts[0]))
 
     def losses(self, population: Population) -> Mapping[str, Tensor]:
-        """Return the terms of the losses by name, [B, K]; invaders share minus species 0's loss."""
+        """Return the terms of the losses by name, [B, S]; invaders share minus species 0's loss."""
         invaders = population.counts[1:]
         present = max(sum(count > 0 for count in invaders), 1)
         return {
@@ -256,7 +256,7 @@ class InvasionTask(PictureLossTask):
         return torch.where((population.species > 0)[:, None], drawn, action)
 
     def final_rewards(self, rewards: Tensor, live: Tensor, species: Tensor) -> Tensor:
-        """Return rewards, [B, A]: live invaders lose in equal parts what species 0 gains."""
+        """Return rewards, [B, M]: live invaders lose in equal parts what species 0 gains."""
         invading = species > 0
         gained = torch.where(invading, 0.0, rewards).sum(dim=1, keepdim=True)
         payers = live & invading
@@ -284,7 +284,7 @@ class SymbiosisTask(PictureLossTask):
         super().__init__(config, device, (config.target, sum(config.counts)))
 
     def losses(self, population: Population) -> Mapping[str, Tensor]:
-        """Return density error and weighted colour error, by name, equal for all, [B, K]."""
+        """Return density error and weighted colour error, by name, equal for all, [B, S]."""
         terms = self.picture_terms(0, population.x, population.s)
         count = len(population.counts)
         return {name: loss[:, None].expand(-1, count) for name, loss in terms.items()}
@@ -303,7 +303,7 @@ def _present(population: Population) -> list[int]:
 
 
 def by_species(losses: list[Tensor], population: Population) -> Tensor:
-    """Return losses of the present species as one tensor, shape [B, K], 0 for the others."""
+    """Return losses of the present species as one tensor, shape [B, S], 0 for the others."""
     present, zeros = iter(losses), population.x.new_zeros(len(population.x))
     return torch.stack([next(present) if n else zeros for n in population.counts], dim=1)
 

@@ -32,7 +32,7 @@ from npa_envs.world.steps import draw_step
 
 
 def perceive_each_species(x: Tensor, counts: Sequence[int], physics: Physics) -> Tensor:
-    """Return the densities of K species, then their gradients, clipped, [B, N, K (1 + D)].
+    """Return the densities of S species, then their gradients, clipped, [B, N, S (1 + D)].
 
     Species k has `counts[k]` consecutive particles; an empty one has zeros.
     """

@@ -59,7 +59,7 @@ def seeded(env, seed):
     """Reset, and return the observation, the same worlds and the streams they came from."""
     observation, _ = env.reset(seed=seed)
     random = npa_envs.WorldRandom(seed)
-    x, s = env.unwrapped.task.seed(random)
+    x, s, *_ = env.unwrapped.task.fresh(random)
     for ours, theirs in zip(env.unwrapped.particles(), (x, s), strict=True):
         assert torch.equal(ours, theirs[0])
     return observation, x, s, random

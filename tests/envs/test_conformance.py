@@ -152,16 +152,16 @@ class TestEveryEnvironment:
         first, second, other = self.make(), self.make(), begun(self.make())
         actions = self.sampled(first, 4)
 
-        def episode(env, seed=5, beside=None):
+        def episode(env, seed=5, neighbour=None):
             trace = [env.reset(seed=seed)]
             for action in actions:
                 trace.append(env.step(action))
-                if beside is not None:
-                    beside.step(beside.action_space.sample())
+                if neighbour is not None:
+                    neighbour.step(neighbour.action_space.sample())
             return trace
 
         trace = episode(first)
-        assert_same(trace, episode(second, beside=other))
+        assert_same(trace, episode(second, neighbour=other))
         following = first.reset(), first.step(actions[0])
         assert_same(trace, episode(first))
         assert_same(following, (first.reset(), first.step(actions[0])))

@@ -28,17 +28,12 @@ def actions(env, count, seed=0, scale=1.0):
     return random.uniform(low, high, (count, *env.action_space.shape)).astype(np.float32)
 
 
-@pytest.mark.parametrize(
-    "program",
-    [
-        "gymnasium.make('npa_envs:npa/Morphogenesis2D-v0', particle_count=8)",
-        "import npa_envs; name = 'npa/Morphogenesis2D-v0'; gymnasium.make(name);"
-        "gymnasium.make_vec(name, 2, 'vector_entry_point')",
-    ],
-)
-def test_ids_are_found_in_a_fresh_process(program):
-    command = [sys.executable, "-W", "error", "-c", f"import gymnasium; {program}"]
-    subprocess.run(command, check=True)
+def test_ids_are_found_in_a_fresh_process():
+    program = (
+        "import gymnasium; gymnasium.make('npa_envs:npa/Morphogenesis2D-v0', particle_count=8);"
+        "gymnasium.make_vec('npa/Morphogenesis2D-v0', 2, 'vector_entry_point')"
+    )
+    subprocess.run([sys.executable, "-W", "error", "-c", program], check=True)
 
 
 @pytest.mark.parametrize("limit", [-1, 2, 3])
@@ -175,13 +170,12 @@ def test_digits_pay_the_score_that_is_asked_for_and_tell_class_and_accuracy(scor
             "accuracy": 1.0 - right,
         }[score]
         assert info[f"loss_{score}"] == pytest.approx(float(expected), rel=1e-5)
-        # A policy that says the class loudly is right.
+    # A policy that says the class loudly is right.
     loud = np.zeros(env.action_space.shape, np.float32)
     loud[:, -10 + label] = 1.0
     before = info["loss"]
-    for _ in range(3):
-        env.unwrapped.step(loud)
-    _, _, _, _, info = env.unwrapped.step(loud)
+    for _ in range(4):
+        _, _, _, _, info = env.unwrapped.step(loud)
     assert info["accuracy"] > 0.9
     assert score == "error" or info["loss"] < before
 
@@ -269,18 +263,15 @@ def test_replaced_particles_are_perceived_and_pay_nothing(name):
     assert reward == 0.0
 
 
-def test_pictures_with_a_read_out_show_what_it_says():
-    shades = []
-    for readout in ("", "duck"):
-        keywords = {"particle_count": 256, "target": "duck", "state_dim": 24, "render_size": 32}
-        env = make("npa/Morphogenesis3D-v0", readout=readout, render_mode="rgb_array", **keywords)
-        env.reset(seed=0)
-        red, green, blue = np.asarray(env.render()).reshape(-1, 3).min(axis=0).astype(float)
-        shades.append((red - blue, green - blue))
-    (grey, _), (yellow, also_green) = shades
-    assert abs(grey) < 2
-    assert yellow > 40
-    assert also_green > 40
+@pytest.mark.parametrize("readout", ["", "duck"])
+def test_pictures_with_a_read_out_show_what_it_says(readout):
+    keywords = {"particle_count": 256, "target": "duck", "state_dim": 24, "render_size": 32}
+    env = make("npa/Morphogenesis3D-v0", readout=readout, render_mode="rgb_array", **keywords)
+    red, green, blue = np.asarray(begun(env).render()).reshape(-1, 3).min(axis=0).astype(float)
+    if readout:
+        assert min(red, green) > blue + 40
+    else:
+        assert abs(red - blue) < 2
 
 
 @pytest.mark.parametrize("name", ["npa/Morphogenesis2D-v0", "npa/Morphogenesis3D-v0"])

@@ -93,7 +93,7 @@ OF_ONE = {
     functools.partial(make, GARDENER): [
         ({"tell_updated": True}, "actions do not belong to particles"),
         ({"tools": ("pull",)}, "tools must be some of"),
-        ({"tools": ("rate", "push")}, "in the order of"),
+        ({"tools": ("rate", "push")}, "in this order"),
         ({"inject_channels": (16,)}, r"inject_channels must lie in \[-16, 15\]"),
         ({"inject_channels": (-1, 15)}, "inject_channels must be different"),
         ({"picture_size": 7}, "picture_size must divide resolution = 16"),
@@ -304,7 +304,7 @@ PARTICLES = [
         r"'particle_7'\] must be real numbers of shape \(18,\)",
     ),
 ]
-BRUSHES = r"action must be real numbers of shape \[K, W\]"
+BRUSHES = r"action must be real numbers of shape \[J, W\]"
 GARDENERS = [
     (
         lambda env: env.action_space("keeper"),
@@ -340,7 +340,7 @@ WRONG_CALLS |= {
         functools.partial(make, SHAPESHIFTER),
         NO_WORLD,
         [
-            (lambda env: env.step(np.zeros(9, np.float32)), r"real numbers of shape \[K\]"),
+            (lambda env: env.step(np.zeros(9, np.float32)), r"real numbers of shape \[code_dim\]"),
             (acting(lambda a: a + np.nan), "action must be finite"),
         ],
     ),

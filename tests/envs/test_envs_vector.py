@@ -164,35 +164,24 @@ def test_a_reset_world_begins_its_next_episode_within_this_one(name, reward, dev
 SPECIES = {"particle_count": 40, "state_dim": 4, "observation_limit": LIMIT, "update_prob": 1.0}
 
 
-def species_pushed(env):
-    """Return actions that push all states of the second species."""
-    actions = still(env)
-    if "species_1" in actions:
-        actions["species_1"][..., 2:] = 1.0
-    return actions
-
-
-def test_species_that_diverge_are_terminated_told_or_let_be(device):
-    for way in ("terminate", "ignore"):
-        keywords = SPECIES | {"on_divergence": way, "device": str(device)}
-        env = begun(multispecies_v0.parallel_env("mixing", **keywords))
-        for _ in range(LAST):
-            observations, _, terminations, *_ = env.step(species_pushed(env))
-        assert terminations == {"species_0": False, "species_1": way == "terminate"}
-        assert env.agents == ["species_0"] + ["species_1"] * (way == "ignore")
-        assert all(np.isfinite(rows).all() for rows in observations.values())
-    assert (env.particles()[1][20:] == LIMIT).all()
-
-
-def test_an_error_names_species_and_world(device):
-    keywords = SPECIES | {"on_divergence": "raise", "device": str(device)}
+@pytest.mark.parametrize("way", ["terminate", "ignore", "raise"])
+def test_species_that_diverge_are_terminated_named_or_continue(way, device):
+    keywords = SPECIES | {"on_divergence": way, "device": str(device)}
     envs = begun(multispecies_v0.batched("mixing", world_count=2, **keywords))
-    action = species_pushed(envs)
-    action["species_1"][0] = 0.0
+    action = still(envs)
+    action["species_1"][1, :, 2:] = 1.0
     for _ in range(LAST - 1):
         envs.step(action)
-    with pytest.raises(DivergedError, match="species_1 of world 1 had none after step 4: take"):
-        envs.step(action)
+    if way == "raise":
+        with pytest.raises(DivergedError, match="species_1 of world 1 had none after step 4: take"):
+            envs.step(action)
+        return
+    observations, _, terminations, _, infos = envs.step(action)
+    assert terminations["species_1"].tolist() == [False, way == "terminate"]
+    assert infos["species_1"]["live"].tolist() == [True, way == "ignore"]
+    assert not terminations["species_0"].any()
+    assert all(np.isfinite(rows).all() for rows in observations.values())
+    assert way == "terminate" or (envs.state()[1, 20:, 2:-1] == LIMIT).all()
 
 
 # Among torch's modes, in threads, and made again and again

@@ -12,7 +12,6 @@ from support.refusals import refused
 from support.small_envs import begun, make, make_vec, small
 
 import npa_envs
-from npa_envs.agents.gardening import ScriptedGardener
 from npa_envs.agents.shapeshifting import RecognisingShapeshifter
 from npa_envs.envs import gardeners_v0
 from npa_envs.envs.garden.base import GardenContext
@@ -94,7 +93,7 @@ def test_what_lacks_is_seen_where_it_lacks():
     assert lack[left, 0] > 0.5
     assert lack[right, 0] < -0.5
     assert lack[left, 0] == pytest.approx(float(lack[:, 0].max()))
-    # From the place beside it, they lack on the other side.
+    # From the place next to it, they lack on the other side.
     assert lack[right, 1] < -0.1
     grey[:, -3:] = -0.5
     lack = task.deficit(Particles(target.points[None], grey[None]), torch.zeros(1, 2))[0]
@@ -223,11 +222,11 @@ def test_rewards_of_goals_are_those_of_steps_and_of_any_other_goals(reward):
 )
 def test_only_rewards_that_come_in_the_last_step_can_be_missed(name, warned):
     env = begun(make(name, reward="sparse", episode_steps=2))
-    with warnings.catch_warnings(record=True) as told:
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         _, reward, *_ = env.step(env.action_space.sample())
         env.reset()
-    assert any("before its sparse reward" in str(one.message) for one in told) == warned
+    assert any("before its sparse reward" in str(one.message) for one in caught) == warned
     # Away from its goal a creature is paid -1 in each step.
     assert reward == (0.0 if warned else -1.0)
 
@@ -249,7 +248,7 @@ def test_hindsight_experience_replay_runs_as_it_is():
     assert 0.0 in batch.rewards
 
 
-def test_weather_comes_as_often_as_it_is_told_to():
+def test_weather_comes_as_often_as_configured():
     still = {"position_noise": 0.0, "gust_length": 0.3}
     for chances, expected in (((1.0, 0.0), (1, 0)), ((0.0, 1.0), (0, 1)), ((0.0, 0.0), (0, 0))):
         env = begun(make(GARDENER, gust_chance=chances[0], blight_chance=chances[1], **still))
@@ -284,15 +283,6 @@ def test_pettingzoo_finds_nothing_to_complain_of(form):
     parallel_api_test(gardeners_v0.parallel_env(max_cycles=5, **GARDEN, **form), num_cycles=12)
     parallel_seed_test(lambda: gardeners_v0.parallel_env(max_cycles=5, **GARDEN, **form), 2)
     api_test(gardeners_v0.env(max_cycles=5, **GARDEN, **form), num_cycles=12)
-
-
-def test_policies_of_gardens_act_for_either_agent():
-    env = gardeners_v0.parallel_env(**GARDEN)
-    seen, _ = env.reset(seed=0)
-    script = ScriptedGardener(env.garden)
-    left, right = (script(seen[agent]) for agent in env.agents)
-    assert np.array_equal(left, right)
-    assert np.abs(left).max() > 0.0
 
 
 @pytest.mark.skipif(not hasattr(pettingzoo, "make"), reason="PettingZoo has no registry yet")

@@ -213,7 +213,7 @@ def crowd(task="mixing", **keywords):
     return particles_v0.parallel_env(**few(task, **keywords))
 
 
-def test_every_particle_is_an_agent_and_is_told_its_species():
+def test_every_particle_is_an_agent_and_reports_its_species():
     env = crowd(particle_counts=(2, 3))
     observations, infos = env.reset(seed=0)
     assert env.agents == [f"particle_{k}" for k in range(5)]

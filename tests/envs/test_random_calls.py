@@ -366,7 +366,7 @@ PLAYED |= dict.fromkeys((*multispecies_v0.ENVIRONMENTS, *particles_v0.ENVIRONMEN
 
 
 def make(name: str, draw: random.Random) -> Played:
-    """Return an environment; a choice of keywords that is refused is drawn anew."""
+    """Return an environment; a choice of keywords that is refused is drawn again."""
     while True:
         try:
             return PLAYED[name].make(name, draw)

@@ -62,8 +62,8 @@ def test_an_id_is_the_environment_of_its_name_with_other_keywords(row):
     assert spec.vector_entry_point == row.vector_entry_point == of_usual.vector_entry_point
     assert spec.max_episode_steps == row.max_episode_steps
     sized = Problem(env_id=row.id, episode_steps=row.max_episode_steps)
-    told = Problem(env_id=usual, keywords=dict(row.keywords), episode_steps=4)
-    assert sized.config == told.config
+    by_keywords = Problem(env_id=usual, keywords=dict(row.keywords), episode_steps=4)
+    assert sized.config == by_keywords.config
     changed = Problem(env_id=row.id, keywords={"update_prob": 0.25}, episode_steps=4)
     assert changed.config.update_prob == 0.25
     assert changed.config.particle_count == sized.config.particle_count

@@ -10,18 +10,15 @@ import torch
 from torch import Tensor
 
 from npa_envs.envs.core.task import EnvTask, checked_tensor
-from npa_envs.world.environment_steps import DIVERGED, SUCCESS, TIME_LIMIT
+from npa_envs.world.environment_steps import DIVERGED, SUCCESS, TIME_LIMIT, with_mean_reward
 from npa_envs.world.particles import Particles
 
-FLAGS = ("success", "diverged")
-"""Names in `info` of the flags that are no part of what Gymnasium's `step` returns."""
-
-FLAG_ROWS = 2 + len(FLAGS) + 1
-"""Rows of flags in a report: terminated, truncated, `FLAGS`, and one that is always True."""
+FLAG_ROWS = 5
+"""Rows of flags in a report: the four of `StepReport.endings`, and `all_worlds`."""
 
 
 def total(terms: Tensor) -> Tensor:
-    """Return the sum of the terms of a loss, [K, B], one after the other.
+    """Return the sum of the terms of a loss, [terms, B], in their order.
 
     `torch.sum` may add in another order, which depends on the number of worlds.
     """
@@ -39,13 +36,40 @@ def reason(ending: int) -> str | None:
     return next((name for bit, name in names.items() if ending & bit), None)
 
 
+class StepNumbers(NamedTuple):
+    """Reward and losses of worlds, as tensors or arrays of shape [B], or of a single world."""
+
+    reward: Any
+    """Reward of the last step."""
+    loss: Any
+    """Loss after it."""
+    terms: Any
+    """The terms of the loss, one row per term."""
+    improvements: Any
+    """Decrease of each term in the last step, one row per term."""
+
+    @classmethod
+    def from_rows(cls, rows: Any) -> StepNumbers:
+        """Return the rows of `StepReport.numbers` by name, or those of one of its columns."""
+        term_count = len(rows) // 2 - 1
+        return cls(rows[0], rows[1], rows[2 : 2 + term_count], rows[2 + term_count :])
+
+
 class StepReport(NamedTuple):
     """Rewards, losses and flags of each world, as views of one buffer that is copied at once."""
 
     buffer: Tensor
     """The memory of the fields below, uint8."""
     numbers: Tensor
-    """Reward, loss, its K terms, and each term's decrease in the last step, shape [2 + 2 K, B]."""
+    """The rows of the next four fields, float32, shape [2 + 2 terms, B]."""
+    reward: Tensor
+    """Rewards of the last step, shape [B]."""
+    loss: Tensor
+    """Losses, shape [B]."""
+    terms: Tensor
+    """The terms of each loss, shape [terms, B]."""
+    improvements: Tensor
+    """Decrease of each term of the loss in the last step, shape [terms, B]."""
     endings: Tensor
     """Terminated, truncated, success, diverged, bool, shape [4, B]."""
     all_worlds: Tensor
@@ -53,7 +77,7 @@ class StepReport(NamedTuple):
 
     @classmethod
     def empty(cls, world_count: int, term_count: int, device: torch.device) -> StepReport:
-        """Return a `StepReport` of zeros, for B worlds whose loss has K terms."""
+        """Return a `StepReport` of zeros, for B worlds whose loss has some terms."""
         rows = 4 * (2 + 2 * term_count) + FLAG_ROWS
         buffer = torch.zeros(rows * world_count, dtype=torch.uint8, device=device)
         report = cls.from_buffer(buffer, world_count)
@@ -66,7 +90,7 @@ class StepReport(NamedTuple):
         numbers, flags = buffer.view(-1, world_count).tensor_split((-FLAG_ROWS,))
         numbers = numbers.flatten().view(torch.float32).view(-1, world_count)
         flags = flags.view(torch.bool)
-        return cls(buffer, numbers, flags[:-1], flags[-1])
+        return cls(buffer, numbers, *StepNumbers.from_rows(numbers), flags[:-1], flags[-1])
 
     def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
         # Unpickled views would not share the buffer's memory.
@@ -75,26 +99,6 @@ class StepReport(NamedTuple):
     def copy(self) -> StepReport:
         """Return a copy of the report, which later steps do not overwrite."""
         return self.from_buffer(self.buffer.clone(), len(self.all_worlds))
-
-    @property
-    def reward(self) -> Tensor:
-        """Rewards of the last step, shape [B]."""
-        return self.numbers[0]
-
-    @property
-    def loss(self) -> Tensor:
-        """Losses, shape [B]."""
-        return self.numbers[1]
-
-    @property
-    def terms(self) -> Tensor:
-        """The terms of each loss, shape [K, B]."""
-        return self.numbers[2 : 1 + len(self.numbers) // 2]
-
-    @property
-    def improvements(self) -> Tensor:
-        """Decrease of each term of the loss in the last step, shape [K, B]."""
-        return self.numbers[1 + len(self.numbers) // 2 :]
 
 
 class ParticleRewards:
@@ -108,15 +112,15 @@ class ParticleRewards:
         self._before = particles if by_loss else particles.map(torch.clone)
 
     def place(self, worlds: Tensor, task: EnvTask[Any], particles: Particles) -> None:
-        """Store the new particles of the worlds of indices `worlds`, int64 [M]; rewards are 0."""
+        """Store the new particles of the worlds of indices `worlds`, int64 [B']; rewards are 0."""
         self.reward.index_fill_(0, worlds, 0.0)
         if self.loss is None:
             self._before.put_(worlds, particles)
         else:
             self.loss[worlds] = self._losses(task, particles)
 
-    def step_rewards(self, task: EnvTask[Any], particles: Particles) -> Tensor:
-        """Return each particle's reward of a step, [B, N]; store these particles for the next."""
+    def gains(self, task: EnvTask[Any], particles: Particles) -> Tensor:
+        """Return what each particle gained in a step, [B, N]; store these particles."""
         if self.loss is None:
             gains = task.particle_gains(self._before[:2], particles[:2])
             gains = checked_tensor(task, "particle_gains", "gains", gains, self.reward.shape)
@@ -126,6 +130,17 @@ class ParticleRewards:
         gains = self.loss - losses
         self.loss.copy_(losses)
         return gains
+
+    def write(self, gains: Tensor, reward: Tensor, by_world: Tensor, enabled: Tensor) -> None:
+        """Write the rewards of a step from `gains`, [B, N], and the worlds' rewards, [B].
+
+        Particles of worlds in `by_world`, bool [B], get the world's reward. Nothing changes unless
+        `enabled`, uint8 [1].
+        """
+        if self.loss is None:
+            gains = with_mean_reward(gains, reward)
+        rewards = torch.where(by_world[:, None], reward[:, None], gains)
+        self.reward.copy_(torch.where(enabled.bool(), rewards, self.reward))
 
     def _losses(self, task: EnvTask[Any], particles: Particles) -> Tensor:
         losses = task.particle_losses(particles.x, particles.s)

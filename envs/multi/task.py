@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.checks import check_field, check_non_negative, check_positive, is_whole
-from npa_envs.envs.core.config import WorldConfig, plain
+from npa_envs.envs.core.config import WorldConfig, as_python
 from npa_envs.envs.core.interface import Interface
 from npa_envs.envs.core.task import WorldTask
 from npa_envs.errors import NPAError
@@ -41,7 +41,7 @@ MAX_COUNT = 64
 class SpeciesConfig(WorldConfig):
     """Fields of all tasks of several species; a task adds its own."""
 
-    words = WorldConfig.words | {
+    choices = WorldConfig.choices | {
         "perception": get_args(Perception),
         "reward": get_args(SpeciesReward),
         "on_divergence": get_args(SpeciesOnDivergence),
@@ -53,7 +53,7 @@ class SpeciesConfig(WorldConfig):
     }
 
     species_count: int = 2
-    """Species K."""
+    """Species S."""
 
     particle_count: int = 1024
     """Particles of all species together, N, divided evenly."""
@@ -130,7 +130,7 @@ class SpeciesConfig(WorldConfig):
     @classmethod
     def from_keywords(cls, keywords: dict[str, Any]) -> Self:
         """As `WorldConfig.from_keywords`; refuse `particle_count` next to `particle_counts`."""
-        if "particle_count" in keywords and plain(keywords.get("particle_counts")):
+        if "particle_count" in keywords and as_python(keywords.get("particle_counts")):
             raise NPAError(
                 "particle_count and particle_counts exclude each other: "
                 "particle_counts gives the number of each species"
@@ -141,10 +141,7 @@ class SpeciesConfig(WorldConfig):
         counts, species_count = self.particle_counts, self.species_count
         whole = isinstance(counts, tuple) and all(is_whole(count) for count in counts)
         fits = not counts or (whole and len(counts) == species_count and min(counts) >= 1)
-        rule = (
-            f"be {species_count} whole numbers of at least 1, one for each of species_count = "
-            f"{species_count}"
-        )
+        rule = f"be {species_count} whole numbers of at least 1, one for each species"
         hint = f"for example particle_counts={(64,) * species_count}"
         check_field(self, "particle_counts", fits, rule, hint)
         enough = bool(counts) or self.particle_count >= species_count
@@ -154,7 +151,7 @@ class SpeciesConfig(WorldConfig):
     def _check_deaths(self) -> None:
         deaths, last = self.deaths, self.species_count - 1
         pairs = isinstance(deaths, tuple) and all(
-            isinstance(pair, tuple) and len(pair) == 2 and all(is_whole(k) for k in pair)
+            isinstance(pair, tuple) and len(pair) == 2 and all(map(is_whole, pair))
             for pair in deaths
         )
         fits = pairs and all(0 <= k <= last and step > 0 for k, step in deaths)
@@ -227,7 +224,7 @@ class SpeciesTask(WorldTask[Any]):
         return x, x.new_zeros(*shape, config.state_dim)
 
     def losses(self, population: Population) -> Mapping[str, Tensor]:
-        """Return the terms of each species' loss by name, shape [B, K] each; their sum is its loss.
+        """Return the terms of each species' loss by name, shape [B, S] each; their sum is its loss.
 
         The losses of a world must not depend on the others, and nothing may synchronise. Losses of
         removed species are not read.
@@ -243,7 +240,7 @@ class SpeciesTask(WorldTask[Any]):
         return action
 
     def final_rewards(self, rewards: Tensor, live: Tensor, species: Tensor) -> Tensor:
-        """Return `rewards`, [B, A], which a task may change; by default unchanged."""
+        """Return `rewards`, [B, M], which a task may change; by default unchanged."""
         return rewards
 
     def is_over(self, counts: tuple[int, ...]) -> bool:

@@ -1,0 +1,134 @@
+"""Base class of environments with several agents, of one world or many, and checks of actions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium.spaces import Box
+from gymnasium.utils import seeding
+from numpy.typing import NDArray
+from torch import Tensor
+
+from npa_envs.envs.core.base import ShownEnv, action_tensor
+from npa_envs.envs.core.config import as_python
+from npa_envs.envs.core.vector import rng_keys
+from npa_envs.envs.multi.species_worlds import SpeciesWorlds
+from npa_envs.errors import DivergedError, NPAError, shown
+
+
+class AgentsEnv(ShownEnv):
+    """Base class of environments with several agents, of one world or many."""
+
+    metadata: Any = {  # noqa: RUF012 (nobody writes to it)
+        "name": "npa_multispecies_v0",
+        "render_modes": ["rgb_array", "human"],
+        "render_fps": 25,
+        "is_parallelizable": True,
+    }
+    worlds: SpeciesWorlds
+
+    def __init__(
+        self, task: str, keywords: dict[str, Any], world_count: int, *, by_particle: bool
+    ) -> None:
+        self.worlds = worlds = SpeciesWorlds(task, keywords, world_count, by_particle=by_particle)
+        self._task_name = task
+        self.config = worlds.config
+        self.render_mode = self.config.render_mode
+        self.max_cycles = self.config.max_cycles
+        """Steps after which an episode is truncated for all agents."""
+        played = self.config.agent_particle_counts
+        word, count = ("particle", sum(played)) if by_particle else ("species", len(played))
+        self.possible_agents = [f"{word}_{k}" for k in range(count)]
+        """Names of the agents."""
+        physics, limits = worlds.physics, worlds.physics.limits
+        self.single_observation_spaces: dict[str, Box] = {}
+        self.single_action_spaces: dict[str, Box] = {}
+        for agent, span in zip(self.possible_agents, worlds.spans[:count], strict=True):
+            rows = () if by_particle else (span.stop - span.start,)
+            limit, observed = limits.perception, (*rows, worlds.perception_dim)
+            self.single_observation_spaces[agent] = Box(-limit, limit, observed, np.float32)
+            self.single_action_spaces[agent] = Box(
+                -1.0, 1.0, (*rows, physics.action_dim), np.float32
+            )
+        # Position, state, present.
+        high = [limits.position] * physics.space_dim + [limits.state] * physics.state_dim
+        upper = np.tile(np.array([*high, 1.0], np.float32), (worlds.particle_count, 1))
+        lower = upper * np.array([-1.0] * len(high) + [0.0], np.float32)
+        self.single_state_space = Box(lower, upper)
+        """Space of one world's `state`: float32, shape [N, 2 + C + 1]."""
+        self.np_random: np.random.Generator | None = None
+
+    def _start(self, worlds: NDArray[np.int64], seed: Any, key_seed: Any) -> Tensor:
+        """Start episodes in worlds, indices [B']; return all worlds' perception, [B, N, P].
+
+        `seed` is that of `reset`; `key_seed` seeds `np_random`, which draws keys without a seed.
+        """
+        keys, batch = None, self.worlds
+        # The first reset may have failed, so that there are no sequences of episodes yet.
+        if seed is not None or not self._started:
+            self.np_random, _ = seeding.np_random(as_python(key_seed))
+            keys = rng_keys(seed, batch.world_count, self.np_random)[worlds]
+        with batch.device_context():
+            observation = batch.start(worlds, keys)
+            if len(worlds) < batch.world_count:
+                observation = batch.perception()
+        self._started = True
+        self._show()
+        return observation
+
+    def _state(self) -> Tensor:
+        if not self._started:
+            raise NPAError("state needs a world: call reset first")
+        return self.worlds.state()
+
+    def _show(self) -> None:
+        self._show_in_window(f"{self.metadata['name']}: {self._task_name}")
+
+
+def joined_actions(
+    actions: Any, agents: Sequence[str], shapes: Sequence[tuple[int, ...]], device: torch.device
+) -> Tensor:
+    """Return the checked actions of `agents`, joined by rows, float32, [N, A] or [B, N, A]."""
+    if not isinstance(actions, Mapping):
+        raise NPAError(
+            f"actions must be a dict with an action for each live agent, got "
+            f"{type(actions).__name__}: see env.agents"
+        )
+    missing = [agent for agent in agents if agent not in actions]
+    if missing:
+        raise NPAError(
+            f"actions must have one for each live agent, got none for {_names(missing)}: "
+            "zeros leave an agent's particles as they are"
+        )
+    live = set(agents)
+    extra = [str(agent) for agent in actions if agent not in live]
+    if extra:
+        raise NPAError(
+            f"actions must be of live agents only, got one for {_names(extra)}: agents that ended "
+            "get no more actions until reset; see env.agents"
+        )
+    rows = [
+        action_tensor(
+            f"actions[{shown(agent)}]", actions[agent], shape, f"env.action_space({shown(agent)})"
+        )
+        for agent, shape in zip(agents, shapes, strict=True)
+    ]
+    # The action of a single particle has no dimension of rows.
+    blocks = [row if row.ndim > 1 else row[None] for row in rows]
+    joined = torch.cat([block.to(device) for block in blocks], dim=-2)
+    if not bool(torch.isfinite(joined).all()):
+        bad = next(k for k, row in enumerate(rows) if not bool(torch.isfinite(row).all()))
+        wrong = rows[bad][~torch.isfinite(rows[bad])]
+        raise DivergedError(
+            f"actions[{shown(agents[bad])}] must be finite, got {wrong[0].item()} ({wrong.numel()} "
+            "such numbers): check the policy; the world is not changed"
+        )
+    return joined
+
+
+def _names(agents: Sequence[str]) -> str:
+    some = ", ".join(agents[:3])
+    return some if len(agents) <= 3 else f"{some} and {len(agents) - 3} more"
