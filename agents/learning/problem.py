@@ -13,6 +13,7 @@ from typing import Any, Literal, NamedTuple, get_args
 
 import gymnasium
 import torch
+from torch import Tensor
 
 from npa_envs.agents.learning.concatenated_species import ConcatenatedSpeciesEnv
 from npa_envs.checks import check_positive, is_whole
@@ -28,6 +29,7 @@ from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.registration import ALL, SPECIES_SIZES
 from npa_envs.registration import SPECIES as SPECIES_TASKS
 from npa_envs.world.environment_steps import Physics
+from npa_envs.wrappers.base import own_rewards
 
 WORLDS_PER_SEED = 10_000
 """Seeds of worlds that each run has: run k has those from k times this."""
@@ -47,10 +49,8 @@ DEFAULT_STEPS = 256
 SPECIES = (*SPECIES_TASKS, *(size.id for size in SPECIES_SIZES))
 """Ids of species tasks."""
 
-RowRewards = Literal["particle", "marginal"]
+ParticleRewards = Literal["particle", "marginal"]
 """Kinds of rewards that each particle gets separately."""
-
-ROW_REWARDS = get_args(RowRewards)
 
 RESERVED_KEYWORDS = {
     "num_envs": "set the field num_envs of Problem",
@@ -96,10 +96,10 @@ class Problem:
         for name in self.keywords:
             if name in RESERVED_KEYWORDS:
                 raise NPAError(f"keywords must not have {shown(name)}: {RESERVED_KEYWORDS[name]}")
-        if (reward := self.keywords.get("reward")) in ROW_REWARDS:
+        if (reward := self.keywords.get("reward")) in get_args(ParticleRewards):
             raise NPAError(
                 f"keywords must not have reward={reward!r}: ask make_envs for "
-                f"row_rewards={reward!r}"
+                f"particle_rewards={reward!r}"
             )
         try:
             plain = json.loads(json.dumps(dict(self.keywords)))
@@ -174,7 +174,7 @@ class Problem:
         num_envs: int | None = None,
         *,
         device: str | torch.device = "cpu",
-        row_rewards: RowRewards | None = None,
+        particle_rewards: ParticleRewards | None = None,
         tell_updated: bool = False,
         copy: bool = True,
     ) -> NPAVectorEnv | ConcatenatedSpeciesEnv:
@@ -188,8 +188,8 @@ class Problem:
         Args:
             num_envs: Worlds B; None: the problem's.
             device: Device of the worlds.
-            row_rewards: Adds `infos["particle_reward"]`, [B, N]: "particle", the decrease of each
-                particle's own loss, or "marginal", the difference that its action makes. With
+            particle_rewards: Adds `infos["particle_reward"]`, [B, N]: "particle", the decrease of
+                each particle's own loss, or "marginal", the difference that its action makes. With
                 several species it is always there: the reward of the particle's species.
             tell_updated: Adds `infos["updated"]`, [B, N]: which actions took effect; not with
                 several species.
@@ -197,8 +197,8 @@ class Problem:
                 overwrites.
 
         Raises:
-            NPAError: The worlds do not fit into memory, the device is unknown, or `row_rewards`
-                contradicts the problem's keywords.
+            NPAError: The worlds do not fit into memory, the device is unknown, or
+                `particle_rewards` contradicts the problem's keywords.
         """
         count = self.num_envs if num_envs is None else num_envs
         device = str(check_device(device))
@@ -212,13 +212,13 @@ class Problem:
                 output="torch",
                 **self.registration.keywords | keywords,
             )
-        if row_rewards:
+        if particle_rewards:
             if keywords.get("reward", "dense") != "dense":
                 raise NPAError(
-                    "row_rewards needs the problem's reward to be 'dense', got "
+                    "particle_rewards needs the problem's reward to be 'dense', got "
                     f"{shown(keywords['reward'])}: leave it out of keywords"
                 )
-            keywords["reward"] = row_rewards
+            keywords["reward"] = particle_rewards
         if tell_updated:
             keywords["tell_updated"] = True
         envs = gymnasium.make_vec(
@@ -253,6 +253,51 @@ class Problem:
                 f"text must be a problem in JSON, got {shown(text)} ({error}): give what "
                 "Problem.to_json returned"
             ) from error
+
+
+class ParticleStep(NamedTuple):
+    """What learners read of a step of B worlds of N particles; flags may be those of worlds."""
+
+    observation: Tensor
+    """Observations after the step, of the next episode where one ended, [B, N, P]."""
+    reward: Tensor
+    """Rewards of particles, [B, N], or of worlds, [B, 1]."""
+    acted: Tensor | None
+    """Whether each action had an effect, [B, N]; None: all count."""
+    terminated: Tensor
+    """Whether a particle's episode terminated, [B, N] or [B, 1]."""
+    ended: Tensor
+    """Whether it terminated or was truncated, [B, N] or [B, 1]."""
+    last_observation: Tensor | None
+    """Last observations of the worlds whose episodes ended, [B, N, P]; None: none did."""
+
+
+def particle_step(
+    envs: NPAVectorEnv | ConcatenatedSpeciesEnv,
+    action: Tensor,
+    *,
+    particle_rewards: bool,
+    masked: bool,
+) -> ParticleStep:
+    """Step the worlds of `Problem.make_envs` by actions [B, N, A].
+
+    Args:
+        particle_rewards: Whether rewards are those of particles.
+        masked: Whether actions of particles that were not updated do not count.
+    """
+    observation, reward, terminated, truncated, infos = envs.step(action)
+    ended = (terminated | truncated)[:, None]
+    terminated = terminated[:, None]
+    acted: Tensor | None = None
+    if isinstance(envs, ConcatenatedSpeciesEnv):
+        # A species may end before its world does.
+        acted, species_terminated = infos["acted"], infos["particle_terminated"]
+        terminated, ended = terminated | species_terminated, ended | species_terminated
+    elif masked:
+        # It describes the step before a restart.
+        acted = infos["updated"]
+    rewards = own_rewards(infos) if particle_rewards else reward[:, None]
+    return ParticleStep(observation, rewards, acted, terminated, ended, infos.get("final_obs"))
 
 
 class RegisteredEnv(NamedTuple):

@@ -154,7 +154,7 @@ class Progress:
         """Particle-steps spent so far."""
         self.log: list[CurvePoint] = []
         """Evaluations so far."""
-        self.ranks = ProcessGroup.current()
+        self.processes = ProcessGroup.current()
         """The processes that share the run."""
         self._evaluation_seeds = checked_seeds("evaluation_seeds", evaluation_seeds)
         check_count("curve_points", curve_points, ": try 20")
@@ -170,9 +170,9 @@ class Progress:
         self._settings = dict(run or {})
         folder = None if out is None else RunFolder(out)
         self._run = Run(
-            folder, self.ranks, self._check_same_run, resume=resume, overwrite=overwrite
+            folder, self.processes, self._check_same_run, resume=resume, overwrite=overwrite
         )
-        if folder is not None and self.ranks.first:
+        if folder is not None and self.processes.first:
             folder.prepare(0, pictures=False)
 
     def first_rules(self, *, zero_output: bool = False) -> RuleSet:
@@ -250,7 +250,7 @@ class Progress:
     @property
     def spent_fraction(self) -> float:
         """Fraction of the budget that is spent; the last iteration may take it above 1."""
-        seconds = self._agreed_seconds if self.ranks.distributed else self.seconds
+        seconds = self._agreed_seconds if self.processes.distributed else self.seconds
         return self.budget.spent_fraction(seconds, self.particle_steps)
 
     @property
@@ -298,7 +298,7 @@ class Progress:
         self._begin = time.perf_counter()
 
     def _agree_on_time(self) -> None:
-        self._agreed_seconds = self.ranks.broadcast(self.seconds)
+        self._agreed_seconds = self.processes.broadcast(self.seconds)
 
     def _check_started(self, caller: str) -> None:
         if not self._started:
@@ -310,7 +310,7 @@ class Progress:
             self._envs = self.problem.make_envs(count, device=self.device)
         if isinstance(policy, RuleSet):
             check_finite(policy, self.particle_steps)
-            self.ranks.check_same(list(policy.parameters()))
+            self.processes.check_same(list(policy.parameters()))
             policy = policy.policy()
         episodes = evaluate_policy(self._envs, policy, self._evaluation_seeds)
         point = CurvePoint(
@@ -322,7 +322,7 @@ class Progress:
         )
         self._synchronise()
         self.log.append(point)
-        if self.ranks.first:
+        if self.processes.first:
             self._on_point(point)
 
     def _synchronise(self) -> None:
@@ -338,8 +338,8 @@ class Progress:
         with self._stopped_clock():
             state = learner_state(learner)
             values = [value for module in state["modules"].values() for value in module.values()]
-            self.ranks.check_same([value for value in values if isinstance(value, Tensor)])
-            if not self.ranks.first:
+            self.processes.check_same([value for value in values if isinstance(value, Tensor)])
+            if not self.processes.first:
                 return
             curve = [asdict(point) for point in self.log]
             state |= {"learner": self._settings, "curve": curve, "iteration": self._run.iteration}
