@@ -65,18 +65,10 @@ class RslRlParticleEnv(ParticleRowsBase, VecEnv):  # type: ignore[misc]
         return TensorDict({"policy": rows}, batch_size=[self.num_envs], device=self.device)
 
     def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict[str, Any]]:
-        """Step all worlds.
+        """Step all worlds by actions [B N, A], with the errors of `ParticleRows.step`.
 
-        Args:
-            actions: Shape [B N, A].
-
-        Returns:
-            Observations, rewards [B N], done flags, int64, [B N], and extras, with `time_outs`
-            [B N], and `log` where episodes ended.
-
-        Raises:
-            NPAError: The actions have another shape; the worlds are not changed.
-            DivergedError: An action is not finite; the worlds are not changed.
+        Returns observations, rewards [B N], done flags, int64, [B N], and extras: `time_outs`
+        [B N], and `log` where episodes ended.
         """
         # RSL-RL collects in inference mode, whose tensors later steps could not write to.
         with torch.inference_mode(False), torch.no_grad():

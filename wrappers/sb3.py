@@ -331,7 +331,7 @@ class RowPolicy:
     Args:
         model: The model; training it further changes the policy.
         deterministic: Whether it acts by its mean instead of a draw.
-        tag: One-hot species to append to each row, shape [K]; None: nothing.
+        tag: One-hot species to append to each row, shape [species]; None: nothing.
 
     Raises:
         NPAError: `model` has no method `predict`.

@@ -238,7 +238,7 @@ CURVE_POINTS = 64
 
 
 class Curve(NamedTuple):
-    """A mean learning curve at K points: abscissa, mean return, standard error; [K] each."""
+    """A mean learning curve at some points: abscissa, mean return, standard error."""
 
     across: NDArray[np.float64]
     mean: NDArray[np.float64]

@@ -162,7 +162,7 @@ class GaussianRules(nn.Module):
         self.noise_factor = 1.0
         """Factor on the first standard deviations (dimensionless)."""
         self.log_std = nn.Parameter(start)
-        """Logarithms of the standard deviations, a row for each species, shape [K, A]."""
+        """Logarithms of the standard deviations, a row for each species, shape [species, A]."""
         self.register_buffer("row_species", species_of(rules.counts), persistent=False)
 
     def get_extra_state(self) -> float:

@@ -111,6 +111,6 @@ class ConcatenatedSpeciesEnv(MultiSpeciesVectorEnv):
         return torch.stack([infos[agent][name] for agent in self.agents], dim=1)
 
     def _by_particle(self, values: Tensor) -> Tensor:
-        """Repeat the values of K species, [B, K], for each of their particles, shape [B, N]."""
+        """Repeat the values of species, [B, species], for each of their particles, [B, N]."""
         count = self.single_action_space.shape[0]
         return values.repeat_interleave(self._counts, dim=1, output_size=count)

@@ -219,7 +219,7 @@ class EnvironmentTask(ParticleTask[Any]):
         return run(rule, x, s, steps, **options)
 
     def _losses(self, worlds: Particles) -> Mapping[str, Tensor]:
-        """Return the terms of each world's loss by name, shape [B], or [B, K] of K species."""
+        """Return the terms of each world's loss by name, [B], or [B, species] of several species."""
         x, s, *_ = worlds
         losses: Mapping[str, Tensor]
         if isinstance(self.inner, SpeciesTask):

@@ -144,7 +144,7 @@ class RuleSet(nn.Module):
         return self.actions(observation, self.mean_by_rule)
 
     def mean_by_rule(self, rule: NPARule, rows: Tensor) -> Tensor:
-        """Return actions [K, A], as `mean`, of one rule for K particles' observations [K, P]."""
+        """Return actions [K, A], as `mean`, of one rule for K rows of observations [K, P]."""
         delta, state_step = bounded_update(rule, rows)
         return torch.cat((delta, state_step / self.interface.state_scale), dim=-1)
 

@@ -323,7 +323,7 @@ class GardenPolicy:
         self._shapes = _shapes(space.spaces if isinstance(space, Dict) else space)
 
     def __call__(self, observation: Any) -> NDArray[np.float32]:
-        """Return actions of K brushes, W columns each, [B, K, W], for observations [B, ...]."""
+        """Return actions [B, J, W] of J brushes with W columns for observations [B, ...]."""
         shapes = {name: shape[1:] for name, shape in _shapes(observation).items()}
         if shapes != self._shapes:
             raise NPAError(

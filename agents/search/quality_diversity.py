@@ -77,7 +77,7 @@ class RandomEmitter:
         self._draws = np.random.default_rng(seed)
 
     def ask(self) -> Numbers:
-        """Return the weights of new candidates, shape [K, W]."""
+        """Return the weights of new candidates, shape [G, W]."""
         return random_weights(self._draws, self._batch_size, self.solution_dim)
 
     def tell(self, *_: Any, **results: Any) -> None:
@@ -127,7 +127,7 @@ METHODS: Mapping[str, Callable[[Any, int, int], Any]] = {
     "cma-es": partial(_evolution, "obj", "basic"),
     "random": RandomEmitter,
 }
-"""Functions that make an emitter of pyribs, whose `ask` returns candidates [K, W], from an archive,
+"""Functions that make an emitter of pyribs, whose `ask` returns candidates [G, W], from an archive,
 a batch size and a seed.
 
 `map-elites` mutates random elites. `cma-me` (arXiv 1912.02400) is CMA-ES that ranks new cells
@@ -139,7 +139,7 @@ draws independent candidates.
 def qualities_and_measures(
     found: Sequence[Found | None], axes: Sequence[Axis]
 ) -> tuple[Numbers, Numbers]:
-    """Return qualities [K] and M descriptors [K, M] of candidates: 0 without a result."""
+    """Return qualities [G] and M descriptors [G, M] of candidates: 0 without a result."""
     nothing = Found(0.0, (0.0,) * len(axes))
     qualities, measures = zip(*(one or nothing for one in found), strict=True)
     return np.array(qualities), np.array(measures)
