@@ -31,9 +31,6 @@ class ParticleRows(ParticleRowsBase, BatchedSpaces):
 
     Args:
         env: A vector environment of this package, wrapped or not, with next-step autoreset.
-
-    Raises:
-        NPAError: The environment is not of this package, or has another autoreset mode.
     """
 
     # Gymnasium closes deleted objects, also if the constructor failed and nothing is open.

@@ -30,11 +30,6 @@ class RslRlParticleEnv(ParticleRowsBase, VecEnv):  # type: ignore[misc]
         env: A vector environment of this package, wrapped or not, made with `output="torch"`, with
             same-step autoreset and `copy=True` (the default), as RSL-RL stores the tensors.
         seed: World w begins with the episode of seed + w; None: a drawn one.
-
-    Raises:
-        NPAError: The environment is not of this package, returns arrays or the same tensors in each
-            step, or has another autoreset mode.
-        MissingDependencyError: RSL-RL is not installed (on import).
     """
 
     def __init__(self, env: AnyVectorEnv, *, seed: int | None = None) -> None:

@@ -268,10 +268,6 @@ class ParticleVecEnv(_EpisodeRows):
         bootstrap: Whether infos mark truncation by the step limit, so that Stable-Baselines3
             bootstraps the value there. On-policy algorithms do that row by row, which takes seconds
             for many thousand rows; False: truncation counts as termination.
-
-    Raises:
-        NPAError: The environment is not of this package, or has another autoreset mode.
-        MissingDependencyError: Stable-Baselines3 is not installed (on import).
     """
 
     def __init__(self, env: AnyVectorEnv, *, bootstrap: bool = True) -> None:
@@ -304,10 +300,6 @@ class WorldVecEnv(_EpisodeRows):
 
     Args:
         env: A vector environment, wrapped or not, with same-step autoreset.
-
-    Raises:
-        NPAError: The environment is a single one, or has another autoreset mode.
-        MissingDependencyError: Stable-Baselines3 is not installed (on import).
     """
 
     per_particle_reward = False
@@ -332,9 +324,6 @@ class RowPolicy:
         model: The model; training it further changes the policy.
         deterministic: Whether it acts by its mean instead of a draw.
         tag: One-hot species to append to each row, shape [species]; None: nothing.
-
-    Raises:
-        NPAError: `model` has no method `predict`.
     """
 
     def __init__(
@@ -374,11 +363,6 @@ class SpeciesVecEnv(RowVecEnv):
     Args:
         env: From `multispecies_v0.batched`, with same-step autoreset.
         others: Policies of the species that are not rows, by name.
-
-    Raises:
-        NPAError: `env` is another environment or has another autoreset mode, a name in `others` is
-            unknown, a policy is no function, or no species remains.
-        MissingDependencyError: Stable-Baselines3 is not installed (on import).
     """
 
     def __init__(

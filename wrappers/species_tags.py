@@ -65,9 +65,6 @@ class SpeciesTags(_TagsSpecies, Observations):
     Args:
         env: An environment of this package.
         species_count: Number of species.
-
-    Raises:
-        NPAError: An argument is wrong, or there are fewer particles than species.
     """
 
 

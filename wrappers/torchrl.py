@@ -36,11 +36,6 @@ class NPATorchRLEnv(EnvBase):  # type: ignore[misc]
         env: A vector environment of this package, wrapped or not, made with `output="torch"`,
             `autoreset_mode="disabled"`, and `copy=True` (the default), as TorchRL stores tensors.
         rows: Whether particles are elements of the batch.
-
-    Raises:
-        NPAError: The environment is not of this package, returns arrays or the same tensors in each
-            step, or has another autoreset mode.
-        MissingDependencyError: TorchRL is not installed (on import).
     """
 
     def __init__(self, env: AnyVectorEnv, *, rows: bool = False) -> None:

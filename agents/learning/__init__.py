@@ -85,11 +85,7 @@ class Trained(NamedTuple):
     of PettingZoo's parallel environments, to a dict of their actions."""
 
     def save(self, folder: str | Path) -> list[Path]:
-        """Write the rules' or the policy's files, if it can be saved; return their paths.
-
-        Raises:
-            NPAError: As for `RuleSet.save`.
-        """
+        """Write the rules' or the policy's files, if it can be saved; return their paths."""
         save = getattr(self.policy if self.rules is None else self.rules, "save", None)
         return [] if save is None else save(folder)
 
@@ -136,7 +132,8 @@ def train(
 
     Raises:
         NPAError: The method or an option is unknown, the method cannot learn this problem, cannot
-            be resumed or distributed, or `start` does not fit. Or as for `Progress`.
+            be resumed or distributed, or `start` does not fit. Or as for
+            `npa_envs.training.run_folder.Run`.
         DivergedError: The rules' weights have become infinite or NaN.
         MissingDependencyError: The method needs a library that is not installed.
     """
@@ -211,10 +208,6 @@ def method_options(method: str) -> dict[str, Any]:
     Args:
         method: A name from `METHODS` or, if not there, `GARDEN_METHODS`; or your own function,
             "package.module:function".
-
-    Raises:
-        NPAError: The method is unknown.
-        MissingDependencyError: It needs a library that is not installed.
     """
     return _options_of(_function(method, GARDEN_METHODS | METHODS))
 

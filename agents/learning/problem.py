@@ -67,11 +67,7 @@ RESERVED_KEYWORDS = {
 
 @dataclass(frozen=True, kw_only=True)
 class Problem:
-    """An environment to learn in, with its keywords; `to_json` and `from_json` store it.
-
-    Raises:
-        NPAError: The environment or a keyword is unknown, or a value is wrong.
-    """
+    """An environment to learn in, with its keywords; `to_json` and `from_json` store it."""
 
     env_id: str
     """Id of an environment of this library, "npa/Mixing-v0", or of your own that is registered with
@@ -161,11 +157,7 @@ class Problem:
         return sum(self.counts)
 
     def make_task(self, device: str | torch.device = "cpu") -> EnvTask[Any] | SpeciesTask:
-        """Return the environment's task, which makes start worlds and their losses, on a device.
-
-        Raises:
-            NPAError: Something that the task needs cannot be loaded.
-        """
+        """Return the environment's task, which makes start worlds and their losses, on a device."""
         device = check_device(device)
         return self.task_type(replace(self.config, device=str(device)), device)
 
@@ -241,11 +233,7 @@ class Problem:
 
     @classmethod
     def from_json(cls, text: str) -> Problem:
-        """Return the problem that `to_json` wrote.
-
-        Raises:
-            NPAError: The text is not a problem in JSON.
-        """
+        """Return the problem that `to_json` wrote."""
         try:
             return cls(**json.loads(text))
         except (TypeError, json.JSONDecodeError) as error:

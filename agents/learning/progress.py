@@ -29,11 +29,7 @@ from npa_envs.world.randomness import Randomness, WorldRandom
 
 @dataclass(frozen=True, kw_only=True)
 class Budget:
-    """Limit of a run: seconds, particle-steps, or whichever of both is reached first.
-
-    Raises:
-        NPAError: Neither is given, or one is not positive.
-    """
+    """Limit of a run: seconds, particle-steps, or whichever of both is reached first."""
 
     seconds: float | None = None
     """Wall-clock time of learning [s]. Set-up and evaluations do not count, and may take longer:
@@ -114,10 +110,6 @@ class Progress:
         initial: Rules to begin with, which are copied; None: new ones.
         run: Settings of the run, of JSON's types, which must be equal when it is resumed.
         others: As of `npa_envs.agents.learning.train`.
-
-    Raises:
-        NPAError: Seeds are missing or wrong, or the number of points is not positive. Or as for
-            `npa_envs.training.run_folder.Run`.
     """
 
     def __init__(

@@ -195,10 +195,6 @@ class Search:
         batch_size: Candidates in a batch, at least 2.
         device: Device of the worlds.
         path: File of the record, which is written after each batch; None: no record.
-
-    Raises:
-        NPAError: A setting is wrong, or the record is of other settings.
-        MissingDependencyError: pyribs or cma is not installed.
     """
 
     def __init__(
@@ -335,9 +331,6 @@ def tried_again(search: Search, seeds: Sequence[int], *, steps: int | None = Non
         search: The search.
         seeds: Seeds of the worlds of each elite.
         steps: Steps; the later half counts. None: those of the search.
-
-    Raises:
-        NPAError: The number of steps is not a multiple of 16.
     """
     world = search.world if steps is None else replace(search.world, steps=steps)
     candidates = Candidates(world, device=search.candidates.device, seeds=seeds)
