@@ -221,7 +221,6 @@ def _options_of(function: Callable[..., Any]) -> dict[str, Any]:
 
 
 def _default_options(function: Callable[..., Any]) -> Any:
-    """Return the default of a method's argument `options`, if that is a dataclass, else None."""
     parameter = inspect.signature(function).parameters.get("options")
     default = None if parameter is None else parameter.default
     return default if is_dataclass(default) else None

@@ -86,7 +86,6 @@ class CommonOptions:
     """Input of the critic: a particle's own perception, or also its whole world ("central")."""
 
     def __post_init__(self) -> None:
-        """Check every field; raises NPAError."""
         check_positive(self, int, "steps", "epochs", "minibatches")
         check_positive(self, float, "max_gradient_norm")
         check_non_negative(self, "entropy_weight")

@@ -45,7 +45,6 @@ class CloneOptions:
     """Learning rate at the end, as a fraction of the first."""
 
     def __post_init__(self) -> None:
-        """Check every field but the teacher; raises NPAError."""
         check_non_negative(self, "student_share", at_most=1.0)
         check_positive(self, int, "collect_steps", "updates", "batch_worlds")
         check_positive(self, float, "learning_rate")

@@ -44,7 +44,6 @@ class EvolutionOptions:
     gain 1; dimensionless)."""
 
     def __post_init__(self) -> None:
-        """Check every field; raises NPAError."""
         check_positive(self, int, "population", at_least=4)
         check_positive(self, int, "worlds_per_candidate")
         check_positive(self, float, "sigma")

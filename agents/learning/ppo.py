@@ -76,7 +76,6 @@ class PPOOptions(CommonOptions):
     """Ignore actions in steps that did not update their particles; not with several species."""
 
     def __post_init__(self) -> None:
-        """Check every field; raises NPAError."""
         super().__post_init__()
         check_flag(self, "masked")
         if self.clip is not None:

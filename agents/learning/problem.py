@@ -82,7 +82,6 @@ class Problem:
     """Width of the hidden layer of new rules."""
 
     def __post_init__(self) -> None:
-        """Check every field; raises NPAError."""
         check_positive(self, int, "episode_steps", "num_envs", "hidden_dim")
         if not isinstance(self.keywords, Mapping):
             raise NPAError(

@@ -38,7 +38,6 @@ class Budget:
     """Steps times particles that took them, of environments and rollouts together."""
 
     def __post_init__(self) -> None:
-        """Check both limits; raises NPAError."""
         if self.seconds is None and self.particle_steps is None:
             raise NPAError(
                 "a budget must say something: Budget(seconds=60) or particle_steps=10**7"
@@ -47,12 +46,6 @@ class Budget:
             check_positive(self, float, "seconds")
         if self.particle_steps is not None:
             check_positive(self, int, "particle_steps")
-
-    def spent_fraction(self, seconds: float, particle_steps: int) -> float:
-        """Return the spent fraction of the time [s] or of the particle-steps, the larger one."""
-        by_time = 0.0 if self.seconds is None else seconds / self.seconds
-        by_steps = 0.0 if self.particle_steps is None else particle_steps / self.particle_steps
-        return max(by_time, by_steps)
 
 
 @dataclass(frozen=True)
@@ -96,8 +89,7 @@ class Progress:
     until the budget is `over`, `advance` and `look` after each iteration.
 
     Set-up before `start`, evaluations and checkpoints do not count as time. On CUDA only these
-    synchronise; `advance` keeps the CPU at most one iteration ahead of the device, so that the time
-    measured is the device's.
+    synchronise, but `advance` keeps the CPU at most one iteration ahead of the device.
 
     With `out`, a checkpoint, the rules and the curve (`log.jsonl`) are written after each point of
     the curve, and when SIGTERM or Ctrl-C stops the run. A resumed run continues from the weights,
@@ -243,7 +235,9 @@ class Progress:
     def spent_fraction(self) -> float:
         """Fraction of the budget that is spent; the last iteration may take it above 1."""
         seconds = self._agreed_seconds if self.processes.distributed else self.seconds
-        return self.budget.spent_fraction(seconds, self.particle_steps)
+        by_time = 0.0 if self.budget.seconds is None else seconds / self.budget.seconds
+        limit = self.budget.particle_steps
+        return max(by_time, 0.0 if limit is None else self.particle_steps / limit)
 
     @property
     def over(self) -> bool:
@@ -268,8 +262,7 @@ class Progress:
 
         None is done if no particle-steps have been counted since the last one.
 
-        Raises:
-            DivergedError: A weight of the rules is not finite, or an action.
+        Raises a DivergedError if a weight of the rules is not finite, or an action.
         """
         self._check_started("look")
         due = self.spent_fraction >= (self._points_due + 1) / self._curve_points
@@ -388,11 +381,7 @@ def annealed(rate: float, last_rate: float, fraction: float) -> float:
 
 
 def check_finite(rules: RuleSet, particle_steps: int) -> None:
-    """Check that rules have not diverged; synchronises with the device.
-
-    Raises:
-        DivergedError: A weight is infinite or NaN.
-    """
+    """Raise a DivergedError if a weight of rules is not finite; synchronises with the device."""
     for number, rule in enumerate(rules):
         for name, weight in rule.named_parameters():
             bad = int((~torch.isfinite(weight)).sum())

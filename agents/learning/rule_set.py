@@ -55,7 +55,7 @@ class RuleSet(nn.Module):
 
     @classmethod
     def new(cls, problem: Problem, seed: int) -> RuleSet:
-        """Return untrained rules for a problem, on the CPU; torch's random state does not change."""
+        """Return untrained rules, on the CPU; torch's random state does not change."""
         seed, interface, config = checked_count("seed", seed), problem.interface, problem.config
         with torch.random.fork_rng(devices=()):
             torch.manual_seed(seed)

@@ -56,7 +56,6 @@ class WorldOptions(CommonOptions):
     means over many particles."""
 
     def __post_init__(self) -> None:
-        """Check every field; raises NPAError."""
         super().__post_init__()
         check_positive(self, float, "clip")
 
@@ -230,7 +229,7 @@ class WorldRulePolicy(ActorCriticPolicy):
         return self.actor.sample(observation)[0]
 
     def _build(self, lr_schedule: Any) -> None:
-        """Do nothing: `__init__` makes networks and optimiser."""
+        """Leave networks and optimiser to `__init__`."""
 
 
 # Gardens: unchanged SAC and PPO, one row for each world.
@@ -249,7 +248,6 @@ class GardenOptions:
     """Adam's learning rate."""
 
     def __post_init__(self) -> None:
-        """Check every field; raises NPAError."""
         check_fraction(self, "gamma")
         check_positive(self, float, "learning_rate")
         check_positive(self, int, *(f.name for f in fields(self) if isinstance(f.default, int)))

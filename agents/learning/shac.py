@@ -63,7 +63,6 @@ class SHACOptions:
     """Rate at which the target critic follows the critic after each window (dimensionless)."""
 
     def __post_init__(self) -> None:
-        """Check every field; raises NPAError."""
         check_positive(self, int, "steps", "num_envs", "critic_epochs", "minibatches")
         check_word(self, "critic", get_args(CriticInput))
         check_positive(self, float, "learning_rate")

@@ -61,7 +61,6 @@ class SearchWorld:
     """Perception radius ε [length units]."""
 
     def __post_init__(self) -> None:
-        """Check every field; raises NPAError."""
         check_positive(self, int, "particle_count", at_least=4)
         check_positive(self, int, "steps", "world_count", "hidden_dim")
         check_positive(self, int, "state_dim", at_least=3)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -291,6 +291,16 @@ class Search:
 
     def _replay(self) -> None:
         """Propose the candidates of the record, if there is one, again; take its results."""
+
+        def batches_of(content: Mapping[str, Any]) -> list[Batch]:
+            return [
+                {
+                    "fingerprint": int(batch["fingerprint"]),
+                    "found": [one and list(map(float, one)) for one in batch["found"]],
+                }
+                for batch in content["batches"]
+            ]
+
         if self._path is None:
             return
         stored = read_record(self._path, self.facts, batches_of, command="search")
@@ -306,17 +316,6 @@ class Search:
             self._tell(batch)
 
 
-def batches_of(content: Mapping[str, Any]) -> list[Batch]:
-    """Return the batches of candidates in a record's JSON object, with checked types."""
-    return [
-        {
-            "fingerprint": int(batch["fingerprint"]),
-            "found": [one and list(map(float, one)) for one in batch["found"]],
-        }
-        for batch in content["batches"]
-    ]
-
-
 def growth_of(archive: Any, evaluations: int) -> Growth:
     """Return the statistics of an archive after a number of evaluations."""
     stats = archive.stats
@@ -324,16 +323,9 @@ def growth_of(archive: Any, evaluations: int) -> Growth:
     return Growth(evaluations, float(stats.qd_score), float(stats.coverage), best)
 
 
-def tried_again(search: Search, seeds: Sequence[int], *, steps: int | None = None) -> Growth:
-    """Evaluate the elites of a search again in other worlds, and return the archive's statistics.
-
-    Args:
-        search: The search.
-        seeds: Seeds of the worlds of each elite.
-        steps: Steps; the later half counts. None: those of the search.
-    """
-    world = search.world if steps is None else replace(search.world, steps=steps)
-    candidates = Candidates(world, device=search.candidates.device, seeds=seeds)
+def tried_again(search: Search, seeds: Sequence[int]) -> Growth:
+    """Evaluate a search's elites again in worlds of other seeds; return their statistics."""
+    candidates = Candidates(search.world, device=search.candidates.device, seeds=seeds)
     archive = make_archive(candidates.weight_count, search.axes)
     elites = search.elites()
     if elites:
