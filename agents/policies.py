@@ -288,7 +288,7 @@ class PaintPolicy(SpreadPolicy):
     Args:
         env: The environment.
         colour: Red, green and blue in [0, 1]; None: the mean colour of the environment's target.
-        gain: That of `SpreadPolicy`.
+        gain: Displacement by the density gradient, as `SpreadPolicy` defines it.
 
     Raises:
         NPAError: Neither a colour nor a target is there, or the colour is not three numbers.
@@ -322,7 +322,7 @@ class MendPolicy(SpreadPolicy):
     Args:
         env: The environment.
         blank: Particles with a state of a smaller norm are blank (dimensionless).
-        gain: That of `SpreadPolicy`, small so that undamaged parts hardly change.
+        gain: Displacement by the density gradient, small so that undamaged parts hardly change.
     """
 
     def __init__(self, env: Any, blank: float = 0.1, gain: float = 0.003) -> None:

@@ -30,7 +30,6 @@ MAKERS = {
 """Functions that make environments, and their tasks, by the ids of PettingZoo's registry."""
 
 ROW_IDS = tuple(row.id for row in ALL)
-"""Ids of Gymnasium's registry."""
 
 WHOLE_IDS = frozenset((*GARDEN_IDS, *(row.id for row in CODED)))
 """Ids of environments whose actions are for a whole world."""

@@ -59,13 +59,10 @@ class RowVecEnv(VecEnv):
         action_space: Space[Any],
     ) -> None:
         self.vector_env = env
-        """The vector environment."""
         self.world_count = world_count
-        """Worlds B."""
         self.row_count = row_count
         """Rows of a world, R."""
         self.spec = getattr(env, "spec", None)
-        """Gymnasium's spec of the environment."""
         self.shared_info: dict[str, Any] = SharedInfo()
         """The info of all rows whose episodes go on."""
         self._actions: NDArray[np.float32] | None = None
@@ -275,7 +272,6 @@ class ParticleVecEnv(_EpisodeRows):
         check_autoreset(autoreset_mode(env), "same-step")
         self.bootstrap = bootstrap
         self.particle_count = base.config.particle_count
-        """Particles N of a world."""
         super().__init__(
             env,
             base.num_envs,

@@ -45,11 +45,8 @@ class NPATorchRLEnv(EnvBase):  # type: ignore[misc]
         batch = (worlds, count) if rows else (worlds,)
         super().__init__(device=base.worlds.x.device, batch_size=torch.Size(batch))
         self.vector_env = env
-        """The vector environment."""
         self.rows = rows
-        """Whether particles are elements of the batch."""
         self.particle_count = count
-        """Particles N of a world."""
         self._first_seed: int | None = None
         observed, acted = (
             _bounded(space, worlds, self.device)

@@ -79,7 +79,6 @@ class Trained(NamedTuple):
     rules: RuleSet | None
     """The rules, on the run's device; None if the method returns a policy."""
     log: list[CurvePoint]
-    """The learning curve."""
     policy: Callable[[Any], Any]
     """Maps observations, [B, N, P], to actions, [B, N, A], and a dict of agents' observations, as
     of PettingZoo's parallel environments, to a dict of their actions."""

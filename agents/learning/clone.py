@@ -32,7 +32,7 @@ class CloneOptions:
     """Id of a Minari dataset to learn from instead; its steps count as particle-steps each time
     that they are used."""
     student_share: float = 0.5
-    """Fraction of the worlds in which the student acts, in [0, 1]; 0: plain cloning."""
+    """Fraction of the worlds in which the student acts, in [0, 1]; 0: only the teacher acts."""
     collect_steps: int = 8
     """Steps of the worlds in an iteration."""
     updates: int = 16

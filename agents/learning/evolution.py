@@ -86,8 +86,8 @@ class RuleWeights:
         for rule in self._rules:
             if not rule.is_plain():
                 raise NPAError(
-                    "rules must be plain NPARules, whose networks are their two layers, got one "
-                    "that overrides its network: evolve it by its own code"
+                    "rules must be NPARules whose networks are their two layers, got one that "
+                    "overrides its network: evolve it by its own code"
                 )
 
     def vector(self) -> NDArray[np.float64]:

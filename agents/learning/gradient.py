@@ -32,7 +32,6 @@ MAX_STEPS = 96
 """Most steps of a rollout by default: longer episodes continue in a pool."""
 
 POOL_SIZE = 64
-"""Default number of worlds in a pool."""
 
 KEY_RANGE = -(2**63), 2**63 - 1
 """Range of the keys of worlds' random streams."""
@@ -143,7 +142,6 @@ class EnvironmentTask(ParticleTask[Any]):
         self.problem, self.config, self.physics = problem, problem.config, problem.physics
         task = problem.make_task(device)
         self.inner: Any = task
-        """The environment's task."""
         self._species = species_of(problem.counts).to(device)
         self._clamped: tuple[RuleSet, list[ClampedRule]] | None = None
         if not isinstance(task, SpeciesTask):

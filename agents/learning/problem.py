@@ -47,7 +47,6 @@ DEFAULT_STEPS = 256
 """Steps of an episode of an id that is registered without a limit."""
 
 SPECIES = (*SPECIES_TASKS, *(size.id for size in SPECIES_SIZES))
-"""Ids of species tasks."""
 
 ParticleRewards = Literal["particle", "marginal"]
 """Kinds of rewards that each particle gets separately."""
@@ -97,13 +96,13 @@ class Problem:
                 f"particle_rewards={reward!r}"
             )
         try:
-            plain = json.loads(json.dumps(dict(self.keywords)))
+            keywords = json.loads(json.dumps(dict(self.keywords)))
         except (TypeError, ValueError) as error:
             raise NPAError(
                 f"keywords must have values of JSON's types, got {shown(dict(self.keywords))}: "
                 f"give numbers, text and lists ({error})"
             ) from error
-        object.__setattr__(self, "keywords", plain)
+        object.__setattr__(self, "keywords", keywords)
         # Raises on unknown ids and wrong keywords.
         _ = self.config
 
@@ -291,7 +290,6 @@ class RegisteredEnv(NamedTuple):
     """What an environment id stands for: a class of tasks and its settings."""
 
     task_type: type[EnvTask[Any]] | type[SpeciesTask]
-    """Class of the task."""
     keywords: dict[str, Any]
     """Fields of the environment's configuration."""
     steps: int

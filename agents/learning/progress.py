@@ -68,7 +68,6 @@ class Learner(Protocol):
     """A learner whose run can be stopped and resumed, by the state that checkpoints contain."""
 
     random: Randomness
-    """Its random source."""
 
     @property
     def modules(self) -> Mapping[str, nn.Module]:
@@ -139,7 +138,6 @@ class Progress:
         self.log: list[CurvePoint] = []
         """Evaluations so far."""
         self.processes = ProcessGroup.current()
-        """The processes that share the run."""
         self._evaluation_seeds = checked_seeds("evaluation_seeds", evaluation_seeds)
         check_count("curve_points", curve_points, ": try 20")
         self._curve_points = curve_points

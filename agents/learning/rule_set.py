@@ -46,7 +46,6 @@ class RuleSet(nn.Module):
                 "give them in the species' order"
             )
         self.rules = nn.ModuleList(rules)
-        """The rules, in the order of the species."""
         self.spans = spans_of(counts)
         """Slice of each species' particles."""
         self.counts = tuple(counts)

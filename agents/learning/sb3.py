@@ -1,6 +1,6 @@
 """Learners of Stable-Baselines3: PPO over whole worlds; PPO and SAC in gardens.
 
-PPO over worlds has one likelihood a world, the mean over its particles. It is an independent
+PPO over worlds has one likelihood per world, the mean over its particles. It is an independent
 baseline for `ppo.py`: rollouts, advantages and updates are Stable-Baselines3's; only the policy,
 whose actor is a set of rules, is this library's.
 """

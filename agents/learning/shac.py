@@ -128,18 +128,15 @@ class SHACLearner:
         self._minibatches = Minibatches(
             self.window, len(self._indices), (1,), options.minibatches, self.random
         )
-        self._begin()
+        self.resume(0, 0)
 
-    def _begin(self) -> None:
+    def resume(self, iteration: int, resumption: int) -> None:
+        """Resume after `iteration` windows, for the `resumption`-th time, in new worlds."""
         restart(self.random)
         self.worlds = self._new_worlds(list(range(len(self._indices))))
         self.windows_left = [1 + k % self.window_count for k in self._indices]
         """Windows left of each world's episode: at first different ones, so that a batch has all
         parts of an episode."""
-
-    def resume(self, iteration: int, resumption: int) -> None:
-        """Resume after `iteration` windows, for the `resumption`-th time, in new worlds."""
-        self._begin()
 
     def learn(self, rate: float) -> None:
         """Run the worlds for a window, and train rules and critic on it."""

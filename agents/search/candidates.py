@@ -52,7 +52,7 @@ class SearchWorld:
     steps: int = 128
     """Steps from the seed, a multiple of 16; the second half of them is evaluated."""
     world_count: int = 1
-    """Worlds of each candidate, B, over which figures are averaged."""
+    """Worlds of each candidate, B, over which metrics are averaged."""
     state_dim: int = 4
     """State channels C, at least 3; the last three are the colour (less 0.5)."""
     hidden_dim: int = 8

@@ -216,7 +216,6 @@ class Search:
                 )
         self.world = world
         self.axes: tuple[Axis, ...] = world.axes()
-        """The descriptors."""
         self.candidates = Candidates(world, device=device)
         self.facts: dict[str, Any] = {
             **asdict(world),

@@ -47,7 +47,7 @@ def learner_of(form):
     learner._new_worlds = lambda worlds: new_worlds(worlds).map(
         lambda part: part.double() if part.is_floating_point() else part
     )
-    learner._begin()
+    learner.resume(0, 0)
     return learner
 
 
