@@ -144,7 +144,6 @@ class Progress:
         self._points_due = 0
         self._on_point, self._on_stop = on_point, on_stop
         self._envs: Any = None
-        self._started = False
         self._begin: float | None = None
         self._seconds = self._agreed_seconds = 0.0
         self._last_event: torch.cuda.Event | None = None
@@ -216,26 +215,19 @@ class Progress:
 
         A resumed run has this evaluation already.
         """
-        if self._started:
+        if self._begin is not None:
             raise NPAError("progress must start once, got a second start: make one for each run")
-        self._started = True
         if not self.log:
             self._evaluate(policy)
         self._begin = time.perf_counter()
         self._agree_on_time()
 
     @property
-    def seconds(self) -> float:
-        """Learning time so far by this process's clock [s]."""
-        return self._seconds + (0.0 if self._begin is None else time.perf_counter() - self._begin)
-
-    @property
     def spent_fraction(self) -> float:
         """Fraction of the budget that is spent; the last iteration may take it above 1."""
-        seconds = self._agreed_seconds if self.processes.distributed else self.seconds
-        by_time = 0.0 if self.budget.seconds is None else seconds / self.budget.seconds
-        limit = self.budget.particle_steps
-        return max(by_time, 0.0 if limit is None else self.particle_steps / limit)
+        seconds, particle_steps = self.budget.seconds, self.budget.particle_steps
+        by_time = 0.0 if seconds is None else self._agreed_seconds / seconds
+        return max(by_time, 0.0 if particle_steps is None else self.particle_steps / particle_steps)
 
     @property
     def over(self) -> bool:
@@ -258,9 +250,8 @@ class Progress:
     def look(self, policy: RuleSet | Callable[[Any], Any], force: bool = False) -> bool:
         """Evaluate if the curve's next point is due, or with `force`; return whether it was done.
 
-        None is done if no particle-steps have been counted since the last one.
-
-        Raises a DivergedError if a weight of the rules is not finite, or an action.
+        It is not, if no particle-steps have been counted since the last one. Raises a DivergedError
+        if a weight of the rules is not finite, or an action.
         """
         self._check_started("look")
         due = self.spent_fraction >= (self._points_due + 1) / self._curve_points
@@ -281,10 +272,12 @@ class Progress:
         self._begin = time.perf_counter()
 
     def _agree_on_time(self) -> None:
-        self._agreed_seconds = self.processes.broadcast(self.seconds)
+        assert self._begin is not None, "the clock runs"
+        seconds = self._seconds + (time.perf_counter() - self._begin)
+        self._agreed_seconds = self.processes.broadcast(seconds)
 
     def _check_started(self, caller: str) -> None:
-        if not self._started:
+        if self._begin is None:
             raise NPAError(f"{caller} needs a start: call progress.start(rules) after the set-up")
 
     def _evaluate(self, policy: RuleSet | Callable[[Any], Any]) -> None:
