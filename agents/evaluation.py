@@ -163,7 +163,6 @@ def _run_single(
 
 
 def _ending(info: Mapping[str, Any], terminated: bool) -> str:
-    """Return why an episode ended, from the infos of its last step."""
     flags = [name for name in ("diverged", "success") if terminated and info.get(name)]
     return str(info.get("reason") or next(iter(flags), TIME_LIMIT))
 

@@ -1,4 +1,7 @@
-"""Gardeners: policies that use brushes, scripted or planned by the gradient of the world."""
+"""Gardeners: policies that use brushes, scripted or planned by the gradient of the world.
+
+Actions of B worlds have shape [B, J, W]: J brushes, W columns each.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +24,7 @@ FREE_PLACES = 8
 
 
 class BrushPolicy:
-    """Policy for an environment, single or vector, of K brushes with W columns each."""
+    """Policy for an environment of brushes, single or vector."""
 
     def __init__(self, env: Any) -> None:
         inner = unwrapped(env)
@@ -35,10 +38,10 @@ class BrushPolicy:
         self.config = self.task.config
         self.columns = BrushLayout.for_config(self.config)
         self.shape = inner.spaces.rows_shape
-        """Shape of a world's actions, (K, W)."""
+        """Shape of a world's actions, (J, W)."""
 
     def __call__(self, observation: Any) -> Any:
-        """Return actions of K brushes, W columns each: [K, W], or [B, K, W] for B worlds.
+        """Return actions [J, W], or [B, J, W] for observations of B worlds.
 
         Only type and shape of the observation count: policies read their environment's worlds.
         """
@@ -48,11 +51,11 @@ class BrushPolicy:
         return action if isinstance(array, Tensor) else action.cpu().numpy()
 
     def act(self) -> Tensor:
-        """Return the actions of each world's K brushes, W columns each, float32, [B, K, W]."""
+        """Return the actions of all worlds, float32, shape [B, J, W]."""
         raise NotImplementedError
 
     def still(self) -> Tensor:
-        """Return actions that do nothing: zeros, shape [B, K, W]."""
+        """Return actions that do nothing: zeros, shape [B, J, W]."""
         return torch.zeros(self.worlds.world_count, *self.shape, device=self.task.device)
 
 
@@ -60,7 +63,7 @@ class StillGardener(BrushPolicy):
     """Do nothing, so that only the rule acts."""
 
     def act(self) -> Tensor:
-        """Return zeros, shape [B, K, W]."""
+        """Return zeros, shape [B, J, W]."""
         return self.still()
 
 
@@ -72,7 +75,7 @@ class RandomGardener(BrushPolicy):
         self._random = PolicyRandom(seed)
 
     def act(self) -> Tensor:
-        """Return actions of K brushes, W columns each, uniform in [-1, 1), shape [B, K, W]."""
+        """Return actions drawn from [-1, 1), shape [B, J, W]."""
         random = self._random.next_step(self.worlds.world_count, self.task.device)
         return 2.0 * random.uniform(*self.shape) - 1.0
 
@@ -107,7 +110,7 @@ class ScriptedGardener(BrushPolicy):
         self._pulls = (checked_positive("share", share) * weight[..., None] * away).double()
 
     def act(self) -> Tensor:
-        """Return actions that push towards places with a deficit, shape [B, K, W]."""
+        """Return actions that push towards places with a deficit, shape [B, J, W]."""
         worlds, action = self.worlds, self.still()
         deficit = self._deficit(worlds.particles, self.task.middle(worlds.x))
         pull = torch.einsum("bq,pqd->bpd", deficit[..., 0].double(), self._pulls).to(deficit.dtype)
@@ -150,7 +153,7 @@ class ScriptedShepherd(BrushPolicy):
             self._places = ring * torch.stack((angle.cos(), angle.sin()), dim=1)
 
     def act(self) -> Tensor:
-        """Return actions that push towards the goals of the worlds, shape [B, K, W]."""
+        """Return actions that push towards the goals of the worlds, shape [B, J, W]."""
         worlds, action = self.worlds, self.still()
         achieved = self.task.achieved(worlds.particles, worlds.context)
         missing = (self.task.desired(worlds.context) - achieved)[:, None, :2]
@@ -171,7 +174,7 @@ class ScriptedShepherd(BrushPolicy):
 class GradientGardener(BrushPolicy):
     """Plan by the gradient of rewards, differentiated through brushes, rule and picture.
 
-    In each step it simulates the worlds for `horizon` steps, with update masks of its own and
+    In each step it simulates the worlds for `horizon` steps, with separate update masks and
     without damage, and improves the actions by Adam, starting from those of `ScriptedGardener` or
     `ScriptedShepherd`. It takes the first step of the best plan.
 
@@ -197,7 +200,7 @@ class GradientGardener(BrushPolicy):
         self._random = PolicyRandom(seed)
 
     def act(self) -> Tensor:
-        """Return the actions of the best plan's first step, shape [B, K, W]."""
+        """Return the actions of the best plan's first step, shape [B, J, W]."""
         random = self._random.next_step(self.worlds.world_count, self.task.device)
         first = self._scripted.act()
         plan = torch.stack([first] + [self.still()] * (self._horizon - 1))
@@ -220,7 +223,7 @@ class GradientGardener(BrushPolicy):
 
     @torch.enable_grad()
     def planned_rewards(self, plan: Tensor, random: WorldRandom) -> Tensor:
-        """Return the sum [B] of each world's rewards in the T steps of a plan [T, B, K, W]."""
+        """Return the sum [B] of each world's rewards in the T steps of a plan [T, B, J, W]."""
         worlds, task = self.worlds, self.task
         particles = worlds.particles
         random = random.substream(StreamId.POLICY)

@@ -45,9 +45,6 @@ def interface_of(env: Any) -> Interface:
 
     Args:
         env: A single or a vector environment of `npa_envs`, wrapped or not.
-
-    Raises:
-        NPAError: `env` is not such an environment.
     """
     worlds = unwrapped(env).worlds
     interface: Interface = worlds.task.config.interface(worlds.physics)
@@ -244,9 +241,6 @@ class RandomPolicy(Policy):
     Args:
         env: The environment.
         seed: An integer of at least 0.
-
-    Raises:
-        NPAError: The seed is wrong, or the environment's actions are not rows of particles.
     """
 
     def __init__(self, env: Any, seed: int = 0) -> None:
@@ -266,9 +260,6 @@ class SpreadPolicy(Policy):
     Args:
         env: The environment.
         gain: Displacement, as a fraction of α ε, for a gradient c^{1+D} ∇ρ / N of 1, c = ε / ε0.
-
-    Raises:
-        NPAError: The gain is not a finite number.
     """
 
     def __init__(self, env: Any, gain: float = 0.03) -> None:
@@ -297,7 +288,7 @@ class PaintPolicy(SpreadPolicy):
     Args:
         env: The environment.
         colour: Red, green and blue in [0, 1]; None: the mean colour of the environment's target.
-        gain: That of `SpreadPolicy`.
+        gain: Displacement by the density gradient, as `SpreadPolicy` defines it.
 
     Raises:
         NPAError: Neither a colour nor a target is there, or the colour is not three numbers.
@@ -331,10 +322,7 @@ class MendPolicy(SpreadPolicy):
     Args:
         env: The environment.
         blank: Particles with a state of a smaller norm are blank (dimensionless).
-        gain: That of `SpreadPolicy`, small so that undamaged parts hardly change.
-
-    Raises:
-        NPAError: A number is not finite.
+        gain: Displacement by the density gradient, small so that undamaged parts hardly change.
     """
 
     def __init__(self, env: Any, blank: float = 0.1, gain: float = 0.003) -> None:

@@ -17,6 +17,7 @@ from npa_envs.envs.morphogenesis2d import PictureEnvTask
 from npa_envs.errors import shown
 from npa_envs.rule.rule import COLOUR_OFFSET
 from npa_envs.tasks.damage import damage_worlds
+from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import StreamId, WorldRandom
 
 RANDOM_DAMAGE = "random"

@@ -169,9 +169,7 @@ class ParticleRowsBase:
         """
         check_autoreset(autoreset_mode(env), mode)
         self.vector_env = env
-        """The environment whose particles these are."""
         self.world_count = base.num_envs
-        """Worlds B."""
         self.particle_count = base.config.particle_count
         """Particles N of a world."""
         self.num_envs = self.world_count * self.particle_count
@@ -371,12 +369,11 @@ class VectorObservations(ChangesObservations, EpisodeWrapper):
 class WrapperBase(RecordConstructorArgs):
     """First base class of wrappers that exist for one world and, named "Vector...", for many."""
 
-    def __init__(self, env: Any, **recorded: Any) -> None:
+    def __init__(self, env: Any, **arguments: Any) -> None:
         self.many = isinstance(self, EpisodeWrapper)
-        """Whether there are many worlds."""
         cls: Any = NPAVectorEnv if self.many else NPAEnv
         self._base: Any = base_env(env, type(self).__name__, cls)
-        RecordConstructorArgs.__init__(self, **recorded)
+        RecordConstructorArgs.__init__(self, **arguments)
         # The next class in the method resolution order is Gymnasium's wrapper.
         super(RecordConstructorArgs, self).__init__(env)  # type: ignore[call-arg]
         self.space_name = "single_observation_space" if self.many else "observation_space"

@@ -99,9 +99,6 @@ class DamageEvents(_DamagesWorlds, AnyWrapper):
     Args:
         env: An environment of this package, without wrappers that change observations.
         events: "STEP:KIND", "STEP:KIND:SIZE" or `DamageEvent`; one or several.
-
-    Raises:
-        NPAError: An event or the environment is wrong.
     """
 
     _elapsed = 0

@@ -53,9 +53,6 @@ def record_episodes(
             its worlds runs an episode at a time.
         policy: Maps observations, [B, ...], to actions, [B, ...].
         seeds: One for each episode.
-
-    Raises:
-        NPAError: The environment is another one, or there are no seeds.
     """
     vector_env(env, "record_episodes")
     check_autoreset(autoreset_mode(env), "same-step")
@@ -203,9 +200,6 @@ def read_pairs(dataset_id: str) -> tuple[Tensor, Tensor]:
 
     Returns:
         Observations, float32, shape [W, ...], and actions, shape [W, ...], of W steps.
-
-    Raises:
-        NPAError: There is no such dataset, or observations are not arrays.
     """
     try:
         dataset = minari.load_dataset(dataset_id)

@@ -163,9 +163,6 @@ class NormalizePerception(_PerceptionNormalizer, Observations):
         epsilon: Added to variances (dimensionless).
         training: Whether new observations update the statistics.
 
-    Raises:
-        NPAError: The environment or a number is wrong.
-
     Attributes:
         training: Whether new observations update the statistics; set it to False to freeze them.
         statistics: The running statistics; set it to those of another wrapper to share them.
@@ -191,9 +188,6 @@ class TorchNormalizeObservation(VectorObservations):
     Args:
         env: A vector environment with torch tensors.
         epsilon: Added to variances (dimensionless).
-
-    Raises:
-        NPAError: `epsilon` is not finite or not positive.
     """
 
     def __init__(self, env: AnyVectorEnv, epsilon: float = 1e-8) -> None:
@@ -228,9 +222,6 @@ class TorchNormalizeReward(RewardSums):
         env: A vector environment with torch tensors.
         gamma: Discount of the return, in [0, 1] (dimensionless).
         epsilon: Added to the variance (dimensionless).
-
-    Raises:
-        NPAError: `gamma` is not in [0, 1], or `epsilon` is not finite or not positive.
     """
 
     def __init__(self, env: AnyVectorEnv, gamma: float = 0.99, epsilon: float = 1e-8) -> None:

@@ -8,7 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from npa_envs.envs.core.vector import BatchedSpaces
-from npa_envs.wrappers.base import AnyVectorEnv, ParticleRowsBase, row_space, to_host, vector_env
+from npa_envs.wrappers.base import (
+    AnyVectorEnv,
+    ParticleRowsBase,
+    VectorStep,
+    row_space,
+    to_host,
+    vector_env,
+)
 
 
 class ParticleRows(ParticleRowsBase, BatchedSpaces):
@@ -24,9 +31,6 @@ class ParticleRows(ParticleRowsBase, BatchedSpaces):
 
     Args:
         env: A vector environment of this package, wrapped or not, with next-step autoreset.
-
-    Raises:
-        NPAError: The environment is not of this package, or has another autoreset mode.
     """
 
     # Gymnasium closes deleted objects, also if the constructor failed and nothing is open.
@@ -43,38 +47,19 @@ class ParticleRows(ParticleRowsBase, BatchedSpaces):
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Start episodes in all worlds.
+        """Start episodes in all worlds; return the rows' observations, [B N, P], and no infos.
 
-        Args:
-            seed: World w begins the sequence of seed + w; None: each world's next episode.
-            options: Not used, as rows cannot restart without the others of their world.
-
-        Returns:
-            Observations of the rows, shape [B N, P], and an empty info.
+        World w begins the sequence of `seed` + w; None: each world's next episode. `options` are
+        not used, as rows cannot restart without the others of their world.
         """
         observations, _ = self.vector_env.reset(seed=seed)
         return to_host(observations).reshape(self.num_envs, -1), {}
 
-    def step(
-        self, actions: Any
-    ) -> tuple[
-        NDArray[np.float32],
-        NDArray[np.float64],
-        NDArray[np.bool_],
-        NDArray[np.bool_],
-        dict[str, Any],
-    ]:
-        """Step all worlds.
+    def step(self, actions: Any) -> VectorStep:
+        """Step all worlds by actions [B N, A]; return the rows' results and no infos.
 
-        Args:
-            actions: Shape [B N, A].
-
-        Returns:
-            Observations [B N, P], rewards, terminations and truncations [B N], and an empty info.
-
-        Raises:
-            NPAError: The actions have another shape; the worlds are not changed.
-            DivergedError: An action is not finite; the worlds are not changed.
+        Actions of a wrong shape raise an NPAError, and those that are not finite a DivergedError,
+        before the worlds change.
         """
         rows, rewards, ended, cut, _ = self.step_worlds(actions)
         return to_host(rows), to_host(rewards).astype(np.float64), to_host(ended), to_host(cut), {}

@@ -26,9 +26,6 @@ class TorchRecordEpisodeStatistics(RewardSums):
         env: A vector environment with torch tensors.
         buffer_length: Number of last episodes in the queues.
         stats_key: Replaces "episode" as the key in `infos`.
-
-    Raises:
-        NPAError: `env` is no vector environment, or `buffer_length` no integer of at least 1.
     """
 
     def __init__(

@@ -30,7 +30,6 @@ MAKERS = {
 """Functions that make environments, and their tasks, by the ids of PettingZoo's registry."""
 
 ROW_IDS = tuple(row.id for row in ALL)
-"""Ids of Gymnasium's registry."""
 
 WHOLE_IDS = frozenset((*GARDEN_IDS, *(row.id for row in CODED)))
 """Ids of environments whose actions are for a whole world."""
@@ -78,9 +77,6 @@ def rllib_config(name: str, *, shared: bool = False, **keywords: Any) -> PPOConf
         name: Id of an environment of several agents, such as `npa/MixingParticles-v0`.
         shared: Whether all agents have one policy, "everyone".
         keywords: Keywords of `parallel_env`.
-
-    Raises:
-        NPAError: There is no such id, or a keyword is wrong.
     """
     _check_id(name, MAKERS, ROW_IDS, "rllib_rows_config")
     make, task = MAKERS[name]
@@ -112,9 +108,6 @@ def rllib_rows_config(name: str, *, world_count: int = 4, **keywords: Any) -> PP
         name: Gymnasium's id of an environment.
         world_count: Worlds B of each environment runner.
         keywords: Keywords of `gymnasium.make_vec`, for example `particle_count`.
-
-    Raises:
-        NPAError: There is no such id, or a keyword is wrong.
     """
     _check_id(name, ROW_IDS, MAKERS, "rllib_config")
     rows = checked_count("world_count", world_count)

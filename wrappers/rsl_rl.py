@@ -30,11 +30,6 @@ class RslRlParticleEnv(ParticleRowsBase, VecEnv):  # type: ignore[misc]
         env: A vector environment of this package, wrapped or not, made with `output="torch"`, with
             same-step autoreset and `copy=True` (the default), as RSL-RL stores the tensors.
         seed: World w begins with the episode of seed + w; None: a drawn one.
-
-    Raises:
-        NPAError: The environment is not of this package, returns arrays or the same tensors in each
-            step, or has another autoreset mode.
-        MissingDependencyError: RSL-RL is not installed (on import).
     """
 
     def __init__(self, env: AnyVectorEnv, *, seed: int | None = None) -> None:
@@ -65,18 +60,10 @@ class RslRlParticleEnv(ParticleRowsBase, VecEnv):  # type: ignore[misc]
         return TensorDict({"policy": rows}, batch_size=[self.num_envs], device=self.device)
 
     def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict[str, Any]]:
-        """Step all worlds.
+        """Step all worlds by actions [B N, A], with the errors of `ParticleRows.step`.
 
-        Args:
-            actions: Shape [B N, A].
-
-        Returns:
-            Observations, rewards [B N], done flags, int64, [B N], and extras, with `time_outs`
-            [B N], and `log` where episodes ended.
-
-        Raises:
-            NPAError: The actions have another shape; the worlds are not changed.
-            DivergedError: An action is not finite; the worlds are not changed.
+        Returns observations, rewards [B N], done flags, int64, [B N], and extras: `time_outs`
+        [B N], and `log` where episodes ended.
         """
         # RSL-RL collects in inference mode, whose tensors later steps could not write to.
         with torch.inference_mode(False), torch.no_grad():

@@ -59,13 +59,10 @@ class RowVecEnv(VecEnv):
         action_space: Space[Any],
     ) -> None:
         self.vector_env = env
-        """The vector environment."""
         self.world_count = world_count
-        """Worlds B."""
         self.row_count = row_count
         """Rows of a world, R."""
         self.spec = getattr(env, "spec", None)
-        """Gymnasium's spec of the environment."""
         self.shared_info: dict[str, Any] = SharedInfo()
         """The info of all rows whose episodes go on."""
         self._actions: NDArray[np.float32] | None = None
@@ -268,10 +265,6 @@ class ParticleVecEnv(_EpisodeRows):
         bootstrap: Whether infos mark truncation by the step limit, so that Stable-Baselines3
             bootstraps the value there. On-policy algorithms do that row by row, which takes seconds
             for many thousand rows; False: truncation counts as termination.
-
-    Raises:
-        NPAError: The environment is not of this package, or has another autoreset mode.
-        MissingDependencyError: Stable-Baselines3 is not installed (on import).
     """
 
     def __init__(self, env: AnyVectorEnv, *, bootstrap: bool = True) -> None:
@@ -279,7 +272,6 @@ class ParticleVecEnv(_EpisodeRows):
         check_autoreset(autoreset_mode(env), "same-step")
         self.bootstrap = bootstrap
         self.particle_count = base.config.particle_count
-        """Particles N of a world."""
         super().__init__(
             env,
             base.num_envs,
@@ -304,10 +296,6 @@ class WorldVecEnv(_EpisodeRows):
 
     Args:
         env: A vector environment, wrapped or not, with same-step autoreset.
-
-    Raises:
-        NPAError: The environment is a single one, or has another autoreset mode.
-        MissingDependencyError: Stable-Baselines3 is not installed (on import).
     """
 
     per_particle_reward = False
@@ -331,10 +319,7 @@ class RowPolicy:
     Args:
         model: The model; training it further changes the policy.
         deterministic: Whether it acts by its mean instead of a draw.
-        tag: One-hot species to append to each row, shape [K]; None: nothing.
-
-    Raises:
-        NPAError: `model` has no method `predict`.
+        tag: One-hot species to append to each row, shape [species]; None: nothing.
     """
 
     def __init__(
@@ -374,11 +359,6 @@ class SpeciesVecEnv(RowVecEnv):
     Args:
         env: From `multispecies_v0.batched`, with same-step autoreset.
         others: Policies of the species that are not rows, by name.
-
-    Raises:
-        NPAError: `env` is another environment or has another autoreset mode, a name in `others` is
-            unknown, a policy is no function, or no species remains.
-        MissingDependencyError: Stable-Baselines3 is not installed (on import).
     """
 
     def __init__(

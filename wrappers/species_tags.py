@@ -51,7 +51,7 @@ class _TagsSpecies(WrapperBase):
         return Box(low, high, dtype=np.float32)
 
     def changed(self, observations: Any) -> Any:
-        """Return observations [..., N, P + K], whose last K columns are the one-hot species."""
+        """Return observations [..., N, P], whose last columns are the one-hot species."""
         if isinstance(observations, Tensor):
             return torch.cat((observations, self._tags), dim=-1)
         return np.concatenate((observations, self._tags), axis=-1)
@@ -64,10 +64,7 @@ class SpeciesTags(_TagsSpecies, Observations):
 
     Args:
         env: An environment of this package.
-        species_count: Species K.
-
-    Raises:
-        NPAError: An argument is wrong, or there are fewer particles than species.
+        species_count: Number of species.
     """
 
 

@@ -36,11 +36,6 @@ class NPATorchRLEnv(EnvBase):  # type: ignore[misc]
         env: A vector environment of this package, wrapped or not, made with `output="torch"`,
             `autoreset_mode="disabled"`, and `copy=True` (the default), as TorchRL stores tensors.
         rows: Whether particles are elements of the batch.
-
-    Raises:
-        NPAError: The environment is not of this package, returns arrays or the same tensors in each
-            step, or has another autoreset mode.
-        MissingDependencyError: TorchRL is not installed (on import).
     """
 
     def __init__(self, env: AnyVectorEnv, *, rows: bool = False) -> None:
@@ -50,11 +45,8 @@ class NPATorchRLEnv(EnvBase):  # type: ignore[misc]
         batch = (worlds, count) if rows else (worlds,)
         super().__init__(device=base.worlds.x.device, batch_size=torch.Size(batch))
         self.vector_env = env
-        """The vector environment."""
         self.rows = rows
-        """Whether particles are elements of the batch."""
         self.particle_count = count
-        """Particles N of a world."""
         self._first_seed: int | None = None
         observed, acted = (
             _bounded(space, worlds, self.device)
@@ -69,10 +61,17 @@ class NPATorchRLEnv(EnvBase):  # type: ignore[misc]
         self.done_spec = Composite(flags, shape=batch, device=self.device)
 
     def _reset(self, tensordict: TensorDictBase | None, **_: Any) -> TensorDictBase:
-        """Start episodes in the worlds of the mask `_reset`, or in all."""
         mask = None if tensordict is None else tensordict.get("_reset", None)
-        chosen = None if mask is None else self._chosen(mask)
-        if chosen is None or bool(chosen.all()):
+        chosen = torch.ones(self.batch_size[0], dtype=torch.bool)
+        if mask is not None:
+            by_world = mask.reshape(self.batch_size[0], -1).cpu()
+            chosen = by_world.any(dim=1)
+            if not torch.equal(chosen, by_world.all(dim=1)):
+                raise NPAError(
+                    "_reset must choose all particles of a world or none, got some of them: "
+                    "they begin their episodes together"
+                )
+        if chosen.all():
             observation, _ = self.vector_env.reset(seed=self._first_seed)
             self._first_seed = None
         else:
@@ -81,7 +80,6 @@ class NPATorchRLEnv(EnvBase):  # type: ignore[misc]
         return self._entries(observation, done=off, terminated=off.clone(), truncated=off.clone())
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Step all worlds."""
         outcome = self.vector_env.step(tensordict["action"])
         observation, reward, terminated, truncated, infos = outcome
         if self.rows and "particle_reward" in infos:
@@ -97,24 +95,12 @@ class NPATorchRLEnv(EnvBase):  # type: ignore[misc]
         )
 
     def _set_seed(self, seed: int | None) -> None:
-        """Set the seed of the next reset of all worlds, seed + k for world k."""
         self._first_seed = seed
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Close the environment; `raise_if_closed` refuses a second call."""
         super().close(raise_if_closed=raise_if_closed)
         self.vector_env.close()
-
-    def _chosen(self, mask: Tensor) -> Tensor:
-        """Return whether TorchRL's mask chooses each world, bool, shape [B], on the host."""
-        by_world = mask.reshape(self.batch_size[0], -1).cpu()
-        chosen = by_world.any(dim=1)
-        if not torch.equal(chosen, by_world.all(dim=1)):
-            raise NPAError(
-                "_reset must choose all particles of a world or none, got some of them: "
-                "they begin their episodes together"
-            )
-        return chosen
 
     def _spread(self, values: Tensor) -> Tensor:
         """Reshape worlds' values [B] to [B, 1], or with `rows=True` repeat them, to [B, N, 1]."""

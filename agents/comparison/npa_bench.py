@@ -45,10 +45,8 @@ MIN_SEEDS = 5
 """Least runs of a method on a problem, from different seeds."""
 
 SCHEMA = Path(__file__).with_name("npa_bench_v0.schema.json")
-"""JSON schema of rows."""
 
 HIDDEN_DIM = 64
-"""Hidden units of new rules."""
 
 QUICK_FRACTION = 1e-3
 """Factor on the budgets of quick runs, which only test that everything runs."""

@@ -105,7 +105,6 @@ class Job:
     task: str
     method: str
     seed: int
-    """Seed of all random numbers of the run."""
 
     @property
     def folder(self) -> PurePosixPath:

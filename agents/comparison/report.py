@@ -37,7 +37,7 @@ HEADINGS: Mapping[Axis, str] = {
     "particle-steps": "Equal particle-steps",
 }
 
-TABLE, FIGURES, CURVES = "comparison.md", "comparison.json", "comparison.csv"
+TABLE, RESULTS, CURVES = "comparison.md", "comparison.json", "comparison.csv"
 
 
 def write_table(
@@ -48,7 +48,7 @@ def write_table(
     shown = markdown(table)
     facts = {"command": command, **asdict(plan), "left_out": sorted(map(list, plan.left_out))}
     write_text(folder / TABLE, f"`{command}`\n\n{shown}")
-    Record(facts, folder / FIGURES, table).write()
+    Record(facts, folder / RESULTS, table).write()
     write_text(folder / CURVES, curves_csv(records))
     return shown
 
@@ -92,7 +92,6 @@ class ReportRow:
     """The results of a method on a task, over its seeds."""
 
     axis: Axis
-    """Kind of the budget."""
     task: str
     method: str
     done: int
@@ -220,7 +219,7 @@ def _table(table: Sequence[ReportRow]) -> str:
 
 
 def curves_csv(records: Iterable[RunRecord]) -> str:
-    """Return the points of all learning curves as comma-separated values, one in a line."""
+    """Return the points of all learning curves as comma-separated values, one per line."""
     names = [field.name for field in fields(CurvePoint)]
     lines = [
         [r.job.axis, r.job.task, r.job.method, r.job.seed, r.status, *astuple(point)]
@@ -238,7 +237,7 @@ CURVE_POINTS = 64
 
 
 class Curve(NamedTuple):
-    """A mean learning curve at K points: abscissa, mean return, standard error; [K] each."""
+    """A mean learning curve at some points: abscissa, mean return, standard error."""
 
     across: NDArray[np.float64]
     mean: NDArray[np.float64]

@@ -1,9 +1,9 @@
 """Runs of a comparison: each learns, is tested on held-out episodes, writes a record and a picture.
 
-Runs are processes, `python -m npa_envs.agents.comparison.single_run FOLDER`, on several cores or
-GPUs. A process loads its libraries, waits for a line on its standard input that names a device, and
-does the run of `request.json` in FOLDER. Two more lines, a folder as JSON and a device, start
-another run. The process ends with its input.
+A run has a folder, with a `RunRequest` (`request.json`) before it, and a `RunRecord` (`run.json`)
+after it. Runs are done by processes, `python -m npa_envs.agents.comparison.single_run FOLDER`, on
+several cores or GPUs. A process loads the libraries that the run in FOLDER needs. Then it does a
+run for each `Order`, a line of JSON on its standard input, and it ends with its input.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -152,8 +152,8 @@ def run(folder: Path, device: str) -> None:
         # The table reports errors.
         traceback.print_exc()
         status = "diverged" if isinstance(error, DivergedError) else "failed"
-        result: dict[str, Any] = {}
-        result["error"] = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        result: dict[str, Any]
+        result = {"error": f"{type(error).__name__}: {' '.join(str(error).split())}"}
     else:
         result = {
             "returns": tuple(episodes.returns.tolist()),
@@ -210,13 +210,20 @@ def final_picture(
     return np.asarray(picture)
 
 
+class Order(NamedTuple):
+    """What a process is told to do: the run that is requested in a folder, on a device."""
+
+    folder: str
+    device: str
+
+
 def main(folder: Path) -> None:
-    """Do the run in `folder`, then others; lines of standard input: device, folder, device, ..."""
-    lines: SimpleQueue[str] = SimpleQueue()
+    """Load the libraries of the run in `folder`; then do the run of each `Order`."""
+    orders: SimpleQueue[Order] = SimpleQueue()
 
     def listen() -> None:
         for line in sys.stdin:
-            lines.put(line.strip())
+            orders.put(Order(*json.loads(line)))
         # The parent process has ended.
         os._exit(1)
 
@@ -226,16 +233,16 @@ def main(folder: Path) -> None:
     with contextlib.suppress(Exception):
         method_options(request.facts["method"])
     while True:
-        run(folder, lines.get())
+        order = orders.get()
+        with Path(order.folder, OUTPUT).open("ab") as output:
+            for number in (1, 2):
+                os.dup2(output.fileno(), number)
+        run(Path(order.folder), order.device)
         for stream in (sys.stdout, sys.stderr):
             stream.flush()
         # Free the memory of a run for the next one.
         gc.collect()
         torch.cuda.empty_cache()
-        folder = Path(json.loads(lines.get()))
-        with (folder / OUTPUT).open("wb") as output:
-            for number in (1, 2):
-                os.dup2(output.fileno(), number)
 
 
 # The parent process. The start of a process (libraries, a GPU's context, kernels) takes longer than
@@ -265,23 +272,20 @@ class RunProcess(Child):
         return (self.folder / RECORD).exists() or self.process.poll() is not None
 
     def begin_work(self, device: str) -> None:
-        """Tell the waiting process the device, on which it starts the run."""
+        """Order the waiting process to do the run."""
         self.begin = time.perf_counter()
-        _send(self.process, device)
+        assert self.process.stdin is not None, "opened at its start"
+        # The death of a process is found and recorded later.
+        with contextlib.suppress(BrokenPipeError):
+            line = json.dumps(Order(str(self.folder), device))
+            self.process.stdin.write(f"{line}\n".encode())
+            self.process.stdin.flush()
 
     def end(self) -> None:
         """Terminate the process, and remove the run's folder."""
         self.process.terminate()
         self.process.communicate()
         shutil.rmtree(self.folder, ignore_errors=True)
-
-
-def _send(process: subprocess.Popen[bytes], line: str) -> None:
-    assert process.stdin is not None, "opened at its start"
-    # The death of a process is found and recorded later.
-    with contextlib.suppress(BrokenPipeError):
-        process.stdin.write(f"{line}\n".encode())
-        process.stdin.flush()
 
 
 def shares_process(plan: ComparisonPlan, job: Job) -> bool:
@@ -381,20 +385,15 @@ def _start(
     temporary = target.parent / f".{target.name}.{secrets.token_hex(4)}"
     temporary.mkdir(parents=True)
     write_record(temporary / REQUEST, asdict(request))
-    if idle:
-        # The process opens this file itself, unless it dies before.
-        (temporary / OUTPUT).touch()
-        process = idle.pop()
-        _send(process, json.dumps(str(temporary)))
-        return RunProcess(request, temporary, process)
-    environment = os.environ | {"OMP_NUM_THREADS": str(threads)}
     with (temporary / OUTPUT).open("wb") as output:
+        if idle:
+            return RunProcess(request, temporary, idle.pop())
         process = subprocess.Popen(
             [*PROGRAM, str(temporary)],
             stdin=subprocess.PIPE,
             stdout=output,
             stderr=output,
-            env=environment,
+            env=os.environ | {"OMP_NUM_THREADS": str(threads)},
         )
     return RunProcess(request, temporary, process)
 

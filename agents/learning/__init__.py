@@ -79,17 +79,12 @@ class Trained(NamedTuple):
     rules: RuleSet | None
     """The rules, on the run's device; None if the method returns a policy."""
     log: list[CurvePoint]
-    """The learning curve."""
     policy: Callable[[Any], Any]
     """Maps observations, [B, N, P], to actions, [B, N, A], and a dict of agents' observations, as
     of PettingZoo's parallel environments, to a dict of their actions."""
 
     def save(self, folder: str | Path) -> list[Path]:
-        """Write the rules' or the policy's files, if it can be saved; return their paths.
-
-        Raises:
-            NPAError: As for `RuleSet.save`.
-        """
+        """Write the rules' or the policy's files, if it can be saved; return their paths."""
         save = getattr(self.policy if self.rules is None else self.rules, "save", None)
         return [] if save is None else save(folder)
 
@@ -136,7 +131,8 @@ def train(
 
     Raises:
         NPAError: The method or an option is unknown, the method cannot learn this problem, cannot
-            be resumed or distributed, or `start` does not fit. Or as for `Progress`.
+            be resumed or distributed, or `start` does not fit. Or as for
+            `npa_envs.training.run_folder.Run`.
         DivergedError: The rules' weights have become infinite or NaN.
         MissingDependencyError: The method needs a library that is not installed.
     """
@@ -211,10 +207,6 @@ def method_options(method: str) -> dict[str, Any]:
     Args:
         method: A name from `METHODS` or, if not there, `GARDEN_METHODS`; or your own function,
             "package.module:function".
-
-    Raises:
-        NPAError: The method is unknown.
-        MissingDependencyError: It needs a library that is not installed.
     """
     return _options_of(_function(method, GARDEN_METHODS | METHODS))
 
@@ -228,7 +220,6 @@ def _options_of(function: Callable[..., Any]) -> dict[str, Any]:
 
 
 def _default_options(function: Callable[..., Any]) -> Any:
-    """Return the default of a method's argument `options`, if that is a dataclass, else None."""
     parameter = inspect.signature(function).parameters.get("options")
     default = None if parameter is None else parameter.default
     return default if is_dataclass(default) else None

@@ -86,7 +86,6 @@ class CommonOptions:
     """Input of the critic: a particle's own perception, or also its whole world ("central")."""
 
     def __post_init__(self) -> None:
-        """Check every field; raises NPAError."""
         check_positive(self, int, "steps", "epochs", "minibatches")
         check_positive(self, float, "max_gradient_norm")
         check_non_negative(self, "entropy_weight")
@@ -162,7 +161,7 @@ class GaussianRules(nn.Module):
         self.noise_factor = 1.0
         """Factor on the first standard deviations (dimensionless)."""
         self.log_std = nn.Parameter(start)
-        """Logarithms of the standard deviations, a row for each species, shape [K, A]."""
+        """Logarithms of the standard deviations, a row for each species, shape [species, A]."""
         self.register_buffer("row_species", species_of(rules.counts), persistent=False)
 
     def get_extra_state(self) -> float:
@@ -256,21 +255,21 @@ class Critic(nn.Module):
         return self.scale * values
 
     @torch.no_grad()
-    def observe(self, observation: Tensor, ranks: ProcessGroup = ALONE) -> None:
+    def observe(self, observation: Tensor, processes: ProcessGroup = ALONE) -> None:
         """Update the inputs' running moments by observations [..., P], averaged over processes."""
         rate = self._rate(0)
         rows = observation.flatten(0, -2)
         mean, square = rows.mean(dim=0), rows.square().mean(dim=0)
-        ranks.reduce([mean, square])
+        processes.reduce([mean, square])
         self.mean.lerp_(mean, rate)
         self.square.lerp_(square, rate)
 
     @torch.no_grad()
-    def rescale(self, targets: Tensor, ranks: ProcessGroup = ALONE) -> None:
+    def rescale(self, targets: Tensor, processes: ProcessGroup = ALONE) -> None:
         """Update the outputs' running scale, the RMS of targets; the last layer offsets it."""
         before = self.scale.clone()
         square = targets.square().mean()
-        ranks.reduce([square])
+        processes.reduce([square])
         size = square.sqrt().clamp(min=1e-8)
         self.scale.lerp_(size, self._rate(1))
         for parameter in (self.value.weight, self.value.bias):
@@ -289,11 +288,18 @@ def seeded_critic(progress: Progress, input_dim: int, inputs: CriticInput) -> Cr
         return Critic(input_dim, progress.problem.counts, inputs).to(progress.device)
 
 
-def learner_random(progress: Progress, total: int, indices: Tensor) -> Randomness:
-    """Return a generator, or with several processes streams of worlds `indices` of `total`."""
-    if progress.ranks.distributed:
-        return world_streams((progress.seed,), total, indices, progress.device)
-    return torch.Generator(progress.device).manual_seed(progress.seed)
+def share_of_worlds(progress: Progress, total: int) -> tuple[list[int], Randomness]:
+    """Return the indices of this process's worlds out of `total`, and their random source.
+
+    That is a generator, or with several processes a stream for each world.
+    """
+    progress.processes.check_even("num_envs", total)
+    indices = progress.processes.indices(total)
+    if progress.processes.distributed:
+        random: Randomness = world_streams((progress.seed,), total, indices, progress.device)
+    else:
+        random = torch.Generator(progress.device).manual_seed(progress.seed)
+    return indices.tolist(), random
 
 
 class Minibatches:

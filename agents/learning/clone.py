@@ -32,7 +32,7 @@ class CloneOptions:
     """Id of a Minari dataset to learn from instead; its steps count as particle-steps each time
     that they are used."""
     student_share: float = 0.5
-    """Fraction of the worlds in which the student acts, in [0, 1]; 0: plain cloning."""
+    """Fraction of the worlds in which the student acts, in [0, 1]; 0: only the teacher acts."""
     collect_steps: int = 8
     """Steps of the worlds in an iteration."""
     updates: int = 16
@@ -45,7 +45,6 @@ class CloneOptions:
     """Learning rate at the end, as a fraction of the first."""
 
     def __post_init__(self) -> None:
-        """Check every field but the teacher; raises NPAError."""
         check_non_negative(self, "student_share", at_most=1.0)
         check_positive(self, int, "collect_steps", "updates", "batch_worlds")
         check_positive(self, float, "learning_rate")

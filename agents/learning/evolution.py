@@ -44,7 +44,6 @@ class EvolutionOptions:
     gain 1; dimensionless)."""
 
     def __post_init__(self) -> None:
-        """Check every field; raises NPAError."""
         check_positive(self, int, "population", at_least=4)
         check_positive(self, int, "worlds_per_candidate")
         check_positive(self, float, "sigma")
@@ -87,8 +86,8 @@ class RuleWeights:
         for rule in self._rules:
             if not rule.is_plain():
                 raise NPAError(
-                    "rules must be plain NPARules, whose networks are their two layers, got one "
-                    "that overrides its network: evolve it by its own code"
+                    "rules must be NPARules whose networks are their two layers, got one that "
+                    "overrides its network: evolve it by its own code"
                 )
 
     def vector(self) -> NDArray[np.float64]:
@@ -121,7 +120,7 @@ def layers_of(rule: NPARule) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def updates_of(rule: NPARule, weights: Tensor, rows: Tensor) -> Tensor:
-    """Return raw updates [K, R, A] of K candidates, weights [K, W], for perceptions [K, R, P]."""
+    """Return raw updates [G, R, A] of G candidates, weights [G, W], for perceptions [G, R, P]."""
     shapes = [tuple(part.shape) for part in layers_of(rule)]
     sizes = [math.prod(shape) for shape in shapes]
     first, bias, second = (
@@ -139,9 +138,9 @@ def updates_of(rule: NPARule, weights: Tensor, rows: Tensor) -> Tensor:
 
 @torch.no_grad()
 def candidates_actions(rules: RuleSet, weights: Tensor, observation: Tensor) -> Tensor:
-    """Return actions [K * M, N, A] of K candidates, with weights [K, W], in M worlds of each.
+    """Return actions [G * M, N, A] of G candidates, with weights [G, W], in M worlds of each.
 
-    Observations, [K * M, N, P], are ordered by candidate.
+    Observations, [G * M, N, P], are ordered by candidate.
     """
     sizes = [sum(part.numel() for part in layers_of(rule)) for rule in rules]
     weights_of = dict(zip(rules, torch.split(weights, sizes, dim=1), strict=True))
@@ -158,9 +157,9 @@ def candidates_actions(rules: RuleSet, weights: Tensor, observation: Tensor) -> 
 def fitness(
     envs: Any, rules: RuleSet, weights: Tensor, seeds: list[int], episode_steps: int
 ) -> Tensor:
-    """Return the mean returns [K] of candidates with weights [K, W] over worlds of the same seeds.
+    """Return the mean returns [G] of candidates with weights [G, W] over worlds of the same seeds.
 
-    `envs` has K * M worlds: M from k * M on for candidate k, one for each of the seeds.
+    `envs` has G * M worlds: M from k * M on for candidate k, one for each of the seeds.
     """
     observation, _ = envs.reset(seed=seeds * len(weights))
     returns = torch.zeros(envs.num_envs, device=weights.device)
@@ -199,7 +198,7 @@ def _strategy(
 
 
 def costs(returns: NDArray[np.float64]) -> list[float]:
-    """Return costs to minimise: minus the mean returns [K]. Not finite ones cost the most."""
+    """Return costs to minimise: minus the mean returns [G]. Not finite ones cost the most."""
     finite = np.isfinite(returns)
     worst = returns[finite].min() - 1.0 if finite.any() else 0.0
     minimised: list[float] = (-np.where(finite, returns, worst)).tolist()

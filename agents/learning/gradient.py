@@ -32,7 +32,6 @@ MAX_STEPS = 96
 """Most steps of a rollout by default: longer episodes continue in a pool."""
 
 POOL_SIZE = 64
-"""Default number of worlds in a pool."""
 
 KEY_RANGE = -(2**63), 2**63 - 1
 """Range of the keys of worlds' random streams."""
@@ -61,7 +60,6 @@ class GradientOptions:
     """What the backward pass reads: "store", "recompute" or "minimal", as in `rollout`."""
 
     def __post_init__(self) -> None:
-        """Check `last_rate`, and check `steps` and make it a tuple; raises NPAError."""
         check_fraction(self, "last_rate")
         steps: Any = self.steps
         if steps is not None:
@@ -104,12 +102,12 @@ def train(progress: Progress, options: GradientOptions = GradientOptions()) -> R
         seed=seed,
         device=str(device),
         memory=options.memory,
-        # A task whose starts are long rollouts is not recorded.
+        # A task whose starts are long rollouts is not captured.
         cuda_graph=not isinstance(task.inner, EnvTask) or task.inner.start_is_short,
     )
     schedule = torch.Generator().manual_seed(seed)
     cycle = TrainingCycle(task, rules, config, device, schedule, task.rollout)
-    # On CUDA there is one recording for each number of steps: make all before the clock starts.
+    # On CUDA there is one graph for each number of steps: capture all before the clock starts.
     for number in range(*config.steps) if device.type == "cuda" else (config.steps[0],):
         cycle.batch.run(number)
     numbers = itertools.count()
@@ -143,7 +141,6 @@ class EnvironmentTask(ParticleTask[Any]):
         self.problem, self.config, self.physics = problem, problem.config, problem.physics
         task = problem.make_task(device)
         self.inner: Any = task
-        """The environment's task."""
         self._species = species_of(problem.counts).to(device)
         self._clamped: tuple[RuleSet, list[ClampedRule]] | None = None
         if not isinstance(task, SpeciesTask):
@@ -200,7 +197,7 @@ class EnvironmentTask(ParticleTask[Any]):
         """Run a `RuleSet` by the environment's physics; options are those of `npa_envs.rollout`."""
         physics, config = self.physics, self.config
         if self._clamped is None or self._clamped[0] is not rules:
-            # Made once, as recorded rollouts identify rules by `id`.
+            # Made once, as captured rollouts identify rules by `id`.
             limit = physics.limits.state_scale
             self._clamped = rules, [ClampedRule(rule, limit) for rule in rules]
         rule: Any = self._clamped[1]
@@ -219,7 +216,7 @@ class EnvironmentTask(ParticleTask[Any]):
         return after
 
     def _losses(self, worlds: Particles) -> Mapping[str, Tensor]:
-        """Return the terms of each world's loss by name, shape [B], or [B, K] of K species."""
+        """Return the terms of each world's loss by name, shape [B], or [B, species]."""
         x, s, *_ = worlds
         losses: Mapping[str, Tensor]
         if isinstance(self.inner, SpeciesTask):

@@ -4,8 +4,8 @@ Source: Schulman et al., arXiv 1707.06347. A round is `steps` steps of all world
 passes over them in minibatches of particles. Read `PPOLearner.play` and `improve` first, then the
 formulas at the end of the file. Actor, critic and minibatches are in `actor_critic.py`.
 
-The CPU reads one byte a world in each step (whether its episode ended) and one number a pass. On
-CUDA most work is recorded once as CUDA graphs, as launching its short kernels one by one takes
+The CPU reads one byte per world in each step (whether its episode ended) and one number per pass.
+On CUDA most work is captured once in CUDA graphs, as launching its short kernels one by one takes
 longer than running them.
 """
 
@@ -15,7 +15,7 @@ import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor, nn
@@ -28,18 +28,23 @@ from npa_envs.agents.learning.actor_critic import (
     Minibatches,
     find_gradients,
     gradients_of,
-    learner_random,
     seeded_critic,
+    share_of_worlds,
 )
-from npa_envs.agents.learning.problem import ROW_REWARDS, WORLDS_PER_SEED, Problem, world_seeds
-from npa_envs.agents.learning.progress import Budget, Progress
+from npa_envs.agents.learning.problem import (
+    WORLDS_PER_SEED,
+    ParticleRewards,
+    Problem,
+    particle_step,
+    world_seeds,
+)
+from npa_envs.agents.learning.progress import Progress
 from npa_envs.agents.learning.rule_set import RuleSet
 from npa_envs.checks import check_flag, check_positive, check_word
 from npa_envs.envs.core.world_state import free_bytes, needed_bytes
 from npa_envs.errors import NPAError
 from npa_envs.training.process_group import ALONE, ProcessGroup, registered, restart
 from npa_envs.world.cuda_graph import GraphedCallable
-from npa_envs.wrappers.base import own_rewards
 
 MANY_PARTICLES = 2**17
 """Particles of all worlds on a GPU by default: fewer take hardly less time."""
@@ -64,14 +69,13 @@ class PPOOptions(CommonOptions):
     ratio: Literal["particle", "world"] = "particle"
     """One likelihood ratio for each particle, or one for each world: of the mean log-probability
     of its particles."""
-    credit: Literal["world", "particle", "marginal"] = "world"
-    """Reward of a particle: that of its world; its own part of it; or the difference that its
-    action makes to the world's."""
+    particle_rewards: ParticleRewards | None = None
+    """Reward of each particle: "particle", its own part of its world's reward; "marginal", the
+    difference that its action makes to the world's. None: its world's reward."""
     masked: bool = False
     """Ignore actions in steps that did not update their particles; not with several species."""
 
     def __post_init__(self) -> None:
-        """Check every field; raises NPAError."""
         super().__post_init__()
         check_flag(self, "masked")
         if self.clip is not None:
@@ -79,18 +83,24 @@ class PPOOptions(CommonOptions):
         if self.num_envs is not None:
             check_positive(self, int, "num_envs")
         check_word(self, "ratio", ("particle", "world"))
-        check_word(self, "credit", ("world", *ROW_REWARDS))
-        if self.ratio == "world" and self.credit != "world":
+        check_word(self, "particle_rewards", (None, *get_args(ParticleRewards)))
+        if self.ratio == "world" and self.particle_rewards is not None:
             raise NPAError(
-                f"credit={self.credit!r} needs ratio='particle': with ratio='world' there is one "
-                "advantage a world"
+                f"particle_rewards={self.particle_rewards!r} needs ratio='particle': with "
+                "ratio='world' there is one advantage per world"
             )
+
+    @property
+    def clip_range(self) -> float:
+        """`clip`, or its default for `ratio`."""
+        if self.clip is not None:
+            return self.clip
+        return 0.02 if self.ratio == "world" else 0.2
 
 
 def train(progress: Progress, options: PPOOptions = PPOOptions()) -> RuleSet:
     """Return the rules that proximal policy optimisation learns within the budget."""
-    problem, device, ranks = progress.problem, progress.device, progress.ranks
-    count = ranks.broadcast(total_num_envs(problem, options, device, progress.budget, ranks))
+    count = progress.processes.broadcast(total_num_envs(progress, options))
     learner = PPOLearner(progress, replace(options, num_envs=count))
 
     def iteration() -> int:
@@ -105,26 +115,23 @@ def train(progress: Progress, options: PPOOptions = PPOOptions()) -> RuleSet:
 class PPOLearner:
     """Rules, critic and worlds, which alternately `play` a round and `improve` from it.
 
-    With several processes (`ranks`) each has some of the worlds, which have random streams of their
-    own. Gradients, moments and weights are averaged over them between replays of CUDA graphs.
+    With several processes each has some of the worlds, which have separate random streams.
+    Gradients, moments and weights are averaged over processes between replays of CUDA graphs.
     """
 
     def __init__(self, progress: Progress, options: PPOOptions) -> None:
-        problem, device, ranks = progress.problem, progress.device, progress.ranks
+        problem, device = progress.problem, progress.device
         self.options, self.schedule = options, options.schedule(progress.initial)
-        self.ranks, self._seed = ranks, progress.seed
+        self.processes, self._seed = progress.processes, progress.seed
         self._total = problem.num_envs if options.num_envs is None else options.num_envs
-        ranks.check_even("num_envs", self._total)
-        indices = ranks.indices(self._total)
-        self._indices = indices.tolist()
+        self._indices, self.random = share_of_worlds(progress, self._total)
         self.envs = problem.make_envs(
-            len(indices),
+            len(self._indices),
             device=device,
-            row_rewards=None if options.credit == "world" else options.credit,
+            particle_rewards=options.particle_rewards,
             tell_updated=options.masked,
             copy=False,
         )
-        self.random = learner_random(progress, self._total, indices)
         rules = progress.first_rules(zero_output=True)
         self.actor = GaussianRules(rules, self.schedule.initial_std).to(device)
         self.critic = seeded_critic(progress, problem.interface.perception_dim, options.critic)
@@ -134,13 +141,13 @@ class PPOLearner:
         # One group of rows for each species, or of worlds, for the rules; worlds for the critic.
         groups = (1,) if options.ratio == "world" else problem.counts
         self._minibatches = Minibatches(
-            options.steps, len(indices), (*groups, 1), options.minibatches, self.random
+            options.steps, len(self._indices), (*groups, 1), options.minibatches, self.random
         )
         observation = self._reset_worlds(0)
-        self.critic.observe(observation, ranks)
-        self.memory = RoundMemory(options, observation, problem.interface.action_dim)
-        shapes: tuple[tuple[int, ...], ...] = ((), (), (2,), (self._minibatches.count, 2))
-        self.update = UpdateState(*(torch.zeros(shape, device=device) for shape in shapes))
+        self.critic.observe(observation, self.processes)
+        self.memory = Memory(
+            options, observation, problem.interface.action_dim, self._minibatches.count
+        )
         self._play_graphs = GraphedMethods(device)
         self._update_graphs = GraphedMethods(device, share_memory=True)
 
@@ -158,7 +165,7 @@ class PPOLearner:
     @property
     def round_size(self) -> int:
         """Particle-steps of a round of all processes, T B N."""
-        return self.ranks.count * self.memory.rewards.numel()
+        return self.processes.count * self.memory.rewards.numel()
 
     @torch.no_grad()
     def play(self) -> Round:
@@ -171,24 +178,24 @@ class PPOLearner:
             self._play_graphs.run(self._draw_actions, generator=registered(self.random))
             memory.actions[step].copy_(memory.action)
             memory.log_probs[step].copy_(memory.log_prob)
-            observation, reward, terminated, truncated, infos = self.envs.step(memory.action)
-            memory.observations[step + 1].copy_(observation)
-            if "final_obs" in infos:
-                last_observations[step] = infos["final_obs"]
-            shared = options.credit == "world"
-            memory.rewards[step].copy_(reward[:, None] if shared else own_rewards(infos))
-            # `updated` is of one species; it describes the step before a restart.
-            acted = infos.get("acted", infos.get("updated") if options.masked else None)
-            if acted is not None:
-                memory.acted[step].copy_(acted)
-            # A species may end before its world does.
-            ended = infos.get("particle_terminated", terminated[:, None])
-            memory.terminated[step].copy_(terminated[:, None] | ended)
-            memory.ended[step].copy_((terminated | truncated)[:, None] | ended)
+            result = particle_step(
+                self.envs,
+                memory.action,
+                particle_rewards=options.particle_rewards is not None,
+                masked=options.masked,
+            )
+            memory.observations[step + 1].copy_(result.observation)
+            memory.rewards[step].copy_(result.reward)
+            memory.terminated[step].copy_(result.terminated)
+            memory.ended[step].copy_(result.ended)
+            if result.acted is not None:
+                memory.acted[step].copy_(result.acted)
+            if result.last_observation is not None:
+                last_observations[step] = result.last_observation
         self._play_graphs.run(self._find_values)
         for step, observation in last_observations.items():
             memory.next_values[step].copy_(self.critic(observation))
-        self._play_graphs.run(self._find_advantages, recorded=not self.ranks.distributed)
+        self._play_graphs.run(self._find_advantages, recorded=not self.processes.distributed)
         return memory.round
 
     @torch.no_grad()
@@ -222,7 +229,7 @@ class PPOLearner:
         memory.targets.copy_(advantages + values)
         if self.options.ratio == "world":
             advantages = particle_means(advantages, memory.acted)
-        memory.advantages.copy_(standardised(advantages, memory.acted, self.ranks))
+        memory.advantages.copy_(standardised(advantages, memory.acted, self.processes))
 
     def improve(self, remaining_budget: float) -> None:
         """Train rules and critic on the last round.
@@ -230,25 +237,25 @@ class PPOLearner:
         Learning rates, and the noise of the next round, fall with the remaining fraction of the
         budget.
         """
-        schedule, update = self.schedule, self.update
+        schedule, memory = self.schedule, self.memory
         rules_learn = self.rounds >= schedule.critic_rounds
         self.rounds += 1
-        self.critic.observe(self.memory.observations[:-1], self.ranks)
-        self.critic.rescale(self.memory.targets, self.ranks)
+        self.critic.observe(memory.observations[:-1], self.processes)
+        self.critic.rescale(memory.targets, self.processes)
         self.optimisers["critic"].param_groups[0]["lr"].fill_(CRITIC_RATE * remaining_budget)
-        update.rules_rate.fill_(schedule.learning_rate * remaining_budget)
-        update.within_kl.fill_(1.0)
+        memory.rules_rate.fill_(schedule.learning_rate * remaining_budget)
+        memory.within_kl.fill_(1.0)
         for _ in range(self.options.epochs):
             self._minibatches.shuffle()
             self._update_graphs.run(self._sum_weights)
-            self.ranks.reduce([update.weight_sums])
+            self.processes.reduce([memory.weight_sums])
             for minibatch in range(self._minibatches.count):
                 if rules_learn:
                     self._train(minibatch)
                 else:
                     self._train_critic(minibatch)
             # The only synchronisation with the device.
-            if not bool(update.within_kl):
+            if not bool(memory.within_kl):
                 break
         self.actor.set_noise(self.options.noise_factor(remaining_budget, schedule.last_noise))
 
@@ -256,12 +263,12 @@ class PPOLearner:
         """Take a step of rules and critic on a minibatch."""
         self._update_graphs.run(self._find_gradients, minibatch)
         gradients = [g for name in ("critic", "actor") for g in gradients_of(self.optimisers[name])]
-        self.ranks.reduce([*gradients, self.update.kl_sums])
+        self.processes.reduce([*gradients, self.memory.kl_sums])
         self._update_graphs.run(self._descend_both)
 
     def _train_critic(self, minibatch: int) -> None:
         self._find_critic_gradients(minibatch)
-        self.ranks.reduce(gradients_of(self.optimisers["critic"]))
+        self.processes.reduce(gradients_of(self.optimisers["critic"]))
         self._descend(self.optimisers["critic"])
 
     def _sum_weights(self) -> None:
@@ -271,23 +278,23 @@ class PPOLearner:
             (worlds,) = self._critic_rows(minibatch, acted)
             rows = torch.cat([group for (group,) in self._rule_rows(minibatch, acted)])
             sums = worlds.sum(), self._ratio_weights(rows).sum()
-            self.update.weight_sums[minibatch].copy_(torch.stack(sums))
+            self.memory.weight_sums[minibatch].copy_(torch.stack(sums))
 
     def _find_gradients(self, minibatch: int) -> None:
         self._find_critic_gradients(minibatch)
         objective, kl_sums = self._objective(minibatch)
         find_gradients(self.optimisers["actor"], -objective)
-        self.update.kl_sums.copy_(kl_sums)
+        self.memory.kl_sums.copy_(kl_sums)
 
     def _find_critic_gradients(self, minibatch: int) -> None:
         worlds = Round(*self._critic_rows(minibatch, self.memory.round))
         error = (self.critic(worlds.observations) - worlds.targets) / self.critic.scale
         squares = (worlds.acted * error.square()).sum()
-        loss = 0.5 * squares / self.update.weight_sums[minibatch, 0].clamp(min=1.0)
+        loss = 0.5 * squares / self.memory.weight_sums[minibatch, 0].clamp(min=1.0)
         find_gradients(self.optimisers["critic"], loss)
 
     def _objective(self, minibatch: int) -> tuple[Tensor, Tensor]:
-        """Return PPO's clipped objective of a minibatch, and its `UpdateState.kl_sums`."""
+        """Return PPO's clipped objective of a minibatch, and its `Memory.kl_sums`."""
         options, actor = self.options, self.actor
         groups = [Round(*rows) for rows in self._rule_rows(minibatch, self.memory.round)]
         if options.ratio == "world":
@@ -308,9 +315,10 @@ class PPOLearner:
         kl_sums = torch.stack((divergence, acted.sum()))
         if options.ratio == "world":
             log_ratio = particle_means(log_ratio, acted)
-        weights, total = self._ratio_weights(acted), self.update.weight_sums[minibatch, 1]
-        clip = options.clip or (0.2 if options.ratio == "particle" else 0.02)
-        objective = clipped_objective(log_ratio, advantages, weights, total, clip=clip)
+        weights, total = self._ratio_weights(acted), self.memory.weight_sums[minibatch, 1]
+        objective = clipped_objective(
+            log_ratio, advantages, weights, total, clip=options.clip_range
+        )
         if options.entropy_weight:
             objective = objective + options.entropy_weight * actor.entropy()
         return objective, kl_sums
@@ -318,10 +326,10 @@ class PPOLearner:
     def _descend_both(self) -> None:
         self._descend(self.optimisers["critic"])
         # Rules that moved too far get the learning rate 0, without a synchronisation.
-        divergence, count = self.update.kl_sums
-        self.update.within_kl.mul_(divergence / count.clamp(min=1.0) <= self.schedule.target_kl)
+        divergence, count = self.memory.kl_sums
+        self.memory.within_kl.mul_(divergence / count.clamp(min=1.0) <= self.schedule.target_kl)
         optimiser = self.optimisers["actor"]
-        rate = self.update.within_kl * self.update.rules_rate
+        rate = self.memory.within_kl * self.memory.rules_rate
         optimiser.param_groups[0]["lr"].copy_(rate)
         self._descend(optimiser)
 
@@ -357,19 +365,6 @@ def _adam(net: nn.Module, device: torch.device) -> torch.optim.Optimizer:
     rate = torch.zeros((), device=device)
     capturable = device.type == "cuda"
     return torch.optim.Adam(net.parameters(), lr=rate, eps=1e-5, fused=True, capturable=capturable)
-
-
-class UpdateState(NamedTuple):
-    """Tensors on the device that the CUDA graphs of an update read and write in place."""
-
-    within_kl: Tensor
-    """1, or 0 once the rules have moved farther than `target_kl` in a round, shape []."""
-    rules_rate: Tensor
-    """Learning rate of the rules while `within_kl` is 1, shape []."""
-    kl_sums: Tensor
-    """Sums of a minibatch's KL estimates [nats] and of their weights, shape [2]."""
-    weight_sums: Tensor
-    """Sums of the weights of the critic's and of the rules' samples by minibatch, shape [M, 2]."""
 
 
 class GraphedMethods:
@@ -412,17 +407,20 @@ class Round(NamedTuple):
     """1 where an action counts, 0 where its species had ended or it is masked, shape [M, N]."""
 
 
-class RoundMemory:
-    """Tensors of a round, which the next round overwrites, as CUDA graphs read them in place.
+class Memory:
+    """Tensors of a round and its updates, which the next round overwrites.
 
-    The default shape is [T, B, N]; for other fields see `Round`.
+    CUDA graphs read and write them in place. The default shape is [T, B, N]; for other fields see
+    `Round`.
     """
 
-    def __init__(self, options: PPOOptions, observation: Tensor, action_dim: int) -> None:
+    def __init__(
+        self, options: PPOOptions, observation: Tensor, action_dim: int, minibatches: int
+    ) -> None:
         steps, (worlds, particles) = options.steps, observation.shape[:2]
 
         def zeros(*shape: int, dtype: torch.dtype = observation.dtype) -> Tensor:
-            return observation.new_zeros(*shape, dtype=dtype)
+            return observation.new_zeros(shape, dtype=dtype)
 
         self.observation = observation.clone()
         """Observations before the current step, shape [B, N, P]."""
@@ -442,6 +440,14 @@ class RoundMemory:
         self.next_values = zeros(*single)
         """The critic's values of the states after each step, before any restart."""
         self.advantages = zeros(steps, worlds, 1 if options.ratio == "world" else particles)
+        self.within_kl = zeros()
+        """1, or 0 once the rules have moved farther than `target_kl` in a round, shape []."""
+        self.rules_rate = zeros()
+        """Learning rate of the rules while `within_kl` is 1, shape []."""
+        self.kl_sums = zeros(2)
+        """Sums of a minibatch's KL estimates [nats] and of their weights, shape [2]."""
+        self.weight_sums = zeros(minibatches, 2)
+        """Sums of the weights of the critic's and of the rules' samples by minibatch, [M, 2]."""
 
     @property
     def round(self) -> Round:
@@ -482,7 +488,7 @@ def particle_means(values: Tensor, weights: Tensor) -> Tensor:
     return total / weights.sum(dim=-1, keepdim=True).clamp(min=1e-8)
 
 
-def standardised(values: Tensor, weights: Tensor, ranks: ProcessGroup = ALONE) -> Tensor:
+def standardised(values: Tensor, weights: Tensor, processes: ProcessGroup = ALONE) -> Tensor:
     """Return values minus the weighted mean of their step, over the standard deviation of all.
 
     Means are by step, as the mean over worlds depends on the step of the episode, which a critic
@@ -490,12 +496,12 @@ def standardised(values: Tensor, weights: Tensor, ranks: ProcessGroup = ALONE) -
     [T, B, 1], weights [T, B, N]. Mean and deviation are over the worlds of all processes.
     """
     weights = weights if values.shape == weights.shape else weights.amax(-1, True)
-    dims = (1, 2) if values.shape[1] * ranks.count > 1 else (0, 1, 2)
+    dims = (1, 2) if values.shape[1] * processes.count > 1 else (0, 1, 2)
     means, totals = (sums.sum(dims, keepdim=True) for sums in (values * weights, weights))
-    ranks.reduce([means, totals])
+    processes.reduce([means, totals])
     centred = weights * (values - means / totals.clamp(min=1e-8))
     square, total = centred.square().sum(), weights.sum()
-    ranks.reduce([square, total])
+    processes.reduce([square, total])
     return centred / (square / total.clamp(min=1e-8) + 1e-16).sqrt()
 
 
@@ -504,7 +510,7 @@ def clipped_objective(
 ) -> Tensor:
     """Return the weighted mean of min(r A, clip(r) A) for likelihood ratios r and advantages A.
 
-    All have shape [M, N], or [M, 1] for one ratio a world; clip(r) is in 1 ± `clip`. `total` is
+    All have shape [M, N], or [M, 1] for one ratio per world; clip(r) is in 1 ± `clip`. `total` is
     the sum of the weights, with several processes its mean over them. Source: Schulman et al.,
     arXiv 1707.06347, equation 7.
     """
@@ -514,26 +520,22 @@ def clipped_objective(
     return (weights * gains).sum() / total.clamp(min=1.0)
 
 
-def total_num_envs(
-    problem: Problem,
-    options: PPOOptions,
-    device: torch.device,
-    budget: Budget,
-    ranks: ProcessGroup = ALONE,
-) -> int:
+def total_num_envs(progress: Progress, options: PPOOptions) -> int:
     """Return the number of worlds B of all processes, as `PPOOptions.num_envs` defines it."""
+    problem, device, budget = progress.problem, progress.device, progress.budget
     if options.num_envs is not None:
         return options.num_envs
     if device.type != "cuda":
         return problem.num_envs
-    counts = [MANY_PARTICLES // problem.particle_count, WORLDS_PER_SEED // ranks.count]
+    process_count = progress.processes.count
+    counts = [MANY_PARTICLES // problem.particle_count, WORLDS_PER_SEED // process_count]
     free = free_bytes(device)
     if free is not None:
         counts.append(int(MEMORY_FRACTION * free) // world_bytes(problem, options, device))
     if budget.particle_steps is not None:
-        round_size = ranks.count * options.steps * problem.particle_count
+        round_size = process_count * options.steps * problem.particle_count
         counts.append(budget.particle_steps // (MIN_ROUNDS * round_size))
-    return max(problem.num_envs, ranks.count * min(counts))
+    return max(problem.num_envs, process_count * min(counts))
 
 
 def world_bytes(problem: Problem, options: PPOOptions, device: torch.device) -> int:

@@ -1,4 +1,4 @@
-"""Problems to learn: an environment with its keywords, its worlds, and the seeds of runs.
+"""Problems to learn: an environment with its keywords, its worlds for learners, and seeds of runs.
 
 Worlds of runs have seeds by `world_seeds`, those of evaluations have larger ones.
 """
@@ -6,28 +6,36 @@ Worlds of runs have seeds by `world_seeds`, those of evaluations have larger one
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal, NamedTuple, get_args
 
 import gymnasium
+import numpy as np
 import torch
+from gymnasium.spaces import Box
+from gymnasium.vector import AutoresetMode
+from torch import Tensor
 
-from npa_envs.agents.learning.concatenated_species import ConcatenatedSpeciesEnv
+from npa_envs.agents.evaluation import TIME_LIMIT
+from npa_envs.agents.policies import spans_of
 from npa_envs.checks import check_positive, is_whole
 from npa_envs.devices import check_device
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.interface import Interface
 from npa_envs.envs.core.task import Controls, EnvTask
-from npa_envs.envs.core.vector import NPAVectorEnv
+from npa_envs.envs.core.vector import NPAVectorEnv, worlds_to_reset
 from npa_envs.envs.multi.task import SpeciesConfig, SpeciesTask
 from npa_envs.envs.multi.tasks import task_settings
 from npa_envs.envs.multi.tasks import task_type as species_task_type
+from npa_envs.envs.multi.vector import MultiSpeciesVectorEnv
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.registration import ALL, SPECIES_SIZES
 from npa_envs.registration import SPECIES as SPECIES_TASKS
+from npa_envs.world.cuda_graph import to_device_async
 from npa_envs.world.environment_steps import Physics
+from npa_envs.wrappers.base import own_rewards
 
 WORLDS_PER_SEED = 10_000
 """Seeds of worlds that each run has: run k has those from k times this."""
@@ -45,12 +53,12 @@ DEFAULT_STEPS = 256
 """Steps of an episode of an id that is registered without a limit."""
 
 SPECIES = (*SPECIES_TASKS, *(size.id for size in SPECIES_SIZES))
-"""Ids of species tasks."""
 
-RowRewards = Literal["particle", "marginal"]
+ParticleRewards = Literal["particle", "marginal"]
 """Kinds of rewards that each particle gets separately."""
 
-ROW_REWARDS = get_args(RowRewards)
+DIVERGED = "left the world"
+"""Reason for the end of a species that diverged."""
 
 RESERVED_KEYWORDS = {
     "num_envs": "set the field num_envs of Problem",
@@ -67,11 +75,7 @@ RESERVED_KEYWORDS = {
 
 @dataclass(frozen=True, kw_only=True)
 class Problem:
-    """An environment to learn in, with its keywords; `to_json` and `from_json` store it.
-
-    Raises:
-        NPAError: The environment or a keyword is unknown, or a value is wrong.
-    """
+    """An environment to learn in, with its keywords; `to_json` and `from_json` store it."""
 
     env_id: str
     """Id of an environment of this library, "npa/Mixing-v0", or of your own that is registered with
@@ -86,7 +90,6 @@ class Problem:
     """Width of the hidden layer of new rules."""
 
     def __post_init__(self) -> None:
-        """Check every field; raises NPAError."""
         check_positive(self, int, "episode_steps", "num_envs", "hidden_dim")
         if not isinstance(self.keywords, Mapping):
             raise NPAError(
@@ -96,19 +99,19 @@ class Problem:
         for name in self.keywords:
             if name in RESERVED_KEYWORDS:
                 raise NPAError(f"keywords must not have {shown(name)}: {RESERVED_KEYWORDS[name]}")
-        if (reward := self.keywords.get("reward")) in ROW_REWARDS:
+        if (reward := self.keywords.get("reward")) in get_args(ParticleRewards):
             raise NPAError(
                 f"keywords must not have reward={reward!r}: ask make_envs for "
-                f"row_rewards={reward!r}"
+                f"particle_rewards={reward!r}"
             )
         try:
-            plain = json.loads(json.dumps(dict(self.keywords)))
+            keywords = json.loads(json.dumps(dict(self.keywords)))
         except (TypeError, ValueError) as error:
             raise NPAError(
                 f"keywords must have values of JSON's types, got {shown(dict(self.keywords))}: "
                 f"give numbers, text and lists ({error})"
             ) from error
-        object.__setattr__(self, "keywords", plain)
+        object.__setattr__(self, "keywords", keywords)
         # Raises on unknown ids and wrong keywords.
         _ = self.config
 
@@ -161,11 +164,7 @@ class Problem:
         return sum(self.counts)
 
     def make_task(self, device: str | torch.device = "cpu") -> EnvTask[Any] | SpeciesTask:
-        """Return the environment's task, which makes start worlds and their losses, on a device.
-
-        Raises:
-            NPAError: Something that the task needs cannot be loaded.
-        """
+        """Return the environment's task, which makes start worlds and their losses, on a device."""
         device = check_device(device)
         return self.task_type(replace(self.config, device=str(device)), device)
 
@@ -174,7 +173,7 @@ class Problem:
         num_envs: int | None = None,
         *,
         device: str | torch.device = "cpu",
-        row_rewards: RowRewards | None = None,
+        particle_rewards: ParticleRewards | None = None,
         tell_updated: bool = False,
         copy: bool = True,
     ) -> NPAVectorEnv | ConcatenatedSpeciesEnv:
@@ -188,8 +187,8 @@ class Problem:
         Args:
             num_envs: Worlds B; None: the problem's.
             device: Device of the worlds.
-            row_rewards: Adds `infos["particle_reward"]`, [B, N]: "particle", the decrease of each
-                particle's own loss, or "marginal", the difference that its action makes. With
+            particle_rewards: Adds `infos["particle_reward"]`, [B, N]: "particle", the decrease of
+                each particle's own loss, or "marginal", the difference that its action makes. With
                 several species it is always there: the reward of the particle's species.
             tell_updated: Adds `infos["updated"]`, [B, N]: which actions took effect; not with
                 several species.
@@ -197,8 +196,8 @@ class Problem:
                 overwrites.
 
         Raises:
-            NPAError: The worlds do not fit into memory, the device is unknown, or `row_rewards`
-                contradicts the problem's keywords.
+            NPAError: The worlds do not fit into memory, the device is unknown, or
+                `particle_rewards` contradicts the problem's keywords.
         """
         count = self.num_envs if num_envs is None else num_envs
         device = str(check_device(device))
@@ -212,13 +211,13 @@ class Problem:
                 output="torch",
                 **self.registration.keywords | keywords,
             )
-        if row_rewards:
+        if particle_rewards:
             if keywords.get("reward", "dense") != "dense":
                 raise NPAError(
-                    "row_rewards needs the problem's reward to be 'dense', got "
+                    "particle_rewards needs the problem's reward to be 'dense', got "
                     f"{shown(keywords['reward'])}: leave it out of keywords"
                 )
-            keywords["reward"] = row_rewards
+            keywords["reward"] = particle_rewards
         if tell_updated:
             keywords["tell_updated"] = True
         envs = gymnasium.make_vec(
@@ -241,11 +240,7 @@ class Problem:
 
     @classmethod
     def from_json(cls, text: str) -> Problem:
-        """Return the problem that `to_json` wrote.
-
-        Raises:
-            NPAError: The text is not a problem in JSON.
-        """
+        """Return the problem that `to_json` wrote."""
         try:
             return cls(**json.loads(text))
         except (TypeError, json.JSONDecodeError) as error:
@@ -255,11 +250,155 @@ class Problem:
             ) from error
 
 
+# Worlds for learners: all particles in one array, also those of several species.
+
+
+class ConcatenatedSpeciesEnv(MultiSpeciesVectorEnv):
+    """Worlds of several species as one agent, with observations [B, N, P] and actions [B, N, A].
+
+    It has those attributes of `NPAVectorEnv` that learners need. Reward and loss of a world are
+    means over its species; a species that ended keeps its last loss. A world terminates once all
+    of its species have; its reason is that of the first one, or "left the world" if any did.
+    Infos of a step have for each particle, [B, N], the `particle_reward` of its species, whether it
+    was alive, `acted`, and whether it terminated in this step, `particle_terminated`.
+    """
+
+    def __init__(self, task: str, **config: Any) -> None:
+        super().__init__(task, **config)
+        self.num_envs, self.episode_steps = self.world_count, self.max_cycles
+        self.task, physics = self.worlds.task, self.worlds.physics
+        self.metadata = self.metadata | {"autoreset_mode": AutoresetMode.SAME_STEP}
+        counts, interface = self.config.agent_particle_counts, self.config.interface(physics)
+        self.spans = dict(zip(self.agents, spans_of(counts), strict=True))
+        limit, observed = physics.limits.perception, (sum(counts), interface.perception_dim)
+        self.single_observation_space = Box(-limit, limit, observed, np.float32)
+        acted = sum(counts), interface.action_dim
+        self.single_action_space = Box(-1.0, 1.0, acted, np.float32)
+        self._counts = torch.tensor(counts, device=self.worlds.device)
+        self._loss = torch.zeros(self.num_envs, len(counts), device=self.worlds.device)
+        self._reasons = np.full(self.num_envs, None, dtype=object)
+
+    @property
+    def unwrapped(self) -> ConcatenatedSpeciesEnv:
+        """The environment itself."""
+        return self
+
+    def reset(  # type: ignore[override]
+        self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Tensor, dict[str, Any]]:
+        """Start episodes as `MultiSpeciesVectorEnv.reset` does; infos have `loss`, [B]."""
+        observations, infos = super().reset(seed, options)
+        chosen = worlds_to_reset(options, self.num_envs)
+        self._reasons[chosen] = None
+        # In worlds that are not reset, infos have no loss of species that ended.
+        losses, index = self._stacked(infos, "loss"), to_device_async(chosen, self._loss.device)
+        self._loss = self._loss.index_copy(0, index, losses[index])
+        return self._concatenated(observations), {"loss": self._loss.mean(dim=1)}
+
+    def step(  # type: ignore[override]
+        self, actions: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
+        """Apply actions, [B, N, A], in [-1, 1], and observe; an error changes no world."""
+        by_species = {agent: actions[:, span] for agent, span in self.spans.items()}
+        observations, *results, infos = super().step(by_species)
+        rewards, terminated, truncated = (
+            torch.stack([result[agent] for agent in self.agents], dim=1) for result in results
+        )
+        acted = self._stacked(infos, "acted")
+        self._loss = torch.where(acted, self._stacked(infos, "loss"), self._loss)
+        info: dict[str, Any] = {
+            "loss": self._loss.mean(dim=1),
+            "particle_reward": self._by_particle(rewards),
+            "acted": self._by_particle(acted),
+            "particle_terminated": self._by_particle(terminated),
+        }
+        self._update_reasons(infos)
+        cut, first = truncated.any(dim=1), infos[self.agents[0]]
+        over = first.get("_final_obs", torch.zeros_like(cut))
+        if "final_obs" in first:
+            last = {agent: infos[agent]["final_obs"] for agent in self.agents}
+            ended = over.cpu().numpy()
+            reasons = self._reasons.copy()
+            reasons[~ended] = self._reasons[ended] = None
+            final = {"loss": info["loss"], "_loss": over, "reason": reasons}
+            info |= {"final_obs": self._concatenated(last), "_final_obs": over}
+            info |= {"final_info": final, "_final_info": over}
+        observation, reward = self._concatenated(observations), rewards.mean(dim=1)
+        return observation, reward, over & ~cut, over & cut, info
+
+    def _update_reasons(self, infos: Mapping[str, Mapping[str, Any]]) -> None:
+        """Store why each world ends: the reason of its first species, or that any diverged."""
+        for agent in self.agents:
+            reasons = infos[agent].get("reason")
+            if reasons is not None:
+                new = reasons != None  # noqa: E711
+                known = (self._reasons != None) & (self._reasons != TIME_LIMIT)  # noqa: E711
+                replaced = (new & ~known) | (reasons == DIVERGED)
+                self._reasons = np.where(replaced, reasons, self._reasons)
+
+    def _concatenated(self, values: Mapping[str, Tensor]) -> Tensor:
+        return torch.cat([values[agent] for agent in self.agents], dim=1)
+
+    def _stacked(self, infos: Mapping[str, Mapping[str, Any]], name: str) -> Tensor:
+        return torch.stack([infos[agent][name] for agent in self.agents], dim=1)
+
+    def _by_particle(self, values: Tensor) -> Tensor:
+        """Repeat the values of species, [B, species], for each of their particles, [B, N]."""
+        count = self.single_action_space.shape[0]
+        return values.repeat_interleave(self._counts, dim=1, output_size=count)
+
+
+class ParticleStep(NamedTuple):
+    """What learners read of a step of B worlds of N particles; flags may be those of worlds."""
+
+    observation: Tensor
+    """Observations after the step, of the next episode where one ended, [B, N, P]."""
+    reward: Tensor
+    """Rewards of particles, [B, N], or of worlds, [B, 1]."""
+    acted: Tensor | None
+    """Whether each action had an effect, [B, N]; None: all count."""
+    terminated: Tensor
+    """Whether a particle's episode terminated, [B, N] or [B, 1]."""
+    ended: Tensor
+    """Whether it terminated or was truncated, [B, N] or [B, 1]."""
+    last_observation: Tensor | None
+    """Last observations of the worlds whose episodes ended, [B, N, P]; None: none did."""
+
+
+def particle_step(
+    envs: NPAVectorEnv | ConcatenatedSpeciesEnv,
+    action: Tensor,
+    *,
+    particle_rewards: bool,
+    masked: bool,
+) -> ParticleStep:
+    """Step the worlds of `Problem.make_envs` by actions [B, N, A].
+
+    With `particle_rewards` rewards are of particles, else of worlds. If `masked`, actions of
+    particles that were not updated do not count.
+    """
+    observation, reward, terminated, truncated, infos = envs.step(action)
+    ended = (terminated | truncated)[:, None]
+    terminated = terminated[:, None]
+    acted: Tensor | None = None
+    if isinstance(envs, ConcatenatedSpeciesEnv):
+        # A species may end before its world does.
+        acted, species_terminated = infos["acted"], infos["particle_terminated"]
+        terminated, ended = terminated | species_terminated, ended | species_terminated
+    elif masked:
+        # It describes the step before a restart.
+        acted = infos["updated"]
+    rewards = own_rewards(infos) if particle_rewards else reward[:, None]
+    return ParticleStep(observation, rewards, acted, terminated, ended, infos.get("final_obs"))
+
+
+# Ids of environments, and seeds.
+
+
 class RegisteredEnv(NamedTuple):
     """What an environment id stands for: a class of tasks and its settings."""
 
     task_type: type[EnvTask[Any]] | type[SpeciesTask]
-    """Class of the task."""
     keywords: dict[str, Any]
     """Fields of the environment's configuration."""
     steps: int

@@ -29,11 +29,7 @@ from npa_envs.world.randomness import Randomness, WorldRandom
 
 @dataclass(frozen=True, kw_only=True)
 class Budget:
-    """Limit of a run: seconds, particle-steps, or whichever of both is reached first.
-
-    Raises:
-        NPAError: Neither is given, or one is not positive.
-    """
+    """Limit of a run: seconds, particle-steps, or whichever of both is reached first."""
 
     seconds: float | None = None
     """Wall-clock time of learning [s]. Set-up and evaluations do not count, and may take longer:
@@ -42,7 +38,6 @@ class Budget:
     """Steps times particles that took them, of environments and rollouts together."""
 
     def __post_init__(self) -> None:
-        """Check both limits; raises NPAError."""
         if self.seconds is None and self.particle_steps is None:
             raise NPAError(
                 "a budget must say something: Budget(seconds=60) or particle_steps=10**7"
@@ -51,12 +46,6 @@ class Budget:
             check_positive(self, float, "seconds")
         if self.particle_steps is not None:
             check_positive(self, int, "particle_steps")
-
-    def spent_fraction(self, seconds: float, particle_steps: int) -> float:
-        """Return the spent fraction of the time [s] or of the particle-steps, the larger one."""
-        by_time = 0.0 if self.seconds is None else seconds / self.seconds
-        by_steps = 0.0 if self.particle_steps is None else particle_steps / self.particle_steps
-        return max(by_time, by_steps)
 
 
 @dataclass(frozen=True)
@@ -79,7 +68,6 @@ class Learner(Protocol):
     """A learner whose run can be stopped and resumed, by the state that checkpoints contain."""
 
     random: Randomness
-    """Its random source."""
 
     @property
     def modules(self) -> Mapping[str, nn.Module]:
@@ -100,8 +88,7 @@ class Progress:
     until the budget is `over`, `advance` and `look` after each iteration.
 
     Set-up before `start`, evaluations and checkpoints do not count as time. On CUDA only these
-    synchronise; `advance` keeps the CPU at most one iteration ahead of the device, so that the time
-    measured is the device's.
+    synchronise, but `advance` keeps the CPU at most one iteration ahead of the device.
 
     With `out`, a checkpoint, the rules and the curve (`log.jsonl`) are written after each point of
     the curve, and when SIGTERM or Ctrl-C stops the run. A resumed run continues from the weights,
@@ -114,10 +101,6 @@ class Progress:
         initial: Rules to begin with, which are copied; None: new ones.
         run: Settings of the run, of JSON's types, which must be equal when it is resumed.
         others: As of `npa_envs.agents.learning.train`.
-
-    Raises:
-        NPAError: Seeds are missing or wrong, or the number of points is not positive. Or as for
-            `npa_envs.training.run_folder.Run`.
     """
 
     def __init__(
@@ -154,15 +137,13 @@ class Progress:
         """Particle-steps spent so far."""
         self.log: list[CurvePoint] = []
         """Evaluations so far."""
-        self.ranks = ProcessGroup.current()
-        """The processes that share the run."""
+        self.processes = ProcessGroup.current()
         self._evaluation_seeds = checked_seeds("evaluation_seeds", evaluation_seeds)
         check_count("curve_points", curve_points, ": try 20")
         self._curve_points = curve_points
         self._points_due = 0
         self._on_point, self._on_stop = on_point, on_stop
         self._envs: Any = None
-        self._started = False
         self._begin: float | None = None
         self._seconds = self._agreed_seconds = 0.0
         self._last_event: torch.cuda.Event | None = None
@@ -170,9 +151,9 @@ class Progress:
         self._settings = dict(run or {})
         folder = None if out is None else RunFolder(out)
         self._run = Run(
-            folder, self.ranks, self._check_same_run, resume=resume, overwrite=overwrite
+            folder, self.processes, self._check_same_run, resume=resume, overwrite=overwrite
         )
-        if folder is not None and self.ranks.first:
+        if folder is not None and self.processes.first:
             folder.prepare(0, pictures=False)
 
     def first_rules(self, *, zero_output: bool = False) -> RuleSet:
@@ -234,24 +215,19 @@ class Progress:
 
         A resumed run has this evaluation already.
         """
-        if self._started:
+        if self._begin is not None:
             raise NPAError("progress must start once, got a second start: make one for each run")
-        self._started = True
         if not self.log:
             self._evaluate(policy)
         self._begin = time.perf_counter()
         self._agree_on_time()
 
     @property
-    def seconds(self) -> float:
-        """Learning time so far by this process's clock [s]."""
-        return self._seconds + (0.0 if self._begin is None else time.perf_counter() - self._begin)
-
-    @property
     def spent_fraction(self) -> float:
         """Fraction of the budget that is spent; the last iteration may take it above 1."""
-        seconds = self._agreed_seconds if self.ranks.distributed else self.seconds
-        return self.budget.spent_fraction(seconds, self.particle_steps)
+        seconds, particle_steps = self.budget.seconds, self.budget.particle_steps
+        by_time = 0.0 if seconds is None else self._agreed_seconds / seconds
+        return max(by_time, 0.0 if particle_steps is None else self.particle_steps / particle_steps)
 
     @property
     def over(self) -> bool:
@@ -274,10 +250,8 @@ class Progress:
     def look(self, policy: RuleSet | Callable[[Any], Any], force: bool = False) -> bool:
         """Evaluate if the curve's next point is due, or with `force`; return whether it was done.
 
-        None is done if no particle-steps have been counted since the last one.
-
-        Raises:
-            DivergedError: A weight of the rules is not finite, or an action.
+        It is not, if no particle-steps have been counted since the last one. Raises a DivergedError
+        if a weight of the rules is not finite, or an action.
         """
         self._check_started("look")
         due = self.spent_fraction >= (self._points_due + 1) / self._curve_points
@@ -298,10 +272,12 @@ class Progress:
         self._begin = time.perf_counter()
 
     def _agree_on_time(self) -> None:
-        self._agreed_seconds = self.ranks.broadcast(self.seconds)
+        assert self._begin is not None, "the clock runs"
+        seconds = self._seconds + (time.perf_counter() - self._begin)
+        self._agreed_seconds = self.processes.broadcast(seconds)
 
     def _check_started(self, caller: str) -> None:
-        if not self._started:
+        if self._begin is None:
             raise NPAError(f"{caller} needs a start: call progress.start(rules) after the set-up")
 
     def _evaluate(self, policy: RuleSet | Callable[[Any], Any]) -> None:
@@ -310,7 +286,7 @@ class Progress:
             self._envs = self.problem.make_envs(count, device=self.device)
         if isinstance(policy, RuleSet):
             check_finite(policy, self.particle_steps)
-            self.ranks.check_same(list(policy.parameters()))
+            self.processes.check_same(list(policy.parameters()))
             policy = policy.policy()
         episodes = evaluate_policy(self._envs, policy, self._evaluation_seeds)
         point = CurvePoint(
@@ -322,7 +298,7 @@ class Progress:
         )
         self._synchronise()
         self.log.append(point)
-        if self.ranks.first:
+        if self.processes.first:
             self._on_point(point)
 
     def _synchronise(self) -> None:
@@ -338,8 +314,8 @@ class Progress:
         with self._stopped_clock():
             state = learner_state(learner)
             values = [value for module in state["modules"].values() for value in module.values()]
-            self.ranks.check_same([value for value in values if isinstance(value, Tensor)])
-            if not self.ranks.first:
+            self.processes.check_same([value for value in values if isinstance(value, Tensor)])
+            if not self.processes.first:
                 return
             curve = [asdict(point) for point in self.log]
             state |= {"learner": self._settings, "curve": curve, "iteration": self._run.iteration}
@@ -396,11 +372,7 @@ def annealed(rate: float, last_rate: float, fraction: float) -> float:
 
 
 def check_finite(rules: RuleSet, particle_steps: int) -> None:
-    """Check that rules have not diverged; synchronises with the device.
-
-    Raises:
-        DivergedError: A weight is infinite or NaN.
-    """
+    """Raise a DivergedError if a weight of rules is not finite; synchronises with the device."""
     for number, rule in enumerate(rules):
         for name, weight in rule.named_parameters():
             bad = int((~torch.isfinite(weight)).sum())

@@ -34,9 +34,6 @@ class RuleSet(nn.Module):
         rules: One for each species; not copied.
         counts: Particles of each species.
         interface: `problem.interface`.
-
-    Raises:
-        NPAError: The numbers of rules and species differ.
     """
 
     def __init__(
@@ -49,7 +46,6 @@ class RuleSet(nn.Module):
                 "give them in the species' order"
             )
         self.rules = nn.ModuleList(rules)
-        """The rules, in the order of the species."""
         self.spans = spans_of(counts)
         """Slice of each species' particles."""
         self.counts = tuple(counts)
@@ -58,11 +54,7 @@ class RuleSet(nn.Module):
 
     @classmethod
     def new(cls, problem: Problem, seed: int) -> RuleSet:
-        """Return untrained rules for a problem, on the CPU; torch's random state does not change.
-
-        Raises:
-            NPAError: The seed is not an integer of at least 0.
-        """
+        """Return untrained rules, on the CPU; torch's random state does not change."""
         seed, interface, config = checked_count("seed", seed), problem.interface, problem.config
         with torch.random.fork_rng(devices=()):
             torch.manual_seed(seed)
@@ -88,9 +80,6 @@ class RuleSet(nn.Module):
             problem: The problem that they are for.
             source: A rule, or what `npa_envs.load_rule` takes, for all species or one for each; or
                 a folder that `save` wrote.
-
-        Raises:
-            NPAError: A rule cannot be loaded or does not fit, or their number is wrong.
         """
         if isinstance(source, str | Path) and (Path(source) / _file_name(0)).is_file():
             return cls.load(source, problem)
@@ -106,11 +95,7 @@ class RuleSet(nn.Module):
 
     @classmethod
     def load(cls, folder: str | Path, problem: Problem) -> RuleSet:
-        """Return the rules that `save` wrote, on the CPU, for a problem.
-
-        Raises:
-            NPAError: A file is missing, is not a rule's, or its rule does not fit.
-        """
+        """Return the rules that `save` wrote, on the CPU, for a problem."""
         return cls.of(problem, [Path(folder) / _file_name(k) for k in range(len(problem.counts))])
 
     def save(self, folder: str | Path) -> list[Path]:
@@ -144,7 +129,7 @@ class RuleSet(nn.Module):
         return self.actions(observation, self.mean_by_rule)
 
     def mean_by_rule(self, rule: NPARule, rows: Tensor) -> Tensor:
-        """Return actions [K, A], as `mean`, of one rule for K particles' observations [K, P]."""
+        """Return actions [K, A], as `mean`, of one rule for K rows of observations [K, P]."""
         delta, state_step = bounded_update(rule, rows)
         return torch.cat((delta, state_step / self.interface.state_scale), dim=-1)
 

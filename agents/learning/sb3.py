@@ -1,6 +1,6 @@
 """Learners of Stable-Baselines3: PPO over whole worlds; PPO and SAC in gardens.
 
-PPO over worlds has one likelihood a world, the mean over its particles. It is an independent
+PPO over worlds has one likelihood per world, the mean over its particles. It is an independent
 baseline for `ppo.py`: rollouts, advantages and updates are Stable-Baselines3's; only the policy,
 whose actor is a set of rules, is this library's.
 """
@@ -56,7 +56,6 @@ class WorldOptions(CommonOptions):
     means over many particles."""
 
     def __post_init__(self) -> None:
-        """Check every field; raises NPAError."""
         super().__post_init__()
         check_positive(self, float, "clip")
 
@@ -230,7 +229,7 @@ class WorldRulePolicy(ActorCriticPolicy):
         return self.actor.sample(observation)[0]
 
     def _build(self, lr_schedule: Any) -> None:
-        """Do nothing: `__init__` makes networks and optimiser."""
+        """Leave networks and optimiser to `__init__`."""
 
 
 # Gardens: unchanged SAC and PPO, one row for each world.
@@ -249,7 +248,6 @@ class GardenOptions:
     """Adam's learning rate."""
 
     def __post_init__(self) -> None:
-        """Check every field; raises NPAError."""
         check_fraction(self, "gamma")
         check_positive(self, float, "learning_rate")
         check_positive(self, int, *(f.name for f in fields(self) if isinstance(f.default, int)))
@@ -323,7 +321,7 @@ class GardenPolicy:
         self._shapes = _shapes(space.spaces if isinstance(space, Dict) else space)
 
     def __call__(self, observation: Any) -> NDArray[np.float32]:
-        """Return actions of K brushes, W columns each, [B, K, W], for observations [B, ...]."""
+        """Return actions [B, J, W] of J brushes with W columns for observations [B, ...]."""
         shapes = {name: shape[1:] for name, shape in _shapes(observation).items()}
         if shapes != self._shapes:
             raise NPAError(

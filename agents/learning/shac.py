@@ -21,8 +21,8 @@ from npa_envs.agents.learning.actor_critic import (
     Minibatches,
     find_gradients,
     gradients_of,
-    learner_random,
     seeded_critic,
+    share_of_worlds,
 )
 from npa_envs.agents.learning.gradient import EnvironmentTask
 from npa_envs.agents.learning.progress import Progress, annealed
@@ -63,7 +63,6 @@ class SHACOptions:
     """Rate at which the target critic follows the critic after each window (dimensionless)."""
 
     def __post_init__(self) -> None:
-        """Check every field; raises NPAError."""
         check_positive(self, int, "steps", "num_envs", "critic_epochs", "minibatches")
         check_word(self, "critic", get_args(CriticInput))
         check_positive(self, float, "learning_rate")
@@ -103,21 +102,19 @@ class StepWindow(NamedTuple):
 class SHACLearner:
     """Rules, critic and worlds, which `learn` runs and trains window by window.
 
-    With several processes (`ranks`) each has some of the worlds, which have random streams of their
-    own. Gradients and moments are averaged over processes.
+    With several processes each has some of the worlds, which have separate random streams.
+    Gradients and moments are averaged over processes.
     """
 
     def __init__(self, progress: Progress, options: SHACOptions) -> None:
-        problem, device, ranks = progress.problem, progress.device, progress.ranks
-        self.options, self.device, self.ranks = options, device, ranks
-        ranks.check_even("num_envs", options.num_envs)
-        indices = ranks.indices(options.num_envs)
+        problem, device = progress.problem, progress.device
+        self.options, self.device, self.processes = options, device, progress.processes
+        self._indices, self.random = share_of_worlds(progress, options.num_envs)
         self.rules = progress.first_rules(zero_output=True)
         count = -(-problem.episode_steps // options.steps)
         self.window = -(-problem.episode_steps // count)
         """Steps of a window, h."""
         self.task = EnvironmentTask(problem, device)
-        self.random = learner_random(progress, options.num_envs, indices)
         width = problem.physics.space_dim + problem.physics.state_dim + 1
         self.critic = seeded_critic(progress, width, options.critic)
         self.target = copy.deepcopy(self.critic).requires_grad_(False)
@@ -128,29 +125,25 @@ class SHACLearner:
             "critic": torch.optim.Adam(self.critic.parameters(), lr=CRITIC_RATE, fused=True),
         }
         self.window_count = count
-        self._indices = indices.tolist()
         self._minibatches = Minibatches(
-            self.window, len(indices), (1,), options.minibatches, self.random
+            self.window, len(self._indices), (1,), options.minibatches, self.random
         )
-        self._begin()
+        self.resume(0, 0)
 
-    def _begin(self) -> None:
+    def resume(self, iteration: int, resumption: int) -> None:
+        """Resume after `iteration` windows, for the `resumption`-th time, in new worlds."""
         restart(self.random)
         self.worlds = self._new_worlds(list(range(len(self._indices))))
         self.windows_left = [1 + k % self.window_count for k in self._indices]
         """Windows left of each world's episode: at first different ones, so that a batch has all
         parts of an episode."""
 
-    def resume(self, iteration: int, resumption: int) -> None:
-        """Resume after `iteration` windows, for the `resumption`-th time, in new worlds."""
-        self._begin()
-
     def learn(self, rate: float) -> None:
         """Run the worlds for a window, and train rules and critic on it."""
         window, optimiser = self.play(), self.optimisers["rules"]
         find_gradients(optimiser, -self.objective(window))
         means = gradients_of(optimiser)
-        self.ranks.reduce(means)
+        self.processes.reduce(means)
         normalise_gradients(means)
         optimiser.param_groups[0]["lr"] = rate
         optimiser.step()
@@ -217,7 +210,7 @@ class SHACLearner:
         features = window.features[:-1].flatten(0, 1)
         with torch.no_grad():
             for critic in (self.critic, self.target):
-                critic.observe(features, self.ranks)
+                critic.observe(features, self.processes)
             later = world_values(self.target, window.features[1:].flatten(0, 1))
             targets = td_lambda_targets(
                 window.rewards,
@@ -226,14 +219,14 @@ class SHACLearner:
                 td_lambda=options.td_lambda,
             ).flatten()
             for critic in (self.critic, self.target):
-                critic.rescale(targets, self.ranks)
+                critic.rescale(targets, self.processes)
         for _ in range(options.critic_epochs):
             self._minibatches.shuffle()
             for index in self._minibatches.indices[0]:
                 values = world_values(self.critic, features[index])
                 error = (values - targets[index]) / self.critic.scale
                 find_gradients(self.optimisers["critic"], 0.5 * error.square().mean())
-                self.ranks.reduce(gradients_of(self.optimisers["critic"]))
+                self.processes.reduce(gradients_of(self.optimisers["critic"]))
                 self.optimisers["critic"].step()
         with torch.no_grad():
             pairs = zip(self.target.parameters(), self.critic.parameters(), strict=True)

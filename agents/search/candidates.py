@@ -53,7 +53,7 @@ class SearchWorld:
     steps: int = 128
     """Steps from the seed, a multiple of 16; the second half of them is evaluated."""
     world_count: int = 1
-    """Worlds of each candidate, B, over which figures are averaged."""
+    """Worlds of each candidate, B, over which metrics are averaged."""
     state_dim: int = 4
     """State channels C, at least 3; the last three are the colour (less 0.5)."""
     hidden_dim: int = 8
@@ -62,7 +62,6 @@ class SearchWorld:
     """Perception radius ε [length units]."""
 
     def __post_init__(self) -> None:
-        """Check every field; raises NPAError."""
         check_positive(self, int, "particle_count", at_least=4)
         check_positive(self, int, "steps", "world_count", "hidden_dim")
         check_positive(self, int, "state_dim", at_least=3)
@@ -110,18 +109,18 @@ class Found(NamedTuple):
 
 
 class Trials(NamedTuple):
-    """Results of K candidates, None if worlds diverged or came to rest, and their last worlds."""
+    """Results of G candidates, None if worlds diverged or came to rest, and their last worlds."""
 
     found: list[Found | None]
     worlds: Particles
-    """Worlds of each candidate: positions [K, B, N, D] and so on."""
+    """Worlds of each candidate: positions [G, B, N, D] and so on."""
 
 
 class RuleStack(NPARule):
-    """K rules of one architecture in one batch of worlds, where each updates its own worlds.
+    """G rules of one architecture in one batch of worlds, where each updates its own worlds.
 
     Each rule must have the same number of worlds with the same update masks, so that each gets the
-    same number of perceptions. Weights [K, W] are in the order of `RuleWeights`.
+    same number of perceptions. Weights [G, W] are in the order of `RuleWeights`.
     """
 
     def __init__(self, rule: NPARule, weights: Tensor) -> None:
@@ -131,7 +130,7 @@ class RuleStack(NPARule):
         self.to(weights.device)
 
     def forward(self, perception: Tensor) -> Tensor:
-        """Map perceptions [K R, P], R of each rule, to raw updates [K R, A]."""
+        """Map perceptions [G R, P], R of each rule, to raw updates [G R, A]."""
         count = len(self.weights)
         if len(perception) % count:
             # If no particle is updated there is one row, which is not used.
@@ -172,7 +171,7 @@ class Candidates:
 
     @torch.no_grad()
     def try_all(self, solutions: Numbers) -> Trials:
-        """Run the worlds of candidates with weights `solutions` [K, W] in units of `scales`."""
+        """Run the worlds of candidates with weights `solutions` [G, W] in units of `scales`."""
         weights = torch.as_tensor(solutions * self.scales, dtype=torch.float32).to(self.device)
         batch_size = len(weights) if self.device.type == "cpu" else 1
         batches = [self._try(batch) for batch in torch.split(weights, batch_size)]
@@ -237,7 +236,7 @@ def quality_of(worlds: Particles) -> Tensor:
 
 
 def correlation(first: Tensor, second: Tensor) -> Tensor:
-    """Return the correlation of two fields [B, N, K] over particles and channels, shape [B].
+    """Return the correlation of two fields [B, N, ...] over particles and channels, shape [B].
 
     The mean of each channel is subtracted. The correlation is 1 if the first field is constant.
     """

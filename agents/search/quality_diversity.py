@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -77,7 +77,7 @@ class RandomEmitter:
         self._draws = np.random.default_rng(seed)
 
     def ask(self) -> Numbers:
-        """Return the weights of new candidates, shape [K, W]."""
+        """Return the weights of new candidates, shape [G, W]."""
         return random_weights(self._draws, self._batch_size, self.solution_dim)
 
     def tell(self, *_: Any, **results: Any) -> None:
@@ -127,7 +127,7 @@ METHODS: Mapping[str, Callable[[Any, int, int], Any]] = {
     "cma-es": partial(_evolution, "obj", "basic"),
     "random": RandomEmitter,
 }
-"""Functions that make an emitter of pyribs, whose `ask` returns candidates [K, W], from an archive,
+"""Functions that make an emitter of pyribs, whose `ask` returns candidates [G, W], from an archive,
 a batch size and a seed.
 
 `map-elites` mutates random elites. `cma-me` (arXiv 1912.02400) is CMA-ES that ranks new cells
@@ -139,7 +139,7 @@ draws independent candidates.
 def qualities_and_measures(
     found: Sequence[Found | None], axes: Sequence[Axis]
 ) -> tuple[Numbers, Numbers]:
-    """Return qualities [K] and M descriptors [K, M] of candidates: 0 without a result."""
+    """Return qualities [G] and M descriptors [G, M] of candidates: 0 without a result."""
     nothing = Found(0.0, (0.0,) * len(axes))
     qualities, measures = zip(*(one or nothing for one in found), strict=True)
     return np.array(qualities), np.array(measures)
@@ -195,10 +195,6 @@ class Search:
         batch_size: Candidates in a batch, at least 2.
         device: Device of the worlds.
         path: File of the record, which is written after each batch; None: no record.
-
-    Raises:
-        NPAError: A setting is wrong, or the record is of other settings.
-        MissingDependencyError: pyribs or cma is not installed.
     """
 
     def __init__(
@@ -220,7 +216,6 @@ class Search:
                 )
         self.world = world
         self.axes: tuple[Axis, ...] = world.axes()
-        """The descriptors."""
         self.candidates = Candidates(world, device=device)
         self.facts: dict[str, Any] = {
             **asdict(world),
@@ -295,6 +290,16 @@ class Search:
 
     def _replay(self) -> None:
         """Propose the candidates of the record, if there is one, again; take its results."""
+
+        def batches_of(content: Mapping[str, Any]) -> list[Batch]:
+            return [
+                {
+                    "fingerprint": int(batch["fingerprint"]),
+                    "found": [one and list(map(float, one)) for one in batch["found"]],
+                }
+                for batch in content["batches"]
+            ]
+
         if self._path is None:
             return
         stored = read_record(self._path, self.facts, batches_of, command="search")
@@ -310,17 +315,6 @@ class Search:
             self._tell(batch)
 
 
-def batches_of(content: Mapping[str, Any]) -> list[Batch]:
-    """Return the batches of candidates in a record's JSON object, with checked types."""
-    return [
-        {
-            "fingerprint": int(batch["fingerprint"]),
-            "found": [one and list(map(float, one)) for one in batch["found"]],
-        }
-        for batch in content["batches"]
-    ]
-
-
 def growth_of(archive: Any, evaluations: int) -> Growth:
     """Return the statistics of an archive after a number of evaluations."""
     stats = archive.stats
@@ -328,19 +322,9 @@ def growth_of(archive: Any, evaluations: int) -> Growth:
     return Growth(evaluations, float(stats.qd_score), float(stats.coverage), best)
 
 
-def tried_again(search: Search, seeds: Sequence[int], *, steps: int | None = None) -> Growth:
-    """Evaluate the elites of a search again in other worlds, and return the archive's statistics.
-
-    Args:
-        search: The search.
-        seeds: Seeds of the worlds of each elite.
-        steps: Steps; the later half counts. None: those of the search.
-
-    Raises:
-        NPAError: The number of steps is not a multiple of 16.
-    """
-    world = search.world if steps is None else replace(search.world, steps=steps)
-    candidates = Candidates(world, device=search.candidates.device, seeds=seeds)
+def tried_again(search: Search, seeds: Sequence[int]) -> Growth:
+    """Evaluate a search's elites again in worlds of other seeds; return their statistics."""
+    candidates = Candidates(search.world, device=search.candidates.device, seeds=seeds)
     archive = make_archive(candidates.weight_count, search.axes)
     elites = search.elites()
     if elites:

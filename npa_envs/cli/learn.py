@@ -73,19 +73,19 @@ def main(arguments: Sequence[str]) -> int:
         requested_processes,
     )
 
-    with joined_processes() as ranks:
+    with joined_processes() as processes:
         request = None
-        if ranks.first:
+        if processes.first:
             resolved = common.resolve_run(arguments, lambda words: parse(words).out)
             request = resolved, parse(resolved)
-        request = ranks.broadcast(request)
+        request = processes.broadcast(request)
         assert request is not None, "broadcast by the first process"
         resolved, options = request
         count = requested_processes(options.gpus, options.processes, options.device) or 1
-        if count > 1 and not ranks.distributed:
+        if count > 1 and not processes.distributed:
             return launch(count, ("learn", *resolved), options.out, options.device)
-        with print_once(ranks):
-            return run(options, ranks)
+        with print_once(processes):
+            return run(options, processes)
 
 
 def parse(arguments: Sequence[str]) -> LearnOptions:
@@ -95,7 +95,7 @@ def parse(arguments: Sequence[str]) -> LearnOptions:
     return options
 
 
-def run(options: LearnOptions, ranks: ProcessGroup) -> int:
+def run(options: LearnOptions, processes: ProcessGroup) -> int:
     """Learn as one of the processes that share the run, and return the exit code."""
     from npa_envs.agents.learning import Budget, train
     from npa_envs.agents.learning.problem import FIRST_EVALUATION_SEED
@@ -139,7 +139,7 @@ def run(options: LearnOptions, ranks: ProcessGroup) -> int:
         overwrite=options.overwrite,
         **kwargs,
     )
-    if ranks.first:
+    if processes.first:
         end = "stopped; the same arguments with --resume continue" if stopped else "finished"
         print(f"{end}: rules, curve and checkpoint are in {options.out}/")
     return INTERRUPTED if stopped else 0

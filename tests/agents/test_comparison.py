@@ -46,11 +46,13 @@ CHILD = """
 import json, os, sys, time
 from pathlib import Path
 folder = Path(sys.argv[1])
-while True:
+seed = json.loads((folder / "request.json").read_text())["job"]["seed"]
+{before}
+for line in sys.stdin:
+    folder, device = json.loads(line)
+    folder = Path(folder)
     request = json.loads((folder / "request.json").read_text())
     seed, status = request["job"]["seed"], "done"
-{before}
-    device = sys.stdin.readline().strip()
 {body}
     record = {{
         "job": request["job"], "facts": request["facts"], "status": status, "error": "",
@@ -59,12 +61,9 @@ while True:
     }}
     (folder / "part").write_text(json.dumps(record))
     os.replace(folder / "part", folder / "run.json")
-    line = sys.stdin.readline()
-    if not line: break
-    folder = Path(json.loads(line))
 """
-"""A process that says at once what it has reached, one run after the other; tests put in what it
-does until it is told where to run, and then."""
+"""A process that records results at once, one run after the other; tests put in what it does before
+the first order, and in each run."""
 
 WRITE_PID = "Path('{}', f'pid-{{os.getpid()}}').write_text(str(os.getpid()))"
 """Code of a process that writes its number into a folder."""
@@ -98,8 +97,7 @@ def child(monkeypatch):
     """Sets what the processes of runs do before they leave their records."""
 
     def set_body(body: str, before: str = "") -> None:
-        body, before = (textwrap.indent(part, "    ") for part in (body, before))
-        code = CHILD.format(body=body, before=before)
+        code = CHILD.format(body=textwrap.indent(body, "    "), before=before)
         monkeypatch.setattr(one_run, "PROGRAM", (sys.executable, "-c", code))
 
     set_body("")
@@ -344,15 +342,16 @@ def test_an_interrupted_comparison_ends_its_processes_and_goes_on_where_it_was(
     assert not list(tmp_path.rglob(".seed*"))
 
 
-@pytest.mark.parametrize("line", [b"", b"cpu\n"], ids=["that waits", "that learns"])
-def test_the_process_of_a_run_ends_with_the_comparison(tmp_path, line):
-    # On a device, it would learn for ten minutes.
+@pytest.mark.parametrize("learns", [False, True], ids=["that waits", "that learns"])
+def test_the_process_of_a_run_ends_with_the_comparison(tmp_path, learns):
+    # With an order it would learn for ten minutes.
     request_of("mixing", "gradient", tmp_path, learning_seconds=600.0)
     process = subprocess.Popen(
         [*one_run.PROGRAM, str(tmp_path)], stdin=subprocess.PIPE, stderr=subprocess.PIPE
     )
     try:
-        process.stdin.write(line)
+        order = one_run.Order(str(tmp_path), "cpu")
+        process.stdin.write(f"{json.dumps(order)}\n".encode() if learns else b"")
         process.stdin.flush()
         _, errors = process.communicate(timeout=100)
     finally:

@@ -45,7 +45,7 @@ def test_every_environment_is_a_problem_with_rules_that_fit(name):
 
 
 def test_rows_are_paid_where_that_is_asked_for():
-    envs = heart().make_envs(row_rewards="particle")
+    envs = heart().make_envs(particle_rewards="particle")
     observation, _ = envs.reset(seed=0)
     _, reward, _, _, infos = envs.step(wild_rules(heart()).policy()(observation))
     assert reward.abs().min() > 1e-3

@@ -328,7 +328,9 @@ def test_a_gpu_is_kept_busy_where_neither_memory_nor_budget_forbids(
 ):
     free, options, device = gibibytes * 2**30, PPOOptions(**options), torch.device(device)
     monkeypatch.setattr(ppo, "free_bytes", lambda _: free)
-    worlds = total_num_envs(HEART, options, device, Budget(**budget))
+    progress = progress_of(HEART)
+    progress.device, progress.budget = device, Budget(**budget)
+    worlds = total_num_envs(progress, options)
     assert least <= worlds <= most
     assert gibibytes != 1 or worlds * world_bytes(HEART, options, device) <= free / 4
 

@@ -118,7 +118,7 @@ def test_a_row_of_ones_own_says_what_was_run(tmp_path, monkeypatch):
     plan = plan_of(
         SMALL_SUITE.name,
         methods=("zero", "still=still:train", "bold=ppo"),
-        options=("bold.credit=marginal", "still.patience=2"),
+        options=("bold.particle_rewards=marginal", "still.patience=2"),
         tasks=("MixingSmall-v0",),
     )
     assert plan.methods == ["zero", "still", "bold"]
@@ -127,7 +127,7 @@ def test_a_row_of_ones_own_says_what_was_run(tmp_path, monkeypatch):
     rows = read_rows(SMALL_SUITE, tmp_path)
     assert (rows["still"].about, rows["bold"].about) == ("still:train", "ppo")
     data = json.loads((tmp_path / "bold.json").read_text(encoding="utf-8"))
-    assert data["options"] == {"credit": "marginal"}
+    assert data["options"] == {"particle_rewards": "marginal"}
     refused("must be a row of npa-bench-v0", read_rows, SUITE, tmp_path)
 
 

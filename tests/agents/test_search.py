@@ -142,8 +142,7 @@ def test_a_stopped_search_goes_on_as_if_it_had_not_been(method, tmp_path):
     same, found = tried_again(whole, [0]), whole.growth[-1]
     assert same.qd_score == pytest.approx(found.qd_score)
     assert same.coverage == found.coverage
-    for other in (tried_again(whole, [1]), tried_again(whole, [0], steps=32)):
-        assert other.qd_score != pytest.approx(found.qd_score)
+    assert tried_again(whole, [1]).qd_score != pytest.approx(found.qd_score)
 
 
 def test_the_command_leaves_elites_that_other_commands_open(tmp_path, capsys):

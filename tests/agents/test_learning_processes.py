@@ -39,16 +39,15 @@ def learner_of(form):
         for name, value in vars(learner.memory).items():
             if value.is_floating_point():
                 setattr(learner.memory, name, value.double())
-        learner.update = type(learner.update)(*(value.double() for value in learner.update))
         # As at the beginning.
         learner.critic.updates.zero_()
-        learner.critic.observe(learner.memory.observations[-1], learner.ranks)
+        learner.critic.observe(learner.memory.observations[-1], learner.processes)
         return learner
     new_worlds = learner._new_worlds
     learner._new_worlds = lambda worlds: new_worlds(worlds).map(
         lambda part: part.double() if part.is_floating_point() else part
     )
-    learner._begin()
+    learner.resume(0, 0)
     return learner
 
 
@@ -150,7 +149,7 @@ def test_a_run_that_is_asked_to_stop_can_be_resumed(tmp_path, monkeypatch):
 
     def asked(learner, share_left):
         improve(learner, share_left)
-        if learner.rounds == 3 and not learner.ranks.rank:
+        if learner.rounds == 3 and not learner.processes.rank:
             os.kill(os.getpid(), signal.SIGTERM)
 
     monkeypatch.setattr(ppo.PPOLearner, "improve", asked)
