@@ -9,8 +9,9 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from npa_envs.envs.core.marginal_gains import with_mean_reward
 from npa_envs.envs.core.task import EnvTask, checked_tensor
-from npa_envs.world.environment_steps import DIVERGED, SUCCESS, TIME_LIMIT, with_mean_reward
+from npa_envs.world.environment_steps import DIVERGED, SUCCESS, TIME_LIMIT
 from npa_envs.world.particles import Particles
 
 FLAG_ROWS = 5

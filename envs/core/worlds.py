@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.envs.core.config import EnvConfig
-from npa_envs.envs.core.marginal_gains import with_mean_reward
 from npa_envs.envs.core.step_report import ParticleRewards, StepReport, total
 from npa_envs.envs.core.task import (
     EnvTask,

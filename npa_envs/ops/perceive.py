@@ -361,8 +361,10 @@ def updates_in_parts(
     updates = None
     for first in range(0, row_capacity, ROWS_TOGETHER):
         part = perception[: min(ROWS_TOGETHER, row_capacity - first)]
-        rows = {"first_row": first, "row_count": len(part)}
-        launch(*perception_launch(plan, ordered, densities, part, **rows))
+        arguments = perception_launch(
+            plan, ordered, densities, part, first_row=first, row_count=len(part)
+        )
+        launch(*arguments)
         mapped = network(part)
         if updates is None:
             updates = mapped.new_empty(row_capacity, mapped.shape[1])
