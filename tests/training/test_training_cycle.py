@@ -7,7 +7,6 @@ from support.small_digits import write_idx
 from support.training_runs import Recording, make_cycle, runaway
 from support.worlds import assert_same
 
-import npa_envs
 from npa_envs.errors import NPAError
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
 from npa_envs.tasks.point_classification import PointClassification
@@ -89,7 +88,7 @@ def test_replayed_operations_train_the_same_rule_as_called_ones(tmp_path, make, 
 
 
 @pytest.mark.gpu
-def test_recorded_iterations_take_means_over_processes_where_eager_ones_do(tmp_path):
+def test_captured_iterations_take_means_over_processes_where_eager_ones_do(tmp_path):
     escaping = {"escape_share": 0.2, "escape_weight": 10.0, "cuda_graph": False}
     config = preset("tiny", out=tmp_path, device="cuda", **escaping)
     task = Morphogenesis2D(config.task, device="cuda")
@@ -108,7 +107,7 @@ def test_recorded_iterations_take_means_over_processes_where_eager_ones_do(tmp_p
             counts.append(float(values[0]))
             values[0] *= 2.0
 
-        arguments = task, rule, config, Particles(x, s), generator, npa_envs.rollout
+        arguments = task, rule, config, Particles(x, s), generator, rollout_particles
         iteration = cls(*arguments, take_means=take_means)
         for number in range(3):
             escaped = x.clone()
