@@ -9,7 +9,7 @@ from npa_envs.world.particles import Particles, combined
 
 def worlds(count, offset=0.0):
     x = offset + torch.arange(count * 6.0).view(count, 3, 2)
-    return Particles(x, -x[..., :1], None, torch.arange(count))
+    return Particles(x, -x[..., :1], goal=torch.arange(count))
 
 
 @pytest.mark.parametrize("with_path", [True, False])
