@@ -354,7 +354,7 @@ class GrowthConfig(PoolDamage, TaskConfig):
     """Largest displacement in one step, as a fraction of ε (dimensionless)."""
 
     seed_radius: float = 0.2
-    """Radius of the ball around the origin that the particles start in [length units]."""
+    """Radius of the ball that the particles start in [length units]."""
 
     motion_weight: float = 0.01
     """Weight of the path length Σ|Δx| of a rollout (per length unit)."""
