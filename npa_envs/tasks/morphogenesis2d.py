@@ -81,7 +81,7 @@ class Morphogenesis2DConfig(GrowthConfig):
     """Weight of the splat loss (dimensionless)."""
 
     colour_weight: float = 5.0
-    """Weight of the colour term of the splat loss relative to the density term (dimensionless)."""
+    """Weight of the splat loss's colour term relative to the density term (dimensionless)."""
 
     drift_weight: float = 0.0
     """Weight of the distance of worlds' centroids from the origin (per length unit)."""
