@@ -52,7 +52,7 @@ class TextureTask(TargetEnvTask[TextureEnvConfig]):
     def losses(self, x: Tensor, s: Tensor) -> Mapping[str, Tensor]:
         """Return the weighted losses of colour image and density image, by name, [B] each."""
         colour, density = self.task.texture_losses(x, s)
-        colour_weight, density_weight = self.task.weights()
+        colour_weight, density_weight = self.task.weights
         return {"colour": colour_weight * colour, "density": density_weight * density}
 
 

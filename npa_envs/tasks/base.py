@@ -17,12 +17,13 @@ from npa_envs.checks import check_fraction, check_non_negative, check_positive
 from npa_envs.errors import NPAError, shown
 from npa_envs.ops import Cameras, world_mean
 from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
-from npa_envs.tasks.damage import PoolDamage, damage_pool
+from npa_envs.tasks.damage import CHANCE, far_points, random_particle, tear_off
 from npa_envs.tasks.gaussian_outputs import Gaussians
 from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.tasks.train_config import Common
+from npa_envs.world.brushes import clump, cut, wipe_state
 from npa_envs.world.particles import Particles
-from npa_envs.world.randomness import Randomness
+from npa_envs.world.randomness import Randomness, uniform_draws
 
 
 class Frame(NamedTuple):
@@ -352,8 +353,28 @@ PictureTask = Task
 
 
 @dataclass(frozen=True, kw_only=True)
-class GrowthConfig(PoolDamage, TaskConfig):
+class GrowthConfig(TaskConfig):
     """Configuration of growth from a ball: target, damage in training, penalties of the loss."""
+
+    damage_radius: float = 0.0
+    """Radius of the ball whose state is wiped in worlds from the pool [length units]; 0: none."""
+
+    clump_radius: float = 0.0
+    """Radius of the ball whose particles are pulled to one point, in a quarter of the worlds from
+    the pool [length units]; 0: none."""
+
+    cut_gap: float = 0.0
+    """Width of the slit through `cut_share` of the worlds from the pool [length units]; 0: none."""
+
+    cut_share: float = CHANCE
+    """Probability of a world from the pool to be cut (dimensionless)."""
+
+    flake_radius: float = 0.0
+    """Radius up to which a ball of particles is torn off and thrown out, in a quarter of the worlds
+    from the pool [length units]; 0: none."""
+
+    escape_share: float = 0.0
+    """Probability of each particle to be thrown out of worlds from the pool (dimensionless)."""
 
     target: str
     """What to grow."""
@@ -362,7 +383,7 @@ class GrowthConfig(PoolDamage, TaskConfig):
     """Largest displacement in one step, as a fraction of ε (dimensionless)."""
 
     seed_radius: float = 0.2
-    """Radius of the ball around the origin that the particles start in [length units]."""
+    """Radius of the ball that the particles start in [length units]."""
 
     motion_weight: float = 0.01
     """Weight of the path length Σ|Δx| of a rollout (per length unit)."""
@@ -374,12 +395,13 @@ class GrowthConfig(PoolDamage, TaskConfig):
     """Weight of the mean path length of particles outside of [−1, 1] (per length unit)."""
 
     def __post_init__(self) -> None:
-        TaskConfig.__post_init__(self)
-        PoolDamage.__post_init__(self)
+        super().__post_init__()
+        check_fraction(self, "cut_share")
+        check_non_negative(self, "damage_radius", "clump_radius", "cut_gap", "flake_radius")
         check_positive(self, int, "state_dim", at_least=3)
         check_positive(self, int, "resolution", at_least=8)
         check_positive(self, float, "alpha", "seed_radius")
-        check_non_negative(self, "motion_weight", "bound_weight", "escape_weight")
+        check_non_negative(self, "motion_weight", "bound_weight", "escape_weight", "escape_share")
 
 
 GrowthConfigT = TypeVar("GrowthConfigT", bound=GrowthConfig)
@@ -403,8 +425,33 @@ class GrowthTask(ParticleTask[GrowthConfigT]):
         )
 
     def damage(self, worlds: Particles, generator: Randomness) -> Particles:
-        """Return worlds after the damage that the configuration sets, at random positions."""
-        return damage_pool(worlds, self.config, generator=generator)
+        """Return worlds after each kind of damage that the configuration sets, at random places."""
+        config = self.config
+        x, s, *_ = worlds
+
+        def chosen_worlds(probability: float) -> Tensor:
+            """Return a random 0 or 1 for each of the B worlds, 1 with this probability, [B]."""
+            return (uniform_draws(generator, (len(x), 1), x)[:, 0] < probability).to(x.dtype)
+
+        if config.damage_radius > 0.0:
+            centre = random_particle(x, generator)
+            s = wipe_state(x, s, centre=centre, radius=config.damage_radius)
+        if config.clump_radius > 0.0:
+            centre = random_particle(x, generator)
+            radius = config.clump_radius * chosen_worlds(CHANCE)
+            x, s = clump(x, s, centre=centre, radius=radius, factor=1.0)
+        if config.cut_gap > 0.0:
+            # Directions need not be uniform; a zero vector cuts nothing.
+            normal = 2.0 * uniform_draws(generator, (len(x), x.shape[2]), x) - 1.0
+            hit = chosen_worlds(config.cut_share)
+            x, s = cut(x, s, centre=world_mean(x), normal=normal, gap=config.cut_gap * hit)
+        if config.flake_radius > 0.0:
+            x = tear_off(x, radius=config.flake_radius, generator=generator)
+        if config.escape_share > 0.0:
+            drawn = uniform_draws(generator, (*x.shape[:2], 1), x)
+            far = far_points(x, x.shape[1], generator)
+            x = torch.where(drawn < config.escape_share, far, x)
+        return worlds._replace(x=x, s=s)
 
     def penalties(self, worlds: Particles) -> dict[str, tuple[float, Tensor]]:
         """Return penalties of motion, and of states, positions and motion outside of [-1, 1]."""

@@ -1,4 +1,4 @@
-"""Damage that a rule should heal, in rollouts and in the training pool.
+"""Damage that a rule should heal: of worlds in rollouts, and escaping particles in training.
 
 No function reads a value back from the device, so all may be captured in a CUDA graph.
 """
@@ -11,13 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from npa_envs.checks import (
-    check_fraction,
-    check_non_negative,
-    check_positive,
-    check_world,
-    checked_number,
-)
+from npa_envs.checks import check_positive, check_world, checked_number
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.ops import world_mean
 from npa_envs.tasks.seeds import drawn_indices, uniform_ball
@@ -150,72 +144,13 @@ def tear_off(x: Tensor, *, radius: float, generator: Randomness) -> Tensor:
     draws = uniform_draws(generator, (len(x), 2), x)
     flake_radius = torch.where(draws[:, :1] < CHANCE, radius * draws[:, 1:], -1.0)
     torn = (x - centre[:, None]).norm(dim=-1) <= flake_radius
-    return torch.where(torn[..., None], x + (_outside(x, 1, generator) - centre[:, None]), x)
+    return torch.where(torn[..., None], x + (far_points(x, 1, generator) - centre[:, None]), x)
 
 
-def _outside(x: Tensor, count: int, generator: Randomness) -> Tensor:
+def far_points(x: Tensor, count: int, generator: Randomness) -> Tensor:
     """Return points at random distances, `NEAREST` to `FARTHEST`, from 0; [B, count, D]."""
     ball = uniform_ball(
         len(x), count, x.shape[2], 1.0, generator=generator, device=x.device, dtype=x.dtype
     )
     length: Tensor = ball.norm(dim=-1, keepdim=True)
     return ball * ((NEAREST + (FARTHEST - NEAREST) * length) / length.clamp_min(1e-12))
-
-
-@dataclass(frozen=True, kw_only=True)
-class PoolDamage:
-    """Settings of damage in the training pool; a radius, gap or probability of 0 means none."""
-
-    damage_radius: float = 0.0
-    """Radius of the ball whose state is wiped in worlds from the pool [length units]; 0: none."""
-
-    clump_radius: float = 0.0
-    """Radius of the ball whose particles are pulled to one point, in a quarter of the worlds from
-    the pool [length units]; 0: none."""
-
-    cut_gap: float = 0.0
-    """Width of the slit through `cut_share` of the worlds from the pool [length units]; 0: none."""
-
-    cut_share: float = CHANCE
-    """Probability of a world from the pool to be cut (dimensionless)."""
-
-    flake_radius: float = 0.0
-    """Radius up to which a ball of particles is torn off and thrown out, in a quarter of the worlds
-    from the pool [length units]; 0: none."""
-
-    escape_share: float = 0.0
-    """Probability of each particle to be thrown out of worlds from the pool (dimensionless)."""
-
-    def __post_init__(self) -> None:
-        check_fraction(self, "cut_share")
-        check_non_negative(
-            self, "damage_radius", "clump_radius", "cut_gap", "flake_radius", "escape_share"
-        )
-
-
-def damage_pool(worlds: Particles, damage: PoolDamage, *, generator: Randomness) -> Particles:
-    """Return worlds after each kind of damage that the settings enable, at random positions."""
-    x, s, *_ = worlds
-
-    def chosen_worlds(probability: float) -> Tensor:
-        """Return a random 0 or 1 for each of the B worlds, 1 with this probability, shape [B]."""
-        return (uniform_draws(generator, (len(x), 1), x)[:, 0] < probability).to(x.dtype)
-
-    if damage.damage_radius > 0.0:
-        centre = random_particle(x, generator)
-        s = wipe_state(x, s, centre=centre, radius=damage.damage_radius)
-    if damage.clump_radius > 0.0:
-        centre = random_particle(x, generator)
-        radius = damage.clump_radius * chosen_worlds(CHANCE)
-        x, s = clump(x, s, centre=centre, radius=radius, factor=1.0)
-    if damage.cut_gap > 0.0:
-        # Directions need not be uniform; a zero vector cuts nothing.
-        normal = 2.0 * uniform_draws(generator, (len(x), x.shape[2]), x) - 1.0
-        hit = chosen_worlds(damage.cut_share)
-        x, s = cut(x, s, centre=world_mean(x), normal=normal, gap=damage.cut_gap * hit)
-    if damage.flake_radius > 0.0:
-        x = tear_off(x, radius=damage.flake_radius, generator=generator)
-    if damage.escape_share > 0.0:
-        drawn = uniform_draws(generator, (*x.shape[:2], 1), x)
-        x = torch.where(drawn < damage.escape_share, _outside(x, x.shape[1], generator), x)
-    return worlds._replace(x=x, s=s)

@@ -24,7 +24,6 @@ from npa_envs.ops.pictures.splat import picture_losses
 from npa_envs.rule.picture_codes import replace_code
 from npa_envs.rule.rule import COLOUR_OFFSET, LIFE, NPARule
 from npa_envs.tasks.base import GrowthConfig, GrowthTask
-from npa_envs.tasks.damage import damage_pool
 from npa_envs.tasks.targets.images import MAX_POINT_COUNT
 from npa_envs.tasks.targets.picture_points import PointTarget, load_target
 from npa_envs.tasks.train_config import Common, TrainConfig, fast_run, presets_of, tiny_run
@@ -81,7 +80,7 @@ class Morphogenesis2DConfig(GrowthConfig):
     """Weight of the splat loss (dimensionless)."""
 
     colour_weight: float = 5.0
-    """Weight of the colour term relative to the density term of the splat loss (dimensionless)."""
+    """Weight of the splat loss's colour term relative to the density term (dimensionless)."""
 
     drift_weight: float = 0.0
     """Weight of the distance of worlds' centroids from the origin (per length unit)."""
@@ -247,8 +246,8 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         survive = uniform_draws(generator, x.shape[:2], x) < SURVIVING
         survivors = torch.where(survive[..., None], s, 0.0)
         survivors = torch.where(living(survivors).any(dim=1)[:, None, None], survivors, s)
-        others = replace(self.config, damage_radius=0.0)
-        return damage_pool(worlds._replace(s=survivors), others, generator=generator)
+        others = self._with(config=replace(self.config, damage_radius=0.0))
+        return others.damage(worlds._replace(s=survivors), generator)
 
     def picture(self, x: Tensor, s: Tensor, *, centred: bool = True) -> Tensor:
         """Return each world's picture: sums of colours over splats, density; [B, R, R, 4].

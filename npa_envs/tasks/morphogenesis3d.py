@@ -170,8 +170,14 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
         self._shown = some_views(self.target.held_out, torch.tensor([front], device=device))
         # The first row of a picture is the bottom.
         self._target_picture = self._shown.pictures[0].flip(0)
-        self.schedule = ViewSchedule(len(target.training.pictures), config, device)
-        """Views, blur and backgrounds of an iteration."""
+        view_count = min(config.views_per_iteration, len(target.training.pictures))
+        self.view_index = torch.zeros(view_count, dtype=torch.int64, device=device)
+        """Indices of the training views that the loss compares, shape [V]."""
+        self.backgrounds = torch.zeros(view_count, 3, device=device)
+        """Their background colours, in [0, 1], shape [V, 3]."""
+        self.blur_sigma = torch.zeros((), device=device)
+        """Standard deviation of their blur [pixels], shape []."""
+        self.begin(0)
         with_similarity = config.ssim_weight > 0.0
         self._similarity = MultiScaleSimilarity(side, device=device) if with_similarity else None
 
@@ -192,7 +198,16 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
 
     def begin(self, iteration: int) -> None:
         """Choose the views, backgrounds and blur of the next calls of `loss`."""
-        self.schedule.begin(iteration)
+        config = self.config
+        random = np.random.default_rng((config.view_seed, iteration))
+        total, count = len(self.target.training.pictures), len(self.view_index)
+        index = random.choice(total, count, replace=False).astype(np.int64)
+        backgrounds = random.random(self.backgrounds.shape, dtype=np.float32)
+        sigma = config.blur_sigma * max(0.0, 1.0 - iteration / config.blur_iterations)
+        values: tuple[NDArray[Any], ...] = index, backgrounds, np.array(sigma, dtype=np.float32)
+        tensors = self.view_index, self.backgrounds, self.blur_sigma
+        for tensor, value in zip(tensors, values, strict=True):
+            tensor.copy_(to_device_async(value, tensor.device))
 
     def gaussians(self, s: Tensor) -> Gaussians:
         """Return the 3D Gaussian that draws each particle, from states s."""
@@ -233,11 +248,11 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
 
     def compare(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the batch's weighted loss of the iteration's views, and terms by name, [] each."""
-        config, schedule, x = self.config, self.schedule, worlds.x
+        config, x = self.config, worlds.x
         gaussians = self.gaussians(worlds.s)
-        target = some_views(self.target.training, schedule.index)
-        target = Views(target.cameras, blurred(target.pictures.to(x), schedule.sigma))
-        backgrounds = schedule.backgrounds.to(x)[:, None, None]
+        target = some_views(self.target.training, self.view_index)
+        target = Views(target.cameras, blurred(target.pictures.to(x), self.blur_sigma))
+        backgrounds = self.backgrounds.to(x)[:, None, None]
         by_world = self._compare(x, gaussians, target, backgrounds)
         terms = {name: values.mean() for name, values in by_world.items()}
         terms["isotropy"] = gaussians.stretch.abs().mean()
@@ -271,37 +286,6 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
         if "structure" not in terms:
             return terms["views"]
         return terms["views"] + self.config.ssim_weight * terms["structure"]
-
-
-class ViewSchedule:
-    """Camera views, backgrounds and blur of the loss in an iteration, on the device.
-
-    They depend on the seed and the iteration alone, and are always written to the same tensors.
-    """
-
-    def __init__(
-        self, view_count: int, config: Morphogenesis3DConfig, device: str | torch.device
-    ) -> None:
-        self._view_count, self._config = view_count, config
-        chosen_count = min(config.views_per_iteration, view_count)
-        self.index = torch.zeros(chosen_count, dtype=torch.int64, device=device)
-        """Indices of the views, shape [V]."""
-        self.backgrounds = torch.zeros(chosen_count, 3, device=device)
-        """Their background colours, in [0, 1], shape [V, 3]."""
-        self.sigma = torch.zeros((), device=device)
-        """Standard deviation of their blur [pixels], shape []."""
-        self.begin(0)
-
-    def begin(self, iteration: int) -> None:
-        """Write the views, backgrounds and blur of an iteration, without synchronising."""
-        config = self._config
-        random = np.random.default_rng((config.view_seed, iteration))
-        index = random.choice(self._view_count, len(self.index), replace=False).astype(np.int64)
-        backgrounds = random.random(self.backgrounds.shape, dtype=np.float32)
-        sigma = config.blur_sigma * max(0.0, 1.0 - iteration / config.blur_iterations)
-        values: tuple[NDArray[Any], ...] = index, backgrounds, np.array(sigma, dtype=np.float32)
-        for tensor, value in zip((self.index, self.backgrounds, self.sigma), values, strict=True):
-            tensor.copy_(to_device_async(value, tensor.device))
 
 
 def blurred(pictures: Tensor, sigma: Tensor) -> Tensor:

@@ -161,6 +161,9 @@ class Texture(ParticleTask[TextureConfig]):
         """The target texture."""
         self._target_picture = target.picture
         self.metric_name = config.loss
+        weights = config.colour_weight, config.density_weight
+        self.weights = (1.0, 1.0) if is_joint(config.loss) else weights
+        """Weights of `texture_losses`; 1 for a joint loss, which contains them."""
         # All particles together have the target's mean density.
         self._pixel_size = config.box_size * (target.coverage / config.particle_count) ** 0.5
 
@@ -225,12 +228,6 @@ class Texture(ParticleTask[TextureConfig]):
         some positions then sample others in each world and step.
         """
         return self.compare_pictures(self.picture(x - x[:, :1].detach(), s))
-
-    def weights(self) -> tuple[float, float]:
-        """Return the weights of `texture_losses`; 1 for a joint loss, which contains them."""
-        if is_joint(self.config.loss):
-            return 1.0, 1.0
-        return self.config.colour_weight, self.config.density_weight
 
     def metric(self, x: Tensor, s: Tensor) -> Tensor:
         """Return each world's weighted sum of `texture_losses`, shape [B]."""
@@ -304,7 +301,7 @@ class Texture(ParticleTask[TextureConfig]):
 
     def weighted(self, colour: Tensor, density: Tensor) -> Tensor:
         """Return the sum of both losses, each times its weight."""
-        colour_weight, density_weight = self.weights()
+        colour_weight, density_weight = self.weights
         return colour_weight * colour + density_weight * density
 
     @cached_property

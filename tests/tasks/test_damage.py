@@ -11,12 +11,11 @@ from npa_envs import load_rule
 from npa_envs.errors import NPAError
 from npa_envs.render.world_film import film_world
 from npa_envs.tasks import damage
+from npa_envs.tasks.base import GrowthConfig, GrowthTask
 from npa_envs.tasks.damage import (
     CHANCE,
     FARTHEST,
     NEAREST,
-    PoolDamage,
-    damage_pool,
     damage_worlds,
     parse_damage,
 )
@@ -58,6 +57,12 @@ def worlds(count, space_dim=2, particles=200):
     return Particles(x, torch.ones(count, particles, 3))
 
 
+def damaged_in_pool(before, generator, **fields):
+    task = GrowthTask()
+    task.config = GrowthConfig(target="", **fields)
+    return task.damage(before, generator)
+
+
 def changed(before, after):
     return (before != after).flatten(1).any(dim=1)
 
@@ -65,7 +70,7 @@ def changed(before, after):
 @pytest.mark.parametrize("space_dim", [2, 3])
 def test_a_ball_of_states_is_wiped_in_every_world(space_dim):
     before = worlds(40, space_dim)
-    damaged = damage_pool(before, PoolDamage(damage_radius=0.3), generator=seeded(2))
+    damaged = damaged_in_pool(before, seeded(2), damage_radius=0.3)
     assert damaged.x is before.x
     for positions, blank in zip(damaged.x, (damaged.s == 0.0).all(dim=-1), strict=True):
         assert 0 < int(blank.sum()) < 150
@@ -82,7 +87,7 @@ def test_a_ball_of_states_is_wiped_in_every_world(space_dim):
 @pytest.mark.parametrize("space_dim", [2, 3])
 def test_as_many_worlds_are_hit_as_asked_for(fields, fraction, space_dim):
     before = worlds(400, space_dim, 60)
-    damaged = damage_pool(before, PoolDamage(**fields), generator=seeded(2))
+    damaged = damaged_in_pool(before, seeded(2), **fields)
     # Five standard deviations of a share of 400 worlds; some are hit where nobody is.
     assert fraction - 0.13 < float(changed(before.x, damaged.x).float().mean()) < fraction + 0.11
     assert torch.equal(damaged.s, before.s)
@@ -90,7 +95,7 @@ def test_as_many_worlds_are_hit_as_asked_for(fields, fraction, space_dim):
 
 def test_a_clump_is_one_point():
     x, s, *_ = worlds(40)
-    damaged, *_ = damage_pool(Particles(x, s), PoolDamage(clump_radius=0.3), generator=seeded(2))
+    damaged, *_ = damaged_in_pool(Particles(x, s), seeded(2), clump_radius=0.3)
     hit = changed(x, damaged)
     assert hit.any()
     for before, after in zip(x[hit], damaged[hit], strict=True):
@@ -104,7 +109,7 @@ def test_a_clump_is_one_point():
 @pytest.mark.parametrize("space_dim", [2, 3])
 def test_a_flake_leaves_as_it_is(space_dim):
     before = worlds(120, space_dim)
-    x, damaged = before.x, damage_pool(before, PoolDamage(flake_radius=0.3), generator=seeded(3)).x
+    x, damaged = before.x, damaged_in_pool(before, seeded(3), flake_radius=0.3).x
     hit = changed(x, damaged)
     assert 15 <= int(hit.sum()) <= 45
     sizes = []
@@ -121,17 +126,16 @@ def test_a_flake_leaves_as_it_is(space_dim):
 
 
 def test_each_world_suffers_what_it_would_suffer_alone(device):
-    every = PoolDamage(
-        damage_radius=0.1, clump_radius=0.3, cut_gap=0.2, flake_radius=0.3, escape_share=0.05
-    )
+    every = {"damage_radius": 0.1, "clump_radius": 0.3, "cut_gap": 0.2, "flake_radius": 0.3}
+    every["escape_share"] = 0.05
     before = worlds(6).map(lambda value: value.to(device))
-    together = damage_pool(before, every, generator=WorldRandom(range(6), device=device))
+    together = damaged_in_pool(before, WorldRandom(range(6), device=device), **every)
     for k in range(6):
         random = WorldRandom([k], device=device)
-        alone = damage_pool(before.map(lambda v, k=k: v[k : k + 1]), every, generator=random)
+        alone = damaged_in_pool(before.map(lambda v, k=k: v[k : k + 1]), random, **every)
         torch.testing.assert_close(alone.x, together.x[k : k + 1], rtol=0.0, atol=2e-7)
         assert torch.equal(alone.s, together.s[k : k + 1])
-    untouched = damage_pool(before, PoolDamage(), generator=torch.Generator())
+    untouched = damaged_in_pool(before, torch.Generator())
     assert (untouched.x, untouched.s) == (before.x, before.s)
 
 
@@ -243,7 +247,7 @@ SMALL = Morphogenesis2DConfig(target="ring", target_point_count=96, escape_weigh
 def test_as_many_are_thrown_out_as_was_said_and_on_all_sides(device, by_world, space_dim):
     x = torch.zeros(2, 4000, space_dim, device=device)
     random = WorldRandom([4, 5], device=device) if by_world else torch.Generator(device)
-    damaged = damage_pool(Particles(x, x), PoolDamage(escape_share=0.25), generator=random).x
+    damaged = damaged_in_pool(Particles(x, x), random, escape_share=0.25).x
     distance = damaged.norm(dim=-1)
     out = distance > 0.0
     assert ((distance[out] >= NEAREST) & (distance[out] <= FARTHEST)).all()

@@ -152,13 +152,12 @@ def test_loss_sees_the_views_of_its_iteration_before_their_backgrounds(task):
     later, parts = task.loss(Particles(x, s, far))
     assert float(first) != float(later)
     # No blur is left: by hand, over the training views that the schedule says.
-    schedule = task.schedule
-    assert float(schedule.sigma) == 0.0
-    chosen = some_views(task.target.training, schedule.index)
+    assert float(task.blur_sigma) == 0.0
+    chosen = some_views(task.target.training, task.view_index)
     drawn = task.views(x, s, chosen.cameras)
     error = 0.0
     for view in range(2):
-        back = schedule.backgrounds[view]
+        back = task.backgrounds[view]
         colours = composited(drawn[:, view], back) - composited(chosen.pictures[view], back)
         alpha = drawn[:, view, ..., 3:] - chosen.pictures[view, ..., 3:]
         error += float(torch.cat((colours, alpha), dim=-1).abs().mean()) / 2

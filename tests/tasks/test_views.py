@@ -12,7 +12,7 @@ from PIL import Image
 from npa_envs.errors import NPAError
 from npa_envs.ops import orbit
 from npa_envs.tasks.losses.image_distances import MultiScaleSimilarity
-from npa_envs.tasks.morphogenesis3d import Morphogenesis3DConfig, ViewSchedule, blurred
+from npa_envs.tasks.morphogenesis3d import Morphogenesis3D, Morphogenesis3DConfig, blurred
 from npa_envs.tasks.targets import meshes
 from npa_envs.tasks.targets.meshes import AMBIENT, RADIUS, Mesh, draw_mesh, load_mesh
 from npa_envs.tasks.targets.views import (
@@ -254,22 +254,27 @@ def test_blur_is_a_gaussian_and_none_at_zero():
     assert torch.equal(blurred(noise, torch.tensor(0.0)), noise)
 
 
-def test_schedules_follow_from_seed_and_iteration_alone():
-    def make(seed):
-        config = Morphogenesis3DConfig(view_seed=seed, blur_sigma=10.0, blur_iterations=50)
-        return ViewSchedule(20, config, "cpu")
+def test_views_follow_from_seed_and_iteration_alone():
+    views = {"training_views": 20, "held_out_views": 1, "resolution": 8, "ssim_weight": 0.0}
 
-    def drawn(schedule, iteration):
-        schedule.begin(iteration)
-        return [t.clone() for t in (schedule.index, schedule.backgrounds, schedule.sigma)]
+    def make(seed, **fields):
+        config = {"blur_sigma": 10.0, "blur_iterations": 50, **views, **fields}
+        return Morphogenesis3D(Morphogenesis3DConfig(target="doughnut", view_seed=seed, **config))
+
+    def tensors(task):
+        return task.view_index, task.backgrounds, task.blur_sigma
+
+    def drawn(task, iteration):
+        task.begin(iteration)
+        return [t.clone() for t in tensors(task)]
 
     one, other = make(0), make(0)
-    before = one.index, one.backgrounds, one.sigma
+    before = tensors(one)
     history = [drawn(one, k) for k in range(60)]
     for k in (59, 7, 0):
         assert all(torch.equal(a, b) for a, b in zip(history[k], drawn(other, k), strict=True))
-    # Graphs that were recorded read the same tensors.
-    assert all(a is b for a, b in zip(before, (one.index, one.backgrounds, one.sigma), strict=True))
+    # Captured graphs read the same tensors.
+    assert all(a is b for a, b in zip(before, tensors(one), strict=True))
     assert [float(history[k][2]) for k in (0, 25, 50, 59)] == [10.0, 5.0, 0.0, 0.0]
     chosen = torch.stack([h[0] for h in history])
     assert all(len(set(row.tolist())) == 4 for row in chosen)
@@ -278,5 +283,4 @@ def test_schedules_follow_from_seed_and_iteration_alone():
     assert not torch.equal(drawn(make(1), 0)[1], history[0][1])
     backgrounds = torch.stack([h[1] for h in history])
     assert 0.4 < float(backgrounds.mean()) < 0.6
-    few = ViewSchedule(2, Morphogenesis3DConfig(blur_sigma=0.0, blur_iterations=1), "cpu")
-    assert sorted(few.index.tolist()) == [0, 1]
+    assert sorted(make(0, training_views=2).view_index.tolist()) == [0, 1]
