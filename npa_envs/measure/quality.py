@@ -379,7 +379,7 @@ def tables_of(
     changed: bool = True,
     device: str | torch.device = "cpu",
     progress: Callable[[int], None] | None = None,
-    texture_metric: TextureMetric | None = None,
+    texture_metric: bool = False,
 ) -> dict[str, Sequence[Any]]:
     """Measure a rule of any task; return tables by name.
 
@@ -387,6 +387,7 @@ def tables_of(
     `changes`; and `judge` of `texture_metric`. Clouds run on their task's device, with the first
     seed.
     """
+    metric = TextureMetric(task) if texture_metric else None
     options: dict[str, Any] = {"progress": progress}
     tables: dict[str, Sequence[Any]] = {}
     if task.classifies:
@@ -401,8 +402,8 @@ def tables_of(
     texture_rows: list[TextureRow] = []
 
     def watch(x: Tensor, s: Tensor, step: int) -> None:
-        if texture_metric is not None:
-            texture_rows.append(texture_metric.row(x, s, step))
+        if metric is not None:
+            texture_rows.append(metric.row(x, s, step))
 
     steps = checkpoints or CHECKPOINTS
     tables["growth"] = evaluate(rule, task, checkpoints=steps, watch=watch, **options)
