@@ -111,6 +111,7 @@ def train_small(options: DemoOptions, device: torch.device) -> Iterator[str]:
 
     from npa_envs.measure.quality import measure
     from npa_envs.render.world_film import film_world
+    from npa_envs.rule.files import load_rule
     from npa_envs.tasks.morphogenesis2d import HALF_SEEDS
     from npa_envs.training import RunFolder, override, preset, task_entry, train
 
@@ -136,7 +137,9 @@ def train_small(options: DemoOptions, device: torch.device) -> Iterator[str]:
     generator = torch.Generator(device).manual_seed(1)
     worlds = task.seed(1, generator=generator, device=device)
     steps = 4 * config.steps[1]
-    worlds, film = film_world(result.rule, task, worlds, steps, generator=generator, every=1)
+    path = RunFolder(result.folder).rule
+    rule = load_rule(path, device=device)
+    worlds, film = film_world(rule, task, worlds, steps, generator=generator, every=1)
     yield f"  grown for {steps} steps: {measure(task, worlds.x, worlds.s, steps).summary}"
     paths = film.write(options.out, f"trained-{Path(options.target).stem}")
-    yield from (f"  wrote {path}" for path in (*paths, RunFolder(result.folder).rule))
+    yield from (f"  wrote {path}" for path in (*paths, path))

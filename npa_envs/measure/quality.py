@@ -563,26 +563,25 @@ def picture_rows(
     tasks: Sequence[Morphogenesis2D],
     *,
     checkpoints: Sequence[int] = PICTURE_CHECKPOINTS,
-    seeds: Sequence[int],
-    device: str | torch.device = "cpu",
-    progress: Callable[[int], None] | None = None,
+    **options: Any,
 ) -> list[PictureRow]:
-    """Return, at each of `checkpoints`, a row for each picture and one of their medians."""
+    """Return, at each of `checkpoints`, a row for each picture and one of their medians.
+
+    `options` are others of `grown`.
+    """
     if len(tasks) < 2:
         raise NPAError(f"pictures must be two or more, got {len(tasks)}: give another")
-    worlds = grown(
-        rule, tasks, checkpoints=checkpoints, seeds=seeds, device=device, progress=progress
-    )
+    worlds = grown(rule, tasks, checkpoints=checkpoints, **options)
     rows = []
     for step, (x, s, *_) in zip(checkpoints, worlds, strict=True):
-        figures = []
+        metrics = []
         for k, task in enumerate(tasks):
             other = (k + 1) % len(tasks)
             loss, shuffled = (task.metric(x[i], s[i]).mean().item() for i in (k, other))
             ratio = psnr(task.picture(x[k], s[k]), task.target_picture).mean().item()
-            figures.append((loss, shuffled, ratio))
+            metrics.append((loss, shuffled, ratio))
             rows.append(PictureRow(step, task.target.name, loss, shuffled, ratio))
-        medians = map(statistics.median, zip(*figures, strict=True))
+        medians = map(statistics.median, zip(*metrics, strict=True))
         rows.append(PictureRow(step, MEDIAN, *medians))
     return rows
 

@@ -129,8 +129,8 @@ def _reasons(
     if plan.lists_neighbours:
         neighbours = (
             "listed by the density pass for the perception pass, "
-            f"{plan.listing.lanes} threads per particle, with room for {plan.listing.capacity} "
-            "each: longer lists are searched for again"
+            f"{plan.listing.lanes} threads a particle, with room for {plan.listing.capacity} each: "
+            "longer lists are searched for again"
         )
     rows = "every particle is perceived and updated"
     if masked and x.device.type == "cpu":
