@@ -122,20 +122,20 @@ def write_report(
     facts |= {"machine": machine(device), "metric": task.metric_name}
     text = tables_json(tables, **facts)
     write_text(folder / f"{path.stem}.json", text)
-    card = folder / f"{path.stem}.md"
+    model_card = folder / f"{path.stem}.md"
     strip = folder / f"{path.stem}-filmstrip.png"
     picture = f"\n![A world from the seed on.]({strip.name})\n" if strip.exists() else ""
-    write_text(card, _card(rule, task, training, facts, tables) + picture)
+    write_text(model_card, _model_card(rule, task, training, facts, tables) + picture)
     rows = tables.get("growth", ())
     least = min(filter(math.isfinite, (row.loss for row in rows)), default=math.nan)
     scores = score_line(json.loads(text))
     # Written so that a last loss of NaN also counts as unstable.
     if rows and not rows[-1].loss <= 4.0 * least:
         scores += f"; unstable: at step {rows[-1].step} the loss is many times the least"
-    return card, scores + not_filmed
+    return model_card, scores + not_filmed
 
 
-def _card(
+def _model_card(
     rule: NPARule,
     task: Any,
     training: Training,

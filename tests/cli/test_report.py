@@ -1,4 +1,4 @@
-"""A training run ends with its report: figures, a film and a card, for every task."""
+"""A training run ends with its report: metrics, a film and a model card, for every task."""
 
 import json
 import math
@@ -34,7 +34,7 @@ def words_of(task, folder):
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_a_run_of_every_task_ends_with_a_card_of_each_rule(task, tmp_path, capsys):
+def test_a_run_of_every_task_ends_with_a_model_card_of_each_rule(task, tmp_path, capsys):
     words = words_of(task, tmp_path)
     assert main(words) == 0
     output = capsys.readouterr().out
@@ -67,7 +67,7 @@ def test_a_run_of_every_task_ends_with_a_card_of_each_rule(task, tmp_path, capsy
     assert {path.name for path in (run / "report").iterdir()} == expected
 
 
-def test_the_figures_of_a_report_are_those_of_the_command_that_it_names(tmp_path):
+def test_the_metrics_of_a_report_are_those_of_the_command_that_it_names(tmp_path):
     words = words_of("morphogenesis2d", tmp_path)
     assert main(words) == 0
     held = json.loads((tmp_path / "run" / "report" / "rule.json").read_text("utf-8"))
