@@ -50,7 +50,6 @@ def main(arguments: Sequence[str]) -> int:
     from npa_envs.atomic_files import write_text
     from npa_envs.measure import quality
     from npa_envs.measure.benchmark_records import UNMEASURED, table_text, tables_json
-    from npa_envs.measure.texture_metric import TextureMetric
     from npa_envs.rule.files import load_rule
     from npa_envs.training.task_of_rule import task_of_rule, tasks_of_codes
 
@@ -61,7 +60,6 @@ def main(arguments: Sequence[str]) -> int:
     rule = load_rule(options.rule, device=device).float()
     seeds = range(quality.FIRST_SEED, quality.FIRST_SEED + options.seed_count)
     kwargs: dict[str, Any] = {"seeds": seeds, "device": device}
-    tables: dict[str, Sequence[Any]]
     if rule.codes is not None and options.target is None:
         if options.healing or options.judge:
             raise NPAError(
@@ -72,7 +70,7 @@ def main(arguments: Sequence[str]) -> int:
         kwargs["checkpoints"] = options.checkpoints or quality.PICTURE_CHECKPOINTS
         with common.progress_bar(None, show=options.progress) as advance:
             rows = quality.picture_rows(rule, tasks, progress=advance, **kwargs)
-        tables = {"pictures": rows}
+        tables: dict[str, Sequence[Any]] = {"pictures": rows}
         metric = tasks[0].metric_name
         what = f"{len(tasks)} pictures, {options.seed_count} worlds each"
         note = ", shuffled: with the code of the next picture"
@@ -86,7 +84,7 @@ def main(arguments: Sequence[str]) -> int:
                 "give --target, a built-in name or a picture"
             )
         kwargs["checkpoints"] = options.checkpoints
-        kwargs["texture_metric"] = TextureMetric(task) if options.judge else None
+        kwargs["texture_metric"] = options.judge
         kwargs["changed"] = task.classifies or options.healing
         total = None if kwargs["changed"] else max(checkpoints)
         with common.progress_bar(total, show=options.progress) as advance:

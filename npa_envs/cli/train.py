@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import math
 import shlex
 from collections.abc import Sequence
@@ -31,9 +30,6 @@ from npa_envs.training.process_launcher import (
     requested_processes,
 )
 from npa_envs.training.trainer import TrainResult
-
-VIEWER = ("starlette", "uvicorn")
-"""Packages that `npa-envs view` needs."""
 
 THREADED_BATCH = 4096
 """From this number of particles of a batch on, two threads are faster than one."""
@@ -157,11 +153,7 @@ def finish(
         where = f"--distances {config.task.distance:g}"
         where += f" --particle-count {sum(config.task.counts[:2])}"
         print(f"  together    npa-envs influence {shlex.join(map(str, rules))} {where}")
-    shown_path = shlex.quote(str(folder.path))
-    if any(importlib.util.find_spec(name) is None for name in VIEWER):
-        print(f"  look at it  npa-envs rollout {shown_path} (live: pip install 'npa-envs[view]')")
-    else:
-        print(f"  look at it  npa-envs view {shown_path}")
+    print(f"  look at it  npa-envs view {shlex.quote(str(folder.path))}")
 
 
 def thread_count(config: TrainConfig[Any]) -> int:

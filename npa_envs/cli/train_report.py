@@ -32,7 +32,6 @@ from npa_envs.measure.quality import (
     score_line,
     tables_of,
 )
-from npa_envs.measure.texture_metric import TextureMetric
 from npa_envs.render.world_film import SCREEN, film_world, write_3d_world
 from npa_envs.rule.files import load_rule
 from npa_envs.tasks.damage import DamageEvent
@@ -83,7 +82,6 @@ def write_report(
     clouds = task.classifies
     checkpoints = (CLOUD_CHECKPOINTS if clouds else CHECKPOINTS)[: None if thorough else 5]
     seeds = range(FIRST_SEED, FIRST_SEED + (8 if thorough else 2))
-    texture_metric = TextureMetric(task) if task.has_texture_metric else None
     not_filmed = ""
     with common.progress_bar(None, show=progress) as advance:
         tables = tables_of(
@@ -94,7 +92,7 @@ def write_report(
             changed=thorough and (clouds or task.aligned),
             device=device,
             progress=advance,
-            texture_metric=texture_metric,
+            texture_metric=task.has_texture_metric,
         )
         generator = torch.Generator(device).manual_seed(FIRST_SEED)
         worlds = task.seed(1, generator=generator, device=device)
@@ -119,25 +117,25 @@ def write_report(
     command = f"npa-envs evaluate {shlex.quote(str(path))} --device {device.type}"
     if not clouds:
         command += f" --seed-count {len(seeds)} --checkpoints {' '.join(map(str, checkpoints))}"
-        command += " --healing" * ("healing" in tables) + " --judge" * (texture_metric is not None)
+        command += " --healing" * ("healing" in tables) + " --judge" * task.has_texture_metric
     facts = {"command": command, "commit": current_commit(), "date": date.today().isoformat()}
     facts |= {"machine": machine(device), "metric": task.metric_name}
     text = tables_json(tables, **facts)
     write_text(folder / f"{path.stem}.json", text)
-    card = folder / f"{path.stem}.md"
+    model_card = folder / f"{path.stem}.md"
     strip = folder / f"{path.stem}-filmstrip.png"
     picture = f"\n![A world from the seed on.]({strip.name})\n" if strip.exists() else ""
-    write_text(card, _card(rule, task, training, facts, tables) + picture)
+    write_text(model_card, _model_card(rule, task, training, facts, tables) + picture)
     rows = tables.get("growth", ())
     least = min(filter(math.isfinite, (row.loss for row in rows)), default=math.nan)
     scores = score_line(json.loads(text))
     # Written so that a last loss of NaN also counts as unstable.
     if rows and not rows[-1].loss <= 4.0 * least:
         scores += f"; unstable: at step {rows[-1].step} the loss is many times the least"
-    return card, scores + not_filmed
+    return model_card, scores + not_filmed
 
 
-def _card(
+def _model_card(
     rule: NPARule,
     task: Any,
     training: Training,

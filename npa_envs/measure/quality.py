@@ -379,7 +379,7 @@ def tables_of(
     changed: bool = True,
     device: str | torch.device = "cpu",
     progress: Callable[[int], None] | None = None,
-    texture_metric: TextureMetric | None = None,
+    texture_metric: bool = False,
 ) -> dict[str, Sequence[Any]]:
     """Measure a rule of any task; return tables by name.
 
@@ -387,6 +387,7 @@ def tables_of(
     `changes`; and `judge` of `texture_metric`. Clouds run on their task's device, with the first
     seed.
     """
+    metric = TextureMetric(task) if texture_metric else None
     options: dict[str, Any] = {"progress": progress}
     tables: dict[str, Sequence[Any]] = {}
     if task.classifies:
@@ -401,8 +402,8 @@ def tables_of(
     texture_rows: list[TextureRow] = []
 
     def watch(x: Tensor, s: Tensor, step: int) -> None:
-        if texture_metric is not None:
-            texture_rows.append(texture_metric.row(x, s, step))
+        if metric is not None:
+            texture_rows.append(metric.row(x, s, step))
 
     steps = checkpoints or CHECKPOINTS
     tables["growth"] = evaluate(rule, task, checkpoints=steps, watch=watch, **options)
@@ -563,26 +564,25 @@ def picture_rows(
     tasks: Sequence[Morphogenesis2D],
     *,
     checkpoints: Sequence[int] = PICTURE_CHECKPOINTS,
-    seeds: Sequence[int],
-    device: str | torch.device = "cpu",
-    progress: Callable[[int], None] | None = None,
+    **options: Any,
 ) -> list[PictureRow]:
-    """Return, at each of `checkpoints`, a row for each picture and one of their medians."""
+    """Return, at each of `checkpoints`, a row for each picture and one of their medians.
+
+    `options` are others of `grown`.
+    """
     if len(tasks) < 2:
         raise NPAError(f"pictures must be two or more, got {len(tasks)}: give another")
-    worlds = grown(
-        rule, tasks, checkpoints=checkpoints, seeds=seeds, device=device, progress=progress
-    )
+    worlds = grown(rule, tasks, checkpoints=checkpoints, **options)
     rows = []
     for step, (x, s, *_) in zip(checkpoints, worlds, strict=True):
-        figures = []
+        metrics = []
         for k, task in enumerate(tasks):
             other = (k + 1) % len(tasks)
             loss, shuffled = (task.metric(x[i], s[i]).mean().item() for i in (k, other))
             ratio = psnr(task.picture(x[k], s[k]), task.target_picture).mean().item()
-            figures.append((loss, shuffled, ratio))
+            metrics.append((loss, shuffled, ratio))
             rows.append(PictureRow(step, task.target.name, loss, shuffled, ratio))
-        medians = map(statistics.median, zip(*figures, strict=True))
+        medians = map(statistics.median, zip(*metrics, strict=True))
         rows.append(PictureRow(step, MEDIAN, *medians))
     return rows
 

@@ -4,17 +4,15 @@ import json
 import math
 import sys
 from dataclasses import dataclass
-from functools import partial
 
 import pytest
 import torch
 from drift import DriftRow
-from support.clock import Clock
 
 from npa_envs.cli import main
 from npa_envs.measure.speed import suites
 from npa_envs.measure.speed.explain import explain
-from npa_envs.measure.speed.timing import Timing, TimingSession, Workload, compare
+from npa_envs.measure.speed.timing import Timing, TimingSession, Workload
 
 TINY = Workload(2, 2, 150, 2, hidden_dim=16, eps=0.2)
 FORWARD = 1e-5
@@ -107,25 +105,8 @@ def test_kernels_are_cudas(device):
 # One species beside `rollout`
 
 
-def test_calls_are_compared_in_turn_and_each_pair_the_other_way_round(device, monkeypatch):
-    calls, clock = [], Clock()
-    monkeypatch.setattr("npa_envs.measure.speed.timing.time", clock)
-
-    def call(name, seconds):
-        calls.append(name)
-        clock.sleep(seconds)
-
-    source = torch.Generator(device)
-    first, second = partial(call, "a", 0.01), partial(call, "b", 0.02)
-    # A graph holds nothing of a call that launches nothing.
-    *times, ratio = compare((first, source), (second, source), device, repeats=4, graph=False)
-    assert "".join(calls)[4:] == "abbaabba"
-    assert [time.median for time in times] == pytest.approx([10_000, 20_000])
-    assert ratio == pytest.approx(2.0)
-
-
 def test_one_species_is_compared_with_the_rollout_that_it_is():
-    here = TimingSession(torch.device("cpu"), repeats=9, small=True)
+    here = session()
     rows = suites.SUITES["species"](here)["one_species"]
     assert [(row.workload, row.what, row.calls) for row in rows] == [
         ("2D (1, 256, 2)", what, "eager") for what in ("inference", "training")

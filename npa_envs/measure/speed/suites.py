@@ -26,9 +26,8 @@ from npa_envs.measure.speed.timing import (
     Timing,
     TimingSession,
     Workload,
-    compare,
     rollout_call,
-    timed_calls,
+    timed,
 )
 from npa_envs.rule.rule import NPARule
 from npa_envs.world.graphed_rollouts import release_captures
@@ -127,7 +126,9 @@ def _public_row(session: TimingSession, workload: Workload) -> PublicRow:
     for options in calls:
         for train in (False, True):
             run, _ = rollout_call(workload, x, s, train=train, **options)
-            timing = timed_calls(run, session.device, warm=3, repeats=session.repeats)
+            for _ in range(3):
+                run()
+            timing = timed(run, session.device, session.repeats, calls=1)
             timings.append(timing.divided(workload.steps))
     release_captures()
     return PublicRow(workload.name, *timings)
@@ -307,8 +308,8 @@ SPECIES = {
 class OneSpeciesRow:
     """Times of one step [µs] of `rollout`, and of `rollout_species` with one species.
 
-    `calls` is "graph" for replays of a CUDA graph, else "eager". `ratio` is the median of the
-    second time / the first.
+    `calls` is "graph" for replays of a CUDA graph, else "eager". `ratio` is the second time / the
+    first.
     """
 
     workload: str
@@ -341,21 +342,16 @@ def _species_row(
         count = [workload.particle_count]
         return rollout_species([rule], *arguments, counts=count, density_counts=count, **options)
 
+    times = []
     # Both draw the same masks.
-    alone, species = (
-        rollout_call(workload, x, s, train=train, roll=roll) for roll in (rollout, roll_species)
-    )
-    # A ratio of nearly 1 needs more readings than other tables.
-    repeats = 3 * session.repeats
-    first, second, ratio = compare(alone, species, session.device, repeats=repeats, graph=graph)
-    return OneSpeciesRow(
-        workload.name,
-        "training" if train else "inference",
-        "graph" if graph else "eager",
-        first.divided(workload.steps),
-        second.divided(workload.steps),
-        ratio,
-    )
+    for roll in (rollout, roll_species):
+        run, generator = rollout_call(workload, x, s, train=train, roll=roll)
+        cost = session.cost(run, graph=graph, generator=generator)
+        times.append(cost.time.divided(workload.steps))
+    alone, species = times
+    what, calls = "training" if train else "inference", "graph" if graph else "eager"
+    ratio = species.median / alone.median
+    return OneSpeciesRow(workload.name, what, calls, alone, species, ratio)
 
 
 # The suites

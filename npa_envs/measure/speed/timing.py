@@ -6,7 +6,7 @@ import gc
 import math
 import statistics
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
@@ -113,9 +113,6 @@ def rollout_call(
 
 # Time
 
-Sampled = tuple[Callable[[], object], torch.Generator]
-"""A call, and the generator that it draws from."""
-
 MIN_SECONDS = {"cpu": 2e-3, "cuda": 1e-2}
 """Least duration of a reading, for which short calls are repeated [s]."""
 
@@ -152,64 +149,28 @@ def synchronize(device: torch.device) -> None:
         torch.cuda.synchronize(device)
 
 
-def compare(
-    first: Sampled, second: Sampled, device: torch.device, *, repeats: int, graph: bool = True
-) -> tuple[Timing, Timing, float]:
-    """Time two calls in `repeats` pairs, whose order alternates, under the same conditions.
-
-    Returns both times, and the median of the ratios second / first. On CUDA, `graph` times replays
-    of CUDA graphs.
-    """
-    runs: list[Callable[[], object]] = []
-    for run, generator in (first, second):
-        run()
-        captured = graph and device.type == "cuda"
-        runs.append(
-            capture(run, device, generator=generator, warm_up=run).replay if captured else run
-        )
-    calls = _calls(max(_reading(run, device, 1) for run in runs), device)
-    readings: list[list[float]] = [[], []]
-    for number in range(repeats):
-        for which in (0, 1) if number % 2 == 0 else (1, 0):
-            readings[which].append(_reading(runs[which], device, calls) * 1e6)
-    ratio = statistics.median(b / a for a, b in zip(*readings, strict=True))
-    return _summary(readings[0]), _summary(readings[1]), ratio
-
-
-def timed_calls(
-    run: Callable[[], object], device: torch.device, *, warm: int, repeats: int
+def timed(
+    run: Callable[[], object], device: torch.device, repeats: int, *, calls: int | None = None
 ) -> Timing:
-    """Return the time of single synchronised calls, after `warm` calls that are not timed."""
-    for _ in range(warm):
-        run()
-    return _summary([_reading(run, device, 1) * 1e6 for _ in range(repeats)])
+    """Return the time of a call, from readings of `calls` calls in a row.
 
+    By default as many calls as take `MIN_SECONDS`.
+    """
 
-def _summary(readings: Sequence[float]) -> Timing:
-    return Timing(statistics.median(readings), min(readings), max(readings))
+    def reading(count: int) -> float:
+        synchronize(device)
+        start = time.perf_counter()
+        for _ in range(count):
+            run()
+        synchronize(device)
+        return (time.perf_counter() - start) / count * 1e6
 
-
-def _timing(run: Callable[[], object], device: torch.device, repeats: int) -> Timing:
-    calls = _calls(_reading(run, device, 1), device)
-    readings = [_reading(run, device, calls) * 1e6]
+    count = calls or max(1, math.ceil(MIN_SECONDS[device.type] * 1e6 / reading(1)))
+    readings = [reading(count)]
     # Slow calls have fewer readings: those of a second, but at least three.
-    while len(readings) < repeats and (len(readings) < 3 or sum(readings) * calls < 1e6):
-        readings.append(_reading(run, device, calls) * 1e6)
-    return _summary(readings)
-
-
-def _calls(seconds: float, device: torch.device) -> int:
-    return max(1, math.ceil(MIN_SECONDS[device.type] / seconds))
-
-
-def _reading(run: Callable[[], object], device: torch.device, calls: int) -> float:
-    """Return the mean time of `calls` calls in a row [s]."""
-    synchronize(device)
-    start = time.perf_counter()
-    for _ in range(calls):
-        run()
-    synchronize(device)
-    return (time.perf_counter() - start) / calls
+    while len(readings) < repeats and (len(readings) < 3 or sum(readings) * count < 1e6):
+        readings.append(reading(count))
+    return Timing(statistics.median(readings), min(readings), max(readings))
 
 
 # The session
@@ -262,13 +223,13 @@ class TimingSession:
         run()
         synchronize(device)
         if not self.cuda:
-            return Cost(_timing(run, device, self.repeats), None)
+            return Cost(timed(run, device, self.repeats), None)
         gc.collect()
         torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats(device)
         before = torch.cuda.memory_allocated(device)
         replay = capture(run, device, generator=generator, warm_up=run).replay if graph else run
-        timing = _timing(replay, device, self.repeats)
+        timing = timed(replay, device, self.repeats)
         return Cost(timing, (torch.cuda.max_memory_allocated(device) - before) / 2**20)
 
     def attempt(self, what: str, make: Callable[[], Row]) -> list[Row]:
