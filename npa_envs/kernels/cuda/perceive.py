@@ -485,11 +485,10 @@ def make_add_searched(
     return add_searched
 
 
-def row_functions(variant: PerceptionVariant) -> SimpleNamespace:
-    """Return the functions that scale sums and write them to shared memory, as perception rows."""
+def scaling_functions(variant: PerceptionVariant) -> SimpleNamespace:
+    """Return the functions that scale sums logarithmically."""
     scalar = wp.float32
-    space_dim, width, lane_width = variant.space_dim, variant.width, variant.lane_width
-    lane_channels = wp.types.vector(lane_width, scalar)
+    space_dim, lane_width = variant.space_dim, variant.lane_width
     vector = wp.types.vector(space_dim, scalar)
     lane_gradient = wp.types.matrix((space_dim, lane_width), scalar)
     lane_rows = wp.types.vector(lane_width * space_dim, scalar)
@@ -537,23 +536,6 @@ def row_functions(variant: PerceptionVariant) -> SimpleNamespace:
             result *= log_scale_of_square(squared)
         return result
 
-    @wp.func
-    def stage_sums(
-        slot: wp.uint32,
-        lane: int,
-        own_state: lane_channels,
-        blur: lane_channels,
-        gradient_scale: scalar,
-        gradient: lane_gradient,
-    ):
-        """Write a thread's part of a perception row to shared memory, with scaled gradients."""
-        first_channel = (lane & wp.static(CUDA_LANES - 1)) * wp.static(lane_width)
-        stage(slot, first_channel, own_state)
-        stage(slot, wp.static(width) + first_channel, blur)
-        if wp.static(variant.state_gradient):
-            scaled = scaled_gradient(gradient_scale, gradient)
-            stage(slot, wp.static(2 * width) + first_channel * wp.static(space_dim), scaled)
-
     return native.namespace(locals())
 
 
@@ -565,7 +547,7 @@ def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
     state_gradient, moment_correction = variant.state_gradient, variant.moment_inverse is not None
     grouped, capacity = variant.grouped, variant.capacity
     for_adjoint, per_particle = variant.for_adjoint, variant.per_particle
-    lane_width, team = variant.lane_width, CUDA_LANES
+    width, lane_width, team = variant.width, variant.lane_width, CUDA_LANES
     space = domain_types(space_dim, scalar)
     vector, Domain = space.vector, space.Domain
     vector_f64 = wp.types.vector(space_dim, wp.float64)
@@ -583,7 +565,7 @@ def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
     slots = slot_functions(variant, lane_channels)
     summing = sum_functions(variant, slots, lane_channels, lane_gradient)
     add_searched = make_add_searched(variant, slots, summing)
-    rows = row_functions(variant)
+    scaling = scaling_functions(variant)
 
     @wp.kernel(
         enable_backward=False,
@@ -698,8 +680,12 @@ def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
                 for c in range(r):
                     moment[r, c] = moment[c, r]
             gradient = corrected(gradient, moment)
-        staged_state = wp.where(present, own.own_state, lane_channels())
-        rows.stage_sums(own.slot, lane, staged_state, blur, gradient_scale, gradient)
+        channel = (lane & wp.static(team - 1)) * wp.static(lane_width)
+        stage(own.slot, channel, wp.where(present, own.own_state, lane_channels()))
+        stage(own.slot, wp.static(width) + channel, blur)
+        if wp.static(state_gradient):
+            scaled = scaling.scaled_gradient(gradient_scale, gradient)
+            stage(own.slot, wp.static(2 * width) + channel * wp.static(space_dim), scaled)
         bound = wp.where(limit > scalar(0.0), limit, scalar(wp.static(math.nan)))
         slots.write_rows(own.slot, destination, g, state_dim, bound, perception)
         if wp.static(for_adjoint):
@@ -713,7 +699,7 @@ def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
             along = vector()
             for d in range(wp.static(space_dim)):
                 along[d] = scalar(gradient_f64[d]) * density_scale
-            along = rows.scaled_vector(along)
+            along = scaling.scaled_vector(along)
             if destination >= 0 and lane == 0 and g == 0:
                 for d in range(wp.static(space_dim)):
                     perception[destination, column + d] = within(along[d], bound)
