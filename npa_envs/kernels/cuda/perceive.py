@@ -74,7 +74,7 @@ stage = native.function("stage", untyped="slot word value")
 
 
 class PerceptionVariant(NamedTuple):
-    """Options of the perception kernel; each combination is compiled as a kernel of its own."""
+    """Options of the perception kernel; each combination is another kernel."""
 
     space_dim: int
     width: int
@@ -207,7 +207,7 @@ def sum_functions(
         `density_gradient` has no factor `spiky_norm` yet.
         """
 
-        blur: lane_channels
+        smoothed: lane_channels
         gradient: lane_gradient
         kernel: vector
         moment: square
@@ -353,7 +353,7 @@ def sum_functions(
                 number = as_number(packed[a, wp.static(space_dim + 1)])
                 loaded[a] = slots.part_of_state(own.states, own.part_count, number)
             for a in range(wp.static(TOGETHER)):
-                sums.blur += packed[a, 0] * loaded[a]
+                sums.smoothed += packed[a, 0] * loaded[a]
                 if wp.static(state_gradient):
                     difference = loaded[a] - own.own_state
                     for d in range(wp.static(space_dim)):
@@ -668,11 +668,11 @@ def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
             own,
             sums,
         )
-        blur = sums.blur
+        smoothed = sums.smoothed
         gradient = sums.gradient
         gradient_f64 = wp.float64(domain.spiky_norm) * add_f64(sums.density_gradient)
         if wp.static(teams > 1):
-            blur = add_channels(blur)
+            smoothed = add_channels(smoothed)
             gradient = add_gradient(gradient)
         if wp.static(state_gradient and moment_correction):
             moment = add_square(sums.moment)
@@ -682,7 +682,7 @@ def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
             gradient = corrected(gradient, moment)
         channel = (lane & wp.static(team - 1)) * wp.static(lane_width)
         stage(own.slot, channel, wp.where(present, own.own_state, lane_channels()))
-        stage(own.slot, wp.static(width) + channel, blur)
+        stage(own.slot, wp.static(width) + channel, smoothed)
         if wp.static(state_gradient):
             scaled = scaling.scaled_gradient(gradient_scale, gradient)
             stage(own.slot, wp.static(2 * width) + channel * wp.static(space_dim), scaled)
