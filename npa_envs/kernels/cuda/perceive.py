@@ -56,7 +56,7 @@ CUDA_REGISTERS, TEAM_REGISTERS = {2: 80, 3: 112}, 128
 """Registers per thread: with one team for a particle, by dimension, and with several."""
 
 PAIR = 2
-"""Listed neighbours that a lane processes at a time: their steps are packed in 32 bits."""
+"""Listed neighbours that a lane processes at a time: their entries are packed in 32 bits."""
 
 TOGETHER = 4
 """Neighbours whose states are loaded at a time; a divisor of `SLOT_ENTRIES`."""
@@ -177,14 +177,14 @@ def sum_functions(
     indices_of_pair = wp.types.vector(PAIR, wp.int32)
     records_of_pair = wp.types.matrix((PAIR, 4), scalar)
 
-    # A list's entry, or step, is the neighbour's sorted index minus the particle's.
-    pair = {"lists": wp.array3d[wp.int16], "row": int, "pair": int}
-    steps_at = native.function("steps_at", variant.capacity, variant.tiled, **pair, returns=int)
-    step_of = native.function("step_of", steps=int, entry=int, returns=int)
+    # A list's entry is the neighbour's sorted index minus the particle's.
+    place = {"lists": wp.array3d[wp.int16], "row": int, "number": int}
+    pair_at = native.function("pair_at", variant.capacity, variant.tiled, **place, returns=int)
+    entry_of = native.function("entry_of", pair=int, number=int, returns=int)
 
     @wp.struct
     class Lane:
-        """A thread and its particle: sorted index k, position, slot, and this lane's channels.
+        """A lane and its particle: sorted index k, slot, position, the lane's channels of `state`.
 
         `states`, `part_count`: arguments of `part_of_state`. `first`: first neighbour of its team.
         """
@@ -195,7 +195,7 @@ def sum_functions(
         slot: wp.uint32
         states: wp.uint64
         part_count: int
-        own_state: lane_channels
+        state: lane_channels
         position: vector
         precise: vector_f64
         inverse_eps: wp.float64
@@ -311,22 +311,22 @@ def sum_functions(
         begin: int,
         length: int,
         own: Lane,
-        steps: int,
+        pair: int,
         sums: Sums,
     ):
         """Weigh a neighbour list's entries from `begin` on, at most `SLOT_ENTRIES` of them.
 
-        `steps` has this thread's next two entries, loaded before the current ones are used.
+        `pair` has this lane's next two entries, loaded before the current ones are used.
         """
         end = begin + slots.padded(wp.clamp(length - begin, 0, wp.static(SLOT_ENTRIES)))
         for first in range(begin + wp.static(PAIR) * own.lane, end, wp.static(PAIR * lanes)):
             indices = indices_of_pair()
             loaded = records_of_pair()
             for a in range(wp.static(PAIR)):
-                indices[a] = own.k + wp.where(first + a < length, step_of(steps, a), wp.int32(0))
+                indices[a] = own.k + wp.where(first + a < length, entry_of(pair, a), wp.int32(0))
             for a in range(wp.static(PAIR)):
                 loaded[a] = load_record(records, indices[a])
-            steps = steps_at(lists, row, (first >> 1) + wp.static(lanes))
+            pair = pair_at(lists, row, (first >> 1) + wp.static(lanes))
             for a in range(wp.static(PAIR)):
                 entry = first + a - begin
                 is_neighbour = first + a < length
@@ -334,7 +334,7 @@ def sum_functions(
                     domain, state_index, entry, indices[a], own, loaded[a], is_neighbour, sums
                 )
         sync_warp()
-        return steps, sums
+        return pair, sums
 
     @wp.func
     def add_states(own: Lane, count: int, sums: Sums):
@@ -355,7 +355,7 @@ def sum_functions(
             for a in range(wp.static(TOGETHER)):
                 sums.smoothed += packed[a, 0] * loaded[a]
                 if wp.static(state_gradient):
-                    difference = loaded[a] - own.own_state
+                    difference = loaded[a] - own.state
                     for d in range(wp.static(space_dim)):
                         for c in range(wp.static(lane_width)):
                             sums.gradient[d, c] += packed[a, d + 1] * difference[c]
@@ -637,7 +637,7 @@ def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
             own_index = load_integer(state_index, k)
         own.k = k
         own.states = slots.part_address(states, part)
-        own.own_state = slots.part_of_state(own.states, own.part_count, own_index)
+        own.state = slots.part_of_state(own.states, own.part_count, own_index)
         own.position = load_vector(sorted_positions, k)
         for d in range(wp.static(space_dim)):
             own.precise[d] = wp.float64(own.position[d])
@@ -650,10 +650,10 @@ def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
         length = wp.where(searching, wp.int32(0), length)
         longest = largest_in_warp(length)
         sums = summing.Sums()
-        steps = summing.steps_at(lists, list_number, lane)
+        pair = summing.pair_at(lists, list_number, lane)
         for begin in range(0, longest, wp.static(SLOT_ENTRIES)):
-            steps, sums = summing.weigh_listed(
-                domain, records, lists, state_index, list_number, begin, length, own, steps, sums
+            pair, sums = summing.weigh_listed(
+                domain, records, lists, state_index, list_number, begin, length, own, pair, sums
             )
             count = wp.clamp(length - begin, 0, wp.static(SLOT_ENTRIES))
             sums = summing.add_states(own, count, sums)
@@ -681,7 +681,7 @@ def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
                     moment[r, c] = moment[c, r]
             gradient = corrected(gradient, moment)
         channel = (lane & wp.static(team - 1)) * wp.static(lane_width)
-        stage(own.slot, channel, wp.where(present, own.own_state, lane_channels()))
+        stage(own.slot, channel, wp.where(present, own.state, lane_channels()))
         stage(own.slot, wp.static(width) + channel, smoothed)
         if wp.static(state_gradient):
             scaled = scaling.scaled_gradient(gradient_scale, gradient)
