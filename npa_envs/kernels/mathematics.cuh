@@ -1,4 +1,4 @@
-// Formulas of `mathematics.py` with fewer instructions than Warp's code for them.
+// Formulas of `mathematics.py`, which explains them, with fewer instructions than Warp's code.
 
 namespace npa {
 
@@ -24,17 +24,14 @@ CUDA_CALLABLE inline double fast_exp2(double value)
 
 #if defined(__CUDA_ARCH__)
 
-// 1 / sqrt(value), with an error of at most two units in the last place.
 __device__ inline float inverse_root(float value) { return rsqrtf(value); }
 
-// The value clipped to plus and minus a limit; unchanged if the limit is NaN: fminf and fmaxf then
-// return the other operand.
+// If the limit is NaN, fminf and fmaxf return the other operand.
 __device__ inline float within(float value, float limit)
 {
     return fminf(fmaxf(value, -limit), limit);
 }
 
-// 1 - r^2 / eps^2, 0 beyond eps and for NaN.
 __device__ inline float falloff_within(float squared, float inverse_squared_eps)
 {
     return __saturatef(fmaf(-squared, inverse_squared_eps, 1.0f));
@@ -73,8 +70,7 @@ __device__ inline float log_above_one(float value)
     return fmaf((float)exponent, 0.693147182f * 0x1p-23f, series);
 }
 
-// L(v) / v of the logarithmic scaling, from v . v: log(1 + |v|) / |v|. Without branches: those of
-// several vectors overlap.
+// Without branches: those of several vectors overlap.
 __device__ inline float log_scale_of_square(float squared)
 {
     float inverse, quotient;

@@ -1,6 +1,6 @@
 """The formulas of perception, each once: kernels W and K, the scaling L, the inverse of moments.
 
-Sources: arXiv 2601.16096, section 3 and appendix; `npa_envs.reference` has the same in plain torch.
+Sources: arXiv 2601.16096, section 3 and appendix; `npa_envs.reference` has the same in torch.
 """
 
 from typing import Any

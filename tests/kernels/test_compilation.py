@@ -1,8 +1,6 @@
 """Kernels compile for every GPU generation that is served, without a CUDA device."""
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 import warp as wp
@@ -29,12 +27,7 @@ from npa_envs.kernels.portable.rewards_and_ends import update_episodes
 from npa_envs.ops import warmup
 from npa_envs.ops.launch import loaded_modules
 
-
-def perception(*switches: Any, **more: Any) -> wp.Kernel:
-    return listed_perception(PerceptionVariant(*switches, **more))
-
-
-VARIANTS: dict[str, Callable[[], Any]] = {
+VARIANTS = {
     "sort": lambda: sort_small_worlds(3, 1024),
     "sort 2D": lambda: sort_small_worlds(2, max(BLOCKS)),
     "order": lambda: order_particles(2, 16),
@@ -42,9 +35,11 @@ VARIANTS: dict[str, Callable[[], Any]] = {
     "density": lambda: listed_density(2, 4, True, 128, True),
     "density 3D": lambda: listed_density(3, 1, False, 128, False),
     "density in tiles": lambda: tiled_density(True, 256, True),
-    "perceive": lambda: perception(3, 16, True, "smooth", False, True, 128, True, 2),
-    "perceive tiles": lambda: perception(
-        2, 16, True, "threshold", True, False, 256, False, 2, per_particle=True, tiled=True
+    "perceive": lambda: listed_perception(
+        PerceptionVariant(3, 16, True, "smooth", False, True, 128, True, 2)
+    ),
+    "perceive tiles": lambda: listed_perception(
+        PerceptionVariant(2, 16, True, "threshold", True, False, 256, False, 2, True, True)
     ),
     "adjoint": lambda: listed_adjoint(3, 16, True, True, True).gather_state_cotangents,
     "adjoint 2D": lambda: listed_adjoint(2, 16, True, False, False).unscale_cotangents,
@@ -65,7 +60,7 @@ VARIANTS: dict[str, Callable[[], Any]] = {
 
 
 @pytest.mark.parametrize("name", VARIANTS)
-def test_cuda_kernels_compile(name: str, tmp_path: Path) -> None:
+def test_cuda_kernels_compile(name, tmp_path):
     wp.init()
     if not wp.get_cuda_supported_archs():
         pytest.skip("Warp has no CUDA compiler here")
@@ -75,7 +70,7 @@ def test_cuda_kernels_compile(name: str, tmp_path: Path) -> None:
     assert ".entry" in ptx.read_text(errors="replace", encoding="utf-8")
 
 
-def test_every_source_file_is_read() -> None:
+def test_every_source_file_is_read():
     folder = Path(native.__file__).parent
     files = {path.relative_to(folder).as_posix() for path in folder.rglob("*.cuh")}
     assert files == {*native.BOTH_DEVICES, *native.CUDA_ONLY}

@@ -105,10 +105,9 @@ def test_vectors_of_rows_are_what_the_portable_kernels_make_of_them(form, count,
         "ROWS": rows_of_warp,
         "READ_BLOCKS": -(-count // (rows_of_warp * cuda.READ_WARPS)),
         "STEER_BLOCKS": -(-count // (cuda.STEERED_ROWS * cuda.STEER_WARPS)),
-        "SUM_WARPS": cuda.MIXING_SUM_WARPS,
     }
-    sizes |= {n: getattr(cuda, n) for n in ("READ_WARPS", "PULL_WARPS", "STEER_WARPS")}
-    sizes["STEERED_ROWS"] = cuda.STEERED_ROWS
+    warps = ("READ_WARPS", "PULL_WARPS", "STEER_WARPS", "MIXING_SUM_WARPS")
+    sizes |= {name: getattr(cuda, name) for name in (*warps, "STEERED_ROWS")}
     defined = "".join(f"#define {name} {value}\n" for name, value in sizes.items())
     (tmp_path / "sizes.h").write_text(defined, encoding="utf-8")
     adding = function_of(text_of("cuda/network.cuh"), "add_partial_sums")

@@ -46,8 +46,8 @@ int main()
             rows.array, mixing.array, mixed.array, mixed_bar.array, inputs_bar.array,
             rows_bar.array, sums.array);
     });
-    block::launch((WEIGHTS + 31) / 32, SUM_WARPS * 32, [&] {
-        npa::add_partial_sums<SUM_WARPS>(sums.array, mixing_bar.array);
+    block::launch((WEIGHTS + 31) / 32, MIXING_SUM_WARPS * 32, [&] {
+        npa::add_partial_sums<MIXING_SUM_WARPS>(sums.array, mixing_bar.array);
     });
     block::launch(STEER_BLOCKS, STEER_WARPS * 32, [&] {
         npa::steer_by_gates<STEERING, STEER_WARPS, STEERED_ROWS>(

@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 from support import reference_gaussians as oracle
-from support.worlds import assert_same, cotangents, relative_error
+from support.worlds import assert_same, cotangents, relative_error, with_gradients
 
 from npa_envs.ops import render_gaussians
 from npa_envs.ops.pictures.cameras import Cameras, look_at, orbit
@@ -120,13 +120,6 @@ def expected_pictures(gaussians, cameras, *, background=None, dilation=0.3):
     return image, 1.0 - passing
 
 
-def pulled(gaussians, cameras, **options):
-    """Return image, alpha and the gradients of both along random cotangents."""
-    pictures = render_gaussians(*gaussians, cameras, **options)
-    drawn = (pictures.image, pictures.alpha)
-    return [*drawn, *torch.autograd.grad(drawn, gaussians, cotangents(drawn))]
-
-
 def gradients_of(image, alpha, inputs):
     """Return the gradients of image and alpha along random cotangents, then of alpha alone."""
     bars = cotangents((image, alpha))
@@ -216,23 +209,6 @@ def test_harmonics_colour_a_gaussian_by_where_it_is_seen_from(device):
     assert float(image[:, 2].abs().max()) == 0.0
 
 
-def test_the_nearest_is_on_top_and_what_lies_behind_enough_has_no_gradient(device):
-    """One covers 0.99 at most; two leave 1e-4, and a third would leave less."""
-    wide = {"scale": (50.0, 50.0, 0.1), "opacity": 1.0, "device": device}
-    layers = [
-        single((0.0, 0.0, 4.0 - k), colour=c, **wide) for k, c in enumerate(torch.eye(3).tolist())
-    ]
-    gaussians = [torch.cat(layer, dim=1).requires_grad_() for layer in zip(*layers, strict=True)]
-    pictures = render_gaussians(*gaussians, frontal(20, 20, device=device))
-    gradients = torch.autograd.grad(pictures.image.sum(), gaussians)
-    expected = torch.tensor([0.0, 0.0099, 0.99], dtype=torch.float64)
-    torch.testing.assert_close(pictures.image[0, 0, 10, 10].detach().cpu(), expected)
-    assert float(pictures.alpha.detach().min()) == pytest.approx(0.9999)
-    for gradient in gradients:
-        assert float(gradient[0, 0].abs().max()) == 0.0
-    assert float(gradients[4][0, 1].min()) == pytest.approx(400 * 0.0099)
-
-
 def test_without_visible_gaussians_there_is_the_background(device):
     scene = Scene(worlds=2, views=2, size=(20, 18))
     gaussians, cameras = scene.of(torch.float32, device)
@@ -284,10 +260,11 @@ HOSTILE = [
 @pytest.mark.parametrize(("name", "value"), HOSTILE)
 def test_gaussians_that_are_not_finite_leave_the_picture_alone(name, value, device):
     gaussians, cameras = SCENES["batch"].of(torch.float32, device)
-    expected = pulled(gaussians, cameras)
+    drawn = lambda *gaussians: render_gaussians(*gaussians, cameras)[:2]  # noqa: E731
+    expected = with_gradients(drawn, *gaussians)
     hostile = [torch.cat((t.detach()[:, :1], t.detach()), dim=1) for t in gaussians]
     hostile[NAMES.index(name)][:, 0] = value
-    actual = pulled([t.requires_grad_() for t in hostile], cameras)
+    actual = with_gradients(drawn, *hostile)
     assert_same([*actual[:2], *(bar[:, 1:] for bar in actual[2:])], expected)
     assert not any(bar[:, 0].any() for bar in actual[2:])
 
@@ -322,8 +299,4 @@ def test_a_compiled_function_equals_the_eager_one(pairs, device):
 
     gaussians, cameras = SCENES["batch"].of(torch.float32, device)
     compiled = torch.compile(loss, backend="aot_eager", fullgraph=True)
-    value, expected = compiled(*gaussians), loss(*gaussians)
-    assert torch.equal(value, expected)
-    actual = torch.autograd.grad(value, gaussians)
-    wanted = torch.autograd.grad(expected, gaussians)
-    assert_same(actual, wanted)
+    assert_same(with_gradients(compiled, *gaussians), with_gradients(loss, *gaussians))

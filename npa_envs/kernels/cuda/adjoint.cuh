@@ -68,10 +68,9 @@ __device__ inline void split_number(float number, unsigned& part, unsigned& rest
     rest = __float_as_uint(number - __uint_as_float(part & 0xffffe000u));
 }
 
-template <int DIMS, int WIDTH, int WEIGHTS, bool PERIODIC>
+template <int DIMS, int WIDTH, int WEIGHTS, bool PERIODIC, typename Domain>
 __device__ inline FourChannels sum_listed(
-    unsigned address, int count, wp::vec_t<DIMS, float> position, float inverse_eps,
-    float inverse_squared_eps, wp::vec_t<DIMS, float> box, wp::vec_t<DIMS, float> inverse_box,
+    unsigned address, int count, const Domain& domain, wp::vec_t<DIMS, float> position,
     const wp::array_t<float>& channels, FourChannels value)
 {
     __syncwarp();
@@ -100,13 +99,13 @@ __device__ inline FourChannels sum_listed(
             #pragma unroll
             for (unsigned d = 0; d < DIMS; ++d) {
                 offset[d] = position[d] - other[d];
-                if (PERIODIC) offset[d] -= box[d] * rintf(offset[d] * inverse_box[d]);
+                if (PERIODIC) offset[d] -= domain.box[d] * rintf(offset[d] * domain.inverse_box[d]);
                 squared = fmaf(offset[d], offset[d], squared);
             }
-            const float weight = smoothing(squared, inverse_squared_eps);
+            const float weight = smoothing(squared, domain.inverse_squared_eps);
             split_number(weight, weights[0][half], weight_rests[0][half]);
             if constexpr (WEIGHTS > 1) {
-                const float factor = spiky_factor(squared, inverse_eps);
+                const float factor = spiky_factor(squared, domain.inverse_eps);
                 #pragma unroll
                 for (unsigned d = 0; d < WEIGHTS - 1; ++d) {
                     const float component = factor * offset[d];

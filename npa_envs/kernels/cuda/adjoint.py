@@ -248,11 +248,8 @@ def listed_adjoint(
         *(space_dim, width, weight_count, periodic),
         address=wp.uint32,
         count=int,
+        domain=Domain,
         position=vector,
-        inverse_eps=float,
-        inverse_squared_eps=float,
-        box=vector,
-        inverse_box=vector,
         channels=wp.array[scalar],
         value=CHANNELS,
         returns=CHANNELS,
@@ -266,7 +263,7 @@ def listed_adjoint(
     def unscale_cotangents(
         state_dim: int,
         gradient_scale: scalar,
-        blur_scale: scalar,
+        smoothed_scale: scalar,
         row_base: int,
         row_capacity: int,
         group_count: int,
@@ -278,7 +275,7 @@ def listed_adjoint(
     ):
         """Write each row's cotangents before the logarithmic scaling, from those of perception.
 
-        Those of smoothed states are multiplied by `blur_scale`.
+        Those of smoothed states are multiplied by `smoothed_scale`.
         """
         wait_for_previous_kernel()
         allow_next_launch()
@@ -294,8 +291,8 @@ def listed_adjoint(
                 wide_store(cotangents, index + n * wp.static(parts), CHANNELS())
         if row < wp.min(load_integer(starts, starts.shape[0] - 1) - row_base, row_capacity):
             column = state_dim + channel
-            blur = read_channels(perception_bar, row, column, 2 * state_dim)
-            wide_store(cotangents, index, blur_scale * blur)
+            smoothed = read_channels(perception_bar, row, column, 2 * state_dim)
+            wide_store(cotangents, index, smoothed_scale * smoothed)
             if wp.static(state_gradient):
                 column = 2 * state_dim + channel * wp.static(space_dim)
                 end = (2 + wp.static(space_dim)) * state_dim
@@ -426,11 +423,8 @@ def listed_adjoint(
                         block_sums = sum_listed(
                             address,
                             summed_count,
+                            domain,
                             position,
-                            domain.inverse_eps,
-                            domain.inverse_squared_eps,
-                            domain.box,
-                            domain.inverse_box,
                             flat_cotangents,
                             block_sums,
                         )

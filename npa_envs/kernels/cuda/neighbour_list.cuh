@@ -80,18 +80,18 @@ __device__ inline int leave_list(
     return total;
 }
 
-// Entries 2 pair and 2 pair + 1 of a row's list, packed in 32 bits; beyond the capacity, those of
+// Entries 2 number and 2 number + 1 of a row's list, packed in 32 bits; beyond the capacity, those of
 // another pair. TILED: lists are stored one after the other.
 template <int CAPACITY, bool TILED>
-__device__ inline int steps_at(const wp::array_t<wp::int16>& lists, int row, int pair)
+__device__ inline int pair_at(const wp::array_t<wp::int16>& lists, int row, int number)
 {
-    const int known = min(pair, CAPACITY / 2 - 1);
+    const int known = min(number, CAPACITY / 2 - 1);
     const short* from = TILED ? lists.data + (size_t)row * CAPACITY + 2 * known
                               : lists.data + place_of_list<CAPACITY>(row) + 64 * known;
     return *reinterpret_cast<const int*>(from);
 }
 
 // Entry 0 or 1 of two packed entries.
-__device__ inline int step_of(int steps, int entry) { return (short)(steps >> 16 * entry); }
+__device__ inline int entry_of(int pair, int number) { return (short)(pair >> 16 * number); }
 
 }  // namespace npa

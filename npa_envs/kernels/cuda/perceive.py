@@ -56,7 +56,7 @@ CUDA_REGISTERS, TEAM_REGISTERS = {2: 80, 3: 112}, 128
 """Registers per thread: with one team for a particle, by dimension, and with several."""
 
 PAIR = 2
-"""Listed neighbours that a lane processes at a time: their steps are packed in 32 bits."""
+"""Listed neighbours that a lane processes at a time: their entries are packed in 32 bits."""
 
 TOGETHER = 4
 """Neighbours whose states are loaded at a time; a divisor of `SLOT_ENTRIES`."""
@@ -74,7 +74,7 @@ stage = native.function("stage", untyped="slot word value")
 
 
 class PerceptionVariant(NamedTuple):
-    """Options of the perception kernel; each combination is compiled as a kernel of its own."""
+    """Options of the perception kernel; each combination is another kernel."""
 
     space_dim: int
     width: int
@@ -177,14 +177,14 @@ def sum_functions(
     indices_of_pair = wp.types.vector(PAIR, wp.int32)
     records_of_pair = wp.types.matrix((PAIR, 4), scalar)
 
-    # A list's entry, or step, is the neighbour's sorted index minus the particle's.
-    pair = {"lists": wp.array3d[wp.int16], "row": int, "pair": int}
-    steps_at = native.function("steps_at", variant.capacity, variant.tiled, **pair, returns=int)
-    step_of = native.function("step_of", steps=int, entry=int, returns=int)
+    # A list's entry is the neighbour's sorted index minus the particle's.
+    place = {"lists": wp.array3d[wp.int16], "row": int, "number": int}
+    pair_at = native.function("pair_at", variant.capacity, variant.tiled, **place, returns=int)
+    entry_of = native.function("entry_of", pair=int, number=int, returns=int)
 
     @wp.struct
     class Lane:
-        """A thread and its particle: sorted index k, position, slot, and this lane's channels.
+        """A lane and its particle: sorted index k, slot, position, the lane's channels of `state`.
 
         `states`, `part_count`: arguments of `part_of_state`. `first`: first neighbour of its team.
         """
@@ -195,7 +195,7 @@ def sum_functions(
         slot: wp.uint32
         states: wp.uint64
         part_count: int
-        own_state: lane_channels
+        state: lane_channels
         position: vector
         precise: vector_f64
         inverse_eps: wp.float64
@@ -207,7 +207,7 @@ def sum_functions(
         `density_gradient` has no factor `spiky_norm` yet.
         """
 
-        blur: lane_channels
+        smoothed: lane_channels
         gradient: lane_gradient
         kernel: vector
         moment: square
@@ -311,22 +311,22 @@ def sum_functions(
         begin: int,
         length: int,
         own: Lane,
-        steps: int,
+        pair: int,
         sums: Sums,
     ):
         """Weigh a neighbour list's entries from `begin` on, at most `SLOT_ENTRIES` of them.
 
-        `steps` has this thread's next two entries, loaded before the current ones are used.
+        `pair` has this lane's next two entries, loaded before the current ones are used.
         """
         end = begin + slots.padded(wp.clamp(length - begin, 0, wp.static(SLOT_ENTRIES)))
         for first in range(begin + wp.static(PAIR) * own.lane, end, wp.static(PAIR * lanes)):
             indices = indices_of_pair()
             loaded = records_of_pair()
             for a in range(wp.static(PAIR)):
-                indices[a] = own.k + wp.where(first + a < length, step_of(steps, a), wp.int32(0))
+                indices[a] = own.k + wp.where(first + a < length, entry_of(pair, a), wp.int32(0))
             for a in range(wp.static(PAIR)):
                 loaded[a] = load_record(records, indices[a])
-            steps = steps_at(lists, row, (first >> 1) + wp.static(lanes))
+            pair = pair_at(lists, row, (first >> 1) + wp.static(lanes))
             for a in range(wp.static(PAIR)):
                 entry = first + a - begin
                 is_neighbour = first + a < length
@@ -334,7 +334,7 @@ def sum_functions(
                     domain, state_index, entry, indices[a], own, loaded[a], is_neighbour, sums
                 )
         sync_warp()
-        return steps, sums
+        return pair, sums
 
     @wp.func
     def add_states(own: Lane, count: int, sums: Sums):
@@ -353,9 +353,9 @@ def sum_functions(
                 number = as_number(packed[a, wp.static(space_dim + 1)])
                 loaded[a] = slots.part_of_state(own.states, own.part_count, number)
             for a in range(wp.static(TOGETHER)):
-                sums.blur += packed[a, 0] * loaded[a]
+                sums.smoothed += packed[a, 0] * loaded[a]
                 if wp.static(state_gradient):
-                    difference = loaded[a] - own.own_state
+                    difference = loaded[a] - own.state
                     for d in range(wp.static(space_dim)):
                         for c in range(wp.static(lane_width)):
                             sums.gradient[d, c] += packed[a, d + 1] * difference[c]
@@ -485,11 +485,10 @@ def make_add_searched(
     return add_searched
 
 
-def row_functions(variant: PerceptionVariant) -> SimpleNamespace:
-    """Return the functions that scale sums and write them to shared memory, as perception rows."""
+def scaling_functions(variant: PerceptionVariant) -> SimpleNamespace:
+    """Return the functions that scale sums logarithmically."""
     scalar = wp.float32
-    space_dim, width, lane_width = variant.space_dim, variant.width, variant.lane_width
-    lane_channels = wp.types.vector(lane_width, scalar)
+    space_dim, lane_width = variant.space_dim, variant.lane_width
     vector = wp.types.vector(space_dim, scalar)
     lane_gradient = wp.types.matrix((space_dim, lane_width), scalar)
     lane_rows = wp.types.vector(lane_width * space_dim, scalar)
@@ -537,23 +536,6 @@ def row_functions(variant: PerceptionVariant) -> SimpleNamespace:
             result *= log_scale_of_square(squared)
         return result
 
-    @wp.func
-    def stage_sums(
-        slot: wp.uint32,
-        lane: int,
-        own_state: lane_channels,
-        blur: lane_channels,
-        gradient_scale: scalar,
-        gradient: lane_gradient,
-    ):
-        """Write a thread's part of a perception row to shared memory, with scaled gradients."""
-        first_channel = (lane & wp.static(CUDA_LANES - 1)) * wp.static(lane_width)
-        stage(slot, first_channel, own_state)
-        stage(slot, wp.static(width) + first_channel, blur)
-        if wp.static(variant.state_gradient):
-            scaled = scaled_gradient(gradient_scale, gradient)
-            stage(slot, wp.static(2 * width) + first_channel * wp.static(space_dim), scaled)
-
     return native.namespace(locals())
 
 
@@ -565,7 +547,7 @@ def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
     state_gradient, moment_correction = variant.state_gradient, variant.moment_inverse is not None
     grouped, capacity = variant.grouped, variant.capacity
     for_adjoint, per_particle = variant.for_adjoint, variant.per_particle
-    lane_width, team = variant.lane_width, CUDA_LANES
+    width, lane_width, team = variant.width, variant.lane_width, CUDA_LANES
     space = domain_types(space_dim, scalar)
     vector, Domain = space.vector, space.Domain
     vector_f64 = wp.types.vector(space_dim, wp.float64)
@@ -583,7 +565,7 @@ def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
     slots = slot_functions(variant, lane_channels)
     summing = sum_functions(variant, slots, lane_channels, lane_gradient)
     add_searched = make_add_searched(variant, slots, summing)
-    rows = row_functions(variant)
+    scaling = scaling_functions(variant)
 
     @wp.kernel(
         enable_backward=False,
@@ -655,7 +637,7 @@ def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
             own_index = load_integer(state_index, k)
         own.k = k
         own.states = slots.part_address(states, part)
-        own.own_state = slots.part_of_state(own.states, own.part_count, own_index)
+        own.state = slots.part_of_state(own.states, own.part_count, own_index)
         own.position = load_vector(sorted_positions, k)
         for d in range(wp.static(space_dim)):
             own.precise[d] = wp.float64(own.position[d])
@@ -668,10 +650,10 @@ def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
         length = wp.where(searching, wp.int32(0), length)
         longest = largest_in_warp(length)
         sums = summing.Sums()
-        steps = summing.steps_at(lists, list_number, lane)
+        pair = summing.pair_at(lists, list_number, lane)
         for begin in range(0, longest, wp.static(SLOT_ENTRIES)):
-            steps, sums = summing.weigh_listed(
-                domain, records, lists, state_index, list_number, begin, length, own, steps, sums
+            pair, sums = summing.weigh_listed(
+                domain, records, lists, state_index, list_number, begin, length, own, pair, sums
             )
             count = wp.clamp(length - begin, 0, wp.static(SLOT_ENTRIES))
             sums = summing.add_states(own, count, sums)
@@ -686,11 +668,11 @@ def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
             own,
             sums,
         )
-        blur = sums.blur
+        smoothed = sums.smoothed
         gradient = sums.gradient
         gradient_f64 = wp.float64(domain.spiky_norm) * add_f64(sums.density_gradient)
         if wp.static(teams > 1):
-            blur = add_channels(blur)
+            smoothed = add_channels(smoothed)
             gradient = add_gradient(gradient)
         if wp.static(state_gradient and moment_correction):
             moment = add_square(sums.moment)
@@ -698,8 +680,12 @@ def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
                 for c in range(r):
                     moment[r, c] = moment[c, r]
             gradient = corrected(gradient, moment)
-        staged_state = wp.where(present, own.own_state, lane_channels())
-        rows.stage_sums(own.slot, lane, staged_state, blur, gradient_scale, gradient)
+        channel = (lane & wp.static(team - 1)) * wp.static(lane_width)
+        stage(own.slot, channel, wp.where(present, own.state, lane_channels()))
+        stage(own.slot, wp.static(width) + channel, smoothed)
+        if wp.static(state_gradient):
+            scaled = scaling.scaled_gradient(gradient_scale, gradient)
+            stage(own.slot, wp.static(2 * width) + channel * wp.static(space_dim), scaled)
         bound = wp.where(limit > scalar(0.0), limit, scalar(wp.static(math.nan)))
         slots.write_rows(own.slot, destination, g, state_dim, bound, perception)
         if wp.static(for_adjoint):
@@ -713,7 +699,7 @@ def listed_perception(variant: PerceptionVariant) -> wp.Kernel:
             along = vector()
             for d in range(wp.static(space_dim)):
                 along[d] = scalar(gradient_f64[d]) * density_scale
-            along = rows.scaled_vector(along)
+            along = scaling.scaled_vector(along)
             if destination >= 0 and lane == 0 and g == 0:
                 for d in range(wp.static(space_dim)):
                     perception[destination, column + d] = within(along[d], bound)

@@ -81,7 +81,7 @@ def adjoint_kernels(
         perception: wp.array2d[scalar],
         perception_bar: wp.array2d[scalar],
         # outputs
-        blur_bar: wp.array[scalar],
+        smoothed_bar: wp.array[scalar],
         gradient_bar: wp.array[scalar],
         density_gradient_bar: wp.array[vector],
     ):
@@ -90,16 +90,16 @@ def adjoint_kernels(
         row += range_start
         if row >= starts[starts.shape[0] - 1] - row_base:
             return
-        blur = scalar(0.0)
+        smoothed = scalar(0.0)
         gradient = vector()
         if channel < state_dim:
-            blur = perception_bar[row, state_dim + channel]
+            smoothed = perception_bar[row, state_dim + channel]
             if wp.static(state_gradient):
                 column = 2 * state_dim + channel * wp.static(space_dim)
                 gradient = gradient_scale * unscaled(perception, perception_bar, row, column)
         entry = row * group_count + channel / wp.static(width)
         c = channel % wp.static(width)
-        blur_bar[entry * wp.static(width) + c] = blur
+        smoothed_bar[entry * wp.static(width) + c] = smoothed
         for d in range(wp.static(space_dim)):
             gradient_bar[(entry * wp.static(space_dim) + d) * wp.static(width) + c] = gradient[d]
         if channel == 0 and density_gradient_bar.shape[0] > 0:
@@ -155,7 +155,7 @@ def adjoint_kernels(
         row_positions: wp.array[vector],
         row_kernel_sum: wp.array[vector],
         perception_bar: wp.array2d[scalar],
-        blur_bar: wp.array[group],
+        smoothed_bar: wp.array[group],
         gradient_bar: wp.array[group_gradient],
         flat_gradient_bar: wp.array[scalar],
         # outputs
@@ -186,8 +186,8 @@ def adjoint_kernels(
                     offset = space.minimum_image(domain, position - row_positions[row])
                     squared = wp.dot(offset, offset)
                     weight = smoothing(squared, domain.inverse_squared_eps, domain.smoothing_norm)
-                    blur = load_group(blur_bar, row * group_count + g)
-                    total = add_scaled(total, weight, blur)
+                    smoothed = load_group(smoothed_bar, row * group_count + g)
+                    total = add_scaled(total, weight, smoothed)
                     if wp.static(state_gradient):
                         kernel = offset * spiky_factor(
                             wp.sqrt(squared), domain.inverse_eps, domain.spiky_norm
@@ -223,7 +223,7 @@ def adjoint_kernels(
         states: wp.array[group],
         original_index: wp.array[wp.int32],
         row_of: wp.array[wp.int32],
-        blur_bar: wp.array[group],
+        smoothed_bar: wp.array[group],
         gradient_bar: wp.array[group_gradient],
         # outputs
         density_bar: wp.array[scalar],
@@ -249,12 +249,11 @@ def adjoint_kernels(
                     )
                     for g in range(group_count):
                         own_state = states[k * group_count + g]
-                        volume_bar += weight * wp.dot(own_state, blur_bar[row * group_count + g])
+                        index = row * group_count + g
+                        volume_bar += weight * wp.dot(own_state, smoothed_bar[index])
                         if wp.static(state_gradient):
-                            volume_bar += wp.dot(
-                                own_state - states[j * group_count + g],
-                                kernel * gradient_bar[row * group_count + g],
-                            )
+                            difference = own_state - states[j * group_count + g]
+                            volume_bar += wp.dot(difference, kernel * gradient_bar[index])
         density_bar[k] = -volume * volume * volume_bar
 
     @wp.func
@@ -288,7 +287,7 @@ def adjoint_kernels(
         original_index: wp.array[wp.int32],
         row_of: wp.array[wp.int32],
         density_bar: wp.array[scalar],
-        blur_bar: wp.array[group],
+        smoothed_bar: wp.array[group],
         gradient_bar: wp.array[group_gradient],
         density_gradient_bar: wp.array[vector],
         # outputs
@@ -324,19 +323,15 @@ def adjoint_kernels(
                         own_state = states[k * group_count + g]
                         other_state = states[j * group_count + g]
                         if row >= 0:
-                            as_neighbour += volume * wp.dot(
-                                own_state, blur_bar[row * group_count + g]
-                            )
-                            neighbour_kernel += volume * (
-                                gradient_bar[row * group_count + g] * (own_state - other_state)
-                            )
+                            index = row * group_count + g
+                            as_neighbour += volume * wp.dot(own_state, smoothed_bar[index])
+                            away = own_state - other_state
+                            neighbour_kernel += volume * (gradient_bar[index] * away)
                         if own_row >= 0:
-                            as_centre += other_volume * wp.dot(
-                                other_state, blur_bar[own_row * group_count + g]
-                            )
-                            centre_kernel += other_volume * (
-                                gradient_bar[own_row * group_count + g] * (other_state - own_state)
-                            )
+                            index = own_row * group_count + g
+                            as_centre += other_volume * wp.dot(other_state, smoothed_bar[index])
+                            away = other_state - own_state
+                            centre_kernel += other_volume * (gradient_bar[index] * away)
                     pull += pair_pull(domain, offset, squared, as_neighbour, neighbour_kernel)
                     pull -= pair_pull(domain, -offset, squared, as_centre, centre_kernel)
         positions_bar[original_index[k]] = pull

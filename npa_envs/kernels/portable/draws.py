@@ -10,7 +10,6 @@ import math
 
 import warp as wp
 
-from npa_envs.kernels.domain import scalar_name
 from npa_envs.thread_lock import cached_under_lock
 
 # Typed constants: a literal in a kernel would be an int32 or a float32.
@@ -136,11 +135,9 @@ def draw_kernel(distribution: str, value_type: type) -> tuple[wp.Kernel, int]:
             result[k] = value_type(joined(w[2 * k], w[2 * k + 1]) % bound)
         return result
 
-    functions = {"uniform": uniform, "normal": normal}
-    numbers_of = (functions | {"bernoulli": bernoulli, "integers": integers})[distribution]
-    name = distribution
-    if distribution in functions:
-        name += f"_{scalar_name(value_type)}"
+    functions = {"uniform": uniform, "normal": normal, "bernoulli": bernoulli, "integers": integers}
+    numbers_of = functions[distribution]
+    name = f"{distribution}_{value_type.__name__}"
 
     @wp.kernel(enable_backward=False, module=wp.get_module(f"npa_envs.kernels.draws_{name}"))
     def draw(

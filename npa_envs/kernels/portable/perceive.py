@@ -73,7 +73,7 @@ def perception_kernels(
         """Return smoothed state, state gradient, sum of v K and moment matrix of particle k."""
         position = space.position_of(particles[k])
         own = load_group(states, k * group_count + g)
-        blur = group()
+        smoothed = group()
         gradient = group_gradient()
         kernel_sum = vector()
         moment = square()
@@ -93,7 +93,7 @@ def perception_kernels(
                     volume = entry[wp.static(space_dim)]
                     state = load_group(states, j * group_count + g)
                     weight = smoothing(squared, domain.inverse_squared_eps, domain.smoothing_norm)
-                    blur = add_scaled(blur, volume * weight, state)
+                    smoothed = add_scaled(smoothed, volume * weight, state)
                     if wp.static(state_gradient):
                         kernel = offset * spiky_factor(
                             wp.sqrt(squared), domain.inverse_eps, domain.spiky_norm
@@ -104,7 +104,7 @@ def perception_kernels(
                             gradient[d] = add_scaled(gradient[d], weighted[d], state - own)
                         if wp.static(moment_correction):
                             moment += wp.outer(offset, weighted)
-        return blur, gradient, kernel_sum, moment
+        return smoothed, gradient, kernel_sum, moment
 
     @wp.func
     def clipped(value: scalar, limit: scalar):
@@ -156,7 +156,7 @@ def perception_kernels(
         to = row
         if row_destination.shape[0] > 0:
             to = row_destination[row]
-        blur, gradient, kernel_sum, moment = sum_neighbours(
+        smoothed, gradient, kernel_sum, moment = sum_neighbours(
             domain, particle_count, starts, ends, neighbours, particles, states, k, g, group_count
         )
         if wp.static(state_gradient and moment_correction):
@@ -165,7 +165,7 @@ def perception_kernels(
             channel = g * wp.static(width) + c
             if channel < state_dim:
                 perception[to, channel] = clipped(flat_states[k, channel], limit)
-                perception[to, state_dim + channel] = clipped(blur[c], limit)
+                perception[to, state_dim + channel] = clipped(smoothed[c], limit)
                 if wp.static(state_gradient):
                     along = vector()
                     for d in range(wp.static(space_dim)):
@@ -203,7 +203,7 @@ def perception_kernels(
         original_index: wp.array[wp.int32],
         # outputs
         density: wp.array[scalar],
-        blur_field: wp.array2d[scalar],
+        smoothed_field: wp.array2d[scalar],
         gradient_field: wp.array3d[scalar],
         moment_field: wp.array[square],
         corrected_field: wp.array3d[scalar],
@@ -213,14 +213,14 @@ def perception_kernels(
         k += range_start
         i = original_index[k]
         no_list = starts
-        blur, gradient, _kernel_sum, moment = sum_neighbours(
+        smoothed, gradient, _kernel_sum, moment = sum_neighbours(
             domain, particle_count, starts, no_list, no_list, particles, states, k, g, group_count
         )
         straight = corrected(gradient, moment)
         for c in range(wp.static(width)):
             channel = g * wp.static(width) + c
             if channel < state_dim:
-                blur_field[i, channel] = blur[c]
+                smoothed_field[i, channel] = smoothed[c]
                 for d in range(wp.static(space_dim)):
                     gradient_field[i, channel, d] = gradient[d, c]
                     corrected_field[i, channel, d] = straight[d, c]
