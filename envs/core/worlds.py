@@ -44,7 +44,6 @@ from npa_envs.world.environment_steps import (
     EpisodeRules,
     EpisodeUpdate,
     NeighbourState,
-    build_neighbours,
 )
 from npa_envs.world.particles import Particles
 
@@ -233,7 +232,7 @@ class BatchedWorlds(WorldState):
 
     def _start_and_sort(self, worlds: Tensor) -> NeighbourState:
         start = self.start(worlds)
-        return build_neighbours(start.x, start.s, self.physics, world_indices=worlds)
+        return NeighbourState(start.x, start.s, self.physics, world_indices=worlds)
 
     @makes_plain_tensors
     def restart(self, worlds: NDArray[np.int64], observation: Tensor) -> None:
@@ -241,7 +240,7 @@ class BatchedWorlds(WorldState):
         if self.task.target_rows is not None:
             index = to_device_async(worlds, self.device)
             start = self.start(index)
-            rows = build_neighbours(start.x, start.s, self.physics).perceive()
+            rows = NeighbourState(start.x, start.s, self.physics).perceive()
             observation[index] = self._with_target(rows, self.goal[index])
         elif not (self.x.is_cuda and self.task.start_is_short):
             index = to_device_async(worlds, self.device)
@@ -263,7 +262,7 @@ class BatchedWorlds(WorldState):
     @makes_plain_tensors
     def perceive(self, out: Tensor | None = None) -> Tensor:
         """Return all worlds' current observations, shape [B, ...], in `out` if it is given."""
-        return self._observed(build_neighbours(self.x, self.s, self.physics), out)
+        return self._observed(NeighbourState(self.x, self.s, self.physics), out)
 
     def _observed(self, neighbours: NeighbourState, out: Tensor | None) -> Tensor:
         if self.task.target_rows is None:
@@ -359,14 +358,14 @@ class BatchedWorlds(WorldState):
                 returns_arrays = self.world_count == 1 and self.task.config.output == "numpy"
                 if returns_arrays and self.task.target_rows is None:
                     self._host_perceived = pinned_like(self._perceived)
-            build_neighbours(self.x, self.s, self.physics).perceive(self._perceived)
+            NeighbourState(self.x, self.s, self.physics).perceive(self._perceived)
             if self._host_perceived is not None:
                 self._host_perceived.copy_(self._perceived, non_blocking=True)
 
     def _evaluate_and_sort(self) -> None:
         """Evaluate the worlds and, at the same time, search neighbours."""
         with self._evaluating_on_side():
-            self._neighbours = build_neighbours(self.x, self.s, self.physics)
+            self._neighbours = NeighbourState(self.x, self.s, self.physics)
 
     @contextlib.contextmanager
     def _evaluating_on_side(self) -> Iterator[None]:

@@ -29,7 +29,6 @@ from npa_envs.world.divergence import MAX_REPORT
 from npa_envs.world.environment_steps import (
     Actions,
     NeighbourState,
-    build_neighbours,
     perceive_each_species,
 )
 from npa_envs.world.particles import Particles
@@ -481,7 +480,7 @@ class Cohort:
         """
         x, s, counts, _ = population or self.population
         neighbours = self._neighbours if stepped else None
-        rows = (neighbours or build_neighbours(x, s, self._physics)).perceive()
+        rows = (neighbours or NeighbourState(x, s, self._physics)).perceive()
         if self._task.config.perception == "per_species":
             rows = torch.cat((rows, perceive_each_species(x, counts, self._physics)), dim=-1)
         return rows
@@ -496,7 +495,7 @@ class Cohort:
         count = torch.zeros(len(inside), self._agent_count, device=inside.device)
         self.diverged = count.index_add_(1, self._owners, inside.float()) == 0.0
         self.terms = self.loss_terms()
-        self._neighbours = build_neighbours(x, s, physics)
+        self._neighbours = NeighbourState(x, s, physics)
 
 
 def population_of(

@@ -377,14 +377,45 @@ def updates_in_parts(
 
 
 class NeighbourState:
-    """Worlds sorted into cells, with densities, for `perceive`; made by `build_neighbours`."""
+    """Worlds x and s, unchecked, sorted into cells with densities; valid until one changes.
+
+    `world_indices`, int64, shape [B], are the worlds' indices in a larger batch, into which
+    perception is written; default: the worlds are the whole batch.
+    """
 
     def __init__(
-        self, launch_of: Callable[[Tensor], tuple[Any, ...]], shape: tuple[int, ...], like: Tensor
+        self, x: Tensor, s: Tensor, physics: Physics, world_indices: Tensor | None = None
     ) -> None:
-        self._launch_of = launch_of
-        self._shape = shape
-        self._like = like
+        x, s = x.contiguous(), s.contiguous()
+        plan = plan_kernels(x, x.shape, s.shape[2], x.shape[0] * x.shape[1], False, physics)
+        with_lists = plan.lists_neighbours
+        in_place = with_lists and plan.state_dim % plan.width == 0 and is_aligned(s)
+        ordered = sort_worlds(plan, x, None if in_place else s, None, with_rows=not with_lists)
+        # World k of a batch equals that world alone, bit for bit: the lists must not depend on the
+        # number of worlds.
+        densities = compute_densities(
+            plan,
+            ordered,
+            environment_lists(plan.request),
+            state_index=ordered.original_index if in_place else None,
+            with_particles=False,
+        )
+        destination = ordered.original_index
+        if world_indices is not None:
+            moved = world_indices - torch.arange(len(world_indices), device=x.device)
+            shift = (moved * plan.particle_count).int()[:, None]
+            destination = (destination.view(plan.world_count, -1) + shift).view(-1)
+        self._launch_of = functools.partial(
+            perception_launch,
+            plan,
+            ordered,
+            densities,
+            states=s if in_place else None,
+            destination=destination,
+            limit=physics.limits.perception,
+        )
+        self._shape = *x.shape[:2], physics.perception_dim
+        self._like = x
         self._perceived = False
         self._tape: Tape | None = None
 
@@ -411,44 +442,3 @@ class NeighbourState:
         self._tape.move(self._slots, rows)
         self._tape.replay()
         return out
-
-
-def build_neighbours(
-    x: Tensor, s: Tensor, physics: Physics, world_indices: Tensor | None = None
-) -> NeighbourState:
-    """Return x and s, unchecked, sorted into cells with densities; valid until one changes.
-
-    `world_indices`, int64, shape [B], are the worlds' indices in a larger batch, into which
-    perception is written; default: the worlds are the whole batch.
-    """
-    x, s = x.contiguous(), s.contiguous()
-    plan = plan_kernels(x, x.shape, s.shape[2], x.shape[0] * x.shape[1], False, physics)
-    with_lists = plan.lists_neighbours
-    in_place = with_lists and plan.state_dim % plan.width == 0 and is_aligned(s)
-    ordered = sort_worlds(plan, x, None if in_place else s, None, with_rows=not with_lists)
-    # World k of a batch equals that world alone, bit for bit: the lists must not depend on the
-    # number of worlds.
-    densities = compute_densities(
-        plan,
-        ordered,
-        environment_lists(plan.request),
-        state_index=ordered.original_index if in_place else None,
-        with_particles=False,
-    )
-    destination = ordered.original_index
-    if world_indices is not None:
-        shift = (
-            world_indices - torch.arange(len(world_indices), device=x.device)
-        ) * plan.particle_count
-        destination = (destination.view(plan.world_count, -1) + shift.int()[:, None]).view(-1)
-
-    launch_of = functools.partial(
-        perception_launch,
-        plan,
-        ordered,
-        densities,
-        states=s if in_place else None,
-        destination=destination,
-        limit=physics.limits.perception,
-    )
-    return NeighbourState(launch_of, (*x.shape[:2], physics.perception_dim), x)

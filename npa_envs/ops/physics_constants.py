@@ -118,7 +118,7 @@ class Physics(NamedTuple):
     def from_list(cls, numbers: list[float]) -> Physics:
         """Return the constants in a list by `numbers`: all but limits, D and C."""
         count = len(NUMBER_FIELDS)
-        state_gradient, inverse, density_gradient, moving, boundary, *sides = numbers[count:]
+        inverse, boundary, state_gradient, density_gradient, moving, *sides = numbers[count:]
         return cls(
             space_dim=0,
             state_dim=0,
@@ -134,9 +134,9 @@ class Physics(NamedTuple):
         """Return all but limits, D and C as a list of numbers, which torch operators can take."""
         state_gradient, inverse, density_gradient = self.terms
         choices = INVERSES.index(inverse), BOUNDARIES.index(self.boundary)
-        flags = state_gradient, choices[0], density_gradient, self.moving, choices[1]
+        flags = map(float, (*choices, state_gradient, density_gradient, self.moving))
         scalars = [getattr(self, name) for name in NUMBER_FIELDS]
-        return [constant(number) for number in (*scalars, *map(float, flags), *(self.box or ()))]
+        return [constant(number) for number in (*scalars, *flags, *(self.box or ()))]
 
     def scale(self) -> float:
         """Return c = eps / eps0, the factor on perceived gradients."""

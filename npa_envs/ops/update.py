@@ -136,7 +136,7 @@ class _UpdateParticles(torch.autograd.Function):
         rows: Rows,
         physics: Physics,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        ctx.options = rows.row_base, physics
+        ctx.row_base, ctx.physics = rows.row_base, physics
         before = (x, rows.row_of) if physics.boundary == "reflecting" else ()
         ctx.save_for_backward(update, rows.row_particle, rows.starts, *before)
         return _update_particles(update, x, s, path_length, rows.row_of, physics, True)
@@ -145,21 +145,19 @@ class _UpdateParticles(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *bars: Tensor) -> tuple[Tensor | None, ...]:
         update, row_particle, starts, *before = ctx.saved_tensors
-        bars = _before_reflection(ctx.options[1], update, *before, *bars) if before else bars
-        arguments: list[Any] = [update, *bars, row_particle, starts, *ctx.options]
-        update_bar = _update_particles_backward(*arguments)
-        return (update_bar, *bars, None, None)
-
-
-def _before_reflection(
-    physics: Physics, update: Tensor, x: Tensor, row_of: Tensor, x_bar: Tensor, *others: Tensor
-) -> tuple[Tensor, ...]:
-    """Return the outputs' gradients, that of positions mirrored where walls reflected them."""
-    assert physics.box is not None
-    # Positions do not depend on states and paths: any tensors of their shapes will do.
-    s_bar, path_bar = (bar.contiguous() for bar in others)
-    free, *_ = _update_particles(update, x, s_bar, path_bar, row_of, physics, False)
-    return x_bar * _mirror_signs(free, physics.box), *others
+        x_bar, s_bar, path_bar = bars
+        physics: Physics = ctx.physics
+        if before and physics.box is not None:
+            # Where walls reflected a position, its gradient is mirrored. Positions do not depend on
+            # states and paths: any tensors of their shapes will do.
+            x, row_of = before
+            others = s_bar.contiguous(), path_bar.contiguous()
+            free, *_ = _update_particles(update, x, *others, row_of, physics, False)
+            x_bar = x_bar * _mirror_signs(free, physics.box)
+        update_bar = _update_particles_backward(
+            update, x_bar, s_bar, path_bar, row_particle, starts, ctx.row_base, physics
+        )
+        return update_bar, x_bar, s_bar, path_bar, None, None
 
 
 def update_particles(
@@ -226,11 +224,10 @@ class ActedWorlds(NamedTuple):
         check_world(x, s)
         check_derivatives(action=action, x=x, s=s, noise=self.noise)
         worlds = x.shape[:2]
-        action_dim = s.shape[2] + (x.shape[2] if physics.moving else 0)
         for name, tensor, size, dtype in (
             ("x", x, x.shape, x.dtype),
             ("s", s, s.shape, x.dtype),
-            ("action", action, (*worlds, action_dim), x.dtype),
+            ("action", action, (*worlds, physics.action_dim), x.dtype),
             ("mask", self.mask, worlds, torch.uint8),
             ("noise", self.noise, x.shape, x.dtype),
             ("enabled", self.enabled, (1,), torch.uint8),

@@ -15,7 +15,7 @@ from npa_envs.ops.backend import SHARED_WORLD
 from npa_envs.ops.draws import draw
 from npa_envs.ops.equivariance import MIXED_VECTORS, VectorSizes, read_rows, steer_rows
 from npa_envs.ops.network import arrange_weights, run_network
-from npa_envs.ops.perceive import build_neighbours, perceive, perceive_rows
+from npa_envs.ops.perceive import NeighbourState, perceive, perceive_rows
 from npa_envs.ops.physics_constants import Limits, Physics
 from npa_envs.ops.pictures.cameras import orbit
 from npa_envs.ops.pictures.gaussians import render_gaussians
@@ -67,7 +67,7 @@ def warmup(
             # Small, medium and large worlds run different kernels.
             for count in (2, SHARED_WORLD, SHARED_WORLD + 1):
                 positions, states = (v.detach()[:, :1].expand(-1, count, -1) for v in (x, s))
-                build_neighbours(positions, states, physics).perceive()
+                NeighbourState(positions, states, physics).perceive()
                 _warm_steps(positions, states, physics)
                 if space_dim == 2:
                     target, middle = x.new_zeros(8, 8, 4), x.new_zeros(2)
@@ -77,7 +77,10 @@ def warmup(
             _warm_static(x, s, physics)
             _warm_network(x, physics)
             _warm_invariants(x, state_dim)
-            _warm_actions(x, s, physics)
+            enabled, diverged = torch.ones(2, 1, dtype=torch.uint8, device=device)
+            copies = x.detach().clone(), s.detach().clone()
+            acted = ActedWorlds(*copies, None, None, enabled, diverged)
+            PreparedActions(acted, physics)(x.new_zeros(1, 2, physics.action_dim))
             if space_dim == 2:
                 _pull_back(splat(x, x.new_zeros(1, 2, 3), resolution=8, pixel_size=0.1))
             else:
@@ -169,22 +172,10 @@ def _warm_views(x: torch.Tensor) -> None:
         x, scales, quaternions, x.new_ones(x.shape[:2]), colours, cameras.to(x)
     )
     _pull_back(pictures.image)
-    corners = torch.zeros(1, 3, dtype=torch.float64, device="cpu")
-    nearest_triangles(
-        corners[..., None].expand(-1, -1, 2),
-        corners,
-        corners[0, :, None].expand(-1, 3),
-        torch.arange(3, device="cpu")[None],
-        corners[:, :1] == 0.0,
-        width=1,
-        height=1,
-    )
-
-
-def _warm_actions(x: torch.Tensor, s: torch.Tensor, physics: Physics) -> None:
-    enabled, diverged = torch.ones(2, 1, dtype=torch.uint8, device=x.device)
-    worlds = ActedWorlds(x.detach().clone(), s.detach().clone(), None, None, enabled, diverged)
-    PreparedActions(worlds, physics)(x.new_zeros(*x.shape[:2], physics.action_dim))
+    corners = torch.zeros(3, 3, dtype=torch.float64, device="cpu")
+    faces = torch.arange(3, device="cpu")[None]
+    seen = faces[:, :1] == 0
+    nearest_triangles(corners[None, :, :2], corners[:1], corners, faces, seen, width=1, height=1)
 
 
 def _pull_back(value: torch.Tensor) -> None:

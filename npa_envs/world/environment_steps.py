@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 from npa_envs.ops.perceive import NeighbourState as NeighbourState
-from npa_envs.ops.perceive import build_neighbours as build_neighbours
 from npa_envs.ops.physics_constants import Boundary as Boundary
 from npa_envs.ops.physics_constants import Limits as Limits
 from npa_envs.ops.physics_constants import Physics as Physics

@@ -19,7 +19,7 @@ from npa_envs import reference
 from npa_envs.ops import launch as threads
 from npa_envs.ops import orbit, render_gaussians, splat
 from npa_envs.ops.launch import even_ranges, run_together
-from npa_envs.ops.perceive import build_neighbours
+from npa_envs.ops.perceive import NeighbourState
 from npa_envs.ops.physics_constants import Limits, Physics
 from npa_envs.ops.pictures.splat import picture_losses
 from npa_envs.ops.update import ActedWorlds, PreparedActions
@@ -207,7 +207,7 @@ def acted_and_observed(x, s):
     actions = PreparedActions(ActedWorlds(x, s, None, None, enabled, diverged), physics)
     for k in range(2):
         actions(torch.cat((x, s), dim=-1).roll(k, dims=1))
-    neighbours = build_neighbours(x, s, physics)
+    neighbours = NeighbourState(x, s, physics)
     first = neighbours.perceive()
     return x, s, diverged, first, neighbours.perceive(torch.empty_like(first))
 

@@ -20,7 +20,7 @@ from support.worlds import (
 
 import npa_envs
 from npa_envs import reference as oracle
-from npa_envs.ops.perceive import build_neighbours
+from npa_envs.ops.perceive import NeighbourState
 from npa_envs.ops.physics_constants import Limits, Terms, make_physics
 
 # The bound of the tests, then the worst error measured on CPUs and CUDA: a quarter of it at most.
@@ -157,7 +157,7 @@ def test_a_clump_takes_no_more_memory_than_the_same_particles_apart(space_dim):
 def observed(x, s, *, eps=0.2, eps0=0.2, box=None, limit=16.0, **terms):
     options = {"eps": eps, "eps0": eps0, "box": box, "terms": Terms(**terms)}
     physics = make_physics(x.shape[2], s.shape[2], x.dtype, **options)
-    return build_neighbours(x, s, physics._replace(limits=Limits(perception=limit)))
+    return NeighbourState(x, s, physics._replace(limits=Limits(perception=limit)))
 
 
 @both_inverses

@@ -24,10 +24,10 @@ def nearest_triangles(
     Everything is on the CPU, in float64. A triangle covers a pixel if it covers the centre.
 
     Args:
-        positions: Coordinates of J corners in the pictures of V cameras [pixels], shape [V, J, 2].
-        nearness: 1 / depth of the corners [1 / length units], shape [V, J].
-        colours: Colours of the corners, shape [J, 3].
-        faces: Corners of each triangle, from 0 to J − 1, shape [F, 3].
+        positions: Coordinates of Q corners in the pictures of V cameras [pixels], shape [V, Q, 2].
+        nearness: 1 / depth of the corners [1 / length units], shape [V, Q].
+        colours: Colours of the corners, shape [Q, 3].
+        faces: Corners of each triangle, from 0 to Q − 1, shape [F, 3].
         visible: Whether a triangle is visible to a camera, shape [V, F].
     """
     count = len(positions)
