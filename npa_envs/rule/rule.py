@@ -57,7 +57,6 @@ STEP_PARTS = frozenset(
         "_call_impl",
         "_folded",
         "_folded_invariants",
-        "_update_by_invariants",
         "_with_code_zeros",
         "division_probabilities",
         "folded",
@@ -311,9 +310,14 @@ class NPARule(nn.Module):
         Returns:
             Updates [δ (D) ; Δs (C)], dimensionless, shape [..., A]; δ is not yet bounded.
         """
+        output: Tensor
         if self.equivariant:
-            return self._update_by_invariants(perception)
-        output: Tensor = self.output(torch.relu(self.hidden(perception)))
+            mixed, inputs = invariants(perception, self.mixing, self.vector_form)
+            output = self.output(torch.relu(self.hidden(inputs)))
+            return (
+                output if self.static else steered(output, mixed, self.steering, self.vector_form)
+            )
+        output = self.output(torch.relu(self.hidden(perception)))
         return self._with_code_zeros(without_small(output, self.dead_zone), dim=-1)
 
     @property
@@ -329,12 +333,6 @@ class NPARule(nn.Module):
         shape = list(states.shape)
         shape[dim] = self.code_dim
         return torch.cat((moves, states.new_zeros(shape), states), dim=dim)
-
-    def _update_by_invariants(self, perception: Tensor) -> Tensor:
-        """Do as `forward`, for an equivariant rule."""
-        mixed, inputs = invariants(perception, self.mixing, self.vector_form)
-        output: Tensor = self.output(torch.relu(self.hidden(inputs)))
-        return output if self.static else steered(output, mixed, self.steering, self.vector_form)
 
     def is_plain(self) -> bool:
         """Return whether the rule computes only its two layers, so that `folded` may replace it.

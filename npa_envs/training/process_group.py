@@ -171,7 +171,7 @@ class RunRandomness:
     `worlds` which worlds a batch has, their damage and seeds; `masks` which particles are updated.
 
     By default a batch draws from generators, whose states checkpoints store. With
-    `per_world_streams`, which runs of several processes need, each world has streams of its own.
+    `per_world_streams`, which runs of several processes need, each world has its own streams.
     They depend on the seed, the world's index among those of all processes, and the iteration, so
     they are the same for any number of processes, and checkpoints need not store them.
     """

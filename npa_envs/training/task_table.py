@@ -63,13 +63,14 @@ class TaskEntry:
         """
         if config.device != "cpu":
             return None
-        return self.fast_seconds * _particle_steps(config) / _particle_steps(self.presets["fast"])
-
-
-def _particle_steps(config: TrainConfig[Any]) -> int:
-    species = getattr(config.task, "species", (config.task,))
-    particles: int = sum(one.particle_count for one in species)
-    return config.total_iterations * config.world_count * particles * sum(config.steps)
+        ours, fast = (
+            run.total_iterations
+            * run.world_count
+            * sum(run.steps)
+            * sum(task.particle_count for task in getattr(run.task, "species", (run.task,)))
+            for run in (config, self.presets["fast"])
+        )
+        return self.fast_seconds * ours / fast
 
 
 TASKS: Mapping[str, TaskEntry] = {

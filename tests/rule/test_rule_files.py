@@ -452,9 +452,6 @@ BAD_EQUIVARIANT = {
     "few inputs": (lambda e: e.update({"w1.weight": ones(5, 8)}), "must have"),
     "no channels": (lambda e: e.update(W_hidden=ones(1, 8)), "must have the"),
 }
-BAD_EQUIVARIANT_STATES = {
-    "a missing key": (lambda s: s.pop("model.W_out"), r"missing: \['model.W_out'\]"),
-}
 BAD_STACKS = {
     "fewer rules": (lambda e: e.update({"w2.bias": ones(1, 8)}), "w2.bias must have as many ru"),
     "a huge stack": (
@@ -464,21 +461,16 @@ BAD_STACKS = {
 }
 
 
-def write_state(path, state):
-    torch.save(state, path)
-
-
-def write_entry(path, entry):
-    write_json(path, {"mine": entry})
-
-
-def changed(make, write):
-    """Return a function that writes a file whose content is changed first."""
+def changed(make):
+    """Return a function that writes a file of the authors whose content is changed first."""
 
     def write_changed(path, change):
         content = make()
         change(content)
-        write(path, content)
+        if path.suffix == ".pth":
+            torch.save(content, path)
+        else:
+            write_json(path, content if path.stem == "stack" else {"mine": content})
 
     return write_changed
 
@@ -489,14 +481,14 @@ def equivariant_demo():
 
 FORMATS = {
     "rule.safetensors": (write_ours, BAD_HEADERS),
-    "npa.pth": (changed(lambda: authors_state(NPARule()), write_state), BAD_STATES),
-    "equivariant.pth": (changed(equivariant_state, write_state), BAD_EQUIVARIANT_STATES),
-    "models.json": (changed(lambda: demo_entry(demo_tensors(NPARule())), write_entry), BAD_ENTRIES),
-    "equivariant.json": (
-        changed(lambda: demo_entry(equivariant_demo()), write_entry),
-        BAD_EQUIVARIANT,
+    "npa.pth": (changed(lambda: authors_state(NPARule())), BAD_STATES),
+    "equivariant.pth": (
+        changed(equivariant_state),
+        {"a missing key": (lambda s: s.pop("model.W_out"), r"missing: \['model.W_out'\]")},
     ),
-    "stack.json#1": (changed(lambda: demo_stack([equivariant_demo()] * 2), write_json), BAD_STACKS),
+    "models.json": (changed(lambda: demo_entry(demo_tensors(NPARule()))), BAD_ENTRIES),
+    "equivariant.json": (changed(lambda: demo_entry(equivariant_demo())), BAD_EQUIVARIANT),
+    "stack.json#1": (changed(lambda: demo_stack([equivariant_demo()] * 2)), BAD_STACKS),
 }
 """How a changed file is written and the changes that are refused; #1: a stack's second rule."""
 

@@ -7,7 +7,6 @@ import pytest
 
 import npa_envs
 from npa_envs.cli import main
-from npa_envs.errors import NPAError
 from npa_envs.measure.quality import accuracies, evaluate, score_line, scores
 from npa_envs.rule.files import rule_metadata, shipped_rules
 from npa_envs.training.task_of_rule import task_of_rule
@@ -100,9 +99,3 @@ def test_the_list_tells_every_score(capsys):
         assert score_line(scores(name)) in text
     assert "gecko: morphogenesis2d, 10880 weights; splat loss 0.087 at 128, 0.0835 at 256" in text
     assert "98.1% of clouds by majority, 96.7% of particles at step 32" in text
-
-
-def test_scores_of_an_unknown_rule_are_refused():
-    for name, message in (("geko", r"unknown rule 'geko'.*gecko"), (3, "unknown rule 3: known: b")):
-        with pytest.raises(NPAError, match=message):
-            scores(name)
