@@ -105,7 +105,7 @@ class RuleWorld(LiveWorld):
         )
 
     def _plant(self, name: Any, particle_count: int | None = None) -> None:
-        """Choose a rule with the task that it was trained on, and start a fresh world."""
+        """Choose a rule with the task that it was trained on, and start a new world."""
         main = self._live_rule(name)
         self.trained = self._trained(main.name, particle_count)
         self.main = main
@@ -117,14 +117,14 @@ class RuleWorld(LiveWorld):
 
     @torch.no_grad()
     def _begin(self, seed: int | None) -> None:
-        """Start a fresh world whose particles all follow the chosen rule."""
+        """Start a new world whose particles all follow the chosen rule."""
         super()._begin(seed)
         self._generator = torch.Generator(self._device).manual_seed(self.seed)
         seed_world = self.task.seed(1, generator=self._generator, device=self._device)
         # The goal is the world's: it is no field of particles that come and go.
         self.particles, self._goal = seed_world._replace(goal=None), seed_world.goal
         self.count = self.particles.x.shape[1]
-        """Particles of a fresh world."""
+        """Particles of a newly seeded world."""
         self.live_rules = [replace(self.main, count=self.count, divisor=float(self.count))]
         self._colouring = Colouring()
         self._loss_due = 0.0
@@ -259,7 +259,7 @@ class RuleWorld(LiveWorld):
         if self._is_unchanged():
             x, s, path_length = rollout(rules[0], x, s, steps, return_path_length=True, **options)
         else:
-            # Divided by the particles of a fresh world: particles that a brush adds or removes
+            # Divided by the particles of a newly seeded world: those that a brush adds or removes
             # change only the densities around them.
             divisors = [live_rule.divisor for live_rule in self.live_rules]
             x, s, path_length = rollout_species(
@@ -445,7 +445,7 @@ class RunWorld(RuleWorld):
 
     @torch.no_grad()
     def _begin(self, seed: int | None) -> None:
-        """Start a fresh world of all rules of the run."""
+        """Start a new world of all rules of the run."""
         super()._begin(seed)
         if len(self._files) == 1:
             return

@@ -234,7 +234,7 @@ class ViewerSession:
         self._free_frames = threading.BoundedSemaphore(FRAMES_AHEAD)
         self._stopped = threading.Event()
         self._pictures: list[bytes] | None = None
-        """The film that is being recorded, or None."""
+        """The pictures of the film, while one is made."""
 
     async def serve(self) -> None:
         """Read and write until the page disconnects or the server stops."""

@@ -47,14 +47,15 @@ const DAMAGES = {
 };
 
 export class RuleWorld {
-  // settings: {rules, seed, ramp, constants} as npa_envs/web/export.py writes them; the first rule is shown
+  // settings: {rules, seed, colours, constants} as npa_envs/web/export.py writes them; the first rule is shown
   // first. send(event, transferred) sends an event to the page; device: a GPU, or null.
   // settings.engine: "auto" uses the GPU if it is faster, "gpu" always.
   constructor(settings, send, device = null) {
     this.device = device;
     this.engine = settings.engine ?? "auto";
     this.rules = settings.rules.map(decoded);
-    this.ramp = bytesOf(settings.ramp);
+    this.colourTables = {};
+    for (const [name, text] of Object.entries(settings.colours)) this.colourTables[name] = bytesOf(text);
     this.constants = settings.constants;
     this.send = send;
     this.playing = true;
@@ -71,7 +72,7 @@ export class RuleWorld {
     return rule;
   }
 
-  // Chooses a rule with the settings of its task, and starts a fresh world.
+  // Chooses a rule with the settings of its task, and starts a new world.
   choose(rule) {
     this.rule = rule;
     this.values = {};
@@ -81,17 +82,17 @@ export class RuleWorld {
     this.reset(this.seed);
   }
 
-  // Starts a fresh world whose particles all follow the chosen rule.
+  // Starts a new world whose particles all follow the chosen rule.
   reset(seed) {
     this.seed = seed;
     this.random = new Random(seed);
     this.steps = this.milliseconds = 0;
     this.species = [this.rule];
-    // Each species divides densities by the particles of a fresh world: particles that a brush adds or
+    // Each species divides densities by the particles of a newly seeded world: particles that a brush adds or
     // removes change only the densities around them.
     this.seedCount = this.values.count;
     this.divisors = [this.seedCount];
-    this.colouring = new Colouring(this.ramp);
+    this.colouring = new Colouring(this.colourTables);
     this.setParticles(this.seedPositions(), new Float32Array(this.seedCount * this.channels), new Uint8Array(this.seedCount));
     this.prepare();
     this.announce();
@@ -109,7 +110,7 @@ export class RuleWorld {
     return this.rule.world.box;
   }
 
-  // Returns positions of a fresh world [length units].
+  // Returns positions of a newly seeded world [length units].
   seedPositions() {
     const { seed } = this.rule.world;
     if (seed.kind === "ball") return this.random.ball(this.seedCount, this.dimension, seed.radius);
@@ -456,7 +457,7 @@ class Random {
     return vector.map((part) => part / length);
   }
 
-  // Points uniform in a ball around the origin [length units], one after the other.
+  // Points uniform in a ball around the origin [length units].
   ball(count, dimension, radius) {
     const points = new Float32Array(count * dimension);
     for (let i = 0; i < count; i++) {
