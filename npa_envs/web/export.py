@@ -45,14 +45,6 @@ POLICY = (
 )
 """The page's content security policy: it may load nothing."""
 
-CONSTANTS = {
-    "AGREEMENTS": AGREEMENTS,
-    "CLUMP_FACTOR": CLUMP_FACTOR,
-    "DAMAGE_SIZES": DAMAGE_SIZES,
-    "MIN_SEED": MIN_SEED,
-}
-"""Numbers and names of the Python worlds that page_world.js also needs."""
-
 IMPORT = re.compile(r'^import (\{[^}]*\}) from "\./([\w.]+)";', re.MULTILINE)
 EXPORT = re.compile(r"^export (?=(?:async )?(?:function|class|const) (\w+))", re.MULTILINE)
 """The only forms of imports and exports in the page's modules."""
@@ -240,7 +232,12 @@ def page_text(
             name: base64.b64encode(table.tobytes()).decode()
             for name, table in colour_tables(len(rules)).items()
         },
-        "constants": CONSTANTS,
+        "constants": {
+            "AGREEMENTS": AGREEMENTS,
+            "CLUMP_FACTOR": CLUMP_FACTOR,
+            "DAMAGE_SIZES": DAMAGE_SIZES,
+            "MIN_SEED": MIN_SEED,
+        },
         "rules": rules,
     }
     # With "<" a rule's text could end the script element.

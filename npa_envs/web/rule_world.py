@@ -316,7 +316,8 @@ class RuleWorld(LiveWorld):
                 self.particles = self.particles._replace(s=wipe_state(x, s, **ball))
             case "remove":
                 outside = ~inside_ball(x, box=self.box, **ball)[0]
-                self._arrange(_taken(self.particles, outside), self._species()[outside])
+                kept = self.particles.map(lambda value: value[:, outside])
+                self._arrange(kept, self._species()[outside])
             case "graft":
                 self._graft(touch)
             case "add":
@@ -389,17 +390,12 @@ class RuleWorld(LiveWorld):
         if not torch.equal(order, torch.arange(self.particles.x.shape[1], device=order.device)):
             # The page's tracers follow particles by their index.
             self._events.append({"type": "reordered"})
-        self.particles = _taken(particles, order)
+        self.particles = particles.map(lambda value: value[:, order])
         counts = torch.bincount(species, minlength=len(self.live_rules)).tolist()
         for live_rule, count in zip(self.live_rules, counts, strict=True):
             live_rule.count = count
         present = [live_rule for live_rule in self.live_rules if live_rule.count]
         self.live_rules = present or self.live_rules[:1]
-
-
-def _taken(particles: Particles, indices: Tensor) -> Particles:
-    """Return the particles that indices or a mask [N] select."""
-    return particles.map(lambda value: value[:, indices])
 
 
 def name_of(source: str) -> str:
@@ -441,7 +437,8 @@ class RunWorld(RuleWorld):
         super().__init__(
             str(files[0]), device=device, seed=seed, particle_count=self._each, choices=choices
         )
-        self._goals = self._goal_choices()
+        rules = {name: self._live_rule(name).rule for name in self._files}
+        self._run_identities = self._identities(rules)
 
     @torch.no_grad()
     def _begin(self, seed: int | None) -> None:
@@ -516,21 +513,17 @@ class RunWorld(RuleWorld):
         return bool(points)
 
     def _take_rules(self) -> None:
-        """Load the newest rules; the world continues if they have the same hyper-parameters."""
+        """Load the newest rules; the world continues if they are of the same run."""
         self._resting = False
         new_rules = {
             name: load_rule(path, device=self._device).float() for name, path in self._files.items()
         }
-        rules = {name: self._live_rule(name).rule for name in new_rules}
-        goals = self._goal_choices()
+        identities = self._identities(new_rules)
         # Cached tasks have the codes of the old rules.
         self._trained.cache_clear()
-        if goals == self._goals and all(
-            new_rules[name].hyper_parameters() == rule.hyper_parameters()
-            for name, rule in rules.items()
-        ):
-            for name, rule in rules.items():
-                rule.load_state_dict(new_rules[name].state_dict())
+        if identities == self._run_identities:
+            for name, rule in new_rules.items():
+                self._live_rule(name).rule.load_state_dict(rule.state_dict())
             task = self.task.for_rule(self.main.rule)
             self.trained = replace(self.trained, task=task)
             with torch.no_grad():
@@ -541,16 +534,17 @@ class RunWorld(RuleWorld):
             self._rules.clear()
             self._plant(self.main.name, self._each)
             self._events.append({"type": "reordered"})
-        self._goals = goals
+        self._run_identities = identities
 
-    def _goal_choices(self) -> list[Any]:
-        """Return the task's name and configuration of each rule's file; they tell another run."""
-        goals: list[Any] = []
-        for path in self._files.values():
+    def _identities(self, rules: Mapping[str, NPARule]) -> list[Any]:
+        """Return hyper-parameters and tasks of the run's rules, which are others in another run."""
+        identities: list[Any] = []
+        for name, rule in rules.items():
+            path = self._files[name]
             metadata = rule_metadata(path)
             config = trained_config(path, metadata).task if "config" in metadata else None
-            goals.append((metadata.get("task"), config))
-        return goals
+            identities.append((rule.hyper_parameters(), metadata.get("task"), config))
+        return identities
 
 
 def _version(path: Path) -> tuple[int, ...] | None:

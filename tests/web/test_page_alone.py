@@ -11,10 +11,8 @@ import pytest
 
 from npa_envs.web.live_world import TOOLS
 
-TOOLS_SENT = json.dumps([{"name": name} | tool._asdict() for name, tool in TOOLS.items()])
-SETUP = (
-    f"const tools = {TOOLS_SENT};"
-    """
+SENT_TOOLS = [{"name": name} | tool._asdict() for name, tool in TOOLS.items()]
+SETUP = """
 const world = { type: "world", title: "t", dimension: 2, tools, capabilities: ["film"] };
 const frame = (step, places = [0, 0, 1, 1]) => ({
   type: "frame", step, positions: new Float32Array(places), colours: new Uint8Array(6),
@@ -25,7 +23,6 @@ listen(world);
 tick();
 sent.length = 0;
 """
-)
 
 
 @pytest.fixture
@@ -34,7 +31,8 @@ def run(modules):
 
     def script(text):
         program = str(Path(__file__).with_name("run_page.mjs"))
-        command = ["node", program, str(modules), SETUP + text]
+        tools = f"const tools = {json.dumps(SENT_TOOLS)};"
+        command = ["node", program, str(modules), tools + SETUP + text]
         output = subprocess.check_output(command, text=True, timeout=300, encoding="utf-8")
         return json.loads(output)
 

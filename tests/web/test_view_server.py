@@ -30,19 +30,17 @@ THERE = "ws://lab.example:8765/socket"
 
 
 class Counter:
-    """A live world of two particles that counts its steps, and remembers its messages."""
+    """A live world of two particles that counts its steps."""
 
     def __init__(self) -> None:
         self.playing = True
         self.step = 0
-        self.messages: list[dict] = []
         self.closed = threading.Event()
 
     def describe(self):
         return {"type": "world", "title": "counter", "playing": self.playing}
 
     def handle(self, message):
-        self.messages.append(message)
         match message.get("type"):
             case "play":
                 self.playing = message["on"]
