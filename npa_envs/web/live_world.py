@@ -79,7 +79,7 @@ TOOLS = {
         icon="M12 4a8 8 0 1 0 .1 0M12 8v8M8 12h8",
     ),
 }  # fmt: skip
-"""All brushes, in the order of their buttons and keys. `brushed` applies those that change
+"""All brushes, in the order of their buttons and keys. `LiveWorld._brush` applies those that change
 positions or states, `RuleWorld._brush` the others, and `BRUSHES` of page_world.js all."""
 
 
@@ -239,7 +239,24 @@ class LiveWorld(ABC):
 
     def _brush(self, touch: Touch) -> bool:
         """Apply a brush; return whether `describe` returns something else now."""
-        self.particles = brushed(self.particles, touch, self.box)
+        x, s, *_ = self.particles
+        disk: dict[str, Any] = {"radius": touch.radius, "box": self.box}
+        match touch.tool:
+            case "push":
+                x = push(x, centre=touch.at, move=touch.move, strength=touch.amount, **disk)
+            case "clump":
+                x, s = clump(x, s, centre=touch.at, factor=touch.amount, **disk)
+            case "cut":
+                space_dim, half = x.shape[2], 0.5 * touch.move
+                move = torch.nn.functional.pad(touch.move, (0, 3 - space_dim))
+                normal = torch.linalg.cross(touch.view, move)[:, :space_dim]
+                line: dict[str, Any] = {"centre": touch.at + half, "normal": normal, "along": half}
+                x, s = cut(x, s, gap=touch.radius, box=self.box, **line)
+            case "inject":
+                state, exists = state_around(x, s, centre=touch.source, **disk)
+                weight = touch.amount * exists.to(x.dtype)
+                s = inject(x, s, centre=touch.at, state=state, strength=weight, **disk)
+        self.particles = self.particles._replace(x=x, s=s)
         return False
 
     def _set(self, name: str, value: Any) -> bool:
@@ -306,28 +323,6 @@ class Touch(NamedTuple):
             _checked_vector("view", message.get("view", [0.0, 0.0, 1.0]), 3, x),
             message.get("rule"),
         )
-
-
-def brushed(particles: Particles, touch: Touch, box: tuple[float, ...] | None) -> Particles:
-    """Return particles after the brush push, clump, cut or inject."""
-    x, s, *_ = particles
-    disk: dict[str, Any] = {"radius": touch.radius, "box": box}
-    match touch.tool:
-        case "push":
-            x = push(x, centre=touch.at, move=touch.move, strength=touch.amount, **disk)
-        case "clump":
-            x, s = clump(x, s, centre=touch.at, factor=touch.amount, **disk)
-        case "cut":
-            space_dim, half = x.shape[2], 0.5 * touch.move
-            move = torch.nn.functional.pad(touch.move, (0, 3 - space_dim))
-            normal = torch.linalg.cross(touch.view, move)[:, :space_dim]
-            line: dict[str, Any] = {"centre": touch.at + half, "normal": normal, "along": half}
-            x, s = cut(x, s, gap=touch.radius, box=box, **line)
-        case "inject":
-            state, exists = state_around(x, s, centre=touch.source, **disk)
-            weight = touch.amount * exists.to(x.dtype)
-            s = inject(x, s, centre=touch.at, state=state, strength=weight, **disk)
-    return particles._replace(x=x, s=s)
 
 
 def checked_seed(value: Any) -> int:

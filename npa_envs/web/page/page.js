@@ -441,8 +441,15 @@ class Controls {
     $("other-field").hidden = !world.tools.some(({ takes }) => takes === "rule");
     $("brush").hidden = !world.tools.length;
     this.showTools();
-    this.showDamages();
-    this.showSettings();
+    $("damages").hidden = !world.damages.length;
+    $("damages").replaceChildren(...world.damages.map((name) => make("button", {
+      textContent: name, title: `Damage: ${name}`, onclick: () => this.page.send({ type: "damage", name }),
+    })));
+    $("physics").hidden = !PHYSICS.some((name) => name in world.settings);
+    for (const name of ["speed", ...PHYSICS]) {
+      $(name).parentElement.hidden = !world.settings[name];
+      if (world.settings[name]) this.slider($(name), name, world.settings[name]);
+    }
   }
 
   fold(away) {
@@ -477,22 +484,6 @@ class Controls {
       return button;
     }));
     tools.choose(tools.chosen.name);
-  }
-
-  showDamages() {
-    $("damages").hidden = !this.page.world.damages.length;
-    $("damages").replaceChildren(...this.page.world.damages.map((name) => make("button", {
-      textContent: name, title: `Damage: ${name}`, onclick: () => this.page.send({ type: "damage", name }),
-    })));
-  }
-
-  showSettings() {
-    const { settings } = this.page.world;
-    $("physics").hidden = !PHYSICS.some((name) => name in settings);
-    for (const name of ["speed", ...PHYSICS]) {
-      $(name).parentElement.hidden = !settings[name];
-      if (settings[name]) this.slider($(name), name, settings[name]);
-    }
   }
 
   slider(input, name, { value, low, high, scale, whole }) {
