@@ -23,7 +23,7 @@ from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule, check_rule
 from npa_envs.tasks.damage import CLUMP_FACTOR, DAMAGE_SIZES
 from npa_envs.tasks.point_classification import PALETTE, UNDECIDED, PointClassification
-from npa_envs.web.live_world import checked_seed, colour_ramp
+from npa_envs.web.live_world import checked_seed, colour_tables
 from npa_envs.web.rule_world import MIN_SEED, RuleWorld, name_of
 from npa_envs.world.species import AGREEMENTS
 
@@ -44,14 +44,6 @@ POLICY = (
     "worker-src blob:; img-src data: blob:; media-src blob:; base-uri 'none'; form-action 'none'"
 )
 """The page's content security policy: it may load nothing."""
-
-CONSTANTS = {
-    "AGREEMENTS": AGREEMENTS,
-    "CLUMP_FACTOR": CLUMP_FACTOR,
-    "DAMAGE_SIZES": DAMAGE_SIZES,
-    "MIN_SEED": MIN_SEED,
-}
-"""Numbers and names of the Python worlds that page_world.js also needs."""
 
 IMPORT = re.compile(r'^import (\{[^}]*\}) from "\./([\w.]+)";', re.MULTILINE)
 EXPORT = re.compile(r"^export (?=(?:async )?(?:function|class|const) (\w+))", re.MULTILINE)
@@ -97,7 +89,7 @@ def export_web(
         path: The file to write, ending in `.html`; an existing one is replaced.
         title: Title of the page; None: the first rule's name.
         particle_count: Particles of each world; None: as trained.
-        previews: Begin with pictures of the rules' grown worlds to choose from.
+        previews: Begin with pictures of the rules' worlds after some steps, to choose from.
         seed: Seed of the first world, 0 to 2^53 - 1.
 
     Raises:
@@ -123,15 +115,15 @@ def export_web(
             )
     if title is not None and not isinstance(title, str):
         raise NPAError(f"title must be text, or None for the first rule's name, got {shown(title)}")
-    words = [str(source) for source in sources]
-    names = distinct_names(words, "a page")
+    texts = [str(source) for source in sources]
+    names = distinct_names(texts, "a page")
     seed = checked_seed(seed)
     # Opened first: an error in the path is reported before the slow growth of previews.
     with atomic_path(path) as temporary:
-        rules = [page_rule(source, particle_count=particle_count) for source in words]
+        rules = [page_rule(source, particle_count=particle_count) for source in texts]
         pictures = {
             name: preview(source, particle_count=particle_count)
-            for name, source in zip(names, words, strict=True)
+            for name, source in zip(names, texts, strict=True)
             if previews
         }
         text = page_text(rules, title=title or names[0], seed=seed, previews=pictures)
@@ -208,7 +200,7 @@ def check_browser_rule(rule: NPARule, name: str) -> None:
 
 
 def preview(source: str, *, particle_count: int | None = None) -> str:
-    """Return a picture of a rule's grown world as a data URL: WebP with transparency."""
+    """Return a picture of a rule's world after `PREVIEW_STEPS` as a data URL of a WebP file."""
     live = RuleWorld(source, device=torch.device("cpu"), particle_count=particle_count, choices={})
     live.speed = PREVIEW_STEPS if live.task.aligned else PREVIEW_STEPS // 2
     live.advance()
@@ -236,8 +228,16 @@ def page_text(
     """
     settings = {
         "seed": seed,
-        "ramp": base64.b64encode(colour_ramp().tobytes()).decode(),
-        "constants": CONSTANTS,
+        "colours": {
+            name: base64.b64encode(table.tobytes()).decode()
+            for name, table in colour_tables(len(rules)).items()
+        },
+        "constants": {
+            "AGREEMENTS": AGREEMENTS,
+            "CLUMP_FACTOR": CLUMP_FACTOR,
+            "DAMAGE_SIZES": DAMAGE_SIZES,
+            "MIN_SEED": MIN_SEED,
+        },
         "rules": rules,
     }
     # With "<" a rule's text could end the script element.

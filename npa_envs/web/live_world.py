@@ -79,7 +79,7 @@ TOOLS = {
         icon="M12 4a8 8 0 1 0 .1 0M12 8v8M8 12h8",
     ),
 }  # fmt: skip
-"""All brushes, in the order of their buttons and keys. `brushed` applies those that change
+"""All brushes, in the order of their buttons and keys. `LiveWorld._brush` applies those that change
 positions or states, `RuleWorld._brush` the others, and `BRUSHES` of page_world.js all."""
 
 
@@ -202,12 +202,12 @@ class LiveWorld(ABC):
         """Release the world's resources."""
 
     def reset(self, seed: int | None) -> None:
-        """Start a fresh world from a seed; None: from the next one."""
+        """Start a new world from a seed; None: from the next one."""
         self.seed = self.seed + 1 if seed is None else seed
         self._begin(self.seed)
 
     def _begin(self, seed: int | None) -> None:
-        """Start a fresh world from a seed; None: from any one."""
+        """Start a new world from a seed; None: from any one."""
         self.step, self._milliseconds = 0, 0.0
         self._travelled: Tensor | None = None
         self._updated: Tensor | None = None
@@ -238,7 +238,24 @@ class LiveWorld(ABC):
 
     def _brush(self, touch: Touch) -> bool:
         """Apply a brush; return whether `describe` returns something else now."""
-        self.particles = brushed(self.particles, touch, self.box)
+        x, s, *_ = self.particles
+        disk: dict[str, Any] = {"radius": touch.radius, "box": self.box}
+        match touch.tool:
+            case "push":
+                x = push(x, centre=touch.at, move=touch.move, strength=touch.amount, **disk)
+            case "clump":
+                x, s = clump(x, s, centre=touch.at, factor=touch.amount, **disk)
+            case "cut":
+                space_dim, half = x.shape[2], 0.5 * touch.move
+                move = torch.nn.functional.pad(touch.move, (0, 3 - space_dim))
+                normal = torch.linalg.cross(touch.view, move)[:, :space_dim]
+                line: dict[str, Any] = {"centre": touch.at + half, "normal": normal, "along": half}
+                x, s = cut(x, s, gap=touch.radius, box=self.box, **line)
+            case "inject":
+                state, exists = state_around(x, s, centre=touch.source, **disk)
+                weight = touch.amount * exists.to(x.dtype)
+                s = inject(x, s, centre=touch.at, state=state, strength=weight, **disk)
+        self.particles = self.particles._replace(x=x, s=s)
         return False
 
     def _set(self, name: str, value: Any) -> bool:
@@ -307,28 +324,6 @@ class Touch(NamedTuple):
         )
 
 
-def brushed(particles: Particles, touch: Touch, box: tuple[float, ...] | None) -> Particles:
-    """Return particles after the brush push, clump, cut or inject."""
-    x, s, *_ = particles
-    disk: dict[str, Any] = {"radius": touch.radius, "box": box}
-    match touch.tool:
-        case "push":
-            x = push(x, centre=touch.at, move=touch.move, strength=touch.amount, **disk)
-        case "clump":
-            x, s = clump(x, s, centre=touch.at, factor=touch.amount, **disk)
-        case "cut":
-            space_dim, half = x.shape[2], 0.5 * touch.move
-            move = torch.nn.functional.pad(touch.move, (0, 3 - space_dim))
-            normal = torch.linalg.cross(touch.view, move)[:, :space_dim]
-            line: dict[str, Any] = {"centre": touch.at + half, "normal": normal, "along": half}
-            x, s = cut(x, s, gap=touch.radius, box=box, **line)
-        case "inject":
-            state, exists = state_around(x, s, centre=touch.source, **disk)
-            weight = touch.amount * exists.to(x.dtype)
-            s = inject(x, s, centre=touch.at, state=state, strength=weight, **disk)
-    return particles._replace(x=x, s=s)
-
-
 def checked_seed(value: Any) -> int:
     """Return `value` if it is a valid seed; raises NPAError."""
     return int(Range(0, 2**53, whole=True).checked("seed", value))
@@ -368,7 +363,7 @@ class ColouredWorld(NamedTuple):
     counts: Sequence[int]
     """Particles of each species, species after species."""
     usual_count: int
-    """Particles of a fresh world."""
+    """Particles of a newly seeded world."""
     travelled: Tensor | None
     """Distance of each particle in the last step over the largest possible one, [1, N]."""
     updated: Tensor | None
@@ -379,7 +374,8 @@ class Colouring:
     """Computes the colours of one world's particles, frame by frame."""
 
     def __init__(self) -> None:
-        self._covariance: Tensor | None = None
+        self._average: Tensor | None = None
+        """Moving average of the states' covariance."""
         self._basis: Tensor | None = None
 
     def __call__(self, show: str, world: ColouredWorld) -> NDArray[np.uint8]:
@@ -417,10 +413,10 @@ class Colouring:
         known = s[s.isfinite().all(dim=-1)].double()
         mean = known.mean(dim=0)
         covariance = (known - mean).T @ (known - mean) / max(len(known), 1)
-        if self._covariance is None or self._covariance.shape != covariance.shape:
-            self._covariance, self._basis = covariance, None
-        self._covariance = BALANCE * self._covariance + (1.0 - BALANCE) * covariance
-        values, vectors = torch.linalg.eigh(self._covariance.cpu())
+        if self._average is None or self._average.shape != covariance.shape:
+            self._average, self._basis = covariance, None
+        self._average = BALANCE * self._average + (1.0 - BALANCE) * covariance
+        values, vectors = torch.linalg.eigh(self._average.cpu())
         count = min(3, len(values))
         basis = vectors[:, -count:].flip(-1).to(s.device)
         if self._basis is not None:
@@ -458,6 +454,16 @@ def _or_zeros(values: Tensor | None, world: ColouredWorld) -> Tensor:
     if values is None or values.shape[1] != world.x.shape[1]:
         return torch.zeros(world.x.shape[1], device=world.x.device)
     return values[0]
+
+
+def colour_tables(species_count: int) -> dict[str, NDArray[np.uint8]]:
+    """Return the colours that colours.js reads, uint8, shape [K, 3]: of densities, states, species.
+
+    `state` has those of `signed_colours` at equal steps of 1 / (1 + exp(-STATE_GAIN value)).
+    """
+    values = torch.logit(torch.linspace(0.0, 1.0, 1025)) / STATE_GAIN
+    state = _bytes(signed_colours(values))
+    return {"ramp": colour_ramp(), "state": state, "species": species_colours(species_count)}
 
 
 def colour_ramp() -> NDArray[np.uint8]:

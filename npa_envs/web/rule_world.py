@@ -105,7 +105,7 @@ class RuleWorld(LiveWorld):
         )
 
     def _plant(self, name: Any, particle_count: int | None = None) -> None:
-        """Choose a rule with the task that it was trained on, and start a fresh world."""
+        """Choose a rule with the task that it was trained on, and start a new world."""
         main = self._live_rule(name)
         self.trained = self._trained(main.name, particle_count)
         self.main = main
@@ -117,14 +117,14 @@ class RuleWorld(LiveWorld):
 
     @torch.no_grad()
     def _begin(self, seed: int | None) -> None:
-        """Start a fresh world whose particles all follow the chosen rule."""
+        """Start a new world whose particles all follow the chosen rule."""
         super()._begin(seed)
         self._generator = torch.Generator(self._device).manual_seed(self.seed)
         seed_world = self.task.seed(1, generator=self._generator, device=self._device)
         # The goal is the world's: it is no field of particles that come and go.
         self.particles, self._goal = seed_world._replace(goal=None), seed_world.goal
         self.count = self.particles.x.shape[1]
-        """Particles of a fresh world."""
+        """Particles of a newly seeded world."""
         self.live_rules = [replace(self.main, count=self.count, divisor=float(self.count))]
         self._colouring = Colouring()
         self._loss_due = 0.0
@@ -260,7 +260,7 @@ class RuleWorld(LiveWorld):
                 rules[0], self.particles, steps, return_path_length=True, **options
             )
         else:
-            # Divided by the particles of a fresh world: particles that a brush adds or removes
+            # Divided by the particles of a newly seeded world: those that a brush adds or removes
             # change only the densities around them.
             divisors = [live_rule.divisor for live_rule in self.live_rules]
             after = species_particles(
@@ -318,7 +318,8 @@ class RuleWorld(LiveWorld):
                 self.particles = self.particles._replace(s=wipe_state(x, s, **ball))
             case "remove":
                 outside = ~inside_ball(x, box=self.box, **ball)[0]
-                self._arrange(_taken(self.particles, outside), self._species()[outside])
+                kept = self.particles.map(lambda value: value[:, outside])
+                self._arrange(kept, self._species()[outside])
             case "graft":
                 self._graft(touch)
             case "add":
@@ -391,17 +392,12 @@ class RuleWorld(LiveWorld):
         if not torch.equal(order, torch.arange(self.particles.x.shape[1], device=order.device)):
             # The page's tracers follow particles by their index.
             self._events.append({"type": "reordered"})
-        self.particles = _taken(particles, order)
+        self.particles = particles.map(lambda value: value[:, order])
         counts = torch.bincount(species, minlength=len(self.live_rules)).tolist()
         for live_rule, count in zip(self.live_rules, counts, strict=True):
             live_rule.count = count
         present = [live_rule for live_rule in self.live_rules if live_rule.count]
         self.live_rules = present or self.live_rules[:1]
-
-
-def _taken(particles: Particles, indices: Tensor) -> Particles:
-    """Return the particles that indices or a mask [N] select."""
-    return particles.map(lambda value: value[:, indices])
 
 
 def name_of(source: str) -> str:
@@ -443,11 +439,12 @@ class RunWorld(RuleWorld):
         super().__init__(
             str(files[0]), device=device, seed=seed, particle_count=self._each, choices=choices
         )
-        self._goals = self._goal_choices()
+        rules = {name: self._live_rule(name).rule for name in self._files}
+        self._run_identities = self._identities(rules)
 
     @torch.no_grad()
     def _begin(self, seed: int | None) -> None:
-        """Start a fresh world of all rules of the run."""
+        """Start a new world of all rules of the run."""
         super()._begin(seed)
         if len(self._files) == 1:
             return
@@ -518,21 +515,17 @@ class RunWorld(RuleWorld):
         return bool(points)
 
     def _take_rules(self) -> None:
-        """Load the newest rules; the world continues if they have the same hyper-parameters."""
+        """Load the newest rules; the world continues if they are of the same run."""
         self._resting = False
         new_rules = {
             name: load_rule(path, device=self._device).float() for name, path in self._files.items()
         }
-        rules = {name: self._live_rule(name).rule for name in new_rules}
-        goals = self._goal_choices()
+        identities = self._identities(new_rules)
         # Cached tasks have the codes of the old rules.
         self._trained.cache_clear()
-        if goals == self._goals and all(
-            new_rules[name].hyper_parameters() == rule.hyper_parameters()
-            for name, rule in rules.items()
-        ):
-            for name, rule in rules.items():
-                rule.load_state_dict(new_rules[name].state_dict())
+        if identities == self._run_identities:
+            for name, rule in new_rules.items():
+                self._live_rule(name).rule.load_state_dict(rule.state_dict())
             task = self.task.for_rule(self.main.rule)
             self.trained = replace(self.trained, task=task)
             with torch.no_grad():
@@ -543,16 +536,17 @@ class RunWorld(RuleWorld):
             self._rules.clear()
             self._plant(self.main.name, self._each)
             self._events.append({"type": "reordered"})
-        self._goals = goals
+        self._run_identities = identities
 
-    def _goal_choices(self) -> list[Any]:
-        """Return the task's name and configuration of each rule's file; they tell another run."""
-        goals: list[Any] = []
-        for path in self._files.values():
+    def _identities(self, rules: Mapping[str, NPARule]) -> list[Any]:
+        """Return hyper-parameters and tasks of the run's rules, which are others in another run."""
+        identities: list[Any] = []
+        for name, rule in rules.items():
+            path = self._files[name]
             metadata = rule_metadata(path)
             config = trained_config(path, metadata).task if "config" in metadata else None
-            goals.append((metadata.get("task"), config))
-        return goals
+            identities.append((rule.hyper_parameters(), metadata.get("task"), config))
+        return identities
 
 
 def _version(path: Path) -> tuple[int, ...] | None:

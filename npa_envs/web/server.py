@@ -136,18 +136,15 @@ class Site:
 
     def allows_token(self, token: str | None) -> bool:
         """Return whether the token is right, or none is required."""
-        required = self.token or ""
-        return not required or secrets.compare_digest((token or "").encode(), required.encode())
+        given = (token or "").encode()
+        return self.token is None or secrets.compare_digest(given, self.token.encode())
 
 
 def is_loopback(host: str) -> bool:
     """Return whether only this computer can connect to an address."""
-    if host == "localhost":
-        return True
-    try:
+    with contextlib.suppress(ValueError):
         return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
+    return host == "localhost"
 
 
 def make_app(site: Site) -> Starlette:
@@ -234,7 +231,7 @@ class ViewerSession:
         self._free_frames = threading.BoundedSemaphore(FRAMES_AHEAD)
         self._stopped = threading.Event()
         self._pictures: list[bytes] | None = None
-        """The film that is being recorded, or None."""
+        """The pictures of the film, while one is made."""
 
     async def serve(self) -> None:
         """Read and write until the page disconnects or the server stops."""

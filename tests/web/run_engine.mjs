@@ -33,7 +33,7 @@ const acts = {
 
   // Principal components of states, frame after frame.
   components({ channels, frames }) {
-    const colouring = new Colouring(new Uint8Array(6));
+    const colouring = new Colouring({});
     return frames.map((s) => {
       const bytes = new Uint8ClampedArray((3 * floats(s).length) / channels);
       colouring.components(floats(s), channels, bytes);

@@ -176,7 +176,7 @@ def test_species_are_grafted_and_added_where_rules_agree(run, settings):
     assert sum(wrong["species"]) == 0
 
 
-def test_settings_reach_the_world_and_wrong_messages_are_told(run, settings):
+def test_settings_reach_the_world_and_wrong_messages_are_reported(run, settings):
     def set_to(name, value):
         return {"type": "set", "name": name, "value": value}
 
@@ -334,12 +334,12 @@ class OwnNetwork(NPARule):
         (NPARule(hidden_dim=13000), "at most 1048576 weights, 'mine' has 1105000"),
     ],
 )
-def test_rules_that_a_browser_cannot_run_are_refused(rule, message):
+def test_rules_that_a_browser_cannot_run_are_rejected(rule, message):
     with pytest.raises(NPAError, match=message):
         check_browser_rule(rule, "mine")
 
 
-def test_bad_pages_are_refused_before_any_work(tmp_path, monkeypatch):
+def test_bad_pages_are_rejected_before_any_work(tmp_path, monkeypatch):
     monkeypatch.setattr("npa_envs.web.export.page_rule", lambda *_, **__: pytest.fail("worked"))
     for sources, path, message in (
         (["gecko"], "page.htm", r"must end in \.html"),

@@ -89,20 +89,6 @@ def test_a_page_records_a_film_and_a_picture(exported):
 
 
 @pytest.mark.slow
-def test_a_page_may_not_reach_the_network(exported):
-    page = exported("gecko", particle_count=64)
-    refused = page.run(
-        """new Promise((resolve) => {
-          addEventListener("securitypolicyviolation", (event) => resolve(event.effectiveDirective));
-          fetch("http://127.0.0.1:9/").catch(() => null);
-        })"""
-    )
-    assert refused == "connect-src"
-    # The browser has complained of it.
-    page.complaints.clear()
-
-
-@pytest.mark.slow
 def test_a_gallery_opens_a_rule_and_goes_back(exported):
     page = exported("gecko", "dots", particle_count=256, previews=True, size=PHONE, steps=0)
     shown = "[...document.querySelectorAll('#gallery img')].filter((image) => image.naturalWidth)"

@@ -237,22 +237,6 @@ def test_push_carries_particles_along_and_clump_and_cut_move_them(world):
     assert float(world.particles.x[..., 1].abs().min()) >= 0.025 - 1e-6
 
 
-def test_a_state_is_injected_elsewhere(world):
-    world.particles.s[..., 0] = (world.particles.x[..., 0] < 0).to(world.particles.s)
-    x, s = world.particles.x.clone(), world.particles.s.clone()
-    there = {"at": [0.1, 0.0], "radius": 0.08, "strength": 1.0}
-    world.handle(brush("inject", source=[-0.1, 0.0], **there))
-    gained = world.particles.s[0, :, 0] - s[0, :, 0]
-    inside = (x[0] - x.new_tensor([0.1, 0.0])).norm(dim=-1) < 0.08
-    assert float(gained[inside].max()) > 0.3
-    assert float(gained[~inside].abs().max()) == 0.0
-    assert torch.equal(world.particles.x, x)
-    after = world.particles.s.clone()
-    # Without a source, particles become like those around them.
-    world.handle(brush("inject", at=[0.0, 0.0], radius=0.2, strength=1.0))
-    assert float(world.particles.s[..., 0].std()) < float(after[..., 0].std())
-
-
 def test_grafts_follow_the_other_rule(world):
     assert world.handle(brush("graft", rule="heart", radius=0.15))
     description = world.describe()
@@ -383,7 +367,7 @@ def test_the_loss_is_computed_only_where_it_is_wanted(world, monkeypatch):
         (brush("graft", rule="duck"), "duck cannot live in a world of gecko"),
     ],
 )
-def test_a_wrong_message_is_refused_and_changes_nothing(shared, message, error):
+def test_a_wrong_message_is_rejected_and_changes_nothing(shared, message, error):
     particles, description = shared.particles, shared.describe()
     with pytest.raises(NPAError, match=error):
         shared.handle(message)
@@ -597,7 +581,7 @@ def test_particles_carry_the_codes_of_the_newest_rule(tmp_path):
     assert torch.equal(world.particles.s[0, :, :8], code.expand(64, 8))
 
 
-def test_a_log_that_begins_anew_or_goes_back_is_told_from_its_start(tmp_path, followed):
+def test_a_log_that_begins_again_or_goes_back_is_shown_from_its_start(tmp_path, followed):
     world, path = followed, tmp_path / "log.jsonl"
     points(world)
     # A resumed run drops the lines after its checkpoint.
@@ -620,7 +604,7 @@ def test_a_log_that_begins_anew_or_goes_back_is_told_from_its_start(tmp_path, fo
     assert points(world) == [(True, [[10, 0.25]])]
 
 
-def test_a_rule_that_is_damaged_meanwhile_is_told_and_the_world_lives_on(tmp_path, followed):
+def test_a_rule_that_is_damaged_meanwhile_is_reported_and_the_world_lives_on(tmp_path, followed):
     world = followed
     world.take_events()
     (tmp_path / "rule.safetensors").write_bytes(b"half")
@@ -632,7 +616,7 @@ def test_a_rule_that_is_damaged_meanwhile_is_told_and_the_world_lives_on(tmp_pat
     assert world.step == 1
 
 
-def test_an_unfinished_run_is_refused_in_words(tmp_path):
+def test_an_unfinished_run_is_rejected(tmp_path):
     for content, folder, message in (
         (None, tmp_path, r"must hold the rule\.safetensors of a run"),
         ("{}", tmp_path, "has not written its rules yet: wait for its first"),

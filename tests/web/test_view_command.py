@@ -1,4 +1,4 @@
-"""The command `npa-envs view`: what it shows, what it prints, what it refuses."""
+"""The command `npa-envs view`: what it shows, what it prints, what it rejects."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def make(what, **options):
     return world
 
 
-def test_a_rule_a_run_and_an_environment_are_told_apart(tmp_path):
+def test_a_rule_a_run_and_an_environment_are_distinguished(tmp_path):
     save_rule(load_rule("gecko"), tmp_path / "rule.safetensors")
     assert type(make("heart")) is RuleWorld
     # A folder with nothing but a rule is that rule.
@@ -94,7 +94,7 @@ def test_what_is_wrong_is_said_before_anything_is_served(words, error, capsys, t
     assert error in capsys.readouterr().err
 
 
-def test_half_written_rules_are_refused(capsys, tmp_path):
+def test_half_written_rules_are_rejected(capsys, tmp_path):
     run = tmp_path / "run"
     run.mkdir()
     save_rule(load_rule("gecko"), run / "rule.safetensors")

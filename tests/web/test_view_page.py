@@ -184,7 +184,8 @@ def test_a_recording_yields_a_film_and_a_snapshot_a_picture(shown, tmp_path):
 
 @pytest.mark.slow
 def test_on_a_phone_fingers_brush_and_the_settings_fold(shown):
-    page, _ = shown(size=PHONE)
+    page, _ = shown(size=PHONE, light=True)
+    assert page.run("document.page.background.map((c) => Math.round(255 * c))") == [247, 246, 242]
     assert page.run("document.getElementById('panel').hidden")
     width = page.run("document.documentElement.scrollWidth")
     assert width == PHONE[0]

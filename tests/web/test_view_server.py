@@ -30,19 +30,17 @@ THERE = "ws://lab.example:8765/socket"
 
 
 class Counter:
-    """A live world of two particles that counts its steps, and remembers its messages."""
+    """A live world of two particles that counts its steps."""
 
     def __init__(self) -> None:
         self.playing = True
         self.step = 0
-        self.messages: list[dict] = []
         self.closed = threading.Event()
 
     def describe(self):
         return {"type": "world", "title": "counter", "playing": self.playing}
 
     def handle(self, message):
-        self.messages.append(message)
         match message.get("type"):
             case "play":
                 self.playing = message["on"]
@@ -160,7 +158,7 @@ def test_only_names_of_this_computer_are_answered(client, host):
 @pytest.mark.parametrize(
     "origin", ["http://evil.example", "null", "http://127.0.0.1:9999", "http://localhost:8765"]
 )
-def test_sockets_of_foreign_pages_are_refused(client, worlds, origin):
+def test_sockets_of_foreign_pages_are_rejected(client, worlds, origin):
     refuse(client, SOCKET, origin=origin)
     assert worlds == []
     with client.websocket_connect(SOCKET, headers={"origin": HERE}) as reader:
@@ -189,7 +187,7 @@ def test_a_server_that_others_reach_asks_for_a_token(tmp_path):
         ("0.0.0.0", False), ("::", False), ("192.168.0.2", False), ("", False), ("lab", False),
     ],
 )  # fmt: skip
-def test_loopback_addresses_are_told_from_others(tmp_path, host, loopback):
+def test_loopback_addresses_need_no_token(tmp_path, host, loopback):
     assert server.is_loopback(host) == loopback
     assert (server.Site(Counter, films=tmp_path, host=host).token is None) == loopback
 
@@ -247,7 +245,7 @@ def test_a_world_that_is_paused_is_shown_after_each_message(client, worlds):
         ('{"type": "film", "action": "stop"}', "action must be 'start', then 'stop'"),
     ],
 )
-def test_bad_messages_are_told_and_the_world_goes_on(client, text, error):
+def test_bad_messages_are_reported_and_the_world_goes_on(client, text, error):
     with meet(client) as reader:
         reader.send_text(text)
         assert error in next_error(reader)
@@ -423,7 +421,7 @@ def test_without_ffmpeg_there_is_a_gif(client, site, monkeypatch):
         ([jpeg(), jpeg((16, 16))], "frames must all have one size"),
     ],
 )
-def test_wrong_pictures_of_a_film_are_told(client, pictures, error):
+def test_wrong_pictures_of_a_film_are_reported(client, pictures, error):
     with recording(client, pictures) as reader:
         assert error in next_error(reader)
 

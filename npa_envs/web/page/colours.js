@@ -5,8 +5,6 @@ import { inner } from "./brushes.js";
 
 // Of npa_envs/render/colours.py and npa_envs/web/live_world.py.
 const COLOUR_OFFSET = 0.5;
-const GOLDEN_ANGLE = Math.PI * (3 - Math.sqrt(5));
-const STATE_CHROMA = 0.16;
 const STATE_GAIN = 2.8;
 const BALANCE = 0.9;
 const UPDATED = [0.98, 0.78, 0.36];
@@ -17,16 +15,16 @@ const JACOBI_SWEEPS = 12;
 
 // Computes red, green and blue bytes of each particle, frame by frame.
 export class Colouring {
-  // ramp: Uint8Array, red, green and blue from sparse to dense.
-  constructor(ramp) {
-    this.ramp = ramp;
-    this.covariance = null;
+  // tables: those of `colour_tables` of npa_envs/web/live_world.py, each a Uint8Array of red, green and blue.
+  constructor(tables) {
+    this.tables = tables;
+    this.average = null; // moving average of the states' covariance
     this.basis = null;
   }
 
   // live: the RuleWorld; show: one of its shows.
   of(live, show) {
-    const { world } = live;
+    const { world } = live, { ramp, state, species } = this.tables;
     const bytes = new Uint8ClampedArray(3 * world.count);
     if (show === "colours") {
       live.ruleColours.forEach((colours, number) => colours.write(world, number, bytes));
@@ -35,15 +33,14 @@ export class Colouring {
     } else if (show === "components") {
       this.components(world.s, live.channels, bytes);
     } else if (show === "species") {
-      const tints = live.species.map((_, k) => speciesColour(k));
-      writeColours(bytes, (i) => tints[world.species[i]]);
+      writeColours(bytes, (i) => entryOf(species, world.species[i]));
     } else if (show === "speed") {
-      writeColours(bytes, (i) => this.onRamp(Math.sqrt(live.travelled[i] || 0)));
+      writeColours(bytes, (i) => between(ramp, Math.sqrt(live.travelled[i] || 0)));
     } else if (show === "mask") {
       writeColours(bytes, (i) => (live.updated[i] ? UPDATED : RESTING));
     } else {
       const channel = Number(show.slice("state ".length));
-      writeColours(bytes, (i) => signedColour(world.s[i * live.channels + channel]));
+      writeColours(bytes, (i) => between(state, 1 / (1 + Math.exp(-STATE_GAIN * world.s[i * live.channels + channel]))));
     }
     return new Uint8Array(bytes.buffer);
   }
@@ -55,7 +52,7 @@ export class Colouring {
     const volume = box === null ? 2 ** dimension : box.reduce((product, side) => product * side, 1);
     const usual = (seedCount / volume) * (box === null ? 4 : 1);
     for (let k = 0; k < world.count; k++) {
-      writeColour(bytes, physics.order[k], this.onRamp(1 - 2 ** (-physics.density[k] / usual)));
+      writeColour(bytes, physics.order[k], between(this.tables.ramp, 1 - 2 ** (-physics.density[k] / usual)));
     }
   }
 
@@ -69,20 +66,20 @@ export class Colouring {
     }
     const mean = new Float64Array(channels);
     for (const i of known) for (let c = 0; c < channels; c++) mean[c] += s[i * channels + c] / known.length;
-    const fresh = new Float64Array(channels * channels);
+    const covariance = new Float64Array(channels * channels);
     const row = new Float64Array(channels);
     for (const i of known) {
       for (let c = 0; c < channels; c++) row[c] = s[i * channels + c] - mean[c];
       for (let a = 0; a < channels; a++) {
-        for (let b = 0; b < channels; b++) fresh[a * channels + b] += (row[a] * row[b]) / known.length;
+        for (let b = 0; b < channels; b++) covariance[a * channels + b] += (row[a] * row[b]) / known.length;
       }
     }
-    if (this.covariance?.length !== fresh.length) {
-      this.covariance = fresh.slice();
+    if (this.average?.length !== covariance.length) {
+      this.average = covariance.slice();
       this.basis = null;
     }
-    this.covariance = this.covariance.map((average, k) => BALANCE * average + (1 - BALANCE) * fresh[k]);
-    const components = eigenvectors(this.covariance, channels).slice(0, 3);
+    this.average = this.average.map((average, k) => BALANCE * average + (1 - BALANCE) * covariance[k]);
+    const components = eigenvectors(this.average, channels).slice(0, 3);
     components.forEach(({ vector }, k) => {
       // An eigenvector's sign is arbitrary: colours must not flip between frames.
       if (this.basis?.[k] && inner(vector, this.basis[k]) < 0) vector.forEach((part, c) => (vector[c] = -part));
@@ -98,13 +95,15 @@ export class Colouring {
       writeColour(bytes, i, tint);
     }
   }
+}
 
-  // Red, green and blue at a fraction of the ramp.
-  onRamp(fraction) {
-    const last = this.ramp.length / 3 - 1;
-    const entry = 3 * Math.round(last * Math.min(1, Math.max(0, fraction)));
-    return [this.ramp[entry] / 255, this.ramp[entry + 1] / 255, this.ramp[entry + 2] / 255];
-  }
+// The entry of a table of colours at a fraction of its length.
+function between(table, fraction) {
+  return entryOf(table, Math.round((table.length / 3 - 1) * Math.min(1, Math.max(0, fraction))));
+}
+
+function entryOf(table, index) {
+  return [table[3 * index] / 255, table[3 * index + 1] / 255, table[3 * index + 2] / 255];
 }
 
 // Colours of one rule's particles by the outputs of its read-out, or their states: the last three, or the
@@ -172,32 +171,6 @@ function writeColour(bytes, i, tint) {
   bytes[3 * i] = 255 * tint[0];
   bytes[3 * i + 1] = 255 * tint[1];
   bytes[3 * i + 2] = 255 * tint[2];
-}
-
-// Blue below 0, grey at 0, orange above.
-function signedColour(value) {
-  const pull = Math.tanh(0.5 * STATE_GAIN * value);
-  return srgb(0.62 + 0.18 * Math.abs(pull), 0.5 * STATE_CHROMA * pull, STATE_CHROMA * pull);
-}
-
-function speciesColour(number) {
-  const hue = 0.9 + GOLDEN_ANGLE * number;
-  return srgb(0.72, 0.13 * Math.cos(hue), 0.13 * Math.sin(hue));
-}
-
-// Red, green and blue of an OKLab colour (B. Ottosson, 2020).
-function srgb(lightness, a, b) {
-  const long = (lightness + 0.3963377774 * a + 0.2158037573 * b) ** 3;
-  const middle = (lightness - 0.1055613458 * a - 0.0638541728 * b) ** 3;
-  const short = (lightness - 0.0894841775 * a - 1.291485548 * b) ** 3;
-  return [
-    4.0767416621 * long - 3.3077115913 * middle + 0.2309699292 * short,
-    -1.2684380046 * long + 2.6097574011 * middle - 0.3413193965 * short,
-    -0.0041960863 * long - 0.7034186147 * middle + 1.7076147010 * short,
-  ].map((linear) => {
-    const clipped = Math.min(1, Math.max(0, linear));
-    return clipped <= 0.0031308 ? 12.92 * clipped : 1.055 * clipped ** (1 / 2.4) - 0.055;
-  });
 }
 
 // Eigenvalues and eigenvectors of a symmetric matrix, the largest first, by Jacobi's rotations.

@@ -347,16 +347,15 @@ class Tools {
   brush(position, pixels) {
     const { canvas, stroke, chosen: tool, page: { camera, world: { dimension, box } } } = this;
     const width = canvas.clientWidth, height = canvas.clientHeight;
-    const near = stroke?.near ?? 0;
-    const at = camera.position(...position, width, height, near).slice(0, dimension);
-    const move = camera.movement(...pixels, width, height, near).slice(0, dimension);
+    const at = camera.position(...position, width, height, stroke.near).slice(0, dimension);
+    const move = camera.movement(...pixels, width, height, stroke.near).slice(0, dimension);
     const wrapped = box ? at.map((v, k) => v - box[k] * Math.round(v / box[k])) : at;
-    if (stroke) stroke.source ??= wrapped;
+    stroke.source ??= wrapped;
     const message = {
       type: "brush", tool: tool.name, at: wrapped, move,
       radius: this.radius(), strength: +$("strength").value,
     };
-    if (tool.takes === "source") message.source = stroke?.source ?? wrapped;
+    if (tool.takes === "source") message.source = stroke.source;
     if (tool.takes === "rule") message.rule = $("other").value;
     if (dimension === 3) message.view = camera.axes[2];
     this.page.send(message);
@@ -415,8 +414,7 @@ class Controls {
     $("plots").ontoggle = () => page.send({ type: "set", name: "loss", value: $("plots").open });
     $("tracers").onchange = () => { page.tracers.clear(); page.dirty = true; };
     $("style").onchange = () => (page.dirty = true);
-    $("theme").value = storedTheme();
-    $("theme").onchange = () => { storedTheme($("theme").value); this.showTheme(); };
+    $("theme").onchange = () => this.showTheme();
     matchMedia("(prefers-color-scheme: dark)").onchange = () => this.showTheme();
     this.showTheme();
     for (const name of ["radius", "strength", "size"]) {
@@ -443,8 +441,15 @@ class Controls {
     $("other-field").hidden = !world.tools.some(({ takes }) => takes === "rule");
     $("brush").hidden = !world.tools.length;
     this.showTools();
-    this.showDamages();
-    this.showSettings();
+    $("damages").hidden = !world.damages.length;
+    $("damages").replaceChildren(...world.damages.map((name) => make("button", {
+      textContent: name, title: `Damage: ${name}`, onclick: () => this.page.send({ type: "damage", name }),
+    })));
+    $("physics").hidden = !PHYSICS.some((name) => name in world.settings);
+    for (const name of ["speed", ...PHYSICS]) {
+      $(name).parentElement.hidden = !world.settings[name];
+      if (world.settings[name]) this.slider($(name), name, world.settings[name]);
+    }
   }
 
   fold(away) {
@@ -479,22 +484,6 @@ class Controls {
       return button;
     }));
     tools.choose(tools.chosen.name);
-  }
-
-  showDamages() {
-    $("damages").hidden = !this.page.world.damages.length;
-    $("damages").replaceChildren(...this.page.world.damages.map((name) => make("button", {
-      textContent: name, title: `Damage: ${name}`, onclick: () => this.page.send({ type: "damage", name }),
-    })));
-  }
-
-  showSettings() {
-    const { settings } = this.page.world;
-    $("physics").hidden = !PHYSICS.some((name) => name in settings);
-    for (const name of ["speed", ...PHYSICS]) {
-      $(name).parentElement.hidden = !settings[name];
-      if (settings[name]) this.slider($(name), name, settings[name]);
-    }
   }
 
   slider(input, name, { value, low, high, scale, whole }) {
@@ -613,14 +602,4 @@ function options(select, names, chosen) {
 // The components from 0 to 1 of a colour such as "rgb(13, 16, 23)".
 function components(colour) {
   return colour.match(/\d+/g).map((component) => component / 255);
-}
-
-// Returns the stored theme, or stores another one, if the browser allows it.
-function storedTheme(theme) {
-  const key = "npa-envs theme";
-  try {
-    if (theme === undefined) return localStorage.getItem(key) ?? "";
-    localStorage.setItem(key, theme);
-  } catch { /* private windows */ }
-  return "";
 }

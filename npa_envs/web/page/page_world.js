@@ -17,7 +17,13 @@ const TRIAL_TOLERANCE = 1e-3;
 // Brushes by the names of `TOOLS` of npa_envs/web/live_world.py. Each applies a message of page.js, whose
 // strength has become an `amount`, to a RuleWorld.
 const BRUSHES = {
-  remove: (live, { at, radius }) => live.remove(new Set(insideBall(live.world, at, radius))),
+  remove(live, { at, radius }) {
+    const removed = new Set(insideBall(live.world, at, radius));
+    if (removed.size === 0) return;
+    const { x, s, species } = live.world;
+    const others = (array, width) => array.filter((_, k) => !removed.has(Math.floor(k / width)));
+    live.setParticles(others(x, live.dimension), others(s, live.channels), others(species, 1));
+  },
   push: ({ world }, { at, move, radius, amount }) => push(world, at, move, radius, amount),
   clump: ({ world }, { at, radius, amount }) => clump(world, at, radius, amount),
   cut({ world, dimension }, { at, move, radius, view }) {
@@ -34,7 +40,19 @@ const BRUSHES = {
     for (const i of insideBall(live.world, at, radius)) live.world.species[i] = index;
   },
   add(live, { at, radius, amount, rule }) {
-    live.add(at, radius, Math.max(live.constants.MIN_SEED, Math.round(amount * live.seedCount)), rule);
+    const { world: { x, s, species }, dimension } = live;
+    const count = Math.max(live.constants.MIN_SEED, Math.round(amount * live.seedCount));
+    const room = (live.rule.world.settings.count?.high ?? live.seedCount) - live.world.count;
+    if (count > room) throw Error(`the world has room for ${Math.max(0, room)} particles more, got ${count}`);
+    // A new species divides densities by its own number of particles, as in a world alone.
+    const index = live.speciesOf(rule, count);
+    const ball = live.random.ball(count, dimension, radius);
+    for (let k = 0; k < ball.length; k++) ball[k] += at[k % dimension];
+    live.setParticles(
+      joined(x, ball),
+      joined(s, new Float32Array(count * live.channels)),
+      joined(species, new Uint8Array(count).fill(index)),
+    );
   },
 };
 
@@ -47,14 +65,15 @@ const DAMAGES = {
 };
 
 export class RuleWorld {
-  // settings: {rules, seed, ramp, constants} as npa_envs/web/export.py writes them; the first rule is shown
+  // settings: {rules, seed, colours, constants} as npa_envs/web/export.py writes them; the first rule is shown
   // first. send(event, transferred) sends an event to the page; device: a GPU, or null.
   // settings.engine: "auto" uses the GPU if it is faster, "gpu" always.
   constructor(settings, send, device = null) {
     this.device = device;
     this.engine = settings.engine ?? "auto";
     this.rules = settings.rules.map(decoded);
-    this.ramp = bytesOf(settings.ramp);
+    this.colourTables = {};
+    for (const [name, text] of Object.entries(settings.colours)) this.colourTables[name] = bytesOf(text);
     this.constants = settings.constants;
     this.send = send;
     this.playing = true;
@@ -71,9 +90,12 @@ export class RuleWorld {
     return rule;
   }
 
-  // Chooses a rule with the settings of its task, and starts a fresh world.
+  // Chooses a rule with the settings of its task, and starts a new world.
   choose(rule) {
     this.rule = rule;
+    this.dimension = rule.space_dim;
+    this.channels = rule.state_dim;
+    this.box = rule.world.box;
     this.values = {};
     for (const [name, { value }] of Object.entries(rule.world.settings)) this.values[name] = value;
     this.values.count ??= rule.world.count;
@@ -81,35 +103,23 @@ export class RuleWorld {
     this.reset(this.seed);
   }
 
-  // Starts a fresh world whose particles all follow the chosen rule.
+  // Starts a new world whose particles all follow the chosen rule.
   reset(seed) {
     this.seed = seed;
     this.random = new Random(seed);
     this.steps = this.milliseconds = 0;
     this.species = [this.rule];
-    // Each species divides densities by the particles of a fresh world: particles that a brush adds or
+    // Each species divides densities by the particles of a newly seeded world: particles that a brush adds or
     // removes change only the densities around them.
     this.seedCount = this.values.count;
     this.divisors = [this.seedCount];
-    this.colouring = new Colouring(this.ramp);
+    this.colouring = new Colouring(this.colourTables);
     this.setParticles(this.seedPositions(), new Float32Array(this.seedCount * this.channels), new Uint8Array(this.seedCount));
     this.prepare();
     this.announce();
   }
 
-  get dimension() {
-    return this.rule.space_dim;
-  }
-
-  get channels() {
-    return this.rule.state_dim;
-  }
-
-  get box() {
-    return this.rule.world.box;
-  }
-
-  // Returns positions of a fresh world [length units].
+  // Returns positions of a newly seeded world [length units].
   seedPositions() {
     const { seed } = this.rule.world;
     if (seed.kind === "ball") return this.random.ball(this.seedCount, this.dimension, seed.radius);
@@ -236,37 +246,14 @@ export class RuleWorld {
     this.wrapPositions();
   }
 
-  // Removes the particles of a set of indices.
-  remove(removed) {
-    if (removed.size === 0) return;
-    const { x, s, species } = this.world;
-    const others = (array, width) => array.filter((_, k) => !removed.has(Math.floor(k / width)));
-    this.setParticles(others(x, this.dimension), others(s, this.channels), others(species, 1));
-  }
-
-  // Adds particles of a rule, with states 0, in a ball.
-  add(at, radius, count, name) {
-    const { x, s, species } = this.world;
-    const room = (this.rule.world.settings.count?.high ?? this.seedCount) - this.world.count;
-    if (count > room) throw Error(`the world has room for ${Math.max(0, room)} particles more, got ${count}`);
-    // A new species divides densities by its own number of particles, as in a world alone.
-    const index = this.speciesOf(name, count);
-    const ball = this.random.ball(count, this.dimension, radius);
-    for (let k = 0; k < ball.length; k++) ball[k] += at[k % this.dimension];
-    this.setParticles(
-      joined(x, ball),
-      joined(s, new Float32Array(count * this.channels)),
-      joined(species, new Uint8Array(count).fill(index)),
-    );
-  }
-
   // Returns the index of a rule's species; a rule that is new in the world is appended.
   speciesOf(name, divisor) {
     const rule = this.ruleNamed(name);
     const index = this.species.indexOf(rule);
     if (index >= 0) return index;
     if (!this.mayJoin(rule)) {
-      throw Error(`${name} cannot live in a world of ${this.rule.name}: rules of one world must agree in ${this.constants.AGREEMENTS.join(", ")}`);
+      const fields = this.constants.AGREEMENTS.join(", ");
+      throw Error(`${name} cannot live in a world of ${this.rule.name}: rules of one world must agree in ${fields}`);
     }
     this.species.push(rule);
     this.divisors.push(divisor);
@@ -456,7 +443,7 @@ class Random {
     return vector.map((part) => part / length);
   }
 
-  // Points uniform in a ball around the origin [length units], one after the other.
+  // Points uniform in a ball around the origin [length units].
   ball(count, dimension, radius) {
     const points = new Float32Array(count * dimension);
     for (let i = 0; i < count; i++) {

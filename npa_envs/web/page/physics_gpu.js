@@ -19,7 +19,7 @@ function shaders(rule) {
   const span = CELLS_PER_RADIUS;
   const axes = ["x", "y", "z"].slice(0, dimension);
   const smooth = rule.moment_inverse === "smooth";
-  // Visits all j in the cells around sorted particle i: d is the way to it, square its length's square.
+  // Visits all j in the cells around sorted particle i: d is the vector to it, square its squared length.
   const around = (body) => `
     let own = points[i].xyz;
     let cell = home[i];

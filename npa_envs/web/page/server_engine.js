@@ -1,5 +1,4 @@
-// The engine of the viewer. An engine runs the world that a page shows: it takes the page's messages and sends it
-// frames and other events, which page.js lists. This one is a server, npa_envs/web/server.py, over a WebSocket.
+// The engine of the viewer, as page.js describes engines: a server, npa_envs/web/server.py, over a WebSocket.
 
 import { start } from "./page.js";
 

@@ -1,6 +1,5 @@
-// The engine of an exported page, and the gallery to choose a rule. An engine runs the world that a page shows: it
-// takes the page's messages and sends it frames and other events, which page.js lists. This one is a worker in the
-// page, which runs the RuleWorld of page_world.js.
+// The engine of an exported page, as page.js describes engines: a worker in the page, which runs the RuleWorld of
+// page_world.js. Also the gallery to choose a rule.
 
 import { start } from "./page.js";
 
