@@ -170,10 +170,6 @@ class Morphogenesis3DEnv(NPAEnv):
 
     Particles are uniform in a ball of radius `seed_radius`, all states are zero.
 
-    ## Episode end
-
-    `success_loss` is None by default.
-
     ## Info
 
     | Key | In | Value |

@@ -167,15 +167,14 @@ class Played:
         seed = draw.choice((draw.randrange(99), None, 3, np.int64(7), np.uint8(4), 2**31))
         if draw.random() < 0.25:
             seed = wrong(draw, "seed", 3)
-        options, is_known = self.options(draw)
+        options = self.options(draw)
         result = self.refused(lambda: self.env.reset(seed=seed, options=options))
         if result is not None:
-            assert not options or is_known, "unknown options were taken without a word"
+            assert not options, "unknown options were taken without a word"
             self.expect_reset(*result)
 
-    def options(self, draw: random.Random) -> tuple[Any, bool]:
-        """Return options of `reset`, and whether they are known."""
-        return (wrong(draw, "options", None), False) if draw.random() < 0.2 else (None, True)
+    def options(self, draw: random.Random) -> Any:
+        return wrong(draw, "options", None) if draw.random() < 0.2 else None
 
     def expect_reset(self, observation: Any, info: Any) -> None:
         self.started = True
@@ -307,8 +306,8 @@ class Crowd(Played):
     def snapshot(self) -> Any:
         return self.env.state()
 
-    def options(self, draw: random.Random) -> tuple[Any, bool]:
-        return None, True
+    def options(self, draw: random.Random) -> Any:
+        """Return none: PettingZoo's environments ignore them."""
 
     def expect_reset(self, observation: Any, info: Any) -> None:
         super().expect_reset(observation, info)
