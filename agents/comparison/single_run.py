@@ -92,13 +92,12 @@ class RunRecord:
         """Return the record in a run's folder, if any; raises NPAError if it has other `facts`."""
 
         def make(content: dict[str, Any]) -> RunRecord:
-            points: list[dict[str, Any]]
+            fields: dict[str, Any] = {"job": Job(**content["job"])}
+            for name in ("returns", "final_losses"):
+                fields[name] = tuple(map(number, content[name]))
             points = [{name: number(v) for name, v in row.items()} for row in content["curve"]]
-            fields: dict[str, Any] = {
-                name: tuple(map(number, content[name])) for name in ("returns", "final_losses")
-            }
-            fields |= {"job": Job(**content["job"])}
-            return cls(**content | fields | {"curve": tuple(CurvePoint(**p) for p in points)})
+            fields["curve"] = tuple(CurvePoint(**point) for point in points)  # type: ignore[arg-type]
+            return cls(**content | fields)
 
         return read_record(folder / RECORD, facts, make, command="compare")
 
