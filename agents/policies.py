@@ -81,10 +81,6 @@ class Policy:
 
     Args:
         interface: `interface_of(env)`.
-
-    Raises:
-        NPAError: `env` is not an environment of `npa_envs`. When called: the observation has
-            another shape.
     """
 
     def __init__(self, interface: Interface) -> None:

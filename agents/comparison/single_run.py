@@ -1,9 +1,10 @@
 """Runs of a comparison: each learns, is tested on held-out episodes, writes a record and a picture.
 
-A run has a folder, with a `RunRequest` (`request.json`) before it, and a `RunRecord` (`run.json`)
-after it. Runs are done by processes, `python -m npa_envs.agents.comparison.single_run FOLDER`, on
-several cores or GPUs. A process loads the libraries that the run in FOLDER needs. Then it does a
-run for each `Order`, a line of JSON on its standard input, and it ends with its input.
+A run has a folder, with its job and settings (`request.json`) before it, and its `RunRecord`
+(`run.json`) after it. Runs are done by processes on several cores or GPUs, `python -m
+npa_envs.agents.comparison.single_run FOLDER`. A process loads the libraries that the run in FOLDER
+needs. Then it does a run for each `Order`, a line of JSON on its standard input, and it ends with
+its input.
 """
 
 from __future__ import annotations
@@ -87,18 +88,24 @@ class RunRecord:
         """Write the record into the run's folder; numbers that are not finite become null."""
         write_record(folder / RECORD, asdict(self))
 
+    def write_ended(self, folder: Path, begin: float) -> RunRecord:
+        """Write and return the record of a run that ends now and began at `begin` [s]."""
+        seconds, date = time.perf_counter() - begin, time.strftime("%Y-%m-%d")
+        ended = replace(self, seconds=seconds, date=date)
+        ended.write(folder)
+        return ended
+
     @classmethod
     def read(cls, folder: Path, facts: Mapping[str, Any]) -> RunRecord | None:
         """Return the record in a run's folder, if any; raises NPAError if it has other `facts`."""
 
         def make(content: dict[str, Any]) -> RunRecord:
-            points: list[dict[str, Any]]
+            fields: dict[str, Any] = {"job": Job(**content["job"])}
+            for name in ("returns", "final_losses"):
+                fields[name] = tuple(map(number, content[name]))
             points = [{name: number(v) for name, v in row.items()} for row in content["curve"]]
-            fields: dict[str, Any] = {
-                name: tuple(map(number, content[name])) for name in ("returns", "final_losses")
-            }
-            fields |= {"job": Job(**content["job"])}
-            return cls(**content | fields | {"curve": tuple(CurvePoint(**p) for p in points)})
+            fields["curve"] = tuple(CurvePoint(**point) for point in points)  # type: ignore[arg-type]
+            return cls(**content | fields)
 
         return read_record(folder / RECORD, facts, make, command="compare")
 
@@ -108,74 +115,58 @@ def mean_of(values: Sequence[float]) -> float:
     return sum(values) / len(values) if values else math.nan
 
 
-@dataclass(frozen=True)
-class RunRequest:
-    """A run that a process is asked to do, in `request.json`."""
-
-    job: Job
-    facts: dict[str, Any]
-    command: str = ""
-    teacher: str = ""
-    """Folder of the run whose rules are cloned, if any."""
-
-    @classmethod
-    def read(cls, folder: Path) -> RunRequest:
-        """Return the request that a folder contains."""
-        content = json.loads((folder / REQUEST).read_text("utf-8"))
-        return cls(**content | {"job": Job(**content["job"])})
-
-    def record(self, status: Status, begin: float, **fields: Any) -> RunRecord:
-        """Return the record of a run that began at `begin` of `time.perf_counter` [s]."""
-        return RunRecord(
-            job=self.job,
-            facts=self.facts,
-            status=status,
-            seconds=time.perf_counter() - begin,
-            command=self.command,
-            date=time.strftime("%Y-%m-%d"),
-            **fields,
-        )
+def requested_run(folder: Path) -> RunRecord:
+    """Return the record of the run that a folder requests, which has failed until it is done."""
+    content = json.loads((folder / REQUEST).read_text("utf-8"))
+    return RunRecord(**content | {"job": Job(**content["job"])}, status="failed")
 
 
-def run(folder: Path, device: str) -> None:
-    """Do the run of `request.json` in a folder; write record, rules and picture into the folder.
+def run(folder: Path, device: str, teacher: str = "") -> None:
+    """Do the run that a folder requests; write record, rules and picture into the folder.
 
-    Errors are recorded, so that other runs can continue.
+    Errors are recorded, so that other runs can continue. `teacher` is the folder of the run whose
+    rules are cloned, if any.
     """
-    request = RunRequest.read(folder)
-    begin = time.perf_counter()
+    record, begin = requested_run(folder), time.perf_counter()
     curve: list[CurvePoint] = []
-    status: Status = "done"
     try:
-        episodes = _learn(request, folder, device, curve.append)
+        episodes = _learn(record, folder, device, teacher, curve.append)
     except Exception as error:
         # The table reports errors.
         traceback.print_exc()
-        status = "diverged" if isinstance(error, DivergedError) else "failed"
-        result: dict[str, Any]
-        result = {"error": f"{type(error).__name__}: {' '.join(str(error).split())}"}
+        record = replace(
+            record,
+            status="diverged" if isinstance(error, DivergedError) else "failed",
+            error=f"{type(error).__name__}: {' '.join(str(error).split())}",
+        )
     else:
-        result = {
-            "returns": tuple(episodes.returns.tolist()),
-            "final_losses": tuple(episodes.final_losses.tolist()),
-            "endings": dict(Counter(episodes.endings)),
-        }
-        if not math.isfinite(episodes.mean_return):
-            status, result["error"] = "diverged", "returns of held-out episodes are not finite"
-    request.record(status, begin, curve=tuple(curve), **result).write(folder)
+        finite = math.isfinite(episodes.mean_return)
+        record = replace(
+            record,
+            status="done" if finite else "diverged",
+            error="" if finite else "returns of held-out episodes are not finite",
+            returns=tuple(episodes.returns.tolist()),
+            final_losses=tuple(episodes.final_losses.tolist()),
+            endings=dict(Counter(episodes.endings)),
+        )
+    replace(record, curve=tuple(curve)).write_ended(folder, begin)
 
 
 def _learn(
-    request: RunRequest, folder: Path, device: str, on_point: Callable[[CurvePoint], None]
+    record: RunRecord,
+    folder: Path,
+    device: str,
+    teacher: str,
+    on_point: Callable[[CurvePoint], None],
 ) -> Episodes:
     """Learn, write rules or policy and a picture, and return the held-out episodes."""
-    job, facts = request.job, request.facts
+    job, facts = record.job, record.facts
     problem, amount = Problem(**facts["problem"]), facts["budget"]
     in_seconds = job.axis == "seconds"
     budget = Budget(seconds=amount) if in_seconds else Budget(particle_steps=int(amount))
     options = dict(facts["options"], device=device, on_point=on_point)
-    if request.teacher:
-        options["teacher"] = request.teacher
+    if teacher:
+        options["teacher"] = teacher
     trained = train(facts["method"], problem, budget, job.seed, **options)
     trained.save(folder)
     seeds = range(FIRST_TEST_SEED, FIRST_TEST_SEED + facts["episodes"])
@@ -211,10 +202,12 @@ def final_picture(
 
 
 class Order(NamedTuple):
-    """What a process is told to do: the run that is requested in a folder, on a device."""
+    """What a process has to do: the run that a folder requests, on a device."""
 
     folder: str
     device: str
+    teacher: str
+    """Folder of the run whose rules are cloned, if any."""
 
 
 def main(folder: Path) -> None:
@@ -228,16 +221,15 @@ def main(folder: Path) -> None:
         os._exit(1)
 
     threading.Thread(target=listen, daemon=True).start()
-    request = RunRequest.read(folder)
     # Loads the method's libraries. Errors are raised again, and recorded, by `run`.
     with contextlib.suppress(Exception):
-        method_options(request.facts["method"])
+        method_options(requested_run(folder).facts["method"])
     while True:
         order = orders.get()
         with Path(order.folder, OUTPUT).open("ab") as output:
             for number in (1, 2):
                 os.dup2(output.fileno(), number)
-        run(Path(order.folder), order.device)
+        run(Path(order.folder), order.device, order.teacher)
         for stream in (sys.stdout, sys.stderr):
             stream.flush()
         # Free the memory of a run for the next one.
@@ -259,9 +251,10 @@ LAST_OUTPUT = 2000
 
 @dataclass
 class RunProcess(Child):
-    """A run in progress: its request, process and temporary folder."""
+    """A run in progress: its job, its process, and its temporary folder, which requests it."""
 
-    request: RunRequest
+    job: Job
+    teacher: str
     folder: Path
     process: subprocess.Popen[bytes]
     begin: float = 0.0
@@ -277,7 +270,7 @@ class RunProcess(Child):
         assert self.process.stdin is not None, "opened at its start"
         # The death of a process is found and recorded later.
         with contextlib.suppress(BrokenPipeError):
-            line = json.dumps(Order(str(self.folder), device))
+            line = json.dumps(Order(str(self.folder), device, self.teacher))
             self.process.stdin.write(f"{line}\n".encode())
             self.process.stdin.flush()
 
@@ -337,19 +330,25 @@ def run_jobs(
     idle: list[subprocess.Popen[bytes]] = []
 
     def start(unfinished: Sequence[RunProcess]) -> RunProcess | None:
-        ahead = {*waiting, *(one.request.job for one in unfinished)}
+        ahead = {*waiting, *(one.job for one in unfinished)}
         for job in waiting:
             teacher = plan.teacher(job)
             if teacher not in ahead:
                 waiting.remove(job)
+                target = folder / job.folder
+                temporary = target.parent / f".{target.name}.{secrets.token_hex(4)}"
+                temporary.mkdir(parents=True)
+                request = {"job": asdict(job), "facts": plan.facts(job), "command": command}
+                write_record(temporary / REQUEST, request)
+                (temporary / OUTPUT).touch()
+                reused = idle and shares_process(plan, job)
+                process = idle.pop() if reused else _new_process(temporary, slots.threads)
                 rules = "" if teacher is None else str(folder / teacher.folder)
-                request = RunRequest(job, plan.facts(job), command, rules)
-                reusable = idle if shares_process(plan, job) else []
-                return _start(request, folder, slots.threads, reusable)
+                return RunProcess(job, rules, temporary, process)
         return None
 
     def finished(one: RunProcess) -> None:
-        again = shares_process(plan, one.request.job)
+        again = shares_process(plan, one.job)
         if not again:
             one.process.communicate()
         record = _finish(one, folder)
@@ -377,39 +376,29 @@ def run_jobs(
             process.communicate()
 
 
-def _start(
-    request: RunRequest, folder: Path, threads: int, idle: list[subprocess.Popen[bytes]]
-) -> RunProcess:
-    """Return a run in an idle or a new process, which waits for a device."""
-    target = folder / request.job.folder
-    temporary = target.parent / f".{target.name}.{secrets.token_hex(4)}"
-    temporary.mkdir(parents=True)
-    write_record(temporary / REQUEST, asdict(request))
-    with (temporary / OUTPUT).open("wb") as output:
-        if idle:
-            return RunProcess(request, temporary, idle.pop())
-        process = subprocess.Popen(
-            [*PROGRAM, str(temporary)],
+def _new_process(folder: Path, threads: int) -> subprocess.Popen[bytes]:
+    """Return a process that loads the libraries of the run in `folder`, and waits for orders."""
+    with (folder / OUTPUT).open("wb") as output:
+        return subprocess.Popen(
+            [*PROGRAM, str(folder)],
             stdin=subprocess.PIPE,
             stdout=output,
             stderr=output,
             env=os.environ | {"OMP_NUM_THREADS": str(threads)},
         )
-    return RunProcess(request, temporary, process)
 
 
 def _finish(one: RunProcess, folder: Path) -> RunRecord:
     """Move the results of an ended run into its folder, and return its record."""
-    request = one.request
-    record = RunRecord.read(one.folder, request.facts)
+    requested = requested_run(one.folder)
+    record = RunRecord.read(one.folder, requested.facts)
     if record is None:
         code = one.process.returncode
         text = (one.folder / OUTPUT).read_text("utf-8", errors="replace").strip()[-LAST_OUTPUT:]
         error = f"its process ended with code {code}: {' '.join(text.split())}"
-        record = request.record("failed", one.begin, error=error)
-        record.write(one.folder)
+        record = replace(requested, error=error).write_ended(one.folder, one.begin)
     (one.folder / REQUEST).unlink(missing_ok=True)
-    target = folder / request.job.folder
+    target = folder / one.job.folder
     if target.exists():
         # A failed run, or one without a record.
         shutil.rmtree(target)

@@ -70,9 +70,8 @@ def train(progress: Progress, options: CloneOptions = CloneOptions()) -> RuleSet
 
     def iteration() -> int:
         steps = options.updates * options.batch_worlds if collect is None else collect()
-        rate = annealed(options.learning_rate, options.last_rate, progress.spent_fraction)
-        for group in optimiser.param_groups:
-            group["lr"] = rate
+        (weights,) = optimiser.param_groups
+        weights["lr"] = annealed(options.learning_rate, options.last_rate, progress.spent_fraction)
         for _ in range(options.updates):
             loss = unexplained_variance(
                 rules, *demonstrations.draw(options.batch_worlds, generator)

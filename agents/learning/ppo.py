@@ -136,7 +136,17 @@ class PPOLearner:
         self.actor = GaussianRules(rules, self.schedule.initial_std).to(device)
         self.critic = seeded_critic(progress, problem.interface.perception_dim, options.critic)
         self.modules = {"actor": self.actor, "critic": self.critic}
-        self.optimisers = {name: _adam(net, device) for name, net in self.modules.items()}
+        self.optimisers = {
+            name: torch.optim.Adam(
+                net.parameters(),
+                # CUDA graphs read the learning rate from a tensor.
+                lr=torch.zeros((), device=device),
+                eps=1e-5,
+                fused=True,
+                capturable=device.type == "cuda",
+            )
+            for name, net in self.modules.items()
+        }
         self.rounds = 0
         # One group of rows for each species, or of worlds, for the rules; worlds for the critic.
         groups = (1,) if options.ratio == "world" else problem.counts
@@ -358,13 +368,6 @@ class PPOLearner:
 
     def _ratio_weights(self, acted: Tensor) -> Tensor:
         return acted.amax(dim=1, keepdim=True) if self.options.ratio == "world" else acted
-
-
-def _adam(net: nn.Module, device: torch.device) -> torch.optim.Optimizer:
-    # CUDA graphs read the learning rate from a tensor.
-    rate = torch.zeros((), device=device)
-    capturable = device.type == "cuda"
-    return torch.optim.Adam(net.parameters(), lr=rate, eps=1e-5, fused=True, capturable=capturable)
 
 
 class GraphedMethods:

@@ -49,7 +49,7 @@ folder = Path(sys.argv[1])
 seed = json.loads((folder / "request.json").read_text())["job"]["seed"]
 {before}
 for line in sys.stdin:
-    folder, device = json.loads(line)
+    folder, device, teacher = json.loads(line)
     folder = Path(folder)
     request = json.loads((folder / "request.json").read_text())
     seed, status = request["job"]["seed"], "done"
@@ -271,9 +271,8 @@ def test_runs_follow_each_other_in_a_process_until_one_fails(tmp_path, child):
 @pytest.mark.parametrize("device", ["cpu", "cuda"])
 def test_a_run_that_clones_begins_when_its_teacher_is_over(tmp_path, child, device):
     child(
-        "taught = request['teacher']\n"
-        "if not taught: time.sleep(0.5)\n"
-        "(folder / 'seen').write_text(str(bool(taught) and (Path(taught) / 'run.json').exists()))"
+        "if not teacher: time.sleep(0.5)\n"
+        "(folder / 'seen').write_text(str(bool(teacher) and Path(teacher, 'run.json').exists()))"
     )
     made = plan(methods=["clone", "gradient"], seeds=(0, 1))
     order = [one.job for one in ran(made, tmp_path, device, jobs=4)]
@@ -350,7 +349,7 @@ def test_the_process_of_a_run_ends_with_the_comparison(tmp_path, learns):
         [*one_run.PROGRAM, str(tmp_path)], stdin=subprocess.PIPE, stderr=subprocess.PIPE
     )
     try:
-        order = one_run.Order(str(tmp_path), "cpu")
+        order = one_run.Order(str(tmp_path), "cpu", "")
         process.stdin.write(f"{json.dumps(order)}\n".encode() if learns else b"")
         process.stdin.flush()
         _, errors = process.communicate(timeout=100)

@@ -100,7 +100,7 @@ def test_what_is_differentiated_is_the_environments_own_episode(problem):
 
 
 @pytest.mark.parametrize("cuda_graph", ["auto", True])
-def test_repeated_rollouts_stay_clamped_where_they_are_recorded(cuda_graph, device):
+def test_repeated_rollouts_stay_clamped_where_they_are_captured(cuda_graph, device):
     problem = heart(state_scale=0.1)
     rules, task = wild_rules(problem).to(device), EnvironmentTask(problem, device)
     worlds = task.seed(2, generator=torch.Generator(device).manual_seed(0), device=device)

@@ -255,11 +255,11 @@ def test_entropy_is_rewarded_and_gradients_are_clipped():
         pytest.param(HEART, {"steps": 4, "minibatches": 2, "shared": True}, id="shared"),
     ],
 )
-def test_recorded_rounds_are_those_of_kernels_one_by_one(
+def test_captured_rounds_are_those_of_kernels_one_by_one(
     problem, options, device, tmp_path, monkeypatch
 ):
     if device.type != "cuda":
-        pytest.skip("rounds are recorded on CUDA only")
+        pytest.skip("rounds are captured on CUDA only")
     options = {"critic_rounds": 3, **options}
     if shared := options.pop("shared", False):
         store = dist.FileStore(str(tmp_path / "store"), 1)
@@ -267,16 +267,16 @@ def test_recorded_rounds_are_those_of_kernels_one_by_one(
 
     def learned():
         given = PPOLearner(progress_of(problem, device), PPOOptions(**options))
-        # The third call of what is recorded is the first replay that nothing was recorded in.
+        # The third call of a captured function is the first replay after all captures.
         for share_left in (1.0, 0.9, 0.7, 0.5, 0.3, 0.1):
             batch = given.play()
             given.improve(share_left)
         return [*batch, *given.actor.parameters(), *given.critic.parameters()]
 
     try:
-        recorded = learned()
+        captured = learned()
         monkeypatch.setattr(ppo, "GraphedCallable", lambda function, *_, **__: function)
-        for value, wanted in zip(recorded, learned(), strict=True):
+        for value, wanted in zip(captured, learned(), strict=True):
             assert float(wanted.detach().norm()) > 0.0
             torch.testing.assert_close(value, wanted, rtol=1e-3, atol=1e-5)
     finally:

@@ -1,4 +1,4 @@
-"""The search for rules that differ: what candidates are judged by, and what a search leaves."""
+"""The search for rules that differ: metrics of candidates, and what a search leaves."""
 
 import json
 import sys
@@ -48,7 +48,7 @@ def search(**options):
 # Worlds
 
 
-def test_a_candidate_comes_to_the_same_alone_and_beside_others_and_as_its_rule(device):
+def test_a_candidate_comes_to_the_same_alone_and_among_others_and_as_its_rule(device):
     tried = candidates(device)
     given = solutions(tried, 3)
     together = tried.try_all(given)
@@ -59,10 +59,10 @@ def test_a_candidate_comes_to_the_same_alone_and_beside_others_and_as_its_rule(d
         x, s = rollout(rule, x, s, 16, update_prob=UPDATE_PROB, generator=random)
         torch.testing.assert_close(together.worlds.x[number], x, atol=1e-4, rtol=0.0)
         torch.testing.assert_close(together.worlds.s[number], s, atol=1e-4, rtol=1e-3)
-        (alone,), beside = tried.try_all(one[None]).found, together.found[number]
+        (alone,), among = tried.try_all(one[None]).found, together.found[number]
         # But for rounding: some processors add up products of other sizes in another order.
-        assert alone.quality == pytest.approx(beside.quality, abs=1e-6)
-        assert alone.measures == pytest.approx(beside.measures, abs=1e-6)
+        assert alone.quality == pytest.approx(among.quality, abs=1e-6)
+        assert alone.measures == pytest.approx(among.measures, abs=1e-6)
 
 
 def test_dead_and_exploding_rules_are_nothing_and_descriptors_lie_within_their_axes():

@@ -196,7 +196,7 @@ def test_episodes_are_recorded_as_by_gymnasium(mode):
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_the_return_begins_anew_with_each_episode(mode):
+def test_the_return_begins_again_with_each_episode(mode):
     plain, env = begun(
         batched(autoreset_mode=mode, output="torch"),
         TorchNormalizeReward(batched(autoreset_mode=mode, output="torch"), gamma=0.5),
