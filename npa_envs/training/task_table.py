@@ -70,7 +70,7 @@ class TaskEntry:
             * sum(task.particle_count for task in getattr(run.task, "species", (run.task,)))
             for run in (config, self.presets["fast"])
         )
-        return self.fast_seconds * ours / fast
+        return float(self.fast_seconds * ours / fast)
 
 
 TASKS: Mapping[str, TaskEntry] = {

@@ -3,13 +3,13 @@
 import pytest
 import torch
 
-import npa_envs
 from npa_envs.rule.rule import FIRST_FATES, LIFE
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 from npa_envs.training import Trainer, optimiser, preset
 from npa_envs.training.iteration import EagerIteration
 from npa_envs.world.division import living
 from npa_envs.world.particles import Particles
+from npa_envs.world.rollout import rollout_particles
 
 SMALL = {"target": "ring", "target_point_count": 64, "particle_count": 64, "resolution": 32}
 
@@ -89,7 +89,7 @@ def test_births_are_no_unrest(tmp_path):
     x, s, *_ = task.seed(1, generator=torch.Generator().manual_seed(0))
     s[:, 0, LIFE + 1 :] = 0.5
     batch = EagerIteration(
-        task, rule, config, Particles(x, s), torch.Generator().manual_seed(0), npa_envs.rollout
+        task, rule, config, Particles(x, s), torch.Generator().manual_seed(0), rollout_particles
     )
     batch.past_min_age.fill_(True)
     batch.run(12)
