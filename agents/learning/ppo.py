@@ -205,7 +205,7 @@ class PPOLearner:
         self._play_graphs.run(self._find_values)
         for step, observation in last_observations.items():
             memory.next_values[step].copy_(self.critic(observation))
-        self._play_graphs.run(self._find_advantages, recorded=not self.processes.distributed)
+        self._play_graphs.run(self._find_advantages, captured=not self.processes.distributed)
         return memory.round
 
     @torch.no_grad()

@@ -171,7 +171,7 @@ class TrainingCycle:
         self._steps = torch.zeros_like(self._index[0])
         self._replaced = torch.zeros_like(self._index[0])
         self._fresh_worlds = batch.map(torch.empty_like)
-        graph = functools.partial(GraphedCallable, device=device, recorded=graphed)
+        graph = functools.partial(GraphedCallable, device=device, captured=graphed)
         self._draw = graph(self._draw_worlds, generator=registered(self.random.worlds))
         self._store = graph(self._store_worlds)
         self._record = graph(self._record_iteration)

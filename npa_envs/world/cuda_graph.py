@@ -169,7 +169,7 @@ class GraphSequence:
             graph.replay()
 
     def begin(self) -> None:
-        """Begin to record the current stream's work."""
+        """Begin to capture the current stream's work."""
         graph = torch.cuda.CUDAGraph()
         if self._generator is not None:
             # Without this every replay would draw the same numbers as the capture.
@@ -180,7 +180,7 @@ class GraphSequence:
             graph.capture_begin(pool=self._pool, capture_error_mode="thread_local")
 
     def end(self) -> None:
-        """End the recording."""
+        """End the capture."""
         self._graphs[-1].capture_end()
 
     def pause(self, work: Callable[[], object]) -> None:
@@ -217,7 +217,7 @@ def _stand_in(graph: torch.cuda.CUDAGraph) -> Iterator[None]:
 
 
 _capturing: ContextVar[GraphSequence | None] = ContextVar("capturing", default=None)
-"""The recording of this thread, if any."""
+"""The capture of this thread, if any."""
 
 
 def host_call(work: Callable[[], object]) -> None:
@@ -247,7 +247,7 @@ def capture(
     warm_up: Callable[[], object] | None = None,
     alone: bool = False,
 ) -> GraphSequence:
-    """Record a function's launches as CUDA graphs, without running them.
+    """Capture a function's launches as CUDA graphs, without running them.
 
     It is one graph, unless the function calls `host_call`. The function must not synchronise, and
     its kernels must be loaded (by `warm_up`, which runs on the capture stream). A `pool` of memory
@@ -267,16 +267,16 @@ def capture(
         if warm_up is not None:
             prepare_capture(warm_up, device)
         with contextlib.suppress(torch.OutOfMemoryError):
-            return _record(function, stream, GraphSequence(pool, generator, alone=alone))
+            return _capture(function, stream, GraphSequence(pool, generator, alone=alone))
         # Only here is the first error gone, which kept the memory of that attempt alive.
         torch.cuda.empty_cache()
-        return _record(function, stream, GraphSequence(pool, generator, alone=alone))
+        return _capture(function, stream, GraphSequence(pool, generator, alone=alone))
 
 
-def _record(
+def _capture(
     function: Callable[[], object], stream: torch.cuda.Stream, sequence: GraphSequence
 ) -> GraphSequence:
-    """Record the launches of a function on a stream in `sequence`, and return it."""
+    """Capture the launches of a function on a stream in `sequence`, and return it."""
     current = torch.cuda.current_stream()
     # A capture does run one thing: torch resets generator offsets on the device, which earlier
     # graphs read and the next replay writes. So the two streams wait for each other.
@@ -349,13 +349,13 @@ class GraphedCallable:
         device: torch.device,
         generator: torch.Generator | None = None,
         *,
-        recorded: bool = True,
+        captured: bool = True,
         pool: Any = None,
     ) -> None:
         self._function = WeakFunction(function)
         self._device = device
         self._generator = generator
-        self._recorded = recorded and device.type == "cuda" and can_capture()
+        self._captured = captured and device.type == "cuda" and can_capture()
         self._pool = pool
         self._warm = False
         self._graph: GraphSequence | None = None
@@ -368,7 +368,7 @@ class GraphedCallable:
     def __call__(self) -> None:
         """Run the function, kernel by kernel or as a graph."""
         function = self._function()
-        if not self._recorded or not self._warm:
+        if not self._captured or not self._warm:
             function()
             self._warm = True
             return
