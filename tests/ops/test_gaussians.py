@@ -155,12 +155,9 @@ def frontal(width, height, focal=50.0, dtype=torch.float64, device="cpu"):
     return Cameras(world_to_camera=motion, intrinsics=lens, width=width, height=height)
 
 
-def single(mean, *, scale=(0.1, 0.1, 0.1), opacity=0.5, colour=(1.0, 0.5, 0.25), **options):
-    options = {"dtype": torch.float64, **options}
-    return [
-        torch.tensor(values, **options)[None, None]
-        for values in (mean, scale, (1.0, 0.0, 0.0, 0.0), opacity, colour)
-    ]
+def single(mean, *, scale=(0.1, 0.1, 0.1), device):
+    values = (mean, scale, (1.0, 0.0, 0.0, 0.0), 0.5, (1.0, 0.5, 0.25))
+    return [torch.tensor(v, dtype=torch.float64, device=device)[None, None] for v in values]
 
 
 def test_a_footprint_has_the_covariance_of_projected_samples(device):
