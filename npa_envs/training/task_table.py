@@ -70,7 +70,8 @@ class TaskEntry:
             * sum(task.particle_count for task in getattr(run.task, "species", (run.task,)))
             for run in (config, self.presets["fast"])
         )
-        return float(self.fast_seconds * ours / fast)
+        seconds: float = self.fast_seconds * ours / fast
+        return seconds
 
 
 TASKS: Mapping[str, TaskEntry] = {
