@@ -97,7 +97,7 @@ class CapturedRollout:
         x = call.particles.x
         self.device = x.device
         worlds = call.particles.with_zero_paths()
-        self._no_paths = worlds.path_length
+        _, _, self._no_paths, *_ = worlds
         """Path lengths at the start, zeros."""
         self.bytes = 0
         """Memory of the graphs [bytes]."""
