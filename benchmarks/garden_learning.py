@@ -34,7 +34,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 import npa_envs  # noqa: F401 (registers the environments)
 from npa_envs.agents.comparison.single_run import FIRST_TEST_SEED
-from npa_envs.agents.gardening import (
+from npa_envs.agents.garden_policies import (
     RandomGardener,
     ScriptedGardener,
     ScriptedShepherd,

@@ -24,7 +24,7 @@ import torch
 from scripts import script_facts, script_parser
 
 import npa_envs  # noqa: F401 (registers the environments)
-from npa_envs.agents.gardening import (
+from npa_envs.agents.garden_policies import (
     GradientGardener,
     RandomGardener,
     ScriptedGardener,

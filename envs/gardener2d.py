@@ -90,7 +90,7 @@ class Gardener2DEnv(GardenEnv):
     grid, which push particles; with other `tools` they wipe or change states, or slow down or speed
     up the rule. It observes the difference to the target at each place of the grid.
 
-    `npa_envs.agents.gardening` has policies to compare with: `StillGardener` does nothing,
+    `npa_envs.agents.garden_policies` has policies to compare with: `StillGardener` does nothing,
     `ScriptedGardener` pushes particles to where the picture has too few, linearly in what it
     observes, and `GradientGardener` plans by the gradient of the reward through brushes, rule and
     picture.

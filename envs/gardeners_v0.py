@@ -54,8 +54,8 @@ class GardenersEnv(KnownAgents):
     The id for `pettingzoo.make`, of PettingZoo 1.27 or newer, is `npa/Gardeners-v0`, once
     `npa_envs.envs.gardeners_v0` is imported.
 
-    `garden` is the world as a Gymnasium environment. Policies of `npa_envs.agents.gardening` take
-    it, and their actions fit either agent: `ScriptedGardener(env.garden)`.
+    `garden` is the world as a Gymnasium environment. Policies of `npa_envs.agents.garden_policies`
+    take it, and their actions fit either agent: `ScriptedGardener(env.garden)`.
 
     ## Spaces, starting state and info
 

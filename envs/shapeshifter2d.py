@@ -245,8 +245,8 @@ class Shapeshifter2DEnv(NPAEnv):
 
     The default rule, `seven-pictures`, was trained on the package's seven drawings in small worlds
     on a CPU. It recolours a grown picture at once, but hardly changes its shape.
-    `npa_envs.agents.shapeshifting.RecognisingShapeshifter` gives the goal's code and gets −0.03 per
-    step, random actions get −0.37 (means of 8 episodes). Other rules, of `npa-envs train
+    `npa_envs.agents.shapeshifter_policies.RecognisingShapeshifter` gives the goal's code and gets
+    −0.03 per step, random actions get −0.37 (means of 8 episodes). Other rules, of `npa-envs train
     morphogenesis2d --targets ...`, need their own `state_dim`, `eps`, `eps0` and `particle_count`.
 
     ## Observation space

@@ -7,7 +7,7 @@ so that the import loads neither torch nor Warp and the command line starts fast
 from importlib import import_module as _import_module
 from typing import TYPE_CHECKING, Any
 
-from npa_envs._module_search import extend_path as _extend_path
+from npa_envs._checkout_imports import extend_path as _extend_path
 from npa_envs.registration import register_environments as _register_environments
 
 if TYPE_CHECKING:

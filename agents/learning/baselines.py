@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from npa_envs.agents.evaluation import evaluate_policy
-from npa_envs.agents.gardening import (
+from npa_envs.agents.garden_policies import (
     BrushPolicy,
     GradientGardener,
     RandomGardener,

@@ -20,13 +20,13 @@ from films import FPS, IMAGES, STILL, Frame
 
 from npa_envs import load_rule
 from npa_envs.agents import RulePolicy, SpreadPolicy
-from npa_envs.agents.gardening import (
+from npa_envs.agents.garden_policies import (
     GradientGardener,
     ScriptedGardener,
     ScriptedShepherd,
     StillGardener,
 )
-from npa_envs.agents.shapeshifting import RecognisingShapeshifter
+from npa_envs.agents.shapeshifter_policies import RecognisingShapeshifter
 from npa_envs.registration import CODED, ENVIRONMENTS, GARDENS, Registration
 from npa_envs.render import write_filmstrip, write_webp
 

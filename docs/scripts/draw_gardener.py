@@ -19,7 +19,7 @@ from films import FPS, IMAGES, Frame
 from stable_baselines3 import PPO
 
 import npa_envs  # noqa: F401 (registers the environments)
-from npa_envs.agents.gardening import StillGardener
+from npa_envs.agents.garden_policies import StillGardener
 from npa_envs.render import write_webp
 
 IMAGE = IMAGES / "tutorial_gardener.webp"

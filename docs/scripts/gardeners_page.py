@@ -13,7 +13,7 @@ from draw_environment_pictures import FILM_SIZE, PICTURE_SIZE, film_steps
 from films import FPS, IMAGES, Frame
 from page_parts import NOTE, film_and_strip, sections, table
 
-from npa_envs.agents.gardening import RandomGardener, ScriptedGardener, StillGardener
+from npa_envs.agents.garden_policies import RandomGardener, ScriptedGardener, StillGardener
 from npa_envs.envs import gardeners_v0
 from npa_envs.render import write_filmstrip, write_webp
 
@@ -28,7 +28,7 @@ CAPTION = (
 KEEPERS = (StillGardener, ScriptedGardener)
 EXAMPLE = """\
 ```python
-from npa_envs.agents.gardening import RandomGardener, ScriptedGardener
+from npa_envs.agents.garden_policies import RandomGardener, ScriptedGardener
 from npa_envs.envs import gardeners_v0
 
 env = gardeners_v0.parallel_env(max_cycles=32)

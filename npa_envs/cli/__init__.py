@@ -32,7 +32,7 @@ GROUPS = {
     "measure": {
         "evaluate": "loss, PSNR, overflow and extent of a rule over thousands of steps",
         "robustness": "losses of rules under changed conditions; recovery times after damage",
-        "influence": "how rules that grow next to each other change each other",
+        "rule-interaction": "how rules that grow next to each other change each other",
         "stress": "correctness: hard cases, each with an expectation and a verdict",
         "bench": "speed: the paper's table and scaling; which kernels a step runs, and why",
         "doctor": "what is broken, slow or missing on this machine, and how to fix it",

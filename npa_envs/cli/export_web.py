@@ -41,8 +41,8 @@ def main(arguments: Sequence[str]) -> int:
     """Write the HTML page, or the JSON collection of rules; return 0."""
     options = common.parse_options(ExportOptions, "export-web", arguments)
     common.check_numbers(options, particle_count=1)
-    from npa_envs.rule.authors import save_demo_json
     from npa_envs.rule.files import load_rule, shipped_rules
+    from npa_envs.rule.paper_formats import save_demo_json
     from npa_envs.web.export import distinct_names, export_web
 
     collection = options.out.suffix == ".json"

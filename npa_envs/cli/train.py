@@ -152,7 +152,7 @@ def finish(
     if joint:
         where = f"--distances {config.task.distance:g}"
         where += f" --particle-count {sum(config.task.counts[:2])}"
-        print(f"  together    npa-envs influence {shlex.join(map(str, rules))} {where}")
+        print(f"  together    npa-envs rule-interaction {shlex.join(map(str, rules))} {where}")
     print(f"  look at it  npa-envs view {shlex.quote(str(folder.path))}")
 
 

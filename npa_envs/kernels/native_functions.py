@@ -28,7 +28,7 @@ CUDA_ONLY = (
     "cuda/network.cuh",
     "cuda/equivariance.cuh",
     "pictures/warp_sums.cuh",
-    "pictures/tile_order.cuh",
+    "pictures/tiles_by_work.cuh",
 )
 """Files for CUDA, in an order in which each uses only earlier ones."""
 

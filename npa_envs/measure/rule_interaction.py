@@ -296,7 +296,7 @@ def _loss_and_centroid(
 class InteractionRecord(Record[InteractionRow]):
     """Rows of all pairs of rules and settings."""
 
-    command, key = "influence", "settings"
+    command, key = "rule-interaction", "settings"
 
     def parse(self, content: dict[str, Any]) -> list[InteractionRow]:
         """Return the rows; null stands for infinite numbers."""

@@ -19,7 +19,7 @@ from torch.utils._python_dispatch import is_in_torch_dispatch_mode
 
 from npa_envs.errors import NPAError
 from npa_envs.ops.launch import tracing
-from npa_envs.ops.physics_constants import Physics
+from npa_envs.ops.physics import Physics
 
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")

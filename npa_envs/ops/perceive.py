@@ -33,7 +33,7 @@ from npa_envs.ops.perception_passes import (
     perception_launch,
     portable_kernels,
 )
-from npa_envs.ops.physics_constants import ALL_TERMS, Physics, Terms, make_physics
+from npa_envs.ops.physics import ALL_TERMS, Physics, Terms, make_physics
 from npa_envs.ops.sort import plan_kernels, sort_worlds
 from npa_envs.ops.static import StaticRows, StaticWorlds, static_worlds
 

@@ -19,7 +19,7 @@ from npa_envs.kernels.primitives import WARP
 from npa_envs.ops.backend import ListLayout
 from npa_envs.ops.custom_op import custom_op
 from npa_envs.ops.launch import launch
-from npa_envs.ops.physics_constants import Physics
+from npa_envs.ops.physics import Physics
 from npa_envs.ops.sort import MAX_INDEX, KernelPlan, SortedWorlds, plan_kernels
 
 INTERLEAVED_LISTS = 32

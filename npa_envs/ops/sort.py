@@ -23,7 +23,7 @@ from npa_envs.ops.backend import (
     rollout_lists,
 )
 from npa_envs.ops.launch import SCALARS, channel_width, is_aligned, is_taped, launch
-from npa_envs.ops.physics_constants import Physics
+from npa_envs.ops.physics import Physics
 
 MAX_INDEX = 2**31 - 1
 """Largest index of an array in a kernel: indices have 32 bits."""

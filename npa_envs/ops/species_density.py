@@ -15,7 +15,7 @@ from npa_envs.kernels.portable.density import species_kernel
 from npa_envs.ops.custom_op import custom_op
 from npa_envs.ops.launch import SCALARS, launch
 from npa_envs.ops.perceive import checked_physics, perceive
-from npa_envs.ops.physics_constants import Physics
+from npa_envs.ops.physics import Physics
 from npa_envs.ops.sort import plan_kernels, sort_worlds
 
 MAX_SPECIES = 64

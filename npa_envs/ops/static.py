@@ -21,7 +21,7 @@ from npa_envs.ops.perception_passes import (
     StaticNeighbours,
     compute_densities,
 )
-from npa_envs.ops.physics_constants import Physics
+from npa_envs.ops.physics import Physics
 from npa_envs.ops.sort import KernelPlan, SortedWorlds, plan_kernels, sort_worlds
 
 MAX_LISTS = 2**31

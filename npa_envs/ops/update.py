@@ -23,7 +23,7 @@ from npa_envs.kernels.portable.update import (
 from npa_envs.ops.custom_op import check_derivatives, custom_op, once_differentiable
 from npa_envs.ops.launch import SCALARS, Tape, is_aligned, launch
 from npa_envs.ops.perceive import Rows
-from npa_envs.ops.physics_constants import Physics
+from npa_envs.ops.physics import Physics
 from npa_envs.ops.sort import MAX_INDEX
 
 

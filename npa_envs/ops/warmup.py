@@ -16,7 +16,7 @@ from npa_envs.ops.draws import draw
 from npa_envs.ops.equivariance import MIXED_VECTORS, VectorSizes, read_rows, steer_rows
 from npa_envs.ops.network import arrange_weights, run_network
 from npa_envs.ops.perceive import NeighbourState, perceive, perceive_rows
-from npa_envs.ops.physics_constants import Limits, Physics
+from npa_envs.ops.physics import Limits, Physics
 from npa_envs.ops.pictures.cameras import orbit
 from npa_envs.ops.pictures.gaussians import render_gaussians
 from npa_envs.ops.pictures.splat import picture_losses, splat

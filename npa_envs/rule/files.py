@@ -28,7 +28,7 @@ from npa_envs.atomic_files import (
 )
 from npa_envs.devices import check_device
 from npa_envs.errors import NPAError, shown, suggest
-from npa_envs.rule.authors import (
+from npa_envs.rule.paper_formats import (
     ZIP_MARK,
     RuleParts,
     check_weights,

@@ -22,7 +22,7 @@ from npa_envs.checks import (
 )
 from npa_envs.errors import NPAError, shown
 from npa_envs.ops.equivariance import MIXED_VECTORS, VectorSizes, invariants, signed_gates, steered
-from npa_envs.ops.physics_constants import Terms
+from npa_envs.ops.physics import Terms
 from npa_envs.rule.folded_network import (
     FOLD,
     FoldedInvariants,

@@ -142,7 +142,7 @@ def distinct_names(sources: Sequence[str], what: str) -> list[str]:
 
 
 def page_rule(source: str, *, particle_count: int | None = None) -> dict[str, Any]:
-    """Return a rule and its world as JSON for page_world.js, with arrays as float32 in base64."""
+    """Return a rule and its world as JSON for rule_world.js, with arrays as float32 in base64."""
     check_browser_rule(load_rule(source), name_of(source))
     live = RuleWorld(source, device=torch.device("cpu"), particle_count=particle_count, choices={})
     rule, task = live.main.rule, live.task
@@ -163,7 +163,7 @@ def page_rule(source: str, *, particle_count: int | None = None) -> dict[str, An
             f"a {type(task).__name__}: watch it with npa-envs view"
         )
     world = live.describe()
-    # page_world.js adds these itself.
+    # rule_world.js adds these itself.
     for name in ("type", "rules", "rule", "others", "species", "show", "playing", "seed"):
         del world[name]
     classes = {"palette": PALETTE, "undecided": UNDECIDED}
@@ -242,8 +242,8 @@ def page_text(
     }
     # With "<" a rule's text could end the script element.
     data = json.dumps(settings, separators=(",", ":")).replace("<", "\\u003c")
-    code = joined_modules("worker_engine.js") + 'modules["worker_engine.js"].begin();\n'
-    worker = joined_modules("page_world.js") + 'modules["page_world.js"].serve(self);\n'
+    code = joined_modules("worker_connection.js") + 'modules["worker_connection.js"].begin();\n'
+    worker = joined_modules("rule_world.js") + 'modules["rule_world.js"].serve(self);\n'
     style = (PAGE / "page.css").read_text(encoding="utf-8")
     policy = POLICY.format(scripts=_digest(code), styles=_digest(style))
     page = (PAGE / "index.html").read_text(encoding="utf-8")
@@ -256,7 +256,7 @@ def page_text(
         ("<title>npa-envs</title>", f"<title>{html.escape(title)}</title>"),
         ('<link rel="stylesheet" href="page.css">', f"<style>{style}</style>"),
         (
-            '<script type="module" src="server_engine.js"></script>',
+            '<script type="module" src="server_connection.js"></script>',
             f"{_gallery(title, previews) if previews else ''}"
             f'<script type="application/json" id="rules">{data}</script>\n'
             f'<script type="text/plain" id="worker">{worker}</script>\n'

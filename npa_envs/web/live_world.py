@@ -80,7 +80,7 @@ TOOLS = {
     ),
 }  # fmt: skip
 """All brushes, in the order of their buttons and keys. `LiveWorld._brush` applies those that change
-positions or states, `RuleWorld._brush` the others, and `BRUSHES` of page_world.js all."""
+positions or states, `RuleWorld._brush` the others, and `BRUSHES` of rule_world.js all."""
 
 
 class WorldView(NamedTuple):

@@ -16,12 +16,6 @@ from npa_envs.errors import NPAError
 from npa_envs.ops.custom_op import once_differentiable
 from npa_envs.rule.rule import NPARule
 from npa_envs.world.cuda_graph import GraphSequence, capture, current_stream, prepare_capture
-from npa_envs.world.network_fingerprint import (
-    rule_settings,
-    rule_tensors,
-    settings_and_weights,
-    tensor_form,
-)
 from npa_envs.world.particles import Particles, combined
 from npa_envs.world.randomness import (
     Randomness,
@@ -29,6 +23,12 @@ from npa_envs.world.randomness import (
     give_back_draws,
     reserve_draws,
     torch_generator,
+)
+from npa_envs.world.rule_settings import (
+    rule_settings,
+    rule_tensors,
+    settings_and_weights,
+    tensor_form,
 )
 
 if TYPE_CHECKING:

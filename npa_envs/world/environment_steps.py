@@ -12,10 +12,10 @@ import torch
 from torch import Tensor
 
 from npa_envs.ops.perceive import NeighbourState as NeighbourState
-from npa_envs.ops.physics_constants import Boundary as Boundary
-from npa_envs.ops.physics_constants import Limits as Limits
-from npa_envs.ops.physics_constants import Physics as Physics
-from npa_envs.ops.physics_constants import Terms as Terms
+from npa_envs.ops.physics import Boundary as Boundary
+from npa_envs.ops.physics import Limits as Limits
+from npa_envs.ops.physics import Physics as Physics
+from npa_envs.ops.physics import Terms as Terms
 from npa_envs.ops.rewards_and_ends import DIVERGED as DIVERGED
 from npa_envs.ops.rewards_and_ends import NOT_FINITE as NOT_FINITE
 from npa_envs.ops.rewards_and_ends import SUCCESS as SUCCESS

@@ -15,7 +15,7 @@ from torch.utils.checkpoint import checkpoint
 from npa_envs.checks import check_finite_positions
 from npa_envs.errors import NPAError
 from npa_envs.ops.launch import Tape
-from npa_envs.ops.physics_constants import Physics
+from npa_envs.ops.physics import Physics
 from npa_envs.ops.sort import sorts_at_once
 from npa_envs.rule.folded_network import Network
 from npa_envs.rule.rule import NPARule
@@ -27,9 +27,9 @@ from npa_envs.world.graphed_rollouts import (
     CudaGraph,
     run_captured,
 )
-from npa_envs.world.network_fingerprint import rule_form
 from npa_envs.world.particles import Particles, combined
 from npa_envs.world.randomness import Randomness
+from npa_envs.world.rule_settings import rule_form
 from npa_envs.world.steps import (
     DivisionStep,
     Draws,

@@ -26,9 +26,9 @@ from npa_envs.checks import check_finite_positions
 from npa_envs.rule.rule import NPARule
 from npa_envs.world.captured_rollout import CapturedRollout, RolloutCall
 from npa_envs.world.cuda_graph import can_capture, capture_lock, may_be_disturbed, plain_tensors
-from npa_envs.world.network_fingerprint import settings_and_weights
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness, WorldRandom, torch_generator
+from npa_envs.world.rule_settings import settings_and_weights
 
 if TYPE_CHECKING:
     from npa_envs.world.execute import RolloutSpec

@@ -10,7 +10,7 @@ from torch import Tensor
 from npa_envs.checks import Box, check_world, checked_choice, checked_count, checked_flag
 from npa_envs.errors import NPAError, shown
 from npa_envs.ops.custom_op import check_derivatives
-from npa_envs.ops.physics_constants import Boundary, Physics, make_physics
+from npa_envs.ops.physics import Boundary, Physics, make_physics
 from npa_envs.rule.rule import NPARule, check_rule
 from npa_envs.world.divergence import OnDivergence, make_watch
 from npa_envs.world.execute import Memory, RolloutSpec, execute, resting

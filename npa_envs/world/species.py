@@ -9,7 +9,7 @@ from torch import Tensor
 
 from npa_envs.checks import Box, as_list, check_world, checked_choice, checked_positive
 from npa_envs.errors import NPAError, shown
-from npa_envs.ops.physics_constants import Boundary
+from npa_envs.ops.physics import Boundary
 from npa_envs.ops.species_density import checked_counts
 from npa_envs.rule.rule import NPARule
 from npa_envs.world.divergence import OnDivergence

@@ -14,7 +14,7 @@ from npa_envs.agents import (
     RulePolicy,
     ZeroPolicy,
     evaluate_policy,
-    gardening,
+    garden_policies,
 )
 from npa_envs.agents.comparison.plan import ComparisonPlan
 from npa_envs.agents.learning import Budget, Problem, Progress, RuleSet, train
@@ -135,12 +135,15 @@ REFUSED = {
     ],
     garden: [
         (
-            {"policy": gardening.StillGardener, "actions": "discrete"},
+            {"policy": garden_policies.StillGardener, "actions": "discrete"},
             "must be a garden with actions",
         ),
-        ({"policy": gardening.ScriptedGardener, "tools": ("wipe",)}, "have brushes that push"),
-        ({"policy": gardening.ScriptedShepherd}, "env must be npa/Shepherd2D-v0"),
-        ({"policy": gardening.ScriptedGardener, "gain": 0.0}, "gain must be positive"),
+        (
+            {"policy": garden_policies.ScriptedGardener, "tools": ("wipe",)},
+            "have brushes that push",
+        ),
+        ({"policy": garden_policies.ScriptedShepherd}, "env must be npa/Shepherd2D-v0"),
+        ({"policy": garden_policies.ScriptedGardener, "gain": 0.0}, "gain must be positive"),
     ],
     problem: [
         ({"env_id": "npa/Mixng-v0"}, "did you mean 'npa/Mixing-v0'"),

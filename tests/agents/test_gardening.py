@@ -11,7 +11,7 @@ from support.small_envs import begun
 import npa_envs
 from npa_envs.agents import evaluate_policy
 from npa_envs.agents.evaluation import bound_to
-from npa_envs.agents.gardening import (
+from npa_envs.agents.garden_policies import (
     GradientGardener,
     RandomGardener,
     ScriptedGardener,

@@ -12,7 +12,7 @@ from support.refusals import refused
 from support.small_envs import begun, make, make_vec, small
 
 import npa_envs
-from npa_envs.agents.shapeshifting import RecognisingShapeshifter
+from npa_envs.agents.shapeshifter_policies import RecognisingShapeshifter
 from npa_envs.envs import gardeners_v0
 from npa_envs.envs.garden.base import GardenContext
 from npa_envs.envs.garden.brushes import BrushLayout, apply_brushes, grid_places

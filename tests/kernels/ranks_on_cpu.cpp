@@ -4,7 +4,7 @@
 
 #include "cuda_on_cpu.h"
 
-#include "tile_order.cuh"
+#include "tiles_by_work.cuh"
 
 constexpr int CAPACITY = 128;
 

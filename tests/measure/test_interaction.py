@@ -208,7 +208,7 @@ def rules(tmp_path_factory):
 
 def words_of(rules, out, *more):
     paths = [str(rules / f"{name}.safetensors") for name in ("one", "two")]
-    return ["influence", *paths, "--out", str(out), "--no-progress", *more]
+    return ["rule-interaction", *paths, "--out", str(out), "--no-progress", *more]
 
 
 def record_in(folder):
@@ -220,8 +220,14 @@ def test_mistakes_are_refused_and_nothing_is_written(rules, tmp_path, capsys):
     save_rule(make_rule(), unknown)
     one = str(rules / "one.safetensors")
     for words, message in (
-        (["influence", one, "--no-itself", "--out", str(out)], "more without itself, got one"),
-        (["influence", str(unknown), "--out", str(out)], "does not say what it grows: leave it"),
+        (
+            ["rule-interaction", one, "--no-itself", "--out", str(out)],
+            "more without itself, got one",
+        ),
+        (
+            ["rule-interaction", str(unknown), "--out", str(out)],
+            "does not say what it grows: leave it",
+        ),
     ):
         assert main(words) == 2
         assert message in capsys.readouterr().err

@@ -8,7 +8,7 @@ from support.worlds import assert_same, random_mask
 
 from npa_envs.errors import NPAError
 from npa_envs.ops import apply_actions
-from npa_envs.ops.physics_constants import Limits, make_physics
+from npa_envs.ops.physics import Limits, make_physics
 from npa_envs.ops.update import ActedWorlds, PreparedActions
 
 B, N, C = 3, 77, 5

@@ -20,7 +20,7 @@ from npa_envs.ops import launch as threads
 from npa_envs.ops import orbit, render_gaussians, splat
 from npa_envs.ops.launch import even_ranges, run_together
 from npa_envs.ops.perceive import NeighbourState
-from npa_envs.ops.physics_constants import Limits, Physics
+from npa_envs.ops.physics import Limits, Physics
 from npa_envs.ops.pictures.splat import picture_losses
 from npa_envs.ops.update import ActedWorlds, PreparedActions
 

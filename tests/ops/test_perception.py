@@ -21,7 +21,7 @@ from support.worlds import (
 import npa_envs
 from npa_envs import reference as oracle
 from npa_envs.ops.perceive import NeighbourState
-from npa_envs.ops.physics_constants import Limits, Terms, make_physics
+from npa_envs.ops.physics import Limits, Terms, make_physics
 
 # The bound of the tests, then the worst error measured on CPUs and CUDA: a quarter of it at most.
 FORWARD = {torch.float32: 8e-6, torch.float64: 2e-14}  # 1.9e-6, 3.8e-15 (CUDA)

@@ -18,7 +18,7 @@ from npa_envs.ops import (
     splat,
     world_mean,
 )
-from npa_envs.ops.physics_constants import Limits, Physics
+from npa_envs.ops.physics import Limits, Physics
 from npa_envs.ops.pictures.splat import picture_losses
 
 SIZE = {"width": 40, "height": 30}

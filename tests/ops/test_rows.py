@@ -14,7 +14,7 @@ from support.worlds import (
 import npa_envs
 from npa_envs.errors import NPAError
 from npa_envs.ops import backend, perception_passes
-from npa_envs.ops.physics_constants import Terms
+from npa_envs.ops.physics import Terms
 
 # The worst errors measured were 1.2e-6 (CUDA), and in a box of two eps 2.1e-6 (CUDA).
 BOUNDS = (5e-6, 1e-5)

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 import npa_envs
-from npa_envs._module_search import MAPPED_PACKAGES, extend_path
+from npa_envs._checkout_imports import MAPPED_PACKAGES, extend_path
 from npa_envs.cli.doctor import EXTRAS
 
 ROOT = Path(__file__).resolve().parents[2]

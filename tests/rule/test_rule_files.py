@@ -13,8 +13,8 @@ from safetensors.torch import save_file
 from support.worlds import relative_error
 
 from npa_envs.errors import NPAError
-from npa_envs.rule.authors import save_demo_json
 from npa_envs.rule.files import load_rule, preset_rules, rule_metadata, save_rule, shipped_rules
+from npa_envs.rule.paper_formats import save_demo_json
 from npa_envs.rule.rule import HYPER_PARAMETERS, NPARule
 
 RULES = {

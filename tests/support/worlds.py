@@ -5,7 +5,7 @@ from torch.utils._pytree import tree_leaves
 
 import npa_envs
 from npa_envs.ops.perceive import perceive_rows
-from npa_envs.ops.physics_constants import Terms, make_physics
+from npa_envs.ops.physics import Terms, make_physics
 
 
 def tensors(*values):

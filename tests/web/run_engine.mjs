@@ -8,7 +8,7 @@ const folder = process.argv[2];
 const load = (name) => import(pathToFileURL(`${folder}/${name}`));
 const { Physics, padded, plainKernels, prepareRule } = await load("physics.js");
 const { simdKernels } = await load("kernels_simd.js");
-const { RuleWorld } = await load("page_world.js");
+const { RuleWorld } = await load("rule_world.js");
 const { Colouring } = await load("colours.js");
 
 const floats = (text) => new Float32Array(Uint8Array.from(Buffer.from(text, "base64")).buffer);

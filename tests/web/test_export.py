@@ -311,7 +311,7 @@ def test_a_page_is_one_small_file_that_asks_for_nothing(tmp_path):
 
 @pytest.mark.usefixtures("modules")
 @pytest.mark.parametrize(
-    ("name", "count"), [("worker_engine.js", 4), ("page_world.js", 6), ("physics_gpu.js", 2)]
+    ("name", "count"), [("worker_connection.js", 4), ("rule_world.js", 6), ("physics_gpu.js", 2)]
 )
 def test_a_joined_script_is_that_of_a_module_after_its_imports(name, count):
     script = joined_modules(name) + "console.log(Object.keys(modules).join())"

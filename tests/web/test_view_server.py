@@ -126,7 +126,7 @@ def test_the_page_and_its_files_are_served(client):
     assert page.status_code == 200
     assert "frame-ancestors 'none'" in page.headers["content-security-policy"]
     assert "unsafe" not in page.headers["content-security-policy"]
-    for name in ("page.js", "drawing.js", "plots.js", "server_engine.js", "page.css"):
+    for name in ("page.js", "drawing.js", "plots.js", "server_connection.js", "page.css"):
         part = client.get(f"/{name}")
         assert part.status_code == 200
         assert name.split(".")[1] in part.headers["content-type"].replace("javascript", "js")

@@ -9,7 +9,7 @@ from test_captured_rollouts import as_launched as follows
 from torch import nn
 
 import npa_envs
-from npa_envs.world.network_fingerprint import rule_settings
+from npa_envs.world.rule_settings import rule_settings
 
 pytestmark = pytest.mark.usefixtures("nothing_captured")
 

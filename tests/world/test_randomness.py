@@ -10,7 +10,7 @@ from support.worlds import assert_same, lively_rule, random_world
 import npa_envs
 from npa_envs import WorldRandom
 from npa_envs.errors import NPAError
-from npa_envs.ops.physics_constants import Physics
+from npa_envs.ops.physics import Physics
 from npa_envs.tasks.damage import random_particle
 from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.world.randomness import check_generator, uniform_draws

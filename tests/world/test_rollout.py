@@ -18,7 +18,7 @@ import npa_envs
 from npa_envs import reference as oracle
 from npa_envs.ops import splat
 from npa_envs.ops.perceive import Rows
-from npa_envs.ops.physics_constants import make_physics
+from npa_envs.ops.physics import make_physics
 from npa_envs.ops.update import update_particles
 from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.world.steps import row_capacity

@@ -15,7 +15,7 @@ from npa_envs.measure.benchmark_records import aligned
 from npa_envs.measure.speed.timing import TimingSession, Workload, rollout_call
 from npa_envs.ops.backend import describe
 from npa_envs.ops.launch import noted_launches
-from npa_envs.ops.physics_constants import make_physics
+from npa_envs.ops.physics import make_physics
 from npa_envs.ops.sort import plan_kernels
 from npa_envs.rule.rule import NPARule
 from npa_envs.world.rollout import step

@@ -1,5 +1,5 @@
 // The page: a canvas, brushes, controls and plots. An engine runs the world: its function `connect` is
-// that of `server_engine.js`, for a server in Python, or of `worker_engine.js`, for a worker in the page.
+// that of `server_connection.js`, for a server in Python, or of `worker_connection.js`, for a worker in the page.
 //
 //   const engine = await connect(settings, listener);   // settings: those of `start`
 //   engine.send(message);                               // page -> engine, a JSON object
@@ -44,8 +44,8 @@
 //   {type: "file", name, url}                                      a file of a film is ready
 //   {type: "error", message}
 //
-// index.html loads server_engine.js. npa_envs/web/export.py joins worker_engine.js and its imports into one
-// script, and page_world.js and its imports into that of the worker.
+// index.html loads server_connection.js. npa_envs/web/export.py joins worker_connection.js and its imports into one
+// script, and rule_world.js and its imports into that of the worker.
 //
 // `show`: "colours", "density", "species", "speed", "mask", "components" (the first three principal
 // components of the state as red, green and blue), "state 0", "state 1", ...

@@ -1,5 +1,5 @@
 // The engine of an exported page, as page.js describes engines: a worker in the page, which runs the RuleWorld of
-// page_world.js. Also the gallery to choose a rule.
+// rule_world.js. Also the gallery to choose a rule.
 
 import { start } from "./page.js";
 

@@ -1,4 +1,4 @@
-"""`npa-envs influence`: grows rules in one world and measures how each changes the other."""
+"""`npa-envs rule-interaction`: grows rules in one world and measures how each changes the other."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ TASK = "morphogenesis2d"
 
 
 @dataclass(frozen=True, kw_only=True)
-class InfluenceOptions(common.RunOptions, InteractionSettings):
+class RuleInteractionOptions(common.RunOptions, InteractionSettings):
     """Grow every rule next to every other one, and measure how that changes it.
 
     For every ordered pair of rules, distance, ratio and radius it measures: the first rule's task
@@ -42,21 +42,21 @@ class InfluenceOptions(common.RunOptions, InteractionSettings):
     stopped run continues.
 
     Examples:
-      npa-envs influence gecko heart
-      npa-envs influence --particle-count 512 --steps 32
+      npa-envs rule-interaction gecko heart
+      npa-envs rule-interaction --particle-count 512 --steps 32
     """
 
     rules: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RULE")] = ()
     """Rules of 2D morphogenesis: shipped ones (`npa-envs list`) or files; default: all shipped."""
     itself: bool = True
     """Also pair each rule with itself."""
-    out: Path = Path("runs/influence")
+    out: Path = Path("runs/rule-interaction")
     """Folder to write to; created where missing."""
 
 
 def main(arguments: Sequence[str]) -> int:
     """Grow the pairs of rules that are not measured yet; write results and print their table."""
-    options = common.parse_options(InfluenceOptions, "influence", arguments)
+    options = common.parse_options(RuleInteractionOptions, "rule-interaction", arguments)
     device = options.checked_device()
     sources = common.named_rules(options.rules or shipped_rules(TASK))
     rules = [_loaded(name, source, device) for name, source in sources.items()]
