@@ -91,10 +91,6 @@ def export_web(
         particle_count: Particles of each world; None: as trained.
         previews: Begin with pictures of the rules' worlds after some steps, to choose from.
         seed: Seed of the first world, 0 to 2^53 - 1.
-
-    Raises:
-        NPAError: The suffix is not .html, a rule cannot be loaded or run in a browser, two have the
-            same name, or the file cannot be written.
     """
     path = checked_path(path)
     if path.suffix != ".html":
