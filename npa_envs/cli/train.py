@@ -13,14 +13,7 @@ import torch.distributed as dist
 from npa_envs.cli import INTERRUPTED, common
 from npa_envs.cli.train_options import TrainOptions, default_preset, parse_run, resolve_task
 from npa_envs.errors import NPAError
-from npa_envs.training import (
-    TASKS,
-    RunFolder,
-    TrainConfig,
-    check_device,
-    task_entry,
-    train,
-)
+from npa_envs.training import TASKS, RunFolder, TrainConfig, check_device, task_entry, train
 from npa_envs.training.checkpoint import has_per_world_streams, load_checkpoint
 from npa_envs.training.process_group import ProcessGroup
 from npa_envs.training.process_launcher import (

@@ -53,13 +53,7 @@ TITLES: Mapping[str, str] = {
 
 
 def write_report(
-    path: Path,
-    folder: Path,
-    task_name: str,
-    training: str,
-    device: torch.device,
-    *,
-    progress: bool,
+    path: Path, folder: Path, task_name: str, training: str, device: torch.device, *, progress: bool
 ) -> tuple[Path, str]:
     """Measure and film the rule in a file; return the report's path and one line of scores.
 

@@ -128,7 +128,7 @@ _open_window: Window | None = None
 
 
 class Window:
-    """A window on the screen; without a screen it warns once and then does nothing.
+    """A window on the screen, by pygame; without a screen it warns once and then does nothing.
 
     A process has one window: a new one closes the previous one.
 
@@ -136,9 +136,6 @@ class Window:
         title: Text of the title bar.
         size: Side of the window [screen pixels]. Frames of another size are scaled to it.
         fps: Largest number of frames per second, kept by waiting in `show`; None: no limit.
-
-    Raises:
-        MissingDependencyError: pygame is not installed.
     """
 
     def __init__(self, title: str, size: int = 512, *, fps: float | None = None) -> None:

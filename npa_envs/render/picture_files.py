@@ -108,12 +108,9 @@ def encode_webp(frames: Iterable[Frame], fps: float = 25, *, quality: int = 50) 
 
 
 def write_mp4(path: str | Path, frames: Iterable[Frame], fps: float = 25) -> None:
-    """Write frames [H, W, 3] as an H.264 film that browsers play.
+    """Write frames [H, W, 3] as an H.264 film that browsers play; needs imageio and its ffmpeg.
 
     An odd width or height is made even by repeating the last column or row.
-
-    Raises:
-        MissingDependencyError: imageio or its ffmpeg is not installed.
     """
     pictures = checked_frames(frames)
     check_rate(fps)
