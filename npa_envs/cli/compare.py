@@ -22,19 +22,6 @@ if TYPE_CHECKING:
     from npa_envs.agents.comparison.plan import Axis, ComparisonPlan
     from npa_envs.agents.comparison.single_run import RunRecord
 
-ROWS = "rows"
-"""Folder, within that of the comparison, of the results of each method on a suite."""
-
-QUICK_EPISODES, QUICK_STEPS = 4, 200_000
-"""Held-out episodes and particle-steps of a quick comparison."""
-
-QUICK: dict[str, Any] = {
-    "tasks": ("morphogenesis2d",),
-    "methods": ("gradient", "evolution", "zero"),
-    "seed_count": 1,
-}
-"""Defaults of a quick comparison."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class CompareOptions(common.PartOptions, common.MeasureOptions):
@@ -97,10 +84,11 @@ def main(arguments: Sequence[str]) -> int:
     sys.path.insert(0, str(Path.cwd()))
     plan = make_plan(options)
     folder = common.writable_folder(options.out)
+    rows_folder = folder / "rows"
     # Read before any run, so that a record of other settings is rejected at once.
     records = held_records(plan, folder)
     if options.suite is not None:
-        check_rows(SUITES[options.suite], plan, folder / ROWS)
+        check_rows(SUITES[options.suite], plan, rows_folder)
     jobs = plan.jobs()
     part_jobs = plan.part(options.part)
     missing = [job for job in part_jobs if job not in records]
@@ -127,7 +115,7 @@ def main(arguments: Sequence[str]) -> int:
     done = done_records()
     lines = [write_table(plan, done, folder, command), *write_pictures(done, folder)]
     if options.suite is not None:
-        rows_folder = common.writable_folder(folder / ROWS)
+        common.writable_folder(rows_folder)
         rows = write_rows(SUITES[options.suite], plan, done, rows_folder, command)
         lines += [f"wrote {path}" for path in rows]
     failed = [record for record in done if record.status == "failed"]
@@ -161,8 +149,12 @@ def make_plan(options: CompareOptions) -> ComparisonPlan:
                     "frozen: leave it out, or compare without a suite"
                 )
     elif quick:
-        changes = {name: getattr(options, name) or value for name, value in QUICK.items()}
-        options = replace(options, **changes)
+        options = replace(
+            options,
+            tasks=options.tasks or ("morphogenesis2d",),
+            methods=options.methods or ("gradient", "evolution", "zero"),
+            seed_count=options.seed_count or 1,
+        )
     tasks = common.chosen_names("task", options.tasks, suite.tasks if suite else PROBLEMS)
     if suite and quick and not options.tasks:
         tasks = tasks[:1]
@@ -200,7 +192,7 @@ def make_plan(options: CompareOptions) -> ComparisonPlan:
         options=changed_options,
         own=own,
         left_out=left_out,
-        episodes=options.episodes or (QUICK_EPISODES if quick else episodes),
+        episodes=options.episodes or (4 if quick else episodes),
         settings=_settings(options),
     )
 
@@ -208,7 +200,7 @@ def make_plan(options: CompareOptions) -> ComparisonPlan:
 def _budgets(options: CompareOptions) -> dict[Axis, float]:
     seconds, steps = options.learning_seconds, options.particle_steps
     if options.quick and steps is None and seconds is None:
-        steps = QUICK_STEPS
+        steps = 200_000
     limits: dict[Axis, float | None] = {"seconds": seconds, "particle-steps": steps}
     budgets = {axis: limit for axis, limit in limits.items() if limit is not None}
     if not budgets:

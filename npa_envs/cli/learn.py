@@ -18,10 +18,6 @@ if TYPE_CHECKING:
     from npa_envs.training.process_group import ProcessGroup
 
 
-NUM_ENVS = 16
-"""Default number of worlds, and the most for evaluations."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class LearnOptions(common.SharedRunOptions, common.RunOptions):
     """Learn an environment by reinforcement learning, and write the run to a folder.
@@ -126,7 +122,7 @@ def run(options: LearnOptions, processes: ProcessGroup) -> int:
     )
     train(
         options.method,
-        common.problem_of(options, options.num_envs or NUM_ENVS, options.episode_steps),
+        common.problem_of(options, options.num_envs or 16, options.episode_steps),
         budget,
         options.seed,
         device=options.device,

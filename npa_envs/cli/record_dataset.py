@@ -17,9 +17,6 @@ from npa_envs.errors import NPAError
 if TYPE_CHECKING:
     from npa_envs.agents.learning import Problem
 
-UNTRAINED = ("zero", "random", "scripted")
-"""Policies that need no file."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class RecordOptions(common.RunOptions):
@@ -60,7 +57,11 @@ def main(arguments: Sequence[str]) -> int:
     from npa_envs.measure.benchmark_records import command_text
     from npa_envs.wrappers.minari import ROOT, record_episodes, spec_of, write_dataset
 
-    problem = problem_of(options)
+    problem = common.problem_of(options, min(options.num_envs, options.episodes))
+    if problem.controlled == "species":
+        raise NPAError(
+            f"env must be of one species, as Minari keeps one agent's episodes, got {options.env}"
+        )
     envs: Any = problem.make_envs(device=options.device)
     policy = bound_to(envs, policy_of(options, problem))
     seeds = range(options.first_seed, options.first_seed + options.episodes)
@@ -86,22 +87,13 @@ def main(arguments: Sequence[str]) -> int:
     return 0
 
 
-def problem_of(options: RecordOptions) -> Problem:
-    """Return the environment to record, checked to be of one species."""
-    problem = common.problem_of(options, min(options.num_envs, options.episodes))
-    if problem.controlled == "species":
-        raise NPAError(
-            f"env must be of one species, as Minari keeps one agent's episodes, got {options.env}"
-        )
-    return problem
-
-
 def policy_of(options: RecordOptions, problem: Problem) -> Callable[[Any], Any]:
     """Return the policy named by `options.policy`, loaded or made for the environment."""
     from npa_envs.agents.learning import Budget, RuleSet, train
     from npa_envs.agents.learning.problem import WORLDS_PER_SEED
 
-    known = (*UNTRAINED, "gradient") if problem.controlled == "brushes" else UNTRAINED
+    known: tuple[str, ...] = ("zero", "random", "scripted")
+    known += ("gradient",) if problem.controlled == "brushes" else ()
     if options.policy in known:
         # These learn nothing: `train` plays each scripted policy once and returns the best.
         seed = 0

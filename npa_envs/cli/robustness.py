@@ -11,9 +11,6 @@ import tyro
 
 from npa_envs.cli import common
 
-QUICK_SEEDS, QUICK_PARTICLES = 2, 256
-"""Seeds and particles of a quick run."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class RobustnessOptions(common.MeasureOptions):
@@ -59,7 +56,7 @@ def main(arguments: Sequence[str]) -> int:
         # One of each task.
         names = list({task_name(name): name for name in reversed(names)}.values())[::-1]
     device = options.checked_device()
-    count = options.seed_count or (QUICK_SEEDS if options.quick else 8)
+    count = options.seed_count or (2 if options.quick else 8)
     seeds = range(FIRST_SEED, FIRST_SEED + count)
     facts = measured_facts(device, options.commit, quick=options.quick, seeds=list(seeds))
     folder = None if options.out is None else common.writable_folder(options.out)
@@ -79,7 +76,7 @@ def main(arguments: Sequence[str]) -> int:
             if not record.done and not enough():
                 task = task_name(sources[name])
                 plan = quick_plan(task) if options.quick else PLANS[task]
-                small = QUICK_PARTICLES if options.quick else None
+                small = 256 if options.quick else None
                 trial = RuleTrial(sources[name], device, plan, seeds, small)
                 report.measure_rule(record, trial, enough=enough)
             advance(1)

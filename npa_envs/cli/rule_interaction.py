@@ -8,7 +8,6 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated
 
-import torch
 import tyro
 
 from npa_envs.cli import common
@@ -59,7 +58,15 @@ def main(arguments: Sequence[str]) -> int:
     options = common.parse_options(RuleInteractionOptions, "rule-interaction", arguments)
     device = options.checked_device()
     sources = common.named_rules(options.rules or shipped_rules(TASK))
-    rules = [_loaded(name, source, device) for name, source in sources.items()]
+    rules = []
+    for name, source in sources.items():
+        rule = load_rule(source, device=device).float().requires_grad_(False)
+        trained = task_of_rule(source, rule, device)
+        if trained.task_name != TASK:
+            raise NPAError(f"rules must be of the task {TASK}, got {source!r}: leave it out")
+        if trained.why_not_measurable is not None:
+            raise NPAError(f"cannot measure {source!r}: {trained.why_not_measurable}: leave it out")
+        rules.append(RuleUnderTest(name, rule, trained.task))
     pairs = [
         (first, second)
         for first, second in itertools.product(rules, rules)
@@ -93,13 +100,3 @@ def main(arguments: Sequence[str]) -> int:
     path = folder / "interactions.png"
     print("\n".join(write_plots(lambda: {"": interaction_map(record.rows)}, path, "heat map")))
     return 0
-
-
-def _loaded(name: str, source: str, device: torch.device) -> RuleUnderTest:
-    rule = load_rule(source, device=device).float().requires_grad_(False)
-    trained = task_of_rule(source, rule, device)
-    if trained.task_name != TASK:
-        raise NPAError(f"rules must be of the task {TASK}, got {source!r}: leave it out")
-    if trained.why_not_measurable is not None:
-        raise NPAError(f"cannot measure {source!r}: {trained.why_not_measurable}: leave it out")
-    return RuleUnderTest(name, rule, trained.task)

@@ -29,9 +29,6 @@ RESERVED = ("out", "device", "resume", "overwrite", "max-seconds", "processes", 
 
 PROGRAM = (sys.executable, "-m", "npa_envs", "train")
 
-SHOWN = 300
-"""Last characters of a failed run's output that are printed."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class SweepOptions(common.PartOptions):
@@ -154,8 +151,8 @@ def main(arguments: Sequence[str]) -> int:
     unfinished = [run for run in part_runs if not run.done]
     failed = [run for run in unfinished if (run.folder / RECORD).exists()]
     for run in failed:
-        output = (run.folder / OUTPUT).read_text("utf-8", errors="replace").strip()[-SHOWN:]
-        print(f"{run.folder.name} failed: {' '.join(output.split())}")
+        output = (run.folder / OUTPUT).read_text("utf-8", errors="replace").strip()
+        print(f"{run.folder.name} failed: {' '.join(output[-300:].split())}")
     if len(unfinished) > len(failed):
         print(f"{len(unfinished) - len(failed)} {hint}")
     return 1 if failed else 0

@@ -13,14 +13,7 @@ import torch.distributed as dist
 from npa_envs.cli import INTERRUPTED, common
 from npa_envs.cli.train_options import TrainOptions, default_preset, parse_run, resolve_task
 from npa_envs.errors import NPAError
-from npa_envs.training import (
-    TASKS,
-    RunFolder,
-    TrainConfig,
-    check_device,
-    task_entry,
-    train,
-)
+from npa_envs.training import TASKS, RunFolder, TrainConfig, check_device, task_entry, train
 from npa_envs.training.checkpoint import has_per_world_streams, load_checkpoint
 from npa_envs.training.process_group import ProcessGroup
 from npa_envs.training.process_launcher import (
@@ -30,9 +23,6 @@ from npa_envs.training.process_launcher import (
     requested_processes,
 )
 from npa_envs.training.trainer import TrainResult
-
-THREADED_BATCH = 4096
-"""From this number of particles of a batch on, two threads are faster than one."""
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -135,15 +125,16 @@ def finish(
         print(f"  rule        {rule}")
     print(f"  log         {folder.log}\n  pictures    {folder.pictures}/")
     if options.report and result.iteration > 0 and not result.interrupted:
-        from npa_envs.cli.train_report import Training, write_report
+        from npa_envs.cli.train_report import write_report
 
         seconds = result.record.get("seconds", 0.0)
-        training = Training(task_name, ("train", *arguments), result.iteration, seconds)
+        command = shlex.join(["npa-envs", "train", *arguments])
+        training = f"{result.iteration} iterations in {seconds:.0f} s.\n\n```sh\n{command}\n```"
         device = check_device(config.device)
         for rule in rules:
             try:
                 card, scores = write_report(
-                    rule, folder.report, training, device, progress=options.progress
+                    rule, folder.report, task_name, training, device, progress=options.progress
                 )
                 print(f"  report      {card}: {scores}")
             except NPAError as error:
@@ -157,9 +148,9 @@ def finish(
 
 
 def thread_count(config: TrainConfig[Any]) -> int:
-    """Return the number of CPU threads for training: 1 for batches below `THREADED_BATCH`."""
+    """Return the number of CPU threads: 1 for batches too small to gain from a second one."""
     batch = config.world_count * sum(task.particle_count for task in _species(config))
-    return 1 if batch < THREADED_BATCH else torch.get_num_threads()
+    return 1 if batch < 4096 else torch.get_num_threads()
 
 
 def process_count(task_name: str, options: TrainOptions, config: TrainConfig[Any]) -> int:

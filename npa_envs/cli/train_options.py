@@ -25,8 +25,6 @@ from npa_envs.training import (
 )
 from npa_envs.training.checkpoint import check_task, load_checkpoint
 
-HELP = {"-h", "--help", "--help-all"}
-
 
 @dataclass(frozen=True, kw_only=True)
 class TrainOptions(common.SharedRunOptions):
@@ -73,7 +71,7 @@ def starting_configuration(task_name: str, arguments: Sequence[str]) -> TrainCon
     first = common.first_options(arguments)
     device = first.device if first.device and first.config is None else "cpu"
     base = preset(first.preset or default_preset(task_name, device), task_name)
-    if first.resume and not HELP & set(arguments):
+    if first.resume and not {"-h", "--help", "--help-all"} & set(arguments):
         folder = RunFolder(first.out or base.out)
         if not folder.checkpoint.is_file():
             raise NPAError(

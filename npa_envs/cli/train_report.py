@@ -8,7 +8,7 @@ import shlex
 from collections.abc import Mapping, Sequence
 from datetime import date
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import torch
 
@@ -43,33 +43,21 @@ if TYPE_CHECKING:
 FILM_STEPS = 512
 """Steps of the film."""
 
-FILM_DAMAGES = (DamageEvent(200, "cut"), DamageEvent(350, "wipe"))
-"""Damage in films of tasks that compare pixel by pixel."""
-
 TITLES: Mapping[str, str] = {
-    "growth": "",
     "healing": "After damage:",
     "pictures": "Each picture by its own code, and by that of the next one, shuffled:",
     "judge": "Distances that no loss uses; 1 is that of the target drawn by particles:",
-    "accuracy": "",
     "changes": "Some steps after a change of the clouds:",
 }
-"""Line above each table of a model card."""
-
-
-class Training(NamedTuple):
-    """How a rule was trained: task, words after `npa-envs`, optimiser steps, wall time [s]."""
-
-    task_name: str
-    arguments: Sequence[str]
-    iterations: int
-    seconds: float
+"""Lines above tables of a model card."""
 
 
 def write_report(
-    path: Path, folder: Path, training: Training, device: torch.device, *, progress: bool
+    path: Path, folder: Path, task_name: str, training: str, device: torch.device, *, progress: bool
 ) -> tuple[Path, str]:
     """Measure and film the rule in a file; return the report's path and one line of scores.
+
+    `training` tells how it was trained: iterations, time and command.
 
     The folder gets the report STEM.md, STEM.json as of `npa-envs evaluate --json`, STEM.gif,
     STEM.mp4 and STEM-filmstrip.png, for a 3D rule also a turntable and point files. On a CPU fewer
@@ -97,13 +85,14 @@ def write_report(
         generator = torch.Generator(device).manual_seed(FIRST_SEED)
         worlds = task.seed(1, generator=generator, device=device)
         film_task = task_for_film(task, str(path), rule, device, least=SCREEN)
+        damages = (DamageEvent(200, "cut"), DamageEvent(350, "wipe")) if task.aligned else ()
         worlds, film = film_world(
             rule,
             film_task,
             worlds,
             FILM_STEPS,
             generator=generator,
-            damages=FILM_DAMAGES if task.aligned else (),
+            damages=damages,
             progress=advance,
         )
         try:
@@ -125,7 +114,7 @@ def write_report(
     model_card = folder / f"{path.stem}.md"
     strip = folder / f"{path.stem}-filmstrip.png"
     picture = f"\n![A world from the seed on.]({strip.name})\n" if strip.exists() else ""
-    write_text(model_card, _model_card(rule, task, training, facts, tables) + picture)
+    write_text(model_card, _model_card(rule, task, task_name, training, facts, tables) + picture)
     rows = tables.get("growth", ())
     least = min(filter(math.isfinite, (row.loss for row in rows)), default=math.nan)
     scores = score_line(json.loads(text))
@@ -138,7 +127,8 @@ def write_report(
 def _model_card(
     rule: NPARule,
     task: Any,
-    training: Training,
+    task_name: str,
+    training: str,
     facts: Mapping[str, str],
     tables: Mapping[str, Sequence[Any]],
 ) -> str:
@@ -164,15 +154,14 @@ def _model_card(
     ]
     parts = [
         f"# {Path(goal).stem}",
-        f"A rule of the task `{training.task_name}` for `{goal}`{others}.",
+        f"A rule of the task `{task_name}` for `{goal}`{others}.",
         markdown_table(("", ""), rows),
         "## Training",
-        f"Commit {facts['commit']}: {training.iterations} iterations in {training.seconds:.0f} s.",
-        f"```sh\n{shlex.join(['npa-envs', *training.arguments])}\n```",
+        f"Commit {facts['commit']}: {training}",
         "## Measured",
         f"`{facts['command']}`, seeds that training never saw. Loss: {task.metric_name}.",
     ]
     for name, table in tables.items():
-        parts += [TITLES[name]] if TITLES[name] else []
+        parts += [TITLES[name]] if name in TITLES else []
         parts.append(table_markdown(table, missing=UNMEASURED if name == "growth" else "never"))
     return "\n\n".join(parts) + "\n"

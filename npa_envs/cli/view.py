@@ -22,12 +22,6 @@ if TYPE_CHECKING:
 
     from npa_envs.web.live_world import LiveWorld
 
-RESERVED = ("id", "policy", "device", "output", "disable_env_checker")
-"""Keywords of an environment that the command sets itself."""
-
-RUN_FILES = ("config.json", "log.jsonl", "checkpoint.pt")
-"""Files that mark a folder as that of a run."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class ViewOptions(common.DeviceOptions):
@@ -108,7 +102,7 @@ def world_maker(options: ViewOptions, device: torch.device) -> Callable[[], Live
     if re.search(r"-v\d+$", options.what) and not folder.exists():
         policy = options.policy
         keywords = common.named_values("keywords", options.keywords)
-        for name in RESERVED:
+        for name in ("id", "policy", "device", "output", "disable_env_checker"):
             if name in keywords:
                 is_option = name in ("device", "policy")
                 hint = f"say --{name} {keywords[name]}" if is_option else "leave it out"
@@ -132,6 +126,7 @@ def world_maker(options: ViewOptions, device: torch.device) -> Callable[[], Live
         )
     kwargs: dict[str, Any] = {"device": device, "seed": options.seed}
     kwargs["particle_count"] = options.particle_count
-    if folder.is_dir() and any((folder / name).exists() for name in RUN_FILES):
+    run_files = ("config.json", "log.jsonl", "checkpoint.pt")
+    if folder.is_dir() and any((folder / name).exists() for name in run_files):
         return lambda: RunWorld(folder, **kwargs)
     return lambda: RuleWorld(options.what, **kwargs)

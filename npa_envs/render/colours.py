@@ -84,14 +84,8 @@ RAMP_STOPS = ("#2a1858", "#792a86", "#cc4a70", "#f2985f", "#fbe6bd")
 RAMP_LENGTH = 1024
 """Number of colours of a ramp."""
 
-LIGHT_BACKGROUND = 0.6
-"""OKLab lightness of backgrounds above which a ramp gets darker with density."""
-
 GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 """Angle between the hues of successive channels, which spreads any number of hues evenly."""
-
-STATE_LIGHTNESS = (0.67, 0.2)
-"""OKLab lightness of a particle with zero states, and its largest change by states."""
 
 STATE_CHROMA = 0.16
 """Largest OKLab a and b of a state."""
@@ -137,7 +131,8 @@ def ramp(background: tuple[float, float, float]) -> NDArray[np.uint8]:
     """Return the colour ramp of densities, uint8, [RAMP_LENGTH, 3], from the background on."""
     stops = [[int(stop[k : k + 2], 16) / 255 for k in (1, 3, 5)] for stop in RAMP_STOPS]
     first = oklab(torch.tensor([background], dtype=torch.float64))
-    if first[0, 0] > LIGHT_BACKGROUND:
+    # Over a light background the ramp gets darker with density.
+    if first[0, 0] > 0.6:
         stops.reverse()
     knots = torch.cat([first, oklab(torch.tensor(stops, dtype=torch.float64))]).numpy()
     lengths = np.cumsum([0.0, *np.linalg.norm(np.diff(knots, axis=0), axis=1)])
@@ -161,8 +156,7 @@ def state_colours(hidden: Tensor) -> Tensor:
     terms = [[w[k] * hidden[..., c] for c, w in enumerate(weights)] for k in range(3)]
     gain = STATE_GAIN / math.sqrt(max(len(angles), 1))
     pull = [torch.tanh(sum(part, zeros) * gain) for part in terms]
-    middle, swing = STATE_LIGHTNESS
-    lab = (middle + swing * pull[0], STATE_CHROMA * pull[1], STATE_CHROMA * pull[2])
+    lab = (0.67 + 0.2 * pull[0], STATE_CHROMA * pull[1], STATE_CHROMA * pull[2])
     return srgb(torch.stack(lab, dim=-1))
 
 

@@ -29,7 +29,6 @@ from npa_envs.render.worlds import draw_worlds
 MAX_SHOWN = 16
 """Largest number of worlds in a picture."""
 
-_CELL_PARTICLES = 4
 _GAP = 4
 
 
@@ -116,22 +115,20 @@ def _spacing(x: Tensor) -> float:
         return 1.0
     count, space_dim = points.shape
     spans = (points.amax(dim=0) - points.amin(dim=0)).clamp(min=1e-6)
-    side = (float(spans.prod()) * _CELL_PARTICLES / count) ** (1.0 / space_dim)
+    # About four particles in a cell.
+    side = (float(spans.prod()) * 4 / count) ** (1.0 / space_dim)
     filled = len(torch.unique(torch.floor(points / side), dim=0))
     return max(float((filled / count) ** (1.0 / space_dim) * side), 1e-6)
 
 
 # A window on the screen, which needs pygame.
 
-_NO_SCREEN = ("offscreen", "dummy")
-"""SDL's drivers without a screen, which `SDL_VIDEODRIVER` may select."""
-
 _open_window: Window | None = None
 """The open window: pygame allows one for each process."""
 
 
 class Window:
-    """A window on the screen; without a screen it warns once and then does nothing.
+    """A window on the screen, by pygame; without a screen it warns once and then does nothing.
 
     A process has one window: a new one closes the previous one.
 
@@ -139,9 +136,6 @@ class Window:
         title: Text of the title bar.
         size: Side of the window [screen pixels]. Frames of another size are scaled to it.
         fps: Largest number of frames per second, kept by waiting in `show`; None: no limit.
-
-    Raises:
-        MissingDependencyError: pygame is not installed.
     """
 
     def __init__(self, title: str, size: int = 512, *, fps: float | None = None) -> None:
@@ -210,7 +204,8 @@ class Window:
         try:
             display.init()
             driver = display.get_driver()
-            if driver not in _NO_SCREEN or os.environ.get("SDL_VIDEODRIVER") == driver:
+            # The drivers without a screen may be selected by name.
+            if driver not in ("offscreen", "dummy") or os.environ.get("SDL_VIDEODRIVER") == driver:
                 self._surface = display.set_mode(self.size)
                 display.set_caption(title)
                 return None

@@ -31,7 +31,6 @@ Frame = NDArray[np.uint8]
 GIF_HIGHEST_RATE = 50
 """Largest `fps` of a GIF in players."""
 
-_PALETTE_SAMPLE = 2**20
 _MARGIN = 8
 
 
@@ -109,12 +108,9 @@ def encode_webp(frames: Iterable[Frame], fps: float = 25, *, quality: int = 50) 
 
 
 def write_mp4(path: str | Path, frames: Iterable[Frame], fps: float = 25) -> None:
-    """Write frames [H, W, 3] as an H.264 film that browsers play.
+    """Write frames [H, W, 3] as an H.264 film that browsers play; needs imageio and its ffmpeg.
 
     An odd width or height is made even by repeating the last column or row.
-
-    Raises:
-        MissingDependencyError: imageio or its ffmpeg is not installed.
     """
     pictures = checked_frames(frames)
     check_rate(fps)
@@ -231,7 +227,7 @@ def checked_frames(frames: Iterable[Frame]) -> list[Frame]:
 
 def _shared_palette(pictures: list[Frame]) -> tuple[Image.Image, Frame, int]:
     """Return a palette for all frames, the most frequent colour, and its index in the palette."""
-    step = max(1, math.ceil(sum(p.size // 3 for p in pictures) / _PALETTE_SAMPLE))
+    step = max(1, math.ceil(sum(p.size // 3 for p in pictures) / 2**20))
     sample = np.concatenate([p.reshape(-1, 3)[k % step :: step] for k, p in enumerate(pictures)])
     _, which, counts = np.unique(
         (sample >> 3) @ np.array([1024, 32, 1]), return_inverse=True, return_counts=True
@@ -263,14 +259,9 @@ def turntable_frames(
 ) -> list[NDArray[np.uint8]]:
     """Return pictures, uint8, [R, R, 3] each, of a world from cameras on a circle around it.
 
-    Args:
-        views: Returns pictures of V cameras: colours times alpha, and alpha, [1, V, H, W, 4].
-        frame_count: Number of pictures in one turn.
-        resolution: Pixels R along each side.
-        elevation: Angle of the cameras above the horizon [degrees].
-        azimuth: Angle of the first camera around the vertical axis [degrees].
-        background: A colour name, "#rrggbb", or red, green and blue in [0, 1].
-        device: The world's device.
+    `views` returns pictures of V cameras: colours times alpha, and alpha, [1, V, H, W, 4]. The
+    cameras stand at the angle `elevation` above the horizon, the first one at the angle `azimuth`
+    around the vertical axis [degrees]. `device` is that of the world.
     """
     frame_count = checked_count("frame_count", frame_count)
     azimuth = checked_finite("azimuth", azimuth, " [degrees]")

@@ -29,12 +29,6 @@ from npa_envs.world.rollout import rollout_particles
 SCREEN = 256
 """Least default resolution of a film [pixels]."""
 
-FRAME_COUNT = 150
-"""Default number of frames of a film, without those of damage."""
-
-EARLY_STEPS = (0, 16, 32, 64, 128)
-"""Steps whose nearest frames are in every filmstrip: most of the growth is there."""
-
 
 @dataclass
 class WorldFilm:
@@ -59,13 +53,15 @@ class WorldFilm:
 
         A film that ends within the early steps gives damaged and evenly spaced ones.
         """
+        # Most of the growth is there.
+        early_steps = (0, 16, 32, 64, 128)
         damaged, last = {*range(len(self.frames))} - self.steps.keys(), len(self.frames) - 1
-        if max(self.steps.values(), default=0) <= EARLY_STEPS[-1]:
+        if max(self.steps.values(), default=0) <= early_steps[-1]:
             others = max(count - 2 - len(damaged), 2)
             even = np.linspace(0, last, min(others, len(self.frames)))
             chosen = sorted({*damaged, *(round(float(k)) for k in even)})
         else:
-            early = {min(self.steps, key=lambda k: abs(self.steps[k] - n)) for n in EARLY_STEPS}
+            early = {min(self.steps, key=lambda k: abs(self.steps[k] - n)) for n in early_steps}
             chosen = sorted({*early, *damaged, last})
             while len(chosen) < min(count, len(self.frames)):
                 start, end = max(pairwise(chosen), key=lambda pair: pair[1] - pair[0])
@@ -101,13 +97,13 @@ def film_world(
 ) -> tuple[Particles, WorldFilm]:
     """Run one world with damage; return it and its film, a frame every `every` steps.
 
-    By default there are about `FRAME_COUNT` frames. `first_step` is the world's age in steps.
+    By default there are about 150 frames. `first_step` is the age of the world in steps.
     `progress` is called with the number of steps since its last call. After each frame the run ends
     if `stop` returns true.
     """
     film = WorldFilm() if film is None else film
     last = first_step + steps
-    every = every or math.ceil(steps / FRAME_COUNT)
+    every = every or math.ceil(steps / 150)
     stops = {damage.step for damage in damages if first_step <= damage.step < last}
     stops |= {*range(first_step, last, every), last}
     now = first_step

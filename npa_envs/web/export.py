@@ -30,12 +30,6 @@ from npa_envs.world.species import AGREEMENTS
 PAGE = Path(__file__).resolve().parent / "page"
 """The folder of the page's files."""
 
-PREVIEW_STEPS = 256
-"""Steps of a world before its preview; half of them for textures and clouds."""
-
-PREVIEW_PIXELS = 192
-"""Pixels on each side of a preview."""
-
 MAX_WEIGHTS = 2**20
 """Most weights of a rule in a page: 5.6 MB of text, and very slow in a browser."""
 
@@ -91,10 +85,6 @@ def export_web(
         particle_count: Particles of each world; None: as trained.
         previews: Begin with pictures of the rules' worlds after some steps, to choose from.
         seed: Seed of the first world, 0 to 2^53 - 1.
-
-    Raises:
-        NPAError: The suffix is not .html, a rule cannot be loaded or run in a browser, two have the
-            same name, or the file cannot be written.
     """
     path = checked_path(path)
     if path.suffix != ".html":
@@ -200,16 +190,16 @@ def check_browser_rule(rule: NPARule, name: str) -> None:
 
 
 def preview(source: str, *, particle_count: int | None = None) -> str:
-    """Return a picture of a rule's world after `PREVIEW_STEPS` as a data URL of a WebP file."""
+    """Return a picture of a rule's world after some steps as a data URL of a WebP file."""
     live = RuleWorld(source, device=torch.device("cpu"), particle_count=particle_count, choices={})
-    live.speed = PREVIEW_STEPS if live.task.aligned else PREVIEW_STEPS // 2
+    live.speed = 256 if live.task.aligned else 128
     live.advance()
     with torch.no_grad():
         fields = live.task.picture(*live.particles[:2])[0].flip(0)
     colour = fields[..., :3] / fields[..., 3:].clamp_min(1e-6)
     pixels = torch.cat((colour, fields[..., 3:]), dim=-1).clamp(0.0, 1.0)
     picture = Image.fromarray((pixels * 255.0).round().to(torch.uint8).numpy(), "RGBA")
-    shrunk = picture.resize((PREVIEW_PIXELS, PREVIEW_PIXELS), Image.Resampling.LANCZOS)
+    shrunk = picture.resize((192, 192), Image.Resampling.LANCZOS)
     file = io.BytesIO()
     shrunk.save(file, "WEBP", quality=80)
     return f"data:image/webp;base64,{base64.b64encode(file.getvalue()).decode()}"

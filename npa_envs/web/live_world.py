@@ -23,15 +23,6 @@ from npa_envs.tasks.damage import check_damage, damage_worlds
 from npa_envs.world.brushes import clump, cut, inject, push, state_around
 from npa_envs.world.particles import Particles
 
-MAX_STEPS = 64
-"""Most steps between two frames."""
-
-FARTHEST = 1e4
-"""Largest coordinate in a message [length units]."""
-
-MAX_RADIUS = 10.0
-"""Largest radius of a brush [length units]."""
-
 
 class Tool(NamedTuple):
     """A brush: its button on the page, when a stroke of it sends messages, and what it does."""
@@ -275,7 +266,7 @@ class LiveWorld(ABC):
 
     def _ranges(self) -> dict[str, Range]:
         """Return the allowed values of the settings, by name; attributes have the same names."""
-        return {"speed": Range(1, MAX_STEPS, "log", whole=True)}
+        return {"speed": Range(1, 64, "log", whole=True)}
 
     def _run_timed(self, steps: int) -> None:
         start = time.perf_counter()
@@ -316,7 +307,7 @@ class Touch(NamedTuple):
             name,
             _checked_vector("at", at, space_dim, x),
             _checked_vector("move", message.get("move", [0.0] * space_dim), space_dim, x),
-            Range(1e-4, MAX_RADIUS).checked("radius", message.get("radius")),
+            Range(1e-4, 10.0).checked("radius", message.get("radius")),
             min(1.0, least + added * strength),
             _checked_vector("source", message.get("source", at), space_dim, x),
             _checked_vector("view", message.get("view", [0.0, 0.0, 1.0]), 3, x),
@@ -331,21 +322,12 @@ def checked_seed(value: Any) -> int:
 
 def _checked_vector(name: str, value: Any, length: int, like: Tensor) -> Tensor:
     fits = isinstance(value, list) and len(value) == length and all(map(is_real, value))
-    if not fits or max(map(abs, value)) > FARTHEST:
+    if not fits or max(map(abs, value)) > 1e4:
         raise NPAError(f"{name} must be {length} finite numbers, got {shown(value)}")
     return like.new_tensor([value])
 
 
 # Colours of particles by state, density, species, speed or update mask.
-
-SHOWS = ("colours", "density", "components", "species", "speed", "mask")
-"""Choices of the page; those of the state channels follow: "state 0", "state 1", ..."""
-
-DARK = (0.05, 0.06, 0.09)
-"""First colour of the ramp of densities and speeds."""
-
-MASK_COLOURS = (0.98, 0.78, 0.36), (0.29, 0.33, 0.42)
-"""Red, green and blue of updated particles, and of the others."""
 
 BALANCE = 0.9
 """Weight of earlier frames in the moving average of the covariance behind "components"."""
@@ -401,7 +383,8 @@ class Colouring:
                 return _ramp(speed.clamp(0.0, 1.0).sqrt())
             case ["mask"]:
                 updated = _or_zeros(world.updated, world).bool()[:, None]
-                on, off = (updated.new_tensor(tint, dtype=torch.float32) for tint in MASK_COLOURS)
+                tints = ((0.98, 0.78, 0.36), (0.29, 0.33, 0.42))
+                on, off = (updated.new_tensor(tint, dtype=torch.float32) for tint in tints)
                 return _bytes(torch.where(updated, on, off))
             case _:
                 channel = int(show.removeprefix("state "))
@@ -431,8 +414,9 @@ class Colouring:
 
 def shows_of(state_dim: int, *, species: bool = True) -> list[str]:
     """Return all values of `show` for particles with `state_dim` state channels."""
-    shows = SHOWS if species else ("colours", "density", "components", "speed")
-    return [*shows, *(f"state {k}" for k in range(state_dim))]
+    last = ("species", "speed", "mask") if species else ("speed",)
+    states = (f"state {k}" for k in range(state_dim))
+    return ["colours", "density", "components", *last, *states]
 
 
 def signed_colours(values: Tensor) -> Tensor:
@@ -468,7 +452,7 @@ def colour_tables(species_count: int) -> dict[str, NDArray[np.uint8]]:
 
 def colour_ramp() -> NDArray[np.uint8]:
     """Return the colours of densities and speeds from low to high, uint8, shape [K, 3]."""
-    table = ramp(DARK)
+    table = ramp((0.05, 0.06, 0.09))
     # The darkest colours are invisible on a dark background.
     return table[len(table) // 6 :]
 

@@ -36,20 +36,11 @@ MAX_PARTICLES = {"cpu": 16384, "cuda": 131072}
 MIN_SEED = 16
 """Fewest particles that the brush `add` adds."""
 
-SMALL_VIEWS = {"resolution": 64, "training_views": 1, "held_out_views": 6}
-"""Options of 3D tasks for a fast start: targets of full size take many seconds to draw."""
-
-MAX_TASKS = 8
-"""Cached tasks with their targets; the slider of N makes many."""
-
 REST_CHECK_STEPS = 64
 """Steps between two checks whether the world is at rest."""
 
 LOSS_FRACTION = 0.1
 """Largest fraction of the time for computing losses while their plot is open."""
-
-POLL_SECONDS = 1.0
-"""Time between two checks of the files of a run [s]."""
 
 
 @dataclass
@@ -83,7 +74,8 @@ class RuleWorld(LiveWorld):
         super().__init__(seed)
         self._device = device
         self._rules: dict[str, NPARule] = {}
-        self._trained = functools.lru_cache(MAX_TASKS)(self._load_task)
+        # Tasks with their targets, of which the slider of N makes many.
+        self._trained = functools.lru_cache(8)(self._load_task)
         others = {name: name for name in shipped_rules()} if choices is None else dict(choices)
         name = name_of(source)
         self._choices = others | {name: source}
@@ -99,7 +91,9 @@ class RuleWorld(LiveWorld):
 
     def _load_task(self, name: str, particle_count: int | None) -> TrainedTask:
         rule = self._live_rule(name).rule
-        options = SMALL_VIEWS if rule.space_dim == 3 else {}
+        # For a fast start: 3D targets of full size take many seconds to draw.
+        small_views = {"resolution": 64, "training_views": 1, "held_out_views": 6}
+        options = small_views if rule.space_dim == 3 else {}
         return task_of_rule(
             self._choices[name], rule, self._device, particle_count=particle_count, **options
         )
@@ -476,9 +470,9 @@ class RunWorld(RuleWorld):
         return ranges
 
     def take_events(self) -> list[dict[str, Any]]:
-        """Return the events since the last call, also of the run's new losses and rules."""
+        """Return the events since the last call, once a second also of new losses and rules."""
         if time.monotonic() >= self._poll_due:
-            self._poll_due = time.monotonic() + POLL_SECONDS
+            self._poll_due = time.monotonic() + 1.0
             try:
                 self._poll()
             except NPAError as error:

@@ -50,9 +50,6 @@ except ImportError as error:
 PORT = 8765
 """First default port."""
 
-PORTS_TRIED = 20
-"""Number of default ports from `PORT` on."""
-
 MAX_SESSIONS = 4
 """Most open pages; each has its own world."""
 
@@ -62,17 +59,11 @@ FRAMES_AHEAD = 2
 FRAME_SECONDS = 1.0 / 60.0
 """Least time between two frames [s]."""
 
-MAX_MESSAGE = 2**20
-"""Most bytes of a message."""
-
 MESSAGES_KEPT = 256
 """Most messages in a queue; others are dropped."""
 
 MAX_PICTURES = 500
 """Most pictures of a film, 20 seconds; each takes a megabyte of memory when it is written."""
-
-FILM_RATE = 25.0
-"""Pictures of a film per second."""
 
 MAX_PICTURE = 1024
 """Most pixels on each side of a film's pictures."""
@@ -94,12 +85,8 @@ SECURITY = {
 class Site:
     """What a server serves: its worlds, address and token.
 
-    Args:
-        make_world: Makes the world of a page, in the thread that runs it.
-        films: Folder of films; created with the first one.
-        host: The address to bind; if it is no loopback address, requests need a token.
-        one_at_a_time: Run worlds one at a time: a CUDA graph of one thread must not record
-            another's work.
+    `make_world` makes the world of a page, in the thread that runs it. With `one_at_a_time` worlds
+    do not run together: a CUDA graph of one thread must not capture another's work.
     """
 
     def __init__(
@@ -113,6 +100,7 @@ class Site:
         self.make_world, self.films, self.host = make_world, films, host
         self.token = None if is_loopback(host) else secrets.token_urlsafe(24)
         """The required token, or None."""
+        self.query = "" if self.token is None else f"?token={self.token}"
         self.exclusive: contextlib.AbstractContextManager[Any] = (
             threading.Lock() if one_at_a_time else contextlib.nullcontext()
         )
@@ -128,11 +116,6 @@ class Site:
             # With a token, any name is allowed: the token protects enough.
             return bool(name)
         return name == self.host or name in ("localhost", "127.0.0.1", "::1")
-
-    @property
-    def query(self) -> str:
-        """The query string with the token, or an empty string."""
-        return "" if self.token is None else f"?token={self.token}"
 
     def allows_token(self, token: str | None) -> bool:
         """Return whether the token is right, or none is required."""
@@ -417,7 +400,7 @@ def write_film(pictures: Sequence[bytes], folder: Path) -> Iterator[Path]:
             # The GIF comes first, as it needs no ffmpeg.
             for suffix, write in ((".gif", write_gif), (".mp4", write_mp4)):
                 path = folder / f"{name}{suffix}"
-                write(path, frames, FILM_RATE)
+                write(path, frames, 25.0)
                 yield path
     except NPAError:
         raise
@@ -429,7 +412,7 @@ def open_port(host: str, port: int | None) -> socket.socket:
     """Return a listening socket on a port; None: the first free one from `PORT` on."""
     if port is not None and not 0 <= port <= 65535:
         raise NPAError(f"port must be in [0, 65535], got {port}: leave it out for a free one")
-    ports = [port] if port is not None else [*range(PORT, PORT + PORTS_TRIED), 0]
+    ports = [port] if port is not None else [*range(PORT, PORT + 20), 0]
     try:
         family, *_, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
     except (OSError, UnicodeError) as error:
@@ -466,7 +449,7 @@ def make_server(site: Site) -> uvicorn.Server:
     config = uvicorn.Config(
         make_app(site),
         log_level="warning",
-        ws_max_size=MAX_MESSAGE,
+        ws_max_size=2**20,
         # Compressing frames takes longer than sending them, and gains little.
         ws_per_message_deflate=False,
         server_header=False,

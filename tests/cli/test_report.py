@@ -15,8 +15,6 @@ from npa_envs.errors import MissingDependencyError
 from npa_envs.render import world_film
 from npa_envs.training import TASKS
 
-SOLID = {"turntable.gif", "points.ply", "gaussians.ply", "cloud.splat"}
-
 
 @pytest.fixture(autouse=True)
 def short(monkeypatch):
@@ -42,7 +40,8 @@ def test_a_run_of_every_task_ends_with_a_model_card_of_each_rule(task, tmp_path,
     run = tmp_path / "run"
     rules = sorted(run.glob("rule*.safetensors"))
     assert len(rules) == (2 if TASKS[task].joint else 1)
-    expected = set(SOLID) if task == "morphogenesis3d" else set()
+    solid = {"turntable.gif", "points.ply", "gaussians.ply", "cloud.splat"}
+    expected = solid if task == "morphogenesis3d" else set()
     for rule in rules:
         stem = rule.stem
         expected |= {stem + end for end in (".md", ".json", ".gif", ".mp4", "-filmstrip.png")}

@@ -19,13 +19,7 @@ from npa_envs.rule.files import load_rule, save_rule
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.damage import DAMAGE_SIZES
 from npa_envs.tasks.point_classification import class_colours
-from npa_envs.web.export import (
-    check_browser_rule,
-    export_web,
-    joined_modules,
-    page_rule,
-    page_text,
-)
+from npa_envs.web.export import check_browser_rule, export_web, page_rule, page_text
 from npa_envs.web.live_world import TOOLS, ColouredWorld, Colouring
 from npa_envs.web.rule_world import RuleWorld
 from npa_envs.world.brushes import nearest_image
@@ -307,17 +301,6 @@ def test_a_page_is_one_small_file_that_asks_for_nothing(tmp_path):
     assert "<script>alert(1)" not in text
     assert "<b>" not in text
     assert '"name":"\\u003cb>"' in text
-
-
-@pytest.mark.usefixtures("modules")
-@pytest.mark.parametrize(
-    ("name", "count"), [("worker_connection.js", 4), ("rule_world.js", 6), ("physics_gpu.js", 2)]
-)
-def test_a_joined_script_is_that_of_a_module_after_its_imports(name, count):
-    script = joined_modules(name) + "console.log(Object.keys(modules).join())"
-    names = subprocess.check_output(["node", "-e", script], text=True).strip().split(",")
-    assert (len(names), names[-1]) == (count, name)
-    assert not re.search(r"^(import|export)\b", script, re.MULTILINE)
 
 
 class OwnNetwork(NPARule):

@@ -33,7 +33,8 @@ def test_a_rule_a_run_and_an_environment_are_distinguished(tmp_path):
     assert type(make("heart")) is RuleWorld
     # A folder with nothing but a rule is that rule.
     assert type(make(tmp_path)) is RuleWorld
-    (tmp_path / "config.json").write_text("{}", encoding="utf-8")
+    # Of a run of one rule, no configuration is read: it may be half written.
+    (tmp_path / "config.json").write_text('{"particle_cou', encoding="utf-8")
     assert type(make(tmp_path)) is RunWorld
     assert type(make("npa/Morphogenesis2D-v0", policy="heart")) is EnvironmentWorld
 
@@ -92,19 +93,6 @@ def test_what_is_wrong_is_said_before_anything_is_served(words, error, capsys, t
     port = [] if "--port" in words else ["--port", "0"]
     assert main(["view", *words, "--no-browser", *port, "--out", str(tmp_path)]) == 2
     assert error in capsys.readouterr().err
-
-
-def test_half_written_rules_are_rejected(capsys, tmp_path):
-    run = tmp_path / "run"
-    run.mkdir()
-    save_rule(load_rule("gecko"), run / "rule.safetensors")
-    whole = (run / "rule.safetensors").read_bytes()
-    (run / "config.json").write_text('{"particle_cou', encoding="utf-8")
-    assert type(make(run)) is RunWorld
-    (run / "rule.safetensors").write_bytes(whole[: len(whole) // 2])
-    words = ["--no-browser", "--out", str(tmp_path)]
-    assert main(["view", str(run), "--port", "0", *words]) == 2
-    assert "this is no safetensors file, or a truncated one" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "0.0.0.0"])

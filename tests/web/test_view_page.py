@@ -127,13 +127,6 @@ def test_the_world_moves_the_brush_removes_and_a_slider_changes_eps(shown, tmp_p
     assert np.ptp(picture[300:500, 5:60].reshape(-1, 3), axis=0).max() == 0
 
 
-def until(condition) -> None:
-    """Wait for the world, of which a page may know more or less; a test then checks it."""
-    deadline = time.monotonic() + 60
-    while not condition() and time.monotonic() < deadline:
-        time.sleep(0.05)
-
-
 @pytest.mark.slow
 def test_every_tool_and_every_show_works(shown):
     page, _ = shown(count=512)
@@ -176,7 +169,9 @@ def test_a_recording_yields_a_film_and_a_snapshot_a_picture(shown, tmp_path):
         assert len(np.unique(np.asarray(frames.convert("RGB")).reshape(-1, 3), axis=0)) > 20
     click(page, "snapshot")
     page.wait("document.querySelectorAll('#files a').length === 3")
-    until(lambda: list(tmp_path.glob("gecko-*.png")))
+    deadline = time.monotonic() + 60
+    while not list(tmp_path.glob("gecko-*.png")) and time.monotonic() < deadline:
+        time.sleep(0.05)
     (path,) = tmp_path.glob("gecko-*.png")
     with Image.open(path) as picture:
         assert picture.size == (992, 800)

@@ -12,7 +12,8 @@ from npa_envs.agents import evaluate_policy
 from npa_envs.agents.learning import Budget, train
 from npa_envs.agents.learning.problem import registration_of, world_seeds
 from npa_envs.cli import main
-from npa_envs.cli.record_dataset import RecordOptions, policy_of, problem_of
+from npa_envs.cli.common import problem_of
+from npa_envs.cli.record_dataset import RecordOptions, policy_of
 from npa_envs.errors import DivergedError, NPAError
 
 minari = pytest.importorskip("minari")
@@ -178,6 +179,6 @@ def test_a_scripted_policy_is_chosen_in_worlds_that_are_not_recorded(
     )
     fields = {"env": "npa/Morphogenesis2DSmall-v0", "dataset": "a/b-v0", "policy": "scripted"}
     options = RecordOptions(**fields, first_seed=first, episodes=count)
-    policy_of(options, problem_of(options))
+    policy_of(options, problem_of(options, 1))
     assert seeds == [seed]
     assert set(world_seeds(seed, 16)).isdisjoint(range(first, first + count))

@@ -77,13 +77,9 @@ export function plainKernels() {
     for (let r = 0; r < rangesEnd; r += 2) {
       const last = ranges[r + 1];
       for (let j = ranges[r]; j < last; j++) {
-        let dx = x[j] - ownX, dy = y[j] - ownY, dz = z[j] - ownZ;
-        if (dx > halfX) dx -= sideX;
-        else if (dx < -halfX) dx += sideX;
-        if (dy > halfY) dy -= sideY;
-        else if (dy < -halfY) dy += sideY;
-        if (dz > halfZ) dz -= sideZ;
-        else if (dz < -halfZ) dz += sideZ;
+        const dx = toNearest(x[j] - ownX, sideX, halfX);
+        const dy = toNearest(y[j] - ownY, sideY, halfY);
+        const dz = toNearest(z[j] - ownZ, sideZ, halfZ);
         const squared = dx * dx + dy * dy + dz * dz;
         if (!(squared < squaredRadius)) continue;
         const left = squaredRadius - squared;
@@ -353,13 +349,9 @@ export class Physics {
           const last = ranges[r + 1];
           // Each pair once: i and j add the same to each other, the gradient with opposite sign.
           for (let j = Math.max(ranges[r], i + 1); j < last; j++) {
-            let dx = px[j] - x, dy = py[j] - y, dz = pz[j] - z;
-            if (dx > halfX) dx -= sideX;
-            else if (dx < -halfX) dx += sideX;
-            if (dy > halfY) dy -= sideY;
-            else if (dy < -halfY) dy += sideY;
-            if (dz > halfZ) dz -= sideZ;
-            else if (dz < -halfZ) dz += sideZ;
+            const dx = toNearest(px[j] - x, sideX, halfX);
+            const dy = toNearest(py[j] - y, sideY, halfY);
+            const dz = toNearest(pz[j] - z, sideZ, halfZ);
             const squared = dx * dx + dy * dy + dz * dz;
             if (!(squared < squaredRadius)) continue;
             const left = squaredRadius - squared;
@@ -467,6 +459,11 @@ export class Physics {
     }
     for (let c = 0; c < channels; c++) s[particle * channels + c] += updates[from + c];
   }
+}
+
+// Returns a difference of coordinates to the nearest image.
+function toNearest(difference, side, half) {
+  return difference > half ? difference - side : difference < -half ? difference + side : difference;
 }
 
 // Moves positions into a periodic box around the origin.
