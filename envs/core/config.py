@@ -7,7 +7,6 @@ from dataclasses import dataclass, fields
 from typing import Any, ClassVar, Literal, Self, TypeVar, get_args
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from npa_envs.checks import (
@@ -191,11 +190,6 @@ class WorldConfig:
         """Return what each column of observations and of actions means."""
         limits = physics.limits
         return Interface(physics.space_dim, self.state_dim, physics.moving, limits.state_scale)
-
-    @property
-    def torch_device(self) -> torch.device:
-        """The device of the worlds."""
-        return check_device(self.device)
 
     @classmethod
     def from_keywords(cls, keywords: dict[str, Any]) -> Self:

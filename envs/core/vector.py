@@ -70,6 +70,8 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
         "autoreset_mode": AutoresetMode.SAME_STEP,
     }
 
+    _is_batch = True
+
     def __init__(
         self,
         num_envs: int = 1,
@@ -177,11 +179,6 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
                 infos |= {"reason": REASONS[endings], "_reason": self._mask(ended)}
         self._show()
         return self.spaces.observation_output(observation), *results, infos
-
-    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
-        """Return a picture of each world, shape [R, R, 3], with the render mode "rgb_array"."""
-        pictures = self._pictures()
-        return None if pictures is None else tuple(pictures)
 
     close = VectorEnv.close
 

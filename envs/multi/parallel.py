@@ -8,7 +8,6 @@ from typing import Any, ParamSpec
 import numpy as np
 import torch
 from gymnasium.spaces import Box
-from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.envs.multi.agents_env import AgentsEnv, joined_actions
@@ -105,11 +104,6 @@ class CrowdEnv(AgentsEnv, KnownAgents):
     def state(self) -> Any:
         """Return the full state of the world, for central critics; see `state_space`."""
         return self._out(self._state()[0])
-
-    def render(self) -> NDArray[np.uint8] | None:
-        """Return the world's picture, shape [R, R, 3], with the render mode "rgb_array"."""
-        pictures = self._pictures()
-        return None if pictures is None else pictures[0]
 
     def particles(self) -> tuple[Tensor, Tensor]:
         """Return copies of positions [length units], [N', 2], and states, [N', C]; N' are left."""

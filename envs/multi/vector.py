@@ -64,6 +64,8 @@ class MultiSpeciesVectorEnv(AgentsEnv):
         config: Fields of the task's configuration.
     """
 
+    _is_batch = True
+
     def __init__(
         self,
         task: str = "mixing",
@@ -143,11 +145,6 @@ class MultiSpeciesVectorEnv(AgentsEnv):
     def state(self) -> Any:
         """Return the full state of the worlds, for central critics, [B, N, 2 + C + 1]."""
         return self._out(self._state())
-
-    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
-        """Return a picture of each world, shape [R, R, 3], with the render mode "rgb_array"."""
-        pictures = self._pictures()
-        return None if pictures is None else tuple(pictures)
 
     def _infos(self, numbers: dict[str, Tensor], acted: NDArray[np.bool_]) -> Infos:
         """Return the infos of all species: `numbers`, [B, M] each, 0 where not `acted`, [B, M]."""
