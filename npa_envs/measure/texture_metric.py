@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.tasks.losses.image_distances import quantiles
+from npa_envs.tasks.losses.texture import quantiles
 from npa_envs.tasks.texture import Texture, colour_image
 
 REFERENCE = 128
