@@ -123,7 +123,6 @@ class CrowdEnv(AgentsEnv, KnownAgents):
         return self._by_agent(observation)
 
     def _update_agents(self) -> None:
-        """Set `agents` to the names of those that act in the next step."""
         self._live = np.flatnonzero(self.worlds.live[0, : len(self.possible_agents)]).tolist()
         self.agents = [self.possible_agents[k] for k in self._live]
 

@@ -343,7 +343,6 @@ class SpeciesWorlds(WorldState):
         return endings
 
     def _divergence_message(self, diverged: NDArray[np.bool_]) -> str:
-        """Return the message of the error for agents out of bounds, shape [B, M]."""
         limits, word = self.physics.limits, "particle" if self.by_particle else "species"
         indices = np.argwhere(diverged)
         names = [f"{word}_{agent} of world {world}" for world, agent in indices[:MAX_REPORT]]

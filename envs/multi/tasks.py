@@ -289,7 +289,6 @@ class SymbiosisTask(PictureLossTask):
 
 
 def _present(population: Population) -> list[int]:
-    """Return the indices of the species that have particles left."""
     return [k for k, count in enumerate(population.counts) if count]
 
 

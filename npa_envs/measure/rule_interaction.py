@@ -56,7 +56,6 @@ class InteractionSettings:
     """Fraction by which a loss must change to count as changed."""
 
     def __post_init__(self) -> None:
-        """Check every field; raises NPAError."""
         check_positive(self, int, "steps", "seed_count")
         if self.particle_count is not None:
             check_positive(self, int, "particle_count", at_least=2)

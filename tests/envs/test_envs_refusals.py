@@ -43,7 +43,6 @@ OF_ALL = [
 OF_ONE = {
     functools.partial(make, IDS[0]): [
         ({"target": "geko"}, "did you mean 'gecko'"),
-        ({"target": "nowhere.png"}, "nowhere.png"),
     ],
     functools.partial(make_vec, IDS[0], 1): [
         ({"max_episode_steps": 0}, "max_episode_steps must be"),
@@ -66,20 +65,17 @@ OF_ONE = {
         ({"target": "cels"}, "did you mean 'cells'"),
         ({"boundary": "open"}, "boundary must be 'periodic' for textures"),
         ({"loss": "swd"}, "did you mean 'patch_swd'|known: filter_swd"),
-        ({"resolution": 8}, "resolution must be a whole number of at least 12"),
     ],
     functools.partial(make, POINTS): [
         ({"data": "mnisd"}, "data must be a known data set or a folder.*did you mean 'mnist'"),
         ({"boundary": "periodic"}, "boundary must be 'open' for"),
         ({"state_dim": 9}, "state_dim must be a whole number of at"),
         ({"rule": "gecko"}, "rule must be a rule with a read-out of state_dim"),
-        ({"class_count": 9}, "class_count must be more than the"),
     ],
     functools.partial(make, SOLID): [
         ({"target": "rocke"}, "did you mean 'rocket'"),
         ({"readout": "gecko"}, "read-out of state_dim = 16 channels, but .gecko. has 16"),
         ({"readout": 3}, "for example readout='mushroom'"),
-        ({"opacity": 1.0}, "opacity must lie below 1"),
         ({"seed_radius": 5.0}, "seed_radius must be below"),
     ],
     functools.partial(gymnasium.make, "npa/Pictures2D-v0"): [
