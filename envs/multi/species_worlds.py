@@ -293,10 +293,6 @@ class SpeciesWorlds(WorldState):
         placed = self.checked_particles(x, s, 1, population.x.shape[1])
         population.x.copy_(placed.x)
         population.s.copy_(placed.s)
-        return self._measure_unrewarded()
-
-    def _measure_unrewarded(self) -> Tensor:
-        """Measure the losses again, without a reward; return what particles perceive."""
         self.agent_returns.replace(self.loss_terms())
         return self.perception()
 
@@ -362,10 +358,10 @@ class SpeciesWorlds(WorldState):
         if not self.running.any():
             return observation
         # A death changes the losses of others; this is not rewarded.
-        perceived = self._measure_unrewarded()
+        self.agent_returns.replace(self.loss_terms())
         stays = (endings == 0) & self.running[:, None]
         where = to_device_async(stays, self.device)[:, self._owner, None]
-        return torch.where(where, perceived, observation)
+        return torch.where(where, self.perception(), observation)
 
     @property
     def cohorts(self) -> list[Cohort]:

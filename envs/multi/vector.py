@@ -109,10 +109,9 @@ class MultiSpeciesVectorEnv(AgentsEnv):
         return self._rows(observation), self._infos(worlds.agent_returns.loss_infos(), worlds.live)
 
     def step(self, actions: Mapping[str, Any]) -> BatchOutcome:
-        """Apply every species' actions, shape [B, N_k, A]; errors are those of `CrowdEnv.step`.
+        """Apply every species' actions, shape [B, N_k, A]; return a `BatchOutcome`.
 
-        Returns:
-            Observations, rewards (float32), terminations, truncations and infos.
+        Rewards are float32. Errors are those of `CrowdEnv.step`.
         """
         if not self._started:
             raise NPAError("step needs worlds: call reset first")

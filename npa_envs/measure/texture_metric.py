@@ -55,9 +55,6 @@ class TextureMetric:
     """Distance of pictures of a texture task from its target.
 
     It is computed in float64 with directions from a fixed seed, so that CPU and GPU agree.
-
-    Raises:
-        NPAError: The task is not a texture.
     """
 
     def __init__(self, task: object) -> None:
