@@ -8,9 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.envs.core.vector import checked_count
@@ -125,7 +123,7 @@ class GardenersEnv(KnownAgents):
             {agent: dict(info) for agent in AGENTS},
         )
 
-    def render(self) -> NDArray[np.uint8] | None:
+    def render(self) -> Any:
         """Return the world's picture, shape [R, R, 3], with the render mode "rgb_array"."""
         return self.garden.render()
 

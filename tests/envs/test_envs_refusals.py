@@ -41,9 +41,7 @@ OF_ALL = [
 """Keywords of every environment of one species, and what is said of them."""
 
 OF_ONE = {
-    functools.partial(make, IDS[0]): [
-        ({"target": "geko"}, "did you mean 'gecko'"),
-    ],
+    functools.partial(make, IDS[0]): [({"target": "geko"}, "did you mean 'gecko'")],
     functools.partial(make_vec, IDS[0], 1): [
         ({"max_episode_steps": 0}, "max_episode_steps must be"),
         ({"autoreset_mode": "disable"}, "did you mean 'disabled'"),
