@@ -59,9 +59,6 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
             `reset(options={"reset_mask": ...})` is called.
         copy: Return new arrays; False: the same ones in each step, overwritten by the next.
         keywords: Fields of the task's configuration.
-
-    Raises:
-        NPAError: A keyword is unknown or wrong, or the worlds do not fit into memory.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 (each instance gets a dictionary of its own)

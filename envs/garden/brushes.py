@@ -167,11 +167,9 @@ def brush_weights(away: Tensor, config: GardenConfig) -> Tensor:
 def apply_brushes(
     particles: Particles, action: Tensor, middle: Tensor, config: GardenConfig
 ) -> tuple[Particles, Tensor | None]:
-    """Apply all brushes at once, adding up their effects; differentiable.
+    """Return particles after all brushes at once, whose effects add up, and rates; differentiable.
 
-    Returns:
-        Particles, and by how much to multiply each one's change in a step of the rule,
-        dimensionless, shape [B, N, 1]; None without the tool "rate".
+    Rates multiply a particle's change in a step of the rule, [B, N, 1]; None without tool "rate".
     """
     x, s, *_ = particles
     columns, action = BrushLayout.for_config(config), action.clamp(-1.0, 1.0)
