@@ -14,7 +14,7 @@ from npa_envs.agents.policies import (
     ZeroPolicy,
     interface_of,
 )
-from npa_envs.envs.core.interface import Interface
+from npa_envs.envs.core.config import Interface
 
 __all__ = [
     "Episodes",

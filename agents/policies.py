@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.checks import checked_count, checked_finite, checked_positive, number_tensor
-from npa_envs.envs.core.interface import Interface
+from npa_envs.envs.core.config import Interface
 from npa_envs.errors import NPAError, shown
 from npa_envs.rule.rule import COLOUR_OFFSET, NPARule, check_rule
 from npa_envs.world.randomness import StreamId, WorldRandom

@@ -8,9 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.envs.core.vector import checked_count
@@ -49,10 +47,9 @@ class GardenersEnv(KnownAgents):
     place. Both agents have the same brushes and the same observation. All brushes act at once, and
     their effects add up.
 
-    In `parallel_env` both act at once. In `env` and `raw_env` they act in turn, by PettingZoo's own
-    conversion, and the world moves on after the raider. `env` also clips actions into their space.
-    The id for `pettingzoo.make`, of PettingZoo 1.27 or newer, is `npa/Gardeners-v0`, once
-    `npa_envs.envs.gardeners_v0` is imported.
+    `parallel_env`, `env` and `raw_env` are as for [several species](MultiSpecies.md); in turn, the
+    world moves on after the raider. Once `npa_envs.envs.gardeners_v0` is imported,
+    `pettingzoo.make`, of PettingZoo 1.27 or newer, takes the id `npa/Gardeners-v0`.
 
     `garden` is the world as a Gymnasium environment. Policies of `npa_envs.agents.garden_policies`
     take it, and their actions fit either agent: `ScriptedGardener(env.garden)`.
@@ -126,7 +123,7 @@ class GardenersEnv(KnownAgents):
             {agent: dict(info) for agent in AGENTS},
         )
 
-    def render(self) -> NDArray[np.uint8] | None:
+    def render(self) -> Any:
         """Return the world's picture, shape [R, R, 3], with the render mode "rgb_array"."""
         return self.garden.render()
 

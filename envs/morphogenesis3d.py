@@ -123,15 +123,13 @@ class Morphogenesis3DEnv(NPAEnv):
     ball. At its end they should look like the target: a mushroom, a duck, a rocket, a doughnut, any
     mesh, or a scene given by pictures. Particles are drawn as 3D Gaussians.
 
-    Particles perceive and policies act as in `npa/Morphogenesis2D-v0`. Rules are trained by
-    gradient with `npa-envs train morphogenesis3d`;
-    `npa_envs.agents.RulePolicy(npa_envs.load_rule("rule.safetensors"), env)` makes a policy of one.
-    Such a rule also has a network that maps states to the particles' shapes and colours, so give it
-    as `readout` too. Shipped rules need the worlds that they were trained in:
-    `particle_count=16384`, `state_dim=24`, `eps` and `eps0` 0.1, `alpha=1.0`, `seed_radius` 0.7
-    (the mushroom's 0.5), `sigma=0.02`, `opacity=0.15`. The duck, other than the older rule
-    `duck-v0`, needs `particle_count=8192`, `eps` and `eps0` 0.126, `sigma=0.014`, `opacity=0.6`,
-    and views of `resolution=192`.
+    Particles perceive and policies act as in `npa/Morphogenesis2D-v0`. Rules trained by gradient
+    with `npa-envs train morphogenesis3d` are policies, as there. Such a rule also has a network
+    that maps states to the particles' shapes and colours, so give it as `readout` too. Shipped
+    rules need the worlds that they were trained in: `particle_count=16384`, `state_dim=24`, `eps`
+    and `eps0` 0.1, `alpha=1.0`, `seed_radius` 0.7 (the mushroom's 0.5), `sigma=0.02`,
+    `opacity=0.15`. The duck, other than the older rule `duck-v0`, needs `particle_count=8192`,
+    `eps` and `eps0` 0.126, `sigma=0.014`, `opacity=0.6`, and views of `resolution=192`.
 
     ## Observation space
 

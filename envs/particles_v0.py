@@ -105,10 +105,7 @@ class ParticlesEnv(CrowdEnv):
 def parallel_env(task: str = "mixing", species_count: int = 2, **config: Any) -> ParticlesEnv:
     """Return an environment in which all particles act at once.
 
-    Args:
-        task: "mixing", "segregation", "co_morphogenesis", "invasion" or "symbiosis".
-        species_count: Species S; `info["species"]` is each particle's.
-        config: Fields of the task's configuration.
+    Arguments are those of `multispecies_v0.parallel_env`, but that `task` cannot be an id.
     """
     if not as_python(config.get("particle_counts")):
         config.setdefault("particle_count", PARTICLE_COUNT)

@@ -15,7 +15,7 @@ from gymnasium.spaces import Box, Discrete, Space
 from torch import Tensor
 
 from npa_envs.checks import check_positive
-from npa_envs.envs.core.base import ParticleSpaces, batch_choices, batch_tensor
+from npa_envs.envs.core.base import ParticleSpaces, batch_tensor
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import Start
@@ -120,7 +120,7 @@ class CodeSpaces(ParticleSpaces):
         if not self._chosen:
             code = batch_tensor(action, world_count, (dim,), "code_dim")
             return self._limit * code[:, None].clamp(-1.0, 1.0)
-        chosen = batch_choices(action, world_count, (), "")
+        chosen = batch_tensor(action, world_count, (), "", discrete=True)
         if not bool(((chosen >= 0) & (chosen < count)).all()):
             raise NPAError(f"action must be the number of one of {count} codes, from 0 on")
         return self._table.to(chosen.device)[chosen[:, None]]

@@ -67,9 +67,8 @@ class TextureEnv(NPAEnv):
     look like the target. It does not matter where the parts of the pattern lie. For dots, bubbles
     and meshes particles gather and leave places empty; cells and stripes are made of colours alone.
 
-    Particles perceive and policies act as in `npa/Morphogenesis2D-v0`. Rules for textures are
-    trained by gradient with `npa-envs train texture`;
-    `npa_envs.agents.RulePolicy(npa_envs.load_rule("rule.safetensors"), env)` makes a policy of one.
+    Particles perceive and policies act as in `npa/Morphogenesis2D-v0`. Rules trained by gradient
+    with `npa-envs train texture` are policies, as there.
 
     ## Reward
 

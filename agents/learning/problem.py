@@ -22,8 +22,7 @@ from npa_envs.agents.evaluation import TIME_LIMIT
 from npa_envs.agents.policies import spans_of
 from npa_envs.checks import check_positive, is_whole
 from npa_envs.devices import check_device
-from npa_envs.envs.core.config import EnvConfig
-from npa_envs.envs.core.interface import Interface
+from npa_envs.envs.core.config import EnvConfig, Interface
 from npa_envs.envs.core.task import Controls, EnvTask
 from npa_envs.envs.core.vector import NPAVectorEnv, worlds_to_reset
 from npa_envs.envs.multi.task import SpeciesConfig, SpeciesTask

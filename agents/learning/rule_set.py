@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from npa_envs.agents.policies import Policy, bounded_update, check_rule_fits, spans_of
 from npa_envs.atomic_files import made_folder
 from npa_envs.checks import checked_count
-from npa_envs.envs.core.interface import Interface
+from npa_envs.envs.core.config import Interface
 from npa_envs.errors import NPAError, shown
 from npa_envs.rule.files import load_rule, save_rule
 from npa_envs.rule.rule import NPARule

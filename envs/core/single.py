@@ -8,7 +8,6 @@ from typing import Any, ClassVar
 import gymnasium
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.checks import number_tensor
@@ -182,11 +181,6 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
         self._show()
         returned = self.spaces.observation_output(worlds.host_observation(observation)[0])
         return returned, numbers[0], terminated, truncated, info
-
-    def render(self) -> NDArray[np.uint8] | None:
-        """Return the world's picture, shape [R, R, 3], with the render mode "rgb_array"."""
-        pictures = self._pictures()
-        return None if pictures is None else pictures[0]
 
     def particles(self) -> tuple[Tensor, Tensor]:
         """Return copies of positions [length units], [N, D], and states, [N, C], on the device."""

@@ -9,9 +9,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from npa_envs.envs.core.marginal_gains import with_mean_reward
 from npa_envs.envs.core.task import EnvTask, checked_tensor
-from npa_envs.world.environment_steps import DIVERGED, SUCCESS, TIME_LIMIT
+from npa_envs.world.environment_steps import DIVERGED, SUCCESS, TIME_LIMIT, world_mean
 from npa_envs.world.particles import Particles
 
 FLAG_ROWS = 5
@@ -35,25 +34,6 @@ def reason(ending: int) -> str | None:
     """Return `info["reason"]` for the flags of an ending; None if the episode goes on."""
     names = {DIVERGED: "diverged", SUCCESS: "success", TIME_LIMIT: "time limit"}
     return next((name for bit, name in names.items() if ending & bit), None)
-
-
-class StepNumbers(NamedTuple):
-    """Reward and losses of worlds, as tensors or arrays of shape [B], or of a single world."""
-
-    reward: Any
-    """Reward of the last step."""
-    loss: Any
-    """Loss after it."""
-    terms: Any
-    """The terms of the loss, one row per term."""
-    improvements: Any
-    """Decrease of each term in the last step, one row per term."""
-
-    @classmethod
-    def from_rows(cls, rows: Any) -> StepNumbers:
-        """Return the rows of `StepReport.numbers` by name, or those of one of its columns."""
-        term_count = len(rows) // 2 - 1
-        return cls(rows[0], rows[1], rows[2 : 2 + term_count], rows[2 + term_count :])
 
 
 class StepReport(NamedTuple):
@@ -91,7 +71,9 @@ class StepReport(NamedTuple):
         numbers, flags = buffer.view(-1, world_count).tensor_split((-FLAG_ROWS,))
         numbers = numbers.flatten().view(torch.float32).view(-1, world_count)
         flags = flags.view(torch.bool)
-        return cls(buffer, numbers, *StepNumbers.from_rows(numbers), flags[:-1], flags[-1])
+        terms, improvements = numbers[2:].chunk(2)
+        rows = (numbers[0], numbers[1], terms, improvements)
+        return cls(buffer, numbers, *rows, flags[:-1], flags[-1])
 
     def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
         # Unpickled views would not share the buffer's memory.
@@ -139,7 +121,9 @@ class ParticleRewards:
         `enabled`, uint8 [1].
         """
         if self.loss is None:
-            gains = with_mean_reward(gains, reward)
+            # The same for all, so that a world's mean is its reward.
+            missed = reward - world_mean(gains[..., None])[:, 0]
+            gains = gains + missed[:, None]
         rewards = torch.where(by_world[:, None], reward[:, None], gains)
         self.reward.copy_(torch.where(enabled.bool(), rewards, self.reward))
 

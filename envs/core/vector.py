@@ -59,9 +59,6 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
             `reset(options={"reset_mask": ...})` is called.
         copy: Return new arrays; False: the same ones in each step, overwritten by the next.
         keywords: Fields of the task's configuration.
-
-    Raises:
-        NPAError: A keyword is unknown or wrong, or the worlds do not fit into memory.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 (each instance gets a dictionary of its own)
@@ -69,6 +66,8 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
         "render_fps": 25,
         "autoreset_mode": AutoresetMode.SAME_STEP,
     }
+
+    _is_batch = True
 
     def __init__(
         self,
@@ -177,11 +176,6 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
                 infos |= {"reason": REASONS[endings], "_reason": self._mask(ended)}
         self._show()
         return self.spaces.observation_output(observation), *results, infos
-
-    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
-        """Return a picture of each world, shape [R, R, 3], with the render mode "rgb_array"."""
-        pictures = self._pictures()
-        return None if pictures is None else tuple(pictures)
 
     close = VectorEnv.close
 

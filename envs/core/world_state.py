@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.checks import number_tensor
+from npa_envs.devices import check_device
 from npa_envs.envs.core.config import WorldConfig
 from npa_envs.envs.core.task import WorldTask
 from npa_envs.errors import DivergedError, NPAError
@@ -100,7 +101,7 @@ class WorldState:
         extra_bytes: int,
     ) -> None:
         check_default_dtype()
-        self.device = device = config.torch_device
+        self.device = device = check_device(config.device)
         self.world_count = world_count
         self.particle_count = particle_count
         self.physics = physics = config.physics(task_type.space_dim, static=task_type.static)

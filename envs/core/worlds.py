@@ -454,7 +454,6 @@ class BatchedWorlds(WorldState):
         return self.task.draw(first, self.elapsed[:count].cpu().numpy())
 
     def _divergence_message(self, diverged: NDArray[np.int64]) -> str:
-        """Return the message of the error for `on_divergence="raise"`."""
         physics, lines = self.physics, []
         for world in diverged[:MAX_REPORT].tolist():
             numbers = torch.cat((self.x[world], self.s[world]), dim=1)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from npa_envs import world_mean
 from npa_envs.checks import check_field, check_flag, check_positive, is_whole
-from npa_envs.envs.core.base import ParticleSpaces, batch_choices, batch_tensor
+from npa_envs.envs.core.base import ParticleSpaces, batch_tensor
 from npa_envs.envs.grown_worlds import GrownConfig, check_rule_driven
 from npa_envs.errors import NPAError, shown
 from npa_envs.world.brushes import offsets_from, softness
@@ -167,11 +167,9 @@ def brush_weights(away: Tensor, config: GardenConfig) -> Tensor:
 def apply_brushes(
     particles: Particles, action: Tensor, middle: Tensor, config: GardenConfig
 ) -> tuple[Particles, Tensor | None]:
-    """Apply all brushes at once, adding up their effects; differentiable.
+    """Return particles after all brushes at once, whose effects add up, and rates; differentiable.
 
-    Returns:
-        Particles, and by how much to multiply each one's change in a step of the rule,
-        dimensionless, shape [B, N, 1]; None without the tool "rate".
+    Rates multiply a particle's change in a step of the rule, [B, N, 1]; None without tool "rate".
     """
     x, s, *_ = particles
     columns, action = BrushLayout.for_config(config), action.clamp(-1.0, 1.0)
@@ -247,7 +245,8 @@ class BrushSpaces(ParticleSpaces):
         if self._config.actions != "discrete":
             return batch_tensor(action, world_count, self.rows_shape, "J, W")
         brushes = self._config.brush_count
-        chosen = batch_choices(action, world_count, (4 * brushes,), "4 J").view(-1, brushes, 4)
+        chosen = batch_tensor(action, world_count, (4 * brushes,), "4 J", discrete=True)
+        chosen = chosen.view(-1, brushes, 4)
         highest = torch.tensor(self._choices, device=chosen.device)
         if not bool(((chosen >= 0) & (chosen < highest)).all()):
             raise NPAError(

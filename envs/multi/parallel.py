@@ -8,7 +8,6 @@ from typing import Any, ParamSpec
 import numpy as np
 import torch
 from gymnasium.spaces import Box
-from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.envs.multi.agents_env import AgentsEnv, joined_actions
@@ -106,11 +105,6 @@ class CrowdEnv(AgentsEnv, KnownAgents):
         """Return the full state of the world, for central critics; see `state_space`."""
         return self._out(self._state()[0])
 
-    def render(self) -> NDArray[np.uint8] | None:
-        """Return the world's picture, shape [R, R, 3], with the render mode "rgb_array"."""
-        pictures = self._pictures()
-        return None if pictures is None else pictures[0]
-
     def particles(self) -> tuple[Tensor, Tensor]:
         """Return copies of positions [length units], [N', 2], and states, [N', C]; N' are left."""
         population = self.worlds.population(0)
@@ -129,7 +123,6 @@ class CrowdEnv(AgentsEnv, KnownAgents):
         return self._by_agent(observation)
 
     def _update_agents(self) -> None:
-        """Set `agents` to the names of those that act in the next step."""
         self._live = np.flatnonzero(self.worlds.live[0, : len(self.possible_agents)]).tolist()
         self.agents = [self.possible_agents[k] for k in self._live]
 

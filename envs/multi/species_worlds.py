@@ -26,11 +26,7 @@ from npa_envs.world.cuda_graph import (
     to_device_async,
 )
 from npa_envs.world.divergence import MAX_REPORT
-from npa_envs.world.environment_steps import (
-    Actions,
-    NeighbourState,
-    perceive_each_species,
-)
+from npa_envs.world.environment_steps import Actions, NeighbourState, perceive_each_species
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import WorldRandom
 
@@ -293,10 +289,6 @@ class SpeciesWorlds(WorldState):
         placed = self.checked_particles(x, s, 1, population.x.shape[1])
         population.x.copy_(placed.x)
         population.s.copy_(placed.s)
-        return self._measure_unrewarded()
-
-    def _measure_unrewarded(self) -> Tensor:
-        """Measure the losses again, without a reward; return what particles perceive."""
         self.agent_returns.replace(self.loss_terms())
         return self.perception()
 
@@ -343,7 +335,6 @@ class SpeciesWorlds(WorldState):
         return endings
 
     def _divergence_message(self, diverged: NDArray[np.bool_]) -> str:
-        """Return the message of the error for agents out of bounds, shape [B, M]."""
         limits, word = self.physics.limits, "particle" if self.by_particle else "species"
         indices = np.argwhere(diverged)
         names = [f"{word}_{agent} of world {world}" for world, agent in indices[:MAX_REPORT]]
@@ -363,10 +354,10 @@ class SpeciesWorlds(WorldState):
         if not self.running.any():
             return observation
         # A death changes the losses of others; this is not rewarded.
-        perceived = self._measure_unrewarded()
+        self.agent_returns.replace(self.loss_terms())
         stays = (endings == 0) & self.running[:, None]
         where = to_device_async(stays, self.device)[:, self._owner, None]
-        return torch.where(where, perceived, observation)
+        return torch.where(where, self.perception(), observation)
 
     @property
     def cohorts(self) -> list[Cohort]:

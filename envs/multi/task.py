@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.checks import check_field, check_non_negative, check_positive, is_whole
-from npa_envs.envs.core.config import WorldConfig, as_python
-from npa_envs.envs.core.interface import Interface
+from npa_envs.envs.core.config import Interface, WorldConfig, as_python
 from npa_envs.envs.core.task import WorldTask
 from npa_envs.errors import NPAError
 from npa_envs.render import STYLES

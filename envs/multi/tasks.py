@@ -99,16 +99,10 @@ class PictureLossConfig(SpeciesConfig):
         super().__post_init__()
         _ = self.task_config()
 
-    def task_config(
-        self, target: str = Morphogenesis2DConfig.target, particle_count: int = 1
-    ) -> Morphogenesis2DConfig:
-        """Return the training task's configuration for a target and a number of particles."""
-        return self.as_config(
-            Morphogenesis2DConfig,
-            target=target,
-            target_point_count=particle_count,
-            particle_count=particle_count,
-        )
+    def task_config(self, particle_count: int = 1, **changes: Any) -> Morphogenesis2DConfig:
+        """Return the training task's configuration for a number of particles, with `changes`."""
+        counts = {"target_point_count": particle_count, "particle_count": particle_count}
+        return self.as_config(Morphogenesis2DConfig, **counts, **changes)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,10 +111,6 @@ class OnePictureConfig(PictureLossConfig):
 
     target: str = Morphogenesis2DConfig.target
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _ = self.task_config(self.target)
-
 
 class PictureLossTask(SpeciesTask):
     """Pictures to grow, each compared by the splat loss of `npa_envs.tasks.morphogenesis2d`."""
@@ -128,7 +118,8 @@ class PictureLossTask(SpeciesTask):
     def __init__(self, config: Any, device: torch.device, *pictures: tuple[str, int]) -> None:
         super().__init__(config, device)
         self.tasks = [
-            Morphogenesis2D(config.task_config(*picture), device=device) for picture in pictures
+            Morphogenesis2D(config.task_config(count, target=target), device=device)
+            for target, count in pictures
         ]
         """Training tasks, with target and loss, of each picture."""
         self.task = self.tasks[0]
@@ -298,7 +289,6 @@ class SymbiosisTask(PictureLossTask):
 
 
 def _present(population: Population) -> list[int]:
-    """Return the indices of the species that have particles left."""
     return [k for k, count in enumerate(population.counts) if count]
 
 

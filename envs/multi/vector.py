@@ -16,11 +16,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.envs.core.vector import (
-    checked_count,
-    checked_mode,
-    worlds_to_reset,
-)
+from npa_envs.envs.core.vector import checked_count, checked_mode, worlds_to_reset
 from npa_envs.envs.multi.agents_env import AgentsEnv, joined_actions
 from npa_envs.envs.multi.species_worlds import AgentOutcome
 from npa_envs.errors import NPAError
@@ -63,6 +59,8 @@ class MultiSpeciesVectorEnv(AgentsEnv):
             `reset(options={"reset_mask": ...})` starts it.
         config: Fields of the task's configuration.
     """
+
+    _is_batch = True
 
     def __init__(
         self,
@@ -107,10 +105,9 @@ class MultiSpeciesVectorEnv(AgentsEnv):
         return self._rows(observation), self._infos(worlds.agent_returns.loss_infos(), worlds.live)
 
     def step(self, actions: Mapping[str, Any]) -> BatchOutcome:
-        """Apply every species' actions, shape [B, N_k, A]; errors are those of `CrowdEnv.step`.
+        """Apply every species' actions, shape [B, N_k, A]; return a `BatchOutcome`.
 
-        Returns:
-            Observations, rewards (float32), terminations, truncations and infos.
+        Rewards are float32. Errors are those of `CrowdEnv.step`.
         """
         if not self._started:
             raise NPAError("step needs worlds: call reset first")
@@ -143,11 +140,6 @@ class MultiSpeciesVectorEnv(AgentsEnv):
     def state(self) -> Any:
         """Return the full state of the worlds, for central critics, [B, N, 2 + C + 1]."""
         return self._out(self._state())
-
-    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
-        """Return a picture of each world, shape [R, R, 3], with the render mode "rgb_array"."""
-        pictures = self._pictures()
-        return None if pictures is None else tuple(pictures)
 
     def _infos(self, numbers: dict[str, Tensor], acted: NDArray[np.bool_]) -> Infos:
         """Return the infos of all species: `numbers`, [B, M] each, 0 where not `acted`, [B, M]."""

@@ -222,7 +222,6 @@ def table_markdown(rows: Sequence[Any], *, missing: str = "never") -> str:
 
 
 def _cells(rows: Sequence[Any], missing: str) -> list[list[str]]:
-    """Return the headings, followed by the cells of each row, as text."""
     names = [field.name for field in dataclasses.fields(rows[0])]
     if missing == UNMEASURED:
         names = [name for name in names if any(getattr(row, name) is not None for row in rows)]

@@ -319,7 +319,6 @@ def changes_of_mind(
 
 
 def _blank_clouds(runner: RuleRunner, index: Tensor) -> Particles:
-    """Return the clouds of these indices, with zero states."""
     x = runner.task.clouds.x[index].to(next(runner.rule.parameters()).dtype)
     return Particles(x, x.new_zeros(*x.shape[:2], runner.task.config.state_dim))
 
@@ -473,7 +472,6 @@ def _from_seeds(
     device: str | torch.device,
     progress: Callable[[int], None] | None,
 ) -> tuple[RuleRunner, Particles]:
-    """Return a runner and one world for each of the seeds."""
     if not seeds:
         raise NPAError("seeds must have at least one number, got none: for example seeds=(0, 1)")
     device = check_device(device)

@@ -22,7 +22,7 @@ from npa_envs.checks import check_field, check_positive
 from npa_envs.errors import NPAError
 from npa_envs.measure.benchmark_records import Record
 from npa_envs.measure.plots import heat_map
-from npa_envs.measure.quality import FIRST_SEED
+from npa_envs.measure.quality import FIRST_SEED, PROGRESS_STEPS
 from npa_envs.ops import species_fields
 from npa_envs.render import draw_worlds
 from npa_envs.rule.rule import NPARule
@@ -56,7 +56,6 @@ class InteractionSettings:
     """Fraction by which a loss must change to count as changed."""
 
     def __post_init__(self) -> None:
-        """Check every field; raises NPAError."""
         check_positive(self, int, "steps", "seed_count")
         if self.particle_count is not None:
             check_positive(self, int, "particle_count", at_least=2)
@@ -141,9 +140,6 @@ def mixing_index(x: Tensor, counts: Sequence[int], *, eps: float) -> Tensor:
     entropy: Tensor = torch.special.entr(fractions).sum(dim=2)
     return entropy.mean(dim=1) / math.log(rho.shape[2])
 
-
-PROGRESS_STEPS = 32
-"""Steps between two reports of progress."""
 
 FRAME_TIMES = (0.0, 0.125, 0.25, 0.5, 1.0)
 """Times of pictures, as fractions of the run."""

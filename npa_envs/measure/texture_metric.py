@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.tasks.losses.image_distances import quantiles
+from npa_envs.tasks.losses.texture import quantiles
 from npa_envs.tasks.texture import Texture, colour_image
 
 REFERENCE = 128
@@ -55,9 +55,6 @@ class TextureMetric:
     """Distance of pictures of a texture task from its target.
 
     It is computed in float64 with directions from a fixed seed, so that CPU and GPU agree.
-
-    Raises:
-        NPAError: The task is not a texture.
     """
 
     def __init__(self, task: object) -> None:

@@ -88,13 +88,9 @@ def damage_worlds(
 ) -> Particles:
     """Return worlds damaged at a random position, or cut through the middle at a random angle.
 
-    Args:
-        worlds: The worlds; fields other than x and s are returned as they are.
-        kind: "wipe", "cut", "clump", or "noise" on every position.
-        size: Radius, gap or standard deviation [length units]; None is the usual one.
-        box: Sides of the periodic box [length units], across whose edges damage continues; None:
-            open space. Positions may leave the box; the next step wraps them.
-        generator: Source of the random position, on the worlds' device; None is torch's own.
+    `size` is the radius, gap or standard deviation [length units], by default that of
+    `DAMAGE_SIZES`. Damage continues across the edges of a periodic `box` [length units]; positions
+    may leave it, and the next step wraps them. `generator` is on the worlds' device.
     """
     x, s, *_ = worlds
     check_damage(kind)

@@ -35,18 +35,12 @@ class Gaussians(NamedTuple):
 
 
 def appearance(outputs: Tensor, sigma: float, anisotropy: float, opacity: float) -> Gaussians:
-    """Return the Gaussian that draws each particle, from K outputs of its rule.
+    """Return the Gaussian that draws each particle, from K outputs of its rule, [B, N, K].
 
     Of a read-out's 20 outputs four are added to the quaternion (1, 0, 0, 0), three stretch
     the axes, one changes the opacity, nine are coefficients of view-dependent colour, and the last
     three, plus 0.5, are the colour. With any other number of outputs particles are round, and the
-    last three outputs, plus 0.5, are the colour.
-
-    Args:
-        outputs: Outputs of the read-out, or states (dimensionless), shape [B, N, K].
-        sigma: Standard deviation of a round particle [length units].
-        anisotropy: Largest |log(scale / sigma)| (dimensionless).
-        opacity: Opacity of a particle whose output is 0, in (0, 1).
+    last three outputs, plus 0.5, are the colour. The numbers are fields of `Morphogenesis3DConfig`.
     """
     lead = outputs.shape[:-1]
     # The renderer adds one half, as `NPARule.colour` does.

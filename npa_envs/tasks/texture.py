@@ -22,9 +22,9 @@ from npa_envs.ops import periodic_splat
 from npa_envs.rule.rule import COLOUR_OFFSET
 from npa_envs.tasks.base import ParticleTask, TaskConfig, contributions_to_loss, distances_moved
 from npa_envs.tasks.damage import random_particle
-from npa_envs.tasks.losses.image_distances import LossOptions
 from npa_envs.tasks.losses.texture import (
     DEFAULT_LOSS,
+    LossOptions,
     TextureLoss,
     check_loss_name,
     is_joint,

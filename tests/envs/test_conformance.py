@@ -243,8 +243,8 @@ class TestEveryEnvironment:
         section = page.read_text(encoding="utf-8").split("## Info\n")[1].split("\n## ")[0]
         rows = [line.split("|")[1:3] for line in section.splitlines() if line.startswith("| `")]
         listed = [(key, when) for keys, when in rows for key in re.findall("`([^`]+)`", keys)]
-        listed = [pair for pair in listed if pair[0] not in ("particle_reward", "updated")]
-        env = self.make(success_loss=1e6)
+        of_particles = {"reward": "particle", "tell_updated": True} if self.name in IDS else {}
+        env = self.make(success_loss=1e6, **of_particles)
         _, at_reset = env.reset(seed=0)
         *_, at_step = env.step(env.action_space.sample())
         assert sorted(key for key, when in listed if "reset" in when) == sorted(at_reset)

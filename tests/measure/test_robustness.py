@@ -20,7 +20,6 @@ from npa_envs.measure.robustness.trials import (
     TrialPlan,
     disk,
     quick_plan,
-    trained_value,
 )
 from npa_envs.rule import files
 from npa_envs.tasks.damage import random_particle
@@ -316,7 +315,8 @@ def test_plans_are_whole_chunks_and_hold_what_was_trained():
             assert all(step % plan.chunk == 0 for step in (*plan.heal_steps, plan.grow_steps))
             assert set(plan.values) <= set(CONDITIONS)
             for condition, values in plan.values.items():
-                assert trained_value(condition, update_prob) in values
+                as_trained = {"update_prob": update_prob, "noise": 0.0, "shape": "trained"}
+                assert as_trained.get(condition, 1.0) in values
                 assert condition == "shape" or list(values) == sorted(values)
 
 

@@ -3,7 +3,6 @@
 import json
 import math
 import sys
-from dataclasses import dataclass
 
 import pytest
 import torch
@@ -117,20 +116,17 @@ def test_one_species_is_compared_with_the_rollout_that_it_is():
 # Plots, report
 
 
-@dataclass
-class TimeRow:
-    step_us: Timing
-
-
 def test_a_report_is_json_without_numbers_that_json_has_not():
     row = DriftRow("tiny", 1e-6, math.nan, 1e-6, 1e-6, 1e-6)
-    tables = {"drift": [row], "times": [TimeRow(Timing(3.0, 3.0, 3.0))]}
+    skip = suites.SkipRow("a", "b", Timing(3.0, 3.0, 3.0), Timing(3.0, 3.0, 3.0), "0%")
+    tables = {"drift": [row], "skips": [skip]}
     report = suites.BenchReport("quick", "npa-envs bench", "abc", 1, session(), tables)
     loaded = json.loads(report.json())
     assert {"suite", "command", "commit", "date", "device", "machine", "versions"} <= set(loaded)
     assert torch.__version__.startswith(loaded["versions"]["torch"])
     assert loaded["tables"]["drift"][0]["states"] is None
-    assert loaded["tables"]["times"] == [{"step_us": {"median": 3.0, "low": 3.0, "high": 3.0}}]
+    (times,) = loaded["tables"]["skips"]
+    assert times["done_us"] == {"median": 3.0, "low": 3.0, "high": 3.0}
 
 
 # Explanations

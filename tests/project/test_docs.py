@@ -18,7 +18,6 @@ from gymnasium.utils.env_checker import check_env
 from PIL import Image
 from support.crowds import TASKS, still
 from support.crowds import small as small_crowd
-from support.small_envs import make
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import npa_envs
@@ -164,20 +163,6 @@ def test_links_lead_somewhere(path):
 
 MODULES = {"MultiSpecies": multispecies_v0, "Particles": particles_v0}
 every_module = pytest.mark.parametrize("name", MODULES)
-
-
-@every_environment
-def test_a_page_lists_the_keys_of_info(name):
-    keywords = {"reward": "particle", "success_loss": 1e6, "tell_updated": True}
-    env = make(f"npa/{name}-v0", **keywords)
-    _, at_reset = env.reset(seed=0)
-    *_, terminated, _, at_step = env.step(np.zeros(env.action_space.shape, np.float32))
-    assert terminated
-    listed = section(f"environments/{name}", "Info")
-    rows = [line for line in listed.splitlines() if line.startswith("| `")]
-    in_reset = [name for row in rows if "| reset" in row for name in first_cells(row)]
-    assert sorted(in_reset) == sorted(at_reset)
-    assert sorted(first_cells(listed)) == sorted(at_step)
 
 
 @every_environment

@@ -12,13 +12,7 @@ from npa_envs.errors import NPAError
 from npa_envs.render.world_film import film_world
 from npa_envs.tasks import damage
 from npa_envs.tasks.base import GrowthConfig, GrowthTask
-from npa_envs.tasks.damage import (
-    CHANCE,
-    FARTHEST,
-    NEAREST,
-    damage_worlds,
-    parse_damage,
-)
+from npa_envs.tasks.damage import CHANCE, FARTHEST, NEAREST, damage_worlds, parse_damage
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.tasks.texture import Texture, TextureConfig

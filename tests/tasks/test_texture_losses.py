@@ -7,15 +7,10 @@ import pytest
 import torch
 
 from npa_envs.errors import NPAError
-from npa_envs.tasks.losses.image_distances import (
-    EVEN,
-    MATCHED_PATCH,
-    pyramid,
-    quantiles,
-)
 from npa_envs.tasks.losses.texture import (
     FILTERS,
     FLOOR,
+    MATCHED_PATCH,
     TEXTURE_LOSSES,
     WEIGHTS_FILE,
     FilterDescriptor,
@@ -25,6 +20,8 @@ from npa_envs.tasks.losses.texture import (
     load_vgg_weights,
     make_texture_loss,
     moment_distance,
+    pyramid,
+    quantiles,
     relaxed_transport,
 )
 from npa_envs.tasks.targets.textures import load_texture
@@ -173,7 +170,7 @@ def test_patch_transport_equals_plain_arithmetic():
     for actual, expected in zip(pyramid(image[None], 2), pyramid(target[None], 2), strict=True):
         ours, theirs = (rolled_patches(p[0].numpy(), MATCHED_PATCH) for p in (actual, expected))
         costs = ((ours[:, None] - theirs[None]) ** 2).mean(axis=2)
-        spread = theirs.var(axis=0).mean() + EVEN
+        spread = theirs.var(axis=0).mean() + FLOOR
         total += max(costs.min(axis=1).mean(), costs.min(axis=0).mean()) / spread
     loss = make_texture_loss("patch_ot", target)
     assert float(loss(image[None])) == pytest.approx(total / 2, rel=1e-10)

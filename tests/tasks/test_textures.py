@@ -77,17 +77,10 @@ def test_transparency_is_the_density_and_colours_do_not_leak(tmp_path):
     assert float(target.picture[..., 1].max()) == 0.0
 
 
-def test_bad_pictures_are_refused(tmp_path):
-    Image.new("RGBA", (8, 8), (0, 0, 0, 0)).save(tmp_path / "empty.png")
+def test_a_picture_of_one_column_is_refused(tmp_path):
     Image.new("RGB", (1, 9)).save(tmp_path / "thin.png")
-    (tmp_path / "text.png").write_text("no picture", encoding="utf-8")
-    for name, message in (
-        ("empty.png", "alpha above 0.5"),
-        ("thin.png", "at least 2 x 2 pixels"),
-        ("text.png", "must be a picture"),
-    ):
-        with pytest.raises(NPAError, match=message):
-            load_texture(tmp_path / name)
+    with pytest.raises(NPAError, match="at least 2 x 2 pixels"):
+        load_texture(tmp_path / "thin.png")
 
 
 def test_gap_is_the_way_between_neighbouring_things():

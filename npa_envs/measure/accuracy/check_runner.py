@@ -55,7 +55,6 @@ class CheckResult:
     """Hash of the weights of the check's rule (`rule_digest`)."""
 
     def __post_init__(self) -> None:
-        """Set the verdict from the limits, unless it is given."""
         # Comparisons with NaN are false.
         within = all(self.metrics.get(key, math.nan) <= limit for key, limit in self.limits.items())
         default = "range" if self.holds else "pass"

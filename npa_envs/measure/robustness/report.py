@@ -31,7 +31,6 @@ from npa_envs.measure.robustness.trials import (
     RuleTrial,
     healing,
     ratio,
-    trained_value,
 )
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import StreamId
@@ -183,8 +182,10 @@ def grow(
 def responses(trial: RuleTrial, trained: Response, *, done: int = 0) -> Iterator[Response]:
     """Yield the response to each value of each condition, without the first `done`."""
     every = [(name, value) for name, values in trial.plan.values.items() for value in values]
+    as_trained = {"update_prob": trial.task.update_prob, "noise": 0.0, "shape": "trained"}
     for condition, value in every[done:]:
-        if value == trained_value(condition, trial.task.update_prob):
+        # Values of other conditions are factors on what was trained.
+        if value == as_trained.get(condition, 1.0):
             yield Response(condition, value, trained.steps, trained.losses)
             continue
         fraction = float(value) if condition == "particles" else 1.0

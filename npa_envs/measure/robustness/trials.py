@@ -95,14 +95,6 @@ CONDITIONS = {
 """Conditions, varied one at a time, with their summaries."""
 
 
-def trained_value(condition: str, update_prob: float) -> float | str:
-    """Return the trained value of a condition; `update_prob` is that of the task."""
-    trained: dict[str, float | str]
-    trained = {"update_prob": update_prob, "noise": 0.0, "shape": "trained"}
-    # All other conditions are factors on what was trained.
-    return trained.get(condition, 1.0)
-
-
 @dataclass(frozen=True, kw_only=True)
 class TrialPlan:
     """Plan of the measurements of a rule; steps of growth are rounded to multiples of `chunk`.

@@ -111,7 +111,6 @@ def explain(
 def _reasons(
     workload: Workload, x: Tensor, rule: NPARule, box: float | None, gradients: Gradients
 ) -> list[str]:
-    """Return the reasons for the choice of kernels as lines of text."""
     prob, total, masked = workload.update_prob, x.shape[0] * x.shape[1], workload.update_prob < 1.0
     plan = plan_kernels(
         torch.empty(0, dtype=x.dtype, device=x.device),

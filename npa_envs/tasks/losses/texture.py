@@ -17,21 +17,24 @@ from torch import Tensor
 from npa_envs.atomic_files import check_torch_archive, home_path, open_regular
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.ops import world_mean
-from npa_envs.tasks.losses.image_distances import (
-    LossOptions,
-    PatchTransport,
-    TextureDistance,
-    level_count,
-    orthogonal,
-    patches,
-    products,
-    pyramid,
-    quantiles,
-    stride_of,
-)
 
 DEFAULT_LOSS = "patch_swd"
 """The loss that needs no weights and no options."""
+
+
+@dataclass(frozen=True)
+class LossOptions:
+    """Options of a texture loss."""
+
+    tiles: bool = True
+    """Whether the target's opposite edges fit together, so that patches may cross them."""
+
+    seed: int = 0
+    """Seed of the loss's directions, filters and positions."""
+
+    vgg_weights: str = ""
+    """File of VGG16's weights, for `vgg_ot`; empty: torch's usual folder of downloads."""
+
 
 DEFAULT_OPTIONS = LossOptions()
 """Options for a target that tiles, with seed 0."""
@@ -99,6 +102,124 @@ def make_texture_loss(
 
 def _summed(losses: list[TextureLoss], images: Tensor) -> Tensor:
     return torch.stack([loss(images) for loss in losses]).sum(0)
+
+
+# What the losses share: images at several sizes, their patches, quantiles.
+
+LEVELS = 4
+"""Largest number of image sizes, each half of the one before."""
+
+MIN_SIDE = 12
+"""Least side of the smallest image size [pixels]."""
+
+POSITIONS = 64
+"""Largest number of positions along each side that are compared; larger images are subsampled."""
+
+ALIGNMENT = 64
+"""Alignment of the matrices that are multiplied [bytes]."""
+
+
+class TextureDistance:
+    """Base class of distances between images and a target of K channels, shape [K, R, R]."""
+
+    same_in_every_batch: bool = False
+    """Whether `compare` returns the same for an image, bit for bit, in every batch."""
+
+    def __init__(self, target: Tensor) -> None:
+        if target.shape[-1] < MIN_SIDE:
+            raise NPAError(
+                f"resolution must be at least {MIN_SIDE} pixels, got {target.shape[-1]}: for "
+                "example 64"
+            )
+        self._shape = tuple(target.shape)
+
+    def __call__(self, images: Tensor) -> Tensor:
+        """Return the distance of images [B, K, R, R] from the target (dimensionless), [B].
+
+        It is differentiable. Without gradient it is the same, bit for bit, in every batch.
+        """
+        if images.ndim != 4 or tuple(images.shape[1:]) != self._shape:
+            raise NPAError(
+                f"images must have shape [B, K, R, R] with (K, R, R) = {self._shape} as the "
+                f"target, got {tuple(images.shape)}: draw them at the target's resolution"
+            )
+        with_gradient = torch.is_grad_enabled() and images.requires_grad
+        if len(images) == 1 or with_gradient or self.same_in_every_batch:
+            return self.compare(images)
+        return torch.cat([self.compare(image[None]) for image in images])
+
+    def compare(self, images: Tensor) -> Tensor:
+        """Return the distance of images [B, K, R, R] from the target, [B]."""
+        raise NotImplementedError
+
+
+def level_count(resolution: int) -> int:
+    """Return at how many sizes images of a resolution [pixels] are compared."""
+    count = 1
+    while count < LEVELS and resolution % 2 == 0 and resolution // 2 >= MIN_SIDE:
+        resolution //= 2
+        count += 1
+    return count
+
+
+def pyramid(images: Tensor, count: int) -> list[Tensor]:
+    """Return images [B, K, R, R] and `count` - 1 smaller sizes, each by means of 2 x 2 pixels."""
+    levels = [images]
+    while len(levels) < count:
+        fine = levels[-1]
+        # Written out: the order of additions is fixed, whatever the size of the batch.
+        rows = fine[:, :, ::2] + fine[:, :, 1::2]
+        levels.append(0.25 * (rows[..., ::2] + rows[..., 1::2]))
+    return levels
+
+
+def stride_of(level: Tensor, thinned: bool) -> int:
+    """Return the distance [pixels] between an image's compared positions; 1 unless `thinned`."""
+    return max(1, level.shape[-1] // POSITIONS) if thinned else 1
+
+
+def patches(images: Tensor, size: int, *, stride: int, wrap: bool) -> Tensor:
+    """Return the M square patches of each image as rows, [B, M, K size²].
+
+    `wrap`: opposite edges of an image are connected.
+    """
+    if wrap:
+        half = size // 2
+        images = torch.cat((images[:, :, -half:], images, images[:, :, :half]), dim=2)
+        images = torch.cat((images[..., -half:], images, images[..., :half]), dim=3)
+    windows = images.unfold(2, size, stride).unfold(3, size, stride)
+    return windows.permute(0, 2, 3, 1, 4, 5).flatten(3).flatten(1, 2)
+
+
+def products(rows: Tensor, weights: Tensor) -> Tensor:
+    """Return the matrix product of rows [B, M, E] and weights [E, F], shape [B, M, F].
+
+    It is computed image by image, from aligned memory: otherwise rounding may depend on the batch.
+    Rows must be contiguous.
+    """
+    weights = weights.to(rows)
+    tables = [one if one.data_ptr() % ALIGNMENT == 0 else one.clone() for one in rows]
+    return torch.stack([table @ weights for table in tables])
+
+
+def orthogonal(size: int, count: int, generator: torch.Generator) -> Tensor:
+    """Return `count` random orthonormal columns, shape [size, count]."""
+    normal = torch.randn(size, count, generator=generator, dtype=torch.float64)
+    basis: Tensor = torch.linalg.qr(normal).Q
+    return basis
+
+
+def quantiles(values: Tensor, count: int) -> Tensor:
+    """Return evenly spaced quantiles of each row of values [F, M], rising, shape [F, count]."""
+    ordered = values.sort(dim=1).values
+    total = ordered.shape[1]
+    if total == count:
+        return ordered
+    position = (torch.arange(count, dtype=values.dtype, device=values.device) + 0.5) / count
+    position = (position * total - 0.5).clamp(0.0, total - 1.0)
+    low = position.floor().long()
+    part = position - low
+    return ordered[:, low] * (1.0 - part) + ordered[:, (low + 1).clamp(max=total - 1)] * part
 
 
 # Sliced Wasserstein distances. A texture is described, at each image size, by many features at each
@@ -217,6 +338,70 @@ class FilterDescriptor:
             around = patches(field, SECOND_PATCH, stride=stride, wrap=wrap)
             result.append(products(around, second))
         return result
+
+
+# Optimal transport of raw patches.
+
+MATCHED_PATCH = 7
+"""Side of a matched patch [pixels]; at the smallest of four sizes it spans 56 image pixels."""
+
+WORLD_POSITIONS = 32
+"""Largest number of patches of a world along each side, for each size."""
+
+TARGET_POSITIONS = 64
+"""Largest number of patches of the target along each side, for each size."""
+
+
+class PatchTransport(TextureDistance):
+    """Relaxed optimal transport of raw patches at several sizes.
+
+    At each size every patch of a world is compared with the nearest patch of the target, and every
+    patch of the target with the nearest of the world. The larger of both mean squared distances,
+    relative to the target's variance, is averaged over the sizes: it penalises both additional and
+    missing parts. After the relaxed transport of Kolkin, Salavon and Shakhnarovich (2019), with
+    patches in place of a network's features.
+    """
+
+    def __init__(self, target: Tensor, options: LossOptions) -> None:
+        super().__init__(target)
+        self._expected = []
+        self._scales = []
+        for level in pyramid(target[None], level_count(target.shape[-1])):
+            stride = -(-level.shape[-1] // TARGET_POSITIONS)
+            rows = patches(level, MATCHED_PATCH, stride=stride, wrap=options.tiles)[0].contiguous()
+            spread = (rows.double() - rows.double().mean(0)).square().mean()
+            self._expected.append(rows)
+            self._scales.append(1.0 / (spread + FLOOR))
+
+    def compare(self, images: Tensor) -> Tensor:
+        """Return the distance of images [B, K, R, R] from the target, [B]."""
+        total = images.new_zeros(len(images))
+        levels = pyramid(images, len(self._expected))
+        for level, expected, scale in zip(levels, self._expected, self._scales, strict=True):
+            stride = -(-level.shape[-1] // WORLD_POSITIONS)
+            rows = patches(level, MATCHED_PATCH, stride=stride, wrap=True)
+            total = total + scale.to(total) * _matched(rows, expected.to(rows))
+        return total / len(self._expected)
+
+
+def _matched(rows: Tensor, expected: Tensor) -> Tensor:
+    """Return the mean squared distance to the nearest patch, the larger of both directions, [B]."""
+    with torch.no_grad():
+        squares = rows.square().sum(2)[:, :, None] + expected.square().sum(1)
+        costs = squares - 2.0 * (rows @ expected.T)
+        there, back = costs.argmin(2), costs.argmin(1)
+        # The target patches to which each patch of a world is nearest: their number and sum.
+        chosen = (back[:, None] == torch.arange(rows.shape[1], device=rows.device)[:, None]).to(
+            rows
+        )
+        times, sums = chosen.sum(2, keepdim=True), chosen @ expected
+        rest = expected.square().mean()
+    forward = (rows - expected[there]).square()
+    # Σ (p − t)² over the target's patches, gathered by the world's: its gradient has a fixed order.
+    ratio = rows.shape[1] / expected.shape[0]
+    backward = ratio * (times * rows.square() - 2.0 * rows * sums)
+    both = [world_mean(part.flatten(1)[..., None])[:, 0] for part in (forward, backward)]
+    return torch.maximum(both[0], both[1] + rest)
 
 
 # The paper's loss. Of VGG16 (Simonyan and Zisserman 2014) only the weights are needed, not

@@ -75,16 +75,9 @@ def load_target(
 
     A string is a built-in name if there is one, else a path if the file exists or the string has a
     suffix or a folder in it, else an emoji. A `Path` is always a path. Pixels with an alpha of at
-    least one half become points; the plain background of a picture without transparency is removed.
-
-    Args:
-        source: A name from `builtin_targets`, the path of a PNG, JPEG or WebP file, or one emoji.
-        point_count: Number of points; the result may differ by a few, as the picture allows.
-        keep_background: Use the picture's whole rectangle, white where it is transparent: for
-            photographs.
-
-    Raises:
-        MissingDependencyError: An emoji is asked for, and no colour-emoji font is installed.
+    least one half become points, about `point_count`; the plain background of a picture without
+    transparency is removed. `keep_background`: the picture's whole rectangle is used, white where
+    it is transparent: for photographs.
     """
     check_count("point_count", point_count, ": try 4096", at_most=MAX_POINT_COUNT)
     if not isinstance(source, str | Path):

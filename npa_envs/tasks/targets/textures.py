@@ -119,13 +119,9 @@ def load_texture(
     """Make a target from a built-in name or a picture file.
 
     The density is the picture's alpha: transparent parts stay empty, and a picture without
-    transparency is covered evenly. The largest square in the middle of the picture is scaled to the
-    resolution.
-
-    Args:
-        source: A name from `builtin_textures`, or the path of a PNG, JPEG or WebP file.
-        resolution: Pixels R along each side.
-        tiles: Whether the opposite edges of a picture file fit together; built-in textures tile.
+    transparency is covered evenly. The largest square in the middle of the picture is scaled to
+    `resolution` pixels along each side. `tiles`: the opposite edges of a picture file fit together;
+    built-in textures tile.
     """
     if not isinstance(source, str | Path) or not str(source):
         raise NPAError(

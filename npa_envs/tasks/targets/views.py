@@ -73,14 +73,8 @@ def load_views(
     """Make a target from a built-in mesh, a mesh file, or a folder in the format of NeRF-synthetic.
 
     A mesh is drawn from cameras all around. Of a folder's pictures and cameras evenly spaced ones
-    are taken; the scene is rotated so that y is up, and scaled into the ball of radius 0.85.
-
-    Args:
-        source: A name from `builtin_meshes`, the path of a mesh file, or a folder with
-            `transforms_train.json`.
-        resolution: Pixels along each side of a view.
-        training_count: Largest number of views to train with.
-        held_out_count: Largest number of other views, for metrics.
+    are taken, at most `training_count` and `held_out_count`; the scene is rotated so that y is up,
+    and scaled into the ball of radius 0.85. Views have `resolution` pixels along each side.
     """
     if not isinstance(source, str | Path) or not str(source):
         raise NPAError(
