@@ -56,7 +56,12 @@ def write_table(
 def write_pictures(records: Sequence[RunRecord], folder: Path) -> list[str]:
     """Write filmstrips and, with matplotlib, plots of curves; return "wrote PATH" for each."""
     strips = [f"wrote {path}" for path in write_strips(records, folder)]
-    return [*strips, *write_plots(lambda: curve_plots(records), folder / "curves_*.png", "curves")]
+
+    def curves() -> dict[str, bytes]:
+        tasks = dict.fromkeys(record.job.task for record in records)
+        return {task: _picture([r for r in records if r.job.task == task]) for task in tasks}
+
+    return [*strips, *write_plots(curves, folder / "curves_*.png", "curves")]
 
 
 # Rows: the results of a method on a task
@@ -269,12 +274,6 @@ def mean_curve(records: Sequence[RunRecord], across: str) -> Curve | None:
     if len(lines) > 1:
         error = values.std(axis=0, ddof=1) / np.sqrt(len(lines))
     return Curve(grid, values.mean(axis=0), error)
-
-
-def curve_plots(records: Sequence[RunRecord]) -> dict[str, bytes]:
-    """Return a PNG file of the mean learning curves for each task, by name. Needs matplotlib."""
-    tasks = dict.fromkeys(record.job.task for record in records)
-    return {task: _picture([r for r in records if r.job.task == task]) for task in tasks}
 
 
 def _picture(records: Sequence[RunRecord]) -> bytes:

@@ -126,7 +126,7 @@ class BudgetTrainConfig(TrainConfig[Any]):
     last_rate: float
     """Learning rate at the end, as a fraction of the first (dimensionless)."""
 
-    def learning_rate_at(self, iteration: int, share: float = 0.0) -> float:
+    def learning_rate_at(self, iteration: int, fraction: float = 0.0) -> float:
         """Return the rate by the budget spent, half a cosine; `TrainConfig` needs the arguments."""
         return annealed(self.learning_rate, self.last_rate, self.progress.spent_fraction)
 

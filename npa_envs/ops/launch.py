@@ -56,7 +56,6 @@ def _warp_stream(device: torch.device, handle: int) -> Any:
 
 
 def _current_stream(device: torch.device) -> int:
-    """Return the handle of torch's current stream of a CUDA device."""
     index = torch.cuda.current_device() if device.index is None else device.index
     # Ten times faster than `torch.cuda.current_stream`, which makes an object of it.
     return torch._C._cuda_getCurrentRawStream(index)
@@ -98,7 +97,6 @@ def _null(tensor: Tensor) -> int:
 
 
 def _overwrite(memory: Any, value: Any) -> None:
-    """Copy the bytes of a descriptor or struct into memory."""
     ctypes.memmove(ctypes.addressof(memory), ctypes.addressof(value), ctypes.sizeof(value))
 
 

@@ -101,7 +101,6 @@ def task_of_rule(
 
 
 def _file_of(source: str) -> tuple[Path, Mapping[str, str]]:
-    """Return the path and the metadata of a rule's file."""
     path = rule_file(source)
     return path, rule_metadata(path) if path.suffix == ".safetensors" else {}
 

@@ -53,8 +53,6 @@ class TaskEntry:
     """Space dimension D of its worlds."""
     static: bool = False
     """Whether particles never move."""
-    joint: bool = False
-    """Whether several rules are trained, one for each species, by `train_together`."""
 
     def expected_seconds(self, config: TrainConfig[Any]) -> float | None:
         """Return the estimated duration of a run on a CPU [s], by its particle-steps.
@@ -100,7 +98,6 @@ TASKS: Mapping[str, TaskEntry] = {
             "--preset paper --targets gecko heart --device cuda",
         ),
         fast_seconds=340.0,
-        joint=True,
     ),
     "morphogenesis3d": TaskEntry(
         summary="grow a 3D object from a ball of blank particles",

@@ -349,8 +349,8 @@ def test_the_process_of_a_run_ends_with_the_comparison(tmp_path, learns):
         [*one_run.PROGRAM, str(tmp_path)], stdin=subprocess.PIPE, stderr=subprocess.PIPE
     )
     try:
-        order = one_run.Order(str(tmp_path), "cpu", "")
-        process.stdin.write(f"{json.dumps(order)}\n".encode() if learns else b"")
+        order = json.dumps([str(tmp_path), "cpu", ""])
+        process.stdin.write(f"{order}\n".encode() if learns else b"")
         process.stdin.flush()
         _, errors = process.communicate(timeout=100)
     finally:
