@@ -261,11 +261,12 @@ class PPOLearner:
         budget.
         """
         schedule, memory = self.schedule, self.memory
+        critic, actor = (self.optimisers[name] for name in ("critic", "actor"))
         rules_learn = self.rounds >= schedule.critic_rounds
         self.rounds += 1
         self.critic.observe(memory.observations[:-1], self.processes)
         self.critic.rescale(memory.targets, self.processes)
-        self.optimisers["critic"].param_groups[0]["lr"].fill_(CRITIC_RATE * remaining_budget)
+        critic.param_groups[0]["lr"].fill_(CRITIC_RATE * remaining_budget)
         memory.rules_rate.fill_(schedule.learning_rate * remaining_budget)
         memory.within_kl.fill_(1.0)
         for _ in range(self.options.epochs):
@@ -274,24 +275,19 @@ class PPOLearner:
             self.processes.reduce([memory.weight_sums])
             for minibatch in range(self._minibatches.count):
                 if rules_learn:
-                    self._train(minibatch)
+                    self._update_graphs.run(self._find_gradients, minibatch)
+                    self.processes.reduce(
+                        [*gradients_of(critic), *gradients_of(actor), memory.kl_sums]
+                    )
+                    self._update_graphs.run(self._descend_both)
                 else:
-                    self._train_critic(minibatch)
+                    self._find_critic_gradients(minibatch)
+                    self.processes.reduce(gradients_of(critic))
+                    self._descend(critic)
             # The only synchronisation with the device.
             if not bool(memory.within_kl):
                 break
         self.actor.set_noise(self.options.noise_factor(remaining_budget, schedule.last_noise))
-
-    def _train(self, minibatch: int) -> None:
-        self._update_graphs.run(self._find_gradients, minibatch)
-        gradients = [g for name in ("critic", "actor") for g in gradients_of(self.optimisers[name])]
-        self.processes.reduce([*gradients, self.memory.kl_sums])
-        self._update_graphs.run(self._descend_both)
-
-    def _train_critic(self, minibatch: int) -> None:
-        self._find_critic_gradients(minibatch)
-        self.processes.reduce(gradients_of(self.optimisers["critic"]))
-        self._descend(self.optimisers["critic"])
 
     def _sum_weights(self) -> None:
         """Sum the weights of the samples in each minibatch of a pass, for critic and rules."""

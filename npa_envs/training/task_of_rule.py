@@ -26,7 +26,6 @@ class TrainedTask:
     """The task of a rule, and whether its target is known."""
 
     task: Task
-
     why_not_measurable: str | None
     """Why comparisons with the target are meaningless; None where they are meaningful."""
     task_name: str

@@ -93,10 +93,7 @@ TASKS: Mapping[str, TaskEntry] = {
         # Its rules are filmed and evaluated one by one, as rules of morphogenesis2d.
         make=lambda config, device: CoMorphogenesis2D(config, device=device),
         targets=tuple,
-        examples=(
-            "--targets ring heart",
-            "--preset paper --targets gecko heart --device cuda",
-        ),
+        examples=("--targets ring heart", "--preset paper --targets gecko heart --device cuda"),
         fast_seconds=340.0,
     ),
     "morphogenesis3d": TaskEntry(
