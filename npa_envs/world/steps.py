@@ -38,7 +38,7 @@ ROWS_KEPT = 2**24
 """Most rows of perception that are stored for the network at once."""
 
 MAX_AHEAD = 4
-"""Most steps whose random draws a recording makes in advance: they take memory."""
+"""Most steps whose random draws a CUDA graph makes in advance: they take memory."""
 
 OVERFLOW_LOG_PROBABILITY = 34.5
 """Row capacities suffice with probability 1 - exp(-34.5), about 1 - 1e-15, for each step."""
@@ -118,8 +118,8 @@ class Step:
 
     physics: Physics
 
-    def enter(self, particles: Particles) -> Particles:
-        """Return worlds as `advance` needs them, for example in sorted order."""
+    def to_step_order(self, particles: Particles) -> Particles:
+        """Return worlds given in the caller's order in that of `advance`; here it is the same."""
         return particles
 
     def draw_step(self, like: Tensor, source: Randomness | None) -> Draws:
@@ -132,8 +132,8 @@ class Step:
         In a CUDA graph draws are made in advance, in parallel with the steps before.
         """
         # In this order: a compiler cannot trace queries of streams.
-        recording = not torch.compiler.is_compiling() and like.is_cuda
-        if not (recording and torch.cuda.is_current_stream_capturing()):
+        may_capture = not torch.compiler.is_compiling() and like.is_cuda
+        if not (may_capture and torch.cuda.is_current_stream_capturing()):
             for _ in range(steps):
                 yield self.draw_step(like, source)
             return
@@ -153,8 +153,8 @@ class Step:
         """Return the worlds after one step with these draws."""
         raise NotImplementedError
 
-    def leave(self, particles: Particles) -> Particles:
-        """Undo `enter`: return worlds in the caller's order."""
+    def to_caller_order(self, particles: Particles) -> Particles:
+        """Undo `to_step_order`."""
         return particles
 
 
@@ -216,7 +216,7 @@ class StaticStep(RuleStep):
         self.sorted = prepare_static(self.x, physics)
         super().__init__(rule, rule.network(), physics, True, self.sorted)
 
-    def enter(self, particles: Particles) -> Particles:
+    def to_step_order(self, particles: Particles) -> Particles:
         """Return the worlds in sorted order."""
         return particles._replace(x=self.x).gather(self.sorted.original_index)
 
@@ -235,7 +235,7 @@ class StaticStep(RuleStep):
                 drawn = [Draws(None, None, of_step) for of_step in rows]
             yield from drawn
 
-    def leave(self, particles: Particles) -> Particles:
+    def to_caller_order(self, particles: Particles) -> Particles:
         """Return the worlds in the caller's order."""
         return particles.gather(self.sorted.sorted_index)
 
@@ -243,7 +243,7 @@ class StaticStep(RuleStep):
 class DivisionStep(RuleStep):
     """The step of a rule whose particles divide: an update of the living, then births, deaths."""
 
-    def enter(self, particles: Particles) -> Particles:
+    def to_step_order(self, particles: Particles) -> Particles:
         """Return the worlds with states of zero in dead slots."""
         # Dead slots must not enter gradients either: 0 times NaN is NaN.
         s = particles.s
@@ -370,8 +370,7 @@ class SpeciesStep(Step):
             row_width = max(network.row_width if network else row_width for network in networks)
         total = row_count(mask, x, physics.update_prob)
         if mask is not None and mask.is_cuda:
-            every = x.shape[0] * x.shape[1]
-            total = min(every, sum(species.capacity(x.shape[0]) for species in self.species))
+            total = min(mask.numel(), sum(own.capacity(x.shape[0]) for own in self.species))
         perception, active = perceive_rows(
             x.detach() if self.detach_positions else x,
             s,
