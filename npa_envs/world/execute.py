@@ -101,18 +101,18 @@ class RolloutSpec(NamedTuple):
         self,
         rules: Sequence[NPARule],
         particles: Particles,
-        source: Randomness | None,
+        generator: Randomness | None,
         watch: DivergenceWatch | None = None,
     ) -> Particles:
         """Launch the rollout of checked worlds: from a tape on a CPU, step by step otherwise."""
         step = self.make_step(rules, particles)
         if type(step) is RuleStep and watch is None:
-            taped = run_taped(step, particles, source, self.steps, self.keep_every)
+            taped = run_taped(step, particles, generator, self.steps, self.keep_every)
             if taped is not None:
                 return taped
         # Worlds keep their dtype under autocast, as kernels read the rules' outputs.
         with torch.autocast(particles.x.device.type, enabled=False):
-            after = self._launch_steps(step, rules, particles, source, watch)
+            after = self._launch_steps(step, rules, particles, generator, watch)
         if watch is not None:
             watch.raise_diverged()
         return after
@@ -122,7 +122,7 @@ class RolloutSpec(NamedTuple):
         step: Step,
         rules: Sequence[NPARule],
         particles: Particles,
-        source: Randomness | None,
+        generator: Randomness | None,
         watch: DivergenceWatch | None,
     ) -> Particles:
         """Launch step by step; return the last worlds, or with `keep_every` those kept, stacked."""
@@ -133,7 +133,7 @@ class RolloutSpec(NamedTuple):
         if interval > 1 and not torch.compiler.is_compiling():
             recomputed = RecomputedSteps(step.advance, rules, particles)
         trajectory: list[Particles] = []
-        for number, draws in enumerate(step.draw(particles.x, self.steps, source)):
+        for number, draws in enumerate(step.draw(particles.x, self.steps, generator)):
             if (self.steps - 1 - number) % interval == 0:
                 particles = step.advance(particles, draws)
             else:
@@ -234,7 +234,7 @@ def execute(
     spec: RolloutSpec,
     rules: Sequence[NPARule],
     particles: Particles,
-    source: Randomness | None,
+    generator: Randomness | None,
     *,
     graph: CudaGraph = "auto",
     watch: DivergenceWatch | None = None,
@@ -246,19 +246,19 @@ def execute(
     may be skipped once all worlds are at rest.
     """
     if watch is not None or not may_rest or not _can_rest(spec, rules, particles.x):
-        return run_all_steps(spec, rules, particles, source, graph=graph, watch=watch)
+        return run_all_steps(spec, rules, particles, generator, graph=graph, watch=watch)
     # In parts, to skip the steps after all worlds are at rest.
     remaining, part = spec.steps, FIRST_PART[particles.x.device.type]
     while remaining and not resting(rules, particles, spec.physics, graph).all():
         steps = min(part, remaining)
         part_spec = spec._replace(steps=steps)
-        particles = run_all_steps(part_spec, rules, particles, source, graph=graph)
+        particles = run_all_steps(part_spec, rules, particles, generator, graph=graph)
         remaining, part = remaining - steps, 2 * part
         if remaining and not particles.x.isfinite().all():
             # A world has diverged: the next call raises an error for it, this one does not.
-            return spec._replace(steps=remaining).run(rules, particles.with_zero_paths(), source)
+            return spec._replace(steps=remaining).run(rules, particles.with_zero_paths(), generator)
     # The generator ends where it would be after all steps.
-    skip_draws(particles.x, spec.physics, remaining, source)
+    skip_draws(particles.x, spec.physics, remaining, generator)
     # The caller may write to the results.
     return particles.map(torch.clone) if remaining == spec.steps else particles
 
@@ -267,21 +267,21 @@ def run_all_steps(
     spec: RolloutSpec,
     rules: Sequence[NPARule],
     particles: Particles,
-    source: Randomness | None,
+    generator: Randomness | None,
     *,
     graph: CudaGraph = "auto",
     watch: DivergenceWatch | None = None,
 ) -> Particles:
     """Run a checked rollout as `execute` does, without skipping steps."""
     if watch is None:
-        replayed = run_captured(spec, rules, particles, source, cuda_graph=graph)
+        replayed = run_captured(spec, rules, particles, generator, cuda_graph=graph)
         if replayed is not None:
             return replayed
     check_finite_positions(particles.x)
     if particles.x.is_cuda and torch.is_grad_enabled():
         # Gradients are added in the order of a capture: first those of this rollout.
         particles = particles.map(lambda value: value.view_as(value))
-    return spec.run(rules, particles.with_zero_paths(), source, watch)
+    return spec.run(rules, particles.with_zero_paths(), generator, watch)
 
 
 def resting(
@@ -388,7 +388,7 @@ _groups_lock = threading.Lock()
 def run_taped(
     step: RuleStep,
     particles: Particles,
-    source: Randomness | None,
+    generator: Randomness | None,
     steps: int,
     keep_every: int | None,
 ) -> Particles | None:
@@ -423,7 +423,7 @@ def run_taped(
     except IndexError:
         with torch.inference_mode(False), torch.no_grad():
             taped = TapedSteps(step, particles)
-    masks = (draws.mask for draws in step.draw(x, steps, source))
+    masks = (draws.mask for draws in step.draw(x, steps, generator))
     try:
         with torch.autocast("cpu", enabled=False):
             trajectory = taped.run(step.network, particles, masks, keep_every or steps)

@@ -97,7 +97,7 @@ def draw_step(x: Tensor, physics: Physics, generator: Randomness | None) -> Draw
 
 
 def skip_draws(x: Tensor, physics: Physics, steps: int, generator: Randomness | None) -> None:
-    """Advance a random source as so many steps of worlds at x would."""
+    """Advance a generator as `steps` steps of worlds at positions x would."""
     if steps == 0:
         return
     if isinstance(generator, WorldRandom):
@@ -114,7 +114,7 @@ def skip_draws(x: Tensor, physics: Physics, steps: int, generator: Randomness | 
 
 
 class Step:
-    """The repeated part of a rollout: random draws, and an advance that depends only on them."""
+    """One step of a rollout: its random draws, and `advance`, which draws nothing itself."""
 
     physics: Physics
 
@@ -122,11 +122,11 @@ class Step:
         """Return worlds given in the caller's order in that of `advance`; here it is the same."""
         return particles
 
-    def draw_step(self, like: Tensor, source: Randomness | None) -> Draws:
+    def draw_step(self, like: Tensor, generator: Randomness | None) -> Draws:
         """Return the draws of the next step, for positions of the shape and dtype of `like`."""
-        return draw_step(like, self.physics, source)
+        return draw_step(like, self.physics, generator)
 
-    def draw(self, like: Tensor, steps: int, source: Randomness | None) -> Iterator[Draws]:
+    def draw(self, like: Tensor, steps: int, generator: Randomness | None) -> Iterator[Draws]:
         """Yield each step's draws, in the same order on every device.
 
         In a CUDA graph draws are made in advance, in parallel with the steps before.
@@ -135,15 +135,15 @@ class Step:
         may_capture = not torch.compiler.is_compiling() and like.is_cuda
         if not (may_capture and torch.cuda.is_current_stream_capturing()):
             for _ in range(steps):
-                yield self.draw_step(like, source)
+                yield self.draw_step(like, generator)
             return
         side_stream = SideStream.of_thread(like.device, threading.get_ident())
-        ready, rest = [self.draw_step(like, source)], steps - 1
+        ready, rest = [self.draw_step(like, generator)], steps - 1
         while rest > 0:
             # Draws reuse the memory of earlier steps, so the two streams wait for each other.
             count = min(3 * len(ready), MAX_AHEAD, rest)
             with side_stream.overlap():
-                coming = [self.draw_step(like, source) for _ in range(count)]
+                coming = [self.draw_step(like, generator) for _ in range(count)]
             yield from ready
             side_stream.join()
             ready, rest = coming, rest - count
@@ -220,14 +220,14 @@ class StaticStep(RuleStep):
         """Return the worlds in sorted order."""
         return particles._replace(x=self.x).gather(self.sorted.original_index)
 
-    def draw(self, like: Tensor, steps: int, source: Randomness | None) -> Iterator[Draws]:
+    def draw(self, like: Tensor, steps: int, generator: Randomness | None) -> Iterator[Draws]:
         """Yield each step's draws; few launches assign the rows of several steps together."""
         total = like.shape[0] * like.shape[1]
         physics = self.physics
         together = max(min(16, ROWS_TOGETHER // total), 1)
         for first in range(0, steps, together):
             count = min(together, steps - first)
-            drawn = [draw_step(like, physics, source) for _ in range(count)]
+            drawn = [draw_step(like, physics, generator) for _ in range(count)]
             masks = [draws.mask for draws in drawn if draws.mask is not None]
             if masks:
                 capacity = row_capacity(total, physics.update_prob)
@@ -249,11 +249,11 @@ class DivisionStep(RuleStep):
         s = particles.s
         return particles._replace(s=torch.where(living(s)[..., None], s, 0.0))
 
-    def draw_step(self, like: Tensor, source: Randomness | None) -> Draws:
+    def draw_step(self, like: Tensor, generator: Randomness | None) -> Draws:
         """Return update mask, position noise and random numbers of divisions."""
-        drawn = super().draw_step(like, source)
-        chance = uniform_draws(source, like.shape[:2], like)
-        return drawn._replace(births=Births(chance, normal_draws(source, like.shape, like)))
+        drawn = super().draw_step(like, generator)
+        chance = uniform_draws(generator, like.shape[:2], like)
+        return drawn._replace(births=Births(chance, normal_draws(generator, like.shape, like)))
 
     def advance(self, particles: Particles, draws: Draws) -> Particles:
         """Return the worlds after one step with these draws."""
@@ -349,13 +349,13 @@ class SpeciesStep(Step):
             ]
             self.update_fraction = torch.cat(fractions)
 
-    def draw_step(self, like: Tensor, source: Randomness | None) -> Draws:
+    def draw_step(self, like: Tensor, generator: Randomness | None) -> Draws:
         """Return a step's mask, 1 with each species' own update probability, and its noise."""
-        drawn = super().draw_step(like, source)
+        drawn = super().draw_step(like, generator)
         if self.update_fraction is None:
             return drawn
         # Of the fractions' dtype.
-        chance = uniform_draws(source, like.shape[:2], self.update_fraction)
+        chance = uniform_draws(generator, like.shape[:2], self.update_fraction)
         mask, kept = drawn.mask, (chance < self.update_fraction).to(torch.uint8)
         return drawn._replace(mask=kept if mask is None else mask * kept)
 

@@ -180,7 +180,7 @@ def row_search(space_dim: int, periodic: bool) -> SimpleNamespace:
 
     @wp.func
     def near_box(domain: Domain, offset: vector, half: vector):
-        """Return whether a point at `offset` from a box's centre is within eps; sides are 2 `half`."""
+        """Return whether a point is within eps of a box, of half sides `half`, by its offset."""
         nearest = offset
         if wp.static(periodic):
             nearest = space.periodic_image(domain, nearest)
