@@ -286,11 +286,11 @@ def _gaussians_backward(
     contents = (starts, owners, pair_slots, footprints, stops, picture_bar)
     if device.type == "cuda":
         kernel = block_kernels(scalar).pull_back_blocks
-        arguments = (*contents, passing, passing_bar, tile_bars.view(-1))
-        launch(kernel, tiles * TILE_PIXELS, device, frame, *arguments, block_dim=TILE_PIXELS)
+        of_tiles = (*contents, passing, passing_bar, tile_bars.view(-1))
+        launch(kernel, tiles * TILE_PIXELS, device, frame, *of_tiles, block_dim=TILE_PIXELS)
     else:
-        arguments = (*contents, passing.clone(), passing * passing_bar, tile_bars)
-        launch(tile_kernels(scalar).pull_back_tiles, tiles, device, frame, *arguments)
+        of_tiles = (*contents, passing.clone(), passing * passing_bar, tile_bars)
+        launch(tile_kernels(scalar).pull_back_tiles, tiles, device, frame, *of_tiles)
     means, scales, quaternions, colours, *_ = scene
     bars = [torch.empty_like(tensor) for tensor in (means, scales, quaternions)]
     bars += [means.new_empty(means.shape[:2]), torch.empty_like(colours)]
