@@ -100,7 +100,7 @@ def read_json(path: str | Path, *, limit: int = 16 * _MIB) -> Any:
 def check_torch_archive(file: IO[bytes], *, checksums: bool = True) -> None:
     """Check the checksums of a file of `torch.save` before torch, which does not, unpacks it.
 
-    Compressed content, which torch does not write, is refused: it could take any amount of memory.
+    Compressed content, which torch does not write, is rejected: it could take any amount of memory.
     """
     try:
         size = file.seek(0, os.SEEK_END)

@@ -348,10 +348,10 @@ def check_fraction(config: object, *names: str) -> None:
     _check_fields(config, names, lambda v: is_real(v) and 0 < v <= 1, "lie in (0, 1]", 0.5)
 
 
-def check_word(config: object, name: str, words: Sequence[str | None]) -> None:
-    """Check that a field is one of `words`, among which None may be."""
-    value, known = getattr(config, name), [word for word in words if word is not None]
-    check_field(config, name, value in words, "be a known word", suggest(value, known))
+def check_word(config: object, name: str, choices: Sequence[str | None]) -> None:
+    """Check that a field is one of `choices`, among which None may be."""
+    value, known = getattr(config, name), [choice for choice in choices if choice is not None]
+    check_field(config, name, value in choices, "be a known word", suggest(value, known))
 
 
 def check_flag(config: object, *names: str) -> None:

@@ -37,13 +37,13 @@ def scalar_name(scalar: type) -> str:
 
 
 @cached_under_lock()
-def kernel_module(
-    module_name: str, space_dim: int, scalar: type, width: int = 0, lanes: int = 0
-) -> wp.Module:
-    """Return the Warp module of kernels such as "sort", for a D, scalar type, width and lanes."""
-    variant = f"{space_dim}d_{scalar_name(scalar)}"
-    variant += f"_w{width}" * bool(width) + f"_l{lanes}" * bool(lanes)
-    return native.module(f"npa_envs.kernels.{module_name}_{variant}")
+def kernel_module(name: str, space_dim: int, scalar: type, **options: int) -> wp.Module:
+    """Return the Warp module of kernels such as "sort": one for each combination of options."""
+    words = [name, f"{space_dim}d", scalar_name(scalar)]
+    for option, value in options.items():
+        if value is not False:
+            words.append(option if value is True else f"{option}{value}")
+    return native.module(f"npa_envs.kernels.{'_'.join(words)}")
 
 
 @cached_under_lock()

@@ -97,7 +97,7 @@ __device__ inline float log_scale_tangential(float length, float radial)
 
 // Pulls a cotangent of L(v) back to v, given L(v).
 template <typename Vector>
-__device__ inline Vector log_scale_pull(Vector scaled, Vector cotangent)
+__device__ inline Vector log_scale_cotangent(Vector scaled, Vector cotangent)
 {
     const float squared = wp::dot(scaled, scaled) + 1e-37f;  // which has an inverse root
     const float inverse = inverse_root(squared);

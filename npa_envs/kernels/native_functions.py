@@ -61,11 +61,11 @@ def module(name: str) -> wp.Module:
 def function(
     name: str, /, *parameters: Any, untyped: str = "", returns: Any = None, **arguments: Any
 ) -> Any:
-    """Return a Warp function of the C++ function `npa::name`, which does what the file says.
+    """Return a Warp function that calls `npa::name`, a C++ function of the `.cuh` files.
 
-    `parameters` are the C++ template parameters that do not follow from the arguments: numbers,
-    booleans, `npa`'s constants, types. `untyped` names arguments of any types, separated by spaces,
-    and `arguments` others with their types, as all are of functions that return a value.
+    `parameters` are the template parameters that C++ cannot deduce: numbers, booleans, types, names
+    of constants in `npa`. `arguments` are the types of arguments by name. Of functions without a
+    result (`returns` is None) some may have any type: `untyped`, names separated by spaces.
     """
     arguments = dict.fromkeys(untyped.split(), Any) | arguments
     template = f"<{', '.join(map(_in_cpp, parameters))}>" if parameters else ""

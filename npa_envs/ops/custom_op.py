@@ -84,13 +84,12 @@ def _tensors(value: Any) -> Iterator[Tensor]:
 
 
 class CustomOp(Generic[Arguments, Result]):
-    """A function of tensors that becomes a torch operator only where torch has to see one.
+    """A function of tensors that is called directly, or as a torch operator where torch needs one.
 
-    That is under torch.compile, in dispatch modes and for tensor subclasses. Other calls run the
-    function itself, as an operator's call costs as much CPU time as several launches. Arguments are
-    positional. Results share no memory with each other or with arguments. The operator takes a
-    `Physics` as the list `Physics.numbers`. For tensors without memory, as in tracing, the function
-    runs without its launches.
+    It needs one under torch.compile, in dispatch modes and for tensor subclasses; elsewhere its
+    call would cost as much CPU time as several launches. Arguments are positional. Results share no
+    memory with each other or with arguments. The operator takes a `Physics` as the list
+    `Physics.numbers`. With torch's fake tensors, which have no memory, no kernel is launched.
     """
 
     def __init__(self, name: str, function: Callable[Arguments, Result]) -> None:

@@ -28,7 +28,7 @@ from npa_envs.ops.launch import Tape, is_aligned, launch
 from npa_envs.ops.perception_passes import (
     SavedPerception,
     compute_densities,
-    compute_density_gradients,
+    compute_densities_in_cells,
     perceive_rows_backward,
     perception_launch,
     portable_kernels,
@@ -149,7 +149,7 @@ def perception_fields(
     x, s = x.contiguous(), s.contiguous()
     plan = plan_kernels(x, x.shape, state_dim, world_count * particle_count, False, physics)
     ordered = sort_worlds(plan, x, s, None)
-    densities = compute_density_gradients(plan, ordered)
+    densities = compute_densities_in_cells(plan, ordered)
     fields = PerceptionFields(
         rho=x.new_empty(plan.total),
         blur=x.new_empty(plan.total, state_dim),

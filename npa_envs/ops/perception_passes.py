@@ -30,7 +30,6 @@ class NeighbourLists(NamedTuple):
     """Neighbour lists of active particles (rows) for the CUDA kernels; they include themselves."""
 
     layout: ListLayout
-    """Layout of the lists."""
     steps: Tensor
     """Differences of sorted indices from each neighbour to the next, int16; lists of 32 rows are
     interleaved, those of tiles are stored one after the other."""
@@ -86,11 +85,10 @@ def compute_densities(
     """Return densities, with neighbour lists (CUDA) or density gradients (elsewhere).
 
     `layout` of the lists is by default that of rollouts. `state_index` has the index of each sorted
-    particle's state, by default in order. `with_particles`: also return `particles`,
-    which the adjoint reads.
+    particle's state, by default in order. `with_particles`: also `particles`, for the adjoint.
     """
     if not plan.lists_neighbours:
-        return compute_density_gradients(plan, ordered)
+        return compute_densities_in_cells(plan, ordered)
     layout = layout or plan.list_layout
     positions = ordered.positions
     records = positions.new_empty(plan.total, 4)
@@ -135,8 +133,8 @@ def compute_densities(
     return Densities(particles, no_gradient, NeighbourLists(layout, steps, lengths, records))
 
 
-def compute_density_gradients(plan: KernelPlan, ordered: SortedWorlds) -> Densities:
-    """Return densities of all particles, and density gradients of active ones, without lists."""
+def compute_densities_in_cells(plan: KernelPlan, ordered: SortedWorlds) -> Densities:
+    """Return densities of all particles and density gradients of active ones; makes no lists."""
     positions = ordered.positions
     particles = positions.new_empty(plan.total, plan.space_dim + 1)
     density_gradient = positions.new_empty(plan.total, plan.space_dim, dtype=torch.float64)
@@ -197,17 +195,17 @@ def perception_launch(
         lists = lists._replace(steps=shifted[0], lengths=shifted[1])
     if lists is not None:
         variant = PerceptionVariant(
-            plan.space_dim,
-            plan.width,
-            terms.state_gradient,
-            terms.correction,
-            plan.periodic,
-            plan.group_count > 1,
-            lists.layout.capacity,
-            row_kernel_sum is not None,
-            lists.layout.teams,
-            lists.per_particle,
-            lists.layout.tiled,
+            space_dim=plan.space_dim,
+            width=plan.width,
+            state_gradient=terms.state_gradient,
+            moment_inverse=terms.correction,
+            periodic=plan.periodic,
+            grouped=plan.group_count > 1,
+            capacity=lists.layout.capacity,
+            for_adjoint=row_kernel_sum is not None,
+            teams=lists.layout.teams,
+            per_particle=lists.per_particle,
+            tiled=lists.layout.tiled,
         )
         return (
             listed_perception(variant),
@@ -349,7 +347,7 @@ def _gather_by_cells(
         plan.domain,
         plan.particle_count,
         plan.state_dim,
-        *plan.row_numbers,
+        *plan.row_arguments,
         plan.group_count,
         saved.starts,
         ends,
@@ -361,6 +359,7 @@ def _gather_by_cells(
         saved.row_kernel_sum,
         bar,
         smoothed_bar,
+        # Twice: in the kernel's matrices, and as its flat array of numbers.
         gradient_bar,
         gradient_bar,
         states_bar,
@@ -424,7 +423,7 @@ def _gather_by_tiles(plan: KernelPlan, saved: SavedPerception, bar: Tensor) -> T
         plan.particle_count,
         tile_count,
         plan.state_dim,
-        *plan.row_numbers,
+        *plan.row_arguments,
         plan.group_count,
         saved.starts,
         saved.particles,
@@ -433,6 +432,7 @@ def _gather_by_tiles(plan: KernelPlan, saved: SavedPerception, bar: Tensor) -> T
         saved.row_positions,
         saved.row_kernel_sum,
         bar,
+        # Twice: in the kernel's vectors of channels, and as its flat array of numbers.
         cotangents,
         cotangents,
         states_bar,

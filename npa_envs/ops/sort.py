@@ -113,8 +113,8 @@ class KernelPlan(NamedTuple):
         return self.total if self.masked else 0
 
     @property
-    def row_numbers(self) -> tuple[int, int, int]:
-        """`active_offset`, `row_base` and `row_capacity`, in the order of kernels' arguments."""
+    def row_arguments(self) -> tuple[int, int, int]:
+        """Arguments of kernels that number or look up rows, in their order."""
         return self.active_offset, self.row_base, self.row_capacity
 
     @property
@@ -265,7 +265,7 @@ def sort_worlds(
         plan.group_count,
         int(aligned),
         s,
-        *plan.row_numbers,
+        *plan.row_arguments,
         arrived,
         *ordered,
     )
@@ -320,7 +320,7 @@ def _sort_by_threads(
         plan.group_count,
         int(s is not None and plan.state_dim % plan.width == 0 and is_aligned(s)),
         s,
-        *plan.row_numbers,
+        *plan.row_arguments,
         torch.empty_like(ordered.original_index),
         *ordered,
     )
@@ -350,7 +350,7 @@ def _sort_by_blocks(
         int(plan.state_dim % THREAD_CHANNELS == 0),
         s,
         mask,
-        *plan.row_numbers,
+        *plan.row_arguments,
         *ordered,
         block_dim=block,
     )

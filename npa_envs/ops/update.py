@@ -17,7 +17,8 @@ from npa_envs.kernels.portable.update import (
     THREAD_CHANNELS,
     UPDATE_ALIGNMENT,
     VALUES_PER_THREAD,
-    find_not_finite,
+    action_kernel,
+    flag_not_finite,
     update_kernels,
 )
 from npa_envs.ops.custom_op import check_derivatives, custom_op, once_differentiable
@@ -26,7 +27,7 @@ from npa_envs.ops.perceive import Rows
 from npa_envs.ops.physics import Physics
 from npa_envs.ops.sort import MAX_INDEX
 
-BOUNDARIES = {"open": OPEN, "periodic": PERIODIC, "reflecting": REFLECTING}
+BOUNDARY_NUMBERS = {"open": OPEN, "periodic": PERIODIC, "reflecting": REFLECTING}
 """The kernels' constant for each boundary."""
 
 
@@ -252,7 +253,7 @@ class ActedWorlds(NamedTuple):
         aligned = aligned and state_dim % THREAD_CHANNELS == 0
         aligned = aligned and (space_dim % 2 == 0 or not physics.moving)
         return (
-            update_kernels(space_dim, SCALARS[x.dtype]).apply_actions,
+            action_kernel(space_dim, SCALARS[x.dtype]),
             world_count * particle_count * -(-state_dim // THREAD_CHANNELS),
             x.device,
             particle_count,
@@ -353,7 +354,7 @@ class PreparedActions:
             self._tape = Tape()
             x, s = self._worlds[:2]
             threads = -(-action.numel() // VALUES_PER_THREAD)
-            check = find_not_finite(SCALARS[x.dtype])
+            check = flag_not_finite(SCALARS[x.dtype])
             self._tape.add(check, threads, x.device, threads, action, self._worlds.enabled)
             self._tape.add(*self._worlds.launch_of(action, self._physics, is_aligned(s)))
             self._action_slots = self._tape.argument_slots(action)

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 MAX_GRAPHS = 128
 """Most graphs of a captured rollout, each for one number of steps."""
 
-WARM_UP_STEPS = 4
+CAPTURE_WARM_UP_STEPS = 4
 """Steps that load all kernels: enough for static worlds and every `memory` mode."""
 
 
@@ -132,8 +132,7 @@ class CapturedRollout:
         self._draws_per_step = 0
         """Increase of a generator's offset in one step."""
         self._pool = torch.cuda.graph_pool_handle()
-        self.stream: torch.cuda.Stream | None = None
-        """Stream of the last use."""
+        self.last_stream: torch.cuda.Stream | None = None
         self.token = torch.empty(0, device=self.device)
         """What autograd saves in the place of tensors for the backward pass."""
 
@@ -144,7 +143,7 @@ class CapturedRollout:
     def capture(self, steps: int, call: RolloutCall) -> None:
         """Capture `steps` steps as CUDA graphs; before the first, run some of `call` eagerly."""
         if not self.graphs:
-            self._warm_up(min(steps, WARM_UP_STEPS), call)
+            self._warm_up(min(steps, CAPTURE_WARM_UP_STEPS), call)
         elif len(self.graphs) >= MAX_GRAPHS:
             self.compared.discard(self.graphs.popitem(last=False)[0])
         spec = self._spec._replace(steps=steps)
@@ -239,7 +238,7 @@ class CapturedRollout:
         return [tensor._version for tensor in self._inputs]
 
     def _cotangents_of(self, steps: int) -> list[Tensor]:
-        """Return the buffers for the gradients by the worlds that so many steps return."""
+        """Return buffers for the gradients by the worlds that a rollout of `steps` returns."""
         interval = self._spec.keep_every
         count = None if interval is None else steps // interval
         if count not in self._cotangents:
@@ -364,10 +363,10 @@ class CapturedRollout:
     def _wait_for_last_use(self) -> None:
         """Make the current stream wait for the stream of the last use."""
         stream = current_stream(self.device)
-        if self.stream is not stream:
-            if self.stream is not None:
-                stream.wait_stream(self.stream)
-            self.stream = stream
+        if self.last_stream is not stream:
+            if self.last_stream is not None:
+                stream.wait_stream(self.last_stream)
+            self.last_stream = stream
 
 
 class _MemoryView:

@@ -112,7 +112,7 @@ class DivergenceWatch:
 
     @torch.no_grad()
     def check(self, worlds: Particles) -> None:
-        """Check the worlds after a step."""
+        """Count this check; store its number and values for worlds that first diverged in it."""
         values = torch.cat((worlds.x, worlds.s), dim=2)
         is_first = ~values.isfinite().all(dim=(1, 2)) & (self._first_check < 0)
         self._first_check.masked_fill_(is_first, self._checks)

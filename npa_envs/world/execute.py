@@ -52,10 +52,10 @@ MIN_STATIC = 3
 MIN_RESTING = 256
 """Fewest steps of a rollout that is checked for worlds at rest."""
 
-MAX_TOTAL = 4096
+MAX_TAPED_PARTICLES = 4096
 """Most particles of a batch whose steps are on a tape: in larger ones kernels take most time."""
 
-MAX_GROUPS = 32
+MAX_TAPED_GROUPS = 32
 """Most groups of calls whose tapes are cached."""
 
 FIRST_PART = {"cpu": 64, "cuda": 1024}
@@ -101,63 +101,71 @@ class RolloutSpec(NamedTuple):
         self,
         rules: Sequence[NPARule],
         particles: Particles,
-        source: Randomness | None,
+        generator: Randomness | None,
         watch: DivergenceWatch | None = None,
     ) -> Particles:
-        """Launch the rollout of checked worlds: from a tape on a CPU, in a loop otherwise.
-
-        Raises:
-            DivergedError: A world diverged under a watch.
-        """
+        """Launch the rollout of checked worlds: from a tape on a CPU, step by step otherwise."""
         step = self.make_step(rules, particles)
         if type(step) is RuleStep and watch is None:
-            taped = run_taped(step, particles, source, self.steps, self.keep_every)
+            taped = run_taped(step, particles, generator, self.steps, self.keep_every)
             if taped is not None:
                 return taped
-        particles = step.enter(particles)
-        keep_every = self.keep_every
-        interval = STORED_INTERVAL[self.memory] if torch.is_grad_enabled() else 1
-        trajectory: list[Particles] = []
-        # During a capture torch's random state cannot be read, and draws belong to the graph.
-        capturing = particles.x.is_cuda and torch.cuda.is_current_stream_capturing()
-        with_modules = not all(rule.has_network() for rule in rules)
-        redraw = with_modules and not capturing
-        if with_modules and capturing and not draws_alone():
-            # Recomputed, a module that draws random numbers would draw others.
-            interval = 1
+        # Worlds keep their dtype under autocast, as kernels read the rules' outputs.
+        with torch.autocast(particles.x.device.type, enabled=False):
+            after = self._launch_steps(step, rules, particles, generator, watch)
+        if watch is not None:
+            watch.raise_diverged()
+        return after
+
+    def _launch_steps(
+        self,
+        step: Step,
+        rules: Sequence[NPARule],
+        particles: Particles,
+        generator: Randomness | None,
+        watch: DivergenceWatch | None,
+    ) -> Particles:
+        """Launch step by step; return the last worlds, or with `keep_every` those kept, stacked."""
+        particles = step.to_step_order(particles)
+        interval, restores_random_state = self._recomputation(rules, particles.x)
         recomputed = None
         # A compiled function reads copies.
         if interval > 1 and not torch.compiler.is_compiling():
             recomputed = RecomputedSteps(step.advance, rules, particles)
-        # Worlds keep their dtype under autocast, as kernels read the rules' outputs.
-        with torch.autocast(particles.x.device.type, enabled=False):
-            for number, draws in enumerate(step.draw(particles.x, self.steps, source)):
-                if (self.steps - 1 - number) % interval > 0:
-                    particles = checkpoint(
-                        recomputed or step.advance,
-                        particles,
-                        draws,
-                        use_reentrant=False,
-                        preserve_rng_state=redraw,
-                    )
-                else:
-                    particles = step.advance(particles, draws)
-                if watch is not None:
-                    watch.check(step.leave(particles.map(Tensor.detach)))
-                if keep_every is not None and (number + 1) % keep_every == 0:
-                    trajectory.append(step.leave(particles))
-            if recomputed is not None:
-                recomputed.store_versions()
-            if self.steps == 0:
-                # The caller may write to the results.
-                particles = particles.map(torch.clone)
-            if keep_every is None:
-                particles = step.leave(particles)
+        trajectory: list[Particles] = []
+        for number, draws in enumerate(step.draw(particles.x, self.steps, generator)):
+            if (self.steps - 1 - number) % interval == 0:
+                particles = step.advance(particles, draws)
             else:
-                particles = combined(torch.stack, trajectory)
-        if watch is not None:
-            watch.raise_diverged()
-        return particles
+                particles = checkpoint(
+                    recomputed or step.advance,
+                    particles,
+                    draws,
+                    use_reentrant=False,
+                    preserve_rng_state=restores_random_state,
+                )
+            if watch is not None:
+                watch.check(step.to_caller_order(particles.map(Tensor.detach)))
+            if self.keep_every is not None and (number + 1) % self.keep_every == 0:
+                trajectory.append(step.to_caller_order(particles))
+        if recomputed is not None:
+            recomputed.store_versions()
+        if self.keep_every is not None:
+            return combined(torch.stack, trajectory)
+        # Without steps it is a copy, as the caller may write to the results.
+        return step.to_caller_order(particles if self.steps else particles.map(torch.clone))
+
+    def _recomputation(self, rules: Sequence[NPARule], x: Tensor) -> tuple[int, bool]:
+        """Return the interval of stored steps, and whether others restore torch's random state."""
+        interval = STORED_INTERVAL[self.memory] if torch.is_grad_enabled() else 1
+        if all(rule.has_network() for rule in rules):
+            return interval, False
+        # During a capture torch's random state cannot be read, and draws belong to the graph.
+        capturing = x.is_cuda and torch.cuda.is_current_stream_capturing()
+        if capturing and not draws_alone():
+            # Recomputed, a module that draws random numbers would draw others.
+            interval = 1
+        return interval, not capturing
 
 
 class RecomputedSteps:
@@ -226,7 +234,7 @@ def execute(
     spec: RolloutSpec,
     rules: Sequence[NPARule],
     particles: Particles,
-    source: Randomness | None,
+    generator: Randomness | None,
     *,
     graph: CudaGraph = "auto",
     watch: DivergenceWatch | None = None,
@@ -238,19 +246,19 @@ def execute(
     may be skipped once all worlds are at rest.
     """
     if watch is not None or not may_rest or not _can_rest(spec, rules, particles.x):
-        return run_all_steps(spec, rules, particles, source, graph=graph, watch=watch)
+        return run_all_steps(spec, rules, particles, generator, graph=graph, watch=watch)
     # In parts, to skip the steps after all worlds are at rest.
     remaining, part = spec.steps, FIRST_PART[particles.x.device.type]
     while remaining and not resting(rules, particles, spec.physics, graph).all():
         steps = min(part, remaining)
         part_spec = spec._replace(steps=steps)
-        particles = run_all_steps(part_spec, rules, particles, source, graph=graph)
+        particles = run_all_steps(part_spec, rules, particles, generator, graph=graph)
         remaining, part = remaining - steps, 2 * part
         if remaining and not particles.x.isfinite().all():
             # A world has diverged: the next call raises an error for it, this one does not.
-            return spec._replace(steps=remaining).run(rules, particles.with_zero_paths(), source)
+            return spec._replace(steps=remaining).run(rules, particles.with_zero_paths(), generator)
     # The generator ends where it would be after all steps.
-    skip_draws(particles.x, spec.physics, remaining, source)
+    skip_draws(particles.x, spec.physics, remaining, generator)
     # The caller may write to the results.
     return particles.map(torch.clone) if remaining == spec.steps else particles
 
@@ -259,21 +267,21 @@ def run_all_steps(
     spec: RolloutSpec,
     rules: Sequence[NPARule],
     particles: Particles,
-    source: Randomness | None,
+    generator: Randomness | None,
     *,
     graph: CudaGraph = "auto",
     watch: DivergenceWatch | None = None,
 ) -> Particles:
     """Run a checked rollout as `execute` does, without skipping steps."""
     if watch is None:
-        replayed = run_captured(spec, rules, particles, source, cuda_graph=graph)
+        replayed = run_captured(spec, rules, particles, generator, cuda_graph=graph)
         if replayed is not None:
             return replayed
     check_finite_positions(particles.x)
     if particles.x.is_cuda and torch.is_grad_enabled():
         # Gradients are added in the order of a capture: first those of this rollout.
         particles = particles.map(lambda value: value.view_as(value))
-    return spec.run(rules, particles.with_zero_paths(), source, watch)
+    return spec.run(rules, particles.with_zero_paths(), generator, watch)
 
 
 def resting(
@@ -306,7 +314,7 @@ def _can_rest(spec: RolloutSpec, rules: Sequence[NPARule], x: Tensor) -> bool:
 # Small worlds on a CPU: a step takes some 50 µs in kernels and several times as much in Python, for
 # checks, memory and arguments of launches. From the third call with the same shapes and options on,
 # a rollout without gradients replays launches from a tape, which go back and forth between two
-# buffers. The same kernels run on the same numbers. Captured rollouts on CUDA are the same idea.
+# buffers. The same kernels run on the same numbers, as in captured rollouts on CUDA.
 
 
 class _TapedStep:
@@ -374,14 +382,13 @@ class TapedSteps:
 
 _groups = CallGroups()
 
-_lock = threading.Lock()
-"""Lock of `_groups`."""
+_groups_lock = threading.Lock()
 
 
 def run_taped(
     step: RuleStep,
     particles: Particles,
-    source: Randomness | None,
+    generator: Randomness | None,
     steps: int,
     keep_every: int | None,
 ) -> Particles | None:
@@ -395,7 +402,7 @@ def run_taped(
         torch.compiler.is_compiling()
         or torch.is_grad_enabled()
         or x.device.type != "cpu"
-        or x.shape[0] * x.shape[1] > MAX_TOTAL
+        or x.shape[0] * x.shape[1] > MAX_TAPED_PARTICLES
         or step.network is None
         or step.physics.position_noise > 0.0
         or steps == 0
@@ -406,8 +413,8 @@ def run_taped(
     ):
         return None
     key = (step.physics, rule_form(step.rule), x.shape, s.shape[2], x.dtype)
-    with _lock:
-        group = _groups.count(key, MAX_GROUPS)
+    with _groups_lock:
+        group = _groups.count(key, MAX_TAPED_GROUPS)
     if group.calls <= LAUNCHED_FIRST:
         return None
     # Another thread may have taken the last one in the meantime.
@@ -416,7 +423,7 @@ def run_taped(
     except IndexError:
         with torch.inference_mode(False), torch.no_grad():
             taped = TapedSteps(step, particles)
-    masks = (draws.mask for draws in step.draw(x, steps, source))
+    masks = (draws.mask for draws in step.draw(x, steps, generator))
     try:
         with torch.autocast("cpu", enabled=False):
             trajectory = taped.run(step.network, particles, masks, keep_every or steps)

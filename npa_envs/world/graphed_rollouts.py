@@ -13,7 +13,6 @@ in use, and another rollout of the group gets another capture.
 from __future__ import annotations
 
 import collections
-import contextlib
 import itertools
 import logging
 from collections.abc import Hashable, Sequence
@@ -50,7 +49,7 @@ BLOCK_STEPS = 64
 MAX_STEPS = 1024
 """Most steps of a graph with gradients: longer rollouts are launched."""
 
-MAX_GROUPS = 256
+MAX_CAPTURED_GROUPS = 256
 """Most groups of calls that are counted."""
 
 logger = logging.getLogger(__name__)
@@ -84,7 +83,7 @@ def run_captured(
     shape = (x.shape, particles.s.shape[2], x.dtype, x.device)
     key = spec._replace(steps=0), forms, shape, grad_flags, per_world_streams, precision
     with _lock:
-        group = _groups.count(key, MAX_GROUPS)
+        group = _groups.count(key, MAX_CAPTURED_GROUPS)
     if group.launched_only or group.calls <= (1 if explicit else LAUNCHED_FIRST):
         return None
     if grad_flags and (spec.steps > MAX_STEPS or _saves_tensors_elsewhere()):
@@ -166,8 +165,7 @@ class CallGroup:
         self.free: collections.deque[Any] = collections.deque()
         """Captures, or taped steps, that are not in use."""
         self.captures: list[CapturedRollout] = []
-        self.failures = 0
-        """Number of failed captures."""
+        self.failed_captures = 0
         self.launched_only = False
         """Whether calls of this group cannot be captured."""
 
@@ -190,12 +188,12 @@ class CallGroups(collections.OrderedDict[Hashable, CallGroup]):
     def forget(self, key: Hashable) -> None:
         """Delete a key and its captures; those in use live until their backward pass has run."""
         for rollout in self.pop(key).captures:
-            if rollout.stream is not None:
-                rollout.stream.synchronize()
+            if rollout.last_stream is not None:
+                rollout.last_stream.synchronize()
 
 
 class CaptureUse:
-    """One use of a captured rollout, which ends when autograd and the caller drop this object."""
+    """Lends a captured rollout to one call, until nothing refers to this object any more."""
 
     def __init__(self, rollout: CapturedRollout, group: CallGroup) -> None:
         self.rollout = rollout
@@ -233,10 +231,8 @@ def release_captures() -> None:
 def _reserve_capture(group: CallGroup, call: RolloutCall) -> CaptureUse | None:
     """Reserve a captured rollout with the graphs for a call; None: the call has to be launched."""
     with _lock:
-        use = None
-        with contextlib.suppress(IndexError):
-            # The one used last: it more likely has these numbers of steps.
-            use = CaptureUse(group.free.pop(), group)
+        # The one used last: it more likely has these numbers of steps.
+        use = CaptureUse(group.free.pop(), group) if group.free else None
         try:
             if use is None:
                 with plain_tensors():
@@ -252,8 +248,8 @@ def _reserve_capture(group: CallGroup, call: RolloutCall) -> CaptureUse | None:
                 with plain_tensors(), torch.autocast("cuda", enabled=False):
                     rollout.capture(steps, call)
         except Exception as error:
-            group.failures += 1
-            if use is not None and may_be_disturbed(group.failures):
+            group.failed_captures += 1
+            if use is not None and may_be_disturbed(group.failed_captures):
                 use.broken = True
                 group.captures.remove(use.rollout)
                 return None

@@ -136,7 +136,7 @@ class WorldRandom:
         self._draw_count = 0
 
     def take(self, worlds: Tensor | slice) -> WorldRandom:
-        """Return a copy of the streams of some worlds: indices, int64, shape [K], or a slice."""
+        """Return a copy of the streams of some worlds: indices, int64, 1D, or a slice."""
         taken = copy.copy(self)
         taken.keys = self.keys[worlds].clone()
         taken.episodes = self.episodes[worlds].clone()
@@ -164,8 +164,8 @@ class WorldRandom:
         """Write the keys, episodes and steps of other streams into some worlds, in place.
 
         All worlds share the index of the next draw in a step. So from the next `advance` on, draws
-        equal those of the other streams; until then no number is drawn twice. `worlds` are K
-        indices, int64, or a slice.
+        equal those of the other streams; until then no number is drawn twice. `worlds` are
+        indices, int64, 1D, or a slice.
         """
         self.keys[worlds] = other.keys
         self.episodes[worlds] = other.episodes

@@ -38,7 +38,7 @@ ROWS_KEPT = 2**24
 """Most rows of perception that are stored for the network at once."""
 
 MAX_AHEAD = 4
-"""Most steps whose random draws a recording makes in advance: they take memory."""
+"""Most steps whose random draws a CUDA graph makes in advance: they take memory."""
 
 OVERFLOW_LOG_PROBABILITY = 34.5
 """Row capacities suffice with probability 1 - exp(-34.5), about 1 - 1e-15, for each step."""
@@ -97,7 +97,7 @@ def draw_step(x: Tensor, physics: Physics, generator: Randomness | None) -> Draw
 
 
 def skip_draws(x: Tensor, physics: Physics, steps: int, generator: Randomness | None) -> None:
-    """Advance a random source as so many steps of worlds at x would."""
+    """Advance a generator as `steps` steps of worlds at positions x would."""
     if steps == 0:
         return
     if isinstance(generator, WorldRandom):
@@ -114,36 +114,36 @@ def skip_draws(x: Tensor, physics: Physics, steps: int, generator: Randomness | 
 
 
 class Step:
-    """The repeated part of a rollout: random draws, and an advance that depends only on them."""
+    """One step of a rollout: its random draws, and `advance`, which draws nothing itself."""
 
     physics: Physics
 
-    def enter(self, particles: Particles) -> Particles:
-        """Return worlds as `advance` needs them, for example in sorted order."""
+    def to_step_order(self, particles: Particles) -> Particles:
+        """Return worlds given in the caller's order in that of `advance`; here it is the same."""
         return particles
 
-    def draw_step(self, like: Tensor, source: Randomness | None) -> Draws:
+    def draw_step(self, like: Tensor, generator: Randomness | None) -> Draws:
         """Return the draws of the next step, for positions of the shape and dtype of `like`."""
-        return draw_step(like, self.physics, source)
+        return draw_step(like, self.physics, generator)
 
-    def draw(self, like: Tensor, steps: int, source: Randomness | None) -> Iterator[Draws]:
+    def draw(self, like: Tensor, steps: int, generator: Randomness | None) -> Iterator[Draws]:
         """Yield each step's draws, in the same order on every device.
 
         In a CUDA graph draws are made in advance, in parallel with the steps before.
         """
         # In this order: a compiler cannot trace queries of streams.
-        recording = not torch.compiler.is_compiling() and like.is_cuda
-        if not (recording and torch.cuda.is_current_stream_capturing()):
+        may_capture = not torch.compiler.is_compiling() and like.is_cuda
+        if not (may_capture and torch.cuda.is_current_stream_capturing()):
             for _ in range(steps):
-                yield self.draw_step(like, source)
+                yield self.draw_step(like, generator)
             return
         side_stream = SideStream.of_thread(like.device, threading.get_ident())
-        ready, rest = [self.draw_step(like, source)], steps - 1
+        ready, rest = [self.draw_step(like, generator)], steps - 1
         while rest > 0:
             # Draws reuse the memory of earlier steps, so the two streams wait for each other.
             count = min(3 * len(ready), MAX_AHEAD, rest)
             with side_stream.overlap():
-                coming = [self.draw_step(like, source) for _ in range(count)]
+                coming = [self.draw_step(like, generator) for _ in range(count)]
             yield from ready
             side_stream.join()
             ready, rest = coming, rest - count
@@ -153,8 +153,8 @@ class Step:
         """Return the worlds after one step with these draws."""
         raise NotImplementedError
 
-    def leave(self, particles: Particles) -> Particles:
-        """Undo `enter`: return worlds in the caller's order."""
+    def to_caller_order(self, particles: Particles) -> Particles:
+        """Undo `to_step_order`."""
         return particles
 
 
@@ -216,18 +216,18 @@ class StaticStep(RuleStep):
         self.sorted = prepare_static(self.x, physics)
         super().__init__(rule, rule.network(), physics, True, self.sorted)
 
-    def enter(self, particles: Particles) -> Particles:
+    def to_step_order(self, particles: Particles) -> Particles:
         """Return the worlds in sorted order."""
         return particles._replace(x=self.x).gather(self.sorted.original_index)
 
-    def draw(self, like: Tensor, steps: int, source: Randomness | None) -> Iterator[Draws]:
+    def draw(self, like: Tensor, steps: int, generator: Randomness | None) -> Iterator[Draws]:
         """Yield each step's draws; few launches assign the rows of several steps together."""
         total = like.shape[0] * like.shape[1]
         physics = self.physics
         together = max(min(16, ROWS_TOGETHER // total), 1)
         for first in range(0, steps, together):
             count = min(together, steps - first)
-            drawn = [draw_step(like, physics, source) for _ in range(count)]
+            drawn = [draw_step(like, physics, generator) for _ in range(count)]
             masks = [draws.mask for draws in drawn if draws.mask is not None]
             if masks:
                 capacity = row_capacity(total, physics.update_prob)
@@ -235,7 +235,7 @@ class StaticStep(RuleStep):
                 drawn = [Draws(None, None, of_step) for of_step in rows]
             yield from drawn
 
-    def leave(self, particles: Particles) -> Particles:
+    def to_caller_order(self, particles: Particles) -> Particles:
         """Return the worlds in the caller's order."""
         return particles.gather(self.sorted.sorted_index)
 
@@ -243,17 +243,17 @@ class StaticStep(RuleStep):
 class DivisionStep(RuleStep):
     """The step of a rule whose particles divide: an update of the living, then births, deaths."""
 
-    def enter(self, particles: Particles) -> Particles:
+    def to_step_order(self, particles: Particles) -> Particles:
         """Return the worlds with states of zero in dead slots."""
         # Dead slots must not enter gradients either: 0 times NaN is NaN.
         s = particles.s
         return particles._replace(s=torch.where(living(s)[..., None], s, 0.0))
 
-    def draw_step(self, like: Tensor, source: Randomness | None) -> Draws:
+    def draw_step(self, like: Tensor, generator: Randomness | None) -> Draws:
         """Return update mask, position noise and random numbers of divisions."""
-        drawn = super().draw_step(like, source)
-        chance = uniform_draws(source, like.shape[:2], like)
-        return drawn._replace(births=Births(chance, normal_draws(source, like.shape, like)))
+        drawn = super().draw_step(like, generator)
+        chance = uniform_draws(generator, like.shape[:2], like)
+        return drawn._replace(births=Births(chance, normal_draws(generator, like.shape, like)))
 
     def advance(self, particles: Particles, draws: Draws) -> Particles:
         """Return the worlds after one step with these draws."""
@@ -349,13 +349,13 @@ class SpeciesStep(Step):
             ]
             self.update_fraction = torch.cat(fractions)
 
-    def draw_step(self, like: Tensor, source: Randomness | None) -> Draws:
+    def draw_step(self, like: Tensor, generator: Randomness | None) -> Draws:
         """Return a step's mask, 1 with each species' own update probability, and its noise."""
-        drawn = super().draw_step(like, source)
+        drawn = super().draw_step(like, generator)
         if self.update_fraction is None:
             return drawn
         # Of the fractions' dtype.
-        chance = uniform_draws(source, like.shape[:2], self.update_fraction)
+        chance = uniform_draws(generator, like.shape[:2], self.update_fraction)
         mask, kept = drawn.mask, (chance < self.update_fraction).to(torch.uint8)
         return drawn._replace(mask=kept if mask is None else mask * kept)
 
@@ -370,8 +370,7 @@ class SpeciesStep(Step):
             row_width = max(network.row_width if network else row_width for network in networks)
         total = row_count(mask, x, physics.update_prob)
         if mask is not None and mask.is_cuda:
-            every = x.shape[0] * x.shape[1]
-            total = min(every, sum(species.capacity(x.shape[0]) for species in self.species))
+            total = min(mask.numel(), sum(own.capacity(x.shape[0]) for own in self.species))
         perception, active = perceive_rows(
             x.detach() if self.detach_positions else x,
             s,

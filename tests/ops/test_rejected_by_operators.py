@@ -148,7 +148,7 @@ OWN = {"cameras": made(world_to_camera=torch.eye(4).repeat(3, 1, 1, 1))}
         (seeing, {"scales": torch.zeros(1, 2, 3).double()}, "scales and means must share dtype"),
         (seeing, {"quaternions": torch.zeros(1, 2, 3)}, r"must have shape \[B, N, 4\]"),
         (seeing, {"opacities": torch.zeros(1, 2, 1)}, r"opacities must have shape \[B, N\]"),
-        (seeing, {"colours": torch.zeros(1, 2, 5)}, r"colours must have .* K from 1 to 4"),
+        (seeing, {"colours": torch.zeros(1, 2, 5)}, r"colours must have .* F from 1 to 4"),
         (seeing, {"colours": torch.zeros(1, 2, 3, 3)}, r"\[B, N, 4, 3\]"),
         (seeing, {"cameras": torch.eye(4)}, "cameras must be Cameras, got Tensor"),
         (seeing, OWN, r"each of 1 worlds, got .* \(3, 1, 4, 4\)"),

@@ -126,7 +126,7 @@ def test_threads_step_worlds_of_their_own():
 
 
 def test_groups_are_forgotten_in_turn(monkeypatch):
-    monkeypatch.setattr(execute, "MAX_GROUPS", 2)
+    monkeypatch.setattr(execute, "MAX_TAPED_GROUPS", 2)
     rule = make_rule()
     for particle_count in (30, 31, 32):
         for _ in range(3):

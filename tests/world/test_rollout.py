@@ -181,10 +181,10 @@ def test_rows_and_columns_that_nothing_reads_change_nothing(
     generator = torch.Generator().manual_seed(1)
     integers = {"dtype": torch.int32, "device": device}
     active = torch.randperm(255, generator=generator)[:120].to(device)
-    row_source = torch.cat((active.int(), torch.tensor([2**30, -(2**30)], **integers)))
+    row_particle = torch.cat((active.int(), torch.tensor([2**30, -(2**30)], **integers)))
     row_of = torch.full((255,), -1, **integers)
     row_of[active] = torch.arange(120, **integers)
-    rows = Rows(row_of, row_source, torch.tensor([0, 255 + 120], **integers), row_base=255)
+    rows = Rows(row_of, row_particle, torch.tensor([0, 255 + 120], **integers), row_base=255)
     width = state_dim + space_dim * moving
     update = torch.randn(122, width, generator=generator).to(device)
 

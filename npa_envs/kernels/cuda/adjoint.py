@@ -157,7 +157,7 @@ def row_search(space_dim: int, periodic: bool) -> SimpleNamespace:
 
     @wp.func
     def count_runs(domain: Domain, to_column: int):
-        """Return the number of runs of cells around a line, whose columns end at `to_column`."""
+        """Return how many runs `run_cells` has around a line, for columns up to `to_column`."""
         runs = space.cells_around(domain, 1)
         if wp.static(space_dim == 3):
             runs *= space.cells_around(domain, wp.static(space_dim - 1))
@@ -180,10 +180,7 @@ def row_search(space_dim: int, periodic: bool) -> SimpleNamespace:
 
     @wp.func
     def near_box(domain: Domain, offset: vector, half: vector):
-        """Return whether a point at `offset` from a box's centre is within eps of the box.
-
-        `half`: half the box's sides [length units].
-        """
+        """Return whether a point is within eps of a box, of half sides `half`, by its offset."""
         nearest = offset
         if wp.static(periodic):
             nearest = space.periodic_image(domain, nearest)
@@ -225,7 +222,7 @@ def row_search(space_dim: int, periodic: bool) -> SimpleNamespace:
 def listed_adjoint(
     space_dim: int, width: int, state_gradient: bool, periodic: bool, grouped: bool
 ) -> SimpleNamespace:
-    """Return the kernels that pull the cotangents of perception back to states.
+    """Return the kernels that compute cotangents of states from those of perception.
 
     `periodic`: in a box, else in open space. `grouped`: with several groups of `width` channels.
     The cotangents of a row and group are contiguous, [1 + D, width]: of the smoothed state, then of
@@ -236,9 +233,8 @@ def listed_adjoint(
     vector, Domain = space.vector, space.Domain
     thread_gradient = wp.types.matrix((space_dim, THREAD_CHANNELS), scalar)
     weight_count = 1 + space_dim if state_gradient else 1
-    module_name = "listed_adjoint" if state_gradient else "listed_smoothing_adjoint"
-    module_name += "_in_box" * periodic + "_grouped" * grouped
-    module = kernel_module(module_name, space_dim, scalar, width)
+    options = {"gradient": state_gradient, "periodic": periodic, "grouped": grouped}
+    module = kernel_module("listed_adjoint", space_dim, scalar, width=width, **options)
     load_vector = make_wide_load(vector)
     search = row_search(space_dim, periodic)
     parts = width // THREAD_CHANNELS
@@ -254,8 +250,8 @@ def listed_adjoint(
         value=CHANNELS,
         returns=CHANNELS,
     )
-    log_scale_pull = native.function(
-        "log_scale_pull", scaled=vector, cotangent=vector, returns=vector
+    log_scale_cotangent = native.function(
+        "log_scale_cotangent", scaled=vector, cotangent=vector, returns=vector
     )
     read_gradients = make_read_columns(THREAD_CHANNELS * space_dim)
 
@@ -273,10 +269,7 @@ def listed_adjoint(
         # outputs
         cotangents: wp.array[CHANNELS],
     ):
-        """Write each row's cotangents before the logarithmic scaling, from those of perception.
-
-        Those of smoothed states are multiplied by `smoothed_scale`.
-        """
+        """Write dL/d(smoothed states) times `smoothed_scale`, dL/d(gradients before scaling)."""
         wait_for_previous_kernel()
         allow_next_launch()
         thread = wp.tid()
@@ -298,18 +291,18 @@ def listed_adjoint(
                 end = (2 + wp.static(space_dim)) * state_dim
                 scaled = read_gradients(perception, row, column, end)
                 bars = read_gradients(perception_bar, row, column, end)
-                pulled = thread_gradient()
+                gradient_bars = thread_gradient()
                 for c in range(wp.static(THREAD_CHANNELS)):
                     value = vector()
                     bar = vector()
                     for d in range(wp.static(space_dim)):
                         value[d] = scaled[c * wp.static(space_dim) + d]
                         bar[d] = bars[c * wp.static(space_dim) + d]
-                    pull = gradient_scale * log_scale_pull(value, bar)
+                    gradient_bar = gradient_scale * log_scale_cotangent(value, bar)
                     for d in range(wp.static(space_dim)):
-                        pulled[d, c] = pull[d]
+                        gradient_bars[d, c] = gradient_bar[d]
                 for d in range(wp.static(space_dim)):
-                    wide_store(cotangents, index + (d + 1) * wp.static(parts), pulled[d])
+                    wide_store(cotangents, index + (d + 1) * wp.static(parts), gradient_bars[d])
 
     @wp.kernel(
         enable_backward=False, module=module, cuda_max_registers=CUDA_REGISTERS, grid_stride=False

@@ -122,11 +122,11 @@ def listed_density(
         last = wp.int32(wp.floor(within_cell[0] + along))
         return wp.max(first + 2, 0), wp.max(2 - last, 0)
 
-    module_name = "listed_density" + "_in_box" * periodic + f"_{capacity}" + "_of_rows" * masked
+    options = {"lanes": lanes, "periodic": periodic, "capacity": capacity, "masked": masked}
 
     @wp.kernel(
         enable_backward=False,
-        module=kernel_module(module_name, space_dim, scalar, 0, lanes),
+        module=kernel_module("listed_density", space_dim, scalar, **options),
         cuda_max_registers=CUDA_REGISTERS,
         grid_stride=False,
     )
@@ -144,10 +144,10 @@ def listed_density(
         lists: wp.array3d[wp.int16],
         list_lengths: wp.array[wp.int32],
     ):
-        """Write particles' positions and volumes 1 / rho, and neighbour lists of active particles.
+        """Write positions with volumes 1 / rho, and neighbour lists of active particles.
 
-        `records` also have the index of the particle's state, in 2D; `particles` is left out if
-        empty. A list that is too long is not written; its length is then larger than the capacity.
+        They go to `records`, in 2D with the index of the particle's state, and to `particles`
+        unless it is empty. Of a list longer than the capacity only the length is written.
         """
         wait_for_previous_kernel()
         thread = wp.tid()
@@ -274,11 +274,11 @@ def tiled_density(periodic: bool, capacity: int, masked: bool) -> wp.Kernel:
         returns=float,
     )
 
-    module_name = "tiled_density" + "_in_box" * periodic + f"_{capacity}" + "_of_rows" * masked
+    options = {"periodic": periodic, "capacity": capacity, "masked": masked}
 
     @wp.kernel(
         enable_backward=False,
-        module=kernel_module(module_name, 2, wp.float32),
+        module=kernel_module("tiled_density", 2, wp.float32, **options),
         cuda_max_registers=TILE_REGISTERS,
         grid_stride=False,
     )

@@ -301,12 +301,12 @@ __device__ inline void pull_back_gates(
     const float* bars = update_bar.data + (size_t)first * width;
     float* to = output_bar.data + (size_t)first * in_width;
     float* vectors_to = mixed_bar.data + (size_t)first * MIXED * D;
-    float pull[ROWS][D] = {};
+    float displacement_bar[ROWS][D] = {};
     #pragma unroll
     for (int r = 0; r < ROWS; ++r) {
         #pragma unroll
         for (int d = 0; d < D; ++d) {
-            if (r < count) pull[r][d] = bars[r * width + d];
+            if (r < count) displacement_bar[r][d] = bars[r * width + d];
         }
     }
     for (int i = lane; i < in_width; i += 32) {
@@ -320,10 +320,10 @@ __device__ inline void pull_back_gates(
             } else {
                 const float* u = vectors + (r * MIXED + i % MIXED) * D;
                 if (CHIRAL && i >= MIXED) {
-                    value[r] = u[0] * pull[r][1] - u[1] * pull[r][0];
+                    value[r] = u[0] * displacement_bar[r][1] - u[1] * displacement_bar[r][0];
                 } else {
                     #pragma unroll
-                    for (int d = 0; d < D; ++d) value[r] += u[d] * pull[r][d];
+                    for (int d = 0; d < D; ++d) value[r] += u[d] * displacement_bar[r][d];
                 }
                 value[r] = from[r * in_width + i] > 0.0f ? sign * value[r] : 0.0f;
             }
@@ -343,7 +343,7 @@ __device__ inline void pull_back_gates(
             const float* gates = from + r * in_width;
             value[r] = fmaxf(gates[a], 0.0f) * sign * bars[r * width + d];
             if (CHIRAL) {
-                const float turned = d == 0 ? -pull[r][1] : pull[r][0];
+                const float turned = d == 0 ? -displacement_bar[r][1] : displacement_bar[r][0];
                 value[r] -= fmaxf(gates[MIXED + a], 0.0f) * turned_sign * turned;
             }
         }

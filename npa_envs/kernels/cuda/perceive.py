@@ -113,11 +113,11 @@ class PerceptionVariant(NamedTuple):
 
     def module(self) -> wp.Module:
         """Return the Warp module of the kernel with these options."""
-        module_name = "listed_" + perception_module_name(self.state_gradient, self.moment_inverse)
-        module_name += "_in_box" * self.periodic + "_grouped" * self.grouped + f"_{self.capacity}"
-        module_name += "_for_adjoint" * self.for_adjoint + "_by_place" * self.per_particle
-        module_name += "_tiled" * self.tiled
-        return kernel_module(module_name, self.space_dim, wp.float32, self.width, self.lanes)
+        options = self._asdict()
+        space_dim = options.pop("space_dim")
+        gradient = options.pop("state_gradient"), options.pop("moment_inverse")
+        name = "listed_" + perception_module_name(*gradient)
+        return kernel_module(name, space_dim, wp.float32, **options)
 
 
 def slot_functions(variant: PerceptionVariant, lane_channels: type) -> SimpleNamespace:
@@ -338,10 +338,7 @@ def sum_functions(
 
     @wp.func
     def add_states(own: Lane, count: int, sums: Sums):
-        """Add the team's share of the slot's `count` neighbours' states, times their weights.
-
-        A particle's teams of lanes take its neighbours in turn.
-        """
+        """Return `sums` plus weighted states of this team's part of the slot's `count` entries."""
         for entry in range(own.first, slots.padded(count), wp.static(teams * TOGETHER)):
             packed = entries_together()
             loaded = states_together()
@@ -387,10 +384,7 @@ def make_add_searched(
         runs: int,
         run: int,
     ):
-        """Return the first and last + 1 particle of run number `run` of cells around a cell.
-
-        It is empty for numbers beyond `runs`.
-        """
+        """Return first and last + 1 particle of the cells' run `run`; none from `runs` on."""
         first_cell, last_cell = space.segment_cells(
             domain, cell, wp.min(run, wp.max(runs - 1, wp.int32(0)))
         )
@@ -407,10 +401,7 @@ def make_add_searched(
         end: int,
         count: int,
     ):
-        """Append indices of neighbours to those in the slot; return their new number.
-
-        This thread tests a few candidates, from `first` on, before `end`.
-        """
+        """Append neighbours among this thread's next candidates to the slot; return its count."""
         loaded = candidates_ahead()
         total = wp.int32(count)
         for a in range(wp.static(ahead)):

@@ -89,7 +89,7 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
     @wp.kernel(
         enable_backward=False,
         launch_bounds=(block, RESIDENT_THREADS // block),
-        module=kernel_module(f"small_worlds_{capacity}", space_dim, scalar),
+        module=kernel_module("small_worlds", space_dim, scalar, capacity=capacity),
     )
     def sort_worlds(
         domain: Domain,
@@ -109,16 +109,13 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
         original_index: wp.array[wp.int32],
         sorted_cell: wp.array[wp.int32],
         row_of: wp.array[wp.int32],
-        row_source: wp.array[wp.int32],
+        row_particle: wp.array[wp.int32],
         row_index: wp.array[wp.int32],
         sorted_positions: wp.array[vector],
         row_positions: wp.array[vector],
         sorted_states: wp.array[channels],
     ):
-        """Sort the particles of a world by cell, then index; a block writes a slice of them.
-
-        States and rows are left out where their arrays are empty.
-        """
+        """Sort a world by cell, then index: each of its blocks sorts all of it, writes a slice."""
         wait_for_previous_kernel()
         world = block_number() / slice_count
         slice_number = block_number() - world * slice_count
@@ -196,7 +193,7 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
                         row = wp.where(ranked[2] < row_capacity, ranked[2], wp.int32(-1))
                         wide_store(row_of, i, row)
                         if row >= 0:
-                            wide_store(row_source, row, i)
+                            wide_store(row_particle, row, i)
                             wide_store(row_index, row, target)
                             wide_store(row_positions, row, position)
 
@@ -300,7 +297,7 @@ def order_particles(space_dim: int, width: int) -> wp.Kernel:
     held_type = wp.types.matrix((CUDA_LANES, thread_width), scalar)
     read_channels = make_read_channels(channels)
 
-    @wp.kernel(enable_backward=False, module=kernel_module("order", space_dim, scalar, width))
+    @wp.kernel(enable_backward=False, module=kernel_module("order", space_dim, scalar, width=width))
     def order_particles(
         positions: wp.array[vector],
         state_dim: int,
@@ -316,7 +313,7 @@ def order_particles(space_dim: int, width: int) -> wp.Kernel:
         original_index: wp.array[wp.int32],
         sorted_cell: wp.array[wp.int32],
         row_of: wp.array[wp.int32],
-        row_source: wp.array[wp.int32],
+        row_particle: wp.array[wp.int32],
         row_index: wp.array[wp.int32],
         sorted_positions: wp.array[vector],
         row_positions: wp.array[vector],
@@ -324,8 +321,7 @@ def order_particles(space_dim: int, width: int) -> wp.Kernel:
     ):
         """Write particles sorted by cell, then index, and number the rows of active ones.
 
-        States and rows are left out where their arrays are empty. Launched with whole warps;
-        threads beyond the last particle help to move states.
+        Launched with whole warps; threads beyond the last particle help to move states.
         """
         wait_for_previous_kernel()
         k = wp.tid()
@@ -354,7 +350,7 @@ def order_particles(space_dim: int, width: int) -> wp.Kernel:
                     row = wp.int32(-1)
                 wide_store(row_of, i, row)
                 if row >= 0:
-                    wide_store(row_source, row, i)
+                    wide_store(row_particle, row, i)
                     wide_store(row_index, row, target)
                     wide_store(row_positions, row, position)
 

@@ -12,7 +12,7 @@ is T (c . c̄) - b / (1 - alpha).
 On CUDA there is a block per tile and a thread per pixel; sums over pixels use shuffles within warps
 and shared memory among warps. On a CPU a thread serves a tile, one Gaussian after the other, each
 only at the pixels that it covers. Every pair of a tile and a Gaussian has its own place for the
-cotangents from that tile (its pull): no sum depends on the order of threads.
+cotangents from that tile (`tile_bars`): no sum depends on the order of threads.
 Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
 """
 
@@ -26,7 +26,7 @@ from npa_envs.kernels.native_functions import TILES, in_ranges, namespace
 from npa_envs.kernels.pictures.gaussians import (
     CHANNELS,
     MIN_ALPHA,
-    PULLS,
+    TILE_BAR,
     TILE_SIDE,
     gaussian_functions,
     gaussian_types,
@@ -54,7 +54,7 @@ PATCH_WIDTH, PATCH_HEIGHT = 8, 4
 """Pixels of a tile that a warp serves: nearly square, so that it can skip most Gaussians."""
 
 BATCH = 32
-"""Pairs whose pulls a block keeps in shared memory before it adds those of its warps."""
+"""Pairs whose cotangents a block keeps in shared memory before it adds those of its warps."""
 
 TO_POWER_OF_TWO = -0.7213475204444817
 """-1/2 log2(e), the factor of p in exp(-1/2 p) as a power of two."""
@@ -64,7 +64,7 @@ TO_POWER_OF_TWO = -0.7213475204444817
 def blending_functions(scalar: type) -> SimpleNamespace:
     """Return the functions of all kernels: a Gaussian's effect on a pixel, and its adjoint."""
     types = gaussian_types(scalar)
-    Frame, quad, footprint_type, pulls_type = types.Frame, types.quad, types.footprint, types.pulls
+    Frame, quad, footprint_type, bar_type = types.Frame, types.quad, types.footprint, types.tile_bar
     fast_exp2 = native.function("fast_exp2", value=scalar, returns=scalar)
 
     @wp.func
@@ -79,7 +79,7 @@ def blending_functions(scalar: type) -> SimpleNamespace:
         return quad(footprint[6], footprint[7], footprint[8], footprint[9])
 
     @wp.func
-    def pull(
+    def cotangents(
         footprint: footprint_type,
         x: scalar,
         y: scalar,
@@ -103,16 +103,16 @@ def blending_functions(scalar: type) -> SimpleNamespace:
             slope = alpha * (before * gained - behind * rest)
         slope_x = slope * x
         slope_y = slope * y
-        pulls = pulls_type()
-        pulls[0] = slope
-        pulls[1] = slope_x
-        pulls[2] = slope_y
-        pulls[3] = slope_x * x
-        pulls[4] = slope_x * y
-        pulls[5] = slope_y * y
+        pixel_bar = bar_type()
+        pixel_bar[0] = slope
+        pixel_bar[1] = slope_x
+        pixel_bar[2] = slope_y
+        pixel_bar[3] = slope_x * x
+        pixel_bar[4] = slope_x * y
+        pixel_bar[5] = slope_y * y
         for c in range(wp.static(CHANNELS)):
-            pulls[6 + c] = weight * bar[c]
-        return pulls, before, behind + weight * gained
+            pixel_bar[6 + c] = weight * bar[c]
+        return pixel_bar, before, behind + weight * gained
 
     @wp.func
     def channels_at(values: wp.array2d[scalar], pixel: int):
@@ -143,7 +143,7 @@ def blending_functions(scalar: type) -> SimpleNamespace:
 def tile_kernels(scalar: type) -> SimpleNamespace:
     """Return the kernels that blend Gaussians, and the adjoint, one thread per tile; for CPUs."""
     types = gaussian_types(scalar)
-    Frame, footprint_type, pulls_type = types.Frame, types.footprint, types.pulls
+    Frame, footprint_type, bar_type = types.Frame, types.footprint, types.tile_bar
     blending = blending_functions(scalar)
     covered = gaussian_functions(scalar).covered
     module = native.module(f"npa_envs.kernels.blending_tiles_{scalar_name(scalar)}")
@@ -220,7 +220,7 @@ def tile_kernels(scalar: type) -> SimpleNamespace:
         through: wp.array[scalar],
         behind: wp.array[scalar],
         # outputs
-        pulls: wp.array[pulls_type],
+        tile_bars: wp.array[bar_type],
     ):
         """Write the cotangents of a tile's Gaussians, each to the slot of its pair with a tile."""
         tile = range_start + wp.tid()
@@ -231,7 +231,7 @@ def tile_kernels(scalar: type) -> SimpleNamespace:
             j = end - 1 - k
             footprint = footprints[owners[j]]
             pixels = shared_pixels(frame, tile, footprint)
-            total = pulls_type()
+            total = bar_type()
             for row in range(pixels[1], pixels[3]):
                 y = blending.middle_of(row) - footprint[1]
                 for column in range(pixels[0], pixels[2]):
@@ -240,13 +240,13 @@ def tile_kernels(scalar: type) -> SimpleNamespace:
                     pixel = blending.pixel_of(frame, image, row, column)
                     if strength >= scalar(MIN_ALPHA) and j < stops[pixel]:
                         bar = blending.channels_at(picture_bar, pixel)
-                        added, before, rest = blending.pull(
+                        added, before, rest = blending.cotangents(
                             footprint, x, y, strength, bar, through[pixel], behind[pixel]
                         )
                         total += added
                         through[pixel] = before
                         behind[pixel] = rest
-            pulls[wp.int32(pair_slots[j])] = total
+            tile_bars[wp.int32(pair_slots[j])] = total
 
     return SimpleNamespace(draw_tiles=draw_tiles, pull_back_tiles=pull_back_tiles)
 
@@ -255,16 +255,16 @@ def tile_kernels(scalar: type) -> SimpleNamespace:
 def block_kernels(scalar: type) -> SimpleNamespace:
     """Return the kernels that blend Gaussians, and the adjoint, one block per tile; for CUDA."""
     types = gaussian_types(scalar)
-    Frame, quad, footprint_type, pulls_type = types.Frame, types.quad, types.footprint, types.pulls
+    Frame, quad, footprint_type, bar_type = types.Frame, types.quad, types.footprint, types.tile_bar
     blending = blending_functions(scalar)
     name = scalar_name(scalar)
-    drawing = native.module(f"npa_envs.kernels.blending_blocks_{name}")
-    pulling = native.module(f"npa_envs.kernels.blending_blocks_adjoint_{name}")
+    drawing_module = native.module(f"npa_envs.kernels.blending_blocks_{name}")
+    adjoint_module = native.module(f"npa_envs.kernels.blending_blocks_adjoint_{name}")
     load_footprint = make_wide_load(footprint_type)
-    add_warp = make_lane_sum(pulls_type, WARP, whole_warps=True)
+    add_warp = make_lane_sum(bar_type, WARP, whole_warps=True)
 
     # Store a warp's cotangents of pair i (`write`), or return an entry of the warps' sum.
-    arguments = {"write": bool, "i": int, "entry": int, "value": pulls_type}
+    arguments = {"write": bool, "i": int, "entry": int, "value": bar_type}
     sizes = BATCH, TILE_PIXELS // WARP
     store_or_sum = native.function("store_or_sum", *sizes, **arguments, returns=scalar)
 
@@ -281,7 +281,7 @@ def block_kernels(scalar: type) -> SimpleNamespace:
         row += patch / across * wp.static(PATCH_HEIGHT) + lane / wp.static(PATCH_WIDTH)
         return column, row
 
-    @wp.kernel(enable_backward=False, module=drawing)
+    @wp.kernel(enable_backward=False, module=drawing_module)
     def draw_blocks(
         frame: Frame,
         starts: wp.array[wp.int32],
@@ -323,7 +323,7 @@ def block_kernels(scalar: type) -> SimpleNamespace:
             passing[pixel] = through
             stops[pixel] = stop
 
-    @wp.kernel(enable_backward=False, module=pulling)
+    @wp.kernel(enable_backward=False, module=adjoint_module)
     def pull_back_blocks(
         frame: Frame,
         starts: wp.array[wp.int32],
@@ -335,7 +335,7 @@ def block_kernels(scalar: type) -> SimpleNamespace:
         passing: wp.array[scalar],
         passing_bar: wp.array[scalar],
         # outputs
-        pulls: wp.array[scalar],
+        tile_bars: wp.array[scalar],
     ):
         """Write the cotangents of a tile's Gaussians, each to the slot of its pair with a tile.
 
@@ -363,7 +363,7 @@ def block_kernels(scalar: type) -> SimpleNamespace:
             count = wp.min(end - begin, wp.static(BATCH))
             for i in range(count):
                 j = end - 1 - i
-                total = pulls_type()
+                total = bar_type()
                 if any_in_warp(j < stop):
                     footprint = load_footprint(footprints, load_integer(owners, j))
                     x = left - footprint[0]
@@ -372,17 +372,18 @@ def block_kernels(scalar: type) -> SimpleNamespace:
                     is_drawn = j < stop and strength >= scalar(MIN_ALPHA)
                     if any_in_warp(is_drawn):
                         if is_drawn:
-                            total, through, behind = blending.pull(
+                            total, through, behind = blending.cotangents(
                                 footprint, x, y, strength, bar, through, behind
                             )
                         total = add_warp(total)
                 store_or_sum(True, i, 0, total)
             sync_block()
-            for entry in range(k, count * wp.static(PULLS), wp.static(TILE_PIXELS)):
-                i = entry / wp.static(PULLS)
-                part = entry - i * wp.static(PULLS)
+            for entry in range(k, count * wp.static(TILE_BAR), wp.static(TILE_PIXELS)):
+                i = entry / wp.static(TILE_BAR)
+                part = entry - i * wp.static(TILE_BAR)
                 slot = wp.int32(pair_slots[end - 1 - i])
-                pulls[slot * wp.static(PULLS) + part] = store_or_sum(False, i, part, pulls_type())
+                block_sum = store_or_sum(False, i, part, bar_type())
+                tile_bars[slot * wp.static(TILE_BAR) + part] = block_sum
             sync_block()
             end -= count
 

@@ -31,9 +31,9 @@ CHANNELS = 4
 FOOTPRINT = 12
 """Entries of a footprint: mean (2), conic Q (3: xx, xy, yy), opacity, colours (4), extent (2)."""
 
-PULLS = 10
-"""Entries of a pull, the cotangents of a Gaussian from a tile: with weights α ᾱ and offsets d of
-pixels, the sums of 1, dx, dy, dx dx, dx dy, dy dy; cotangents of the colours (4)."""
+TILE_BAR = 10
+"""Entries of a Gaussian's cotangents from a tile: with weights α ᾱ and offsets d of pixels, the
+sums of 1, dx, dy, dx dx, dx dy, dy dy; cotangents of the colours (4)."""
 
 MIN_ALPHA = 1.0 / 255.0
 """Smallest alpha that is drawn, as in Kerbl's rasterizer."""
@@ -71,7 +71,7 @@ def gaussian_types(scalar: type) -> SimpleNamespace:
         triple=wp.types.vector(3, scalar),
         quad=wp.types.vector(4, scalar),
         footprint=wp.types.vector(FOOTPRINT, scalar),
-        pulls=wp.types.vector(PULLS, scalar),
+        tile_bar=wp.types.vector(TILE_BAR, scalar),
         square=wp.types.matrix((2, 2), scalar),
         flat=wp.types.matrix((2, 3), scalar),
         cube=wp.types.matrix((3, 3), scalar),
@@ -270,14 +270,14 @@ def gaussian_functions(scalar: type) -> SimpleNamespace:
 
 @cached_under_lock()
 def gaussian_kernels(scalar: type) -> SimpleNamespace:
-    """Return the kernels that project 3D Gaussians, list the tiles they cover, and pull back."""
+    """Return the kernels that project 3D Gaussians, list the tiles they cover, and the adjoint."""
     types, gaussian = gaussian_types(scalar), gaussian_functions(scalar)
     Frame, pair, triple, quad = types.Frame, types.pair, types.triple, types.quad
-    footprint_type, pulls_type, harmonics_type = types.footprint, types.pulls, types.harmonics
+    footprint_type, bar_type, harmonics_type = types.footprint, types.tile_bar, types.harmonics
     square, cube, motion_type = types.square, types.cube, types.motion
     module = native.module(f"npa_envs.kernels.gaussians_{scalar_name(scalar)}")
     load_footprint = make_wide_load(footprint_type)
-    load_pulls = make_wide_load(pulls_type)
+    load_tile_bar = make_wide_load(bar_type)
 
     @in_ranges(PAIRS)
     @wp.kernel(enable_backward=False, module=module)
@@ -406,7 +406,7 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
         footprints: wp.array[footprint_type],
         counts: wp.array[wp.int32],
         slots: wp.array[wp.int32],
-        pulls: wp.array[pulls_type],
+        tile_bars: wp.array[bar_type],
         # outputs
         means_bar: wp.array[triple],
         scales_bar: wp.array[triple],
@@ -434,20 +434,20 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
             slot = slots[entry]
             if slot >= 0:
                 is_drawn = wp.bool(True)
-                pull = pulls_type()
+                tile_bar = bar_type()
                 for k in range(slot, slot + counts[entry]):
-                    pull += load_pulls(pulls, k)
+                    tile_bar += load_tile_bar(tile_bars, k)
                 footprint = load_footprint(footprints, entry)
                 motion = motions[image % motions.shape[0]]
                 camera = intrinsics[image % intrinsics.shape[0]]
                 rotation = gaussian.rotation_part(motion)
                 position = rotation * mean + gaussian.shift_part(motion)
                 conic = square(footprint[2], footprint[3], footprint[3], footprint[4])
-                centre_bar = conic * pair(pull[1], pull[2])
-                opacity_bar += pull[0] / footprint[5]
+                centre_bar = conic * pair(tile_bar[1], tile_bar[2])
+                opacity_bar += tile_bar[0] / footprint[5]
 
                 # Of Q = (A Aᵀ + dilation)⁻¹ with A = J W R S.
-                moments = square(pull[3], pull[4], pull[4], pull[5])
+                moments = square(tile_bar[3], tile_bar[4], tile_bar[4], tile_bar[5])
                 jacobian = gaussian.jacobian_of(frame, camera, position)
                 axes = rotation * own_rotation
                 spread = gaussian.scaled_columns(axes, scale)
@@ -476,12 +476,12 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
 
                 if colours.shape[1] <= wp.static(CHANNELS):
                     for c in range(wp.static(CHANNELS)):
-                        colour_bar[c] += pull[6 + c]
+                        colour_bar[c] += tile_bar[6 + c]
                 else:
                     seen_colour_bar = triple()
                     for c in range(3):
                         if footprint[6 + c] > scalar(0.0):
-                            seen_colour_bar[c] = pull[6 + c]
+                            seen_colour_bar[c] = tile_bar[6 + c]
                     way = gaussian.offset_from_camera(motion, mean)
                     direction = wp.normalize(way)
                     harmonics_bar += wp.outer(gaussian.harmonic_basis(direction), seen_colour_bar)

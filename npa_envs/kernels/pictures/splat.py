@@ -68,7 +68,7 @@ def splat_types(scalar: type) -> SimpleNamespace:
         pixels_per_length: scalar
         falloff: scalar
         area: scalar
-        pull: scalar
+        position_scale: scalar
         tile_columns: int
         tile_rows: int
         cell_columns: int
@@ -85,7 +85,7 @@ def splat_types(scalar: type) -> SimpleNamespace:
         rows=wp.types.vector(TILE_HEIGHT, scalar),
         weights=wp.types.vector(TILE_WIDTH * TILE_HEIGHT, scalar),
         tile=wp.types.matrix((CHANNELS, TILE_WIDTH * TILE_HEIGHT), scalar),
-        pulls=wp.types.vector(CHANNELS + 2, scalar),
+        splat_bar=wp.types.vector(CHANNELS + 2, scalar),
     )
 
 
@@ -106,7 +106,7 @@ def make_view(
     view.pixels_per_length = (resolution - 1) / (high - low)
     # For powers of two, which the hardware computes.
     view.falloff = 0.5 / (sigma * pixels) ** 2 / math.log(2.0)
-    view.pull = view.pixels_per_length / (sigma * pixels) ** 2
+    view.position_scale = view.pixels_per_length / (sigma * pixels) ** 2
     view.area = pixels * pixels
     view.tile_columns = -(-resolution // TILE_WIDTH)
     view.tile_rows = -(-resolution // TILE_HEIGHT)
@@ -303,13 +303,13 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
     """Return the kernels that draw worlds, and the adjoint; `lanes` threads a tile or particle."""
     types = splat_types(scalar)
     View, vector, colour_type = types.View, types.vector, types.colour
-    footprint_type, pulls_type = types.footprint, types.pulls
+    footprint_type, bar_type = types.footprint, types.splat_bar
     group_tiles = GROUP_WIDTH * GROUP_HEIGHT
     lane_pixels = TILE_WIDTH * TILE_HEIGHT // lanes
     module = native.module(f"npa_envs.kernels.splat_{scalar_name(scalar)}_l{lanes}")
     load_footprint = make_wide_load(footprint_type)
     load_colour = make_wide_load(colour_type)
-    lane_sum = make_lane_sum(pulls_type, lanes)
+    lane_sum = make_lane_sum(bar_type, lanes)
     splat = splat_functions(scalar)
     gather_tile = gather_functions(scalar, lanes).gather_tile
 
@@ -503,7 +503,7 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         near = vector(footprint[0], footprint[1])
         slope = scalar(-2.0) * view.falloff * near
         is_drawn = splat.visible(view, centre)
-        pulls = pulls_type()
+        splat_bar = bar_type()
         if is_drawn:
             column = wp.int32(centre[0])
             row = wp.int32(centre[1])
@@ -515,19 +515,19 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
                 away_y = near[1] + scalar(p - row)
                 begin = (world * view.resolution + p) * view.resolution
                 along = colour_type()
-                pull = scalar(0.0)
+                slope_x = scalar(0.0)
                 for q in range(left, right):
                     away_x = near[0] + scalar(q - column)
                     weight = splat.patch_weight(view.falloff, slope[0], scalar(q - column))
                     bar = weight * load_colour(picture_bar, begin + q)
                     along += bar
-                    pull += wp.dot(bar, colours) * away_x
+                    slope_x += wp.dot(bar, colours) * away_x
                 weight = splat.patch_weight(view.falloff, slope[1], scalar(p - row))
                 for c in range(wp.static(CHANNELS)):
-                    pulls[c] += weight * along[c]
-                pulls[4] += weight * pull
-                pulls[5] += weight * wp.dot(along, colours) * away_y
-        pulls = lane_sum(pulls)
+                    splat_bar[c] += weight * along[c]
+                splat_bar[4] += weight * slope_x
+                splat_bar[5] += weight * wp.dot(along, colours) * away_y
+        splat_bar = lane_sum(splat_bar)
         if lane == 0:
             position_bar = vector()
             colour_bar = colour_type()
@@ -541,13 +541,13 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
                         sums[d] += weight
                         moments[d] += weight * (near[d] + scalar(o))
                 for c in range(wp.static(CHANNELS)):
-                    colour_bar[c] = pulls[c]
+                    colour_bar[c] = splat_bar[c]
                 gained = wp.dot(colour_bar, colours)
                 for d in range(2):
-                    position_bar[d] = pulls[4 + d] - gained * moments[d] / sums[d]
+                    position_bar[d] = splat_bar[4 + d] - gained * moments[d] / sums[d]
                 colour_bar *= footprint[7]
             i = original_index[k]
-            positions_bar[i] = view.pull * position_bar
+            positions_bar[i] = view.position_scale * position_bar
             for c in range(3):
                 colours_bar[i, c] = colour_bar[c]
 

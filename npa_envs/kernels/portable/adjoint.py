@@ -46,9 +46,8 @@ def adjoint_kernels(
     vector, particle, Domain = space.vector, space.particle, space.Domain
     group = wp.types.vector(width, scalar)
     group_gradient = wp.types.matrix((space_dim, width), scalar)
-    module_name = "adjoint" if state_gradient else "smoothing_adjoint"
-    module_name = "listed_per_particle_" * listed + "cuda_" * (not on_cpu) + module_name
-    module = kernel_module(module_name, space_dim, scalar, width)
+    options = {"on_cpu": on_cpu, "gradient": state_gradient, "listed": listed}
+    module = kernel_module("adjoint", space_dim, scalar, width=width, **options)
     search = make_search(space_dim, scalar, vector, on_cpu, listed)
     indices = wp.types.vector(search.stride, wp.int32)
     add_scaled = make_add_scaled(group)
@@ -85,7 +84,7 @@ def adjoint_kernels(
         gradient_bar: wp.array[scalar],
         density_gradient_bar: wp.array[vector],
     ):
-        """Write dL/d(row before its logarithmic scaling) from `perception_bar`, by parts."""
+        """Write dL/d(smoothed states) and dL/d(gradients before scaling), from `perception_bar`."""
         row, channel = wp.tid()
         row += range_start
         if row >= starts[starts.shape[0] - 1] - row_base:
@@ -103,13 +102,13 @@ def adjoint_kernels(
         for d in range(wp.static(space_dim)):
             gradient_bar[(entry * wp.static(space_dim) + d) * wp.static(width) + c] = gradient[d]
         if channel == 0 and density_gradient_bar.shape[0] > 0:
-            pull = vector()
+            bar = vector()
             if density_gradient != 0:
                 column = 2 * state_dim
                 if wp.static(state_gradient):
                     column += state_dim * wp.static(space_dim)
-                pull = density_scale * unscaled(perception, perception_bar, row, column)
-            density_gradient_bar[row] = pull
+                bar = density_scale * unscaled(perception, perception_bar, row, column)
+            density_gradient_bar[row] = bar
 
     @wp.func
     def filter_rows(
@@ -257,22 +256,22 @@ def adjoint_kernels(
         density_bar[k] = -volume * volume * volume_bar
 
     @wp.func
-    def pair_pull(
+    def pair_bar(
         domain: Domain, offset: vector, squared: scalar, smoothing_bar: scalar, kernel_bar: vector
     ):
         """Return the cotangent of r = neighbour - centre from the cotangents of W(r) and K(r)."""
         distance = wp.sqrt(squared)
         slope = smoothing_slope(squared, domain.inverse_squared_eps, domain.smoothing_norm)
         factor = spiky_factor(distance, domain.inverse_eps, domain.spiky_norm)
-        pull = smoothing_bar * slope * offset
+        offset_bar = smoothing_bar * slope * offset
         if distance > scalar(0.0):
             # For nearly coincident particles the large factor contributes only across r.
             direction = offset / distance
             fraction = wp.dot(direction, kernel_bar) / wp.dot(direction, direction)
             along = fraction * direction
             radial = spiky_radial_slope(distance, domain.inverse_eps, domain.spiky_norm)
-            pull += factor * (kernel_bar - along) + radial * along
-        return pull
+            offset_bar += factor * (kernel_bar - along) + radial * along
+        return offset_bar
 
     @in_ranges(PAIRS)
     @wp.kernel(enable_backward=False, module=module)
@@ -299,7 +298,7 @@ def adjoint_kernels(
         position = space.position_of(entry)
         volume = entry[wp.static(space_dim)]
         own_row = row_of[original_index[k]]
-        pull = vector()
+        own_bar = vector()
         base = (k / particle_count) * domain.cell_count
         cell = space.cell_of(domain, position)
         for segment in range(space.segment_count(domain, cell)):
@@ -332,8 +331,8 @@ def adjoint_kernels(
                             as_centre += other_volume * wp.dot(other_state, smoothed_bar[index])
                             away = other_state - own_state
                             centre_kernel += other_volume * (gradient_bar[index] * away)
-                    pull += pair_pull(domain, offset, squared, as_neighbour, neighbour_kernel)
-                    pull -= pair_pull(domain, -offset, squared, as_centre, centre_kernel)
-        positions_bar[original_index[k]] = pull
+                    own_bar += pair_bar(domain, offset, squared, as_neighbour, neighbour_kernel)
+                    own_bar -= pair_bar(domain, -offset, squared, as_centre, centre_kernel)
+        positions_bar[original_index[k]] = own_bar
 
     return namespace(locals())

@@ -23,7 +23,7 @@ def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespa
     vector, particle, Domain = space.vector, space.particle, space.Domain
     vector_f64 = wp.types.vector(space_dim, wp.float64)
     search = make_search(space_dim, scalar, particle, on_cpu)
-    module = kernel_module("density" if on_cpu else "cuda_density", space_dim, scalar)
+    module = kernel_module("density", space_dim, scalar, on_cpu=on_cpu)
 
     @wp.func
     def spiky_f64(domain: Domain, centre: vector, neighbour: vector):
@@ -150,7 +150,7 @@ def species_kernel(space_dim: int, scalar: type, species_count: int) -> wp.Kerne
     vector_f64 = wp.types.vector(space_dim, wp.float64)
     densities_type = wp.types.vector(species_count, wp.float64)
     gradients_type = wp.types.matrix((species_count, space_dim), wp.float64)
-    module = kernel_module(f"species_{species_count}", space_dim, scalar)
+    module = kernel_module("species", space_dim, scalar, species=species_count)
 
     @in_ranges(PAIRS)
     @wp.kernel(enable_backward=False, module=module)

@@ -216,20 +216,20 @@ def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         count = mixed.shape[1]
         value = scalar(0.0)
         if column < gate_count:
-            pull = vector()
+            displacement_bar = vector()
             for d in range(wp.static(space_dim)):
-                pull[d] = update_bar[row, d]
+                displacement_bar[d] = update_bar[row, d]
             gate = output[row, column]
             u = mixed[row, column % count]
             if column >= count:
                 u = turned(u)
             if gate > scalar(0.0):
-                value = signs[column] * wp.dot(u, pull)
+                value = signs[column] * wp.dot(u, displacement_bar)
             if column < count:
-                total = wp.max(gate, scalar(0.0)) * signs[column] * pull
+                total = wp.max(gate, scalar(0.0)) * signs[column] * displacement_bar
                 if gate_count > count:
                     other = wp.max(output[row, count + column], scalar(0.0))
-                    total -= other * signs[count + column] * turned(pull)
+                    total -= other * signs[count + column] * turned(displacement_bar)
                 mixed_bar[row, column] = total
         else:
             update_column = column - gate_count + wp.static(space_dim)

@@ -49,9 +49,9 @@ def perception_kernels(
     group = wp.types.vector(width, scalar)
     group_gradient = wp.types.matrix((space_dim, width), scalar)
     square = wp.types.matrix((space_dim, space_dim), scalar)
-    module_name = "listed_per_particle_" * listed + "cuda_" * (not on_cpu)
-    module_name += perception_module_name(state_gradient, moment_inverse)
-    module = kernel_module(module_name, space_dim, scalar, width)
+    name = perception_module_name(state_gradient, moment_inverse)
+    options = {"width": width, "on_cpu": on_cpu, "listed": listed}
+    module = kernel_module(name, space_dim, scalar, **options)
     search = make_search(space_dim, scalar, particle, on_cpu, listed)
     add_scaled = make_add_scaled(group)
     load_group = make_wide_load(group)
@@ -70,7 +70,7 @@ def perception_kernels(
         g: int,
         group_count: int,
     ):
-        """Return smoothed state, state gradient, sum of v K and moment matrix of particle k."""
+        """Return sums over k's neighbours, of group g: smoothed state, gradient, v K, moments."""
         position = space.position_of(particles[k])
         own = load_group(states, k * group_count + g)
         smoothed = group()

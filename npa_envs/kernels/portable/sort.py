@@ -29,7 +29,7 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
     vector, Domain = space.vector, space.Domain
     group = wp.types.vector(width, scalar)
     read_channels = make_read_channels(group)
-    module = kernel_module("sort", space_dim, scalar, width)
+    module = kernel_module("sort", space_dim, scalar, width=width)
 
     @wp.kernel(enable_backward=False, module=module)
     def count_cells(
@@ -93,16 +93,13 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
         original_index: wp.array[wp.int32],
         sorted_cell: wp.array[wp.int32],
         row_of: wp.array[wp.int32],
-        row_source: wp.array[wp.int32],
+        row_particle: wp.array[wp.int32],
         row_index: wp.array[wp.int32],
         sorted_positions: wp.array[vector],
         row_positions: wp.array[vector],
         sorted_states: wp.array[group],
     ):
-        """Write particles sorted by cell, then index, and number the rows of active ones.
-
-        States and rows are left out where their arrays are empty.
-        """
+        """Write particles sorted by cell, then index, and number the rows of active ones."""
         wait_for_previous_kernel()
         k = range_start + wp.tid()
         entry = arrived[k]
@@ -123,7 +120,7 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
                 row = wp.int32(-1)
             row_of[i] = row
             if row >= 0:
-                row_source[row] = i
+                row_particle[row] = i
                 row_index[row] = target
                 row_positions[row] = positions[i]
         if sorted_states.shape[0] > 0:
@@ -152,16 +149,13 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
         original_index: wp.array[wp.int32],
         sorted_cell: wp.array[wp.int32],
         row_of: wp.array[wp.int32],
-        row_source: wp.array[wp.int32],
+        row_particle: wp.array[wp.int32],
         row_index: wp.array[wp.int32],
         sorted_positions: wp.array[vector],
         row_positions: wp.array[vector],
         sorted_states: wp.array[group],
     ):
-        """Sort a world by cell, then index, in one thread, as the three other kernels do.
-
-        States and rows are left out where their arrays are empty.
-        """
+        """Sort a world by cell, then index, in one thread, as the three other kernels do."""
         world = range_start + wp.tid()
         first = world * particle_count
         end = first + particle_count
@@ -212,7 +206,7 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
             if row_of.shape[0] > 0:
                 row_of[i] = wp.where(row < row_capacity, row, wp.int32(-1))
                 if row < row_capacity:
-                    row_source[row] = i
+                    row_particle[row] = i
                     row_index[row] = target
                     row_positions[row] = positions[i]
             if sorted_states.shape[0] > 0:
@@ -245,7 +239,7 @@ def give_rows(space_dim: int, scalar: type) -> wp.Kernel:
         positions: wp.array[vector],
         # outputs
         row_of: wp.array2d[wp.int32],
-        row_source: wp.array2d[wp.int32],
+        row_particle: wp.array2d[wp.int32],
         starts: wp.array2d[wp.int32],
         row_positions: wp.array2d[vector],
     ):
@@ -275,9 +269,9 @@ def give_rows(space_dim: int, scalar: type) -> wp.Kernel:
                 before = active_before[step * total + t - 1] - earlier
             active = active_before[step * total + t] - earlier > before
             row = wp.int32(-1)
-            if active and before < row_source.shape[1]:
+            if active and before < row_particle.shape[1]:
                 row = before
-                row_source[step, row] = t
+                row_particle[step, row] = t
                 row_positions[step, row] = positions[t]
             row_of[step, t] = row
 

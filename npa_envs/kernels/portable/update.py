@@ -36,16 +36,10 @@ MOVED_TOGETHER = 32
 
 
 @cached_under_lock()
-def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
-    """Return the kernels that move particles and change states, by updates or by actions."""
+def motion_functions(space_dim: int, scalar: type) -> SimpleNamespace:
+    """Return the Warp functions that move a position and keep it within the boundary."""
     vector = domain_types(space_dim, scalar).vector
     vector_f64 = wp.types.vector(space_dim, wp.float64)
-    channels = wp.types.vector(THREAD_CHANNELS, scalar)
-    load_scalar = make_wide_load(scalar)
-    read_states = make_read_at(channels, 16)
-    read_actions = make_read_at(channels, 8)
-    read_change = make_read_at(channels, UPDATE_ALIGNMENT[space_dim])
-    module = kernel_module("update", space_dim, scalar)
 
     @wp.func
     def displaced(position: vector, factor: wp.float64, direction: vector_f64):
@@ -68,42 +62,20 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
                     result[d] = -result[d]
         return result
 
-    @wp.func
-    def clipped(value: scalar, limit: scalar):
-        """Return a value clipped to plus and minus a limit (NaN: 0), and whether it changed."""
-        result = value
-        changed = wp.int32(0)
-        if wp.isnan(value):
-            result = scalar(0.0)
-            changed = wp.int32(1)
-        elif value > limit:
-            result = limit
-            changed = wp.int32(1)
-        elif value < -limit:
-            result = -limit
-            changed = wp.int32(1)
-        return result, changed
+    return namespace(locals())
 
-    @wp.func
-    def acted_state(state: scalar, action: scalar, largest_change: wp.float64):
-        """Return a state plus `largest_change` times an action, which is clipped to [-1, 1]."""
-        # Comparisons keep NaN; a clamp would not.
-        part = action
-        if part > scalar(1.0):
-            part = scalar(1.0)
-        if part < scalar(-1.0):
-            part = scalar(-1.0)
-        return scalar(wp.float64(state) + largest_change * wp.float64(part))
 
-    @wp.func
-    def acted_position(position: vector, action: vector_f64, largest_step: wp.float64):
-        """Return a position moved by `largest_step` times an action, shortened to at most 1."""
-        length = wp.length(action)
-        step = largest_step
-        # Written in this way, one NaN coordinate makes all of them NaN.
-        if not (length <= wp.float64(1.0)):
-            step = largest_step / length
-        return displaced(position, step, action)
+@cached_under_lock()
+def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
+    """Return the kernel that moves particles and changes states by updates, and its adjoint."""
+    vector = domain_types(space_dim, scalar).vector
+    vector_f64 = wp.types.vector(space_dim, wp.float64)
+    channels = wp.types.vector(THREAD_CHANNELS, scalar)
+    motion = motion_functions(space_dim, scalar)
+    load_scalar = make_wide_load(scalar)
+    read_states = make_read_at(channels, 16)
+    read_change = make_read_at(channels, UPDATE_ALIGNMENT[space_dim])
+    module = kernel_module("update", space_dim, scalar)
 
     @in_ranges(ELEMENTS)
     @wp.kernel(enable_backward=False, module=module)
@@ -155,9 +127,9 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
                     delta[d] = wp.float64(load_scalar(update, row_begin + d))
                 length = wp.length(delta)
                 step = largest_step / (wp.float64(1.0) + length)
-                position = displaced(position, step, delta)
+                position = motion.displaced(position, step, delta)
                 path += scalar(step * length)
-            position = bounded(position, boundary, box)
+            position = motion.bounded(position, boundary, box)
             new_positions[i] = position
             new_path_length[i] = path
         else:
@@ -191,7 +163,7 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         update_width: int,
         aligned: int,
         starts: wp.array[wp.int32],
-        row_source: wp.array[wp.int32],
+        row_particle: wp.array[wp.int32],
         update: wp.array[scalar],
         new_positions_bar: wp.array[vector],
         new_states_bar: wp.array[scalar],
@@ -208,7 +180,7 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         row = t / chunks
         first = (t - row * chunks) * wp.static(THREAD_CHANNELS)
         row_begin = row * update_width
-        i = load_integer(row_source, row)
+        i = load_integer(row_particle, row)
         bar = channels()
         if row < load_integer(starts, starts.shape[0] - 1) - row_base:
             offset = wp.int32(0)
@@ -227,12 +199,12 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
                     delta[d] = load_scalar(update, row_begin + d)
                 length = wp.length(delta)
                 shrink = scalar(1.0) / (scalar(1.0) + length)
-                pull = new_positions_bar[i]
+                moved_bar = new_positions_bar[i]
                 radial = scalar(0.0)
                 if length > scalar(0.0):
-                    radial = (new_path_bar[i] - wp.dot(pull, delta)) * shrink * shrink / length
+                    radial = (new_path_bar[i] - wp.dot(moved_bar, delta)) * shrink * shrink / length
                 for d in range(wp.static(space_dim)):
-                    bar[d] = largest_step * (shrink * pull[d] + radial * delta[d])
+                    bar[d] = largest_step * (shrink * moved_bar[d] + radial * delta[d])
         if aligned != 0:
             write_at(update_bar, row_begin + first, bar)
         else:
@@ -240,8 +212,58 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
                 if first + k < update_width:
                     update_bar[row_begin + first + k] = bar[k]
 
+    return namespace(locals())
+
+
+@cached_under_lock()
+def action_kernel(space_dim: int, scalar: type) -> wp.Kernel:
+    """Return the kernel that moves particles and changes states by actions."""
+    vector = domain_types(space_dim, scalar).vector
+    vector_f64 = wp.types.vector(space_dim, wp.float64)
+    channels = wp.types.vector(THREAD_CHANNELS, scalar)
+    motion = motion_functions(space_dim, scalar)
+    read_states = make_read_at(channels, 16)
+    read_actions = make_read_at(channels, 8)
+
+    @wp.func
+    def clipped(value: scalar, limit: scalar):
+        """Return a value clipped to plus and minus a limit (NaN: 0), and whether it changed."""
+        result = value
+        changed = wp.int32(0)
+        if wp.isnan(value):
+            result = scalar(0.0)
+            changed = wp.int32(1)
+        elif value > limit:
+            result = limit
+            changed = wp.int32(1)
+        elif value < -limit:
+            result = -limit
+            changed = wp.int32(1)
+        return result, changed
+
+    @wp.func
+    def acted_state(state: scalar, action: scalar, largest_change: wp.float64):
+        """Return a state plus `largest_change` times an action, which is clipped to [-1, 1]."""
+        # Comparisons keep NaN; a clamp would not.
+        part = action
+        if part > scalar(1.0):
+            part = scalar(1.0)
+        if part < scalar(-1.0):
+            part = scalar(-1.0)
+        return scalar(wp.float64(state) + largest_change * wp.float64(part))
+
+    @wp.func
+    def acted_position(position: vector, action: vector_f64, largest_step: wp.float64):
+        """Return a position moved by `largest_step` times an action, shortened to at most 1."""
+        length = wp.length(action)
+        step = largest_step
+        # Written in this way, one NaN coordinate makes all of them NaN.
+        if not (length <= wp.float64(1.0)):
+            step = largest_step / length
+        return motion.displaced(position, step, action)
+
     @in_ranges(ELEMENTS)
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(enable_backward=False, module=kernel_module("actions", space_dim, scalar))
     def apply_actions(
         range_start: int,
         particle_count: int,
@@ -337,7 +359,7 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
                     position += push
                 if moving != 0 and acting != wp.uint8(0):
                     position = acted_position(position, direction, largest_step)
-                position = bounded(position, boundary, box)
+                position = motion.bounded(position, boundary, box)
                 for d in range(wp.static(space_dim)):
                     coordinate, coordinate_clipped = clipped(position[d], position_limit)
                     position[d] = coordinate
@@ -346,7 +368,7 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         if clipped_count != 0:
             diverged[i / particle_count] = wp.uint8(1)
 
-    return namespace(locals())
+    return apply_actions
 
 
 QUAD = 4
@@ -357,13 +379,13 @@ VALUES_PER_THREAD = 8
 
 
 @cached_under_lock()
-def find_not_finite(scalar: type) -> wp.Kernel:
+def flag_not_finite(scalar: type) -> wp.Kernel:
     """Return the kernel that checks whether all numbers of an array are finite."""
     module = native.module(f"npa_envs.kernels.finite_{scalar_name(scalar)}")
     read_quad = make_read_at(wp.types.vector(QUAD, scalar), 16)
 
     @wp.kernel(enable_backward=False, module=module)
-    def find(
+    def flag_not_finite(
         thread_count: int,
         values: wp.array[scalar],
         # outputs
@@ -387,4 +409,4 @@ def find_not_finite(scalar: type) -> wp.Kernel:
         if wild != 0:
             finite[0] = wp.uint8(0)
 
-    return find
+    return flag_not_finite

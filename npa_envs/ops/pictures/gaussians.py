@@ -14,7 +14,7 @@ from npa_envs.kernels.pictures.blending import TILE_PIXELS, block_kernels, tile_
 from npa_envs.kernels.pictures.gaussians import (
     CHANNELS,
     FOOTPRINT,
-    PULLS,
+    TILE_BAR,
     gaussian_kernels,
     make_frame,
 )
@@ -43,7 +43,7 @@ def check_gaussians(
         (
             "colours",
             colours,
-            f"[B, N, K] with K from 1 to {CHANNELS}, or [B, N, 4, 3]",
+            f"[B, N, F] with F from 1 to {CHANNELS}, or [B, N, 4, 3]",
             (*((k,) for k in range(1, CHANNELS + 1)), (4, 3)),
         ),
     )
@@ -100,7 +100,7 @@ def check_cameras(
         )
     if background is None:
         return
-    _check_tensor("background", background, means, "that broadcasts to [B, V, H, W, K]")
+    _check_tensor("background", background, means, "that broadcasts to [B, V, H, W, F]")
     try:
         joined = torch.broadcast_shapes(background.shape, image)  # type: ignore[no-untyped-call]
         fits = tuple(joined) == image
@@ -108,7 +108,7 @@ def check_cameras(
         fits = False
     if not fits:
         raise NPAError(
-            f"background must broadcast to [B, V, H, W, K] = {list(image)}, "
+            f"background must broadcast to [B, V, H, W, F] = {list(image)}, "
             f"got {tuple(background.shape)}: for example one colour of shape [{channels}]"
         )
 
@@ -147,9 +147,9 @@ def sort_pairs(
     order = torch.sort(depths, dim=1, stable=True).indices
     ends = torch.cumsum(counts.gather(1, order), 1, dtype=torch.int64)
     room = ends.shape[1] * pairs_per_particle or max(int(ends[:, -1].max()), 1)
-    if images * room * PULLS > MAX_INDEX:
+    if images * room * TILE_BAR > MAX_INDEX:
         raise NPAError(
-            f"pairs of tiles and Gaussians must stay below {MAX_INDEX // PULLS} in one batch, "
+            f"pairs of tiles and Gaussians must stay below {MAX_INDEX // TILE_BAR} in one batch, "
             f"got room for {room} in each of {images} pictures: split the batch or lower "
             f"pairs_per_particle"
         )
@@ -167,7 +167,7 @@ def sort_pairs(
 
 
 def blend(frame: Any, footprints: Tensor, pairs: Pairs, images: int) -> tuple[Tensor, ...]:
-    """Return for each of B V H W pixels: colour [K], transmittance, index after its last pair."""
+    """Return for each of B V H W pixels: colour [F], transmittance, index after its last pair."""
     device, pixels = footprints.device, images * frame.width * frame.height
     scalar = SCALARS[footprints.dtype]
     contents = (pairs.starts, pairs.owners, footprints)
@@ -199,7 +199,7 @@ class GaussianPictures(NamedTuple):
     """Pictures that `render_gaussians` draws of worlds."""
 
     image: Tensor
-    """Colours, dimensionless, shape [B, V, H, W, K]; the first row is the upper one."""
+    """Colours, dimensionless, shape [B, V, H, W, F]; the first row is the upper one."""
     alpha: Tensor
     """Opacity of each pixel, in [0, 1], shape [B, V, H, W]."""
     overflow: Tensor
@@ -279,23 +279,23 @@ def _gaussians_backward(
     picture_bar = picture_bar.contiguous().view(-1, frame.channels)
     passing, passing_bar = passing.view(-1), passing_bar.contiguous().view(-1)
     # Cotangents from tiles, a row for each slot; unused slots are undefined.
-    pulls = footprints.new_empty(owners.shape[0], PULLS)
+    tile_bars = footprints.new_empty(owners.shape[0], TILE_BAR)
     tiles = starts.shape[0] - 1
     contents = (starts, owners, pair_slots, footprints, stops, picture_bar)
     if device.type == "cuda":
         kernel = block_kernels(scalar).pull_back_blocks
-        pulled = (*contents, passing, passing_bar, pulls.view(-1))
-        launch(kernel, tiles * TILE_PIXELS, device, frame, *pulled, block_dim=TILE_PIXELS)
+        of_tiles = (*contents, passing, passing_bar, tile_bars.view(-1))
+        launch(kernel, tiles * TILE_PIXELS, device, frame, *of_tiles, block_dim=TILE_PIXELS)
     else:
-        pulled = (*contents, passing.clone(), passing * passing_bar, pulls)
-        launch(tile_kernels(scalar).pull_back_tiles, tiles, device, frame, *pulled)
+        of_tiles = (*contents, passing.clone(), passing * passing_bar, tile_bars)
+        launch(tile_kernels(scalar).pull_back_tiles, tiles, device, frame, *of_tiles)
     means, scales, quaternions, colours, *_ = scene
     bars = [torch.empty_like(tensor) for tensor in (means, scales, quaternions)]
     bars += [means.new_empty(means.shape[:2]), torch.empty_like(colours)]
     flat = scene.flat()
     flat_inputs = [*flat[:3], bars[3].view(-1), flat[3]]
     bars_out = [bar.view(like.shape) for bar, like in zip(bars, flat_inputs, strict=True)]
-    arguments = (*flat, footprints, counts, slots, pulls, *bars_out)
+    arguments = (*flat, footprints, counts, slots, tile_bars, *bars_out)
     kernel = gaussian_kernels(scalar).pull_back_gaussians
     launch(kernel, bars[3].numel(), device, frame, *arguments)
     return bars[0], bars[1], bars[2], bars[3], bars[4]
@@ -357,11 +357,11 @@ def render_gaussians(
         quaternions: Rotations of these axes (w, x, y, z), of any length: they are normalised; a
             zero stands for no rotation. Shape [B, N, 4].
         opacities: Alpha at each Gaussian's centre, in [0, 1], shape [B, N].
-        colours: Dimensionless; K = 1 to 4 channels, shape [B, N, K], or coefficients of real
+        colours: Dimensionless; F = 1 to 4 channels, shape [B, N, F], or coefficients of real
             spherical harmonics up to degree 1 for red, green and blue, shape [B, N, 4, 3], whose
             sum plus 0.5 is clipped to at least 0.
         cameras: V cameras, on the same device.
-        background: Colours behind the Gaussians; the shape broadcasts to [B, V, H, W, K]. None is
+        background: Colours behind the Gaussians; the shape broadcasts to [B, V, H, W, F]. None is
             black.
         dilation: Added to both variances on the picture [pixels squared].
         pairs_per_particle: Room in pairs of a tile (16 x 16 pixels) and a Gaussian that covers it,
