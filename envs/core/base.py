@@ -222,12 +222,12 @@ class WorldsEnv(ShownEnv):
 
     def losses_of(self, numbers: Any) -> dict[str, Any]:
         """Return the loss and its terms by their names in infos, from `StepReport.numbers`."""
-        named = StepNumbers.from_rows(numbers)
-        return {"loss": named.loss} | named_terms("loss", self.worlds.term_names, named.terms)
+        named, names = StepNumbers.from_rows(numbers), self.worlds.episodes.term_names
+        return {"loss": named.loss} | named_terms("loss", names, named.terms)
 
     def _improvements(self, numbers: Any) -> dict[str, Any]:
         improvements = StepNumbers.from_rows(numbers).improvements
-        return named_terms("reward", self.worlds.term_names, improvements)
+        return named_terms("reward", self.worlds.episodes.term_names, improvements)
 
     def _show(self) -> None:
         self._show_in_window(self.spec.id if self.spec is not None else type(self).__name__)

@@ -291,8 +291,8 @@ class EnvConfig(WorldConfig):
 
     @property
     def per_particle_reward(self) -> bool:
-        """Whether `info` has a reward for each particle."""
-        return self.reward in ("particle", "marginal")
+        """Whether `info` has a reward for each particle, by a class of `PARTICLE_REWARDS`."""
+        return self.reward not in ("dense", "sparse")
 
 
 def check_picture_size(config: Any) -> None:

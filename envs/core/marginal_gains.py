@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 import torch
 from torch import Tensor
 
-from npa_envs.world.environment_steps import world_mean, wrapped
+from npa_envs.world.environment_steps import wrapped
 
 
 def marginal_gains(
@@ -41,9 +41,3 @@ def marginal_gains(
             for column in (slope * change).unbind(dim=-1):
                 gains = gains - column
     return gains * gains.shape[1]
-
-
-def with_mean_reward(gains: Tensor, reward: Tensor) -> Tensor:
-    """Shift each world's gains, [B, N], by a constant so that their mean is its reward, [B]."""
-    missed = reward - world_mean(gains[..., None])[:, 0]
-    return gains + missed[:, None]

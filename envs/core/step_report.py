@@ -1,18 +1,23 @@
-"""What a step of a batch of worlds returns: rewards, losses and endings."""
+"""Episodes of a batch of worlds, and what a step reports: rewards, losses and endings."""
 
 from __future__ import annotations
 
+import contextlib
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from npa_envs.envs.core.marginal_gains import with_mean_reward
-from npa_envs.envs.core.task import EnvTask, checked_tensor
-from npa_envs.world.environment_steps import DIVERGED, SUCCESS, TIME_LIMIT
-from npa_envs.world.particles import Particles
+from npa_envs.world.cuda_graph import makes_plain_tensors, pinned_like
+from npa_envs.world.environment_steps import (
+    DIVERGED,
+    SUCCESS,
+    TIME_LIMIT,
+    EpisodeRules,
+    EpisodeUpdate,
+)
 
 FLAG_ROWS = 5
 """Rows of flags in a report: the four of `StepReport.endings`, and `all_worlds`."""
@@ -102,47 +107,94 @@ class StepReport(NamedTuple):
         return self.from_buffer(self.buffer.clone(), len(self.all_worlds))
 
 
-class ParticleRewards:
-    """Rewards of single particles: the decrease of their own losses, or their marginal gains."""
+class Episodes:
+    """The current episodes of B worlds: ages, losses, rewards, endings, and the host's copies.
 
-    def __init__(self, particles: Particles, *, by_loss: bool) -> None:
-        self.reward = torch.zeros_like(particles.x[..., 0])
-        """Each particle's reward of the last step, shape [B, N]."""
-        self.loss = torch.zeros_like(self.reward) if by_loss else None
-        """Each particle's loss, shape [B, N]; None for marginal gains."""
-        self._before = particles if by_loss else particles.map(torch.clone)
+    Args:
+        rules: How losses become rewards, and when episodes end.
+        enabled: Whether the last step was made, uint8, shape [1]; kept and read.
+        diverged: Which worlds diverged in it, uint8, shape [B]; kept and read.
+    """
 
-    def place(self, worlds: Tensor, task: EnvTask[Any], particles: Particles) -> None:
-        """Store the new particles of the worlds of indices `worlds`, int64 [B']; rewards are 0."""
-        self.reward.index_fill_(0, worlds, 0.0)
-        if self.loss is None:
-            self._before.put_(worlds, particles)
-        else:
-            self.loss[worlds] = self._losses(task, particles)
+    def __init__(self, rules: EpisodeRules, enabled: Tensor, diverged: Tensor) -> None:
+        self._rules, self._enabled, self._diverged = rules, enabled, diverged
+        self.elapsed = torch.zeros_like(diverged, dtype=torch.int32)
+        """Steps since the start of each episode, shape [B]."""
+        self._start_loss = torch.zeros_like(diverged, dtype=torch.float32)
+        self._success_loss = torch.zeros_like(self._start_loss)
+        # Each world's ending, then `enabled`.
+        self._endings = diverged.new_zeros(len(diverged) + 1)
+        self.term_names: tuple[str, ...] = ()
+        """Names of the terms of the loss, known once worlds have been placed."""
+        self.report = StepReport.empty(len(diverged), 0, diverged.device)
+        """What a step returns apart from the observation."""
+        self._attach()
 
-    def gains(self, task: EnvTask[Any], particles: Particles) -> Tensor:
-        """Return what each particle gained in a step, [B, N]; store these particles."""
-        if self.loss is None:
-            gains = task.particle_gains(self._before[:2], particles[:2])
-            gains = checked_tensor(task, "particle_gains", "gains", gains, self.reward.shape)
-            self._before.copy_(particles)
-            return gains
-        losses = self._losses(task, particles)
-        gains = self.loss - losses
-        self.loss.copy_(losses)
-        return gains
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | dict.fromkeys(("update", "host_endings", "host_numbers"))
 
-    def write(self, gains: Tensor, reward: Tensor, by_world: Tensor, enabled: Tensor) -> None:
-        """Write the rewards of a step from `gains`, [B, N], and the worlds' rewards, [B].
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._attach()
 
-        Particles of worlds in `by_world`, bool [B], get the world's reward. Nothing changes unless
-        `enabled`, uint8 [1].
+    @makes_plain_tensors
+    def _attach(self) -> None:
+        """Make what refers to the memory of the current `report`."""
+        read = (self._endings, self.report.numbers)
+        self.host_endings, self.host_numbers = (
+            map(pinned_like, read) if self._endings.is_cuda else read
+        )
+        self.update = EpisodeUpdate(
+            self._rules,
+            enabled=self._enabled,
+            diverged=self._diverged,
+            first_loss=self._start_loss,
+            success_loss=self._success_loss,
+            elapsed=self.elapsed,
+            numbers=self.report.numbers,
+            flags=self.report.endings,
+            endings=self._endings,
+        )
+
+    def put_losses(self, world_indices: Tensor, names: tuple[str, ...], terms: Tensor) -> None:
+        """Store the named terms, [terms, B'], of the losses of replaced worlds, unrewarded."""
+        if not self.term_names:
+            self.term_names = names
+            self.report = StepReport.empty(len(self.elapsed), len(names), terms.device)
+            self._attach()
+        zeros = torch.zeros_like(terms)
+        numbers = torch.cat((zeros[:1], total(terms)[None], terms, zeros))
+        self.report.numbers.index_copy_(1, world_indices, numbers)
+        self.report.endings.index_fill_(1, world_indices, False)
+
+    def begin(self, world_indices: Tensor, success_loss: Tensor | None) -> None:
+        """Begin episodes of worlds, int64 [B'], at their current losses.
+
+        They end in success at `success_loss`, shape [B']; None: never.
         """
-        if self.loss is None:
-            gains = with_mean_reward(gains, reward)
-        rewards = torch.where(by_world[:, None], reward[:, None], gains)
-        self.reward.copy_(torch.where(enabled.bool(), rewards, self.reward))
+        self.elapsed.index_fill_(0, world_indices, 0)
+        self._start_loss[world_indices] = self.report.loss[world_indices]
+        if success_loss is None:
+            self._success_loss.index_fill_(0, world_indices, -torch.inf)
+        else:
+            self._success_loss[world_indices] = success_loss
 
-    def _losses(self, task: EnvTask[Any], particles: Particles) -> Tensor:
-        losses = task.particle_losses(particles.x, particles.s)
-        return checked_tensor(task, "particle_losses", "losses", losses, particles.x.shape[:2])
+    @contextlib.contextmanager
+    def unrewarded(self, world_indices: Tensor) -> Iterator[None]:
+        """Keep ages, rewards and endings while the `with` block begins episodes of worlds."""
+        before, elapsed = self.report.copy(), self.elapsed.clone()
+        yield
+        self.elapsed.copy_(elapsed)
+        self.report.reward[world_indices] = before.reward[world_indices]
+        self.report.improvements[:, world_indices] = before.improvements[:, world_indices]
+        self.report.endings.copy_(before.endings)
+        if len(self.elapsed) == 1:
+            # The host reads the numbers of a single world alone; this synchronises.
+            self.host_numbers.copy_(self.report.numbers)
+
+    def copy_to_host(self) -> None:
+        """Copy endings, and the numbers of a single world, to the host without waiting."""
+        if self._endings.is_cuda:
+            self.host_endings.copy_(self._endings, non_blocking=True)
+            if len(self.elapsed) == 1:
+                self.host_numbers.copy_(self.report.numbers, non_blocking=True)

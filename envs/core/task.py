@@ -215,6 +215,11 @@ class EnvTask(WorldTask[Config]):
         """Whether `start` takes few operations, so that on CUDA it is captured as a graph."""
         return not self.grows or self.config.seed_pool > 0
 
+    @property
+    def rewards_last_step_only(self) -> bool:
+        """Whether only the last step of an episode is rewarded."""
+        return self.config.reward == "sparse"
+
     def start(self, random: WorldRandom) -> Start:
         """Return worlds at the beginning of their episodes: fresh ones, or some from the pool."""
         if self.config.seed_pool == 0:

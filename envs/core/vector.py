@@ -121,7 +121,7 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
         self._ended[chosen] = False
         which = np.zeros(self.num_envs, dtype=bool)
         which[chosen] = True
-        values = self.losses_of(self._report_rows(self.worlds.report.copy()))
+        values = self.losses_of(self._report_rows(self.worlds.episodes.report.copy()))
         values |= self._returned_values(self.worlds.extra_info())
         return self.spaces.observation_output(observation), with_masks(values, self._mask(which))
 
@@ -213,7 +213,8 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
     ) -> tuple[Any, Any, Any, dict[str, Any]]:
         """Return rewards, terminations, truncations and infos; `stepped`: worlds that acted."""
         worlds = self.worlds
-        report = worlds.report.copy() if copy else worlds.report
+        report = worlds.episodes.report
+        report = report.copy() if copy else report
         rows = self._report_rows(report)
         terminated, truncated, success, diverged = self._out(report.endings)
         all_worlds = self._out(report.all_worlds if copy else report.all_worlds.clone())

@@ -60,16 +60,12 @@ class RuleDrivenWorlds(BatchedWorlds):
     context: Any = None
     """What the task's `episode_context` returned at the start of each world's episode."""
 
-    def step(self, action: Tensor, out: Tensor | None = None) -> tuple[NDArray[np.uint8], Tensor]:
-        """Apply actions that are finite, which is checked first; else as the base class."""
-        if not bool(torch.isfinite(action).all()):
-            raise not_finite(action)
-        return super().step(action, out)
-
     @torch.no_grad()
     @makes_plain_tensors
     def queue(self, action: Tensor, out: Tensor | None = None) -> Tensor:
-        """Step the worlds without synchronising; return observations, [B, ...]."""
+        """Check that actions are finite, then step the worlds; return observations, [B, O]."""
+        if not bool(torch.isfinite(action).all()):
+            raise not_finite(action)
         action = action.to(self.device)
         diverged = torch.zeros_like(self.diverged, dtype=torch.bool)
         limits = self.physics.limits.position, self.physics.limits.state
@@ -79,8 +75,7 @@ class RuleDrivenWorlds(BatchedWorlds):
             value.copy_(torch.nan_to_num(new, nan=0.0).clamp(-limit, limit))
         self.diverged.copy_(diverged)
         self.evaluate()
-        if self._side_stream is not None:
-            self._side_stream.mark()
+        self.steps.mark()
         return self.perceive(out)
 
     def _stepped(self, action: Tensor) -> tuple[Tensor, Tensor]:
@@ -105,37 +100,33 @@ class RuleDrivenWorlds(BatchedWorlds):
         observed = self.task.observe(self.particles, self.loss, self.context)
         return observed if out is None else out.copy_(observed)
 
-    def restart(self, worlds: NDArray[np.int64], observation: Tensor) -> None:
-        """Start the next episodes of worlds, indices [B']; write their rows of `observation`."""
-        index = to_device_async(worlds, self.device)
+    def restart(self, world_indices: NDArray[np.int64], observation: Tensor) -> None:
+        """Start the next episodes of worlds, [B']; write their rows of `observation`, [B, O]."""
+        index = to_device_async(world_indices, self.device)
         self.start(index)
         observation[index] = self.perceive()[index]
 
-    @property
-    def rewards_last_step_only(self) -> bool:
-        """Whether only the last step of an episode is rewarded."""
-        return super().rewards_last_step_only and not self.task.rewards_each_step
-
-    def begin(self, worlds: Tensor, start: Start, *, check: bool) -> None:
-        """Begin episodes in some worlds; store what the task's `episode_context` returns."""
-        super().begin(worlds, start, check=check)
-        draws = self.random.take(worlds).substream(StreamId.GOAL)
-        context = self.task.episode_context(start, self.loss[worlds], draws)
+    def begin(self, world_indices: Tensor, start: Start, *, check: bool) -> None:
+        """Begin episodes in worlds, int64 [B'], and store their `context`."""
+        super().begin(world_indices, start, check=check)
+        draws = self.random.take(world_indices).substream(StreamId.GOAL)
+        context = self.task.episode_context(start, self.loss[world_indices], draws)
         if self.context is None:
             shapes = ((self.world_count, *value.shape[1:]) for value in context)
             self.context = type(context)(*map(Tensor.new_zeros, context, shapes))
         for stored, value in zip(self.context, context, strict=True):
-            stored[worlds] = value
+            stored[world_indices] = value
 
     def write_rewards(self, terms: Tensor) -> None:
         """Write the task's own rewards and the endings; then let the task change the goals."""
         super().write_rewards(terms)
         rewards = self.task.reward(self.particles, self.loss, self.context)
-        if self.rewards_last_step_only:
-            terminated, truncated, *_ = self.report.endings
+        report = self.episodes.report
+        if self.task.rewards_last_step_only:
+            terminated, truncated, *_ = report.endings
             rewards = torch.where(terminated | truncated, rewards, 0.0)
-        self.report.reward.copy_(rewards)
-        self.task.next_goals(self.elapsed, self.context, self.goal)
+        report.reward.copy_(rewards)
+        self.task.next_goals(self.episodes.elapsed, self.context, self.goal)
 
     def extra_info(self) -> dict[str, Tensor]:
         """Return what the task's `context_info` adds to infos, by name, [B, ...] each."""
@@ -181,9 +172,6 @@ class RuleDrivenTask(PictureEnvTask[AnyPicture]):
 
     worlds_type: ClassVar[type[BatchedWorlds] | None] = RuleDrivenWorlds
 
-    rewards_each_step: ClassVar[bool] = False
-    """Whether `reward="sparse"` also rewards each step."""
-
     def step(
         self, x: Tensor, s: Tensor, action: Tensor, random: WorldRandom
     ) -> tuple[Tensor, Tensor]:
@@ -220,7 +208,7 @@ def coarse(pictures: Tensor, size: int) -> Tensor:
     return observed.clamp(-OBSERVATION_LIMIT, OBSERVATION_LIMIT)
 
 
-class GardenContext(NamedTuple):
+class StartLosses(NamedTuple):
     """Losses of the picture at the start of B episodes."""
 
     intact_loss: Tensor
@@ -285,7 +273,7 @@ class GardenTask(RuleDrivenTask[Config], GrownTask[Config]):
         blank = torch.zeros_like(start.s)
         grey = sum(self.losses(start.x, blank).values(), torch.zeros_like(loss))
         # The loss of a picture that did not grow may not rise at all.
-        return GardenContext(loss, (grey - loss).maximum(MIN_RISE * loss))
+        return StartLosses(loss, (grey - loss).maximum(MIN_RISE * loss))
 
     def lost_fraction(self, loss: Tensor, context: Any) -> Tensor:
         """Return each picture's lost fraction, [B]: 0 as at its start, 1 as with all states 0."""
