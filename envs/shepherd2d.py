@@ -103,7 +103,7 @@ class GoalBrushes(BrushSpaces):
 
 
 class ShepherdEpisode(NamedTuple):
-    """Losses and moments of the creature at the start of B episodes, and its goal."""
+    """The `context` of B episodes: `StartLosses` and moments of the creature, and its goal."""
 
     intact_loss: Tensor
     rise: Tensor

@@ -207,14 +207,15 @@ class WorldsEnv(ShownEnv):
         self.spaces: ParticleSpaces = spaces_type(self.worlds.physics, self.config)
 
     def _change_worlds(
-        self, change: Callable[..., Any], worlds: Tensor, values: Any, buffer: Tensor | None = None
+        self,
+        change: Callable[..., Any],
+        world_indices: Tensor,
+        values: Any,
+        buffer: Tensor | None = None,
     ) -> Tensor:
-        """Call `change(worlds, values)`, values of worlds of indices [B']; return all observations.
-
-        They are written to `buffer` if it is given, [B, ...].
-        """
+        """Call `change(world_indices, values)`; return all observations, in `buffer` if given."""
         with self.worlds.device_context():
-            change(worlds, values)
+            change(world_indices, values)
             observation: Tensor = self.worlds.perceive(buffer)
         self._started = True
         self._show()

@@ -41,10 +41,7 @@ TaskConfig = TypeVar("TaskConfig")
 
 @dataclass(frozen=True, kw_only=True)
 class WorldConfig:
-    """Fields of all environments, of one species or several.
-
-    Lengths are in length units: pictures show [-1, 1] x [-1, 1].
-    """
+    """Fields of all environments; lengths are in length units: pictures show [-1, 1] x [-1, 1]."""
 
     choices: ClassVar[dict[str, tuple[str | None, ...]]] = {
         "moment_inverse": get_args(MomentInverse),

@@ -29,15 +29,11 @@ GROWTH = 4
 
 
 class GraphedSteps:
-    """Applies actions to worlds and calls `evaluate` while it searches neighbours or perceives.
+    """Applies actions to worlds, evaluates them and perceives, without waiting for the device.
 
-    Nothing waits for the device. On CUDA few particles are stepped by one graph, more of them by
-    one for the draws and one for the evaluation.
-
-    Args:
-        actions: What moves `particles`, in place.
-        evaluate: Writes the losses of the moved particles; only referred to weakly.
-        to_host: Whether a graph that perceives also copies its result to the host.
+    `actions` moves `particles` in place. `evaluate` writes their losses, on CUDA while neighbours
+    are searched; the reference to it is weak. `to_host`: a graph of a step, which worlds of few
+    particles have, also copies the perception to the host.
     """
 
     def __init__(
@@ -143,10 +139,9 @@ class GraphedSteps:
 
 
 class GraphedStarts:
-    """Starts the next episodes of worlds by CUDA graphs, instead of some hundred launches.
+    """Starts episodes by CUDA graphs, each for a number of worlds, instead of hundreds of launches.
 
-    `start` starts the worlds of indices [B'] on the device; it is only referred to weakly. There
-    is a graph for each of a few numbers of worlds.
+    `start` starts the worlds of indices [B'] on the device; the reference to it is weak.
     """
 
     def __init__(self, start: Callable[[Tensor], NeighbourState], world_count: int) -> None:
@@ -167,11 +162,7 @@ class GraphedStarts:
 
 
 class GraphedStart:
-    """Starts a fixed number of worlds by one CUDA graph.
-
-    If fewer restart, the last index is repeated, and that world is started in the same way several
-    times.
-    """
+    """Starts up to `size` worlds by a CUDA graph, the last one repeatedly if they are fewer."""
 
     def __init__(
         self, start: Callable[[Tensor], NeighbourState], size: int, device: torch.device

@@ -1,7 +1,4 @@
-"""Rewards of single particles, `info["particle_reward"]`: a class for each such value of `reward=`.
-
-A step calls `gains`, then `write`.
-"""
+"""Rewards of single particles: a class for each value of `reward=` that has them."""
 
 from __future__ import annotations
 
@@ -10,20 +7,23 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from npa_envs.envs.core.task import EnvTask, check_finite, checked_tensor
+from npa_envs.envs.core.task import EnvTask, checked_tensor
 from npa_envs.world.environment_steps import world_mean
 from npa_envs.world.particles import Particles
 
 
 class ParticleRewards:
-    """Base class: the rewards of the particles of B worlds."""
+    """Base class: rewards of the particles of B worlds; a step calls `gains`, then `write`."""
+
+    loss: Tensor | None = None
+    """Each particle's loss, shape [B, N], if it is stored."""
 
     def __init__(self, particles: Particles) -> None:
         self.reward = torch.zeros_like(particles.x[..., 0])
         """Each particle's reward of the last step, shape [B, N]."""
 
     def place(self, world_indices: Tensor, task: EnvTask[Any], placed: Particles) -> None:
-        """Set rewards to 0 in worlds, int64 [B'], whose particles are now `placed`."""
+        """Set rewards to 0 in worlds, int64 [B'], whose particles `placed` replaces."""
         self.reward.index_fill_(0, world_indices, 0.0)
 
     def gains(self, task: EnvTask[Any], particles: Particles) -> Tensor:
@@ -39,36 +39,29 @@ class ParticleRewards:
         rewards = torch.where(by_world[:, None], reward[:, None], gains)
         self.reward.copy_(torch.where(enabled.bool(), rewards, self.reward))
 
-    def check_finite(self, task: EnvTask[Any], world_indices: Tensor) -> None:
-        """Raise an `NPAError` if a stored loss of a particle of these worlds is not finite."""
-
 
 class LossDecreases(ParticleRewards):
     """`reward="particle"`: the decrease of each particle's own loss."""
 
     def __init__(self, particles: Particles) -> None:
         super().__init__(particles)
-        self._loss = torch.zeros_like(self.reward)
+        self.loss: Tensor = torch.zeros_like(self.reward)
 
     def place(self, world_indices: Tensor, task: EnvTask[Any], placed: Particles) -> None:
         """Set rewards to 0, and store the losses of the placed particles."""
         super().place(world_indices, task, placed)
-        self._loss[world_indices] = self._losses(task, placed)
+        self.loss[world_indices] = self._losses(task, placed)
 
     def gains(self, task: EnvTask[Any], particles: Particles) -> Tensor:
         """Return the decrease of each particle's loss, [B, N]; store the new losses."""
         losses = self._losses(task, particles)
-        gains = self._loss - losses
-        self._loss.copy_(losses)
+        gains = self.loss - losses
+        self.loss.copy_(losses)
         return gains
 
     def _losses(self, task: EnvTask[Any], particles: Particles) -> Tensor:
         losses = task.particle_losses(particles.x, particles.s)
         return checked_tensor(task, "particle_losses", "losses", losses, particles.x.shape[:2])
-
-    def check_finite(self, task: EnvTask[Any], world_indices: Tensor) -> None:
-        """Raise an `NPAError` if a stored loss of a particle of these worlds is not finite."""
-        check_finite(task, "particle_losses", {"losses": self._loss[world_indices]})
 
 
 class MarginalGains(ParticleRewards):

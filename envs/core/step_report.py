@@ -24,10 +24,7 @@ FLAG_ROWS = 5
 
 
 def total(terms: Tensor) -> Tensor:
-    """Return the sum of the terms of a loss, [terms, B], in their order.
-
-    `torch.sum` may add in another order, which depends on the number of worlds.
-    """
+    """Return the sum of the terms, [terms, B]; the order of `torch.sum` would depend on B."""
     return functools.reduce(torch.add, terms.unbind())
 
 
@@ -67,15 +64,9 @@ class StepReport(NamedTuple):
     buffer: Tensor
     """The memory of the fields below, uint8."""
     numbers: Tensor
-    """The rows of the next four fields, float32, shape [2 + 2 terms, B]."""
-    reward: Tensor
-    """Rewards of the last step, shape [B]."""
-    loss: Tensor
-    """Losses, shape [B]."""
-    terms: Tensor
-    """The terms of each loss, shape [terms, B]."""
-    improvements: Tensor
-    """Decrease of each term of the loss in the last step, shape [terms, B]."""
+    """Reward, loss, its terms and their decreases, float32, shape [2 + 2 terms, B]."""
+    named: StepNumbers
+    """The rows of `numbers` by name."""
     endings: Tensor
     """Terminated, truncated, success, diverged, bool, shape [4, B]."""
     all_worlds: Tensor
@@ -96,7 +87,7 @@ class StepReport(NamedTuple):
         numbers, flags = buffer.view(-1, world_count).tensor_split((-FLAG_ROWS,))
         numbers = numbers.flatten().view(torch.float32).view(-1, world_count)
         flags = flags.view(torch.bool)
-        return cls(buffer, numbers, *StepNumbers.from_rows(numbers), flags[:-1], flags[-1])
+        return cls(buffer, numbers, StepNumbers.from_rows(numbers), flags[:-1], flags[-1])
 
     def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
         # Unpickled views would not share the buffer's memory.
@@ -110,10 +101,8 @@ class StepReport(NamedTuple):
 class Episodes:
     """The current episodes of B worlds: ages, losses, rewards, endings, and the host's copies.
 
-    Args:
-        rules: How losses become rewards, and when episodes end.
-        enabled: Whether the last step was made, uint8, shape [1]; kept and read.
-        diverged: Which worlds diverged in it, uint8, shape [B]; kept and read.
+    `enabled`, uint8 [1], says whether the last step was made, and `diverged`, uint8 [B], in which
+    worlds it diverged; each `update` reads both.
     """
 
     def __init__(self, rules: EpisodeRules, enabled: Tensor, diverged: Tensor) -> None:
@@ -168,12 +157,9 @@ class Episodes:
         self.report.endings.index_fill_(1, world_indices, False)
 
     def begin(self, world_indices: Tensor, success_loss: Tensor | None) -> None:
-        """Begin episodes of worlds, int64 [B'], at their current losses.
-
-        They end in success at `success_loss`, shape [B']; None: never.
-        """
+        """Begin episodes of worlds, int64 [B'], that succeed at a loss, [B'], or never (None)."""
         self.elapsed.index_fill_(0, world_indices, 0)
-        self._start_loss[world_indices] = self.report.loss[world_indices]
+        self._start_loss[world_indices] = self.report.named.loss[world_indices]
         if success_loss is None:
             self._success_loss.index_fill_(0, world_indices, -torch.inf)
         else:
@@ -185,8 +171,9 @@ class Episodes:
         before, elapsed = self.report.copy(), self.elapsed.clone()
         yield
         self.elapsed.copy_(elapsed)
-        self.report.reward[world_indices] = before.reward[world_indices]
-        self.report.improvements[:, world_indices] = before.improvements[:, world_indices]
+        now, earlier = self.report.named, before.named
+        now.reward[world_indices] = earlier.reward[world_indices]
+        now.improvements[:, world_indices] = earlier.improvements[:, world_indices]
         self.report.endings.copy_(before.endings)
         if len(self.elapsed) == 1:
             # The host reads the numbers of a single world alone; this synchronises.

@@ -91,10 +91,7 @@ class WorldTask(Generic[AnyConfig]):
     def draw_particles(
         self, particles: Particles, style: str, azimuth: float = 0.0
     ) -> NDArray[np.uint8]:
-        """Return a picture of each world in one of `STYLES`, shape [B, R, R, 3].
-
-        `azimuth` [degrees] is that of the camera of 3D worlds.
-        """
+        """Return pictures in one of `STYLES`, [B, R, R, 3]; `azimuth`: of 3D cameras [degrees]."""
         return draw_worlds(
             particles.x,
             particles.s,
@@ -237,14 +234,11 @@ class EnvTask(WorldTask[Config]):
         return 0
 
     def pooled(self, indices: Tensor) -> Start:
-        """Return worlds of the pool, by their indices below `seed_pool`, int64, shape [B].
-
-        On a CPU each is made when it is first needed; on CUDA, where reading the indices would
-        synchronise, the first call makes all of them.
-        """
+        """Return worlds of the pool by indices below `seed_pool`, int64 [B], made if needed."""
         if self.device.type == "cpu":
             missing = sorted(set(indices.tolist()) - self._pooled)
         else:
+            # Reading the indices would synchronise, so the first call makes all worlds.
             missing = list(range(self.config.seed_pool)) if self._pool is None else []
         if missing:
             seeds = [self.first_pool_seed + index for index in missing]
@@ -261,10 +255,7 @@ class EnvTask(WorldTask[Config]):
         return Start(taken.x, taken.s, goal=taken.goal)
 
     def draw(self, particles: Particles, steps: NDArray[np.int64]) -> NDArray[np.uint8]:
-        """Return a picture of each world, shape [B, R, R, 3].
-
-        The camera of 3D worlds turns with `steps`, the steps since each world's start, [B].
-        """
+        """Return pictures, [B, R, R, 3]; 3D cameras turn with `steps` since worlds began, [B]."""
         style = self.config.render_style
         if self.space_dim == 2:
             return self.draw_particles(particles, style)

@@ -229,7 +229,10 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
         return {n: self._out(v.clone() if copy else v) for n, v in values.items()}
 
     def _report_rows(self, report: StepReport) -> list[Any]:
-        """Return the rows of `report.numbers`: tensors, or arrays of float64 as Gymnasium's."""
+        """Return reward, loss, its terms and their decreases, [B] each: `report.numbers` by row.
+
+        They are tensors, or with `output="numpy"` arrays of float64, Gymnasium's type of rewards.
+        """
         rows = self._out(report.numbers)
         return list(rows if isinstance(rows, Tensor) else rows.astype(np.float64))
 

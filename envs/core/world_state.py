@@ -119,9 +119,9 @@ class WorldState:
         """One random stream for each world."""
 
     def next_streams(self, world_indices: Tensor, keys: Tensor | None) -> WorldRandom:
-        """Return the random streams for the next episodes of worlds, int64 [B'].
+        """Return random streams for the next episodes of worlds, int64 [B'].
 
-        Keys, int64, shape [B'], start new sequences of episodes; None: each world's next episode.
+        `keys`, int64 [B'], begin new sequences of episodes; None: the current sequences go on.
         """
         if keys is not None:
             return WorldRandom.from_keys(keys.to(self.device))
@@ -153,10 +153,7 @@ class WorldState:
         return Particles(*checked)
 
     def divergence_error(self, diverged: NDArray[np.int64], elapsed: Tensor) -> DivergedError:
-        """Return the error for `on_divergence="raise"`.
-
-        `diverged` are the indices of the diverged worlds; `elapsed`, [B], is the step of each.
-        """
+        """Return the error for worlds, by their indices; `elapsed`, [B], are all worlds' ages."""
         physics, lines = self.physics, []
         for world in diverged[:MAX_REPORT].tolist():
             numbers = torch.cat((self.x[world], self.s[world]), dim=1)

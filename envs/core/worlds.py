@@ -124,10 +124,7 @@ class BatchedWorlds(WorldState):
         return start
 
     def begin(self, world_indices: Tensor, start: Start, *, check: bool) -> None:
-        """Begin episodes with `start` in worlds, int64 [B'].
-
-        `check` raises an error unless all losses are finite, which synchronises with the device.
-        """
+        """Begin episodes with `start` in worlds, int64 [B']; `check` that losses are finite."""
         self.place(world_indices, Particles(start.x, start.s, goal=start.goal))
         if check:
             self.check_losses(world_indices)
@@ -136,10 +133,7 @@ class BatchedWorlds(WorldState):
     @torch.no_grad()
     @makes_plain_tensors
     def place(self, world_indices: Tensor, placed: Particles) -> None:
-        """Replace the particles of worlds, int64 [B'], without a reward.
-
-        Worlds keep their goals if `placed` has none.
-        """
+        """Replace particles of worlds, int64 [B'], unrewarded; and goals, if `placed` has any."""
         task, goal = self.task, placed.goal
         placed = placed._replace(goal=None).map(Tensor.contiguous)
         if self.goal_task is not task:
@@ -192,10 +186,7 @@ class BatchedWorlds(WorldState):
     @torch.no_grad()
     @makes_plain_tensors
     def reseed(self, world_indices: NDArray[np.int64], observation: Tensor) -> None:
-        """Restart the particles of worlds, [B'], within their episodes, without a reward.
-
-        Their rows of `observation`, [B, ...], are written.
-        """
+        """Place new particles in worlds, [B'], within their episodes; update `observation`."""
         self.steps.host_is_current = False
         rewards = self.particle_rewards
         before = None if rewards is None else rewards.reward.clone()
@@ -207,8 +198,7 @@ class BatchedWorlds(WorldState):
     def step(self, action: Tensor, out: Tensor | None = None) -> tuple[NDArray[np.uint8], Tensor]:
         """Apply actions; return endings, [B], and observations, [B, ...], in `out` if it is given.
 
-        The host reads the endings, one byte per world, and the report of a single world. On CUDA
-        evaluation and neighbour search overlap, and the device perceives while the host reads.
+        An ending has bits such as `SUCCESS`. On CUDA the device perceives while the host reads it.
 
         Raises:
             DivergedError: An action is not finite; worlds and report are not changed.
@@ -254,20 +244,21 @@ class BatchedWorlds(WorldState):
         self.episodes.update(terms, (~torch.isfinite(gains).all(dim=1)).byte())
         # In worlds that left their bounds each particle gets the world's reward.
         by_world = self.diverged.bool() & (self.task.config.on_divergence != "ignore")
-        rewards.write(gains, self.episodes.report.reward, by_world, self.enabled)
+        rewards.write(gains, self.episodes.report.named.reward, by_world, self.enabled)
 
     def check_losses(self, world_indices: Tensor) -> None:
         """Raise an `NPAError` unless the losses of worlds, int64 [B'], are finite."""
-        stored = self.episodes.report.terms[:, world_indices]
+        stored = self.episodes.report.named.terms[:, world_indices]
         terms = zip(self.episodes.term_names, stored, strict=True)
         check_finite(self.task, "losses", {f"term {shown(name)}": term for name, term in terms})
-        if self.particle_rewards is not None:
-            self.particle_rewards.check_finite(self.task, world_indices)
+        if self.particle_rewards is not None and self.particle_rewards.loss is not None:
+            losses = self.particle_rewards.loss[world_indices]
+            check_finite(self.task, "particle_losses", {"losses": losses})
 
     @property
     def loss(self) -> Tensor:
         """Each world's current loss, shape [B]."""
-        return self.episodes.report.loss
+        return self.episodes.report.named.loss
 
     def extra_info(self) -> dict[str, Tensor]:
         """Return what the task adds to infos of resets and steps, by name, [B, ...] each."""

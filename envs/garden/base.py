@@ -49,7 +49,7 @@ Config = TypeVar("Config", bound=GardenConfig)
 
 
 class RuleDrivenWorlds(BatchedWorlds):
-    """Worlds whose particles a rule steps; the task applies actions, observes and rewards.
+    """Worlds whose particles a rule steps; a `RuleDrivenTask` applies actions, observes, rewards.
 
     On a CPU worlds are stepped one by one, as a rule's matrix products depend in the last bit on
     the number of worlds.
@@ -58,7 +58,7 @@ class RuleDrivenWorlds(BatchedWorlds):
     task: RuleDrivenTask[Any]
 
     context: Any = None
-    """What the task's `episode_context` returned at the start of each world's episode."""
+    """The `context` of all worlds' episodes, as `RuleDrivenTask` explains it."""
 
     @torch.no_grad()
     @makes_plain_tensors
@@ -107,7 +107,7 @@ class RuleDrivenWorlds(BatchedWorlds):
         observation[index] = self.perceive()[index]
 
     def begin(self, world_indices: Tensor, start: Start, *, check: bool) -> None:
-        """Begin episodes in worlds, int64 [B'], and store their `context`."""
+        """Begin episodes with `start` in worlds, int64 [B'], and store their `context`."""
         super().begin(world_indices, start, check=check)
         draws = self.random.take(world_indices).substream(StreamId.GOAL)
         context = self.task.episode_context(start, self.loss[world_indices], draws)
@@ -125,7 +125,7 @@ class RuleDrivenWorlds(BatchedWorlds):
         if self.task.rewards_last_step_only:
             terminated, truncated, *_ = report.endings
             rewards = torch.where(terminated | truncated, rewards, 0.0)
-        report.reward.copy_(rewards)
+        report.named.reward.copy_(rewards)
         self.task.next_goals(self.episodes.elapsed, self.context, self.goal)
 
     def extra_info(self) -> dict[str, Tensor]:
@@ -168,7 +168,11 @@ class TargetDeficit:
 
 
 class RuleDrivenTask(PictureEnvTask[AnyPicture]):
-    """Base class of tasks whose worlds a rule steps while an agent acts on them."""
+    """Base class of tasks whose worlds a rule steps while an agent acts on them.
+
+    A `context` is what `episode_context` returned for the worlds' current episodes: a named tuple
+    of tensors, [B, ...], that observations and rewards need besides the particles.
+    """
 
     worlds_type: ClassVar[type[BatchedWorlds] | None] = RuleDrivenWorlds
 
@@ -183,10 +187,7 @@ class RuleDrivenTask(PictureEnvTask[AnyPicture]):
         raise NotImplementedError
 
     def episode_context(self, start: Start, loss: Tensor, random: WorldRandom) -> Any:
-        """Return what observations and rewards need of the starts of B episodes.
-
-        It is a named tuple of tensors, [B, ...]; `loss` are the losses at the starts, [B].
-        """
+        """Return the `context` of B episodes that begin; `loss`, [B], are the losses of `start`."""
         raise NotImplementedError
 
     def reward(self, particles: Particles, loss: Tensor, context: Any) -> Tensor:
@@ -194,7 +195,7 @@ class RuleDrivenTask(PictureEnvTask[AnyPicture]):
         raise NotImplementedError
 
     def next_goals(self, elapsed: Tensor, context: Any, goal: Tensor) -> None:
-        """Change `goal`, [B], in place after a step, by default not; `elapsed`: steps, [B]."""
+        """Change `goal`, [B], in place after step `elapsed`, [B], of episodes; by default not."""
 
     def context_info(self, particles: Particles, context: Any) -> dict[str, Tensor]:
         """Return what the task adds to infos, by name, [B, ...] each; by default nothing."""
@@ -209,7 +210,7 @@ def coarse(pictures: Tensor, size: int) -> Tensor:
 
 
 class StartLosses(NamedTuple):
-    """Losses of the picture at the start of B episodes."""
+    """The `context` of gardens: losses of the grown pictures at the start of B episodes."""
 
     intact_loss: Tensor
     """Loss of the intact picture, shape [B]."""
@@ -302,11 +303,7 @@ class GardenTask(RuleDrivenTask[Config], GrownTask[Config]):
         return torch.cat((picture, self.task.target_picture - picture), dim=-1)
 
     def moments(self, particles: Particles) -> Tensor:
-        """Return first and second moments of positions and states, [B, 5 + 3 C].
-
-        `moments_of` the positions; then, relative to their mean, the means of s, x s and y s for
-        each channel.
-        """
+        """Return `moments_of` x, then means of s, x s, y s (x, y from the mean), [B, 5 + 3 C]."""
         x, s, *_ = particles
         away = x - world_mean(x)[:, None]
         values = torch.cat((s, away[..., :1] * s, away[..., 1:] * s), dim=-1)

@@ -290,10 +290,7 @@ class Texture(ParticleTask[TextureConfig]):
         return compare_colours(colour_image(channels)), compare_densities(density)
 
     def joint_image(self, channels: Tensor) -> Tensor:
-        """Return the image that joint losses compare, [..., 4, R, R], from sums and density.
-
-        It has colours and density^0.5, each times the square root of its weight.
-        """
+        """Return colours and density^0.5, times the roots of their weights, [..., 4, R, R]."""
         density = (channels[..., 3:, :, :] + DENSITY_FLOOR) ** JOINT_POWER
         colour_scale = self.config.colour_weight**0.5
         density_scale = self.config.density_weight**0.5

@@ -97,10 +97,7 @@ def stride_of(level: Tensor, thinned: bool) -> int:
 
 
 def patches(images: Tensor, size: int, *, stride: int, wrap: bool) -> Tensor:
-    """Return the M square patches of each image as rows, [B, M, K size²].
-
-    `wrap`: opposite edges of an image are connected.
-    """
+    """Return the M square patches of images, [B, M, K size²]; `wrap`: over opposite edges."""
     if wrap:
         half = size // 2
         images = torch.cat((images[:, :, -half:], images, images[:, :, :half]), dim=2)

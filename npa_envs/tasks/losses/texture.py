@@ -159,10 +159,7 @@ class SlicedWasserstein(TextureDistance):
 
 
 class PatchDescriptor:
-    """Features of images: square patches of all channels, projected on random directions.
-
-    The directions are an orthonormal basis of the space of patches.
-    """
+    """Features of images: patches of all channels, projected on a random orthonormal basis."""
 
     def __init__(self, like: Tensor, *, seed: int) -> None:
         generator = torch.Generator().manual_seed(seed)
@@ -173,7 +170,7 @@ class PatchDescriptor:
         """Directions for each image size, columns of [K PATCH², K PATCH²]."""
 
     def __call__(self, images: Tensor, *, wrap: bool, thinned: bool) -> list[Tensor]:
-        """Return the projections of patches, [B, M, K PATCH²] for each size."""
+        """Return for each image size the M projected patches of images, [B, M, K PATCH²]."""
         sizes = pyramid(images, len(self.directions))
         return [
             products(patches(level, PATCH, stride=stride_of(level, thinned), wrap=wrap), direction)
@@ -203,7 +200,7 @@ class FilterDescriptor:
             self.levels.append((first.to(like), second.to(like)))
 
     def __call__(self, images: Tensor, *, wrap: bool, thinned: bool) -> list[Tensor]:
-        """Return the features of both layers, [B, M, 2 FILTERS] for each size and layer."""
+        """Return for each image size the features of each layer, two tensors [B, M, 2 FILTERS]."""
         result = []
         for level, (first, second) in zip(
             pyramid(images, len(self.levels)), self.levels, strict=True
