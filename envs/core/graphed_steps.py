@@ -158,11 +158,12 @@ class GraphedStarts:
             size = min(size * GROWTH, self._world_count)
         if size not in self._graphs:
             self._graphs[size] = GraphedStart(self._start(), size, observation.device)
-        self._graphs[size](world_indices, observation)
+        padded = np.pad(world_indices, (0, size - len(world_indices)), mode="edge")
+        self._graphs[size](padded).perceive(observation)
 
 
 class GraphedStart:
-    """Starts up to `size` worlds by a CUDA graph, the last one repeatedly if they are fewer."""
+    """Starts `size` worlds by a CUDA graph; a world whose index is repeated starts the same way."""
 
     def __init__(
         self, start: Callable[[Tensor], NeighbourState], size: int, device: torch.device
@@ -171,13 +172,11 @@ class GraphedStart:
         self._world_indices = torch.zeros(size, dtype=torch.int64, device=device)
         self._replay = GraphedCallable(self._run, device)
 
-    def __call__(self, world_indices: NDArray[np.int64], observation: Tensor) -> None:
-        """Start the next episodes of worlds, [B']; write their perception into `observation`."""
-        padding = (0, len(self._world_indices) - len(world_indices))
-        filled = np.pad(world_indices, padding, mode="edge")
-        self._world_indices.copy_(to_device_async(filled, self._world_indices.device))
+    def __call__(self, world_indices: NDArray[np.int64]) -> NeighbourState:
+        """Start the next episodes of worlds, [size]; return what finds their neighbours."""
+        self._world_indices.copy_(to_device_async(world_indices, self._world_indices.device))
         self._replay()
-        self._neighbours.perceive(observation)
+        return self._neighbours
 
     def _run(self) -> None:
         self._neighbours: NeighbourState = self._start()(self._world_indices)

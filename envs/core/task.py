@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.envs.core.config import EnvConfig, WorldConfig
-from npa_envs.envs.core.marginal_gains import marginal_gains
 from npa_envs.errors import NPAError, shown
 from npa_envs.render import draw_worlds
 from npa_envs.world.cuda_graph import capture_lock
+from npa_envs.world.environment_steps import wrapped
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import StreamId, WorldRandom
 
@@ -189,17 +189,31 @@ class EnvTask(WorldTask[Config]):
     def particle_gains(self, before: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor]) -> Tensor:
         """Return N times what each particle's action contributed to the loss's decrease, [B, N].
 
-        `before` and `after` are positions and states around a step. The default estimates it from
-        the gradient of `losses` by `marginal_gains`.
+        `before` and `after` are positions and states around a step. By default the contribution is
+        minus the particle's change times the gradient of `losses` in the middle of the step. It is
+        the particle's Shapley value: exactly for losses that are quadratic in the changes, and up
+        to third order for others. Detached parts of the loss do not count.
         """
-        gains = marginal_gains(self.losses, before, after, self.periodic_sides)
-        if gains is None:
-            raise NPAError(
-                f"the losses of {type(self).__name__} must be differentiable for "
-                "reward='marginal', but no gradient leads from them to positions or states: choose "
-                "'particle' or 'dense', or give it a particle_gains method"
-            )
-        return gains
+        box = self.periodic_sides
+        moved, changed = wrapped(after[0] - before[0], box), after[1] - before[1]
+        with torch.enable_grad():
+            x = wrapped(after[0] - 0.5 * moved, box).requires_grad_()
+            s = (after[1] - 0.5 * changed).requires_grad_()
+            loss = torch.stack(list(self.losses(x, s).values())).sum()
+            if not loss.requires_grad:
+                raise NPAError(
+                    f"the losses of {type(self).__name__} must be differentiable for "
+                    "reward='marginal', but no gradient leads from them to positions or states: "
+                    "choose 'particle' or 'dense', or give it a particle_gains method"
+                )
+            slopes = torch.autograd.grad(loss, (x, s), allow_unused=True)
+        gains = torch.zeros_like(moved[..., 0])
+        for slope, change in zip(slopes, (moved, changed), strict=True):
+            if slope is not None:
+                # Added one by one, because torch's sums have no fixed order.
+                for column in (slope * change).unbind(dim=-1):
+                    gains = gains - column
+        return gains * gains.shape[1]
 
     @property
     def periodic_sides(self) -> tuple[float, ...] | None:

@@ -229,10 +229,7 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
         return {n: self._out(v.clone() if copy else v) for n, v in values.items()}
 
     def _report_rows(self, report: StepReport) -> list[Any]:
-        """Return reward, loss, its terms and their decreases, [B] each: `report.numbers` by row.
-
-        They are tensors, or with `output="numpy"` arrays of float64, Gymnasium's type of rewards.
-        """
+        """Return rewards, losses, terms and their decreases, [B] each, arrays in float64."""
         rows = self._out(report.numbers)
         return list(rows if isinstance(rows, Tensor) else rows.astype(np.float64))
 

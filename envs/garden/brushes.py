@@ -169,9 +169,8 @@ def apply_brushes(
 ) -> tuple[Particles, Tensor | None]:
     """Apply all brushes at once, adding up their effects; differentiable.
 
-    Returns:
-        Particles, and by how much to multiply each one's change in a step of the rule,
-        dimensionless, shape [B, N, 1]; None without the tool "rate".
+    With the tool "rate" also return by how much to multiply each particle's change in a step of
+    the rule, dimensionless, shape [B, N, 1]; else None.
     """
     x, s, *_ = particles
     columns, action = BrushLayout.for_config(config), action.clamp(-1.0, 1.0)

@@ -26,11 +26,7 @@ from npa_envs.world.cuda_graph import (
     to_device_async,
 )
 from npa_envs.world.divergence import MAX_REPORT
-from npa_envs.world.environment_steps import (
-    Actions,
-    NeighbourState,
-    perceive_each_species,
-)
+from npa_envs.world.environment_steps import Actions, NeighbourState, perceive_each_species
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import WorldRandom
 

@@ -16,11 +16,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.envs.core.vector import (
-    checked_count,
-    checked_mode,
-    worlds_to_reset,
-)
+from npa_envs.envs.core.vector import checked_count, checked_mode, worlds_to_reset
 from npa_envs.envs.multi.agents_env import AgentsEnv, joined_actions
 from npa_envs.envs.multi.species_worlds import AgentOutcome
 from npa_envs.errors import NPAError

@@ -167,10 +167,7 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
     def seed(
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
     ) -> Particles:
-        """Return random clouds with all states zero; goals are their classes.
-
-        Clouds of "train" are augmented. They are made on the task's device and copied to `device`.
-        """
+        """Return random clouds, those of "train" augmented, with blank states; goals: classes."""
         config, clouds = self.config, self.clouds
         chosen = drawn_indices(len(clouds.label), world_count, generator, torch.device(device))
         chosen = chosen.to(clouds.label.device)

@@ -58,11 +58,7 @@ def uniform_box(
     device: str | torch.device = "cpu",
     dtype: torch.dtype = torch.float32,
 ) -> Tensor:
-    """Return points uniform in a box around the origin [length units], shape [B, N, D].
-
-    Args:
-        box: Sides of the box [length units], one for each of D dimensions.
-    """
+    """Return points uniform in a box of D sides around the origin [length units], [B, N, D]."""
     values = as_list(box)
     if not values:
         raise NPAError(
