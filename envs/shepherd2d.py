@@ -120,6 +120,8 @@ class ShepherdTask(GardenTask[Shepherd2DEnvConfig]):
 
     config_type = Shepherd2DEnvConfig
     spaces_type = GoalBrushes
+    # With "sparse" each step away from the goal is rewarded with -1.
+    rewards_last_step_only = False
 
     def episode_context(self, start: Start, loss: Tensor, random: WorldRandom) -> ShepherdEpisode:
         """Return losses and moments of the creatures at the start, and a random goal of each."""
@@ -133,11 +135,6 @@ class ShepherdTask(GardenTask[Shepherd2DEnvConfig]):
             goal = 1.0 + drawn
         intact = super().episode_context(start, loss, random)
         return ShepherdEpisode(intact.intact_loss, intact.rise, goal, moments)
-
-    @property
-    def rewards_last_step_only(self) -> bool:
-        """False: with "sparse" each step away from the goal is rewarded with -1."""
-        return False
 
     def achieved(self, particles: Particles, context: ShepherdEpisode) -> Tensor:
         """Return the achieved goals, [B, 3]: two values that `aim` names, and lost fractions."""

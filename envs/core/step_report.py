@@ -128,7 +128,7 @@ class Episodes:
 
     @makes_plain_tensors
     def _attach(self) -> None:
-        """Make what refers to the memory of the current `report`."""
+        """Make `update`, and what the host reads, for the memory of the current `report`."""
         read = (self._endings, self.report.numbers)
         self.host_endings, self.host_numbers = (
             map(pinned_like, read) if self._endings.is_cuda else read

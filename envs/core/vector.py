@@ -229,7 +229,7 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
         return {n: self._out(v.clone() if copy else v) for n, v in values.items()}
 
     def _report_rows(self, report: StepReport) -> list[Any]:
-        """Return rewards, losses, terms and their decreases, [B] each, arrays in float64."""
+        """Return rewards, losses, terms, their decreases, [B] each: tensors or float64 arrays."""
         rows = self._out(report.numbers)
         return list(rows if isinstance(rows, Tensor) else rows.astype(np.float64))
 

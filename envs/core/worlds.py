@@ -104,7 +104,7 @@ class BatchedWorlds(WorldState):
     @torch.no_grad()
     @makes_plain_tensors
     def start(self, world_indices: Tensor, keys: Tensor | None = None) -> Start:
-        """Start episodes in worlds, int64 [B']; return where; `keys`: see `next_streams`."""
+        """Start episodes in worlds, int64 [B'], and return these; `keys`: see `next_streams`."""
         random = self.next_streams(world_indices, keys)
         check_default_dtype()
         # The first start is not captured as a graph, so that it can synchronise for checks.

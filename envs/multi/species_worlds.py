@@ -218,8 +218,6 @@ class SpeciesWorlds(WorldState):
     def step(self, action: Tensor) -> AgentOutcome:
         """Apply finite actions, [B, N, A], compute rewards, and remove agents that ended.
 
-        The host reads whether each agent is out of bounds, one byte per agent.
-
         Raises:
             DivergedError: An agent is out of bounds, and `on_divergence` is "raise".
         """
@@ -402,10 +400,7 @@ class SpeciesWorlds(WorldState):
 
 
 class Cohort:
-    """Worlds of a batch with the same remaining particles, stepped together.
-
-    On CUDA the second step is captured as a graph; only later steps regain the time it takes.
-    """
+    """Worlds of a batch with the same remaining particles, stepped together, on CUDA by graphs."""
 
     def __init__(
         self,

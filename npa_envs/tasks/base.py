@@ -279,10 +279,7 @@ class ParticleTask(Generic[ConfigT]):
         raise NotImplementedError
 
     def penalties(self, worlds: Particles) -> dict[str, tuple[float, Tensor]]:
-        """Return the terms that the loss adds to `compare`: name -> (weight, term of shape []).
-
-        By default "overflow" penalises states outside of [-1, 1].
-        """
+        """Return what the loss adds to `compare`, name -> (weight, term []); here, "overflow"."""
         outside = (worlds.s - worlds.s.clamp(-1.0, 1.0)).abs().mean()
         return {"overflow": (self.config.overflow_weight, outside)}
 

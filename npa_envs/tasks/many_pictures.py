@@ -150,7 +150,7 @@ class ManyPictures(Morphogenesis2D):
 
     @property
     def target_picture(self) -> Tensor:
-        """Each world's target, drawn as `picture` draws worlds: RGB sums, density; [B, R, R, 4]."""
+        """Each world's target as a `picture`: red, green, blue (summed), density, [B, R, R, 4]."""
         return self._target_pictures.index_select(0, self.goal)
 
     def picture(self, x: Tensor, s: Tensor, *, centred: bool = True) -> Tensor:

@@ -273,10 +273,9 @@ UNDECIDED = (0.6, 0.6, 0.6)
 
 
 def majority(outputs: Tensor) -> Tensor:
-    """Return the class that most particles of a world score highest, int64, shape [B].
+    """Return the class to which most particles give their highest of K scores, int64, [B].
 
-    `outputs` are scores [B, N, K]. Of classes with as many particles it is the one with the
-    largest sum of scores.
+    Of classes with as many particles it is the one with the largest sum of scores.
     """
     particle_count, class_count = outputs.shape[1:]
     classes = torch.arange(class_count, device=outputs.device)

@@ -234,10 +234,7 @@ class Texture(ParticleTask[TextureConfig]):
         return self.weighted(*self.texture_losses(x, s))
 
     def particle_contributions(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return each particle's contribution to its world's texture loss, times N; [B, N].
-
-        See `contributions_to_loss`; effects are derivatives by a factor on a particle's splat.
-        """
+        """Return `contributions_to_loss` times N, by a factor on a particle's splat; [B, N]."""
         x, s = x.detach(), s.detach()
         x = x - x[:, :1]
         blank = s.new_zeros(*s.shape[:2], 3).requires_grad_()

@@ -170,7 +170,10 @@ class PatchDescriptor:
         """Directions for each image size, columns of [K PATCH², K PATCH²]."""
 
     def __call__(self, images: Tensor, *, wrap: bool, thinned: bool) -> list[Tensor]:
-        """Return for each image size the M projected patches of images, [B, M, K PATCH²]."""
+        """Return for each size of images, [B, K, R, R], M projected patches, [B, M, K PATCH²].
+
+        `wrap`: also across opposite edges; `thinned`: at most `POSITIONS` patches along each side.
+        """
         sizes = pyramid(images, len(self.directions))
         return [
             products(patches(level, PATCH, stride=stride_of(level, thinned), wrap=wrap), direction)
