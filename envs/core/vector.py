@@ -213,8 +213,7 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
     ) -> tuple[Any, Any, Any, dict[str, Any]]:
         """Return rewards, terminations, truncations and infos; `stepped`: worlds that acted."""
         worlds = self.worlds
-        report = worlds.episodes.report
-        report = report.copy() if copy else report
+        report = worlds.episodes.report.copy() if copy else worlds.episodes.report
         rows = self._report_rows(report)
         terminated, truncated, success, diverged = self._out(report.endings)
         all_worlds = self._out(report.all_worlds if copy else report.all_worlds.clone())

@@ -258,7 +258,8 @@ class BatchedWorlds(WorldState):
     @property
     def loss(self) -> Tensor:
         """Each world's current loss, shape [B]."""
-        return self.episodes.report.named.loss
+        loss: Tensor = self.episodes.report.named.loss
+        return loss
 
     def extra_info(self) -> dict[str, Tensor]:
         """Return what the task adds to infos of resets and steps, by name, [B, ...] each."""
