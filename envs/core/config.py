@@ -288,7 +288,7 @@ class EnvConfig(WorldConfig):
 
     @property
     def per_particle_reward(self) -> bool:
-        """Whether `info` has a reward for each particle, by a class of `PARTICLE_REWARDS`."""
+        """Whether `info` has a reward for each particle, by `PARTICLE_REWARDS`."""
         return self.reward not in ("dense", "sparse")
 
 

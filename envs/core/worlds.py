@@ -14,8 +14,7 @@ from torch import Tensor
 
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.graphed_steps import GraphedStarts, GraphedSteps
-from npa_envs.envs.core.particle_rewards import PARTICLE_REWARDS, ParticleRewards
-from npa_envs.envs.core.step_report import Episodes
+from npa_envs.envs.core.step_report import PARTICLE_REWARDS, ParticleRewards, WorldEpisodes
 from npa_envs.envs.core.task import (
     EnvTask,
     Start,
@@ -81,7 +80,7 @@ class BatchedWorlds(WorldState):
         """1 where a position or state of the world left its bounds in the last step, shape [B]."""
         rewarded_step = self.episode_steps if rewards_last else None
         rules = EpisodeRules(self.episode_steps, rewarded_step, config.on_divergence)
-        self.episodes = Episodes(rules, self.enabled, self.diverged)
+        self.episodes = WorldEpisodes(rules, self.enabled, self.diverged)
         self.particle_rewards: ParticleRewards | None = None
         """Rewards of single particles, where they have any."""
         if config.per_particle_reward:
