@@ -111,7 +111,7 @@ class Prepared:
         self.device, worlds = device, self.env.unwrapped.worlds
         if staggered:
             ages = torch.arange(case.world_count, device=device) * EPISODE_STEPS
-            worlds.elapsed.copy_(ages // case.world_count)
+            worlds.episodes.elapsed.copy_(ages // case.world_count)
         generator = torch.Generator(device).manual_seed(0)
         shape = (ACTION_SETS, case.world_count, case.particle_count, worlds.physics.action_dim)
         drawn = torch.rand(shape, generator=generator, device=device)
@@ -150,7 +150,7 @@ class Prepared:
         neither reads endings nor makes infos. The difference is the cost of Python.
         """
         worlds = self.env.unwrapped.worlds
-        changing = (worlds.x, worlds.s, worlds.random.steps, worlds.elapsed)
+        changing = (worlds.x, worlds.s, worlds.random.steps, worlds.episodes.elapsed)
         before = [tensor.clone() for tensor in changing]
         out = worlds.perceive()
         calm: list[float] = []

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from npa_envs.checks import check_fraction, check_non_negative, check_positive
 from npa_envs.envs.core.vector import vector_class
-from npa_envs.envs.garden.base import GardenContext, GardenEnv, GardenTask
+from npa_envs.envs.garden.base import GardenEnv, GardenTask, StartLosses
 from npa_envs.envs.garden.brushes import GardenConfig
 from npa_envs.tasks.damage import random_particle
 from npa_envs.world.brushes import push, wipe_state
@@ -74,7 +74,7 @@ class GardenerTask(GardenTask[Gardener2DEnvConfig]):
         s = wipe_state(x, s, centre=centre, radius=radius, box=box)
         return particles._replace(x=x, s=s)
 
-    def reward(self, particles: Particles, loss: Tensor, context: GardenContext) -> Tensor:
+    def reward(self, particles: Particles, loss: Tensor, context: StartLosses) -> Tensor:
         """Return rewards, [B]: 1 for a picture as at its start, 0 for one as bad as grey."""
         return (1.0 - self.lost_fraction(loss, context)).clamp_min(-1.0)
 

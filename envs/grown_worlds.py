@@ -109,10 +109,7 @@ def run_rule(
     random: WorldRandom,
     **changes: Any,
 ) -> Particles:
-    """Return worlds after `steps` steps of a rule with the constants of an environment.
-
-    `changes` replace arguments of `rollout`.
-    """
+    """Return worlds after steps of a rule with an environment's constants, or with `changes`."""
     names = ("eps", "box", "boundary", "update_prob", "dt", "position_noise")
     constants = {name: getattr(config, name) for name in names} | changes
     return rollout_particles(rule, particles, steps, generator=random, **constants)
@@ -121,10 +118,8 @@ def run_rule(
 def grow(
     rule: NPARule, config: Any, seeds: Particles, random: WorldRandom, **changes: Any
 ) -> Particles:
-    """Return seeds after `grow_steps` steps of a rule; other arguments as in `run_rule`.
-
-    Worlds are grown one by one: matrix products depend in the last bit on the number of worlds.
-    """
+    """Return worlds that a rule has grown from `seeds` in `grow_steps` steps, as by `run_rule`."""
+    # One by one: matrix products depend in the last bit on the number of worlds.
     worlds = []
     for one in torch.split(torch.arange(len(seeds.x), device=seeds.x.device), 1):
         stream = random.take(one).substream(StreamId.GROWTH)

@@ -16,7 +16,7 @@ from npa_envs.envs.grown_worlds import GrownConfig, GrownTask
 from npa_envs.envs.morphogenesis2d import PictureEnvTask
 from npa_envs.errors import shown
 from npa_envs.rule.rule import COLOUR_OFFSET
-from npa_envs.tasks.damage import damage_worlds
+from npa_envs.tasks.damage import DAMAGE_SIZES, damage_worlds
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import StreamId, WorldRandom
 
@@ -26,8 +26,9 @@ RANDOM_DAMAGE = "random"
 RANDOM_KINDS = ("wipe", "cut", "clump")
 """Kinds that "random" draws from."""
 
-SIZES = {"wipe": 0.3, "cut": 0.1, "clump": 0.2, "noise": 0.05}
-"""Default radius, width, radius and standard deviation [length units]."""
+SIZES = DAMAGE_SIZES | {"wipe": 0.3}
+"""Default sizes of damage [length units]. A wipe is larger than the usual one, whose radius is that
+which rules of the training preset "best" learn to heal."""
 
 MIN_RISE = 0.02
 """Damage that raises the loss by a smaller fraction than this has no success threshold."""

@@ -131,7 +131,7 @@ class CodeSpaces(ParticleSpaces):
 
 
 class PictureGoals(NamedTuple):
-    """Goals of B episodes, as indices of the rule's pictures, int64."""
+    """The `context` of B episodes: their goals, as indices of the rule's pictures, int64."""
 
     goal: Tensor
     """The current goal, shape [B]."""

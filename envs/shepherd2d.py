@@ -102,8 +102,8 @@ class GoalBrushes(BrushSpaces):
         return last
 
 
-class ShepherdContext(NamedTuple):
-    """Losses and moments of the creature at the start of B episodes, and its goal."""
+class ShepherdEpisode(NamedTuple):
+    """The `context` of B episodes: `StartLosses` and moments of the creature, and its goal."""
 
     intact_loss: Tensor
     rise: Tensor
@@ -120,9 +120,10 @@ class ShepherdTask(GardenTask[Shepherd2DEnvConfig]):
 
     config_type = Shepherd2DEnvConfig
     spaces_type = GoalBrushes
-    rewards_each_step = True
+    # With "sparse" each step away from the goal is rewarded with -1.
+    rewards_last_step_only = False
 
-    def episode_context(self, start: Start, loss: Tensor, random: WorldRandom) -> ShepherdContext:
+    def episode_context(self, start: Start, loss: Tensor, random: WorldRandom) -> ShepherdEpisode:
         """Return losses and moments of the creatures at the start, and a random goal of each."""
         moments, reach = moments_of(start.x), self.config.goal_reach
         drawn = uniform_ball(len(loss), 1, 2, reach, generator=random, device=self.device)[:, 0]
@@ -133,9 +134,9 @@ class ShepherdTask(GardenTask[Shepherd2DEnvConfig]):
         else:
             goal = 1.0 + drawn
         intact = super().episode_context(start, loss, random)
-        return ShepherdContext(intact.intact_loss, intact.rise, goal, moments)
+        return ShepherdEpisode(intact.intact_loss, intact.rise, goal, moments)
 
-    def achieved(self, particles: Particles, context: ShepherdContext) -> Tensor:
+    def achieved(self, particles: Particles, context: ShepherdEpisode) -> Tensor:
         """Return the achieved goals, [B, 3]: two values that `aim` names, and lost fractions."""
         x, s, *_ = particles
         first, now = context.moments, moments_of(x)
@@ -151,7 +152,7 @@ class ShepherdTask(GardenTask[Shepherd2DEnvConfig]):
         loss = sum(self.losses(aligned, s).values(), torch.zeros_like(values[:, 0]))
         return torch.cat((values, self.lost_fraction(loss, context)[:, None]), dim=1)
 
-    def desired(self, context: ShepherdContext) -> Tensor:
+    def desired(self, context: ShepherdEpisode) -> Tensor:
         """Return the desired goals, [B, 3]: two values that `aim` names, and `lost_limit`."""
         limit = torch.full_like(context.goal[:, :1], self.config.lost_limit)
         return torch.cat((context.goal, limit), dim=1)
@@ -166,19 +167,19 @@ class ShepherdTask(GardenTask[Shepherd2DEnvConfig]):
         nearness = -distance * (1.0 / self.config.goal_reach)
         return nearness - self.config.reward_weight * excess.clamp(min=0.0)
 
-    def reward(self, particles: Particles, loss: Tensor, context: ShepherdContext) -> Tensor:
+    def reward(self, particles: Particles, loss: Tensor, context: ShepherdEpisode) -> Tensor:
         """Return rewards [B] of a step, from the particles after it and the goals in `context`."""
         achieved = self.achieved(particles, context)
         return self.goal_reward(achieved, self.desired(context)).to(torch.float32)
 
-    def context_info(self, particles: Particles, context: ShepherdContext) -> dict[str, Tensor]:
+    def context_info(self, particles: Particles, context: ShepherdEpisode) -> dict[str, Tensor]:
         """Return whether worlds are intact at their goals, distances, and lost fractions, [B]."""
         achieved, desired = self.achieved(particles, context), self.desired(context)
         distance = (achieved - desired)[:, :2].square().sum(dim=1).sqrt()
         success = (distance <= self.config.tolerance) & (achieved[:, 2] <= desired[:, 2])
         return {"is_success": success, "distance": distance, "lost": achieved[:, 2]}
 
-    def observe(self, particles: Particles, loss: Tensor, context: ShepherdContext) -> Tensor:
+    def observe(self, particles: Particles, loss: Tensor, context: ShepherdEpisode) -> Tensor:
         """Return the observation, then the achieved and the desired goal, [B, O + 6]."""
         observed = super().observe(particles, loss, context)
         goals = torch.cat((self.achieved(particles, context), self.desired(context)), dim=1)

@@ -127,7 +127,7 @@ class DamageEvents(_DamagesWorlds, AnyWrapper):
         before = float(worlds.loss[0])
         x, s, *_ = self._damaged_particles(due)
         observation = self._base.place_particles(x[0], s[0])
-        losses = self._base.losses_of(worlds.report.numbers[:, 0].tolist())
+        losses = self._base.losses_of(worlds.episodes.report.numbers[:, 0].tolist())
         losses["loss_damage"] = info.get("loss_damage", 0.0) + losses["loss"] - before
         return observation, info | losses | self._base._of_world(worlds.extra_info())
 
@@ -167,7 +167,7 @@ class VectorDamageEvents(_DamagesWorlds, EpisodeWrapper):
         output = base.config.output
         # Arrays are float64, as in environments, and differences equal those of single ones.
         dtype = torch.float64 if output == "numpy" else torch.float32
-        now = base.losses_of(worlds.report.numbers.to(dtype, copy=True))
+        now = base.losses_of(worlds.episodes.report.numbers.to(dtype, copy=True))
         now["loss_damage"] = now["loss"] - before.to(dtype)
         now["_loss_damage"] = torch.from_numpy(damaged).to(base.task.device)
         changed = {name: to_output(value, output) for name, value in now.items()}

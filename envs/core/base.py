@@ -18,7 +18,7 @@ from torch import Tensor
 
 from npa_envs.checks import number_tensor
 from npa_envs.envs.core.config import EnvConfig
-from npa_envs.envs.core.step_report import named_terms
+from npa_envs.envs.core.step_report import StepNumbers, named_terms
 from npa_envs.envs.core.task import EnvTask
 from npa_envs.envs.core.worlds import BatchedWorlds
 from npa_envs.errors import NPAError
@@ -63,31 +63,38 @@ def to_output(tensor: Tensor, output: str) -> Any:
 
 
 def batch_tensor(
-    action: Any,
-    world_count: int | None,
-    shape: tuple[int, ...],
-    letters: str,
-    *,
-    discrete: bool = False,
+    action: Any, world_count: int | None, shape: tuple[int, ...], letters: str
 ) -> Tensor:
     """Return checked actions, float32, [B, *shape]; `world_count` None: of one world, [*shape].
 
-    `letters` names the dimensions of `shape` in the error message, such as "N, A". `discrete`
-    actions are whole numbers, int64.
+    `letters` names the dimensions of `shape` in the error message, such as "N, A".
     """
-    expected = shape
-    if world_count is not None:
-        expected, letters = (world_count, *shape), ", ".join(filter(None, ("B", letters)))
-    if not discrete:
-        checked = action_tensor("action", action, expected, "env.action_space", f"[{letters}] = ")
-        return checked[None] if world_count is None else checked
+    expected, letters = _batch_shape(world_count, shape, letters)
+    checked = action_tensor("action", action, expected, "env.action_space", letters)
+    return checked[None] if world_count is None else checked
+
+
+def batch_choices(
+    action: Any, world_count: int | None, shape: tuple[int, ...], letters: str
+) -> Tensor:
+    """Return the checked whole numbers of discrete actions, int64; else as `batch_tensor`."""
+    expected, letters = _batch_shape(world_count, shape, letters)
     choices = number_tensor("action", action)
     if tuple(choices.shape) != expected or choices.is_floating_point():
         raise NPAError(
-            f"action must be whole numbers of shape [{letters}] = {expected}, got "
+            f"action must be whole numbers of shape {letters}{expected}, got "
             f"{tuple(choices.shape)} of {choices.dtype}: see env.action_space"
         )
     return choices.long().view(-1, *shape)
+
+
+def _batch_shape(
+    world_count: int | None, shape: tuple[int, ...], letters: str
+) -> tuple[tuple[int, ...], str]:
+    """Return the shape that actions must have, and its dimensions' names for errors."""
+    if world_count is None:
+        return shape, f"[{letters}] = "
+    return (world_count, *shape), f"[{', '.join(filter(None, ('B', letters)))}] = "
 
 
 def action_tensor(
@@ -128,15 +135,11 @@ class ShownEnv:
     worlds: Any
     """The batch of worlds."""
     metadata: Any
-    _is_batch: ClassVar[bool] = False
     _started = False
     _window: Window | None = None
 
-    def render(self) -> Any:
-        """Return a picture, uint8, [R, R, 3], or a tuple of one for each world of a batch.
-
-        The result is None unless `render_mode` is "rgb_array".
-        """
+    def _pictures(self) -> NDArray[np.uint8] | None:
+        """Return a picture of each world, uint8, [B, R, R, 3], if `render_mode` is "rgb_array"."""
         if not self._started:
             raise NPAError("render needs worlds: call reset first")
         if self.config.render_mode is None:
@@ -147,8 +150,8 @@ class ShownEnv:
         # A window is updated by reset and step.
         if self.config.render_mode != "rgb_array":
             return None
-        pictures = tuple(self.worlds.pictures(self.worlds.world_count))
-        return pictures if self._is_batch else pictures[0]
+        pictures: NDArray[np.uint8] = self.worlds.pictures(self.worlds.world_count)
+        return pictures
 
     def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> dict[str, Any]:
         """Return what Jupyter displays: text, and after a reset pictures of the first worlds."""
@@ -181,7 +184,7 @@ class ShownEnv:
     def _out(self, values: Tensor | NDArray[Any]) -> Any:
         """Return values as an array, or as a tensor on the device if `output` is "torch"."""
         if isinstance(values, np.ndarray) and self.config.output == "torch":
-            return to_device_async(values, self.worlds.device)
+            return to_device_async(values, self.config.torch_device)
         return to_output(values, self.config.output) if isinstance(values, Tensor) else values
 
 
@@ -204,14 +207,15 @@ class WorldsEnv(ShownEnv):
         self.spaces: ParticleSpaces = spaces_type(self.worlds.physics, self.config)
 
     def _change_worlds(
-        self, change: Callable[..., Any], worlds: Tensor, values: Any, buffer: Tensor | None = None
+        self,
+        change: Callable[..., Any],
+        world_indices: Tensor,
+        values: Any,
+        buffer: Tensor | None = None,
     ) -> Tensor:
-        """Call `change(worlds, values)`, values of worlds of indices [B']; return all observations.
-
-        They are written to `buffer` if it is given, [B, ...].
-        """
+        """Call `change(world_indices, values)`; return all observations, in `buffer` if given."""
         with self.worlds.device_context():
-            change(worlds, values)
+            change(world_indices, values)
             observation: Tensor = self.worlds.perceive(buffer)
         self._started = True
         self._show()
@@ -219,12 +223,12 @@ class WorldsEnv(ShownEnv):
 
     def losses_of(self, numbers: Any) -> dict[str, Any]:
         """Return the loss and its terms by their names in infos, from `StepReport.numbers`."""
-        names = self.worlds.term_names
-        return {"loss": numbers[1]} | named_terms("loss", names, numbers[2 : 2 + len(names)])
+        named, names = StepNumbers.from_rows(numbers), self.worlds.episodes.term_names
+        return {"loss": named.loss} | named_terms("loss", names, named.terms)
 
     def _improvements(self, numbers: Any) -> dict[str, Any]:
-        names = self.worlds.term_names
-        return named_terms("reward", names, numbers[2 + len(names) :])
+        improvements = StepNumbers.from_rows(numbers).improvements
+        return named_terms("reward", self.worlds.episodes.term_names, improvements)
 
     def _show(self) -> None:
         self._show_in_window(self.spec.id if self.spec is not None else type(self).__name__)

@@ -98,10 +98,7 @@ class Interface(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class WorldConfig:
-    """Fields of all environments, of one species or several.
-
-    Lengths are in length units: pictures show [-1, 1] x [-1, 1].
-    """
+    """Fields of all environments; lengths are in length units: pictures show [-1, 1] x [-1, 1]."""
 
     choices: ClassVar[dict[str, tuple[str | None, ...]]] = {
         "moment_inverse": get_args(MomentInverse),
@@ -343,8 +340,8 @@ class EnvConfig(WorldConfig):
 
     @property
     def per_particle_reward(self) -> bool:
-        """Whether `info` has a reward for each particle."""
-        return self.reward in ("particle", "marginal")
+        """Whether `info` has a reward for each particle, by `PARTICLE_REWARDS`."""
+        return self.reward not in ("dense", "sparse")
 
 
 def check_picture_size(config: Any) -> None:

@@ -150,7 +150,7 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
             self._keyed_from = self.np_random
             keys = rng_keys(None, 1, self.np_random)
         observation = self._change_worlds(self.worlds.start, self._world, keys)
-        info = self.losses_of(self.worlds.report.numbers[:, 0].tolist())
+        info = self.losses_of(self.worlds.episodes.report.numbers[:, 0].tolist())
         info |= self._of_world(self.worlds.extra_info())
         return self.spaces.observation_output(observation[0]), info
 
@@ -171,15 +171,15 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
             diverged = bool(endings[0] & DIVERGED)
             ending = int(worlds.handle_diverged(endings, observation)[0])
         terminated, truncated = ending & (SUCCESS | DIVERGED) != 0, ending & TIME_LIMIT != 0
-        numbers = worlds.host_numbers.numpy()[:, 0].tolist()
+        numbers = worlds.episodes.host_numbers.numpy()[:, 0].tolist()
         info = self.losses_of(numbers) | self._improvements(numbers)
         info |= {"success": bool(ending & SUCCESS), "diverged": diverged}
         if terminated or truncated:
             info["reason"] = reason(ending)
         info |= self._of_world(worlds.extra_info() | worlds.step_info())
-        self._is_unrewarded = worlds.rewards_last_step_only and not (terminated or truncated)
+        self._is_unrewarded = self.task.rewards_last_step_only and not (terminated or truncated)
         self._show()
-        returned = self.spaces.observation_output(worlds.host_observation(observation)[0])
+        returned = self.spaces.observation_output(worlds.steps.host_observation(observation)[0])
         return returned, numbers[0], terminated, truncated, info
 
     def particles(self) -> tuple[Tensor, Tensor]:

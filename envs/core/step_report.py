@@ -1,16 +1,25 @@
-"""What a step of a batch of worlds returns: rewards, losses and endings."""
+"""Episodes of a batch of worlds, and what a step reports: rewards, losses and endings."""
 
 from __future__ import annotations
 
+import contextlib
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from npa_envs.envs.core.task import EnvTask, checked_tensor
-from npa_envs.world.environment_steps import DIVERGED, SUCCESS, TIME_LIMIT, world_mean
+from npa_envs.world.cuda_graph import makes_plain_tensors, pinned_like
+from npa_envs.world.environment_steps import (
+    DIVERGED,
+    SUCCESS,
+    TIME_LIMIT,
+    EpisodeRules,
+    EpisodeUpdate,
+    world_mean,
+)
 from npa_envs.world.particles import Particles
 
 FLAG_ROWS = 5
@@ -18,10 +27,7 @@ FLAG_ROWS = 5
 
 
 def total(terms: Tensor) -> Tensor:
-    """Return the sum of the terms of a loss, [terms, B], in their order.
-
-    `torch.sum` may add in another order, which depends on the number of worlds.
-    """
+    """Return the sum of the terms, [terms, B]; the order of `torch.sum` would depend on B."""
     return functools.reduce(torch.add, terms.unbind())
 
 
@@ -36,21 +42,34 @@ def reason(ending: int) -> str | None:
     return next((name for bit, name in names.items() if ending & bit), None)
 
 
+class StepNumbers(NamedTuple):
+    """Reward and losses of worlds, as tensors or arrays of shape [B], or of a single world."""
+
+    reward: Any
+    """Reward of the last step."""
+    loss: Any
+    """Loss after it."""
+    terms: Any
+    """The terms of the loss, one row per term."""
+    improvements: Any
+    """Decrease of each term in the last step, one row per term."""
+
+    @classmethod
+    def from_rows(cls, rows: Any) -> StepNumbers:
+        """Return the rows of `StepReport.numbers` by name, or those of one of its columns."""
+        term_count = len(rows) // 2 - 1
+        return cls(rows[0], rows[1], rows[2 : 2 + term_count], rows[2 + term_count :])
+
+
 class StepReport(NamedTuple):
     """Rewards, losses and flags of each world, as views of one buffer that is copied at once."""
 
     buffer: Tensor
     """The memory of the fields below, uint8."""
     numbers: Tensor
-    """The rows of the next four fields, float32, shape [2 + 2 terms, B]."""
-    reward: Tensor
-    """Rewards of the last step, shape [B]."""
-    loss: Tensor
-    """Losses, shape [B]."""
-    terms: Tensor
-    """The terms of each loss, shape [terms, B]."""
-    improvements: Tensor
-    """Decrease of each term of the loss in the last step, shape [terms, B]."""
+    """Reward, loss, its terms and their decreases, float32, shape [2 + 2 terms, B]."""
+    named: StepNumbers
+    """The rows of `numbers` by name."""
     endings: Tensor
     """Terminated, truncated, success, diverged, bool, shape [4, B]."""
     all_worlds: Tensor
@@ -71,9 +90,7 @@ class StepReport(NamedTuple):
         numbers, flags = buffer.view(-1, world_count).tensor_split((-FLAG_ROWS,))
         numbers = numbers.flatten().view(torch.float32).view(-1, world_count)
         flags = flags.view(torch.bool)
-        terms, improvements = numbers[2:].chunk(2)
-        rows = (numbers[0], numbers[1], terms, improvements)
-        return cls(buffer, numbers, *rows, flags[:-1], flags[-1])
+        return cls(buffer, numbers, StepNumbers.from_rows(numbers), flags[:-1], flags[-1])
 
     def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
         # Unpickled views would not share the buffer's memory.
@@ -84,35 +101,112 @@ class StepReport(NamedTuple):
         return self.from_buffer(self.buffer.clone(), len(self.all_worlds))
 
 
-class ParticleRewards:
-    """Rewards of single particles: the decrease of their own losses, or their marginal gains."""
+class WorldEpisodes:
+    """The current episodes of B worlds: ages, losses, rewards, endings, and the host's copies.
 
-    def __init__(self, particles: Particles, *, by_loss: bool) -> None:
+    `enabled`, uint8 [1], says whether the last step was made, and `diverged`, uint8 [B], in which
+    worlds it diverged; each `update` reads both.
+    """
+
+    def __init__(self, rules: EpisodeRules, enabled: Tensor, diverged: Tensor) -> None:
+        self._rules, self._enabled, self._diverged = rules, enabled, diverged
+        self.elapsed = torch.zeros_like(diverged, dtype=torch.int32)
+        """Steps since the start of each episode, shape [B]."""
+        self._start_loss = torch.zeros_like(diverged, dtype=torch.float32)
+        self._success_loss = torch.zeros_like(self._start_loss)
+        # Each world's ending, then `enabled`.
+        self._endings = diverged.new_zeros(len(diverged) + 1)
+        self.term_names: tuple[str, ...] = ()
+        """Names of the terms of the loss, known once worlds have been placed."""
+        self.report = StepReport.empty(len(diverged), 0, diverged.device)
+        """What a step returns apart from the observation."""
+        self._attach()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | dict.fromkeys(("update", "host_endings", "host_numbers"))
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._attach()
+
+    @makes_plain_tensors
+    def _attach(self) -> None:
+        """Make `update`, and what the host reads, for the memory of the current `report`."""
+        read = (self._endings, self.report.numbers)
+        self.host_endings, self.host_numbers = (
+            map(pinned_like, read) if self._endings.is_cuda else read
+        )
+        self.update = EpisodeUpdate(
+            self._rules,
+            enabled=self._enabled,
+            diverged=self._diverged,
+            first_loss=self._start_loss,
+            success_loss=self._success_loss,
+            elapsed=self.elapsed,
+            numbers=self.report.numbers,
+            flags=self.report.endings,
+            endings=self._endings,
+        )
+
+    def put_losses(self, world_indices: Tensor, names: tuple[str, ...], terms: Tensor) -> None:
+        """Store the named terms, [terms, B'], of the losses of replaced worlds, unrewarded."""
+        if not self.term_names:
+            self.term_names = names
+            self.report = StepReport.empty(len(self.elapsed), len(names), terms.device)
+            self._attach()
+        zeros = torch.zeros_like(terms)
+        numbers = torch.cat((zeros[:1], total(terms)[None], terms, zeros))
+        self.report.numbers.index_copy_(1, world_indices, numbers)
+        self.report.endings.index_fill_(1, world_indices, False)
+
+    def begin(self, world_indices: Tensor, success_loss: Tensor | None) -> None:
+        """Begin episodes of worlds, int64 [B'], that succeed at a loss, [B'], or never (None)."""
+        self.elapsed.index_fill_(0, world_indices, 0)
+        self._start_loss[world_indices] = self.report.named.loss[world_indices]
+        if success_loss is None:
+            self._success_loss.index_fill_(0, world_indices, -torch.inf)
+        else:
+            self._success_loss[world_indices] = success_loss
+
+    @contextlib.contextmanager
+    def unrewarded(self, world_indices: Tensor) -> Iterator[None]:
+        """Keep ages, rewards and endings while the `with` block begins episodes of worlds."""
+        before, elapsed = self.report.copy(), self.elapsed.clone()
+        yield
+        self.elapsed.copy_(elapsed)
+        now, earlier = self.report.named, before.named
+        now.reward[world_indices] = earlier.reward[world_indices]
+        now.improvements[:, world_indices] = earlier.improvements[:, world_indices]
+        self.report.endings.copy_(before.endings)
+        if len(self.elapsed) == 1:
+            # The host reads the numbers of a single world alone; this synchronises.
+            self.host_numbers.copy_(self.report.numbers)
+
+    def copy_to_host(self) -> None:
+        """Copy endings, and the numbers of a single world, to the host without waiting."""
+        if self._endings.is_cuda:
+            self.host_endings.copy_(self._endings, non_blocking=True)
+            if len(self.elapsed) == 1:
+                self.host_numbers.copy_(self.report.numbers, non_blocking=True)
+
+
+class ParticleRewards:
+    """Base class: rewards of the particles of B worlds; a step calls `gains`, then `write`."""
+
+    loss: Tensor | None = None
+    """Each particle's loss, shape [B, N], if it is stored."""
+
+    def __init__(self, particles: Particles) -> None:
         self.reward = torch.zeros_like(particles.x[..., 0])
         """Each particle's reward of the last step, shape [B, N]."""
-        self.loss = torch.zeros_like(self.reward) if by_loss else None
-        """Each particle's loss, shape [B, N]; None for marginal gains."""
-        self._before = particles if by_loss else particles.map(torch.clone)
 
-    def place(self, worlds: Tensor, task: EnvTask[Any], particles: Particles) -> None:
-        """Store the new particles of the worlds of indices `worlds`, int64 [B']; rewards are 0."""
-        self.reward.index_fill_(0, worlds, 0.0)
-        if self.loss is None:
-            self._before.put_(worlds, particles)
-        else:
-            self.loss[worlds] = self._losses(task, particles)
+    def place(self, world_indices: Tensor, task: EnvTask[Any], placed: Particles) -> None:
+        """Set rewards to 0 in worlds, int64 [B'], whose particles `placed` replaces."""
+        self.reward.index_fill_(0, world_indices, 0.0)
 
     def gains(self, task: EnvTask[Any], particles: Particles) -> Tensor:
-        """Return what each particle gained in a step, [B, N]; store these particles."""
-        if self.loss is None:
-            gains = task.particle_gains(self._before[:2], particles[:2])
-            gains = checked_tensor(task, "particle_gains", "gains", gains, self.reward.shape)
-            self._before.copy_(particles)
-            return gains
-        losses = self._losses(task, particles)
-        gains = self.loss - losses
-        self.loss.copy_(losses)
-        return gains
+        """Return what each particle gained by the step that ended at `particles`, [B, N]."""
+        raise NotImplementedError
 
     def write(self, gains: Tensor, reward: Tensor, by_world: Tensor, enabled: Tensor) -> None:
         """Write the rewards of a step from `gains`, [B, N], and the worlds' rewards, [B].
@@ -120,13 +214,61 @@ class ParticleRewards:
         Particles of worlds in `by_world`, bool [B], get the world's reward. Nothing changes unless
         `enabled`, uint8 [1].
         """
-        if self.loss is None:
-            # The same for all, so that a world's mean is its reward.
-            missed = reward - world_mean(gains[..., None])[:, 0]
-            gains = gains + missed[:, None]
         rewards = torch.where(by_world[:, None], reward[:, None], gains)
         self.reward.copy_(torch.where(enabled.bool(), rewards, self.reward))
+
+
+class LossDecreases(ParticleRewards):
+    """`reward="particle"`: the decrease of each particle's own loss."""
+
+    def __init__(self, particles: Particles) -> None:
+        super().__init__(particles)
+        self.loss: Tensor = torch.zeros_like(self.reward)
+
+    def place(self, world_indices: Tensor, task: EnvTask[Any], placed: Particles) -> None:
+        """Set rewards to 0, and store the losses of the placed particles."""
+        super().place(world_indices, task, placed)
+        self.loss[world_indices] = self._losses(task, placed)
+
+    def gains(self, task: EnvTask[Any], particles: Particles) -> Tensor:
+        """Return the decrease of each particle's loss, [B, N]; store the new losses."""
+        losses = self._losses(task, particles)
+        gains = self.loss - losses
+        self.loss.copy_(losses)
+        return gains
 
     def _losses(self, task: EnvTask[Any], particles: Particles) -> Tensor:
         losses = task.particle_losses(particles.x, particles.s)
         return checked_tensor(task, "particle_losses", "losses", losses, particles.x.shape[:2])
+
+
+class MarginalGains(ParticleRewards):
+    """`reward="marginal"`: what each particle's action contributed to the world's reward."""
+
+    def __init__(self, particles: Particles) -> None:
+        super().__init__(particles)
+        self._before = particles.map(torch.clone)
+
+    def place(self, world_indices: Tensor, task: EnvTask[Any], placed: Particles) -> None:
+        """Set rewards to 0, and store the placed particles."""
+        super().place(world_indices, task, placed)
+        self._before.put_(world_indices, placed)
+
+    def gains(self, task: EnvTask[Any], particles: Particles) -> Tensor:
+        """Return the task's `particle_gains`, [B, N]; store the new particles."""
+        gains = task.particle_gains(self._before[:2], particles[:2])
+        gains = checked_tensor(task, "particle_gains", "gains", gains, self.reward.shape)
+        self._before.copy_(particles)
+        return gains
+
+    def write(self, gains: Tensor, reward: Tensor, by_world: Tensor, enabled: Tensor) -> None:
+        """Write gains, shifted by a constant in each world so that their mean is its reward."""
+        missed = reward - world_mean(gains[..., None])[:, 0]
+        super().write(gains + missed[:, None], reward, by_world, enabled)
+
+
+PARTICLE_REWARDS: dict[str, type[ParticleRewards]] = {
+    "particle": LossDecreases,
+    "marginal": MarginalGains,
+}
+"""How single particles are rewarded, by `reward=`; "dense" and "sparse" reward worlds alone."""

@@ -91,10 +91,7 @@ class WorldTask(Generic[AnyConfig]):
     def draw_particles(
         self, particles: Particles, style: str, azimuth: float = 0.0
     ) -> NDArray[np.uint8]:
-        """Return a picture of each world in one of `STYLES`, shape [B, R, R, 3].
-
-        `azimuth` [degrees] is that of the camera of 3D worlds.
-        """
+        """Return pictures in one of `STYLES`, [B, R, R, 3]; `azimuth`: of 3D cameras [degrees]."""
         return draw_worlds(
             particles.x,
             particles.s,
@@ -192,17 +189,31 @@ class EnvTask(WorldTask[Config]):
     def particle_gains(self, before: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor]) -> Tensor:
         """Return N times what each particle's action contributed to the loss's decrease, [B, N].
 
-        `before` and `after` are positions and states around a step. The default estimates it from
-        the gradient of `losses` by `marginal_gains`.
+        `before` and `after` are positions and states around a step. By default the contribution is
+        minus the particle's change times the gradient of `losses` in the middle of the step. It is
+        the particle's Shapley value: exactly for losses that are quadratic in the changes, and up
+        to third order for others. Detached parts of the loss do not count.
         """
-        gains = marginal_gains(self.losses, before, after, self.periodic_sides)
-        if gains is None:
-            raise NPAError(
-                f"the losses of {type(self).__name__} must be differentiable for "
-                "reward='marginal', but no gradient leads from them to positions or states: choose "
-                "'particle' or 'dense', or give it a particle_gains method"
-            )
-        return gains
+        box = self.periodic_sides
+        moved, changed = wrapped(after[0] - before[0], box), after[1] - before[1]
+        with torch.enable_grad():
+            x = wrapped(after[0] - 0.5 * moved, box).requires_grad_()
+            s = (after[1] - 0.5 * changed).requires_grad_()
+            loss = torch.stack(list(self.losses(x, s).values())).sum()
+            if not loss.requires_grad:
+                raise NPAError(
+                    f"the losses of {type(self).__name__} must be differentiable for "
+                    "reward='marginal', but no gradient leads from them to positions or states: "
+                    "choose 'particle' or 'dense', or give it a particle_gains method"
+                )
+            slopes = torch.autograd.grad(loss, (x, s), allow_unused=True)
+        gains = torch.zeros_like(moved[..., 0])
+        for slope, change in zip(slopes, (moved, changed), strict=True):
+            if slope is not None:
+                # Added one by one, because torch's sums have no fixed order.
+                for column in (slope * change).unbind(dim=-1):
+                    gains = gains - column
+        return gains * gains.shape[1]
 
     @property
     def periodic_sides(self) -> tuple[float, ...] | None:
@@ -214,6 +225,11 @@ class EnvTask(WorldTask[Config]):
     def start_is_short(self) -> bool:
         """Whether `start` takes few operations, so that on CUDA it is captured as a graph."""
         return not self.grows or self.config.seed_pool > 0
+
+    @property
+    def rewards_last_step_only(self) -> bool:
+        """Whether only the last step of an episode is rewarded."""
+        return self.config.reward == "sparse"
 
     def start(self, random: WorldRandom) -> Start:
         """Return worlds at the beginning of their episodes: fresh ones, or some from the pool."""
@@ -232,14 +248,11 @@ class EnvTask(WorldTask[Config]):
         return 0
 
     def pooled(self, indices: Tensor) -> Start:
-        """Return worlds of the pool, by their indices below `seed_pool`, int64, shape [B].
-
-        On a CPU each is made when it is first needed; on CUDA, where reading the indices would
-        synchronise, the first call makes all of them.
-        """
+        """Return worlds of the pool by indices below `seed_pool`, int64 [B], made if needed."""
         if self.device.type == "cpu":
             missing = sorted(set(indices.tolist()) - self._pooled)
         else:
+            # Reading the indices would synchronise, so the first call makes all worlds.
             missing = list(range(self.config.seed_pool)) if self._pool is None else []
         if missing:
             seeds = [self.first_pool_seed + index for index in missing]
@@ -256,10 +269,7 @@ class EnvTask(WorldTask[Config]):
         return Start(taken.x, taken.s, goal=taken.goal)
 
     def draw(self, particles: Particles, steps: NDArray[np.int64]) -> NDArray[np.uint8]:
-        """Return a picture of each world, shape [B, R, R, 3].
-
-        The camera of 3D worlds turns with `steps`, the steps since each world's start, [B].
-        """
+        """Return pictures, [B, R, R, 3]; 3D cameras turn with `steps` since worlds began, [B]."""
         style = self.config.render_style
         if self.space_dim == 2:
             return self.draw_particles(particles, style)
@@ -325,38 +335,6 @@ class TargetEnvTask(EnvTask[Config]):
         losses: Tensor = self.task.particle_contributions(x, s)
         return losses
 
-
-def marginal_gains(
-    losses: Callable[[Tensor, Tensor], Mapping[str, Tensor]],
-    before: tuple[Tensor, Tensor],
-    after: tuple[Tensor, Tensor],
-    box: tuple[float, ...] | None,
-) -> Tensor | None:
-    """Return marginal rewards: how much each particle's action lowered the loss, times N; [B, N].
-
-    It is the change that the particle made in the step, times the gradient of the loss in the
-    middle of the step. The mean over the particles is the decrease of the loss, and the reward is
-    the particle's Shapley value: exactly for losses that are quadratic in the changes, and up to
-    third order for others. Detached parts of the loss do not count.
-
-    `losses` maps positions and states to the named parts of each world's loss, shape [B] each. The
-    result is None if no gradient flows from them to positions or states.
-    """
-    moved, changed = wrapped(after[0] - before[0], box), after[1] - before[1]
-    with torch.enable_grad():
-        x = wrapped(after[0] - 0.5 * moved, box).requires_grad_()
-        s = (after[1] - 0.5 * changed).requires_grad_()
-        total = torch.stack(list(losses(x, s).values())).sum()
-        if not total.requires_grad:
-            return None
-        slopes = torch.autograd.grad(total, (x, s), allow_unused=True)
-    gains = torch.zeros_like(moved[..., 0])
-    for slope, change in zip(slopes, (moved, changed), strict=True):
-        if slope is not None:
-            # Added one by one, because torch's sums have no fixed order.
-            for column in (slope * change).unbind(dim=-1):
-                gains = gains - column
-    return gains * gains.shape[1]
 
 
 # Checks of what tasks return: a mistake in a custom task would silently give wrong rewards.

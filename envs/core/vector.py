@@ -120,7 +120,7 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
         self._ended[chosen] = False
         which = np.zeros(self.num_envs, dtype=bool)
         which[chosen] = True
-        values = self.losses_of(self._report_rows(self.worlds.report.copy()))
+        values = self.losses_of(self._report_rows(self.worlds.episodes.report.copy()))
         values |= self._returned_values(self.worlds.extra_info())
         return self.spaces.observation_output(observation), with_masks(values, self._mask(which))
 
@@ -207,7 +207,7 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
     ) -> tuple[Any, Any, Any, dict[str, Any]]:
         """Return rewards, terminations, truncations and infos; `stepped`: worlds that acted."""
         worlds = self.worlds
-        report = worlds.report.copy() if copy else worlds.report
+        report = worlds.episodes.report.copy() if copy else worlds.episodes.report
         rows = self._report_rows(report)
         terminated, truncated, success, diverged = self._out(report.endings)
         all_worlds = self._out(report.all_worlds if copy else report.all_worlds.clone())
@@ -222,7 +222,7 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
         return {n: self._out(v.clone() if copy else v) for n, v in values.items()}
 
     def _report_rows(self, report: StepReport) -> list[Any]:
-        """Return the rows of `report.numbers`: tensors, or arrays of float64 as Gymnasium's."""
+        """Return rewards, losses, terms, their decreases, [B] each: tensors or float64 arrays."""
         rows = self._out(report.numbers)
         return list(rows if isinstance(rows, Tensor) else rows.astype(np.float64))
 

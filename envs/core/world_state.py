@@ -7,7 +7,9 @@ import os
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.checks import number_tensor
@@ -15,6 +17,7 @@ from npa_envs.devices import check_device
 from npa_envs.envs.core.config import WorldConfig
 from npa_envs.envs.core.task import WorldTask
 from npa_envs.errors import DivergedError, NPAError
+from npa_envs.world.divergence import MAX_REPORT, term_name
 from npa_envs.world.environment_steps import Physics
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import WorldRandom
@@ -116,14 +119,14 @@ class WorldState:
         self.random = WorldRandom.from_keys(keys)
         """One random stream for each world."""
 
-    def next_streams(self, worlds: Tensor, keys: Tensor | None) -> WorldRandom:
-        """Return the random streams for the next episodes of worlds, by their indices, [B'].
+    def next_streams(self, world_indices: Tensor, keys: Tensor | None) -> WorldRandom:
+        """Return random streams for the next episodes of worlds, int64 [B'].
 
-        Keys, int64, shape [B'], start new sequences of episodes; None: each world's next episode.
+        `keys`, int64 [B'], begin new sequences of episodes; None: the current sequences go on.
         """
         if keys is not None:
             return WorldRandom.from_keys(keys.to(self.device))
-        random = self.random.take(worlds)
+        random = self.random.take(world_indices)
         random.restart()
         return random
 
@@ -149,6 +152,30 @@ class WorldState:
                 )
             checked.append(tensor)
         return Particles(*checked)
+
+    def divergence_error(self, diverged: NDArray[np.int64], elapsed: Tensor) -> DivergedError:
+        """Return the error for worlds, by their indices; `elapsed`, [B], are all worlds' ages."""
+        physics, lines = self.physics, []
+        for world in diverged[:MAX_REPORT].tolist():
+            numbers = torch.cat((self.x[world], self.s[world]), dim=1)
+            outside = self.x[world].abs() >= physics.limits.position
+            outside = torch.cat((outside, self.s[world].abs() >= physics.limits.state), dim=1)
+            line = f"world {world} in step {int(elapsed[world])}"
+            if bool(outside.any()):
+                particle, entry = outside.nonzero()[0].tolist()
+                line += (
+                    f": {term_name(entry, physics.space_dim)} of particle {particle} got to "
+                    f"{numbers[particle, entry].item():g} "
+                    f"({int(outside.any(dim=1).sum())} such particles)"
+                )
+            lines.append(line)
+        if len(diverged) > MAX_REPORT:
+            lines.append(f"and {len(diverged) - MAX_REPORT} more worlds")
+        return DivergedError(
+            f"numbers must stay within position_limit = {physics.limits.position:g} and "
+            f"observation_limit = {physics.limits.state:g}, but left them in {'; '.join(lines)}: "
+            "take smaller actions, raise the limits, or choose on_divergence='terminate' or 'reset'"
+        )
 
     def device_context(self) -> contextlib.AbstractContextManager[Any]:
         """Return a context in which the worlds' device is the current one."""

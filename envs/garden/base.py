@@ -49,7 +49,7 @@ Config = TypeVar("Config", bound=GardenConfig)
 
 
 class RuleDrivenWorlds(BatchedWorlds):
-    """Worlds whose particles a rule steps; the task applies actions, observes and rewards.
+    """Worlds whose particles a rule steps; a `RuleDrivenTask` applies actions, observes, rewards.
 
     On a CPU worlds are stepped one by one, as a rule's matrix products depend in the last bit on
     the number of worlds.
@@ -58,18 +58,14 @@ class RuleDrivenWorlds(BatchedWorlds):
     task: RuleDrivenTask[Any]
 
     context: Any = None
-    """What the task's `episode_context` returned at the start of each world's episode."""
-
-    def step(self, action: Tensor, out: Tensor | None = None) -> tuple[NDArray[np.uint8], Tensor]:
-        """Apply actions that are finite, which is checked first; else as the base class."""
-        if not bool(torch.isfinite(action).all()):
-            raise not_finite(action)
-        return super().step(action, out)
+    """The `context` of all worlds' episodes, as `RuleDrivenTask` explains it."""
 
     @torch.no_grad()
     @makes_plain_tensors
     def queue(self, action: Tensor, out: Tensor | None = None) -> Tensor:
-        """Step the worlds without synchronising; return observations, [B, ...]."""
+        """Check that actions are finite, then step the worlds; return observations, [B, O]."""
+        if not bool(torch.isfinite(action).all()):
+            raise not_finite(action)
         action = action.to(self.device)
         diverged = torch.zeros_like(self.diverged, dtype=torch.bool)
         limits = self.physics.limits.position, self.physics.limits.state
@@ -79,8 +75,7 @@ class RuleDrivenWorlds(BatchedWorlds):
             value.copy_(torch.nan_to_num(new, nan=0.0).clamp(-limit, limit))
         self.diverged.copy_(diverged)
         self.evaluate()
-        if self._side_stream is not None:
-            self._side_stream.mark()
+        self.steps.mark()
         return self.perceive(out)
 
     def _stepped(self, action: Tensor) -> tuple[Tensor, Tensor]:
@@ -105,37 +100,33 @@ class RuleDrivenWorlds(BatchedWorlds):
         observed = self.task.observe(self.particles, self.loss, self.context)
         return observed if out is None else out.copy_(observed)
 
-    def restart(self, worlds: NDArray[np.int64], observation: Tensor) -> None:
-        """Start the next episodes of worlds, indices [B']; write their rows of `observation`."""
-        index = to_device_async(worlds, self.device)
+    def restart(self, world_indices: NDArray[np.int64], observation: Tensor) -> None:
+        """Start the next episodes of worlds, [B']; write their rows of `observation`, [B, O]."""
+        index = to_device_async(world_indices, self.device)
         self.start(index)
         observation[index] = self.perceive()[index]
 
-    @property
-    def rewards_last_step_only(self) -> bool:
-        """Whether only the last step of an episode is rewarded."""
-        return super().rewards_last_step_only and not self.task.rewards_each_step
-
-    def begin(self, worlds: Tensor, start: Start, *, check: bool) -> None:
-        """Begin episodes in some worlds; store what the task's `episode_context` returns."""
-        super().begin(worlds, start, check=check)
-        draws = self.random.take(worlds).substream(StreamId.GOAL)
-        context = self.task.episode_context(start, self.loss[worlds], draws)
+    def begin(self, world_indices: Tensor, start: Start, *, check: bool) -> None:
+        """Begin episodes with `start` in worlds, int64 [B'], and store their `context`."""
+        super().begin(world_indices, start, check=check)
+        draws = self.random.take(world_indices).substream(StreamId.GOAL)
+        context = self.task.episode_context(start, self.loss[world_indices], draws)
         if self.context is None:
             shapes = ((self.world_count, *value.shape[1:]) for value in context)
             self.context = type(context)(*map(Tensor.new_zeros, context, shapes))
         for stored, value in zip(self.context, context, strict=True):
-            stored[worlds] = value
+            stored[world_indices] = value
 
     def write_rewards(self, terms: Tensor) -> None:
         """Write the task's own rewards and the endings; then let the task change the goals."""
         super().write_rewards(terms)
         rewards = self.task.reward(self.particles, self.loss, self.context)
-        if self.rewards_last_step_only:
-            terminated, truncated, *_ = self.report.endings
+        report = self.episodes.report
+        if self.task.rewards_last_step_only:
+            terminated, truncated, *_ = report.endings
             rewards = torch.where(terminated | truncated, rewards, 0.0)
-        self.report.reward.copy_(rewards)
-        self.task.next_goals(self.elapsed, self.context, self.goal)
+        report.named.reward.copy_(rewards)
+        self.task.next_goals(self.episodes.elapsed, self.context, self.goal)
 
     def extra_info(self) -> dict[str, Tensor]:
         """Return what the task's `context_info` adds to infos, by name, [B, ...] each."""
@@ -177,12 +168,13 @@ class TargetDeficit:
 
 
 class RuleDrivenTask(PictureEnvTask[AnyPicture]):
-    """Base class of tasks whose worlds a rule steps while an agent acts on them."""
+    """Base class of tasks whose worlds a rule steps while an agent acts on them.
+
+    A `context` is what `episode_context` returned for the worlds' current episodes: a named tuple
+    of tensors, [B, ...], that observations and rewards need besides the particles.
+    """
 
     worlds_type: ClassVar[type[BatchedWorlds] | None] = RuleDrivenWorlds
-
-    rewards_each_step: ClassVar[bool] = False
-    """Whether `reward="sparse"` also rewards each step."""
 
     def step(
         self, x: Tensor, s: Tensor, action: Tensor, random: WorldRandom
@@ -195,10 +187,7 @@ class RuleDrivenTask(PictureEnvTask[AnyPicture]):
         raise NotImplementedError
 
     def episode_context(self, start: Start, loss: Tensor, random: WorldRandom) -> Any:
-        """Return what observations and rewards need of the starts of B episodes.
-
-        It is a named tuple of tensors, [B, ...]; `loss` are the losses at the starts, [B].
-        """
+        """Return the `context` of B episodes that begin; `loss`, [B], are the losses of `start`."""
         raise NotImplementedError
 
     def reward(self, particles: Particles, loss: Tensor, context: Any) -> Tensor:
@@ -206,7 +195,7 @@ class RuleDrivenTask(PictureEnvTask[AnyPicture]):
         raise NotImplementedError
 
     def next_goals(self, elapsed: Tensor, context: Any, goal: Tensor) -> None:
-        """Change `goal`, [B], in place after a step, by default not; `elapsed`: steps, [B]."""
+        """Change `goal`, [B], in place after step `elapsed`, [B], of episodes; by default not."""
 
     def context_info(self, particles: Particles, context: Any) -> dict[str, Tensor]:
         """Return what the task adds to infos, by name, [B, ...] each; by default nothing."""
@@ -220,8 +209,8 @@ def coarse(pictures: Tensor, size: int) -> Tensor:
     return observed.clamp(-OBSERVATION_LIMIT, OBSERVATION_LIMIT)
 
 
-class GardenContext(NamedTuple):
-    """Losses of the picture at the start of B episodes."""
+class StartLosses(NamedTuple):
+    """The `context` of gardens: losses of the grown pictures at the start of B episodes."""
 
     intact_loss: Tensor
     """Loss of the intact picture, shape [B]."""
@@ -285,7 +274,7 @@ class GardenTask(RuleDrivenTask[Config], GrownTask[Config]):
         blank = torch.zeros_like(start.s)
         grey = sum(self.losses(start.x, blank).values(), torch.zeros_like(loss))
         # The loss of a picture that did not grow may not rise at all.
-        return GardenContext(loss, (grey - loss).maximum(MIN_RISE * loss))
+        return StartLosses(loss, (grey - loss).maximum(MIN_RISE * loss))
 
     def lost_fraction(self, loss: Tensor, context: Any) -> Tensor:
         """Return each picture's lost fraction, [B]: 0 as at its start, 1 as with all states 0."""
@@ -314,11 +303,7 @@ class GardenTask(RuleDrivenTask[Config], GrownTask[Config]):
         return torch.cat((picture, self.task.target_picture - picture), dim=-1)
 
     def moments(self, particles: Particles) -> Tensor:
-        """Return first and second moments of positions and states, [B, 5 + 3 C].
-
-        `moments_of` the positions; then, relative to their mean, the means of s, x s and y s for
-        each channel.
-        """
+        """Return `moments_of` x, then means of s, x s, y s (x, y from the mean), [B, 5 + 3 C]."""
         x, s, *_ = particles
         away = x - world_mean(x)[:, None]
         values = torch.cat((s, away[..., :1] * s, away[..., 1:] * s), dim=-1)

@@ -169,7 +169,8 @@ def apply_brushes(
 ) -> tuple[Particles, Tensor | None]:
     """Return particles after all brushes at once, whose effects add up, and rates; differentiable.
 
-    Rates multiply a particle's change in a step of the rule, [B, N, 1]; None without tool "rate".
+    With the tool "rate" also return by how much to multiply each particle's change in a step of
+    the rule, dimensionless, shape [B, N, 1]; else None.
     """
     x, s, *_ = particles
     columns, action = BrushLayout.for_config(config), action.clamp(-1.0, 1.0)

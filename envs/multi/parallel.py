@@ -111,10 +111,7 @@ class CrowdEnv(AgentsEnv, KnownAgents):
         return population.x[0], population.s[0]
 
     def place_particles(self, x: Any, s: Any) -> dict[str, Any]:
-        """Replace the particles of all live agents, without a reward; return the observations.
-
-        Positions have shape [N', 2], states [N', C], as those that `particles` returns.
-        """
+        """Replace `particles`, [N', 2] and [N', C], without a reward; return the observations."""
         if not self.agents:
             raise NPAError("particles need live agents: call reset first")
         with self.worlds.device_context():

@@ -199,10 +199,7 @@ class SpeciesWorlds(WorldState):
     @torch.no_grad()
     @makes_plain_tensors
     def start(self, worlds: NDArray[np.int64], keys: Tensor | None = None) -> Tensor:
-        """Start episodes in the worlds of indices [B']; return their perception, [B', N, P].
-
-        Keys are those of `next_streams`.
-        """
+        """Start episodes in worlds, [B']; return what they perceive; keys: see `next_streams`."""
         self._disband()
         index = to_device_async(worlds, self.device)
         random = self.next_streams(index, keys)
@@ -220,8 +217,6 @@ class SpeciesWorlds(WorldState):
     @makes_plain_tensors
     def step(self, action: Tensor) -> AgentOutcome:
         """Apply finite actions, [B, N, A], compute rewards, and remove agents that ended.
-
-        The host reads whether each agent is out of bounds, one byte per agent.
 
         Raises:
             DivergedError: An agent is out of bounds, and `on_divergence` is "raise".
@@ -400,10 +395,7 @@ class SpeciesWorlds(WorldState):
 
 
 class Cohort:
-    """Worlds of a batch with the same remaining particles, stepped together.
-
-    On CUDA the second step is captured as a graph; only later steps regain the time it takes.
-    """
+    """Worlds of a batch with the same remaining particles, stepped together, on CUDA by graphs."""
 
     def __init__(
         self,
@@ -465,10 +457,7 @@ class Cohort:
         }
 
     def perception(self, population: Population | None = None, *, stepped: bool = False) -> Tensor:
-        """Return what the N' particles of each world perceive, shape [B', N', P].
-
-        `stepped`: particles are as the last step left them, so its neighbour search is reused.
-        """
+        """Return their perception, [B', N', P]; `stepped`: see `SpeciesWorlds.perception`."""
         x, s, counts, _ = population or self.population
         neighbours = self._neighbours if stepped else None
         rows = (neighbours or NeighbourState(x, s, self._physics)).perceive()

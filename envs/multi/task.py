@@ -190,10 +190,7 @@ class Population(NamedTuple):
 
 
 class SpeciesTask(WorldTask[Any]):
-    """A task of several species, with a loss for each species and each particle.
-
-    An agent's reward is the decrease of its loss in a step.
-    """
+    """A task of several species; an agent's reward is the decrease of its loss in a step."""
 
     config_type: ClassVar[type[SpeciesConfig]] = SpeciesConfig
     controls = "species"

@@ -275,7 +275,7 @@ class SymbiosisTask(PictureLossTask):
         super().__init__(config, device, (config.target, sum(config.counts)))
 
     def losses(self, population: Population) -> Mapping[str, Tensor]:
-        """Return density error and weighted colour error, by name, equal for all, [B, S]."""
+        """Return density error and weighted colour error by name, [B, S]: species have the same."""
         terms = self.picture_terms(0, population.x, population.s)
         count = len(population.counts)
         return {name: loss[:, None].expand(-1, count) for name, loss in terms.items()}

@@ -275,25 +275,16 @@ class ParticleTask(Generic[ConfigT]):
         return task
 
     def compare(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the batch's weighted distance from the target, shape [].
-
-        The second result has its terms by name, without weights, each of shape [].
-        """
+        """Return the batch's weighted distance from the target, [], and its unweighted terms."""
         raise NotImplementedError
 
     def penalties(self, worlds: Particles) -> dict[str, tuple[float, Tensor]]:
-        """Return the terms that the loss adds to `compare`: name -> (weight, term of shape []).
-
-        By default "overflow" penalises states outside of [-1, 1].
-        """
+        """Return what the loss adds to `compare`, name -> (weight, term []); here, "overflow"."""
         outside = (worlds.s - worlds.s.clamp(-1.0, 1.0)).abs().mean()
         return {"overflow": (self.config.overflow_weight, outside)}
 
     def loss(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the training loss of worlds after a rollout with path lengths, shape [].
-
-        The second result has its terms by name, without weights, each of shape [].
-        """
+        """Return the training loss of worlds that have path lengths, [], and unweighted terms."""
         path, expected = worlds.path_length, tuple(worlds.x.shape[:2])
         if path is None or path.shape != expected:
             got = "none" if path is None else str(tuple(path.shape))

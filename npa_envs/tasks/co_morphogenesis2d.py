@@ -134,10 +134,7 @@ class CoMorphogenesis2D(ParticleTask[Any]):
         return total, terms
 
     def picture(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return each world's picture with all species, shape [B, R, R, 4].
-
-        It spans [-1, 1] x [-1, 1], at the resolution of the first species.
-        """
+        """Return pictures of all species, [B, R, R, 4], at the resolution of the first one."""
         return self.tasks[0].picture(x, s, centred=False)
 
     @property

@@ -20,7 +20,8 @@ from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness, check_generator, normal_draws, uniform_draws
 
 DAMAGE_SIZES = {"wipe": 0.2, "cut": 0.1, "clump": 0.2, "noise": 0.05}
-"""Kinds of damage with their usual size: radius, gap, radius, standard deviation [length units]."""
+"""Kinds of damage with their usual size: radius, gap, radius, standard deviation [length units].
+`npa/Regeneration2D-v0` wipes more by default: 0.3."""
 
 CLUMP_FACTOR = 0.9
 """Fraction of its distance from the centre by which clumping moves a particle inwards."""

@@ -150,11 +150,11 @@ class ManyPictures(Morphogenesis2D):
 
     @property
     def target_picture(self) -> Tensor:
-        """Picture of each world's target: sums of colours over splats, density; [B, R, R, 4]."""
+        """Each world's target as a `picture`: red, green, blue (summed), density, [B, R, R, 4]."""
         return self._target_pictures.index_select(0, self.goal)
 
     def picture(self, x: Tensor, s: Tensor, *, centred: bool = True) -> Tensor:
-        """Return each world's picture: sums of colours over splats, density; [B, R, R, 4].
+        """Return each world's picture: red, green, blue (sums over splats), density, [B, R, R, 4].
 
         Without goals, densities are scaled for a target of the mean size.
         """

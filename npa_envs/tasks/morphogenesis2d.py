@@ -162,10 +162,7 @@ UNOWNED = 0.05
 
 
 class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
-    """The task of arXiv 2601.16096, section 4.1, with its loss.
-
-    `for_rule` returns the task with the code of this target that a rule of many pictures has.
-    """
+    """The task of arXiv 2601.16096, section 4.1, with its loss."""
 
     metric_name = "splat loss"
     _code: Tensor | None = None
@@ -281,11 +278,7 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         return density, (red + green + blue) / 3.0 * torch.exp(-density.detach())
 
     def splat_losses(self, x: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return each world's density loss and colour loss, dimensionless, shape [B] each.
-
-        They are the means of `splat_errors` over the pixels. With one target and without
-        gradients no picture is stored.
-        """
+        """Return each world's means of the two `splat_errors` over pixels, [B] each."""
         with_gradient = torch.is_grad_enabled() and (x.requires_grad or s.requires_grad)
         if with_gradient or self.config.division or self.goal_count > 0:
             density, colour = self.splat_errors(x, s)

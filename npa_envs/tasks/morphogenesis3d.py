@@ -235,10 +235,7 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
         return (-10.0 * error.square().mean(dim=(2, 3, 4)).log10()).mean(dim=1)
 
     def particle_contributions(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return each particle's contribution to its world's view loss, times N; [B, N].
-
-        See `contributions_to_loss`; effects are derivatives by a factor on a particle's opacity.
-        """
+        """Return `contributions_to_loss` times N, by a factor on a particle's opacity; [B, N]."""
         with torch.enable_grad():
             gaussians = self.gaussians(s.detach())
             opacities = gaussians.opacities.detach().requires_grad_()

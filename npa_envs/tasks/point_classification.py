@@ -167,10 +167,7 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
     def seed(
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
     ) -> Particles:
-        """Return random clouds with all states zero; goals are their classes.
-
-        Clouds of "train" are augmented. They are made on the task's device and copied to `device`.
-        """
+        """Return random clouds, those of "train" augmented, with blank states; goals: classes."""
         config, clouds = self.config, self.clouds
         chosen = drawn_indices(len(clouds.label), world_count, generator, torch.device(device))
         chosen = chosen.to(clouds.label.device)
@@ -276,10 +273,9 @@ UNDECIDED = (0.6, 0.6, 0.6)
 
 
 def majority(outputs: Tensor) -> Tensor:
-    """Return the class that most particles of a world score highest, int64, shape [B].
+    """Return the class to which most particles give their highest of K scores, int64, [B].
 
-    `outputs` are scores [B, N, K]. Of classes with as many particles it is the one with the
-    largest sum of scores.
+    Of classes with as many particles it is the one with the largest sum of scores.
     """
     particle_count, class_count = outputs.shape[1:]
     classes = torch.arange(class_count, device=outputs.device)

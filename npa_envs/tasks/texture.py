@@ -234,10 +234,7 @@ class Texture(ParticleTask[TextureConfig]):
         return self.weighted(*self.texture_losses(x, s))
 
     def particle_contributions(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return each particle's contribution to its world's texture loss, times N; [B, N].
-
-        See `contributions_to_loss`; effects are derivatives by a factor on a particle's splat.
-        """
+        """Return `contributions_to_loss` times N, by a factor on a particle's splat; [B, N]."""
         x, s = x.detach(), s.detach()
         x = x - x[:, :1]
         blank = s.new_zeros(*s.shape[:2], 3).requires_grad_()
@@ -290,10 +287,7 @@ class Texture(ParticleTask[TextureConfig]):
         return compare_colours(colour_image(channels)), compare_densities(density)
 
     def joint_image(self, channels: Tensor) -> Tensor:
-        """Return the image that joint losses compare, [..., 4, R, R], from sums and density.
-
-        It has colours and density^0.5, each times the square root of its weight.
-        """
+        """Return colours and density^0.5, times the roots of their weights, [..., 4, R, R]."""
         density = (channels[..., 3:, :, :] + DENSITY_FLOOR) ** JOINT_POWER
         colour_scale = self.config.colour_weight**0.5
         density_scale = self.config.density_weight**0.5

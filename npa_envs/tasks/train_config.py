@@ -281,10 +281,7 @@ class TrainConfig(Generic[TaskConfigT]):
 
 @dataclass(frozen=True, kw_only=True)
 class JointTrainConfig(TrainConfig[TaskConfigT]):
-    """A training run of several rules in one world, with their initial rules and frozen ones.
-
-    The field `initial_rule` must be empty.
-    """
+    """A training run of several rules in one world; `initial_rule`, of one rule, must be empty."""
 
     initial_rules: Common[tuple[str, ...]] = ()
     """Rules to start from, names of shipped rules or files, one for each species."""

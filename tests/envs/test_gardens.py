@@ -14,7 +14,7 @@ from support.small_envs import begun, make, make_vec, small
 import npa_envs
 from npa_envs.agents.shapeshifter_policies import RecognisingShapeshifter
 from npa_envs.envs import gardeners_v0
-from npa_envs.envs.garden.base import GardenContext
+from npa_envs.envs.garden.base import StartLosses
 from npa_envs.envs.garden.brushes import BrushLayout, apply_brushes, grid_places
 from npa_envs.envs.gardener2d import Gardener2DEnv
 from npa_envs.registration import GARDENS
@@ -266,7 +266,7 @@ def test_the_reward_is_one_for_a_whole_picture_and_zero_for_a_grey_one():
     grey = sum(task.losses(worlds.x, torch.zeros_like(worlds.s)).values())
     assert grey > 1.2 * info["loss"]
     losses = torch.cat((grey, torch.tensor([info["loss"], info["loss"] - 1.0, 1e3])))
-    context = GardenContext(*(value.expand(4) for value in worlds.context))
+    context = StartLosses(*(value.expand(4) for value in worlds.context))
     earned = task.reward(worlds.particles, losses, context)
     better = 1.0 + 1.0 / float(grey - info["loss"])
     assert torch.allclose(earned, torch.tensor([0.0, 1.0, better, -1.0]), rtol=1e-4, atol=1e-5)

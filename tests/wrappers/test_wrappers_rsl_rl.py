@@ -76,7 +76,8 @@ def test_steps_in_inference_mode_leave_no_tensors_that_cannot_be_written_to():
         for _ in range(STEPS):
             seen, rewards, dones, _ = rows.step(torch.zeros(128, ACTIONS))
     worlds = envs.unwrapped.worlds
-    kept = (worlds.x, worlds.s, worlds.elapsed, worlds.particle_rewards.reward, seen["policy"])
+    elapsed = worlds.episodes.elapsed
+    kept = (worlds.x, worlds.s, elapsed, worlds.particle_rewards.reward, seen["policy"])
     assert not any(tensor.is_inference() for tensor in (*kept, rewards, dones))
 
 

@@ -179,10 +179,7 @@ def stride_of(level: Tensor, thinned: bool) -> int:
 
 
 def patches(images: Tensor, size: int, *, stride: int, wrap: bool) -> Tensor:
-    """Return the M square patches of each image as rows, [B, M, K size²].
-
-    `wrap`: opposite edges of an image are connected.
-    """
+    """Return the M square patches of images, [B, M, K size²]; `wrap`: over opposite edges."""
     if wrap:
         half = size // 2
         images = torch.cat((images[:, :, -half:], images, images[:, :, :half]), dim=2)
@@ -280,10 +277,7 @@ class SlicedWasserstein(TextureDistance):
 
 
 class PatchDescriptor:
-    """Features of images: square patches of all channels, projected on random directions.
-
-    The directions are an orthonormal basis of the space of patches.
-    """
+    """Features of images: patches of all channels, projected on a random orthonormal basis."""
 
     def __init__(self, like: Tensor, *, seed: int) -> None:
         generator = torch.Generator().manual_seed(seed)
@@ -294,7 +288,10 @@ class PatchDescriptor:
         """Directions for each image size, columns of [K PATCH², K PATCH²]."""
 
     def __call__(self, images: Tensor, *, wrap: bool, thinned: bool) -> list[Tensor]:
-        """Return the projections of patches, [B, M, K PATCH²] for each size."""
+        """Return for each size of images, [B, K, R, R], M projected patches, [B, M, K PATCH²].
+
+        `wrap`: also across opposite edges; `thinned`: at most `POSITIONS` patches along each side.
+        """
         sizes = pyramid(images, len(self.directions))
         return [
             products(patches(level, PATCH, stride=stride_of(level, thinned), wrap=wrap), direction)
@@ -324,7 +321,7 @@ class FilterDescriptor:
             self.levels.append((first.to(like), second.to(like)))
 
     def __call__(self, images: Tensor, *, wrap: bool, thinned: bool) -> list[Tensor]:
-        """Return the features of both layers, [B, M, 2 FILTERS] for each size and layer."""
+        """Return for each image size the features of each layer, two tensors [B, M, 2 FILTERS]."""
         result = []
         for level, (first, second) in zip(
             pyramid(images, len(self.levels)), self.levels, strict=True

@@ -215,10 +215,7 @@ MNIST_DOWNLOAD = "import torchvision; torchvision.datasets.MNIST({folder!r}, dow
 def load_pictures(
     data: str, split: Split = "train", *, folder: str = "data"
 ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Return the ink of M pictures in [0, 1], [M, H, W], first row on top, and their classes [M].
-
-    No picture is in both splits.
-    """
+    """Return the ink of M pictures, in [0, 1], [M, H, W], top row first, and their classes, [M]."""
     if data == "digits":
         return _digits(split)
     path = home_path(folder) / "MNIST" / "raw" if data == "mnist" else home_path(data)

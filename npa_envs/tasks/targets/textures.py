@@ -166,10 +166,7 @@ OVERSAMPLING = 4
 
 
 def draw_pattern(name: str, resolution: int, *, seed: int = 0) -> Array:
-    """Draw a texture: colours times alpha, and alpha, float64, [R, R, 4].
-
-    The first row is the bottom. Pixel r is centred at (r + 1/2) / R.
-    """
+    """Draw a texture from its bottom row up: colours times alpha, and alpha, float64, [R, R, 4]."""
     samples = resolution * OVERSAMPLING
     axis = (np.arange(samples) + 0.5) / samples
     strips = []

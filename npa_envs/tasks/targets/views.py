@@ -109,11 +109,7 @@ def views_of_mesh(
 
 
 def surrounding_cameras(count: int, resolution: int, *, turn: float = 0.0) -> Cameras:
-    """Return cameras evenly spread over a sphere, pointing at its centre, the origin.
-
-    They lie on a Fibonacci spiral from bottom to top, rotated by the fraction `turn` of a full
-    turn.
-    """
+    """Return cameras on a Fibonacci spiral, rotated by `turn` (of 1), pointing at the origin."""
     k = torch.arange(count, dtype=torch.float64)
     height = (2.0 * k + 1.0) / count - 1.0
     angle = math.tau * (k * (0.5 * (math.sqrt(5.0) - 1.0)) + turn)
