@@ -63,38 +63,31 @@ def to_output(tensor: Tensor, output: str) -> Any:
 
 
 def batch_tensor(
-    action: Any, world_count: int | None, shape: tuple[int, ...], letters: str
+    action: Any,
+    world_count: int | None,
+    shape: tuple[int, ...],
+    letters: str,
+    *,
+    discrete: bool = False,
 ) -> Tensor:
     """Return checked actions, float32, [B, *shape]; `world_count` None: of one world, [*shape].
 
-    `letters` names the dimensions of `shape` in the error message, such as "N, A".
+    `letters` names the dimensions of `shape` in the error message, such as "N, A". `discrete`
+    actions are whole numbers, int64.
     """
-    expected, letters = _batch_shape(world_count, shape, letters)
-    checked = action_tensor("action", action, expected, "env.action_space", letters)
-    return checked[None] if world_count is None else checked
-
-
-def batch_choices(
-    action: Any, world_count: int | None, shape: tuple[int, ...], letters: str
-) -> Tensor:
-    """Return the checked whole numbers of discrete actions, int64; else as `batch_tensor`."""
-    expected, letters = _batch_shape(world_count, shape, letters)
+    expected = shape
+    if world_count is not None:
+        expected, letters = (world_count, *shape), ", ".join(filter(None, ("B", letters)))
+    if not discrete:
+        checked = action_tensor("action", action, expected, "env.action_space", f"[{letters}] = ")
+        return checked[None] if world_count is None else checked
     choices = number_tensor("action", action)
     if tuple(choices.shape) != expected or choices.is_floating_point():
         raise NPAError(
-            f"action must be whole numbers of shape {letters}{expected}, got "
+            f"action must be whole numbers of shape [{letters}] = {expected}, got "
             f"{tuple(choices.shape)} of {choices.dtype}: see env.action_space"
         )
     return choices.long().view(-1, *shape)
-
-
-def _batch_shape(
-    world_count: int | None, shape: tuple[int, ...], letters: str
-) -> tuple[tuple[int, ...], str]:
-    """Return the shape that actions must have, and its dimensions' names for errors."""
-    if world_count is None:
-        return shape, f"[{letters}] = "
-    return (world_count, *shape), f"[{', '.join(filter(None, ('B', letters)))}] = "
 
 
 def action_tensor(
@@ -135,11 +128,15 @@ class ShownEnv:
     worlds: Any
     """The batch of worlds."""
     metadata: Any
+    _is_batch: ClassVar[bool] = False
     _started = False
     _window: Window | None = None
 
-    def _pictures(self) -> NDArray[np.uint8] | None:
-        """Return a picture of each world, uint8, [B, R, R, 3], if `render_mode` is "rgb_array"."""
+    def render(self) -> Any:
+        """Return a picture, uint8, [R, R, 3], or a tuple of one for each world of a batch.
+
+        The result is None unless `render_mode` is "rgb_array".
+        """
         if not self._started:
             raise NPAError("render needs worlds: call reset first")
         if self.config.render_mode is None:
@@ -150,8 +147,8 @@ class ShownEnv:
         # A window is updated by reset and step.
         if self.config.render_mode != "rgb_array":
             return None
-        pictures: NDArray[np.uint8] = self.worlds.pictures(self.worlds.world_count)
-        return pictures
+        pictures = tuple(self.worlds.pictures(self.worlds.world_count))
+        return pictures if self._is_batch else pictures[0]
 
     def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> dict[str, Any]:
         """Return what Jupyter displays: text, and after a reset pictures of the first worlds."""
@@ -184,7 +181,7 @@ class ShownEnv:
     def _out(self, values: Tensor | NDArray[Any]) -> Any:
         """Return values as an array, or as a tensor on the device if `output` is "torch"."""
         if isinstance(values, np.ndarray) and self.config.output == "torch":
-            return to_device_async(values, self.config.torch_device)
+            return to_device_async(values, self.worlds.device)
         return to_output(values, self.config.output) if isinstance(values, Tensor) else values
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import random
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, NamedTuple, Self, TypeVar
 
 import numpy as np
@@ -334,7 +334,6 @@ class TargetEnvTask(EnvTask[Config]):
         """Return the training task's loss of each particle, shape [B, N]."""
         losses: Tensor = self.task.particle_contributions(x, s)
         return losses
-
 
 
 # Checks of what tasks return: a mistake in a custom task would silently give wrong rewards.
