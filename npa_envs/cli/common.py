@@ -103,8 +103,7 @@ class RuleOptions(RunOptions):
 
 def named_rules(arguments: Iterable[str]) -> dict[str, str]:
     """Return a dict from rules' names to what `load_rule` takes: a name, a file or a run folder."""
-    from npa_envs.rule.files import preset_rules, shipped_rules
-    from npa_envs.web.rule_world import name_of
+    from npa_envs.rule.files import preset_rules, rule_name, shipped_rules
 
     arguments = list(arguments)
     known = list(dict.fromkeys([*shipped_rules(), *preset_rules()]))
@@ -113,7 +112,7 @@ def named_rules(arguments: Iterable[str]) -> dict[str, str]:
     names = [word for word in arguments if word not in files]
     sources = {name: name for name in (chosen_names("rule", names, known) if names else ())}
     for source in files:
-        name = name_of(source)
+        name = rule_name(source)
         if sources.setdefault(name, source) != source:
             raise NPAError(
                 f"rules must have different names, but {sources[name]!r} and {source!r} are "

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Annotated, Any, cast
+
+import tyro
 
 from npa_envs.cli import common
 from npa_envs.errors import NPAError, shown
@@ -40,7 +42,7 @@ class EvaluateOptions(common.RuleOptions):
     judge: bool = False
     """Textures only: also measure the texture metric: three distances from the target that no loss
     uses, as ratios: 1 is the distance of the target drawn by particles."""
-    json: Path | None = None
+    json_path: Annotated[Path | None, tyro.conf.arg(name="json")] = None
     """Also write the tables to this JSON file."""
 
 
@@ -96,7 +98,7 @@ def main(arguments: Sequence[str]) -> int:
     print(f"{options.rule}: {what}, loss: {metric}{note}")
     for name, table in tables.items():
         print(table_text(table, missing=UNMEASURED if name == "growth" else "never"))
-    if options.json is not None:
-        write_text(options.json, tables_json(tables, metric=metric))
-        print(f"wrote {options.json}")
+    if options.json_path is not None:
+        write_text(options.json_path, tables_json(tables, metric=metric))
+        print(f"wrote {options.json_path}")
     return 0

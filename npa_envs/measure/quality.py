@@ -36,7 +36,7 @@ FIRST_SEED = 1_000_000
 CHECKPOINTS = (64, 128, 256, 512, 1024, 2048, 4096)
 """Default steps at which a rule is measured."""
 
-DIVERGED = 10.0
+DIVERGED_FACTOR = 10.0
 """A world has diverged if its loss is more than this many times that before the damage."""
 
 HEALED = 1.2
@@ -179,7 +179,7 @@ def healing(
     rows = []
     for name, worlds in damaged.items():
         losses = torch.stack([task.metric(now.x, now.s) for _, now in runner.at(steps, worlds)])
-        diverged = ~(losses[-1] <= DIVERGED * before)
+        diverged = ~(losses[-1] <= DIVERGED_FACTOR * before)
         mean_healed = ((losses.mean(1) <= HEALED * before.mean()) & ~diverged.all()).tolist()
         healed = [step for step, is_healed in zip(steps, mean_healed, strict=True) if is_healed]
         rows.append(

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError, shown, suggest
-from npa_envs.rule.files import load_rule, rule_file, rule_metadata, shipped_rules
+from npa_envs.rule.files import load_rule, rule_metadata, rule_name, shipped_rules
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Task
 from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2DConfig, together
@@ -77,7 +77,7 @@ class RuleWorld(LiveWorld):
         # Tasks with their targets, of which the slider of N makes many.
         self._trained = functools.lru_cache(8)(self._load_task)
         others = {name: name for name in shipped_rules()} if choices is None else dict(choices)
-        name = name_of(source)
+        name = rule_name(source)
         self._choices = others | {name: source}
         self._plant(name, particle_count)
 
@@ -394,14 +394,6 @@ class RuleWorld(LiveWorld):
         self.live_rules = present or self.live_rules[:1]
 
 
-def name_of(source: str) -> str:
-    """Return a rule's name: of its file, or of the run's folder for rule.safetensors."""
-    if "#" in source:
-        return source.rpartition("#")[2]
-    path = rule_file(source)
-    return path.resolve().parent.name if path.name == "rule.safetensors" else path.stem
-
-
 class RunWorld(RuleWorld):
     """A world of the rules of a training run, which are replaced at each new checkpoint."""
 
@@ -418,7 +410,7 @@ class RunWorld(RuleWorld):
         """Iterations and losses of the log."""
         self._log_version: Any = None
         files = rules_of_run(self._run_folder)
-        self._files = {name_of(str(path)): path for path in files}
+        self._files = {rule_name(str(path)): path for path in files}
         self._centres = [0.0]
         if len(files) > 1:
             # Seeds lie in a row, as in training.
