@@ -23,7 +23,8 @@ from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.run_folder import JsonlLog, RunFolder
 from npa_envs.training.task_of_rule import TrainedTask, task_of_rule, trained_config
 from npa_envs.training.task_table import load_config, preset
-from npa_envs.web.live_world import ColouredWorld, Colouring, LiveWorld, Range, Touch, shows_of
+from npa_envs.web.live_world import LiveWorld, Range, Touch
+from npa_envs.web.particle_colours import ColouredWorld, Colouring, shows_of
 from npa_envs.world.brushes import inside_ball, wipe_state
 from npa_envs.world.division import living
 from npa_envs.world.particles import Particles

@@ -20,7 +20,7 @@ from npa_envs.training import config_to_dict, preset
 from npa_envs.training.run_folder import JsonlLog
 from npa_envs.web import rule_world
 from npa_envs.web.environment_world import EnvironmentWorld, make_environment
-from npa_envs.web.live_world import ColouredWorld, Colouring, signed_colours, species_colours
+from npa_envs.web.particle_colours import ColouredWorld, Colouring, signed_colours, species_colours
 from npa_envs.web.rule_world import RuleWorld, RunWorld
 from npa_envs.world.division import living
 from npa_envs.world.rollout import rollout_particles
