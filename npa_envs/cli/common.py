@@ -191,7 +191,7 @@ class MeasureOptions(RunOptions):
 
 
 def check_numbers(options: Any, **least: int) -> None:
-    """Check that options are None or at least their value in `least`, and `max_seconds` > 0."""
+    """Check that options, if given, are at least as large as in `least`, and `max_seconds` > 0."""
     for name, smallest in least.items():
         value = getattr(options, name)
         if value is not None and value < smallest:
@@ -216,7 +216,10 @@ def named_values(name: str, arguments: Iterable[str]) -> dict[str, Any]:
 
 
 def problem_of(options: Any, num_envs: int, steps: int | None = None) -> Problem:
-    """Return the environment `options.env`, with episodes of `steps`, by default as registered."""
+    """Return what to learn: the environment `options.env` with the keywords `options.keywords`.
+
+    It has `num_envs` worlds and episodes of `steps` steps; None: as registered.
+    """
     from npa_envs.agents.learning.problem import Problem, registration_of
 
     steps = registration_of(options.env).steps if steps is None else steps
@@ -265,7 +268,7 @@ def resolve_run(arguments: Sequence[str], out_of: Callable[[Sequence[str]], Path
 
 
 def chosen_names(noun: str, names: Sequence[str], known: Iterable[str]) -> list[str]:
-    """Return `names` in the order of `known`; all known ones if `names` is empty."""
+    """Return `names` in the order of `known`, or all known ones; an error calls them `noun`."""
     known = list(known)
     for name in names:
         if name not in known:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, cast
@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from npa_envs.rule.rule import NPARule
     from npa_envs.tasks.point_classification import PointClassification
 
-Tables: TypeAlias = Mapping[str, Sequence[Any]]
+Result: TypeAlias = tuple[dict[str, Any], str, str]
+"""Tables by name, the name of the metric, and a heading."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,10 +75,7 @@ def main(arguments: Sequence[str]) -> int:
     return 0
 
 
-def _measure_pictures(
-    options: EvaluateOptions, rule: NPARule, **worlds: Any
-) -> tuple[Tables, str, str]:
-    """Measure each picture of a rule of many; return as `_measure_task`."""
+def _measure_pictures(options: EvaluateOptions, rule: NPARule, **worlds: Any) -> Result:
     from npa_envs.measure import quality
     from npa_envs.training.task_of_rule import tasks_of_codes
 
@@ -98,10 +96,7 @@ def _measure_pictures(
     return {"pictures": rows}, metric, f"{heading}, shuffled: with the code of the next picture"
 
 
-def _measure_task(
-    options: EvaluateOptions, rule: NPARule, **worlds: Any
-) -> tuple[Tables, str, str]:
-    """Measure the rule's one task; return tables by name, the metric, and a heading."""
+def _measure_task(options: EvaluateOptions, rule: NPARule, **worlds: Any) -> Result:
     from npa_envs.measure import quality
     from npa_envs.training.task_of_rule import task_of_rule
 

@@ -161,7 +161,7 @@ def main(arguments: Sequence[str]) -> int:
 def combinations(
     over: Sequence[str], task_words: Sequence[str], folder: Path = Path()
 ) -> list[SweepRun]:
-    """Return a run of `npa-envs train TASK_WORDS` with each combination of values NAME=A,B,C."""
+    """Return a run of `task_words` for each combination of the values of `over` (NAME=A,B,C)."""
     from npa_envs.training import TASKS
 
     if not task_words or task_words[0] not in TASKS:

@@ -71,7 +71,7 @@ def draw_band(
     label: str,
     **options: Any,
 ) -> None:
-    """Draw a curve with a band over `across`; `lines`: lower end, curve, upper end."""
+    """Draw a curve and a band at `across` (x); `lines`: the band's lower end, curve, upper end."""
     low, middle, high = lines
     panel.plot(across, middle, color=colour, label=label, **options)
     panel.fill_between(across, low, high, color=colour, alpha=0.2, lw=0)

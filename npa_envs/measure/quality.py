@@ -327,7 +327,7 @@ def _blank_clouds(runner: RuleRunner, index: Tensor) -> Particles:
 def _cloud_means(
     task: PointClassification, measured: Callable[[Tensor], Iterable[Sequence[Tensor]]]
 ) -> list[list[float]]:
-    """Return means over all clouds of the rows of tensors [B] that `measured` yields per batch."""
+    """Return a table of means over all clouds; `measured` gives its values [B] for B indices."""
     count = len(task.clouds.label)
     sums = torch.zeros((), dtype=torch.float64)
     for index in torch.split(torch.arange(count, device=task.clouds.x.device), BATCH):

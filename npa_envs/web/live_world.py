@@ -109,7 +109,7 @@ class LiveWorld(ABC):
         self._events: list[dict[str, Any]] = []
 
     def describe(self) -> dict[str, Any]:
-        """Return the event "world", which describes the world to the page."""
+        """Return the event "world" of page.js: brushes, settings and colourings of this world."""
         return {
             "type": "world",
             "tools": [{"name": name} | tool._asdict() for name, tool in self.tools.items()],

@@ -18,7 +18,7 @@ BALANCE = 0.9
 
 
 class ColouredWorld(NamedTuple):
-    """What `Colouring` needs of a world."""
+    """The values of a world from which `Colouring` computes colours."""
 
     x: Tensor
     s: Tensor

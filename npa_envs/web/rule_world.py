@@ -141,7 +141,7 @@ class RuleWorld(LiveWorld):
         return self.task.box
 
     def describe(self) -> dict[str, Any]:
-        """Return the event "world", which describes the world to the page."""
+        """Return the event "world" of page.js: rules, view, brushes and settings of this world."""
         frame = self.task.frame
         return super().describe() | {
             "title": self.main.name,
@@ -287,7 +287,7 @@ class RuleWorld(LiveWorld):
         return torch.cat([live_rule.rule.colour(states) for live_rule, states in groups], dim=1)
 
     def _loss(self) -> float | None:
-        """Return the task's metric; None if it does not fit the world, or is not due yet."""
+        """Return the task's metric; None for several rules, without a target, or if not due yet."""
         start = time.perf_counter()
         comparable = self.trained.why_not_measurable is None and len(self.live_rules) == 1
         if not comparable or not self.counts[0] or start < self._loss_due:
@@ -448,7 +448,7 @@ class RunWorld(RuleWorld):
         self.count = sum(self.counts)
 
     def describe(self) -> dict[str, Any]:
-        """Return the event "world", without a choice of rules."""
+        """Return the event "world" of page.js; the page cannot choose between rules."""
         return super().describe() | {
             "title": self._run_folder.path.resolve().name,
             "note": f"a training run, iteration {self._iteration}",

@@ -246,5 +246,5 @@ class TimingSession:
         return []
 
     def rows(self, calls: Iterable[tuple[str, Callable[[], Row]]]) -> list[Row]:
-        """Return the rows of calls with their names, each made by `attempt`."""
+        """Return the rows that `calls` (name, function) return, where memory and time allow."""
         return [row for what, make in calls for row in self.attempt(what, make)]

@@ -60,9 +60,7 @@ const BLANK = {
 };
 
 // The tool that all worlds have; it sends no messages.
-const LOOK = {
-  name: "look", label: "Look: drag to move, wheel or pinch to zoom, double click to see all",
-};
+const LOOK = { name: "look", label: "Look: drag to move, wheel or pinch to zoom, double click to see all" };
 
 // SVG paths on a square of side 24, by the names of tools and controls.
 const ICONS = {
