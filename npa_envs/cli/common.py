@@ -216,10 +216,7 @@ def named_values(name: str, arguments: Iterable[str]) -> dict[str, Any]:
 
 
 def problem_of(options: Any, num_envs: int, steps: int | None = None) -> Problem:
-    """Return what to learn: the environment `options.env` with the keywords `options.keywords`.
-
-    It has `num_envs` worlds and episodes of `steps` steps; None: as registered.
-    """
+    """Return the environment of options, to learn in; `steps` an episode, None: as registered."""
     from npa_envs.agents.learning.problem import Problem, registration_of
 
     steps = registration_of(options.env).steps if steps is None else steps

@@ -86,11 +86,9 @@ def _measure_pictures(options: EvaluateOptions, rule: NPARule, **worlds: Any) ->
             f"{len(rule.codes)}: give --target {shown(rule.codes.names[0])}"
         )
     tasks = tasks_of_codes(options.rule, rule, worlds["device"], **options.world)
-    checkpoints = options.checkpoints or quality.PICTURE_CHECKPOINTS
+    steps = options.checkpoints or quality.PICTURE_CHECKPOINTS
     with common.progress_bar(None, show=options.progress) as advance:
-        rows = quality.picture_rows(
-            rule, tasks, checkpoints=checkpoints, progress=advance, **worlds
-        )
+        rows = quality.picture_rows(rule, tasks, checkpoints=steps, progress=advance, **worlds)
     metric = tasks[0].metric_name
     heading = f"{len(tasks)} pictures, {options.seed_count} worlds each, loss: {metric}"
     return {"pictures": rows}, metric, f"{heading}, shuffled: with the code of the next picture"

@@ -11,7 +11,7 @@ import torch
 import torch.distributed as dist
 
 from npa_envs.cli import INTERRUPTED, common
-from npa_envs.cli.train_options import TrainOptions, default_preset, parse_run, resolve_task
+from npa_envs.cli.train_options import TrainOptions, default_preset, parse_run
 from npa_envs.errors import NPAError
 from npa_envs.training import TASKS, RunFolder, TrainConfig, check_device, task_entry, train
 from npa_envs.training.checkpoint import has_per_world_streams, load_checkpoint
@@ -41,12 +41,14 @@ def main(arguments: Sequence[str]) -> int:
         return 0
     if not arguments or arguments[0].startswith("-"):
         raise NPAError(f"train needs a task first: {', '.join(TASKS)}")
-    task_name = arguments[0]
+    task_name, *options_given = arguments
     task_entry(task_name)
     with joined_processes() as ranks:
         request = None
         if ranks.first:
-            resolved = resolve_task(task_name, arguments[1:])
+            resolved = common.resolve_run(
+                options_given, lambda words: parse_run(task_name, words)[1].out
+            )
             request = resolved, *parse_run(task_name, resolved)
         # Only the first process reads files, so that all have the same configuration.
         request = ranks.broadcast(request)

@@ -44,11 +44,6 @@ class TrainOptions(common.SharedRunOptions):
     """End with a report in the folder `out`: metrics, a film and a model card of the rule."""
 
 
-def resolve_task(task_name: str, arguments: Sequence[str]) -> list[str]:
-    """Return arguments after replacing `--resume auto`, and adding the device of `--gpus`."""
-    return common.resolve_run(arguments, lambda words: parse_run(task_name, words)[1].out)
-
-
 def parse_run(task_name: str, arguments: Sequence[str]) -> tuple[TrainOptions, TrainConfig[Any]]:
     """Parse arguments to the options of the run and its training configuration.
 

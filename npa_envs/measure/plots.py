@@ -1,7 +1,4 @@
-"""Plots of measurements: drawn without a window, bands, matrices, logarithmic axes, PNG files.
-
-They need matplotlib, of the extra `bench`.
-"""
+"""Plots of measurements by matplotlib (extra `bench`): bands, matrices, scales, PNG files."""
 
 from __future__ import annotations
 

@@ -56,7 +56,6 @@ class InteractionSettings:
     """Fraction by which a loss must change to count as changed."""
 
     def __post_init__(self) -> None:
-        """Check every field; raises NPAError."""
         check_positive(self, int, "steps", "seed_count")
         if self.particle_count is not None:
             check_positive(self, int, "particle_count", at_least=2)
@@ -307,10 +306,7 @@ class InteractionRecord(Record[InteractionRow]):
 
 
 def interaction_map(rows: Sequence[InteractionRow]) -> bytes:
-    """Return a PNG with a matrix for each setting: changes of the loss of rules (rows) by others.
-
-    Needs matplotlib.
-    """
+    """Return a PNG with a matrix for each setting: changes of a rule's loss (rows) by others."""
     names = list(dict.fromkeys([row.rule for row in rows] + [row.beside for row in rows]))
     cells: dict[str, dict[tuple[str, str], float]] = {}
     for row in rows:

@@ -52,12 +52,9 @@ class TextureRow:
 
 
 class TextureMetric:
-    """Distance of pictures of a texture task from its target.
+    """Distance of pictures from the target of a texture task; other tasks raise NPAError.
 
     It is computed in float64 with directions from a fixed seed, so that CPU and GPU agree.
-
-    Raises:
-        NPAError: The task is not a texture.
     """
 
     def __init__(self, task: object) -> None:

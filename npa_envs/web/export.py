@@ -261,7 +261,6 @@ def page_text(
 
 
 def _gallery(title: str, previews: Mapping[str, str]) -> str:
-    """Return the HTML of the pictures from which a rule is chosen."""
     links = "\n".join(
         f'<li><a href="#{quote(name, safe="")}"><img src="{picture}" alt="">'
         f"<span>{html.escape(name)}</span></a></li>"

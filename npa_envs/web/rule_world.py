@@ -431,7 +431,6 @@ class RunWorld(RuleWorld):
 
     @torch.no_grad()
     def _begin(self, seed: int | None) -> None:
-        """Start a new world of all rules of the run."""
         super()._begin(seed)
         if len(self._files) == 1:
             return

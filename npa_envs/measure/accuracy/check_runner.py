@@ -62,10 +62,7 @@ class CheckResult:
         object.__setattr__(self, "verdict", self.verdict or (default if within else "fail"))
 
     def fraction(self, name: str) -> float:
-        """Return a metric divided by its limit; if this is above 1 or NaN, it exceeds the limit.
-
-        With a limit of 0 it is 0 or infinite.
-        """
+        """Return a metric / its limit; above 1 or NaN: it fails. For the limit 0: 0 or infinite."""
         value, limit = self.metrics.get(name, math.nan), self.limits[name]
         if limit == 0.0:
             return value if value == 0.0 or math.isnan(value) else math.inf

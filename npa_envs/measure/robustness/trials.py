@@ -401,10 +401,7 @@ MASKS_AFTER_DAMAGE, MASKS_OF_CONTROL = 1001, 1002
 
 @dataclass(frozen=True)
 class LossCurve:
-    """Losses of all seeds at `steps` after a damage, and those of their `undamaged` copies.
-
-    The loss of a world that is not finite is NaN.
-    """
+    """Losses of all seeds at `steps` after a damage, and of `undamaged` copies; NaN: not finite."""
 
     damage: str
     steps: tuple[int, ...]

@@ -93,28 +93,30 @@ function gatherCode(width, dimension) {
   for (let first = 0; first < width; first += 8) {
     const parts = first + 4 < width ? [0, 1] : [0];
     const byte = (part) => 4 * first + 16 * part;
-    for (const part of parts) {
-      code.push(...put(`mine ${part}`, load(value("own"), byte(part))));
-      for (const list of lists) code.push(...put(`sum ${list} ${part}`, zeros));
-    }
-    code.push(...put("done", number(0)));
-    const body = put("at", add(value("states"), multiply(loadInteger(add(value("stateAt"), value("done"))), number(4))));
-    for (const list of lists) body.push(...put(`spread ${list}`, loadSplat(add(value(list), value("done")))));
-    for (const part of parts) {
-      body.push(...put("other", load(value("at"), byte(part))));
-      body.push(...put("offset", minus(value("other"), value(`mine ${part}`))));
-      for (const list of lists) {
-        const sum = `sum ${list} ${part}`, factor = value(list === "a" ? "other" : "offset");
-        body.push(...put(sum, plus(value(sum), times(value(`spread ${list}`), factor))));
-      }
-    }
-    body.push(...put("done", add(value("done"), number(4))));
-    code.push(...loopBelow(local("done"), value("listBytes"), body));
-    for (const part of parts) {
-      lists.forEach((list, k) => {
-        code.push(...store(value("sums"), value(`sum ${list} ${part}`), 4 * width * k + byte(part)));
-      });
-    }
+    const addNeighbour = (list, part) => {
+      const sum = `sum ${list} ${part}`, factor = value(list === "a" ? "other" : "offset");
+      return put(sum, plus(value(sum), times(value(`spread ${list}`), factor)));
+    };
+    const neighbour = [
+      ...put("at", add(value("states"), multiply(loadInteger(add(value("stateAt"), value("done"))), number(4)))),
+      ...lists.flatMap((list) => put(`spread ${list}`, loadSplat(add(value(list), value("done"))))),
+      ...parts.flatMap((part) => [
+        ...put("other", load(value("at"), byte(part))),
+        ...put("offset", minus(value("other"), value(`mine ${part}`))),
+        ...lists.flatMap((list) => addNeighbour(list, part)),
+      ]),
+      ...put("done", add(value("done"), number(4))),
+    ];
+    code.push(
+      ...parts.flatMap((part) => [
+        ...put(`mine ${part}`, load(value("own"), byte(part))),
+        ...lists.flatMap((list) => put(`sum ${list} ${part}`, zeros)),
+      ]),
+      ...put("done", number(0)),
+      ...loopBelow(local("done"), value("listBytes"), neighbour),
+      ...parts.flatMap((part) => lists.flatMap((list, k) =>
+        store(value("sums"), value(`sum ${list} ${part}`), 4 * width * k + byte(part)))),
+    );
   }
   return { ...counts, code };
 }
@@ -127,9 +129,7 @@ const PROBE = ["x", "y", "z", "eps", "square", "weight", "slope", "sideX", "side
 // the number of neighbours, and from its 16th byte on six vectors, the lanes of the moment matrix.
 function listCode(dimension) {
   const { local, value, put, counts } = namedLocals(
-    [
-      "probe", "order", "x", "y", "z", "volume", "ranges", "rangesEnd", "width", "stateAt", "a", "kx", "ky", "kz", "out",
-    ],
+    ["probe", "order", "x", "y", "z", "volume", "ranges", "rangesEnd", "width", "stateAt", "a", "kx", "ky", "kz", "out"],
     ["byte", "end", "count", "hits", "at"],
     [
       "lanes", "dx", "dy", "dz", "squared", "inside", "rest", "distance", "factor", "front",
@@ -207,38 +207,39 @@ function lanesToFront() {
 // product(rows, rowBytes, rowEnd, weights, bias, outputs, outputBytes, inputBytes, limit, tiles): for all
 // rows out = W in + b, and max(out, 0) where `limit` is 1. Weights lie tile by tile: [tiles, inputs, 8].
 function productCode() {
-  const parts = [0, 1, 2, 3];
+  const four = [0, 1, 2, 3];
   const { local, value, put, counts } = namedLocals(
     ["rows", "rowBytes", "rowEnd", "weights", "bias", "outputs", "outputBytes", "inputBytes", "limit", "tiles"],
-    ["row", "input", "weight", "out", "tile", ...parts.map((k) => `at ${k}`)],
-    ["left", "right", "spread", "other", ...parts.flatMap((k) => [`left ${k}`, `right ${k}`])],
+    ["row", "input", "weight", "out", "tile", ...four.map((k) => `at ${k}`)],
+    ["left", "right", "spread", "other", ...four.flatMap((k) => [`left ${k}`, `right ${k}`])],
   );
-  const plusProduct = (sum, weights) => put(sum, plus(value(sum), times(value("spread"), value(weights))));
-  const inner = [
-    ...put("left", load(value("weight"))),
-    ...put("right", load(value("weight"), 16)),
+  const addProduct = (sum, weights) => put(sum, plus(value(sum), times(value("spread"), value(weights))));
+  const limited = (sum, byte) => [
+    ...put("other", value(sum)),
+    ...store(value("out"), select(larger(value("other"), zeros), value("other"), value("limit")), byte),
   ];
-  for (const k of parts) {
-    inner.push(...put("spread", loadSplat(add(value(`at ${k}`), value("input")))));
-    inner.push(...plusProduct(`left ${k}`, "left"), ...plusProduct(`right ${k}`, "right"));
-  }
-  inner.push(...put("weight", add(value("weight"), number(4 * TILE_OUTPUTS))));
-  inner.push(...put("input", add(value("input"), number(4))));
-  const perRows = [];
-  for (const k of parts) {
-    perRows.push(...put(`at ${k}`, add(value("row"), multiply(value("rowBytes"), number(k)))));
-    perRows.push(...put(`left ${k}`, load(value("bias"))), ...put(`right ${k}`, load(value("bias"), 16)));
-  }
-  perRows.push(...put("weight", value("weights")), ...put("input", number(0)));
-  perRows.push(...loopBelow(local("input"), value("inputBytes"), inner));
-  for (const k of parts) {
-    [`left ${k}`, `right ${k}`].forEach((sum, half) => {
-      perRows.push(...put("other", value(sum)));
-      perRows.push(...store(value("out"), select(larger(value("other"), zeros), value("other"), value("limit")), 16 * half));
-    });
-    perRows.push(...put("out", add(value("out"), value("outputBytes"))));
-  }
-  perRows.push(...put("row", add(value("row"), multiply(value("rowBytes"), number(TILE_ROWS)))));
+  const inner = [
+    ...put("left", load(value("weight"))), ...put("right", load(value("weight"), 16)),
+    ...four.flatMap((k) => [
+      ...put("spread", loadSplat(add(value(`at ${k}`), value("input")))),
+      ...addProduct(`left ${k}`, "left"), ...addProduct(`right ${k}`, "right"),
+    ]),
+    ...put("weight", add(value("weight"), number(4 * TILE_OUTPUTS))),
+    ...put("input", add(value("input"), number(4))),
+  ];
+  const perRows = [
+    ...four.flatMap((k) => [
+      ...put(`at ${k}`, add(value("row"), multiply(value("rowBytes"), number(k)))),
+      ...put(`left ${k}`, load(value("bias"))), ...put(`right ${k}`, load(value("bias"), 16)),
+    ]),
+    ...put("weight", value("weights")), ...put("input", number(0)),
+    ...loopBelow(local("input"), value("inputBytes"), inner),
+    ...four.flatMap((k) => [
+      ...limited(`left ${k}`, 0), ...limited(`right ${k}`, 16),
+      ...put("out", add(value("out"), value("outputBytes"))),
+    ]),
+    ...put("row", add(value("row"), multiply(value("rowBytes"), number(TILE_ROWS)))),
+  ];
   const perTile = [
     ...put("row", value("rows")),
     ...put("out", add(value("outputs"), multiply(value("tile"), number(4 * TILE_OUTPUTS)))),

@@ -405,9 +405,7 @@ class Controls {
   constructor(page) {
     this.page = page;
     this.pressing = false; // whether a slider is pressed
-    $("one").innerHTML = icon("one");
-    $("reset").innerHTML = icon("reset");
-    $("fold").innerHTML = icon("fold");
+    for (const name of ["one", "reset", "fold"]) $(name).innerHTML = icon(name);
     $("play").onclick = () => page.play(!page.world.playing);
     $("one").onclick = () => { page.play(false); page.send({ type: "step" }); };
     $("reset").onclick = () => page.send({ type: "reset" });
