@@ -216,7 +216,7 @@ def named_values(name: str, arguments: Iterable[str]) -> dict[str, Any]:
 
 
 def problem_of(options: Any, num_envs: int, steps: int | None = None) -> Problem:
-    """Return the environment of options, to learn in; `steps` an episode, None: as registered."""
+    """Return the environment of `options` as a problem to learn; default `steps`: as registered."""
     from npa_envs.agents.learning.problem import Problem, registration_of
 
     steps = registration_of(options.env).steps if steps is None else steps

@@ -150,6 +150,7 @@ def _parse_over(
 def _with_common_fields(config: Any) -> Any:
     """Return an equal configuration, of a subclass whose help shows only the `Common` fields."""
     cls: Any = type(config)
+    suppress: Any = tyro.conf.Suppress
     types: dict[str, Any] = {}
     values = {one.name: getattr(config, one.name) for one in fields(config)}
     for name, hint in get_type_hints(cls, include_extras=True).items():
@@ -157,7 +158,7 @@ def _with_common_fields(config: Any) -> Any:
             values["task"] = _with_common_fields(config.task)
             types["task"] = type(values["task"])
         elif COMMON not in getattr(hint, "__metadata__", ()):
-            types[name] = tyro.conf.Suppress[hint]
+            types[name] = suppress[hint]
     changed = [(name, kind, field(default=values[name])) for name, kind in types.items()]
     base = cls[types["task"]] if getattr(cls, "__parameters__", ()) else cls
     narrow = make_dataclass(cls.__name__, changed, bases=(base,), frozen=True, kw_only=True)

@@ -384,7 +384,7 @@ def tables_of(
     """Measure a rule of any task; return tables by name.
 
     They are `growth` and, if `changed`, `healing`; for clouds `accuracy` and, if `changed`,
-    `changes`; and `judge` of `texture_metric`. Clouds run on their task's device, with the first
+    `changes`; with `texture_metric` also `judge`. Clouds run on their task's device, with the first
     seed.
     """
     metric = TextureMetric(task) if texture_metric else None

@@ -122,7 +122,7 @@ class TextureMetric:
         return torch.stack(distances)
 
     def _projections(self, image: Tensor, wrap: bool) -> Tensor:
-        """Return the quantiles of the patches' projections, [DIRECTIONS, R²]."""
+        """Return the quantiles of the patches' projections, [DIRECTIONS, R²]; `wrap`: periodic."""
         waves = torch.fft.rfft2(image)
         projected = torch.fft.irfft2((waves * self._filters).sum(1), s=image.shape[-2:])
         count = image.shape[-1] ** 2

@@ -75,7 +75,6 @@ class EnvironmentWorld(LiveWorld):
         self.reset(self.seed)
 
     def _begin(self, seed: int | None) -> None:
-        """Start an episode; `seed` as for `reset` of the environment."""
         super()._begin(seed)
         self._observation, info = self._env.reset(seed=seed)
         self._episode += 1
