@@ -17,8 +17,8 @@ from torch import Tensor
 
 from npa_envs.checks import is_real, is_whole
 from npa_envs.errors import NPAError, shown, suggest
+from npa_envs.render.colours import ColouredWorld, Colouring
 from npa_envs.tasks.damage import check_damage, damage_worlds
-from npa_envs.web.particle_colours import ColouredWorld, Colouring
 from npa_envs.world.brushes import clump, cut, inject, push, state_around
 from npa_envs.world.particles import Particles
 
