@@ -14,7 +14,7 @@ from npa_envs.errors import NPAError, suggest
 GROUPS = {
     "make": {
         "demo": "grow a shipped rule, damage it, let it heal; train a small one: a minute on a CPU",
-        "train": "train a rule on a task, by the gradient of its loss",
+        "train": "a picture, texture or class as target: train a rule by the gradient of its loss",
         "sweep": "train with every combination of some options, over devices and machines",
         "search": "search for rules that differ from each other and stay alive; an archive of them",
     },
@@ -25,15 +25,15 @@ GROUPS = {
         "list": "list tasks, presets, environments, targets, losses and shipped rules",
     },
     "learn": {
-        "learn": "learn an environment by its rewards, on one GPU or several",
+        "learn": "an environment's reward as target: learn by PPO or SHAC, on one GPU or several",
         "compare": "compare reinforcement learning, evolution and the gradient on equal tasks",
         "record-dataset": "write episodes of a policy as a Minari dataset",
     },
     "measure": {
-        "evaluate": "loss, PSNR, overflow and extent of a rule over thousands of steps",
-        "robustness": "losses of rules under changed conditions; recovery times after damage",
+        "evaluate": "quality of one rule: loss, PSNR, overflow and extent over thousands of steps",
+        "robustness": "losses of rules under changed conditions, and recovery after damage",
         "rule-interaction": "how rules that grow next to each other change each other",
-        "stress": "correctness: hard cases, each with an expectation and a verdict",
+        "stress": "correctness of the library: hard cases, each with the result that it must have",
         "bench": "speed: the paper's table and scaling; which kernels a step runs, and why",
         "doctor": "what is broken, slow or missing on this machine, and how to fix it",
         "warmup": "compile the kernels ahead of time",
@@ -43,9 +43,9 @@ GROUPS = {
 
 COMMANDS = {name: summary for group in GROUPS.values() for name, summary in group.items()}
 
-USAGE_ERROR = 2
+ERROR = 2
+"""Exit code after an error with a one-line message: in the arguments, or of the system."""
 INTERRUPTED = 130
-
 
 HINTS = {
     errno.ENOSPC: ": free some space, or choose another disk",
@@ -53,13 +53,13 @@ HINTS = {
     errno.EACCES: ": choose another folder (that of compiled kernels is WARP_CACHE_PATH)",
     errno.EPERM: ": choose another folder (that of compiled kernels is WARP_CACHE_PATH)",
 }
-"""What to do about errors of the system, by their numbers."""
+"""What to do about errors of the system, by `errno`."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line, by default the process's arguments, and return the exit code.
 
-    The code is 0, 2 for a mistake in the arguments, or 130 after Ctrl-C.
+    The code is 0; 1 if a check or a run failed; `ERROR`; or `INTERRUPTED`, after Ctrl-C.
     """
     # Read when torch is loaded. On a busy machine, threads that wait in busy loops make every
     # operation several times as slow.
@@ -74,7 +74,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _dispatch(words)
     except NPAError as error:
         print(f"npa-envs: error: {' '.join(str(error).split())}", file=sys.stderr)
-        return USAGE_ERROR
+        return ERROR
     except KeyboardInterrupt:
         print("npa-envs: interrupted", file=sys.stderr)
         return INTERRUPTED
@@ -87,13 +87,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         where = f" {error.filename!r}" if error.filename else ""
         hint = HINTS.get(error.errno or 0, "")
         print(f"npa-envs: error: {error.strerror or error}{where}{hint}", file=sys.stderr)
-        return USAGE_ERROR
+        return ERROR
 
 
 def _dispatch(arguments: Sequence[str]) -> int:
     if not arguments or arguments[0] in {"-h", "--help", "help"}:
         print(_help())
-        return 0 if arguments else USAGE_ERROR
+        return 0 if arguments else ERROR
     if arguments[0] in {"-V", "--version"}:
         from npa_envs import __version__
 

@@ -103,8 +103,7 @@ class RuleOptions(RunOptions):
 
 def named_rules(arguments: Iterable[str]) -> dict[str, str]:
     """Return a dict from rules' names to what `load_rule` takes: a name, a file or a run folder."""
-    from npa_envs.rule.files import preset_rules, shipped_rules
-    from npa_envs.web.rule_world import name_of
+    from npa_envs.rule.files import preset_rules, rule_name, shipped_rules
 
     arguments = list(arguments)
     known = list(dict.fromkeys([*shipped_rules(), *preset_rules()]))
@@ -113,7 +112,7 @@ def named_rules(arguments: Iterable[str]) -> dict[str, str]:
     names = [word for word in arguments if word not in files]
     sources = {name: name for name in (chosen_names("rule", names, known) if names else ())}
     for source in files:
-        name = name_of(source)
+        name = rule_name(source)
         if sources.setdefault(name, source) != source:
             raise NPAError(
                 f"rules must have different names, but {sources[name]!r} and {source!r} are "
@@ -192,7 +191,7 @@ class MeasureOptions(RunOptions):
 
 
 def check_numbers(options: Any, **least: int) -> None:
-    """Check that options are None or at least their value in `least`, and `max_seconds` > 0."""
+    """Check that options, if given, are at least as large as in `least`, and `max_seconds` > 0."""
     for name, smallest in least.items():
         value = getattr(options, name)
         if value is not None and value < smallest:
@@ -217,7 +216,7 @@ def named_values(name: str, arguments: Iterable[str]) -> dict[str, Any]:
 
 
 def problem_of(options: Any, num_envs: int, steps: int | None = None) -> Problem:
-    """Return the environment `options.env`, with episodes of `steps`, by default as registered."""
+    """Return the environment of `options` as a problem to learn; default `steps`: as registered."""
     from npa_envs.agents.learning.problem import Problem, registration_of
 
     steps = registration_of(options.env).steps if steps is None else steps
@@ -266,7 +265,7 @@ def resolve_run(arguments: Sequence[str], out_of: Callable[[Sequence[str]], Path
 
 
 def chosen_names(noun: str, names: Sequence[str], known: Iterable[str]) -> list[str]:
-    """Return `names` in the order of `known`; all known ones if `names` is empty."""
+    """Return `names` in the order of `known`, or all known ones; an error calls them `noun`."""
     known = list(known)
     for name in names:
         if name not in known:

@@ -18,8 +18,7 @@ EXTRAS = ("envs", "sb3", "human", "view", "bench", "evolution", "points", "meshe
 
 @dataclass(frozen=True)
 class DoctorOptions:
-    """Print what is broken, slow or missing on this machine, and how to fix it; also for bug
-    reports."""
+    """Print what is broken, slow or missing on this machine and how to fix it; for bug reports."""
 
 
 class DoctorLine(NamedTuple):

@@ -5,13 +5,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, cast
+
+import tyro
 
 from npa_envs.cli import common
 from npa_envs.errors import NPAError, shown
 
 if TYPE_CHECKING:
+    from npa_envs.rule.rule import NPARule
     from npa_envs.tasks.point_classification import PointClassification
+
+Result: TypeAlias = tuple[dict[str, Any], str, str]
+"""Tables by name, the name of the metric, and a heading."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +46,7 @@ class EvaluateOptions(common.RuleOptions):
     judge: bool = False
     """Textures only: also measure the texture metric: three distances from the target that no loss
     uses, as ratios: 1 is the distance of the target drawn by particles."""
-    json: Path | None = None
+    json_path: Annotated[Path | None, tyro.conf.arg(name="json")] = None
     """Also write the tables to this JSON file."""
 
 
@@ -51,52 +57,69 @@ def main(arguments: Sequence[str]) -> int:
     from npa_envs.measure import quality
     from npa_envs.measure.benchmark_records import UNMEASURED, table_text, tables_json
     from npa_envs.rule.files import load_rule
-    from npa_envs.training.task_of_rule import task_of_rule, tasks_of_codes
 
-    checkpoints = options.checkpoints or quality.CHECKPOINTS
-    quality.check_steps("checkpoints", checkpoints)
+    quality.check_steps("checkpoints", options.checkpoints or quality.CHECKPOINTS)
     common.check_numbers(options, seed_count=1)
     device = options.checked_device()
     rule = load_rule(options.rule, device=device).float()
     seeds = range(quality.FIRST_SEED, quality.FIRST_SEED + options.seed_count)
-    kwargs: dict[str, Any] = {"seeds": seeds, "device": device}
-    if rule.codes is not None and options.target is None:
-        if options.healing or options.judge:
-            raise NPAError(
-                "healing and judge are measured of one picture at a time, of the rule's "
-                f"{len(rule.codes)}: give --target {shown(rule.codes.names[0])}"
-            )
-        tasks = tasks_of_codes(options.rule, rule, device, **options.world)
-        kwargs["checkpoints"] = options.checkpoints or quality.PICTURE_CHECKPOINTS
-        with common.progress_bar(None, show=options.progress) as advance:
-            rows = quality.picture_rows(rule, tasks, progress=advance, **kwargs)
-        tables: dict[str, Sequence[Any]] = {"pictures": rows}
-        metric = tasks[0].metric_name
-        what = f"{len(tasks)} pictures, {options.seed_count} worlds each"
-        note = ", shuffled: with the code of the next picture"
-    else:
-        world = options.world | {"data_folder": options.data_folder}
-        trained = task_of_rule(options.rule, rule, device, **world)
-        task = trained.task
-        if trained.why_not_measurable is not None:
-            raise NPAError(
-                f"cannot measure {options.rule!r}: {trained.why_not_measurable}: "
-                "give --target, a built-in name or a picture"
-            )
-        kwargs["checkpoints"] = options.checkpoints
-        kwargs["texture_metric"] = options.judge
-        kwargs["changed"] = task.classifies or options.healing
-        total = None if kwargs["changed"] else max(checkpoints)
-        with common.progress_bar(total, show=options.progress) as advance:
-            tables = quality.tables_of(rule, task, progress=advance, **kwargs)
-        what, metric, note = f"{options.seed_count} worlds", task.metric_name, ""
-        if task.classifies:
-            clouds = cast("PointClassification", task)
-            what = f"{len(clouds.clouds.label)} {clouds.split} clouds"
-    print(f"{options.rule}: {what}, loss: {metric}{note}")
+    of_all_pictures = rule.codes is not None and options.target is None
+    measure = _measure_pictures if of_all_pictures else _measure_task
+    tables, metric, heading = measure(options, rule, seeds=seeds, device=device)
+    print(f"{options.rule}: {heading}")
     for name, table in tables.items():
         print(table_text(table, missing=UNMEASURED if name == "growth" else "never"))
-    if options.json is not None:
-        write_text(options.json, tables_json(tables, metric=metric))
-        print(f"wrote {options.json}")
+    if options.json_path is not None:
+        write_text(options.json_path, tables_json(tables, metric=metric))
+        print(f"wrote {options.json_path}")
     return 0
+
+
+def _measure_pictures(options: EvaluateOptions, rule: NPARule, **worlds: Any) -> Result:
+    from npa_envs.measure import quality
+    from npa_envs.training.task_of_rule import tasks_of_codes
+
+    assert rule.codes is not None
+    if options.healing or options.judge:
+        raise NPAError(
+            "healing and judge are measured of one picture at a time, of the rule's "
+            f"{len(rule.codes)}: give --target {shown(rule.codes.names[0])}"
+        )
+    tasks = tasks_of_codes(options.rule, rule, worlds["device"], **options.world)
+    steps = options.checkpoints or quality.PICTURE_CHECKPOINTS
+    with common.progress_bar(None, show=options.progress) as advance:
+        rows = quality.picture_rows(rule, tasks, checkpoints=steps, progress=advance, **worlds)
+    metric = tasks[0].metric_name
+    heading = f"{len(tasks)} pictures, {options.seed_count} worlds each, loss: {metric}"
+    return {"pictures": rows}, metric, f"{heading}, shuffled: with the code of the next picture"
+
+
+def _measure_task(options: EvaluateOptions, rule: NPARule, **worlds: Any) -> Result:
+    from npa_envs.measure import quality
+    from npa_envs.training.task_of_rule import task_of_rule
+
+    world = options.world | {"data_folder": options.data_folder}
+    trained = task_of_rule(options.rule, rule, worlds["device"], **world)
+    task = trained.task
+    if trained.why_not_measurable is not None:
+        raise NPAError(
+            f"cannot measure {options.rule!r}: {trained.why_not_measurable}: "
+            "give --target, a built-in name or a picture"
+        )
+    changed = task.classifies or options.healing
+    total = None if changed else max(options.checkpoints or quality.CHECKPOINTS)
+    with common.progress_bar(total, show=options.progress) as advance:
+        tables = quality.tables_of(
+            rule,
+            task,
+            checkpoints=options.checkpoints,
+            changed=changed,
+            texture_metric=options.judge,
+            progress=advance,
+            **worlds,
+        )
+    what = f"{options.seed_count} worlds"
+    if task.classifies:
+        clouds = cast("PointClassification", task)
+        what = f"{len(clouds.clouds.label)} {clouds.split} clouds"
+    return tables, task.metric_name, f"{what}, loss: {task.metric_name}"

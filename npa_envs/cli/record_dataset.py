@@ -101,14 +101,13 @@ def policy_of(options: RecordOptions, problem: Problem) -> Callable[[Any], Any]:
             # The next seed after those of the recorded worlds.
             last = options.first_seed + options.episodes - 1
             seed = last // WORLDS_PER_SEED + 1
-        evaluation_seeds = [2**31]  # Its episode only checks that the policy runs.
         return train(
             options.policy,
             problem,
             Budget(particle_steps=sys.maxsize),
             seed,
             device=options.device,
-            evaluation_seeds=evaluation_seeds,
+            evaluation_seeds=[2**31],  # Its episode only checks that the policy runs.
             curve_points=1,
         ).policy
     source = options.policy

@@ -35,7 +35,7 @@ class StressOptions(common.MeasureOptions):
     names (geometry/clump); default: all."""
     out: Path | None = None
     """Folder for stress_DEVICE.json and heat maps (extra `bench`); default: nothing is written."""
-    list: bool = False
+    only_list: Annotated[bool, tyro.conf.arg(name="list")] = False
     """Run nothing: print the checks and what each expects."""
 
 
@@ -51,7 +51,7 @@ def main(arguments: Sequence[str]) -> int:
     rules = common.named_rules(options.rules)
     checks = accuracy.all_checks(quick=options.quick, rules=rules)
     chosen = check_runner.chosen_checks(checks, options.only)
-    if options.list:
+    if options.only_list:
         for group, summary in check_runner.GROUPS.items():
             some = [check for check in chosen if check.group == group]
             if some:

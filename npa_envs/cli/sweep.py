@@ -161,17 +161,17 @@ def main(arguments: Sequence[str]) -> int:
 def combinations(
     over: Sequence[str], task_words: Sequence[str], folder: Path = Path()
 ) -> list[SweepRun]:
-    """Return a run of `npa-envs train TASK_WORDS` with each combination of values NAME=A,B,C."""
+    """Return a run of `task_words` for each combination of the values of `over` (NAME=A,B,C)."""
     from npa_envs.training import TASKS
 
     if not task_words or task_words[0] not in TASKS:
         hint = suggest(task_words[0], TASKS) if task_words else ", ".join(TASKS)
         raise NPAError(f"the arguments after -- must begin with a task of npa-envs train: {hint}")
-    used = [_option(word.partition("=")[0]) for word in task_words if word.startswith("--")]
+    used = [_option_name(word.partition("=")[0]) for word in task_words if word.startswith("--")]
     values: dict[str, list[str]] = {}
     for word in over:
         name, _, listed = word.partition("=")
-        name, each = _option(name), listed.split(",")
+        name, each = _option_name(name), listed.split(",")
         if not (name and all(each)):
             raise NPAError(f"over must be NAME=A,B,C, got {word!r}: seed=0,1,2")
         if name in used:
@@ -191,8 +191,7 @@ def combinations(
     return runs
 
 
-def _option(word: str) -> str:
-    """Return an option's name with hyphens and without the leading two."""
+def _option_name(word: str) -> str:
     return word.removeprefix("--").replace("_", "-")
 
 

@@ -11,7 +11,7 @@ import torch
 import torch.distributed as dist
 
 from npa_envs.cli import INTERRUPTED, common
-from npa_envs.cli.train_options import TrainOptions, default_preset, parse_run, resolve_task
+from npa_envs.cli.train_options import TrainOptions, default_preset, parse_run
 from npa_envs.errors import NPAError
 from npa_envs.training import (
     TASKS,
@@ -32,23 +32,31 @@ from npa_envs.training.process_launcher import (
 )
 from npa_envs.training.trainer import TrainResult
 
+TASK_LINES = "\n".join(f"  {name:<20}  {entry.summary}" for name, entry in TASKS.items())
+HELP = f"""usage: npa-envs train TASK [options]
+
+Train a rule by the gradient of a task's loss; npa-envs learn takes an environment's reward.
+
+{TASK_LINES}
+
+Options of a task: npa-envs train TASK --help"""
+
 
 def main(arguments: Sequence[str]) -> int:
     """Train; return 0 when the run is finished or out of time, 130 after Ctrl-C."""
+    if arguments and arguments[0] in {"-h", "--help"}:
+        print(HELP)
+        return 0
     if not arguments or arguments[0].startswith("-"):
-        names = "\n".join(f"  {name}  {entry.summary}" for name, entry in TASKS.items())
-        text = f"usage: npa-envs train TASK [options]\n\n{names}\n\n"
-        text += "Options of a task: npa-envs train TASK --help"
-        if arguments and arguments[0] in {"-h", "--help"}:
-            print(text)
-            return 0
         raise NPAError(f"train needs a task first: {', '.join(TASKS)}")
-    task_name = arguments[0]
+    task_name, *options_given = arguments
     task_entry(task_name)
     with joined_processes() as processes:
         request = None
         if processes.first:
-            resolved = resolve_task(task_name, arguments[1:])
+            resolved = common.resolve_run(
+                options_given, lambda words: parse_run(task_name, words)[1].out
+            )
             request = resolved, *parse_run(task_name, resolved)
         # Only the first process reads files, so that all have the same configuration.
         request = processes.broadcast(request)

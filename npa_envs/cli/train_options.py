@@ -44,11 +44,6 @@ class TrainOptions(common.SharedRunOptions):
     """End with a report in the folder `out`: metrics, a film and a model card of the rule."""
 
 
-def resolve_task(task_name: str, arguments: Sequence[str]) -> list[str]:
-    """Return arguments after replacing `--resume auto`, and adding the device of `--gpus`."""
-    return common.resolve_run(arguments, lambda words: parse_run(task_name, words)[1].out)
-
-
 def parse_run(task_name: str, arguments: Sequence[str]) -> tuple[TrainOptions, TrainConfig[Any]]:
     """Parse arguments to the options of the run and its training configuration.
 
@@ -138,10 +133,12 @@ def _parse_over(
         defaults = _with_common_fields(defaults)
     examples = task_entry(task_name).examples
     lines = "".join(f"\n  npa-envs train {task_name} {words}" for words in examples)
-    cls: Any = type(defaults)
     command_type: Any = Command
+    config_type: Any = type(defaults)
+    if config_type.__parameters__:  # The class holds any task: say which.
+        config_type = config_type[type(defaults.task)]
     command = common.parse_options(
-        command_type[cls[type(defaults.task)] if cls.__parameters__ else cls],
+        command_type[config_type],
         f"train {task_name}",
         ["--help" if word == "--help-all" else word for word in arguments],
         description=f"{description}\n\nExamples:{lines}",
@@ -151,23 +148,21 @@ def _parse_over(
 
 
 def _with_common_fields(config: Any) -> Any:
-    """Return a configuration with equal values whose help shows only the `Common` fields."""
+    """Return an equal configuration, of a subclass whose help shows only the `Common` fields."""
     cls: Any = type(config)
-    hints = get_type_hints(cls, include_extras=True)
     suppress: Any = tyro.conf.Suppress
-    types = {
-        name: suppress[hint]
-        for name, hint in hints.items()
-        if COMMON not in getattr(hint, "__metadata__", ())
-    }
-    values = {name: getattr(config, name) for name in types}
-    if "task" in types:
-        values["task"] = _with_common_fields(config.task)
-        types["task"] = type(values["task"])
-        cls = cls[types["task"]] if cls.__parameters__ else cls
-    hidden = [(name, types[name], field(default=value)) for name, value in values.items()]
-    narrow = make_dataclass(type(config).__name__, hidden, bases=(cls,), frozen=True, kw_only=True)
-    return _of_type(narrow, config, **values)
+    types: dict[str, Any] = {}
+    values = {one.name: getattr(config, one.name) for one in fields(config)}
+    for name, hint in get_type_hints(cls, include_extras=True).items():
+        if name == "task":
+            values["task"] = _with_common_fields(config.task)
+            types["task"] = type(values["task"])
+        elif COMMON not in getattr(hint, "__metadata__", ()):
+            types[name] = suppress[hint]
+    changed = [(name, kind, field(default=values[name])) for name, kind in types.items()]
+    base = cls[types["task"]] if getattr(cls, "__parameters__", ()) else cls
+    narrow = make_dataclass(cls.__name__, changed, bases=(base,), frozen=True, kw_only=True)
+    return narrow(**values)
 
 
 # Options of tasks of several species: one level, although their configurations nest.
@@ -175,7 +170,7 @@ def _with_common_fields(config: Any) -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class SpeciesOptions(Morphogenesis2DConfig):
-    """Options of all species together; a --config file can set them for each species."""
+    """Options with one value for all species; a --config file can set them for each species."""
 
     target: tyro.conf.Suppress[str] = "gecko"
     code_dim: tyro.conf.Suppress[int] = 8
@@ -200,34 +195,27 @@ class JointOptions(JointTrainConfig[SpeciesOptions]):
 def parse_joint(
     task_name: str, base: JointTrainConfig[CoMorphogenesis2DConfig], arguments: Sequence[str]
 ) -> tuple[TrainOptions, JointTrainConfig[CoMorphogenesis2DConfig]]:
-    """Parse arguments of a run of several species, whose configuration `base` they change."""
+    """Return the options of a run of several species, and `base` with the options' changes."""
     task = base.task
-    shared_fields = {
-        "targets": tuple(one.target for one in task.species),
-        "distance": task.distance,
-    }
-    # Parsed once for each species, so that fields without an option keep each species' value.
-    parsed = []
+    targets = tuple(species.target for species in task.species)
+    species_options: list[SpeciesOptions] = []
+    # Parsed over the values of each species, which an option that is not given does not change.
     for species in task.species:
-        species_options = _of_type(SpeciesOptions, species, **shared_fields)
-        defaults: JointOptions = _of_type(JointOptions, base, task=species_options)
-        parsed.append(_parse_over(defaults, task_name, arguments))
-    options, first = parsed[0]
-    targets = first.task.targets
+        own = _of_type(SpeciesOptions, species, targets=targets, distance=task.distance)
+        defaults: JointOptions = _of_type(JointOptions, base, task=own)
+        options, parsed = _parse_over(defaults, task_name, arguments)
+        species_options.append(parsed.task)
+    targets, distance = parsed.task.targets, parsed.task.distance
     if len(targets) < 2:
         raise NPAError(f"targets must be two or more, got {len(targets)}: --targets ring heart")
+    # Targets without a species take the options of the last one.
+    species_options += species_options[-1:] * (len(targets) - len(species_options))
     configs = tuple(
-        # Targets without a species take the options of the last one.
-        _of_type(
-            Morphogenesis2DConfig,
-            parsed[min(k, len(parsed) - 1)][1].task,
-            target=target,
-            targets=(),
-        )
-        for k, target in enumerate(targets)
+        _of_type(Morphogenesis2DConfig, own, target=target, targets=())
+        for own, target in zip(species_options, targets, strict=False)
     )
-    together = replace(task, species=configs, distance=first.task.distance)
-    return options, _of_type(JointTrainConfig, first, task=together)
+    together = replace(task, species=configs, distance=distance)
+    return options, _of_type(JointTrainConfig, parsed, task=together)
 
 
 def _of_type(cls: Any, source: Any, **changes: Any) -> Any:

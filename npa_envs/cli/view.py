@@ -124,8 +124,7 @@ def world_maker(options: ViewOptions, device: torch.device) -> Callable[[], Live
         raise NPAError(
             f"{name} is for environments, got --{name} with a rule or a run: leave it out"
         )
-    kwargs: dict[str, Any] = {"device": device, "seed": options.seed}
-    kwargs["particle_count"] = options.particle_count
+    kwargs: Any = {"device": device, "seed": options.seed, "particle_count": options.particle_count}
     run_files = ("config.json", "log.jsonl", "checkpoint.pt")
     if folder.is_dir() and any((folder / name).exists() for name in run_files):
         return lambda: RunWorld(folder, **kwargs)

@@ -33,7 +33,7 @@ Row = TypeVar("Row")
 
 
 class Record(Generic[Row]):
-    """Rows of a measurement and the facts of its run; with `path`, a JSON file."""
+    """The results of a measurement (rows) and the facts of its run, kept in a JSON file, if any."""
 
     command: str
     """The command that writes such records, for errors."""

@@ -1,7 +1,4 @@
-"""Plots of measurements: drawn without a window, bands, matrices, logarithmic axes, PNG files.
-
-They need matplotlib, of the extra `bench`.
-"""
+"""Plots of measurements by matplotlib (extra `bench`): bands, matrices, scales, PNG files."""
 
 from __future__ import annotations
 
@@ -71,7 +68,7 @@ def draw_band(
     label: str,
     **options: Any,
 ) -> None:
-    """Draw a curve with a band over `across`; `lines`: lower end, curve, upper end."""
+    """Draw a curve and a band at `across` (x); `lines`: the band's lower end, curve, upper end."""
     low, middle, high = lines
     panel.plot(across, middle, color=colour, label=label, **options)
     panel.fill_between(across, low, high, color=colour, alpha=0.2, lw=0)

@@ -20,9 +20,6 @@ from typing import Any, TypeVar
 
 from npa_envs.errors import NPAError
 
-POLL_SECONDS = 0.1
-"""Time between two polls of the processes [s]."""
-
 STOPPING = ("SIGINT", "SIGTERM", "SIGHUP")
 """Signals that stop a queue: from Ctrl-C, a scheduler, a closed terminal."""
 
@@ -115,7 +112,7 @@ def run_children(
                         _raise_if_any(signals)
                         del running[slot]
                         finished(child)
-                time.sleep(POLL_SECONDS if running else 0.0)
+                time.sleep(0.1 if running else 0.0)
         finally:
             signals.append(0)  # The next signal raises at once.
             _end([*running.values(), *waiting])

@@ -36,7 +36,7 @@ FIRST_SEED = 1_000_000
 CHECKPOINTS = (64, 128, 256, 512, 1024, 2048, 4096)
 """Default steps at which a rule is measured."""
 
-DIVERGED = 10.0
+DIVERGED_FACTOR = 10.0
 """A world has diverged if its loss is more than this many times that before the damage."""
 
 HEALED = 1.2
@@ -179,7 +179,7 @@ def healing(
     rows = []
     for name, worlds in damaged.items():
         losses = torch.stack([task.metric(now.x, now.s) for _, now in runner.at(steps, worlds)])
-        diverged = ~(losses[-1] <= DIVERGED * before)
+        diverged = ~(losses[-1] <= DIVERGED_FACTOR * before)
         mean_healed = ((losses.mean(1) <= HEALED * before.mean()) & ~diverged.all()).tolist()
         healed = [step for step, is_healed in zip(steps, mean_healed, strict=True) if is_healed]
         rows.append(
@@ -326,7 +326,7 @@ def _blank_clouds(runner: RuleRunner, index: Tensor) -> Particles:
 def _cloud_means(
     task: PointClassification, measured: Callable[[Tensor], Iterable[Sequence[Tensor]]]
 ) -> list[list[float]]:
-    """Return means over all clouds of the rows of tensors [B] that `measured` yields per batch."""
+    """Return a table of means over all clouds; `measured` gives its values [B] for B indices."""
     count = len(task.clouds.label)
     sums = torch.zeros((), dtype=torch.float64)
     for index in torch.split(torch.arange(count, device=task.clouds.x.device), BATCH):
@@ -383,7 +383,7 @@ def tables_of(
     """Measure a rule of any task; return tables by name.
 
     They are `growth` and, if `changed`, `healing`; for clouds `accuracy` and, if `changed`,
-    `changes`; and `judge` of `texture_metric`. Clouds run on their task's device, with the first
+    `changes`; with `texture_metric` also `judge`. Clouds run on their task's device, with the first
     seed.
     """
     metric = TextureMetric(task) if texture_metric else None

@@ -303,10 +303,7 @@ class InteractionRecord(Record[InteractionRow]):
 
 
 def interaction_map(rows: Sequence[InteractionRow]) -> bytes:
-    """Return a PNG with a matrix for each setting: changes of the loss of rules (rows) by others.
-
-    Needs matplotlib.
-    """
+    """Return a PNG with a matrix for each setting: changes of a rule's loss (rows) by others."""
     names = list(dict.fromkeys([row.rule for row in rows] + [row.beside for row in rows]))
     cells: dict[str, dict[tuple[str, str], float]] = {}
     for row in rows:

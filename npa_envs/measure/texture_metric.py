@@ -52,7 +52,7 @@ class TextureRow:
 
 
 class TextureMetric:
-    """Distance of pictures of a texture task from its target.
+    """Distance of pictures from the target of a texture task; other tasks raise NPAError.
 
     It is computed in float64 with directions from a fixed seed, so that CPU and GPU agree.
     """
@@ -122,7 +122,7 @@ class TextureMetric:
         return torch.stack(distances)
 
     def _projections(self, image: Tensor, wrap: bool) -> Tensor:
-        """Return the quantiles of the patches' projections, [DIRECTIONS, R²]."""
+        """Return the quantiles of the patches' projections, [DIRECTIONS, R²]; `wrap`: periodic."""
         waves = torch.fft.rfft2(image)
         projected = torch.fft.irfft2((waves * self._filters).sum(1), s=image.shape[-2:])
         count = image.shape[-1] ** 2

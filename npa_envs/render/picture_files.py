@@ -45,7 +45,6 @@ def encode_frame(frame: Frame, kind: Literal["PNG", "JPEG"]) -> bytes:
 
 
 def _encoded(frames: Iterable[Frame], **options: Any) -> bytes:
-    """Return the bytes of a file of pictures, encoded by Pillow."""
     first, *others = map(Image.fromarray, checked_frames(frames))
     buffer = io.BytesIO()
     first.save(buffer, append_images=others, **options)

@@ -87,7 +87,7 @@ def draw_worlds(
         azimuth: 3D only: angle of the camera around the vertical axis [degrees], counterclockwise
             from above; at 0 x points right and z towards the viewer.
         elevation: 3D only: angle of the camera above the horizon [degrees].
-        background: As of `to_uint8`.
+        background: A colour name, "#rrggbb", or red, green and blue in [0, 1].
 
     Returns:
         Pixels of shape [B, R, R, 3]; the first row is the highest y.

@@ -224,6 +224,14 @@ def rule_file(source: str | Path) -> Path:
     return _locate(source)[0]
 
 
+def rule_name(source: str) -> str:
+    """Return the name of a rule's file; for rule.safetensors, that of its folder."""
+    if "#" in source:
+        return source.rpartition("#")[2]
+    path = rule_file(source)
+    return path.resolve().parent.name if path.name == "rule.safetensors" else path.stem
+
+
 def _locate(source: str | Path) -> tuple[Path, str | None]:
     """Return the file of a rule, and the rule's name in it, after '#', or None."""
     if not isinstance(source, str | os.PathLike):

@@ -19,12 +19,13 @@ from torch import Tensor
 
 from npa_envs.atomic_files import atomic_path, checked_path
 from npa_envs.errors import NPAError, shown
-from npa_envs.rule.files import load_rule
+from npa_envs.render.colours import colour_tables
+from npa_envs.rule.files import load_rule, rule_name
 from npa_envs.rule.rule import NPARule, check_rule
 from npa_envs.tasks.damage import CLUMP_FACTOR, DAMAGE_SIZES
 from npa_envs.tasks.point_classification import PALETTE, UNDECIDED, PointClassification
-from npa_envs.web.live_world import checked_seed, colour_tables
-from npa_envs.web.rule_world import MIN_SEED, RuleWorld, name_of
+from npa_envs.web.live_world import checked_seed
+from npa_envs.web.rule_world import MIN_SEED, RuleWorld
 from npa_envs.world.species import AGREEMENTS
 
 PAGE = Path(__file__).resolve().parent / "page"
@@ -122,7 +123,7 @@ def export_web(
 
 def distinct_names(sources: Sequence[str], what: str) -> list[str]:
     """Return the names of rules; raise NPAError if two are equal. `what` begins its message."""
-    names = [name_of(source) for source in sources]
+    names = [rule_name(source) for source in sources]
     if not names or len(set(names)) < len(names):
         raise NPAError(
             f"{what} needs rules of different names, got {shown(names)}: leave one out, or give "
@@ -133,7 +134,7 @@ def distinct_names(sources: Sequence[str], what: str) -> list[str]:
 
 def page_rule(source: str, *, particle_count: int | None = None) -> dict[str, Any]:
     """Return a rule and its world as JSON for rule_world.js, with arrays as float32 in base64."""
-    check_browser_rule(load_rule(source), name_of(source))
+    check_browser_rule(load_rule(source), rule_name(source))
     live = RuleWorld(source, device=torch.device("cpu"), particle_count=particle_count, choices={})
     rule, task = live.main.rule, live.task
     seed: dict[str, Any]
@@ -260,7 +261,6 @@ def page_text(
 
 
 def _gallery(title: str, previews: Mapping[str, str]) -> str:
-    """Return the HTML of the pictures from which a rule is chosen."""
     links = "\n".join(
         f'<li><a href="#{quote(name, safe="")}"><img src="{picture}" alt="">'
         f"<span>{html.escape(name)}</span></a></li>"

@@ -13,7 +13,8 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError, shown, suggest
-from npa_envs.rule.files import load_rule, rule_file, rule_metadata, shipped_rules
+from npa_envs.render.colours import ColouredWorld, Colouring, shows_of
+from npa_envs.rule.files import load_rule, rule_metadata, rule_name, shipped_rules
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Task
 from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2DConfig, together
@@ -23,7 +24,7 @@ from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.run_folder import JsonlLog, RunFolder
 from npa_envs.training.task_of_rule import TrainedTask, task_of_rule, trained_config
 from npa_envs.training.task_table import load_config, preset
-from npa_envs.web.live_world import ColouredWorld, Colouring, LiveWorld, Range, Touch, shows_of
+from npa_envs.web.live_world import LiveWorld, Range, Touch
 from npa_envs.world.brushes import inside_ball, wipe_state
 from npa_envs.world.division import living
 from npa_envs.world.particles import Particles
@@ -77,7 +78,7 @@ class RuleWorld(LiveWorld):
         # Tasks with their targets, of which the slider of N makes many.
         self._trained = functools.lru_cache(8)(self._load_task)
         others = {name: name for name in shipped_rules()} if choices is None else dict(choices)
-        name = name_of(source)
+        name = rule_name(source)
         self._choices = others | {name: source}
         self._plant(name, particle_count)
 
@@ -140,7 +141,7 @@ class RuleWorld(LiveWorld):
         return self.task.box
 
     def describe(self) -> dict[str, Any]:
-        """Return the event "world", which describes the world to the page."""
+        """Return the event "world" of page.js: rules, view, brushes and settings of this world."""
         frame = self.task.frame
         return super().describe() | {
             "title": self.main.name,
@@ -286,7 +287,7 @@ class RuleWorld(LiveWorld):
         return torch.cat([live_rule.rule.colour(states) for live_rule, states in groups], dim=1)
 
     def _loss(self) -> float | None:
-        """Return the task's metric; None if it does not fit the world, or is not due yet."""
+        """Return the task's metric; None for several rules, without a target, or if not due yet."""
         start = time.perf_counter()
         comparable = self.trained.why_not_measurable is None and len(self.live_rules) == 1
         if not comparable or not self.counts[0] or start < self._loss_due:
@@ -394,14 +395,6 @@ class RuleWorld(LiveWorld):
         self.live_rules = present or self.live_rules[:1]
 
 
-def name_of(source: str) -> str:
-    """Return a rule's name: of its file, or of the run's folder for rule.safetensors."""
-    if "#" in source:
-        return source.rpartition("#")[2]
-    path = rule_file(source)
-    return path.resolve().parent.name if path.name == "rule.safetensors" else path.stem
-
-
 class RunWorld(RuleWorld):
     """A world of the rules of a training run, which are replaced at each new checkpoint."""
 
@@ -418,7 +411,7 @@ class RunWorld(RuleWorld):
         """Iterations and losses of the log."""
         self._log_version: Any = None
         files = rules_of_run(self._run_folder)
-        self._files = {name_of(str(path)): path for path in files}
+        self._files = {rule_name(str(path)): path for path in files}
         self._centres = [0.0]
         if len(files) > 1:
             # Seeds lie in a row, as in training.
@@ -438,7 +431,6 @@ class RunWorld(RuleWorld):
 
     @torch.no_grad()
     def _begin(self, seed: int | None) -> None:
-        """Start a new world of all rules of the run."""
         super()._begin(seed)
         if len(self._files) == 1:
             return
@@ -455,7 +447,7 @@ class RunWorld(RuleWorld):
         self.count = sum(self.counts)
 
     def describe(self) -> dict[str, Any]:
-        """Return the event "world", without a choice of rules."""
+        """Return the event "world" of page.js; the page cannot choose between rules."""
         return super().describe() | {
             "title": self._run_folder.path.resolve().name,
             "note": f"a training run, iteration {self._iteration}",

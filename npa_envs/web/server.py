@@ -180,7 +180,6 @@ def make_app(site: Site) -> Starlette:
 
 
 def _file_response(folder: Path, request: Request, media_types: Mapping[str, str]) -> Response:
-    """Return the response with the requested file of a folder, or 404."""
     path = folder / request.path_params["name"]
     with contextlib.suppress(OSError, ValueError):  # Invalid file names.
         if path.parent == folder and path.suffix in media_types and path.is_file():

@@ -8,9 +8,9 @@ from support.circle_task import circle_config
 from support.training_runs import trainer_of
 
 from npa_envs.cli import main
-from npa_envs.cli.common import torch_threads
+from npa_envs.cli.common import resolve_run, torch_threads
 from npa_envs.cli.train import process_count, thread_count
-from npa_envs.cli.train_options import TrainOptions, resolve_task, starting_configuration
+from npa_envs.cli.train_options import TrainOptions, parse_run, starting_configuration
 from npa_envs.errors import NPAError
 from npa_envs.training import RunFolder, config_to_dict, preset
 from npa_envs.training.checkpoint import load_checkpoint, save_checkpoint
@@ -19,17 +19,21 @@ TASK = "morphogenesis2d"
 WITHOUT_AGES = {"world_count": 4, "pool_size": 30, "max_age_range": (0, 0), "stillness_weight": 0}
 
 
+def resolved(words):
+    return resolve_run(words, lambda words: parse_run(TASK, words)[1].out)
+
+
 def test_resume_auto_begins_and_later_goes_on(tmp_path):
     for words in (["--resume", "auto"], ["--resume=auto"]):
-        assert resolve_task(TASK, [*words, "--out", str(tmp_path)]) == ["--out", str(tmp_path)]
+        assert resolved([*words, "--out", str(tmp_path)]) == ["--out", str(tmp_path)]
     trainer_of(circle_config(tmp_path))
     for words in (["--resume", "auto"], ["--resume=auto"]):
-        chosen = resolve_task(TASK, ["--target", "ring", *words, "--out", str(tmp_path)])
+        chosen = resolved(["--target", "ring", *words, "--out", str(tmp_path)])
         assert chosen == ["--target", "ring", "--out", str(tmp_path), "--resume"]
     # What is plain stays as it is.
-    assert resolve_task(TASK, ["--resume", "--out", "x"]) == ["--resume", "--out", "x"]
+    assert resolved(["--resume", "--out", "x"]) == ["--resume", "--out", "x"]
     with pytest.raises(NPAError, match="resume"):
-        resolve_task(TASK, ["--resume", "never"])
+        resolved(["--resume", "never"])
 
 
 @pytest.mark.parametrize(
@@ -84,9 +88,9 @@ def test_a_run_goes_on_with_its_own_preset_only(tmp_path):
 def test_gpus_are_processes_that_have_a_gpu_each():
     cuda = preset("fast", device="cuda")
     assert process_count(TASK, TrainOptions(gpus=4), cuda) == 4
-    assert resolve_task(TASK, ["--gpus", "4"]) == ["--gpus", "4", "--device", "cuda"]
+    assert resolved(["--gpus", "4"]) == ["--gpus", "4", "--device", "cuda"]
     given = ["--gpus=4", "--device", "cuda"]
-    assert resolve_task(TASK, given) == given
+    assert resolved(given) == given
     for options, config, message in (
         ({"gpus": 4}, preset("fast"), "gpus goes with device 'cuda', got 'cpu'"),
         ({"gpus": 0}, cuda, "gpus must be at least 1, got 0"),

@@ -61,10 +61,7 @@ class CheckResult:
         object.__setattr__(self, "verdict", self.verdict or (default if within else "fail"))
 
     def fraction(self, name: str) -> float:
-        """Return a metric divided by its limit; if this is above 1 or NaN, it exceeds the limit.
-
-        With a limit of 0 it is 0 or infinite.
-        """
+        """Return a metric / its limit; above 1 or NaN: it fails. For the limit 0: 0 or infinite."""
         value, limit = self.metrics.get(name, math.nan), self.limits[name]
         if limit == 0.0:
             return value if value == 0.0 or math.isnan(value) else math.inf
@@ -119,7 +116,7 @@ class Check:
         return self.name.partition("/")[0]
 
     @property
-    def weights(self) -> str:
+    def weights_digest(self) -> str:
         """Hash of the rule's weights (`rule_digest`), "" without a rule."""
         return rule_digest(load_rule(self.rule)) if self.rule else ""
 
@@ -194,7 +191,8 @@ class StressRecord(Record[CheckResult]):
 
     def result_of(self, check: Check) -> CheckResult | None:
         """Return a check's stored result, or None if there is none for the rule's weights."""
-        rows = (row for row in self.rows if row.name == check.name and row.weights == check.weights)
+        digest = check.weights_digest
+        rows = (row for row in self.rows if row.name == check.name and row.weights == digest)
         return next(rows, None)
 
     def is_done(self, check: Check) -> bool:
@@ -270,7 +268,7 @@ def run_checks(
 
 def run_check(check: Check, session: CheckSession) -> CheckResult:
     """Run a check and return its result: "fail" on an error, "skipped" if memory runs out."""
-    weights, begin = check.weights, time.perf_counter()
+    digest, begin = check.weights_digest, time.perf_counter()
     try:
         result = check.run(session)
     except Skipped as reason:
@@ -283,7 +281,7 @@ def run_check(check: Check, session: CheckSession) -> CheckResult:
         result = CheckResult(verdict="fail", note=note)
     seconds = time.perf_counter() - begin
     return replace(
-        result, name=check.name, expected=check.expected, seconds=seconds, weights=weights
+        result, name=check.name, expected=check.expected, seconds=seconds, weights=digest
     )
 
 

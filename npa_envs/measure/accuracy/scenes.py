@@ -36,7 +36,7 @@ class Scene:
 
     @property
     def s(self) -> Tensor:
-        """The states, as `states_at` returns them."""
+        """States of the particles, [B, N, C]: random, and always the same (`states_at`)."""
         return states_at(self.x)
 
 
@@ -209,7 +209,7 @@ class PerceptionOutcome(NamedTuple):
 
 
 def relative_error(value: Tensor, expected: Tensor) -> float:
-    """Return the largest error of B worlds [B, ...], relative to the norm of each, if not 0."""
+    """Return the largest |value - expected| / |expected| (norms) of B worlds, [B, ...] each."""
     exact = expected.detach().cpu().double().flatten(1)
     away = (value.detach().cpu().double().flatten(1) - exact).norm(dim=1)
     size = exact.norm(dim=1)

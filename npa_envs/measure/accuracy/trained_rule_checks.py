@@ -111,7 +111,7 @@ particles in open space.
 
 
 def measured(runner: RuleRunner, worlds: Particles) -> dict[str, float]:
-    """Return measurements of worlds, named as in `BOUNDS`; energy takes `ENERGY_STEPS` steps."""
+    """Return worlds' metrics by the names in `BOUNDS`; "energy" runs `ENERGY_STEPS` more steps."""
     with torch.no_grad():
         x, s, *_ = worlds
         not_finite = (~x.isfinite()).sum() + (~s.isfinite()).sum()

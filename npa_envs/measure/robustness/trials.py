@@ -97,18 +97,17 @@ CONDITIONS = {
 
 @dataclass(frozen=True, kw_only=True)
 class TrialPlan:
-    """Plan of the measurements of a rule; steps of growth are rounded to multiples of `chunk`.
-
-    `grow_steps`: steps from the seed to the damage, or to the loss under a condition. `heal_steps`:
-    steps after the damage at which losses are measured, from 0 on. `values`: increasing values of
-    each condition, which include the trained one.
-    """
+    """How a rule of a task is measured."""
 
     grow_steps: int
+    """Steps from the seed to the damage, or to the loss under a condition."""
     heal_steps: tuple[int, ...]
+    """Steps after the damage at which losses are measured, from 0 on."""
     chunk: int
+    """Steps of growth are a multiple of this, also where they are scaled by dt or update_prob."""
     worlds_per_seed: int = 1
     values: Mapping[str, tuple[float | str, ...]]
+    """Increasing values of each condition, with the trained one."""
 
 
 _HEAL_STEPS = (0, 16, 32, 48, 64, 96, 128, 192, 256, 384, 512, 768, 1024)
@@ -227,7 +226,7 @@ class RuleTrial:
         return self._tasks[particle_count]
 
     def _by_task(self, x: Tensor) -> Iterator[tuple[Any, Tensor]]:
-        """Yield each task and its worlds' indices in x: all worlds, once or several times."""
+        """Yield each picture's task and its worlds' indices in x, which may be several copies."""
         pictures = self._pictures.repeat(len(x) // self.world_count)
         tasks = self.tasks_of(x.shape[1])
         for k in sorted(set(pictures.tolist())):
@@ -347,7 +346,7 @@ def _around(
 
 
 def add_state_noise(x: Tensor, s: Tensor, random: WorldRandom, box: Box) -> tuple[Tensor, Tensor]:
-    """Add normal noise to all states."""
+    """Return the positions as they are, and states plus normal noise of `STATE_NOISE`."""
     return x, s + STATE_NOISE * random.normal(*s.shape[1:], dtype=s.dtype)
 
 
@@ -394,10 +393,7 @@ MASKS_AFTER_DAMAGE, MASKS_OF_CONTROL = 1001, 1002
 
 @dataclass(frozen=True)
 class LossCurve:
-    """Losses of all seeds at `steps` after a damage, and those of their `undamaged` copies.
-
-    The loss of a world that is not finite is NaN.
-    """
+    """Losses of all seeds at `steps` after a damage, and of `undamaged` copies; NaN: not finite."""
 
     damage: str
     steps: tuple[int, ...]

@@ -43,10 +43,7 @@ class Workload:
 
     @property
     def half_width(self) -> float:
-        """Half the side of the square or cube that the particles fill [length units].
-
-        The density does not depend on the number of particles.
-        """
+        """Half the side of the square or cube of particles [length units], by a fixed density."""
         if self.space_dim == 2:
             return 0.7 * math.sqrt(self.particle_count / 4096)
         return 0.8 * math.cbrt(self.particle_count / 16384)
@@ -152,10 +149,7 @@ def synchronize(device: torch.device) -> None:
 def timed(
     run: Callable[[], object], device: torch.device, repeats: int, *, calls: int | None = None
 ) -> Timing:
-    """Return the time of a call, from readings of `calls` calls in a row.
-
-    By default as many calls as take `MIN_SECONDS`.
-    """
+    """Return the time of a call: `repeats` readings of `calls` calls, by default `MIN_SECONDS`."""
 
     def reading(count: int) -> float:
         synchronize(device)
@@ -246,5 +240,5 @@ class TimingSession:
         return []
 
     def rows(self, calls: Iterable[tuple[str, Callable[[], Row]]]) -> list[Row]:
-        """Return the rows of calls with their names, each made by `attempt`."""
+        """Return the rows that `calls` (name, function) return, where memory and time allow."""
         return [row for what, make in calls for row in self.attempt(what, make)]

@@ -67,44 +67,58 @@ function loopBelow(local, limit, body) {
   return [0x02, 0x40, 0x03, 0x40, ...below(get(local), limit), 0x45, 0x0d, 1, ...body, 0x0c, 0, 0x0b, 0x0b];
 }
 
+// A function's locals by name: its parameters and other integers, then vectors; `counts` are how many.
+function namedLocals(parameters, integers, vectors) {
+  const names = [...parameters, ...integers, ...vectors];
+  const local = (name) => names.indexOf(name);
+  return {
+    local, value: (name) => get(local(name)), put: (name, code) => set(local(name), code),
+    counts: { parameters: parameters.length, integers: integers.length, vectors: vectors.length },
+  };
+}
+
 // gather(states, own, listBytes, stateAt, a, kx, ky, kz, sums): as in plainKernels, addresses in bytes.
 function gatherCode(width, dimension) {
-  const [states, own, listBytes, stateAt, a, kx, ky, kz, sums] = [0, 1, 2, 3, 4, 5, 6, 7, 8];
-  const [done, at, other, offset] = [9, 10, 11, 12];
-  const slopes = [kx, ky, kz].slice(0, dimension);
-  const spread = [13, 14, 15, 16];
-  const mine = (part) => 17 + part;
-  const sum = (axis, part) => 19 + 2 * axis + part;
+  const all = ["a", "kx", "ky", "kz"], lists = all.slice(0, dimension + 1);
+  const { local, value, put, counts } = namedLocals(
+    ["states", "own", "listBytes", "stateAt", ...all, "sums"],
+    ["done", "at"],
+    [
+      "other", "offset", ...all.map((list) => `spread ${list}`), "mine 0", "mine 1",
+      ...all.flatMap((list) => [`sum ${list} 0`, `sum ${list} 1`]),
+    ],
+  );
   const code = [];
   // Two vectors at a time: their sums stay in registers.
   for (let first = 0; first < width; first += 8) {
     const parts = first + 4 < width ? [0, 1] : [0];
     const byte = (part) => 4 * first + 16 * part;
-    for (const part of parts) {
-      code.push(...set(mine(part), load(get(own), byte(part))));
-      for (let axis = 0; axis <= dimension; axis++) code.push(...set(sum(axis, part), zeros));
-    }
-    code.push(...set(done, number(0)));
-    const body = [...set(at, add(get(states), multiply(loadInteger(add(get(stateAt), get(done))), number(4))))];
-    [a, ...slopes].forEach((list, axis) => body.push(...set(spread[axis], loadSplat(add(get(list), get(done))))));
-    for (const part of parts) {
-      body.push(...set(other, load(get(at), byte(part))));
-      body.push(...set(offset, minus(get(other), get(mine(part)))));
-      body.push(...set(sum(0, part), plus(get(sum(0, part)), times(get(spread[0]), get(other)))));
-      slopes.forEach((_, axis) => {
-        const total = sum(axis + 1, part);
-        body.push(...set(total, plus(get(total), times(get(spread[axis + 1]), get(offset)))));
-      });
-    }
-    body.push(...set(done, add(get(done), number(4))));
-    code.push(...loopBelow(done, get(listBytes), body));
-    for (const part of parts) {
-      for (let axis = 0; axis <= dimension; axis++) {
-        code.push(...store(get(sums), get(sum(axis, part)), 4 * width * axis + byte(part)));
-      }
-    }
+    const addNeighbour = (list, part) => {
+      const sum = `sum ${list} ${part}`, factor = value(list === "a" ? "other" : "offset");
+      return put(sum, plus(value(sum), times(value(`spread ${list}`), factor)));
+    };
+    const neighbour = [
+      ...put("at", add(value("states"), multiply(loadInteger(add(value("stateAt"), value("done"))), number(4)))),
+      ...lists.flatMap((list) => put(`spread ${list}`, loadSplat(add(value(list), value("done"))))),
+      ...parts.flatMap((part) => [
+        ...put("other", load(value("at"), byte(part))),
+        ...put("offset", minus(value("other"), value(`mine ${part}`))),
+        ...lists.flatMap((list) => addNeighbour(list, part)),
+      ]),
+      ...put("done", add(value("done"), number(4))),
+    ];
+    code.push(
+      ...parts.flatMap((part) => [
+        ...put(`mine ${part}`, load(value("own"), byte(part))),
+        ...lists.flatMap((list) => put(`sum ${list} ${part}`, zeros)),
+      ]),
+      ...put("done", number(0)),
+      ...loopBelow(local("done"), value("listBytes"), neighbour),
+      ...parts.flatMap((part) => lists.flatMap((list, k) =>
+        store(value("sums"), value(`sum ${list} ${part}`), 4 * width * k + byte(part)))),
+    );
   }
-  return { parameters: 9, integers: 2, vectors: 2 + 4 + 2 + 8, code };
+  return { ...counts, code };
 }
 
 // Numbers that `listNeighbours` reads, each of them a word in memory.
@@ -114,18 +128,15 @@ const PROBE = ["x", "y", "z", "eps", "square", "weight", "slope", "sideX", "side
 // plainKernels. `order` holds, for each set of lanes, the bytes that bring them to the front; `out` gets
 // the number of neighbours, and from its 16th byte on six vectors, the lanes of the moment matrix.
 function listCode(dimension) {
-  const names = [
-    "probe", "order", "x", "y", "z", "volume", "ranges", "rangesEnd", "width", "stateAt", "a", "kx", "ky", "kz", "out",
-    // Local integers.
-    "byte", "end", "count", "hits", "at",
-    // Vectors.
-    "lanes", "dx", "dy", "dz", "squared", "inside", "rest", "distance", "factor", "front",
-    "xx", "xy", "xz", "yy", "yz", "zz", "sx", "sy", "sz",
-    ...PROBE.map((name) => `probe ${name}`),
-  ];
-  const local = (name) => names.indexOf(name);
-  const value = (name) => get(local(name));
-  const put = (name, code) => set(local(name), code);
+  const { local, value, put, counts } = namedLocals(
+    ["probe", "order", "x", "y", "z", "volume", "ranges", "rangesEnd", "width", "stateAt", "a", "kx", "ky", "kz", "out"],
+    ["byte", "end", "count", "hits", "at"],
+    [
+      "lanes", "dx", "dy", "dz", "squared", "inside", "rest", "distance", "factor", "front",
+      "xx", "xy", "xz", "yy", "yz", "zz", "sx", "sy", "sz",
+      ...PROBE.map((name) => `probe ${name}`),
+    ],
+  );
   const probed = (name) => value(`probe ${name}`);
   const axes = ["x", "y", "z"].slice(0, dimension);
   const large = { x: "X", y: "Y", z: "Z" };
@@ -178,7 +189,7 @@ function listCode(dimension) {
     ...storeInteger(value("out"), value("count")),
     ...["xx", "xy", "xz", "yy", "yz", "zz"].flatMap((name, k) => store(value("out"), value(name), 16 + 16 * k)),
   ];
-  return { parameters: 15, integers: 5, vectors: names.length - 20, code };
+  return { ...counts, code };
 }
 
 // For each set of four lanes the bytes that bring them to the front, in order: [16, 16].
@@ -196,46 +207,48 @@ function lanesToFront() {
 // product(rows, rowBytes, rowEnd, weights, bias, outputs, outputBytes, inputBytes, limit, tiles): for all
 // rows out = W in + b, and max(out, 0) where `limit` is 1. Weights lie tile by tile: [tiles, inputs, 8].
 function productCode() {
-  const [rows, rowBytes, rowEnd, weights, bias, outputs, outputBytes, inputBytes, limit, tiles] = [0, 1, 2, 3, 4, 5, 6, 7, 8, 9];
-  const [row, input, weight, out, tile, at0, at1, at2, at3] = [10, 11, 12, 13, 14, 15, 16, 17, 18];
-  const addresses = [at0, at1, at2, at3];
-  const [left, right, spread, other] = [19, 20, 21, 22];
-  const sum = (k, half) => 23 + 2 * k + half;
+  const four = [0, 1, 2, 3];
+  const { local, value, put, counts } = namedLocals(
+    ["rows", "rowBytes", "rowEnd", "weights", "bias", "outputs", "outputBytes", "inputBytes", "limit", "tiles"],
+    ["row", "input", "weight", "out", "tile", ...four.map((k) => `at ${k}`)],
+    ["left", "right", "spread", "other", ...four.flatMap((k) => [`left ${k}`, `right ${k}`])],
+  );
+  const addProduct = (sum, weights) => put(sum, plus(value(sum), times(value("spread"), value(weights))));
+  const limited = (sum, byte) => [
+    ...put("other", value(sum)),
+    ...store(value("out"), select(larger(value("other"), zeros), value("other"), value("limit")), byte),
+  ];
   const inner = [
-    ...set(left, load(get(weight))),
-    ...set(right, load(get(weight), 16)),
+    ...put("left", load(value("weight"))), ...put("right", load(value("weight"), 16)),
+    ...four.flatMap((k) => [
+      ...put("spread", loadSplat(add(value(`at ${k}`), value("input")))),
+      ...addProduct(`left ${k}`, "left"), ...addProduct(`right ${k}`, "right"),
+    ]),
+    ...put("weight", add(value("weight"), number(4 * TILE_OUTPUTS))),
+    ...put("input", add(value("input"), number(4))),
   ];
-  addresses.forEach((address, k) => {
-    inner.push(...set(spread, loadSplat(add(get(address), get(input)))));
-    inner.push(...set(sum(k, 0), plus(get(sum(k, 0)), times(get(spread), get(left)))));
-    inner.push(...set(sum(k, 1), plus(get(sum(k, 1)), times(get(spread), get(right)))));
-  });
-  inner.push(...set(weight, add(get(weight), number(4 * TILE_OUTPUTS))));
-  inner.push(...set(input, add(get(input), number(4))));
-  const perRows = [];
-  addresses.forEach((address, k) => {
-    perRows.push(...set(address, add(get(row), multiply(get(rowBytes), number(k)))));
-    perRows.push(...set(sum(k, 0), load(get(bias))), ...set(sum(k, 1), load(get(bias), 16)));
-  });
-  perRows.push(...set(weight, get(weights)), ...set(input, number(0)));
-  perRows.push(...loopBelow(input, get(inputBytes), inner));
-  addresses.forEach((_, k) => {
-    for (const half of [0, 1]) {
-      perRows.push(...set(other, get(sum(k, half))));
-      perRows.push(...store(get(out), select(larger(get(other), zeros), get(other), get(limit)), 16 * half));
-    }
-    perRows.push(...set(out, add(get(out), get(outputBytes))));
-  });
-  perRows.push(...set(row, add(get(row), multiply(get(rowBytes), number(TILE_ROWS)))));
+  const perRows = [
+    ...four.flatMap((k) => [
+      ...put(`at ${k}`, add(value("row"), multiply(value("rowBytes"), number(k)))),
+      ...put(`left ${k}`, load(value("bias"))), ...put(`right ${k}`, load(value("bias"), 16)),
+    ]),
+    ...put("weight", value("weights")), ...put("input", number(0)),
+    ...loopBelow(local("input"), value("inputBytes"), inner),
+    ...four.flatMap((k) => [
+      ...limited(`left ${k}`, 0), ...limited(`right ${k}`, 16),
+      ...put("out", add(value("out"), value("outputBytes"))),
+    ]),
+    ...put("row", add(value("row"), multiply(value("rowBytes"), number(TILE_ROWS)))),
+  ];
   const perTile = [
-    ...set(row, get(rows)),
-    ...set(out, add(get(outputs), multiply(get(tile), number(4 * TILE_OUTPUTS)))),
-    ...loopBelow(row, get(rowEnd), perRows),
-    ...set(weights, add(get(weights), multiply(get(inputBytes), number(TILE_OUTPUTS)))),
-    ...set(bias, add(get(bias), number(4 * TILE_OUTPUTS))),
-    ...set(tile, add(get(tile), number(1))),
+    ...put("row", value("rows")),
+    ...put("out", add(value("outputs"), multiply(value("tile"), number(4 * TILE_OUTPUTS)))),
+    ...loopBelow(local("row"), value("rowEnd"), perRows),
+    ...put("weights", add(value("weights"), multiply(value("inputBytes"), number(TILE_OUTPUTS)))),
+    ...put("bias", add(value("bias"), number(4 * TILE_OUTPUTS))),
+    ...put("tile", add(value("tile"), number(1))),
   ];
-  return { parameters: 10, integers: 9, vectors: 4 + 8, code: [...set(tile, number(0)), ...loopBelow(tile, get(tiles), perTile)] };
+  return { ...counts, code: [...put("tile", number(0)), ...loopBelow(local("tile"), value("tiles"), perTile)] };
 }
 
 // A module of some functions, exported by their names; all parameters are integers, none returns.

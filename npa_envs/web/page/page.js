@@ -32,7 +32,7 @@
 //       [length units]; rules: choices of `rule`; others: choices of graft and add; species: names of
 //       the rules of the world's particles; settings: {name: {value, low, high, scale: "log" or
 //       null, whole: true or false}}, names: eps, update_prob, noise, count, speed (steps a frame);
-//       tools: the brushes that the world offers, {name, label, icon, sends, takes, ...} as `Tool` of
+//       tools: the brushes that the world offers, {name, label, sends, takes, ...} as `Tool` of
 //       npa_envs/web/live_world.py describes them; capabilities: some of "film", "loss".
 //       `BLANK` below has the defaults of missing keys.
 //   {type: "frame", step, positions, colours, milliseconds, loss?}
@@ -60,12 +60,18 @@ const BLANK = {
 };
 
 // The tool that all worlds have; it sends no messages.
-const LOOK = {
-  name: "look", label: "Look: drag to move, wheel or pinch to zoom, double click to see all",
-  icon: "M12 5v14M5 12h14M12 5l-2 2M12 5l2 2M12 19l-2-2M12 19l2-2M5 12l2-2M5 12l2 2M19 12l-2-2M19 12l-2 2",
-};
+const LOOK = { name: "look", label: "Look: drag to move, wheel or pinch to zoom, double click to see all" };
 
+// SVG paths on a square of side 24, by the names of tools and controls.
 const ICONS = {
+  look: "M12 5v14M5 12h14M12 5l-2 2M12 5l2 2M12 19l-2-2M12 19l2-2M5 12l2-2M5 12l2 2M19 12l-2-2M19 12l-2 2",
+  remove: "M4 15l8-9 7 6-7 8H8zM9 20h11",
+  push: "M12 20c-4 0-6-3-7-7 2-1 3 0 4 2V6a1.4 1.4 0 0 1 3 0v5a1.4 1.4 0 0 1 3 0v1a1.4 1.4 0 0 1 3 0v3c0 3-2 5-6 5z",
+  clump: "M4 4l5 5M20 4l-5 5M4 20l5-5M20 20l-5-5M9 6v3H6M15 6v3h3M9 18v-3H6M15 18v-3h3",
+  cut: "M5 19L19 5M6 8a2 2 0 1 0 0-.1M16 18a2 2 0 1 0 0-.1M8 9l8 8",
+  inject: "M4 20l3-1 8-8-2-2-8 8zM12 8l4 4M14 10l3-4a1.8 1.8 0 0 1 3 0 1.8 1.8 0 0 1-1 3l-4 2",
+  graft: "M12 21v-9M12 12c0-5 3-7 8-7 0 5-3 7-8 7zM12 15c0-4-3-6-8-6 0 4 3 6 8 6z",
+  add: "M12 4a8 8 0 1 0 .1 0M12 8v8M8 12h8",
   play: "M8 5l11 7-11 7z", pause: "M8 5v14M16 5v14", one: "M6 5l9 7-9 7zM19 5v14",
   reset: "M5 12a7 7 0 1 0 2-5L5 9M5 4v5h5", fold: "M4 7h10M18 7h2M4 17h2M10 17h10M16 5v4M8 15v4",
 };
@@ -78,8 +84,8 @@ const QUALITY = 0.92;
 
 const $ = (name) => document.getElementById(name);
 
-function icon(path) {
-  return `<svg viewBox="0 0 24 24" aria-hidden="true"><path d="${path}"/></svg>`;
+function icon(name) {
+  return `<svg viewBox="0 0 24 24" aria-hidden="true"><path d="${ICONS[name]}"/></svg>`;
 }
 
 // Starts the page over an engine; the page is also `document.page`, for the console.
@@ -399,9 +405,7 @@ class Controls {
   constructor(page) {
     this.page = page;
     this.pressing = false; // whether a slider is pressed
-    $("one").innerHTML = icon(ICONS.one);
-    $("reset").innerHTML = icon(ICONS.reset);
-    $("fold").innerHTML = icon(ICONS.fold);
+    for (const name of ["one", "reset", "fold"]) $(name).innerHTML = icon(name);
     $("play").onclick = () => page.play(!page.world.playing);
     $("one").onclick = () => { page.play(false); page.send({ type: "step" }); };
     $("reset").onclick = () => page.send({ type: "reset" });
@@ -458,7 +462,7 @@ class Controls {
   }
 
   showPlaying() {
-    $("play").innerHTML = icon(this.page.world.playing ? ICONS.pause : ICONS.play);
+    $("play").innerHTML = icon(this.page.world.playing ? "pause" : "play");
     $("play").setAttribute("aria-pressed", String(this.page.world.playing));
   }
 
@@ -474,9 +478,9 @@ class Controls {
     const { tools } = this.page, names = tools.offered.map(({ name }) => name).join();
     if ($("tools").dataset.names === names) return;
     $("tools").dataset.names = names;
-    $("tools").replaceChildren(...tools.offered.map(({ name, icon: path, label }, k) => {
+    $("tools").replaceChildren(...tools.offered.map(({ name, label }, k) => {
       const button = make("button", {
-        innerHTML: icon(path), title: `${label} (${k + 1})`, onclick: () => tools.choose(name),
+        innerHTML: icon(name), title: `${label} (${k + 1})`, onclick: () => tools.choose(name),
       });
       button.dataset.tool = name;
       button.setAttribute("role", "radio");
