@@ -109,7 +109,7 @@ def train(progress: Progress, options: GradientOptions = GradientOptions()) -> R
     cycle = TrainingCycle(task, rules, config, device, schedule, task.rollout)
     # On CUDA there is one graph for each number of steps: capture all before the clock starts.
     for number in range(*config.steps) if device.type == "cuda" else (config.steps[0],):
-        cycle.batch.run(number)
+        cycle.iteration.run(number)
     numbers = itertools.count()
 
     def iteration() -> int:
