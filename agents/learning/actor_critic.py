@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from npa_envs.agents.learning.progress import Progress
 from npa_envs.agents.learning.rule_set import RuleSet, species_of
 from npa_envs.checks import check_fraction, check_non_negative, check_positive, check_word
-from npa_envs.training.process_group import ALONE, ProcessGroup, restart, world_streams
+from npa_envs.training.process_group import ALONE, ProcessGroup, begin_episodes, world_streams
 from npa_envs.world.randomness import Randomness, WorldRandom, normal_draws
 
 
@@ -340,7 +340,7 @@ class Minibatches:
 
     def shuffle(self) -> None:
         """Draw new random orders, for the next pass."""
-        restart(self._random)
+        begin_episodes(self._random)
         for order, group_size in zip(self._orders, self._group_sizes, strict=True):
             if isinstance(self._random, WorldRandom):
                 order.copy_(self._shuffled_by_world(self._random, group_size))

@@ -43,7 +43,12 @@ from npa_envs.agents.learning.rule_set import RuleSet
 from npa_envs.checks import check_flag, check_positive, check_word
 from npa_envs.envs.core.world_state import free_bytes, needed_bytes
 from npa_envs.errors import NPAError
-from npa_envs.training.process_group import ALONE, ProcessGroup, registered, restart
+from npa_envs.training.process_group import (
+    ALONE,
+    ProcessGroup,
+    begin_episodes,
+    generator_to_register,
+)
 from npa_envs.world.cuda_graph import GraphedCallable
 
 MANY_PARTICLES = 2**17
@@ -185,7 +190,7 @@ class PPOLearner:
         last_observations = {}
         for step in range(options.steps):
             memory.observation.copy_(memory.observations[step])
-            self._play_graphs.run(self._draw_actions, generator=registered(self.random))
+            self._play_graphs.run(self._draw_actions, generator=generator_to_register(self.random))
             memory.actions[step].copy_(memory.action)
             memory.log_probs[step].copy_(memory.log_prob)
             result = particle_step(
@@ -210,7 +215,7 @@ class PPOLearner:
 
     @torch.no_grad()
     def _draw_actions(self) -> None:
-        restart(self.random)
+        begin_episodes(self.random)
         action, log_prob = self.actor.sample(self.memory.observation, self.random)
         self.memory.action.copy_(action)
         self.memory.log_prob.copy_(log_prob)

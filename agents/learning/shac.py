@@ -29,7 +29,7 @@ from npa_envs.agents.learning.progress import Progress, annealed
 from npa_envs.agents.learning.rule_set import RuleSet
 from npa_envs.checks import check_fraction, check_non_negative, check_positive, check_word
 from npa_envs.training.optimiser import normalise_gradients
-from npa_envs.training.process_group import restart
+from npa_envs.training.process_group import begin_episodes
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import WorldRandom
 
@@ -132,7 +132,7 @@ class SHACLearner:
 
     def resume(self, iteration: int, resumption: int) -> None:
         """Resume after `iteration` windows, for the `resumption`-th time, in new worlds."""
-        restart(self.random)
+        begin_episodes(self.random)
         self.worlds = self._new_worlds(list(range(len(self._indices))))
         self.windows_left = [1 + k % self.window_count for k in self._indices]
         """Windows left of each world's episode: at first different ones, so that a batch has all
@@ -153,7 +153,7 @@ class SHACLearner:
         """Run the rules for a window, differentiably; restart worlds whose episode is over."""
         task, steps = self.task, self.window
         begin, limits = self.worlds, task.physics.limits
-        restart(self.random)
+        begin_episodes(self.random)
         later = task.rollout(
             self.rules,
             begin,
@@ -182,7 +182,7 @@ class SHACLearner:
 
     def _restart(self) -> None:
         """Start new episodes in worlds whose episode ended with this window."""
-        restart(self.random)
+        begin_episodes(self.random)
         self.windows_left = [left - 1 for left in self.windows_left]
         over = [world for world, left in enumerate(self.windows_left) if left == 0]
         if over:
