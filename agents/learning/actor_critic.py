@@ -49,8 +49,8 @@ CriticInput = Literal["particle", "central"]
 
 @dataclass(frozen=True, kw_only=True)
 class CommonOptions:
-    """Options of both PPOs: `ppo.py` and Stable-Baselines3's. "None: A, or B with a `start`" is the
-    default for new rules, and for rules to begin with."""
+    """Options of both PPOs: `ppo.py` and Stable-Baselines3's. "None: A, or B with a `start`" means
+    that None is A for new rules, and B for a run that begins with rules, `start`."""
 
     steps: int = 16
     """Steps of all worlds in a round, T."""
@@ -266,7 +266,7 @@ class Critic(nn.Module):
 
     @torch.no_grad()
     def rescale(self, targets: Tensor, processes: ProcessGroup = ALONE) -> None:
-        """Update the outputs' running scale, the RMS of targets; the last layer offsets it."""
+        """Update the outputs' scale, the running RMS of targets, without a change of the values."""
         before = self.scale.clone()
         square = targets.square().mean()
         processes.reduce([square])
@@ -276,7 +276,7 @@ class Critic(nn.Module):
             parameter.mul_(before / self.scale)
 
     def _rate(self, moment: int) -> Tensor:
-        """Count a batch of inputs (`moment` 0) or targets (1); return its weight in the moment."""
+        """Count a batch of inputs (`moment` 0) or targets (1); return its weight in their mean."""
         self.updates[moment] += 1.0
         return (1.0 / self.updates[moment]).clamp(min=MIN_RATE)
 
@@ -289,9 +289,9 @@ def seeded_critic(progress: Progress, input_dim: int, inputs: CriticInput) -> Cr
 
 
 def share_of_worlds(progress: Progress, total: int) -> tuple[list[int], Randomness]:
-    """Return the indices of this process's worlds out of `total`, and their random source.
+    """Return the indices of this process's worlds out of `total`, and what draws their numbers.
 
-    That is a generator, or with several processes a stream for each world.
+    That is a torch generator, or with several processes a stream for each world.
     """
     progress.processes.check_even("num_envs", total)
     indices = progress.processes.indices(total)

@@ -1,6 +1,6 @@
 """The training cycle: worlds from the pool, rollout, gradients, worlds back, optimiser step.
 
-No method synchronises with the device. An iteration runs eagerly or as CUDA graphs; its statistics
+No method waits for the device. An iteration runs eagerly or as CUDA graphs; its statistics
 stay on the device until a line of the log needs them.
 """
 
@@ -68,7 +68,7 @@ class WorldPool:
             self.lifetime = logarithms[indices].exp().round().to(x.device, torch.int64)
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return the tensors of a checkpoint by name."""
+        """Return the worlds' tensors and their ages by name, for a checkpoint."""
         tensors = self.worlds._asdict() | {"age": self.age}
         return {name: value for name, value in tensors.items() if value is not None}
 
@@ -89,7 +89,7 @@ class WorldPool:
         return torch.rand(len(self.worlds.x), generator=generator, device=self.worlds.x.device)
 
     def ages_of(self, index: Tensor) -> tuple[Tensor, Tensor]:
-        """Return worlds' ages [steps], and whether their lifetimes are over, shape [B] each."""
+        """Return ages [steps] of worlds, and whether their lifetimes are over, shape [B] each."""
         assert self.age is not None
         assert self.lifetime is not None
         age = self.age.index_select(0, index)
@@ -265,7 +265,7 @@ class TrainingCycle:
         if config.damages:
             after = self.task.damage(start, worlds)
             start = after if config.damage_share == 1.0 else after.where(damaged, start)
-        # Drawn in every iteration: the host does not know which worlds will diverge.
+        # Drawn in every iteration: the CPU does not know which worlds will diverge.
         fresh = self._seeds(len(self._index), worlds)
         self._fresh_worlds.copy_(fresh)
         if expired is not None:

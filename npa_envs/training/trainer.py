@@ -235,7 +235,7 @@ class Trainer:
         )
 
     def iterate(self, least_progress: float = 0.0) -> None:
-        """Train for one iteration, without synchronising and without writing files.
+        """Train for one iteration, without waiting for the device and without writing files.
 
         Args:
             least_progress: Lower bound on the schedule's progress, in [0, 1]; only "cosine" reads
