@@ -81,8 +81,7 @@ def evaluate_policy(env: Any, policy: Callable[[Any], Any], seeds: Iterable[int]
     seeds = checked_seeds("seeds", seeds)
     policy = bound_to(env, policy)
     single = isinstance(env, gymnasium.Env)
-    count = 1 if single else env.num_envs
-    run = _run_single if single else _run
+    run, count = (_run_single, 1) if single else (_run, env.num_envs)
     batches = [seeds[k : k + count] for k in range(0, len(seeds), count)]
     results = [run(env, policy, [*batch, *batch[-1:] * (count - len(batch))]) for batch in batches]
     returns, start_losses, final_losses, steps, endings = (

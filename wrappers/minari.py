@@ -48,11 +48,8 @@ def record_episodes(
     An episode is the first one after a reset with its seed. It has T + 1 observations, T actions,
     rewards, terminations and truncations, and the info `loss`, of T + 1 numbers.
 
-    Args:
-        env: A vector environment of this package with same-step autoreset and a step limit; each of
-            its worlds runs an episode at a time.
-        policy: Maps observations, [B, ...], to actions, [B, ...].
-        seeds: One for each episode.
+    `env` is a vector environment of this package with same-step autoreset and a step limit. The
+    policy maps observations, [B, ...], to actions, [B, ...].
     """
     vector_env(env, "record_episodes")
     check_autoreset(autoreset_mode(env), "same-step")
@@ -132,15 +129,7 @@ def write_dataset(
 ) -> Path:
     """Write episodes as a dataset, whole or not at all, and return its folder.
 
-    Args:
-        dataset_id: Id for `minari.load_dataset`, "NAMESPACE/NAME-v0".
-        spec: Spec of the single environment, for `dataset.recover_environment()`.
-        episodes: From `record_episodes`.
-        algorithm: Name of the policy's algorithm.
-        description: Description of the dataset.
-
-    Raises:
-        NPAError: The dataset exists, the id is invalid, or files cannot be written.
+    `dataset.recover_environment()` makes an environment by `spec`; `algorithm` names the policy's.
     """
     if not _DATASET_ID.fullmatch(dataset_id):
         raise NPAError(
@@ -196,11 +185,7 @@ def spec_of(env_id: str, keywords: dict[str, Any], episode_steps: int) -> EnvSpe
 
 
 def read_pairs(dataset_id: str) -> tuple[Tensor, Tensor]:
-    """Return all observations of a dataset with the actions taken there, on the CPU.
-
-    Returns:
-        Observations, float32, shape [W, ...], and actions, shape [W, ...], of W steps.
-    """
+    """Return the observations and actions of all W steps of a dataset, float32, [W, ...] each."""
     try:
         dataset = minari.load_dataset(dataset_id)
     except (FileNotFoundError, ValueError) as error:

@@ -39,9 +39,18 @@ def _make_rows(name: str, keywords: dict[str, Any]) -> AnyVectorEnv:
     """Make the vector environment called `name`, with `keywords["num_envs"]` rows, for RLlib."""
     fields = dict(keywords)
     row_count = fields.pop("num_envs")
-    if name in WHOLE_IDS:
-        return _flat(_worlds(name, row_count, fields))
-    return ParticleRows(_worlds(name, row_count // fields["particle_count"], fields))
+    if name not in WHOLE_IDS:
+        return ParticleRows(_worlds(name, row_count // fields["particle_count"], fields))
+    # RLlib's networks need flat observations and actions.
+    worlds = _worlds(name, row_count, fields)
+    space, flat = worlds.single_action_space, FlattenObservation(worlds)
+    if not isinstance(space, Box):
+        return flat
+    return TransformAction(
+        flat,
+        lambda actions: actions.reshape(-1, *(space.shape or ())),
+        single_action_space=flatten_space(space),
+    )
 
 
 def _worlds(name: str, count: int, fields: dict[str, Any]) -> AnyVectorEnv:
@@ -50,18 +59,6 @@ def _worlds(name: str, count: int, fields: dict[str, Any]) -> AnyVectorEnv:
         num_envs=count,
         vectorization_mode="vector_entry_point",
         **{"autoreset_mode": "next-step", **fields},
-    )
-
-
-def _flat(worlds: AnyVectorEnv) -> AnyVectorEnv:
-    """Wrap worlds to flatten observations and actions, as RLlib's networks need."""
-    space, flat = worlds.single_action_space, FlattenObservation(worlds)
-    if not isinstance(space, Box):
-        return flat
-    return TransformAction(
-        flat,
-        lambda actions: actions.reshape(-1, *(space.shape or ())),
-        single_action_space=flatten_space(space),
     )
 
 

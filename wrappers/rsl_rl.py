@@ -72,14 +72,10 @@ class RslRlParticleEnv(ParticleRowsBase, VecEnv):  # type: ignore[misc]
             self._elapsed = torch.where(over, 0, self._elapsed + 1)
             extras: dict[str, Any] = {"time_outs": cut & ~ended}
             if "final_info" in infos:
-                extras["log"] = _episode_log(infos)
+                final, which = infos["final_info"], infos["_final_info"]
+                extras["log"] = {
+                    f"Episode/{name}": torch.where(which, final[name].float(), 0.0).sum()
+                    / which.sum()
+                    for name in ("loss", "success")
+                }
             return self.get_observations(), rewards, over.long(), extras
-
-
-def _episode_log(infos: dict[str, Any]) -> dict[str, Tensor]:
-    """Return mean final loss and success of the episodes that ended, without synchronising."""
-    final, which = infos["final_info"], infos["_final_info"]
-    return {
-        f"Episode/{name}": torch.where(which, final[name].float(), 0.0).sum() / which.sum()
-        for name in ("loss", "success")
-    }

@@ -362,10 +362,7 @@ class SpeciesVecEnv(RowVecEnv):
     """
 
     def __init__(
-        self,
-        env: MultiSpeciesVectorEnv,
-        *,
-        others: Mapping[str, SpeciesPolicy] | None = None,
+        self, env: MultiSpeciesVectorEnv, *, others: Mapping[str, SpeciesPolicy] | None = None
     ) -> None:
         if not isinstance(env, MultiSpeciesVectorEnv):
             raise NPAError(

@@ -36,10 +36,7 @@ class _TagsSpecies(WrapperBase):
         self._tags = to_output(tags, output)
         self.species = to_output(species, output)
         """Species of each particle from 0 on, int64, shape [N], or [B, N] of several worlds."""
-        space = self._tagged_space(getattr(env, self.space_name), particle_count, species_count)
-        setattr(self, self.space_name, space)
-
-    def _tagged_space(self, space: Space[Any], particle_count: int, species_count: int) -> Box:
+        space: Space[Any] = getattr(env, self.space_name)
         if not isinstance(space, Box) or len(space.shape) != 2 or space.shape[0] != particle_count:
             raise NPAError(
                 f"observations must be a row for each of {particle_count} particles, got {space}: "
@@ -48,7 +45,7 @@ class _TagsSpecies(WrapperBase):
         shape = (particle_count, species_count)
         low = np.concatenate((space.low, np.zeros(shape, np.float32)), axis=1)
         high = np.concatenate((space.high, np.ones(shape, np.float32)), axis=1)
-        return Box(low, high, dtype=np.float32)
+        setattr(self, self.space_name, Box(low, high, dtype=np.float32))
 
     def changed(self, observations: Any) -> Any:
         """Return observations [..., N, P], whose last columns are the one-hot species."""

@@ -46,8 +46,6 @@ MIN_SEEDS = 5
 
 SCHEMA = Path(__file__).with_name("npa_bench_v0.schema.json")
 
-HIDDEN_DIM = 64
-
 QUICK_FRACTION = 1e-3
 """Factor on the budgets of quick runs, which only test that everything runs."""
 
@@ -83,7 +81,7 @@ class Suite:
         """Return a task's problem: its registered environment, in 16 worlds, or 64 of a garden."""
         env_id = self.tasks[task]
         steps, worlds = registration_of(env_id).steps, 64 if env_id in GARDEN_IDS else 16
-        return Problem(env_id=env_id, episode_steps=steps, num_envs=worlds, hidden_dim=HIDDEN_DIM)
+        return Problem(env_id=env_id, episode_steps=steps, num_envs=worlds, hidden_dim=64)
 
     def leaves_out(self, task: str, method: str) -> bool:
         """Return whether a method is not run on a task; a user's "module:function" always is."""

@@ -66,7 +66,6 @@ WIDER = {"eps": 0.2, "eps0": 0.2}
 QUICK_KEYWORDS: Mapping[str, Mapping[str, Any]] = {
     "morphogenesis2d": {**WIDER, "resolution": 32},
     "regeneration2d": {**WIDER, "resolution": 32},
-    "point_classification": {},
     "mixing": WIDER,
 }
 """Keywords of tiny tasks, with 64 particles, to test that everything runs."""
@@ -74,15 +73,13 @@ QUICK_KEYWORDS: Mapping[str, Mapping[str, Any]] = {
 LEFT_OUT = frozenset({("point_classification", "scripted")})
 """Pairs (task, method) that do not run by default: no scripted policy classifies."""
 
-QUICK = {"episode_steps": 16, "num_envs": 4, "hidden_dim": 16}
-
 
 def make_problem(name: str, *, quick: bool = False) -> Problem:
     """Return the problem of a name in `PROBLEMS`; `quick`: with tiny worlds and rules."""
     fields = {"num_envs": 32, **PROBLEMS[name]}
     if quick:
-        keywords = {**fields["keywords"], "particle_count": 64, **QUICK_KEYWORDS[name]}
-        fields |= {"keywords": keywords, **QUICK}
+        keywords = {**fields["keywords"], "particle_count": 64, **QUICK_KEYWORDS.get(name, {})}
+        fields |= {"keywords": keywords, "episode_steps": 16, "num_envs": 4, "hidden_dim": 16}
     return Problem(**fields)
 
 

@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, astuple, dataclass, fields
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,7 +56,12 @@ def write_table(
 def write_pictures(records: Sequence[RunRecord], folder: Path) -> list[str]:
     """Write filmstrips and, with matplotlib, plots of curves; return "wrote PATH" for each."""
     strips = [f"wrote {path}" for path in write_strips(records, folder)]
-    return [*strips, *write_plots(lambda: curve_plots(records), folder / "curves_*.png", "curves")]
+
+    def curves() -> dict[str, bytes]:
+        tasks = dict.fromkeys(record.job.task for record in records)
+        return {task: _picture([r for r in records if r.job.task == task]) for task in tasks}
+
+    return [*strips, *write_plots(curves, folder / "curves_*.png", "curves")]
 
 
 # Rows: the results of a method on a task
@@ -236,13 +241,8 @@ CURVE_POINTS = 64
 """Points of a mean curve."""
 
 
-class Curve(NamedTuple):
-    """A mean learning curve at some points: abscissa, mean return, standard error."""
-
-    across: NDArray[np.float64]
-    mean: NDArray[np.float64]
-    error: NDArray[np.float64]
-    """0 for a single seed."""
+Curve = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
+"""Points of a mean learning curve: abscissae, mean returns, standard errors (0 for one seed)."""
 
 
 def mean_curve(records: Sequence[RunRecord], across: str) -> Curve | None:
@@ -268,13 +268,7 @@ def mean_curve(records: Sequence[RunRecord], across: str) -> Curve | None:
     error = np.zeros(len(grid))
     if len(lines) > 1:
         error = values.std(axis=0, ddof=1) / np.sqrt(len(lines))
-    return Curve(grid, values.mean(axis=0), error)
-
-
-def curve_plots(records: Sequence[RunRecord]) -> dict[str, bytes]:
-    """Return a PNG file of the mean learning curves for each task, by name. Needs matplotlib."""
-    tasks = dict.fromkeys(record.job.task for record in records)
-    return {task: _picture([r for r in records if r.job.task == task]) for task in tasks}
+    return grid, values.mean(axis=0), error
 
 
 def _picture(records: Sequence[RunRecord]) -> bytes:
@@ -303,14 +297,16 @@ def _picture(records: Sequence[RunRecord]) -> bytes:
 def _draw(panel: Any, drawn: Curve | None, colour: str, name: str) -> None:
     if drawn is None:
         panel.plot([], [], color=colour, label=name)
-    elif len(drawn.across) == 1:
+        return
+    across, mean, error = drawn
+    lines = (mean - error, mean, mean + error)
+    if len(across) == 1:
         # The method does not learn.
-        (mean,), (error,) = drawn.mean, drawn.error
-        panel.axhline(mean, color=colour, lw=1.0, ls="--", label=name)
-        panel.axhspan(mean - error, mean + error, color=colour, alpha=0.2, lw=0)
+        (low,), (middle,), (high,) = lines
+        panel.axhline(middle, color=colour, lw=1.0, ls="--", label=name)
+        panel.axhspan(low, high, color=colour, alpha=0.2, lw=0)
     else:
-        lines = (drawn.mean - drawn.error, drawn.mean, drawn.mean + drawn.error)
-        draw_band(panel, drawn.across, lines, colour, name, lw=1.5)
+        draw_band(panel, across, lines, colour, name, lw=1.5)
 
 
 # Filmstrips: the last picture of a held-out episode of each run

@@ -3,8 +3,8 @@
 A run has a folder, with its job and settings (`request.json`) before it, and its `RunRecord`
 (`run.json`) after it. Runs are done by processes on several cores or GPUs, `python -m
 npa_envs.agents.comparison.single_run FOLDER`. A process loads the libraries that the run in FOLDER
-needs. Then it does a run for each `Order`, a line of JSON on its standard input, and it ends with
-its input.
+needs. Then it does the run of each order, a line of JSON on its standard input, and it ends with
+its input. An order is [folder, device, folder of the run whose rules are cloned, or ""].
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -201,22 +201,13 @@ def final_picture(
     return np.asarray(picture)
 
 
-class Order(NamedTuple):
-    """What a process has to do: the run that a folder requests, on a device."""
-
-    folder: str
-    device: str
-    teacher: str
-    """Folder of the run whose rules are cloned, if any."""
-
-
 def main(folder: Path) -> None:
-    """Load the libraries of the run in `folder`; then do the run of each `Order`."""
-    orders: SimpleQueue[Order] = SimpleQueue()
+    """Load the libraries of the run in `folder`; then do the run of each order."""
+    orders: SimpleQueue[tuple[str, str, str]] = SimpleQueue()
 
     def listen() -> None:
         for line in sys.stdin:
-            orders.put(Order(*json.loads(line)))
+            orders.put(json.loads(line))
         # The parent process has ended.
         os._exit(1)
 
@@ -225,11 +216,11 @@ def main(folder: Path) -> None:
     with contextlib.suppress(Exception):
         method_options(requested_run(folder).facts["method"])
     while True:
-        order = orders.get()
-        with Path(order.folder, OUTPUT).open("ab") as output:
+        requested, device, teacher = orders.get()
+        with Path(requested, OUTPUT).open("ab") as output:
             for number in (1, 2):
                 os.dup2(output.fileno(), number)
-        run(Path(order.folder), order.device, order.teacher)
+        run(Path(requested), device, teacher)
         for stream in (sys.stdout, sys.stderr):
             stream.flush()
         # Free the memory of a run for the next one.
@@ -270,7 +261,7 @@ class RunProcess(Child):
         assert self.process.stdin is not None, "opened at its start"
         # The death of a process is found and recorded later.
         with contextlib.suppress(BrokenPipeError):
-            line = json.dumps(Order(str(self.folder), device, self.teacher))
+            line = json.dumps([str(self.folder), device, self.teacher])
             self.process.stdin.write(f"{line}\n".encode())
             self.process.stdin.flush()
 

@@ -113,7 +113,6 @@ def _from_teacher(
 
 
 def _from_dataset(progress: Progress, options: CloneOptions) -> Demonstrations:
-    """Return the demonstrations of a Minari dataset, on the run's device."""
     from npa_envs.wrappers.minari import read_pairs
 
     if options.teacher is not None:

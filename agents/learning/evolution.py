@@ -23,7 +23,7 @@ from npa_envs.agents.learning.progress import Progress
 from npa_envs.agents.learning.rule_set import RuleSet
 from npa_envs.agents.policies import columns_read, split_update
 from npa_envs.checks import check_positive
-from npa_envs.errors import MissingDependencyError, NPAError
+from npa_envs.errors import NPAError, importing
 from npa_envs.rule.folded_network import without_small
 from npa_envs.rule.rule import NPARule
 
@@ -177,13 +177,8 @@ def _strategy(
     rule_weights: RuleWeights, options: EvolutionOptions, draws: np.random.Generator
 ) -> Any:
     """Return an evolution strategy of `cma` around the rules, with `ask`, `tell` and `mean`."""
-    try:
+    with importing("cma", "evolution", "pip install 'npa-envs[evolution]'"):
         import cma
-    except ImportError as error:
-        raise MissingDependencyError(
-            "evolution strategies need cma, which is not installed: "
-            "pip install 'npa-envs[evolution]'"
-        ) from error
 
     settings = {
         "popsize": options.population,

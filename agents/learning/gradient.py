@@ -31,8 +31,6 @@ from npa_envs.world.species import species_particles
 MAX_STEPS = 96
 """Most steps of a rollout by default: longer episodes continue in a pool."""
 
-POOL_SIZE = 64
-
 KEY_RANGE = -(2**63), 2**63 - 1
 """Range of the keys of worlds' random streams."""
 
@@ -83,7 +81,7 @@ def train(progress: Progress, options: GradientOptions = GradientOptions()) -> R
     if steps is None:
         steps = (length, length + 1) if length <= MAX_STEPS else (MAX_STEPS // 3, MAX_STEPS + 1)
     if pool_size is None:
-        pool_size = 0 if steps[0] >= length else max(POOL_SIZE, options.num_envs)
+        pool_size = 0 if steps[0] >= length else max(64, options.num_envs)
     config = BudgetTrainConfig(
         task=problem.config,
         progress=progress,
@@ -126,7 +124,7 @@ class BudgetTrainConfig(TrainConfig[Any]):
     last_rate: float
     """Learning rate at the end, as a fraction of the first (dimensionless)."""
 
-    def learning_rate_at(self, iteration: int, share: float = 0.0) -> float:
+    def learning_rate_at(self, iteration: int, fraction: float = 0.0) -> float:
         """Return the rate by the budget spent, half a cosine; `TrainConfig` needs the arguments."""
         return annealed(self.learning_rate, self.last_rate, self.progress.spent_fraction)
 

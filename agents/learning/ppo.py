@@ -33,9 +33,9 @@ from npa_envs.agents.learning.actor_critic import (
 )
 from npa_envs.agents.learning.problem import (
     WORLDS_PER_SEED,
+    ConcatenatedSpeciesEnv,
     ParticleRewards,
     Problem,
-    particle_step,
     world_seeds,
 )
 from npa_envs.agents.learning.progress import Progress
@@ -50,6 +50,7 @@ from npa_envs.training.process_group import (
     generator_to_register,
 )
 from npa_envs.world.cuda_graph import GraphedCallable
+from npa_envs.wrappers.base import own_rewards
 
 MANY_PARTICLES = 2**17
 """Particles of all worlds on a GPU by default: fewer take hardly less time."""
@@ -193,25 +194,37 @@ class PPOLearner:
             self._play_graphs.run(self._draw_actions, generator=generator_to_register(self.random))
             memory.actions[step].copy_(memory.action)
             memory.log_probs[step].copy_(memory.log_prob)
-            result = particle_step(
-                self.envs,
-                memory.action,
-                particle_rewards=options.particle_rewards is not None,
-                masked=options.masked,
-            )
-            memory.observations[step + 1].copy_(result.observation)
-            memory.rewards[step].copy_(result.reward)
-            memory.terminated[step].copy_(result.terminated)
-            memory.ended[step].copy_(result.ended)
-            if result.acted is not None:
-                memory.acted[step].copy_(result.acted)
-            if result.last_observation is not None:
-                last_observations[step] = result.last_observation
+            last_observation = self._step_worlds(step)
+            if last_observation is not None:
+                last_observations[step] = last_observation
         self._play_graphs.run(self._find_values)
         for step, observation in last_observations.items():
             memory.next_values[step].copy_(self.critic(observation))
         self._play_graphs.run(self._find_advantages, captured=not self.processes.distributed)
         return memory.round
+
+    def _step_worlds(self, step: int) -> Tensor | None:
+        """Store a step of all worlds; return last observations [B, N, P] if any episode ended."""
+        memory, options = self.memory, self.options
+        observation, reward, terminated, truncated, infos = self.envs.step(memory.action)
+        # Flags and rewards of worlds, [B, 1], are those of all of their particles.
+        terminated, ended = terminated[:, None], (terminated | truncated)[:, None]
+        if isinstance(self.envs, ConcatenatedSpeciesEnv):
+            # A species may end before its world does.
+            terminated = terminated | infos["particle_terminated"]
+            ended = ended | infos["particle_terminated"]
+            memory.acted[step].copy_(infos["acted"])
+        elif options.masked:
+            # It describes the step before a restart.
+            memory.acted[step].copy_(infos["updated"])
+        memory.observations[step + 1].copy_(observation)
+        memory.rewards[step].copy_(
+            reward[:, None] if options.particle_rewards is None else own_rewards(infos)
+        )
+        memory.terminated[step].copy_(terminated)
+        memory.ended[step].copy_(ended)
+        last: Tensor | None = infos.get("final_obs")
+        return last
 
     @torch.no_grad()
     def _draw_actions(self) -> None:
@@ -253,11 +266,12 @@ class PPOLearner:
         budget.
         """
         schedule, memory = self.schedule, self.memory
+        critic, actor = (self.optimisers[name] for name in ("critic", "actor"))
         rules_learn = self.rounds >= schedule.critic_rounds
         self.rounds += 1
         self.critic.observe(memory.observations[:-1], self.processes)
         self.critic.rescale(memory.targets, self.processes)
-        self.optimisers["critic"].param_groups[0]["lr"].fill_(CRITIC_RATE * remaining_budget)
+        critic.param_groups[0]["lr"].fill_(CRITIC_RATE * remaining_budget)
         memory.rules_rate.fill_(schedule.learning_rate * remaining_budget)
         memory.within_kl.fill_(1.0)
         for _ in range(self.options.epochs):
@@ -266,25 +280,19 @@ class PPOLearner:
             self.processes.reduce([memory.weight_sums])
             for minibatch in range(self._minibatches.count):
                 if rules_learn:
-                    self._train(minibatch)
+                    self._update_graphs.run(self._find_gradients, minibatch)
+                    self.processes.reduce(
+                        [*gradients_of(critic), *gradients_of(actor), memory.kl_sums]
+                    )
+                    self._update_graphs.run(self._descend_both)
                 else:
-                    self._train_critic(minibatch)
+                    self._find_critic_gradients(minibatch)
+                    self.processes.reduce(gradients_of(critic))
+                    self._descend(critic)
             # The only synchronisation with the device.
             if not bool(memory.within_kl):
                 break
         self.actor.set_noise(self.options.noise_factor(remaining_budget, schedule.last_noise))
-
-    def _train(self, minibatch: int) -> None:
-        """Take a step of rules and critic on a minibatch."""
-        self._update_graphs.run(self._find_gradients, minibatch)
-        gradients = [g for name in ("critic", "actor") for g in gradients_of(self.optimisers[name])]
-        self.processes.reduce([*gradients, self.memory.kl_sums])
-        self._update_graphs.run(self._descend_both)
-
-    def _train_critic(self, minibatch: int) -> None:
-        self._find_critic_gradients(minibatch)
-        self.processes.reduce(gradients_of(self.optimisers["critic"]))
-        self._descend(self.optimisers["critic"])
 
     def _sum_weights(self) -> None:
         """Sum the weights of the samples in each minibatch of a pass, for critic and rules."""

@@ -34,7 +34,6 @@ from npa_envs.registration import ALL, SPECIES_SIZES
 from npa_envs.registration import SPECIES as SPECIES_TASKS
 from npa_envs.world.cuda_graph import to_device_async
 from npa_envs.world.environment_steps import Physics
-from npa_envs.wrappers.base import own_rewards
 
 WORLDS_PER_SEED = 10_000
 """Seeds of worlds that each run has: run k has those from k times this."""
@@ -345,50 +344,6 @@ class ConcatenatedSpeciesEnv(MultiSpeciesVectorEnv):
         """Repeat the values of species, [B, species], for each of their particles, [B, N]."""
         count = self.single_action_space.shape[0]
         return values.repeat_interleave(self._counts, dim=1, output_size=count)
-
-
-class ParticleStep(NamedTuple):
-    """What learners read of a step of B worlds of N particles; flags may be those of worlds."""
-
-    observation: Tensor
-    """Observations after the step, of the next episode where one ended, [B, N, P]."""
-    reward: Tensor
-    """Rewards of particles, [B, N], or of worlds, [B, 1]."""
-    acted: Tensor | None
-    """Whether each action had an effect, [B, N]; None: all count."""
-    terminated: Tensor
-    """Whether a particle's episode terminated, [B, N] or [B, 1]."""
-    ended: Tensor
-    """Whether it terminated or was truncated, [B, N] or [B, 1]."""
-    last_observation: Tensor | None
-    """Last observations of the worlds whose episodes ended, [B, N, P]; None: none did."""
-
-
-def particle_step(
-    envs: NPAVectorEnv | ConcatenatedSpeciesEnv,
-    action: Tensor,
-    *,
-    particle_rewards: bool,
-    masked: bool,
-) -> ParticleStep:
-    """Step the worlds of `Problem.make_envs` by actions [B, N, A].
-
-    With `particle_rewards` rewards are of particles, else of worlds. If `masked`, actions of
-    particles that were not updated do not count.
-    """
-    observation, reward, terminated, truncated, infos = envs.step(action)
-    ended = (terminated | truncated)[:, None]
-    terminated = terminated[:, None]
-    acted: Tensor | None = None
-    if isinstance(envs, ConcatenatedSpeciesEnv):
-        # A species may end before its world does.
-        acted, species_terminated = infos["acted"], infos["particle_terminated"]
-        terminated, ended = terminated | species_terminated, ended | species_terminated
-    elif masked:
-        # It describes the step before a restart.
-        acted = infos["updated"]
-    rewards = own_rewards(infos) if particle_rewards else reward[:, None]
-    return ParticleStep(observation, rewards, acted, terminated, ended, infos.get("final_obs"))
 
 
 # Ids of environments, and seeds.

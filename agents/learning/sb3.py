@@ -29,17 +29,13 @@ from npa_envs.agents.learning.problem import world_seeds
 from npa_envs.agents.learning.progress import Progress
 from npa_envs.agents.learning.rule_set import RuleSet
 from npa_envs.checks import check_fraction, check_positive
-from npa_envs.errors import MissingDependencyError, NPAError, shown
+from npa_envs.errors import NPAError, importing, shown
 from npa_envs.wrappers.sb3 import WorldVecEnv, on_host
 
-try:
+with importing("Stable-Baselines3", "this method", "pip install 'npa-envs[sb3]'"):
     from stable_baselines3 import PPO, SAC
     from stable_baselines3.common.callbacks import BaseCallback
     from stable_baselines3.common.policies import ActorCriticPolicy
-except ImportError as error:
-    raise MissingDependencyError(
-        "this method needs Stable-Baselines3: pip install 'npa-envs[sb3]'"
-    ) from error
 
 LearnedT = TypeVar("LearnedT")
 

@@ -177,11 +177,6 @@ class SHACLearner:
             for values, limit in ((x, limits.position), (s, limits.state))
         )
         self.worlds = begin._replace(x=x, s=s)
-        self._restart()
-        return StepWindow(features, losses)
-
-    def _restart(self) -> None:
-        """Start new episodes in worlds whose episode ended with this window."""
         begin_episodes(self.random)
         self.windows_left = [left - 1 for left in self.windows_left]
         over = [world for world, left in enumerate(self.windows_left) if left == 0]
@@ -189,6 +184,7 @@ class SHACLearner:
             self.worlds.put_(torch.tensor(over, device=self.device), self._new_worlds(over))
         for world in over:
             self.windows_left[world] = self.window_count
+        return StepWindow(features, losses)
 
     def _new_worlds(self, worlds: list[int]) -> Particles:
         random = self.random

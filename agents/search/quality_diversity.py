@@ -18,7 +18,7 @@ import torch
 
 from npa_envs.agents.search.candidates import Axis, Candidates, Found, Numbers, SearchWorld
 from npa_envs.checks import is_whole
-from npa_envs.errors import MissingDependencyError, NPAError, shown, suggest
+from npa_envs.errors import NPAError, importing, shown, suggest
 from npa_envs.measure.benchmark_records import installed_version, read_record, write_record
 
 RESULTS = "search.json"
@@ -39,16 +39,11 @@ FIRST_STEP = 0.2
 
 def import_ribs() -> Any:
     """Return the library `ribs` with its modules imported."""
-    try:
+    with importing("pyribs and cma", "the search", "pip install 'npa-envs[search]'"):
         import cma  # noqa: F401
         import ribs.archives
         import ribs.emitters  # noqa: F401
         import ribs.schedulers  # noqa: F401
-    except ImportError as error:
-        raise MissingDependencyError(
-            "the search needs pyribs and cma, which are not both installed: "
-            "pip install 'npa-envs[search]'"
-        ) from error
     return ribs
 
 

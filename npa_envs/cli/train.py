@@ -13,7 +13,15 @@ import torch.distributed as dist
 from npa_envs.cli import INTERRUPTED, common
 from npa_envs.cli.train_options import TrainOptions, default_preset, parse_run, resolve_task
 from npa_envs.errors import NPAError
-from npa_envs.training import TASKS, RunFolder, TrainConfig, check_device, task_entry, train
+from npa_envs.training import (
+    TASKS,
+    JointRules,
+    RunFolder,
+    TrainConfig,
+    check_device,
+    task_entry,
+    train,
+)
 from npa_envs.training.checkpoint import has_per_world_streams, load_checkpoint
 from npa_envs.training.process_group import ProcessGroup
 from npa_envs.training.process_launcher import (
@@ -37,23 +45,23 @@ def main(arguments: Sequence[str]) -> int:
         raise NPAError(f"train needs a task first: {', '.join(TASKS)}")
     task_name = arguments[0]
     task_entry(task_name)
-    with joined_processes() as ranks:
+    with joined_processes() as processes:
         request = None
-        if ranks.first:
+        if processes.first:
             resolved = resolve_task(task_name, arguments[1:])
             request = resolved, *parse_run(task_name, resolved)
         # Only the first process reads files, so that all have the same configuration.
-        request = ranks.broadcast(request)
+        request = processes.broadcast(request)
         assert request is not None, "broadcast by the first process"
         resolved, options, config = request
         count = process_count(task_name, options, config)
-        if count > 1 and not ranks.distributed:
+        if count > 1 and not processes.distributed:
             command = ["train", task_name, *resolved]
             if options.processes is None and options.gpus is None:
                 command += ["--processes", str(count)]
             return launch(count, command, config.out, config.device)
-        with print_once(ranks):
-            return run(task_name, options, config, (task_name, *resolved), ranks)
+        with print_once(processes):
+            return run(task_name, options, config, (task_name, *resolved), processes)
 
 
 def run(
@@ -61,7 +69,7 @@ def run(
     options: TrainOptions,
     config: TrainConfig[Any],
     arguments: Sequence[str],
-    ranks: ProcessGroup,
+    processes: ProcessGroup,
 ) -> int:
     """Train as one of the processes that share the run, and return the exit code.
 
@@ -71,12 +79,12 @@ def run(
         raise NPAError(f"max_seconds must be positive and finite, got {options.max_seconds}")
     folder = RunFolder(config.out)
     resume_command = f"npa-envs train {task_name} --out {shlex.quote(str(config.out))} --resume"
-    if ranks.count > 1 or options.processes is not None:
-        resume_command += f" --processes {ranks.count}"
+    if processes.count > 1 or options.processes is not None:
+        resume_command += f" --processes {processes.count}"
 
     def begun() -> None:
-        if ranks.first:
-            print("\n".join(announcement(task_name, options, config, ranks.count)))
+        if processes.first:
+            print("\n".join(announcement(task_name, options, config, processes.count)))
             end = f"(Ctrl-C writes a checkpoint and stops; {resume_command} continues)"
             print(f"writing to {config.out}/ {end}", flush=True)
 
@@ -94,10 +102,10 @@ def run(
     except KeyboardInterrupt:
         print(f"interrupted; the last checkpoint is {folder.checkpoint}\nresume: {resume_command}")
         raise
-    if ranks.first:
+    if processes.first:
         if options.resume:  # The run's file has the options that these arguments leave out.
             arguments = (task_name, "--config", str(folder.config))
-            arguments += ("--processes", str(ranks.count)) if ranks.count > 1 else ()
+            arguments += ("--processes", str(processes.count)) if processes.count > 1 else ()
         finish(task_name, options, config, result, arguments, resume_command)
     return INTERRUPTED if result.interrupted else 0
 
@@ -112,7 +120,7 @@ def finish(
 ) -> None:
     """Print where the results of a run are and what to do with them; write the report."""
     folder = RunFolder(config.out)
-    joint = task_entry(task_name).joint
+    joint = isinstance(result.rule, JointRules)
     rules = [folder.rule_of(k) for k in range(len(_species(config)))] if joint else [folder.rule]
     loss = result.record.get("loss")
     last_loss = "" if loss is None else f", training loss {loss:.4g}"

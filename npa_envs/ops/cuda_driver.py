@@ -29,9 +29,7 @@ MAX_THREADS = 2**31 - 1
 # Constants and structs of CUDA's driver API, cuda.h.
 
 PROGRAMMATIC_STREAM_SERIALIZATION = 6
-
 KERNEL_NODE = 0
-
 NON_BLOCKING_STREAM = 1
 
 

@@ -128,7 +128,6 @@ BLOCKS_PER_PROCESSOR = 5
 
 
 def _launch_blocks(kernel: Any, blocks: int, warps: int, *tensors: Tensor) -> None:
-    """Launch a kernel on CUDA in `blocks` blocks of `warps` warps each."""
     block = warps * WARP
     launch(kernel, blocks * block, tensors[0].device, *tensors, block_dim=block)
 

@@ -55,13 +55,6 @@ def _warp_stream(device: torch.device, handle: int) -> Any:
     return wp.Stream(wp.device_from_torch(device), cuda_stream=handle)
 
 
-def _current_stream(device: torch.device) -> int:
-    """Return the handle of torch's current stream of a CUDA device."""
-    index = torch.cuda.current_device() if device.index is None else device.index
-    # Ten times faster than `torch.cuda.current_stream`, which makes an object of it.
-    return torch._C._cuda_getCurrentRawStream(index)
-
-
 class _ArrayArgument:
     """Warp's array descriptor of one tensor argument, updated in place for each launch."""
 
@@ -98,7 +91,6 @@ def _null(tensor: Tensor) -> int:
 
 
 def _overwrite(memory: Any, value: Any) -> None:
-    """Copy the bytes of a descriptor or struct into memory."""
     ctypes.memmove(ctypes.addressof(memory), ctypes.addressof(value), ctypes.sizeof(value))
 
 
@@ -231,7 +223,10 @@ class _PreparedLaunch:
         if self._driven is not None:
             bounds = self._bounds_of(size)
             self._addresses[0] = ctypes.addressof(bounds)
-            stream = _current_stream(self._device)
+            index = self._device.index
+            index = torch.cuda.current_device() if index is None else index
+            # Ten times faster than `torch.cuda.current_stream`, which makes an object of it.
+            stream = torch._C._cuda_getCurrentRawStream(index)
             if not self._driven.run(bounds.size, stream):
                 self._launch.bounds = bounds
                 self._launch.launch(_warp_stream(self._device, stream))

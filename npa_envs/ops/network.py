@@ -206,14 +206,10 @@ def run_network(
 ) -> Tensor:
     """Return relu(rows W1ᵀ) W2ᵀ, [K, A'], as accurate as matrix products in float32.
 
-    A row's result depends only on that row and the weights, not on the other rows.
-
-    Args:
-        rows: Perception vectors, padded, shape [K, row_width].
-        weights: W1 [H, row_width] and W2 [A', H], concatenated, shape [H (row_width + A')].
-        output_shape: A' and H.
-        arranged: The same weights by `arrange_weights`; arranged again if gradients are needed
-            that were disabled then.
+    A row's result depends only on that row and the weights, not on the other rows. `rows` are
+    padded perception vectors, [K, row_width]; `weights` are W1 [H, row_width] and W2 [A', H],
+    concatenated; `output_shape` is A' and H. `arranged` has the same weights by `arrange_weights`;
+    they are arranged again if gradients are needed that were disabled then.
     """
     out_width, unit_count = output_shape
     needs_gradient = torch.is_grad_enabled() and (rows.requires_grad or weights.requires_grad)

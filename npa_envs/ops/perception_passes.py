@@ -42,13 +42,9 @@ class NeighbourLists(NamedTuple):
     """Whether there is a list for each sorted particle, not for each row."""
 
 
-class StaticNeighbours(NamedTuple):
-    """Neighbour lists of static particles for the portable kernels; they include themselves."""
-
-    neighbours: Tensor
-    """Sorted indices of the neighbours of all particles, concatenated, int32, shape [E]."""
-    ends: Tensor
-    """End of each particle's part of `neighbours`, int32, shape [B N]."""
+StaticNeighbours = tuple[Tensor, Tensor]
+"""Neighbour lists of static particles for the portable kernels: sorted indices of all particles'
+neighbours, themselves included, int32, [E], and the end of each particle's part, int32, [B N]."""
 
 
 class Densities(NamedTuple):

@@ -74,10 +74,8 @@ class EpisodeUpdate:
     def __call__(self, parts: Tensor, broken: Tensor | None = None) -> None:
         """Compute this step's rewards and endings.
 
-        Args:
-            parts: Terms whose sum is each world's loss, float32, contiguous, shape [L, B].
-            broken: Whether another loss of a world is not finite, uint8, shape [B]; read with
-                `on_divergence="ignore"` only.
+        The sum of the `parts`, float32, contiguous, [L, B], is each world's loss. `broken`, uint8,
+        [B]: another loss of a world is not finite; read with `on_divergence="ignore"` only.
         """
         elapsed, numbers, flags, endings = self._written
         enabled, diverged, first_loss, success_loss = self._read

@@ -273,7 +273,6 @@ def sort_worlds(
 
 
 def _empty_worlds(plan: KernelPlan, x: Tensor, with_states: bool, with_rows: bool) -> SortedWorlds:
-    """Return uninitialised tensors for sorted worlds."""
     total = plan.total
     original_index, cell = torch.empty(2, total, dtype=torch.int32, device=x.device).unbind()
     row_capacity = plan.row_capacity if with_rows else 0

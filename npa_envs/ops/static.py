@@ -51,7 +51,7 @@ class StaticWorlds(NamedTuple):
     @property
     def neighbours(self) -> StaticNeighbours | None:
         """Neighbour lists for the portable kernels, if there are any."""
-        return StaticNeighbours(*self.lists) if len(self.lists) == 2 else None
+        return (self.lists[0], self.lists[1]) if len(self.lists) == 2 else None
 
     @classmethod
     def from_list(cls, tensors: list[Tensor]) -> StaticWorlds:

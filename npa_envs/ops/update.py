@@ -26,19 +26,8 @@ from npa_envs.ops.perceive import Rows
 from npa_envs.ops.physics import Physics
 from npa_envs.ops.sort import MAX_INDEX
 
-
-def _threads_for(count: int) -> int:
-    """Return how many threads update `count` channels of a particle."""
-    return -(-count // THREAD_CHANNELS)
-
-
 BOUNDARIES = {"open": OPEN, "periodic": PERIODIC, "reflecting": REFLECTING}
 """The kernels' constant for each boundary."""
-
-
-def _boundary(physics: Physics, space_dim: int) -> tuple[int, tuple[float, ...]]:
-    """Return the kernels' constant for the boundary, and the sides of its box."""
-    return BOUNDARIES[physics.boundary], physics.box or (1.0,) * space_dim
 
 
 @custom_op("npa::update_particles")
@@ -52,8 +41,7 @@ def _update_particles(
     within: bool,
 ) -> tuple[Tensor, Tensor, Tensor]:
     space_dim, state_dim = int(x.shape[2]), s.shape[2]
-    boundary, sides = _boundary(physics, space_dim)
-    total = x.shape[0] * x.shape[1]
+    total, particle_threads = x.shape[0] * x.shape[1], 1 + -(-state_dim // THREAD_CHANNELS)
     kernels = update_kernels(space_dim, SCALARS[x.dtype])
     if update.numel() >= MAX_INDEX:
         raise NPAError(
@@ -69,12 +57,12 @@ def _update_particles(
     aligned = aligned and is_aligned(update, alignment)
     launch(
         kernels.apply_update,
-        -(-total // MOVED_TOGETHER) * MOVED_TOGETHER * (1 + _threads_for(state_dim)),
+        -(-total // MOVED_TOGETHER) * MOVED_TOGETHER * particle_threads,
         x.device,
         physics.max_displacement * physics.dt,
         physics.dt,
-        boundary if within else OPEN,
-        sides,
+        BOUNDARIES[physics.boundary] if within else OPEN,
+        physics.box or (1.0,) * space_dim,
         int(physics.moving),
         state_dim,
         update.shape[1],
@@ -105,7 +93,7 @@ def _update_particles_backward(
     update_bar = torch.empty_like(update, memory_format=torch.contiguous_format)
     launch(
         kernels.pull_back_update,
-        update.shape[0] * _threads_for(update.shape[1]),
+        update.shape[0] * -(-update.shape[1] // THREAD_CHANNELS),
         update.device,
         physics.max_displacement * physics.dt,
         physics.dt,
@@ -265,12 +253,13 @@ class ActedWorlds(NamedTuple):
         aligned = aligned and (space_dim % 2 == 0 or not physics.moving)
         return (
             update_kernels(space_dim, SCALARS[x.dtype]).apply_actions,
-            world_count * particle_count * _threads_for(state_dim),
+            world_count * particle_count * -(-state_dim // THREAD_CHANNELS),
             x.device,
             particle_count,
             physics.max_displacement * physics.dt,
             physics.limits.state_scale * physics.dt,
-            *_boundary(physics, space_dim),
+            BOUNDARIES[physics.boundary],
+            physics.box or (1.0,) * space_dim,
             int(physics.moving),
             physics.limits.position,
             physics.limits.state,

@@ -88,7 +88,6 @@ def warmup(
 
 
 def _checked_choice(name: str, value: Any, known: tuple[Any, ...]) -> list[Any]:
-    """Return the values given, one or several, after checking that each is known."""
     choice = as_list(value)
     if not choice or not all(value in known for value in choice):
         raise NPAError(f"{name} must be some of {known}, got {shown(value)}: name one or both")
@@ -112,7 +111,6 @@ def _warm_rewards(elapsed: torch.Tensor) -> None:
 
 
 def _warm_steps(x: torch.Tensor, s: torch.Tensor, physics: Physics) -> None:
-    """Run perception and update of rollouts, with and without a mask and gradients."""
     count, width = x.shape[1], physics.perception_dim + 1
     all_active = torch.ones(x.shape[:2], dtype=torch.uint8, device=x.device)
     for mask, gradients in itertools.product((None, all_active), (False, True)):
@@ -126,7 +124,6 @@ def _warm_steps(x: torch.Tensor, s: torch.Tensor, physics: Physics) -> None:
 
 
 def _warm_static(x: torch.Tensor, s: torch.Tensor, physics: Physics) -> None:
-    """Run perception of static worlds, with and without a mask."""
     static = prepare_static(x, physics)
     mask = torch.ones(x.shape[:2], dtype=torch.uint8, device=x.device)
     size = {"row_capacity": x.shape[1], "row_width": physics.perception_dim + 1}
@@ -152,7 +149,6 @@ def _warm_network(x: torch.Tensor, physics: Physics) -> None:
 
 
 def _warm_invariants(x: torch.Tensor, state_dim: int) -> None:
-    """Run the kernels of equivariant rules' vectors."""
     space_dim = x.shape[2]
     for chiral in (False, True)[: 4 - space_dim]:
         sizes = VectorSizes(space_dim, 2 * state_dim, state_dim + 1, MIXED_VECTORS, chiral)
@@ -164,7 +160,6 @@ def _warm_invariants(x: torch.Tensor, state_dim: int) -> None:
 
 
 def _warm_views(x: torch.Tensor) -> None:
-    """Run the kernels that draw 3D worlds and meshes."""
     cameras = orbit(1, width=16, height=16)
     scales, colours = x.new_ones(x.shape), x.new_zeros(*x.shape[:2], 4, 3)
     quaternions = x.new_ones(*x.shape[:2], 4)

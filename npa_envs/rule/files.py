@@ -19,13 +19,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save as serialise
 from torch import Tensor
 
-from npa_envs.atomic_files import (
-    checked_path,
-    open_regular,
-    parse_json,
-    read_bytes,
-    write_bytes,
-)
+from npa_envs.atomic_files import checked_path, open_regular, parse_json, read_bytes, write_bytes
 from npa_envs.devices import check_device
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.rule.paper_formats import (

@@ -215,7 +215,6 @@ class NPARule(nn.Module):
             )
 
     def _check_combinations(self) -> None:
-        """Raise NPAError for arguments that exclude each other."""
         zone, species_count, code_dim = self.dead_zone, self.species_count, self.code_dim
         name_count, encoder = len(self.code_names), self.encoder
         if not 0.0 <= zone < math.inf:

@@ -262,19 +262,19 @@ class TrainConfig(Generic[TaskConfigT]):
         """The torch.dtype of the name `dtype`."""
         return torch.float64 if self.dtype == "float64" else torch.float32
 
-    def learning_rate_at(self, iteration: int, elapsed: float = 0.0) -> float:
+    def learning_rate_at(self, iteration: int, fraction: float = 0.0) -> float:
         """Return the learning rate of an iteration, counted from 0 over all repeats.
 
         A resumed run needs no scheduler state. Each repeat restarts it: steps at the milestones, or
-        a short linear rise and a cosine (Loshchilov and Hutter, arXiv 1608.03983). `elapsed` is
+        a short linear rise and a cosine (Loshchilov and Hutter, arXiv 1608.03983). `fraction` is
         the least progress along the cosine, from 0 to 1, also in earlier iterations.
         """
         within = iteration % self.iterations
         if self.schedule == "milestones":
             passed = sum(milestone <= within for milestone in self.milestones)
             return float(self.learning_rate * float(DECAY**passed))
-        elapsed = min(1.0, max(elapsed, within / self.iterations))
-        fall = 0.5 + 0.5 * math.cos(math.pi * elapsed)
+        fraction = min(1.0, max(fraction, within / self.iterations))
+        fall = 0.5 + 0.5 * math.cos(math.pi * fraction)
         rate = self.learning_rate * (LOWEST + (1.0 - LOWEST) * fall)
         return rate * min(1.0, (within + 1) / (RISE * self.iterations))
 

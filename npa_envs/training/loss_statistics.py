@@ -97,9 +97,8 @@ class LossStatistics:
     def snapshot(self) -> dict[str, Any]:
         """Return the state of the first iteration whose loss was not finite, on the CPU.
 
-        Returns:
-            `iteration`, `steps`, `terms` (by name), `x0`, `s0` (before the rollout), `x`, `s`
-            (after it), `parameters` (one flat vector), and `goal` where the task has goals.
+        That is `iteration`, `steps`, `terms` (by name), `x0`, `s0` (before the rollout), `x`, `s`
+        (after it), `parameters` (one flat vector), and `goal` where the task has goals.
         """
         values = {name: value.cpu() for name, value in self._snapshot.items()}
         terms = values.pop("terms").tolist()

@@ -101,7 +101,6 @@ class RuleOptimiser:
             load_moments(optimiser, {k: moments[i] for k, i in enumerate(order) if i in moments})
 
     def _fresh_optimisers(self) -> list[Optimizer]:
-        """Return new optimisers, whose moments are zero."""
         optimisers: list[Optimizer] = []
         decay = self._config.weight_decay
         if self._orthogonal:

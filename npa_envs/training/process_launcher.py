@@ -121,7 +121,6 @@ def print_once(processes: ProcessGroup) -> Iterator[None]:
 
 
 def _message_of(failure: ProcessFailure) -> str:
-    """Return the message of the error that ended a process, or an empty string."""
     content = failure.error_file_data["message"]
     # Torch writes the error's class before it.
     return str(content["message"]).partition(": ")[2] if isinstance(content, dict) else ""

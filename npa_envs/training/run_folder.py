@@ -54,18 +54,12 @@ def check_choice(*, resume: bool, overwrite: bool) -> None:
 
 
 class Run:
-    """A run of any learner, whose first process reads and writes its files.
+    """A run of any learner, whose first process reads and writes the files in its folder.
 
-    Args:
-        folder: Its files; None: nothing is written, and no signal stops it.
-        processes: Its processes.
-        check: Raises NPAError if a checkpoint, given with its path, is of another run.
-        resume: Continue from the checkpoint in the folder.
-        overwrite: Remove the files of an earlier run in the folder.
-
-    Raises:
-        NPAError: There is a run in the folder, without `resume` or `overwrite`; there is none, or
-            another one, with `resume`; or another process writes to it.
+    Without a folder nothing is written, and no signal stops the run. `resume` continues from the
+    checkpoint, for which `check` raises NPAError if it is of another run; `overwrite` removes an
+    earlier run's files. A folder that holds a run, without either, is an NPAError, and so is one
+    that another process writes to.
     """
 
     def __init__(
@@ -129,15 +123,10 @@ class Run:
     ) -> bool:
         """Repeat `step` until the run is over, or until SIGTERM, Ctrl-C or a time limit stops it.
 
-        Args:
-            step: One iteration; it increments `iteration`.
-            is_over: Returns whether the run is over, the same on all processes.
-            end: Called at the end, with whether the run was stopped; signals are still caught.
-            begin: Called before the first step, when signals are caught.
-            time_is_up: Returns whether the time limit has passed, on this process.
-
-        Returns:
-            Whether a signal came.
+        `step` does an iteration and increments `iteration`. `is_over` returns the same on all
+        processes, `time_is_up` whether this one has reached its limit. Signals are caught from
+        `begin` to `end`, which is called with whether the run was stopped. Returns whether a
+        signal came.
         """
         requests: contextlib.AbstractContextManager[threading.Event]
         requests = stop_flag(patient=self._processes.distributed)
@@ -164,11 +153,9 @@ class Run:
 def stop_flag(*, patient: bool = False) -> Iterator[threading.Event]:
     """Within the block, the first SIGINT or SIGTERM sets the event; later ones act as usual.
 
-    Signals within `ONE_REQUEST` of the first one are ignored. In a thread other than the main one,
+    Signals within `ONE_REQUEST` of the first one are ignored; with `patient` all later ones, as
+    torchrun forwards those that a terminal has sent already. In a thread other than the main one,
     where signals cannot be caught, the event stays unset.
-
-    Args:
-        patient: Ignore all later signals: torchrun forwards those that a terminal has sent already.
     """
     requested = threading.Event()
     if threading.current_thread() is not threading.main_thread():

@@ -26,7 +26,6 @@ class TrainedTask:
     """The task of a rule, and whether its target is known."""
 
     task: Task
-
     why_not_measurable: str | None
     """Why comparisons with the target are meaningless; None where they are meaningful."""
     task_name: str
@@ -101,7 +100,6 @@ def task_of_rule(
 
 
 def _file_of(source: str) -> tuple[Path, Mapping[str, str]]:
-    """Return the path and the metadata of a rule's file."""
     path = rule_file(source)
     return path, rule_metadata(path) if path.suffix == ".safetensors" else {}
 

@@ -53,8 +53,6 @@ class TaskEntry:
     """Space dimension D of its worlds."""
     static: bool = False
     """Whether particles never move."""
-    joint: bool = False
-    """Whether several rules are trained, one for each species, by `train_together`."""
 
     def expected_seconds(self, config: TrainConfig[Any]) -> float | None:
         """Return the estimated duration of a run on a CPU [s], by its particle-steps.
@@ -95,12 +93,8 @@ TASKS: Mapping[str, TaskEntry] = {
         # Its rules are filmed and evaluated one by one, as rules of morphogenesis2d.
         make=lambda config, device: CoMorphogenesis2D(config, device=device),
         targets=tuple,
-        examples=(
-            "--targets ring heart",
-            "--preset paper --targets gecko heart --device cuda",
-        ),
+        examples=("--targets ring heart", "--preset paper --targets gecko heart --device cuda"),
         fast_seconds=340.0,
-        joint=True,
     ),
     "morphogenesis3d": TaskEntry(
         summary="grow a 3D object from a ball of blank particles",

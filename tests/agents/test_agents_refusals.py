@@ -166,14 +166,8 @@ REFUSED = {
         ({"problem": species(**WIDE), "source": ["heart"] * 3}, "one for each of 2 species"),
         ({"problem": heart(), "source": "hart"}, "unknown rule"),
     ],
-    Budget: [
-        ({}, "must say something"),
-        ({"seconds": 0.0}, "seconds must be"),
-    ],
-    entered: [
-        ({"curve_points": 0}, "curve_points"),
-        ({"evaluation_seeds": []}, "seed"),
-    ],
+    Budget: [({}, "must say something"), ({"seconds": 0.0}, "seconds must be")],
+    entered: [({"curve_points": 0}, "curve_points"), ({"evaluation_seeds": []}, "seed")],
     trained: [
         ({"method": "gradients"}, "did you mean 'gradient'"),
         ({"method": "gradient", "learning_rat": 1.0}, "did you mean 'learning_rate'"),
@@ -202,10 +196,7 @@ REFUSED = {
         ({"method": "gradient", "problem": INVASION}, "gradients .* each other's expense"),
         ({"method": "gradient", "problem": DYING}, "gradients must keep all particles"),
         ({"method": "evolution", "problem": problem(env_id=GARDEN)}, "known word, got 'evolution'"),
-        (
-            {"method": "ppo_world", "problem": ALONE, "steps": 1},
-            "at least 2 steps of worlds",
-        ),
+        ({"method": "ppo_world", "problem": ALONE, "steps": 1}, "at least 2 steps of worlds"),
         (
             {"method": "ppo_world", "problem": heart(num_envs=1), "steps": 4},
             "minibatches must have at",
@@ -213,9 +204,7 @@ REFUSED = {
         *(({"method": m, "start": npa_envs.NPARule()}, "start must be a RuleSet") for m in WARM),
         *(({"method": m, **start_of(heart(state_dim=8))}, "state_dim") for m in WARM),
     ],
-    world_seeds: [
-        ({"seed": 0, "count": 10_001}, "at most 10000"),
-    ],
+    world_seeds: [({"seed": 0, "count": 10_001}, "at most 10000")],
     SearchWorld: [
         ({"steps": 20}, f"steps must be a multiple of {SNAPSHOTS}, got 20: take 32"),
         ({"state_dim": 2}, "state_dim must be a whole number of at least 3"),
@@ -241,10 +230,7 @@ REFUSED = {
         ({"episodes": 3}, "--episodes must not"),
         ({"options": ("sac.gamma=0.5",)}, "options of 'sac' are frozen"),
         ({"methods": ("ppo=ppo",)}, "must be new and of small letters"),
-        (
-            {"methods": ("mine=absent_module:train",)},
-            "import, got 'absent_module:train'",
-        ),
+        ({"methods": ("mine=absent_module:train",)}, "import, got 'absent_module:train'"),
         ({"methods": ("mine=ppo",), "options": ("mine.bold=1",)}, "unknown option 'bold'"),
         ({"tasks": ("Gardener2DSmall-v1",)}, "did you mean 'Gardener2DSmall-v0'"),
         ({"methods": ("sacc",)}, "did you mean 'sac'"),

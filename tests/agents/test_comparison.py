@@ -113,7 +113,6 @@ def ran(plan, folder, *devices, jobs=1, **options) -> list[RunRecord]:
 
 
 def output_of(folder, job, name="seen") -> str:
-    """What a run left in a file."""
     return (folder / job.folder / name).read_text(encoding="utf-8")
 
 
@@ -349,8 +348,8 @@ def test_the_process_of_a_run_ends_with_the_comparison(tmp_path, learns):
         [*one_run.PROGRAM, str(tmp_path)], stdin=subprocess.PIPE, stderr=subprocess.PIPE
     )
     try:
-        order = one_run.Order(str(tmp_path), "cpu", "")
-        process.stdin.write(f"{json.dumps(order)}\n".encode() if learns else b"")
+        order = json.dumps([str(tmp_path), "cpu", ""])
+        process.stdin.write(f"{order}\n".encode() if learns else b"")
         process.stdin.flush()
         _, errors = process.communicate(timeout=100)
     finally:
@@ -462,17 +461,17 @@ def test_a_curve_is_the_mean_of_seeds_where_all_of_them_are():
         record("ppo", 1, curve=points((1.0, 3.0), (3.0, 5.0))),
         record("ppo", 2, status="failed"),
     ]
-    mean = mean_of(*some)
-    assert (mean.across[0], mean.across[-1]) == (1.0, 3.0)
-    assert np.allclose(mean.mean, np.interp(mean.across, [1, 2, 3], [2.0, 3.0, 3.5]), atol=0.02)
-    assert mean.error[0] == pytest.approx(1.0)
+    across, mean, error = curve = mean_of(*some)
+    assert (across[0], across[-1]) == (1.0, 3.0)
+    assert np.allclose(mean, np.interp(across, [1, 2, 3], [2.0, 3.0, 3.5]), atol=0.02)
+    assert error[0] == pytest.approx(1.0)
     assert mean_of(some[2]) is None
     # One that broke off early is no part of it, and alone it is all there is.
     diverged = record("ppo", 3, status="diverged", curve=points((0.0, -9.0), (0.5, -9.0)))
-    assert np.array_equal(mean_of(*some, diverged), mean)
-    assert mean_of(diverged).across[-1] == 0.5
-    alone = mean_of(record("zero", 0, curve=points((0.0, 0.5))))
-    assert (alone.across.tolist(), alone.mean.tolist()) == ([0.0], [0.5])
+    assert np.array_equal(mean_of(*some, diverged), curve)
+    assert mean_of(diverged)[0][-1] == 0.5
+    across, mean, _ = mean_of(record("zero", 0, curve=points((0.0, 0.5))))
+    assert (across.tolist(), mean.tolist()) == ([0.0], [0.5])
 
 
 @pytest.mark.parametrize("name", ["morphogenesis2d", "mixing"])

@@ -12,14 +12,7 @@ from support.small_envs import begun
 
 import npa_envs
 from npa_envs.agents import SpreadPolicy
-from npa_envs.agents.learning import (
-    Budget,
-    Problem,
-    Progress,
-    RuleSet,
-    method_options,
-    train,
-)
+from npa_envs.agents.learning import Budget, Problem, Progress, RuleSet, method_options, train
 from npa_envs.agents.learning.progress import annealed
 from npa_envs.envs import multispecies_v0, particles_v0
 from npa_envs.errors import DivergedError

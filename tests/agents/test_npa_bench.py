@@ -18,15 +18,7 @@ from npa_envs.registration import SIZES, SPECIES_SIZES
 
 pytest.importorskip("jsonschema")
 pytest.importorskip("scipy")
-from npa_bench_rows import (
-    BenchRow,
-    BenchRun,
-    normalised,
-    read_row,
-    read_rows,
-    score,
-    scores_in,
-)
+from npa_bench_rows import BenchRow, BenchRun, normalised, read_row, read_rows, score, scores_in
 
 SUITE, SMALL_SUITE = SUITES["npa-bench-v0"], SUITES["npa-bench-small-v0"]
 FIRST = next(iter(SUITE.budgets))
@@ -66,7 +58,6 @@ def zero_row(tmp_path):
 
 
 def changed(path, change) -> None:
-    """Change what a file of JSON holds."""
     data = json.loads(path.read_text(encoding="utf-8"))
     change(data)
     path.write_text(json.dumps(data), encoding="utf-8")

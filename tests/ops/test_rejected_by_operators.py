@@ -53,11 +53,7 @@ def lens(*numbers):
 
 
 def acting(**change):
-    kwargs = {
-        "action": torch.zeros(2, 4, 6),
-        "x": torch.zeros(2, 4, 2),
-        "s": torch.zeros(2, 4, 4),
-    }
+    kwargs = {"action": torch.zeros(2, 4, 6), "x": torch.zeros(2, 4, 2), "s": torch.zeros(2, 4, 4)}
     kwargs |= {"diverged": torch.zeros(2, dtype=torch.uint8), "mask": None, "noise": None}
     limits = Limits(1.0, position=50.0, state=20.0)
     kwargs |= {"physics": Physics(2, 4, 1.0, 1.0, max_displacement=0.1, limits=limits)}

@@ -12,10 +12,11 @@ from npa_envs.measure.quality import evaluate
 from npa_envs.rule.files import load_rule
 from npa_envs.tasks.losses.texture import TEXTURE_LOSSES
 from npa_envs.training import TASKS, Trainer, preset, task_entry, train
+from npa_envs.training.trainer import JOINT_TASK_NAME
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import WorldRandom
 
-NAMES = [name for name, entry in TASKS.items() if not entry.joint]
+NAMES = [name for name in TASKS if name != JOINT_TASK_NAME]
 VARIANTS = [
     ("morphogenesis2d", {}),
     ("texture", {"loss": "patch_swd"}),

@@ -2,8 +2,8 @@
 
 import pytest
 import torch
+from support.refusals import refused
 
-from npa_envs.errors import NPAError
 from npa_envs.rule.files import load_rule
 from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2D, CoMorphogenesis2DConfig
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2DConfig
@@ -91,12 +91,10 @@ class TestTask:
         ],
     )
     def test_species_that_do_not_fit_are_refused(self, fields, message):
-        with pytest.raises(NPAError, match=message):
-            pair(**fields)
+        refused(message, pair, **fields)
 
     def test_one_rule_is_not_enough(self, task):
-        with pytest.raises(NPAError, match="2 species need as many rules, not one"):
-            task.make_rule(torch.Generator())
+        refused("2 species need as many rules, not one", task.make_rule, torch.Generator())
 
 
 class TestRun:
@@ -131,5 +129,4 @@ class TestRun:
             target, own = species
             other = pair(species=(small("ring"), small(target, 32, **own)))
             rules = CoMorphogenesis2D(other).make_rules(torch.Generator())[:count]
-        with pytest.raises(NPAError, match=message):
-            train_together(run_config(tmp_path, **fields), rules, progress=False)
+        refused(message, train_together, run_config(tmp_path, **fields), rules, progress=False)

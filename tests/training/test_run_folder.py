@@ -10,6 +10,7 @@ import sys
 import pytest
 import torch
 from support.circle_task import circle_config
+from support.refusals import refused
 from support.training_runs import Killed, KilledTask, kill, log_of, train, trainer_of
 
 from npa_envs.atomic_files import write_text
@@ -81,8 +82,7 @@ def test_a_folder_that_another_process_trains_in_is_refused_until_that_is_killed
         assert holder.stdout.readline() == "locked\n"
         message = rf"no other run writes to, but process {holder.pid} on .* is training in"
         for options in ({"resume": True}, {"overwrite": True}, {}):
-            with pytest.raises(NPAError, match=message):
-                trainer_of(config, **options)
+            refused(message, trainer_of, config, **options)
         holder.send_signal(signal.SIGKILL)
     # The file of the lock is still there, and of no effect.
     assert f"process {holder.pid}" in (tmp_path / ".lock").read_text(encoding="utf-8")
@@ -92,18 +92,16 @@ def test_a_folder_that_another_process_trains_in_is_refused_until_that_is_killed
 def test_two_trainers_in_one_folder_do_not_both_run(tmp_path):
     config = circle_config(tmp_path)
     first = trainer_of(config)
-    refused = []
+    attempts = []
 
     def resume_meanwhile():
-        with pytest.raises(NPAError, match="no other run writes to, but process"):
-            trainer_of(config, resume=True)
-        refused.append(True)
+        refused("no other run writes to, but process", trainer_of, config, resume=True)
+        attempts.append(True)
 
     second = trainer_of(config, KilledTask(2, end=resume_meanwhile), resume=True)
     assert second.run(progress=False).finished
-    assert refused == [True]
-    with pytest.raises(NPAError, match=r"another one has written .* meanwhile: resume it"):
-        first.run(progress=False)
+    assert attempts == [True]
+    refused(r"another one has written .* meanwhile: resume it", first.run, progress=False)
     assert [record["iteration"] for record in log_of(tmp_path)] == list(range(1, 7))
     # One trainer may go on with what it wrote itself.
     assert second.run(progress=False).finished
@@ -159,8 +157,7 @@ def resumed(finished, monkeypatch):
     def resume(content, message):
         monkeypatch.setattr("npa_envs.training.run_folder.load_checkpoint", lambda _: content)
         before = {path: path.read_bytes() for path in finished.iterdir() if path.is_file()}
-        with pytest.raises(NPAError, match=message):
-            trainer_of(circle_config(finished, log_interval=2), resume=True)
+        refused(message, trainer_of, circle_config(finished, log_interval=2), resume=True)
         del before[finished / ".lock"]
         assert all(path.read_bytes() == data for path, data in before.items())
 

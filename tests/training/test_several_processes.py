@@ -35,7 +35,6 @@ def popen(*words, **variables):
 
 
 def started(out, *options):
-    """A run on two processes."""
     return popen("npa_envs", "--processes", "2", "--out", str(out), *options)
 
 

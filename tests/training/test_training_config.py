@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from support.refusals import refused
 
 from npa_envs.errors import NPAError
 from npa_envs.rule.files import load_rule
@@ -128,8 +129,7 @@ REFUSED_TOGETHER = [
     [(PAPER, *row) for row in REFUSED] + [(PAIR, *row) for row in REFUSED_TOGETHER],
 )
 def test_each_wrong_value_is_named(base, fields, message):
-    with pytest.raises(NPAError, match=message):
-        override(base, **fields)
+    refused(message, override, base, **fields)
 
 
 @pytest.mark.parametrize(
@@ -149,10 +149,8 @@ def test_the_largest_seed_a_device_that_is_not_here_and_sections_are_accepted():
 
 
 def test_unknown_names_get_a_suggestion():
-    with pytest.raises(NPAError, match="unknown preset 'papr' of morphogenesis2d: did you mean"):
-        preset("papr")
-    with pytest.raises(NPAError, match=r"did you mean 'morphogenesis[23]d'"):
-        task_entry("morphogenesis")
+    refused("unknown preset 'papr' of morphogenesis2d: did you mean", preset, "papr")
+    refused(r"did you mean 'morphogenesis[23]d'", task_entry, "morphogenesis")
 
 
 FILES = {
@@ -234,5 +232,4 @@ def test_mappings_are_laid_over_the_species_that_are_there_and_more_over_the_las
 def test_a_rule_with_codes_of_other_targets_is_refused_by_their_names():
     config = preset("fast", targets=("gecko", "heart"), initial_rule="seven-pictures")
     untrained = NPARule(state_dim=24, hidden_dim=128, code_dim=8, code_names=("gecko", "heart"))
-    with pytest.raises(NPAError, match=r"code_names .*, here .*'gecko', 'heart'"):
-        initial_rule(config, untrained)
+    refused(r"code_names .*, here .*'gecko', 'heart'", initial_rule, config, untrained)

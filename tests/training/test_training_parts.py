@@ -6,10 +6,10 @@ import math
 import pytest
 import torch
 from support.circle_task import CircleTask, circle_config, plain_rollout
+from support.refusals import Trap, refused
 from torch import nn
 
 from npa_envs.devices import check_device, parse_device
-from npa_envs.errors import NPAError
 from npa_envs.rule.rule import NPARule, fate_parameters
 from npa_envs.training.checkpoint import load_checkpoint, save_checkpoint
 from npa_envs.training.cycle import WorldPool
@@ -115,8 +115,7 @@ def test_first_step_of_each_repeat_has_the_full_learning_rate_and_fresh_moments(
 
 
 @pytest.mark.parametrize(
-    "options",
-    [{"divides": True}, {"code_names": ("a", "b"), "code_dim": 2}, {"equivariant": True}],
+    "options", [{"divides": True}, {"code_names": ("a", "b"), "code_dim": 2}, {"equivariant": True}]
 )
 def test_muon_makes_steps_of_matrices_orthogonal_and_leaves_all_else_to_adamw(tmp_path, options):
     config = circle_config(tmp_path, optimiser="muon", learning_rate=1e-2, weight_decay=0.5)
@@ -302,21 +301,18 @@ def test_the_snapshot_is_of_the_first_bad_iteration_and_not_of_a_later_one(tmp_p
 def test_what_names_no_device_is_refused(names, rule):
     for name in names:
         for check in (check_device, *[parse_device] * (not isinstance(name, torch.device))):
-            with pytest.raises(NPAError, match=f"device {rule}.*, got .*use 'cpu'"):
-                check(name)
+            refused(f"device {rule}.*, got .*use 'cpu'", check, name)
 
 
 def test_a_cuda_device_must_be_there(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     for name in ("cuda", "cuda:0", torch.device("cuda", 1)):
-        with pytest.raises(NPAError, match=r"got 'cuda.*sees 0 CUDA devices: use device='cpu'"):
-            check_device(name)
+        refused(r"got 'cuda.*sees 0 CUDA devices: use device='cpu'", check_device, name)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     assert check_device("cuda") == torch.device("cuda:0")
     assert check_device(torch.device("cuda:1")) == torch.device("cuda:1")
-    with pytest.raises(NPAError, match="got 'cuda:2', but it sees 2 CUDA devices"):
-        check_device("cuda:2")
+    refused("got 'cuda:2', but it sees 2 CUDA devices", check_device, "cuda:2")
     assert check_device("cpu") == torch.device("cpu") == check_device(torch.device("cpu"))
 
 
@@ -336,23 +332,16 @@ def other_version(path):
     torch.save(torch.load(path, weights_only=True) | {"format_version": 99}, path)
 
 
-class Trap:
-    """Unpickling it would leave a file behind."""
-
-    def __init__(self, path):
-        self.path = path
-
-    def __reduce__(self):
-        return self.path.with_name("ran").touch, ()
-
-
 DAMAGED = r"checkpoint\.pt' is not a checkpoint or is damaged"
 OURS = "npa-envs checkpoint"
 BAD_CHECKPOINTS = {
     "empty": (lambda path: path.write_bytes(b""), DAMAGED),
     "truncated": (damaged(lambda data: data[:-500]), DAMAGED),
     "changed bytes": (damaged(lambda data: data.replace(bytes(4000), b"x" * 4000)), DAMAGED),
-    "code": (lambda path: torch.save({"format": OURS, "trap": Trap(path)}, path), DAMAGED),
+    "code": (
+        lambda path: torch.save({"format": OURS, "a": Trap(path.with_name("ran"))}, path),
+        DAMAGED,
+    ),
     "another file": (lambda path: torch.save({"a": 1}, path), "is not a checkpoint of npa-envs"),
     "no version": (lambda path: torch.save({"format": OURS}, path), "has checkpoint format None"),
     "another version": (other_version, "has checkpoint format 99, this version reads 1"),
@@ -363,6 +352,5 @@ BAD_CHECKPOINTS = {
 def test_what_is_no_checkpoint_is_refused_and_never_run(tmp_path, case):
     write, message = BAD_CHECKPOINTS[case]
     write(tmp_path / "checkpoint.pt")
-    with pytest.raises(NPAError, match=message):
-        load_checkpoint(tmp_path / "checkpoint.pt")
+    refused(message, load_checkpoint, tmp_path / "checkpoint.pt")
     assert [path.name for path in tmp_path.iterdir()] == ["checkpoint.pt"]

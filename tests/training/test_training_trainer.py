@@ -14,6 +14,7 @@ import torch
 from PIL import Image
 from support.circle_task import CircleTask, circle_config, plain_rollout
 from support.clock import Clock
+from support.refusals import refused
 from support.training_runs import (
     Killed,
     KilledTask,
@@ -43,8 +44,7 @@ def test_training_starts_from_an_initial_rule_of_its_shape(tmp_path):
         assert_same(trainer_of(config).rule.state_dict(), first.rule.state_dict())
     save_rule(NPARule(2, 5, 7), tmp_path / "other.safetensors")
     config = circle_config(tmp_path / "run", initial_rule=str(tmp_path / "other.safetensors"))
-    with pytest.raises(NPAError, match=r"shape, but .* differs in .*hidden_dim \(7, here "):
-        trainer_of(config)
+    refused(r"shape, but .* differs in .*hidden_dim \(7, here ", trainer_of, config)
 
 
 def test_a_log_without_its_checkpoint_is_not_gone_on_with(tmp_path):
@@ -52,8 +52,7 @@ def test_a_log_without_its_checkpoint_is_not_gone_on_with(tmp_path):
     train(config)
     (tmp_path / "run" / "checkpoint.pt").unlink()
     before = log_of(tmp_path / "run")
-    with pytest.raises(NPAError, match=r"out must be a folder without a run, .* holds a log with"):
-        trainer_of(config)
+    refused(r"out must be a folder without a run, .* holds a log with", trainer_of, config)
     assert log_of(tmp_path / "run") == before
     train(config, overwrite=True)
     assert log_of(tmp_path / "run") == before
@@ -285,8 +284,7 @@ def test_an_iteration_follows_the_progress_that_it_is_given(tmp_path):
     assert (parameter.detach() - first).abs().max().item() == pytest.approx(rate, rel=1e-3)
     trainer._update_log()
     assert log_of(tmp_path)[-1]["learning_rate"] == pytest.approx(rate)
-    with pytest.raises(NPAError, match=r"least_progress must lie in \[0, 1\], got 1.5"):
-        trainer.iterate(least_progress=1.5)
+    refused(r"least_progress must lie in \[0, 1\], got 1.5", trainer.iterate, least_progress=1.5)
 
 
 def test_run_leaves_rule_configuration_pictures_and_a_board_with_the_logs_numbers(tmp_path):
@@ -430,8 +428,7 @@ def test_second_run_in_a_folder_is_refused_unless_it_overwrites(tmp_path):
         ({}, r"holds one: resume it .*, choose another folder .*, or overwrite"),
         ({"resume": True, "overwrite": True}, "resume and overwrite exclude each other"),
     ):
-        with pytest.raises(NPAError, match=message):
-            trainer_of(config, **options)
+        refused(message, trainer_of, config, **options)
     assert [record["iteration"] for record in log_of(tmp_path)][-1] == config.iterations
     result = train(override(config, iterations=2), overwrite=True)
     assert result.iteration == 2
@@ -449,14 +446,12 @@ def test_checkpoint_of_another_task_or_configuration_is_refused(tmp_path):
         ({"target": "heart"}, {}, r"task.target: 'gecko' there, 'heart' here"),
         ({}, {}, "at iteration 12, beyond the 6 of this run: raise repeats"),
     ):
-        with pytest.raises(NPAError, match=message):
-            trainer_of(override(config, **changes), resume=True, **options)
+        refused(message, trainer_of, override(config, **changes), resume=True, **options)
 
 
 def test_folders_that_do_not_do_are_named_before_training(tmp_path, monkeypatch):
     def refuse(folder, message, **options):
-        with pytest.raises(NPAError, match=message):
-            trainer_of(circle_config(tmp_path / folder), **options)
+        refused(message, trainer_of, circle_config(tmp_path / folder), **options)
 
     refuse("none", "there is no checkpoint to resume from", resume=True)
     assert not (tmp_path / "none").exists()

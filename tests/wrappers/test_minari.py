@@ -166,8 +166,7 @@ def test_episodes_of_an_environment_of_ones_own_are_as_long_as_it_is_registered(
 
 
 @pytest.mark.parametrize(
-    ("first", "count", "seed"),
-    [(0, 16, 1), (9_999, 1, 1), (9_999, 2, 2), (2_000_000, 16, 0)],
+    ("first", "count", "seed"), [(0, 16, 1), (9_999, 1, 1), (9_999, 2, 2), (2_000_000, 16, 0)]
 )
 def test_a_scripted_policy_is_chosen_in_worlds_that_are_not_recorded(
     first, count, seed, monkeypatch

@@ -48,16 +48,12 @@ class Cameras:
     world_to_camera: Tensor
     """Rigid motions [R t; 0 1] into the cameras' frames [length units], shape [V, 4, 4] or
     [B, V, 4, 4]."""
-
     intrinsics: Tensor
     """fx, fy, cx and cy [pixels], shape [4], [V, 4] or [B, V, 4]."""
-
     width: int
     """Pixels across, W."""
-
     height: int
     """Pixels down, H."""
-
     near: float = 0.01
     """Smallest visible depth z [length units]."""
 

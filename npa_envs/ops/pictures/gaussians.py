@@ -200,10 +200,8 @@ class GaussianPictures(NamedTuple):
 
     image: Tensor
     """Colours, dimensionless, shape [B, V, H, W, K]; the first row is the upper one."""
-
     alpha: Tensor
     """Opacity of each pixel, in [0, 1], shape [B, V, H, W]."""
-
     overflow: Tensor
     """Pictures without room for all pairs, whose farthest Gaussians are missing: bool, [B, V]."""
 

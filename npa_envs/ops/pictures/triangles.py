@@ -21,14 +21,10 @@ def nearest_triangles(
 ) -> Tensor:
     """Return pictures [V, H, W, 4]: colour of the nearest triangle at a pixel, and 1; else 0.
 
-    Everything is on the CPU, in float64. A triangle covers a pixel if it covers the centre.
-
-    Args:
-        positions: Coordinates of Q corners in the pictures of V cameras [pixels], shape [V, Q, 2].
-        nearness: 1 / depth of the corners [1 / length units], shape [V, Q].
-        colours: Colours of the corners, shape [Q, 3].
-        faces: Corners of each triangle, from 0 to Q − 1, shape [F, 3].
-        visible: Whether a triangle is visible to a camera, shape [V, F].
+    Everything is on the CPU, in float64. A triangle covers a pixel if it covers the centre. Q
+    corners have `positions` in the pictures of V cameras [pixels], [V, Q, 2], `nearness` 1 / depth
+    [1 / length units], [V, Q], and `colours`, [Q, 3]. `faces`, [F, 3], are the corners of
+    triangles, and `visible`, [V, F], says which cameras see them.
     """
     count = len(positions)
     nearest = positions.new_zeros(count, height * width)
