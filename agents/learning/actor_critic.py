@@ -114,7 +114,7 @@ class CommonOptions:
         return math.pow(last_noise, max(0.0, 1.0 - remaining_budget / self.noise_decay_share))
 
 
-def find_gradients(optimiser: torch.optim.Optimizer, loss: Tensor) -> None:
+def set_gradients(optimiser: torch.optim.Optimizer, loss: Tensor) -> None:
     """Compute a loss's gradients, and write them into `grad` of an optimiser's parameters."""
     # Read-outs and frozen layers have no gradients.
     parameters = [p for p in optimiser.param_groups[0]["params"] if p.requires_grad]

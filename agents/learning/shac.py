@@ -19,9 +19,9 @@ from npa_envs.agents.learning.actor_critic import (
     Critic,
     CriticInput,
     Minibatches,
-    find_gradients,
     gradients_of,
     seeded_critic,
+    set_gradients,
     share_of_worlds,
 )
 from npa_envs.agents.learning.gradient import EnvironmentTask
@@ -141,7 +141,7 @@ class SHACLearner:
     def learn(self, rate: float) -> None:
         """Run the worlds for a window, and train rules and critic on it."""
         window, optimiser = self.play(), self.optimisers["rules"]
-        find_gradients(optimiser, -self.objective(window))
+        set_gradients(optimiser, -self.objective(window))
         means = gradients_of(optimiser)
         self.processes.reduce(means)
         normalise_gradients(means)
@@ -221,7 +221,7 @@ class SHACLearner:
             for index in self._minibatches.indices[0]:
                 values = world_values(self.critic, features[index])
                 error = (values - targets[index]) / self.critic.scale
-                find_gradients(self.optimisers["critic"], 0.5 * error.square().mean())
+                set_gradients(self.optimisers["critic"], 0.5 * error.square().mean())
                 self.processes.reduce(gradients_of(self.optimisers["critic"]))
                 self.optimisers["critic"].step()
         with torch.no_grad():
