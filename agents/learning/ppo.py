@@ -33,13 +33,13 @@ from npa_envs.agents.learning.actor_critic import (
 )
 from npa_envs.agents.learning.problem import (
     WORLDS_PER_SEED,
-    ConcatenatedSpeciesEnv,
-    ParticleRewards,
+    ParticleRewardKind,
     Problem,
     world_seeds,
 )
 from npa_envs.agents.learning.progress import Progress
 from npa_envs.agents.learning.rule_set import RuleSet
+from npa_envs.agents.learning.species_env import ConcatenatedSpeciesEnv
 from npa_envs.checks import check_flag, check_positive, check_word
 from npa_envs.envs.core.world_state import free_bytes, needed_bytes
 from npa_envs.errors import NPAError
@@ -75,7 +75,7 @@ class PPOOptions(CommonOptions):
     ratio: Literal["particle", "world"] = "particle"
     """One likelihood ratio for each particle, or one for each world: of the mean log-probability
     of its particles."""
-    particle_rewards: ParticleRewards | None = None
+    particle_rewards: ParticleRewardKind | None = None
     """Reward of each particle: "particle", its own part of its world's reward; "marginal", the
     difference that its action makes to the world's. None: its world's reward."""
     masked: bool = False
@@ -89,7 +89,7 @@ class PPOOptions(CommonOptions):
         if self.num_envs is not None:
             check_positive(self, int, "num_envs")
         check_word(self, "ratio", ("particle", "world"))
-        check_word(self, "particle_rewards", (None, *get_args(ParticleRewards)))
+        check_word(self, "particle_rewards", (None, *get_args(ParticleRewardKind)))
         if self.ratio == "world" and self.particle_rewards is not None:
             raise NPAError(
                 f"particle_rewards={self.particle_rewards!r} needs ratio='particle': with "
