@@ -150,7 +150,7 @@ class SHACLearner:
         self.learn_values(StepWindow(*(values.detach() for values in window)))
 
     def play(self) -> StepWindow:
-        """Run the rules for a window, differentiably; restart worlds whose episode is over."""
+        """Run the rules for a window, differentiably; then restart worlds whose episode is over."""
         task, steps = self.task, self.window
         begin, limits = self.worlds, task.physics.limits
         begin_episodes(self.random)

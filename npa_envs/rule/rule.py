@@ -329,7 +329,7 @@ class NPARule(nn.Module):
         return self._with_code_zeros(self.output.weight, dim=0)
 
     def _with_code_zeros(self, outputs: Tensor, *, dim: int) -> Tensor:
-        """Insert zeros in dimension `dim` for the code, which no update changes, between δ and Δs."""
+        """Insert zeros for the code, which no update changes, after δ in dimension `dim`."""
         if self.code_dim == 0:
             return outputs
         moves, states = outputs.tensor_split([self.update_dim - self.state_dim], dim=dim)
