@@ -24,7 +24,7 @@ FREE_PLACES = 8
 
 
 class BrushPolicy:
-    """Policy for an environment of brushes, single or vector."""
+    """Policy that reads the worlds of `env`, a single or vector environment with brushes."""
 
     def __init__(self, env: Any) -> None:
         inner = unwrapped(env)
@@ -41,21 +41,21 @@ class BrushPolicy:
         """Shape of a world's actions, (J, W)."""
 
     def __call__(self, observation: Any) -> Any:
-        """Return actions [J, W], or [B, J, W] for observations of B worlds.
+        """Return actions [J, W] for an observation [O] of one world, [B, J, W] for [B, O].
 
-        Only type and shape of the observation count: policies read their environment's worlds.
+        They are arrays for arrays, tensors for tensors; `act` reads the worlds, not observations.
         """
         array = observation["observation"] if isinstance(observation, dict) else observation
-        action = self.act()
-        action = action if array.ndim > 1 else action[0]
-        return action if isinstance(array, Tensor) else action.cpu().numpy()
+        one_world = array.ndim == 1
+        actions = self.act()[0] if one_world else self.act()
+        return actions if isinstance(array, Tensor) else actions.cpu().numpy()
 
     def act(self) -> Tensor:
-        """Return the actions of all worlds, float32, shape [B, J, W]."""
+        """Return actions of the environment's B worlds as they are now, float32 [B, J, W]."""
         raise NotImplementedError
 
     def still(self) -> Tensor:
-        """Return actions that do nothing: zeros, shape [B, J, W]."""
+        """Return actions that do nothing: zeros, [B, J, W]."""
         return torch.zeros(self.worlds.world_count, *self.shape, device=self.task.device)
 
 
@@ -63,7 +63,7 @@ class StillGardener(BrushPolicy):
     """Do nothing, so that only the rule acts."""
 
     def act(self) -> Tensor:
-        """Return zeros, shape [B, J, W]."""
+        """Return zeros, float32 [B, J, W], for B worlds of J brushes and W columns of actions."""
         return self.still()
 
 
@@ -75,13 +75,13 @@ class RandomGardener(BrushPolicy):
         self._random = PolicyRandom(seed)
 
     def act(self) -> Tensor:
-        """Return actions drawn from [-1, 1), shape [B, J, W]."""
+        """Return a number from [-1, 1) for each of J brushes and W columns, [B, J, W]."""
         random = self._random.next_step(self.worlds.world_count, self.task.device)
         return 2.0 * random.uniform(*self.shape) - 1.0
 
 
 class ScriptedGardener(BrushPolicy):
-    """Push particles towards places with a deficit: with less density than the target.
+    """Push particles to places with a deficit: where their density is less than the target's.
 
     On a grid pushes are linear in observations. Free brushes go one by one to the place that needs
     the longest push and has no brush yet.
@@ -110,7 +110,7 @@ class ScriptedGardener(BrushPolicy):
         self._pulls = (checked_positive("share", share) * weight[..., None] * away).double()
 
     def act(self) -> Tensor:
-        """Return actions that push towards places with a deficit, shape [B, J, W]."""
+        """Return pushes by J brushes to where density is below the target's, [B, J, W]."""
         worlds, action = self.worlds, self.still()
         deficit = self._deficit(worlds.particles, self.task.middle(worlds.x))
         pull = torch.einsum("bq,pqd->bpd", deficit[..., 0].double(), self._pulls).to(deficit.dtype)
@@ -153,7 +153,7 @@ class ScriptedShepherd(BrushPolicy):
             self._places = ring * torch.stack((angle.cos(), angle.sin()), dim=1)
 
     def act(self) -> Tensor:
-        """Return actions that push towards the goals of the worlds, shape [B, J, W]."""
+        """Return pushes by J brushes towards each world's goal, [B, J, W]."""
         worlds, action = self.worlds, self.still()
         achieved = self.task.achieved(worlds.particles, worlds.context)
         missing = (self.task.desired(worlds.context) - achieved)[:, None, :2]
@@ -200,7 +200,7 @@ class GradientGardener(BrushPolicy):
         self._random = PolicyRandom(seed)
 
     def act(self) -> Tensor:
-        """Return the actions of the best plan's first step, shape [B, J, W]."""
+        """Return the actions of J brushes in the first step of the best plan found, [B, J, W]."""
         random = self._random.next_step(self.worlds.world_count, self.task.device)
         first = self._scripted.act()
         plan = torch.stack([first] + [self.still()] * (self._horizon - 1))

@@ -30,7 +30,7 @@ from npa_envs.rule.picture_codes import Codes
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.many_pictures import ManyPictures
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2DConfig
-from npa_envs.training.task_of_rule import sources_of_codes
+from npa_envs.training.task_of_rule import targets_of_codes
 from npa_envs.world.environment_steps import Physics
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import WorldRandom
@@ -153,7 +153,7 @@ class ShapeshifterTask(RuleDrivenTask[Shapeshifter2DEnvConfig]):
     def _make_task(self) -> ManyPictures:
         config = self.config
         self.rule, self.codes = load_coded_rule(config, self.device)
-        sources = sources_of_codes(config.rule, self.codes)
+        sources = targets_of_codes(config.rule, self.codes)
         task_config = config.as_config(
             Morphogenesis2DConfig,
             target_point_count=config.particle_count,

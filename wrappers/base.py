@@ -103,7 +103,7 @@ def as_tensor(values: Any) -> Tensor:
 
 
 def to_host(values: Any) -> NDArray[Any]:
-    """Return an array or tensor as an array; synchronises with the device."""
+    """Return an array or tensor as an array; waits for the device."""
     return values.cpu().numpy() if isinstance(values, Tensor) else np.asarray(values)
 
 
@@ -192,9 +192,9 @@ class ParticleRowsBase:
 
 
 class EpisodeClock:
-    """Step counts and restarts of each world of a vector environment, on the host.
+    """Step counts and restarts of each world of a vector environment, on the CPU.
 
-    With `AutoresetMode.SAME_STEP` it synchronises only in steps in which episodes end.
+    With `AutoresetMode.SAME_STEP` it waits for the device only in steps in which episodes end.
     """
 
     def __init__(self, env: AnyVectorEnv) -> None:

@@ -109,7 +109,7 @@ def _mapped(function: Callable[..., Any], *values: Any) -> Any:
 
 
 def _host(values: Any) -> Any:
-    """Copy a tensor or array, or a dictionary of them, to new arrays on the host."""
+    """Copy a tensor or array, or a dictionary of them, to new arrays on the CPU."""
     return _mapped(
         lambda v: v.cpu().numpy().copy() if isinstance(v, Tensor) else np.array(v), values
     )

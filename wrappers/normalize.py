@@ -33,7 +33,7 @@ PRIOR_COUNT = 1e-4
 
 
 class RunningMoments:
-    """Running mean and variance of samples, float64; nothing synchronises with the device."""
+    """Running mean and variance of samples, float64; nothing waits for the device."""
 
     def __init__(self, *shape: int) -> None:
         self.mean = torch.zeros(shape, dtype=torch.float64)
@@ -173,7 +173,7 @@ class VectorNormalizePerception(_PerceptionNormalizer, VectorObservations):
     """`NormalizePerception` for vector environments, of NumPy arrays or tensors on a device.
 
     Final observations are normalised and not counted, nor are repeated ones after a reset of some
-    worlds. Nothing synchronises. Arguments, errors and attributes are those of
+    worlds. Nothing waits for the device. Arguments, errors and attributes are those of
     `NormalizePerception`, except `env`, a vector environment of this package.
     """
 

@@ -51,7 +51,7 @@ class TorchRecordEpisodeStatistics(RewardSums):
 
     @property
     def return_queue(self) -> deque[float]:
-        """Returns of the last episodes; reading them synchronises with the device."""
+        """Returns of the last episodes; reading them waits for the device."""
         returns = torch.cat(tuple(self._returns)).tolist() if self._returns else []
         return deque(returns, maxlen=self._returns.maxlen)
 

@@ -1,4 +1,4 @@
-"""Adapter to RSL-RL: particles as rows of its `VecEnv`, without copies to the host."""
+"""Adapter to RSL-RL: particles as rows of its `VecEnv`, without copies to the CPU."""
 
 from __future__ import annotations
 

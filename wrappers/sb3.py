@@ -167,7 +167,7 @@ class RowVecEnv(VecEnv):
 
 
 def on_host(*batches: Any) -> list[NDArray[Any]]:
-    """Copy arrays or tensors to arrays on the host; each device is synchronised at most once."""
+    """Copy arrays or tensors to arrays on the CPU; each device is waited for at most once."""
     copies = []
     for values in batches:
         tensor = as_tensor(values)
@@ -251,7 +251,7 @@ class ParticleVecEnv(_EpisodeRows):
     its action, shape [A], and gets its own reward where the environment was made with
     `reward="particle"`; with any other reward each row gets its world's. So all particles share one
     policy, with the observation of a rule. A step is one batched step, and copies the observations
-    to the host once (on CUDA make the environment with `output="torch"`: the copy is then pinned).
+    to the CPU once (on CUDA make the environment with `output="torch"`: the copy is then pinned).
 
     Rows of a finished world have their own infos, with `terminal_observation`,
     `TimeLimit.truncated` and `is_success`; the others share a read-only empty one. Attributes and

@@ -1,4 +1,4 @@
-"""Adapter to TorchRL: batches of worlds as one environment, without copies to the host."""
+"""Adapter to TorchRL: batches of worlds as one environment, without copies to the CPU."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 import inspect
 import json
 import pkgutil
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -136,36 +136,9 @@ def train(
         DivergedError: The rules' weights have become infinite or NaN.
         MissingDependencyError: The method needs a library that is not installed.
     """
-    for value, cls, make in (
-        (problem, Problem, "Problem(env_id='npa/Mixing-v0', episode_steps=96)"),
-        (budget, Budget, "Budget(particle_steps=10**6)"),
-    ):
-        if not isinstance(value, cls):
-            name = cls.__name__
-            raise NPAError(
-                f"{name.lower()} must be a {name}, got {shown(value)}: make it with {make}"
-            )
-    if problem.controlled == "codes" and method in GARDEN_METHODS | METHODS:
-        raise NPAError(
-            f"method {shown(method)} cannot learn codes, the actions of {problem.env_id}: "
-            "give a function of your own, 'package.module:function', or take another library"
-        )
-    function = _function(method, methods_for(problem))
-    known = _options_of(function)
-    for name in options:
-        if name not in known:
-            raise NPAError(
-                f"method {shown(method)} has no option {shown(name)}: {suggest(name, known)}"
-            )
+    function = _checked_function(method, problem, budget, options)
     check_run_seed(seed)
-    several = ProcessGroup.current().count > 1
-    if method not in KEPT_METHODS and (several or out is not None):
-        wanted = "be shared by processes" if several else "be kept in a folder (out)"
-        raise NPAError(
-            f"method {shown(method)} cannot {wanted}: take one of {', '.join(KEPT_METHODS)}"
-        )
-    if (resume or overwrite) and out is None:
-        raise NPAError("resume and overwrite need a folder: give out='runs/heart'")
+    _check_folder(method, has_folder=out is not None, needs_folder=resume or overwrite)
     settings = {"method": method, "problem": problem.to_json(), "seed": seed, "options": options}
     settings |= {"started": start is not None}
     progress = Progress(
@@ -192,6 +165,45 @@ def train(
         result.zero_grad()
         return Trained(result, progress.log, result.policy())
     return Trained(None, progress.log, result)
+
+
+def _checked_function(
+    method: str, problem: Problem, budget: Budget, options: Mapping[str, Any]
+) -> Callable[..., Any]:
+    """Return the function of a method that can learn the problem and has these options."""
+    for value, cls, make in (
+        (problem, Problem, "Problem(env_id='npa/Mixing-v0', episode_steps=96)"),
+        (budget, Budget, "Budget(particle_steps=10**6)"),
+    ):
+        if not isinstance(value, cls):
+            name = cls.__name__
+            raise NPAError(
+                f"{name.lower()} must be a {name}, got {shown(value)}: make it with {make}"
+            )
+    if problem.controlled == "codes" and method in GARDEN_METHODS | METHODS:
+        raise NPAError(
+            f"method {shown(method)} cannot learn codes, the actions of {problem.env_id}: "
+            "give a function of your own, 'package.module:function', or take another library"
+        )
+    function = _function(method, methods_for(problem))
+    known = _options_of(function)
+    for name in options:
+        if name not in known:
+            raise NPAError(
+                f"method {shown(method)} has no option {shown(name)}: {suggest(name, known)}"
+            )
+    return function
+
+
+def _check_folder(method: str, *, has_folder: bool, needs_folder: bool) -> None:
+    several = ProcessGroup.current().count > 1
+    if method not in KEPT_METHODS and (several or has_folder):
+        wanted = "be shared by processes" if several else "be kept in a folder (out)"
+        raise NPAError(
+            f"method {shown(method)} cannot {wanted}: take one of {', '.join(KEPT_METHODS)}"
+        )
+    if needs_folder and not has_folder:
+        raise NPAError("resume and overwrite need a folder: give out='runs/heart'")
 
 
 def methods_for(problem: Problem) -> dict[str, str]:

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from npa_envs.agents.learning.progress import Progress
 from npa_envs.agents.learning.rule_set import RuleSet, species_of
 from npa_envs.checks import check_fraction, check_non_negative, check_positive, check_word
-from npa_envs.training.process_group import ALONE, ProcessGroup, restart, world_streams
+from npa_envs.training.process_group import ALONE, ProcessGroup, begin_episodes, world_streams
 from npa_envs.world.randomness import Randomness, WorldRandom, normal_draws
 
 
@@ -49,8 +49,8 @@ CriticInput = Literal["particle", "central"]
 
 @dataclass(frozen=True, kw_only=True)
 class CommonOptions:
-    """Options of both PPOs: `ppo.py` and Stable-Baselines3's. "None: A, or B with a `start`" is the
-    default for new rules, and for rules to begin with."""
+    """Options of both PPOs: `ppo.py` and Stable-Baselines3's. "None: A, or B with a `start`" means
+    that None is A for new rules, and B for a run that begins with rules, `start`."""
 
     steps: int = 16
     """Steps of all worlds in a round, T."""
@@ -114,7 +114,7 @@ class CommonOptions:
         return math.pow(last_noise, max(0.0, 1.0 - remaining_budget / self.noise_decay_share))
 
 
-def find_gradients(optimiser: torch.optim.Optimizer, loss: Tensor) -> None:
+def set_gradients(optimiser: torch.optim.Optimizer, loss: Tensor) -> None:
     """Compute a loss's gradients, and write them into `grad` of an optimiser's parameters."""
     # Read-outs and frozen layers have no gradients.
     parameters = [p for p in optimiser.param_groups[0]["params"] if p.requires_grad]
@@ -266,7 +266,7 @@ class Critic(nn.Module):
 
     @torch.no_grad()
     def rescale(self, targets: Tensor, processes: ProcessGroup = ALONE) -> None:
-        """Update the outputs' running scale, the RMS of targets; the last layer offsets it."""
+        """Update the outputs' scale, the running RMS of targets, without a change of the values."""
         before = self.scale.clone()
         square = targets.square().mean()
         processes.reduce([square])
@@ -276,7 +276,7 @@ class Critic(nn.Module):
             parameter.mul_(before / self.scale)
 
     def _rate(self, moment: int) -> Tensor:
-        """Count a batch of inputs (`moment` 0) or targets (1); return its weight in the moment."""
+        """Count a batch of inputs (`moment` 0) or targets (1); return its weight in their mean."""
         self.updates[moment] += 1.0
         return (1.0 / self.updates[moment]).clamp(min=MIN_RATE)
 
@@ -289,9 +289,9 @@ def seeded_critic(progress: Progress, input_dim: int, inputs: CriticInput) -> Cr
 
 
 def share_of_worlds(progress: Progress, total: int) -> tuple[list[int], Randomness]:
-    """Return the indices of this process's worlds out of `total`, and their random source.
+    """Return the indices of this process's worlds out of `total`, and what draws their numbers.
 
-    That is a generator, or with several processes a stream for each world.
+    That is a torch generator, or with several processes a stream for each world.
     """
     progress.processes.check_even("num_envs", total)
     indices = progress.processes.indices(total)
@@ -340,7 +340,7 @@ class Minibatches:
 
     def shuffle(self) -> None:
         """Draw new random orders, for the next pass."""
-        restart(self._random)
+        begin_episodes(self._random)
         for order, group_size in zip(self._orders, self._group_sizes, strict=True):
             if isinstance(self._random, WorldRandom):
                 order.copy_(self._shuffled_by_world(self._random, group_size))

@@ -120,7 +120,7 @@ def layers_of(rule: NPARule) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def updates_of(rule: NPARule, weights: Tensor, rows: Tensor) -> Tensor:
-    """Return raw updates [G, R, A] of G candidates, weights [G, W], for perceptions [G, R, P]."""
+    """Return raw updates [G, K, A] of G candidates, weights [G, W], for perceptions [G, K, P]."""
     shapes = [tuple(part.shape) for part in layers_of(rule)]
     sizes = [math.prod(shape) for shape in shapes]
     first, bias, second = (
@@ -176,7 +176,7 @@ def fitness(
 def _strategy(
     rule_weights: RuleWeights, options: EvolutionOptions, draws: np.random.Generator
 ) -> Any:
-    """Return an evolution strategy of `cma` around the rules, with `ask`, `tell` and `mean`."""
+    """Return an evolution strategy of library `cma`, which begins at the rules' weights."""
     with importing("cma", "evolution", "pip install 'npa-envs[evolution]'"):
         import cma
 

@@ -106,8 +106,8 @@ def train(progress: Progress, options: GradientOptions = GradientOptions()) -> R
     schedule = torch.Generator().manual_seed(seed)
     cycle = TrainingCycle(task, rules, config, device, schedule, task.rollout)
     # On CUDA there is one graph for each number of steps: capture all before the clock starts.
-    for number in range(*config.steps) if device.type == "cuda" else (config.steps[0],):
-        cycle.batch.run(number)
+    for step_count in range(*config.steps) if device.type == "cuda" else (config.steps[0],):
+        cycle.iteration.run(step_count)
     numbers = itertools.count()
 
     def iteration() -> int:
@@ -249,12 +249,12 @@ class _ClampInward(torch.autograd.Function):
 
 
 class ClampedWeights(FoldedRule):
-    """The `FoldedRule` (weights as two matrix products) of a `ClampedRule`; clamps state steps."""
+    """The network of a `ClampedRule` as two matrix products, whose state steps are then clamped."""
 
     rule: ClampedRule
 
     def __call__(self, rows: Tensor) -> Tensor:
-        """Map padded perceptions [z | 1 | 0] to displacements and clamped state steps, padded."""
+        """Map K perceptions [z | 1 | 0], [K, row_width], to K updates [δ | clamped Δs | 0]."""
         return self.rule.clamped(super().__call__(rows))
 
 
@@ -265,8 +265,7 @@ class ClampedRule(NPARule):
     """
 
     def __init__(self, rule: NPARule, limit: float) -> None:
-        # The same parameters, not copies.
-        vars(self).update(vars(rule))
+        self.share(rule)
         self.limit = limit
         self.rule_is_plain = rule.is_plain()
 
@@ -281,7 +280,7 @@ class ClampedRule(NPARule):
         return torch.cat((update[..., :first], state_step), dim=-1)
 
     def is_plain(self) -> bool:
-        """Return whether the other rule is only its two layers, so that `folded` may replace it."""
+        """Return whether the other rule computes only its two layers, which `folded` then has."""
         return self.rule_is_plain
 
     def has_network(self) -> bool:
@@ -289,7 +288,7 @@ class ClampedRule(NPARule):
         return False
 
     def folded(self) -> FoldedRule:
-        """Return the other rule's `FoldedRule`, with clamped state steps."""
+        """Return the network as `ClampedWeights`."""
         clamped = ClampedWeights(*super().folded())
         clamped.rule = self
         return clamped

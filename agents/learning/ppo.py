@@ -15,7 +15,7 @@ import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor, nn
@@ -26,24 +26,29 @@ from npa_envs.agents.learning.actor_critic import (
     CommonOptions,
     GaussianRules,
     Minibatches,
-    find_gradients,
     gradients_of,
     seeded_critic,
+    set_gradients,
     share_of_worlds,
 )
 from npa_envs.agents.learning.problem import (
     WORLDS_PER_SEED,
-    ConcatenatedSpeciesEnv,
-    ParticleRewards,
+    ParticleRewardKind,
     Problem,
     world_seeds,
 )
 from npa_envs.agents.learning.progress import Progress
 from npa_envs.agents.learning.rule_set import RuleSet
+from npa_envs.agents.learning.species_env import ConcatenatedSpeciesEnv
 from npa_envs.checks import check_flag, check_positive, check_word
 from npa_envs.envs.core.world_state import free_bytes, needed_bytes
 from npa_envs.errors import NPAError
-from npa_envs.training.process_group import ALONE, ProcessGroup, registered, restart
+from npa_envs.training.process_group import (
+    ALONE,
+    ProcessGroup,
+    begin_episodes,
+    generator_to_register,
+)
 from npa_envs.world.cuda_graph import GraphedCallable
 from npa_envs.wrappers.base import own_rewards
 
@@ -70,7 +75,7 @@ class PPOOptions(CommonOptions):
     ratio: Literal["particle", "world"] = "particle"
     """One likelihood ratio for each particle, or one for each world: of the mean log-probability
     of its particles."""
-    particle_rewards: ParticleRewards | None = None
+    particle_rewards: ParticleRewardKind | None = None
     """Reward of each particle: "particle", its own part of its world's reward; "marginal", the
     difference that its action makes to the world's. None: its world's reward."""
     masked: bool = False
@@ -84,7 +89,7 @@ class PPOOptions(CommonOptions):
         if self.num_envs is not None:
             check_positive(self, int, "num_envs")
         check_word(self, "ratio", ("particle", "world"))
-        check_word(self, "particle_rewards", (None, *get_args(ParticleRewards)))
+        check_word(self, "particle_rewards", (None, *get_args(ParticleRewardKind)))
         if self.ratio == "world" and self.particle_rewards is not None:
             raise NPAError(
                 f"particle_rewards={self.particle_rewards!r} needs ratio='particle': with "
@@ -117,7 +122,8 @@ class PPOLearner:
     """Rules, critic and worlds, which alternately `play` a round and `improve` from it.
 
     With several processes each has some of the worlds, which have separate random streams.
-    Gradients, moments and weights are averaged over processes between replays of CUDA graphs.
+    Gradients, moments and weights are averaged over processes. On CUDA `GraphedParts` replays the
+    methods that `play` and `improve` call through `graphed`.
     """
 
     def __init__(self, progress: Progress, options: PPOOptions) -> None:
@@ -151,16 +157,15 @@ class PPOLearner:
         self.rounds = 0
         # One group of rows for each species, or of worlds, for the rules; worlds for the critic.
         groups = (1,) if options.ratio == "world" else problem.counts
-        self._minibatches = Minibatches(
+        self.minibatches = Minibatches(
             options.steps, len(self._indices), (*groups, 1), options.minibatches, self.random
         )
         observation = self._reset_worlds(0)
         self.critic.observe(observation, self.processes)
         self.memory = Memory(
-            options, observation, problem.interface.action_dim, self._minibatches.count
+            options, observation, problem.interface.action_dim, self.minibatches.count
         )
-        self._play_graphs = GraphedMethods(device)
-        self._update_graphs = GraphedMethods(device, share_memory=True)
+        self.graphed = GraphedParts(self, device)
 
     def resume(self, iteration: int, resumption: int) -> None:
         """Resume after `iteration` rounds, for the `resumption`-th time, in new worlds."""
@@ -186,16 +191,16 @@ class PPOLearner:
         last_observations = {}
         for step in range(options.steps):
             memory.observation.copy_(memory.observations[step])
-            self._play_graphs.run(self._draw_actions, generator=registered(self.random))
+            self.graphed.draw_actions()
             memory.actions[step].copy_(memory.action)
             memory.log_probs[step].copy_(memory.log_prob)
             last_observation = self._step_worlds(step)
             if last_observation is not None:
                 last_observations[step] = last_observation
-        self._play_graphs.run(self._find_values)
+        self.graphed.compute_values()
         for step, observation in last_observations.items():
             memory.next_values[step].copy_(self.critic(observation))
-        self._play_graphs.run(self._find_advantages, captured=not self.processes.distributed)
+        self.graphed.compute_advantages()
         return memory.round
 
     def _step_worlds(self, step: int) -> Tensor | None:
@@ -222,14 +227,15 @@ class PPOLearner:
         return last
 
     @torch.no_grad()
-    def _draw_actions(self) -> None:
-        restart(self.random)
+    def draw_actions(self) -> None:
+        """Draw `memory.action` for `memory.observation`, with its log-probability."""
+        begin_episodes(self.random)
         action, log_prob = self.actor.sample(self.memory.observation, self.random)
         self.memory.action.copy_(action)
         self.memory.log_prob.copy_(log_prob)
 
     @torch.no_grad()
-    def _find_values(self) -> None:
+    def compute_values(self) -> None:
         """Compute the critic's values of all observations, in chunks to save memory."""
         memory, observations = self.memory, self.memory.observations.flatten(0, 1)
         size = -(-len(observations) // self.options.minibatches)
@@ -238,7 +244,8 @@ class PPOLearner:
         memory.next_values.copy_(memory.values[1:])
 
     @torch.no_grad()
-    def _find_advantages(self) -> None:
+    def compute_advantages(self) -> None:
+        """Compute the round's standardised advantages, and the critic's targets."""
         memory, values = self.memory, self.memory.values[:-1]
         advantages = generalised_advantages(
             memory.rewards,
@@ -270,18 +277,18 @@ class PPOLearner:
         memory.rules_rate.fill_(schedule.learning_rate * remaining_budget)
         memory.within_kl.fill_(1.0)
         for _ in range(self.options.epochs):
-            self._minibatches.shuffle()
-            self._update_graphs.run(self._sum_weights)
+            self.minibatches.shuffle()
+            self.graphed.sum_weights()
             self.processes.reduce([memory.weight_sums])
-            for minibatch in range(self._minibatches.count):
+            for minibatch in range(self.minibatches.count):
                 if rules_learn:
-                    self._update_graphs.run(self._find_gradients, minibatch)
+                    self.graphed.compute_gradients[minibatch]()
                     self.processes.reduce(
                         [*gradients_of(critic), *gradients_of(actor), memory.kl_sums]
                     )
-                    self._update_graphs.run(self._descend_both)
+                    self.graphed.descend_both()
                 else:
-                    self._find_critic_gradients(minibatch)
+                    self._compute_critic_gradients(minibatch)
                     self.processes.reduce(gradients_of(critic))
                     self._descend(critic)
             # The only synchronisation with the device.
@@ -289,27 +296,28 @@ class PPOLearner:
                 break
         self.actor.set_noise(self.options.noise_factor(remaining_budget, schedule.last_noise))
 
-    def _sum_weights(self) -> None:
+    def sum_weights(self) -> None:
         """Sum the weights of the samples in each minibatch of a pass, for critic and rules."""
         acted = [self.memory.round.acted]
-        for minibatch in range(self._minibatches.count):
+        for minibatch in range(self.minibatches.count):
             (worlds,) = self._critic_rows(minibatch, acted)
             rows = torch.cat([group for (group,) in self._rule_rows(minibatch, acted)])
             sums = worlds.sum(), self._ratio_weights(rows).sum()
             self.memory.weight_sums[minibatch].copy_(torch.stack(sums))
 
-    def _find_gradients(self, minibatch: int) -> None:
-        self._find_critic_gradients(minibatch)
+    def compute_gradients(self, minibatch: int) -> None:
+        """Set the gradients of critic and rules, and `memory.kl_sums`, for a minibatch."""
+        self._compute_critic_gradients(minibatch)
         objective, kl_sums = self._objective(minibatch)
-        find_gradients(self.optimisers["actor"], -objective)
+        set_gradients(self.optimisers["actor"], -objective)
         self.memory.kl_sums.copy_(kl_sums)
 
-    def _find_critic_gradients(self, minibatch: int) -> None:
+    def _compute_critic_gradients(self, minibatch: int) -> None:
         worlds = Round(*self._critic_rows(minibatch, self.memory.round))
         error = (self.critic(worlds.observations) - worlds.targets) / self.critic.scale
         squares = (worlds.acted * error.square()).sum()
         loss = 0.5 * squares / self.memory.weight_sums[minibatch, 0].clamp(min=1.0)
-        find_gradients(self.optimisers["critic"], loss)
+        set_gradients(self.optimisers["critic"], loss)
 
     def _objective(self, minibatch: int) -> tuple[Tensor, Tensor]:
         """Return PPO's clipped objective of a minibatch, and its `Memory.kl_sums`."""
@@ -341,7 +349,8 @@ class PPOLearner:
             objective = objective + options.entropy_weight * actor.entropy()
         return objective, kl_sums
 
-    def _descend_both(self) -> None:
+    def descend_both(self) -> None:
+        """Take a step of critic and rules along the gradients of a minibatch."""
         self._descend(self.optimisers["critic"])
         # Rules that moved too far get the learning rate 0, without a synchronisation.
         divergence, count = self.memory.kl_sums
@@ -358,12 +367,12 @@ class PPOLearner:
 
     def _critic_rows(self, minibatch: int, values: Sequence[Tensor]) -> list[Tensor]:
         """Return the critic's minibatch of each tensor [T B, N, ...]: worlds at some steps."""
-        index = self._minibatches.indices[-1][minibatch]
+        index = self.minibatches.indices[-1][minibatch]
         return [value[index] for value in values]
 
     def _rule_rows(self, minibatch: int, values: Sequence[Tensor]) -> list[list[Tensor]]:
         """Return the rules' minibatch of each tensor, of worlds, or by species of its particles."""
-        indices = [group[minibatch] for group in self._minibatches.indices[:-1]]
+        indices = [group[minibatch] for group in self.minibatches.indices[:-1]]
         if self.options.ratio == "world":
             return [[value[index] for value in values] for index in indices]
         rows, total = [], self.memory.acted.shape[2]
@@ -378,27 +387,27 @@ class PPOLearner:
         return acted.amax(dim=1, keepdim=True) if self.options.ratio == "world" else acted
 
 
-class GraphedMethods:
-    """Runs methods of an object by `GraphedCallable`, with one CUDA graph for each argument.
+class GraphedParts:
+    """Methods of a `PPOLearner` that run as CUDA graphs on CUDA, and as they are on a CPU."""
 
-    A method returns nothing, does not synchronise, and reads and writes the same tensors in each
-    call. With `share_memory` the graphs share a pool of memory.
-    """
-
-    def __init__(self, device: torch.device, *, share_memory: bool = False) -> None:
-        self._device = device
-        shared = share_memory and device.type == "cuda"
-        self._pool = torch.cuda.graph_pool_handle() if shared else None
-        self._graphs: dict[tuple[Any, ...], GraphedCallable] = {}
-
-    def run(self, method: Any, *arguments: int, **options: Any) -> None:
-        """Run a method with arguments; `options` are those of `GraphedCallable`."""
-        key = (method.__name__, *arguments)
-        if key not in self._graphs:
-            # A weak reference, as the object of the method has this one.
-            function = partial(method.__func__, weakref.proxy(method.__self__), *arguments)
-            self._graphs[key] = GraphedCallable(function, self._device, pool=self._pool, **options)
-        self._graphs[key]()
+    def __init__(self, learner: PPOLearner, device: torch.device) -> None:
+        graph = partial(GraphedCallable, device=device)
+        self.draw_actions = graph(
+            learner.draw_actions, generator=generator_to_register(learner.random)
+        )
+        self.compute_values = graph(learner.compute_values)
+        captured = not learner.processes.distributed
+        self.compute_advantages = graph(learner.compute_advantages, captured=captured)
+        # Updates share memory.
+        pool = torch.cuda.graph_pool_handle() if device.type == "cuda" else None
+        self.sum_weights = graph(learner.sum_weights, pool=pool)
+        # The learner has these graphs, so they refer to it weakly.
+        weak = weakref.proxy(learner)
+        self.compute_gradients = [
+            graph(partial(PPOLearner.compute_gradients, weak, minibatch), pool=pool)
+            for minibatch in range(learner.minibatches.count)
+        ]
+        self.descend_both = graph(learner.descend_both, pool=pool)
 
 
 class Round(NamedTuple):

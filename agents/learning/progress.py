@@ -372,7 +372,7 @@ def annealed(rate: float, last_rate: float, fraction: float) -> float:
 
 
 def check_finite(rules: RuleSet, particle_steps: int) -> None:
-    """Raise a DivergedError if a weight of rules is not finite; synchronises with the device."""
+    """Raise a DivergedError if a weight of rules is not finite; waits for the device."""
     for number, rule in enumerate(rules):
         for name, weight in rule.named_parameters():
             bad = int((~torch.isfinite(weight)).sum())

@@ -225,7 +225,7 @@ class WorldRulePolicy(ActorCriticPolicy):
         return self.actor.sample(observation)[0]
 
     def _build(self, lr_schedule: Any) -> None:
-        """Leave networks and optimiser to `__init__`."""
+        """Do nothing: `__init__` makes the networks and the optimiser."""
 
 
 # Gardens: unchanged SAC and PPO, one row for each world.

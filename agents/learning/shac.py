@@ -19,9 +19,9 @@ from npa_envs.agents.learning.actor_critic import (
     Critic,
     CriticInput,
     Minibatches,
-    find_gradients,
     gradients_of,
     seeded_critic,
+    set_gradients,
     share_of_worlds,
 )
 from npa_envs.agents.learning.gradient import EnvironmentTask
@@ -29,7 +29,7 @@ from npa_envs.agents.learning.progress import Progress, annealed
 from npa_envs.agents.learning.rule_set import RuleSet
 from npa_envs.checks import check_fraction, check_non_negative, check_positive, check_word
 from npa_envs.training.optimiser import normalise_gradients
-from npa_envs.training.process_group import restart
+from npa_envs.training.process_group import begin_episodes
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import WorldRandom
 
@@ -132,7 +132,7 @@ class SHACLearner:
 
     def resume(self, iteration: int, resumption: int) -> None:
         """Resume after `iteration` windows, for the `resumption`-th time, in new worlds."""
-        restart(self.random)
+        begin_episodes(self.random)
         self.worlds = self._new_worlds(list(range(len(self._indices))))
         self.windows_left = [1 + k % self.window_count for k in self._indices]
         """Windows left of each world's episode: at first different ones, so that a batch has all
@@ -141,7 +141,7 @@ class SHACLearner:
     def learn(self, rate: float) -> None:
         """Run the worlds for a window, and train rules and critic on it."""
         window, optimiser = self.play(), self.optimisers["rules"]
-        find_gradients(optimiser, -self.objective(window))
+        set_gradients(optimiser, -self.objective(window))
         means = gradients_of(optimiser)
         self.processes.reduce(means)
         normalise_gradients(means)
@@ -150,10 +150,10 @@ class SHACLearner:
         self.learn_values(StepWindow(*(values.detach() for values in window)))
 
     def play(self) -> StepWindow:
-        """Run the rules for a window, differentiably; restart worlds whose episode is over."""
+        """Run the rules for a window, differentiably; then restart worlds whose episode is over."""
         task, steps = self.task, self.window
         begin, limits = self.worlds, task.physics.limits
-        restart(self.random)
+        begin_episodes(self.random)
         later = task.rollout(
             self.rules,
             begin,
@@ -177,7 +177,7 @@ class SHACLearner:
             for values, limit in ((x, limits.position), (s, limits.state))
         )
         self.worlds = begin._replace(x=x, s=s)
-        restart(self.random)
+        begin_episodes(self.random)
         self.windows_left = [left - 1 for left in self.windows_left]
         over = [world for world, left in enumerate(self.windows_left) if left == 0]
         if over:
@@ -221,7 +221,7 @@ class SHACLearner:
             for index in self._minibatches.indices[0]:
                 values = world_values(self.critic, features[index])
                 error = (values - targets[index]) / self.critic.scale
-                find_gradients(self.optimisers["critic"], 0.5 * error.square().mean())
+                set_gradients(self.optimisers["critic"], 0.5 * error.square().mean())
                 self.processes.reduce(gradients_of(self.optimisers["critic"]))
                 self.optimisers["critic"].step()
         with torch.no_grad():

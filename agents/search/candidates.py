@@ -109,11 +109,12 @@ class Found(NamedTuple):
 
 
 class Trials(NamedTuple):
-    """Results of G candidates, None if worlds diverged or came to rest, and their last worlds."""
+    """Results of G candidates that were tried."""
 
     found: list[Found | None]
+    """One for each candidate; None where its worlds diverged or stopped changing."""
     worlds: Particles
-    """Worlds of each candidate: positions [G, B, N, D] and so on."""
+    """The B worlds of each candidate at the end: positions [G, B, N, D] and so on."""
 
 
 class RuleStack(NPARule):
@@ -130,7 +131,7 @@ class RuleStack(NPARule):
         self.to(weights.device)
 
     def forward(self, perception: Tensor) -> Tensor:
-        """Map perceptions [G R, P], R of each rule, to raw updates [G R, A]."""
+        """Map perceptions [G K, P], K for each rule, to raw updates [G K, A]."""
         count = len(self.weights)
         if len(perception) % count:
             # If no particle is updated there is one row, which is not used.
@@ -171,7 +172,7 @@ class Candidates:
 
     @torch.no_grad()
     def try_all(self, solutions: Numbers) -> Trials:
-        """Run the worlds of candidates with weights `solutions` [G, W] in units of `scales`."""
+        """Run G candidates, whose weights are `solutions` [G, W] in units of `scales`."""
         weights = torch.as_tensor(solutions * self.scales, dtype=torch.float32).to(self.device)
         batch_size = len(weights) if self.device.type == "cpu" else 1
         batches = [self._try(batch) for batch in torch.split(weights, batch_size)]
@@ -219,7 +220,7 @@ class Candidates:
 
 
 def _colours(worlds: Particles) -> Tensor:
-    """Return the visible colours minus 0.5, shape [..., 3]."""
+    """Return particles' colours minus 0.5, clipped to ± 0.5, shape [..., 3]."""
     return worlds.s[..., -3:].clamp(-0.5, 0.5)
 
 

@@ -180,7 +180,7 @@ def save_rule(
 
 
 def _fits_a_file(rule: NPARule) -> bool:
-    """Return whether a file would hold all that the rule computes: no hooks or own layers."""
+    """Return whether a file can hold the rule: it has no hooks and no layers of other types."""
     loaded = _without_weights(rule.hyper_parameters())
     same_shapes = _shapes(rule.state_dict()) == _shapes(loaded.state_dict())
     if type(rule).forward is not NPARule.forward or is_altered(rule) or not same_shapes:

@@ -6,8 +6,8 @@ Web demo (`models.json`): for each name `w1.weight` [H, P], `w1.bias`, `w2.weigh
 columns [Δs (C), δ (2)], both padded with zeros to a multiple of four columns; float32 in base64;
 `eps0`, `alpha`, and `N0`, the demo's number of particles. `save_demo_json` writes it.
 
-Equivariant rules (`equivariant_demo/`) hold `W_hidden` [C+1, K], `W_out` [K, 1], `w1.weight` [H, I]
-with columns [s; smoothed s; u_a · u_b, a <= b], `w1.bias`, `w2.weight` [C+K, H] with rows [Δs; g],
+Equivariant rules (`equivariant_demo/`) hold `W_hidden` [C+1, V], `W_out` [V, 1], `w1.weight` [H, I]
+with columns [s; smoothed s; u_a · u_b, a <= b], `w1.bias`, `w2.weight` [C+V, H] with rows [Δs; g],
 `w2.bias`; in the web demo each number of the first two is repeated four times. A state dict
 calls them `model.W_hidden`, `model.W_out`, `model.mlp.0.*` and `model.mlp.2.*`. `NPARule` has no
 output bias: an additional hidden unit whose value is always 1 replaces it.
@@ -146,7 +146,7 @@ def _parts(
 def _equivariant_parts(
     tensors: Mapping[str, Tensor], scalars: Mapping[Any, Any], *, padded: bool = False
 ) -> RuleParts:
-    """Return `RuleParts` of a 2D equivariant rule, from what `models.json` has by these names.
+    """Return `RuleParts` of a 2D equivariant rule from values with the names of `models.json`.
 
     Tensors may be `padded` with zeros.
     """
@@ -168,7 +168,7 @@ def _equivariant_parts(
     got = {name: tuple(tensors[name].shape) for name in wanted}
     if state_dim < 1 or got != wanted:
         raise NPAError(
-            f"an equivariant rule with W_hidden {tuple(mixing.shape)}, [C+1, K], must have the "
+            f"an equivariant rule with W_hidden {tuple(mixing.shape)}, [C+1, V], must have the "
             f"shapes {wanted}, got {got}"
         )
     # The additional hidden unit is always 1: its output weights are the bias.
@@ -393,7 +393,7 @@ def _as_float32(number: float) -> float:
 
 
 def _decode(entry: Mapping[str, Any], name: str, rank: int, index: int | None) -> Tensor:
-    """Return a rule's tensor of `rank` dimensions, in a stack that of the rule `index`."""
+    """Return the tensor `name` of a rule, of `rank` dimensions; `index`: the rule's in a stack."""
     stacked = index is not None
     rank += stacked
     packed = entry.get(name)

@@ -24,15 +24,15 @@ WIDTHS = (16, 32, 64)
 
 
 class Codes(nn.Module):
-    """The codes of a rule of many pictures: one vector of length K = `dim` for each picture's name.
+    """The codes of a rule of many pictures: a vector of `code_dim` numbers for each picture's name.
 
     A code, in about [-1, 1] (dimensionless), tells the rule which picture to grow. It is the first
-    K state channels of each particle, which the rule perceives and never changes. Codes are
+    state channels of each particle, which the rule perceives and never changes. Codes are
     parameters, or a trained network, the encoder, computes them from any pictures.
     """
 
     table: Tensor
-    """The codes, shape [T, K]: parameters, or the encoder's last outputs."""
+    """The codes, shape [pictures, code_dim]: parameters, or the encoder's last outputs."""
 
     def __init__(self, names: Sequence[str], dim: int, *, encoder: bool = False) -> None:
         super().__init__()
@@ -50,13 +50,13 @@ class Codes(nn.Module):
         return len(self.names)
 
     def __getitem__(self, name: str) -> Tensor:
-        """Return the code of the picture called `name`, shape [K]."""
+        """Return the code of the picture called `name`, shape [code_dim]."""
         if name not in self.names:
             raise NPAError(f"unknown code {shown(name)}: {suggest(name, self.names)}")
         return self.table[self.names.index(name)]
 
     def blend(self, shares: Mapping[str, float]) -> Tensor:
-        """Return the weighted mean of codes, shape [K]; `shares` maps names to weights."""
+        """Return the weighted mean of codes, shape [code_dim]; `shares` maps names to weights."""
         total = sum(shares.values())
         if not (math.isfinite(total) and total > 0.0):
             raise NPAError(
@@ -67,7 +67,7 @@ class Codes(nn.Module):
         return torch.stack(parts).sum(dim=0)
 
     def encode(self, pictures: Tensor) -> Tensor:
-        """Return the codes of pictures [B, R, R, 4], shape [B, K]; differentiable."""
+        """Return the codes of pictures [B, R, R, 4], shape [B, code_dim]; differentiable."""
         if self.encoder is None:
             raise NPAError("this rule has no encoder: train one with encoder=True (--encoder)")
         if pictures.ndim != 4 or pictures.shape[3] != 4 or pictures.shape[1] != pictures.shape[2]:
@@ -80,7 +80,7 @@ class Codes(nn.Module):
 
 
 def replace_code(states: Tensor, code: Tensor) -> Tensor:
-    """Return states [..., C] with a code, [K] to [..., K], in the place of the first K channels."""
+    """Return states [..., C] whose first channels are `code`, [code_dim] to [..., code_dim]."""
     expanded = code.to(states).expand(*states.shape[:-1], code.shape[-1])
     return torch.cat((expanded, states[..., code.shape[-1] :]), dim=-1)
 
@@ -114,7 +114,7 @@ class PictureEncoder(nn.Module):
         self.output = nn.Linear(WIDTHS[-1] * side * side, dim)
 
     def forward(self, pictures: Tensor) -> Tensor:
-        """Return the codes of pictures [B, R, R, 4], shape [B, K]."""
+        """Return the codes of pictures [B, R, R, 4], shape [B, code_dim]."""
         planes = F.adaptive_avg_pool2d(
             pictures.to(self.output.weight).permute(0, 3, 1, 2), PICTURE_SIDE
         )

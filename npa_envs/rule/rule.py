@@ -118,8 +118,8 @@ class NPARule(nn.Module):
         mixed_vectors: Mixed vectors of an equivariant rule, at least 1.
 
     Codes:
-        code_dim: Length K of a code, which names what to grow: the first K state channels, which
-            the rule perceives and never changes.
+        code_dim: Length of a code, which names what to grow: the first `code_dim` state channels,
+            which the rule perceives and never changes.
         code_names: Names of the known codes, at least one if `code_dim` > 0.
         encoder: A network computes codes from pictures (`codes.encode`).
 
@@ -214,6 +214,10 @@ class NPARule(nn.Module):
                 f"{self.readout_hidden_dim} with readout_dim={self.readout_dim}"
             )
 
+    def share(self, rule: NPARule) -> None:
+        """Take another rule's parameters and settings, not copied; in place of `__init__`."""
+        vars(self).update(vars(rule))
+
     def _check_combinations(self) -> None:
         zone, species_count, code_dim = self.dead_zone, self.species_count, self.code_dim
         name_count, encoder = len(self.code_names), self.encoder
@@ -279,7 +283,7 @@ class NPARule(nn.Module):
 
     @property
     def output_dim(self) -> int:
-        """Outputs of the second layer: A - K; for an equivariant rule its gates and Δs."""
+        """Outputs of the second layer: A - code_dim; for an equivariant rule its gates and Δs."""
         if not self.equivariant or self.static:
             return self.update_dim - self.code_dim
         return self.vector_form.gate_count + self.state_dim
@@ -325,7 +329,7 @@ class NPARule(nn.Module):
         return self._with_code_zeros(self.output.weight, dim=0)
 
     def _with_code_zeros(self, outputs: Tensor, *, dim: int) -> Tensor:
-        """Insert K zeros for the code, which no update changes, between δ and Δs in a dimension."""
+        """Insert zeros for the code, which no update changes, after δ in dimension `dim`."""
         if self.code_dim == 0:
             return outputs
         moves, states = outputs.tensor_split([self.update_dim - self.state_dim], dim=dim)
@@ -439,8 +443,8 @@ class NPARule(nn.Module):
 
         Args:
             states: Particle states, dimensionless, shape [B, N, C].
-            code: A code, dimensionless, shape [K]; one for each world, [B, 1, K]; or one for each
-                particle, [B, N, K].
+            code: A code, dimensionless, shape [code_dim]; one for each world, [B, 1, code_dim]; or
+                one for each particle, [B, N, code_dim].
 
         Raises:
             NPAError: The rule has no codes, the code is no tensor, or the shapes do not fit.
@@ -457,8 +461,8 @@ class NPARule(nn.Module):
             return replace_code(states, code.expand(shape))
         except RuntimeError as error:
             raise NPAError(
-                f"code must have shape [K], [B, 1, K] or [B, N, K] for {shape}, got "
-                f"{tuple(code.shape)}"
+                "code must have shape [code_dim], [B, 1, code_dim] or [B, N, code_dim] for "
+                f"{shape}, got {tuple(code.shape)}"
             ) from error
 
     def hyper_parameters(self) -> dict[str, Any]:

@@ -1,6 +1,6 @@
 """The training cycle: worlds from the pool, rollout, gradients, worlds back, optimiser step.
 
-No method synchronises with the device. An iteration runs eagerly or as CUDA graphs; its statistics
+No method waits for the device. An iteration runs eagerly or as CUDA graphs; its statistics
 stay on the device until a line of the log needs them.
 """
 
@@ -21,7 +21,13 @@ from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.iteration import EagerIteration, GraphedIteration, Rollout
 from npa_envs.training.loss_statistics import LossStatistics
 from npa_envs.training.optimiser import RuleOptimiser, normalise_gradients
-from npa_envs.training.process_group import ALONE, ProcessGroup, RunRandomness, registered, restart
+from npa_envs.training.process_group import (
+    ALONE,
+    ProcessGroup,
+    RunRandomness,
+    begin_episodes,
+    generator_to_register,
+)
 from npa_envs.world.cuda_graph import GraphedCallable
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness, WorldRandom, uniform_draws
@@ -62,28 +68,28 @@ class WorldPool:
             self.lifetime = logarithms[indices].exp().round().to(x.device, torch.int64)
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return the tensors of a checkpoint by name."""
+        """Return the worlds' tensors and their ages by name, for a checkpoint."""
         tensors = self.worlds._asdict() | {"age": self.age}
         return {name: value for name, value in tensors.items() if value is not None}
 
-    def sample(self, world_count: int, generator: Randomness) -> Tensor:
-        """Return random indices of B worlds, one from each of B equal sections, shape [B].
-
-        A torch.Generator, if worlds have no lifetimes, draws from the whole pool instead.
-        """
-        pool_size, device = len(self.worlds.x), self.worlds.x.device
-        size = pool_size // world_count
-        first = torch.arange(0, size * world_count, size, device=device)
-        if isinstance(generator, WorldRandom):
-            return first + generator.integers(size, 1)[:, 0]
+    def sample(self, world_count: int, generator: torch.Generator) -> Tensor:
+        """Return indices of B different worlds, drawn from the whole pool, shape [B]."""
         # The largest of random numbers: unlike randperm, one short kernel and no host copy.
-        keys = torch.rand(pool_size, generator=generator, device=device)
-        if self.age is None:
-            return keys.topk(world_count).indices
-        return first + keys.view(world_count, size).argmax(dim=1)
+        return self._keys(generator).topk(world_count).indices
+
+    def sample_sections(self, world_count: int, random: Randomness) -> Tensor:
+        """Return indices of B worlds, one drawn from each of B equal sections, shape [B]."""
+        size = len(self.worlds.x) // world_count
+        first = torch.arange(0, size * world_count, size, device=self.worlds.x.device)
+        if isinstance(random, WorldRandom):
+            return first + random.integers(size, 1)[:, 0]
+        return first + self._keys(random).view(world_count, size).argmax(dim=1)
+
+    def _keys(self, generator: torch.Generator) -> Tensor:
+        return torch.rand(len(self.worlds.x), generator=generator, device=self.worlds.x.device)
 
     def ages_of(self, index: Tensor) -> tuple[Tensor, Tensor]:
-        """Return worlds' ages [steps], and whether their lifetimes are over, shape [B] each."""
+        """Return ages [steps] of worlds, and whether their lifetimes are over, shape [B] each."""
         assert self.age is not None
         assert self.lifetime is not None
         age = self.age.index_select(0, index)
@@ -155,7 +161,7 @@ class TrainingCycle:
         batch = seeds.map(lambda value: value[:count])
         graphed = device.type == "cuda" and config.cuda_graph
         cls = GraphedIteration if graphed else EagerIteration
-        self.batch: EagerIteration = cls(
+        self.iteration: EagerIteration = cls(
             self.task,
             rule,
             config,
@@ -164,42 +170,42 @@ class TrainingCycle:
             npa_envs.world.rollout.rollout_particles if rollout is None else rollout,
             take_means=None if processes.count == 1 else processes.reduce,
         )
-        self.optimiser = RuleOptimiser(self.batch.parameters, config, rule)
-        self.statistics = LossStatistics(self.batch)
+        self.optimiser = RuleOptimiser(self.iteration.parameters, config, rule)
+        self.statistics = LossStatistics(self.iteration)
         self._index = torch.zeros(count, dtype=torch.int64, device=device)
         self._age = torch.zeros_like(self._index)
         self._steps = torch.zeros_like(self._index[0])
         self._replaced = torch.zeros_like(self._index[0])
         self._fresh_worlds = batch.map(torch.empty_like)
         graph = functools.partial(GraphedCallable, device=device, captured=graphed)
-        self._draw = graph(self._draw_worlds, generator=registered(self.random.worlds))
+        self._draw = graph(self._draw_worlds, generator=generator_to_register(self.random.worlds))
         self._store = graph(self._store_worlds)
         self._record = graph(self._record_iteration)
 
-    def run(self, iteration: int, least_progress: float = 0.0) -> int:
-        """Train for one iteration, and return the number of steps of its rollout.
+    def run(self, number: int, least_progress: float = 0.0) -> int:
+        """Train for one iteration, after `number` others; return the steps of its rollout.
 
         least_progress: Lower bound on the progress of the learning rate's schedule, in [0, 1].
         """
-        batch = self.batch
+        iteration = self.iteration
         lo, hi = self._config.steps
         steps = int(torch.randint(lo, hi, (), generator=self.random.schedule))
-        self.task.begin(iteration)
+        self.task.begin(number)
         self._draw()
-        is_fresh = self._seeded_worlds(iteration)
+        is_fresh = self._seeded_worlds(number)
         if is_fresh is not None:
-            batch.start.copy_(self._fresh_worlds.where(is_fresh, batch.start))
-        batch.run(steps)
-        self.statistics.begin(iteration + 1, steps)
+            iteration.start.copy_(self._fresh_worlds.where(is_fresh, iteration.start))
+        iteration.run(steps)
+        self.statistics.begin(number + 1, steps)
         self._steps.fill_(steps)
         self._store()
         # Not inside a graph: torch watches NCCL only there for processes that do not answer.
-        self._processes.reduce([*batch.gradients, batch.terms], self._replaced)
+        self._processes.reduce([*iteration.gradients, iteration.terms], self._replaced)
         self._record()
-        self.optimiser.step(iteration, least_progress)
+        self.optimiser.step(number, least_progress)
         return steps
 
-    def _seeded_worlds(self, iteration: int) -> Tensor | None:
+    def _seeded_worlds(self, number: int) -> Tensor | None:
         """Return which worlds of the batch start as fresh seeds, bool, shape [B]; None: none.
 
         Every `seed_interval` iterations there are `fresh_count` of them: the first of the batch.
@@ -208,12 +214,12 @@ class TrainingCycle:
         on, so that seeds come into all sections.
         """
         config = self._config
-        if config.ages or iteration % config.seed_interval != 0:
+        if config.ages or number % config.seed_interval != 0:
             return None
         first = 0
         if self._per_world_streams:
             groups = math.ceil(config.world_count / config.fresh_count)
-            first = iteration // config.seed_interval % groups * config.fresh_count
+            first = number // config.seed_interval % groups * config.fresh_count
         return (self._batch_indices - first) % config.world_count < config.fresh_count
 
     def state_dict(self) -> dict[str, Any]:
@@ -230,7 +236,7 @@ class TrainingCycle:
         }
 
     def load_state_dict(self, state: dict[str, Any], iteration: int) -> None:
-        """Restore what `state_dict` returned after `iteration`; to be called before `run`."""
+        """Restore what `state_dict` returned after `iteration` iterations; call before `run`."""
         self.optimiser.load_state_dict(state["optimiser"])
         for name, local in self.pool.tensors().items():
             local.copy_(self._processes.local(state["pool"][name], self._section))
@@ -241,15 +247,17 @@ class TrainingCycle:
     def _draw_worlds(self) -> None:
         """Copy worlds from the pool to the batch, some damaged or replaced by fresh seeds."""
         config, worlds = self._config, self.random.worlds
-        restart(worlds, self.random.masks)
-        self._index.copy_(self.pool.sample(len(self._index), worlds))
+        begin_episodes(worlds, self.random.masks)
+        by_section = config.ages or isinstance(worlds, WorldRandom)
+        sample: Any = self.pool.sample_sections if by_section else self.pool.sample
+        self._index.copy_(sample(len(self._index), worlds))
         start = self.pool.worlds.take(self._index)
         damaged = self._pool_indices[self._index] < config.damage_share * config.pool_size
         expired = None
         if config.ages:
             age, expired = self.pool.ages_of(self._index)
             self._age.copy_(age.masked_fill(expired, 0))
-            self.batch.past_min_age.copy_((self._age >= config.stillness_min_age) & ~damaged)
+            self.iteration.past_min_age.copy_((self._age >= config.stillness_min_age) & ~damaged)
             if config.damage_and_keep_share > 0.0:
                 chance = uniform_draws(worlds, (len(expired), 1), start.x)[:, 0]
                 renewed = expired & (chance < config.damage_and_keep_share)
@@ -257,17 +265,17 @@ class TrainingCycle:
         if config.damages:
             after = self.task.damage(start, worlds)
             start = after if config.damage_share == 1.0 else after.where(damaged, start)
-        # Drawn in every iteration: the host does not know which worlds will diverge.
+        # Drawn in every iteration: the CPU does not know which worlds will diverge.
         fresh = self._seeds(len(self._index), worlds)
         self._fresh_worlds.copy_(fresh)
         if expired is not None:
             start = fresh.where(expired, start)
-        self.batch.start.copy_(start)
+        self.iteration.start.copy_(start)
 
     @torch.no_grad()
     def _store_worlds(self) -> None:
         age = self._age + self._steps if self._config.ages else None
-        replaced = self.pool.write(self._index, self.batch.end, self._fresh_worlds, age)
+        replaced = self.pool.write(self._index, self.iteration.end, self._fresh_worlds, age)
         self._replaced += replaced.sum()
 
     @torch.no_grad()
@@ -275,7 +283,7 @@ class TrainingCycle:
         """Add the iteration's losses to the statistics, and normalise the gradients."""
         self.statistics.add(self._replaced)
         self._replaced.zero_()
-        normalise_gradients(self.batch.gradients)
+        normalise_gradients(self.iteration.gradients)
 
     def _seeds(self, world_count: int, random: Randomness) -> Particles:
         dtype = self._config.torch_dtype

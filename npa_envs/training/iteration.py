@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from npa_envs.rule.rule import LIFE, fate_parameters
 from npa_envs.tasks.base import Task
 from npa_envs.tasks.train_config import TrainConfig
-from npa_envs.training.process_group import registered
+from npa_envs.training.process_group import generator_to_register
 from npa_envs.world.cuda_graph import GraphSequence, capture, host_call
 from npa_envs.world.division import living
 from npa_envs.world.particles import Particles
@@ -75,7 +75,7 @@ class EagerIteration:
         if take_means is not None:
             self._task = task.with_process_mean(partial(_process_mean, take_means))
         self.terms = total.new_zeros(len(self.term_names))
-        """The loss, followed by its named parts, shape [K]."""
+        """The loss, followed by its named parts, shape [L]."""
         self.parameters = [p for p in rule.parameters() if p.requires_grad]
         self.gradients = [torch.zeros_like(p) for p in self.parameters]
         for parameter, buffer in zip(self.parameters, self.gradients, strict=True):
@@ -154,7 +154,7 @@ class GraphedIteration(EagerIteration):
                     lambda: run_eagerly(steps),
                     self.start.x.device,
                     pool=self._memory_pool,
-                    generator=registered(self._generator),
+                    generator=generator_to_register(self._generator),
                     warm_up=None if self._graphs else self._warm_up,
                 )
             self._graphs[steps].replay()

@@ -65,7 +65,7 @@ class LossStatistics:
             torch.where(first, value, self._snapshot[name], out=self._snapshot[name])
 
     def send(self) -> None:
-        """Start to copy the interval's statistics to the host, and begin the next interval."""
+        """Start to copy the interval's statistics to the CPU, and begin the next interval."""
         self._sent.copy_(self._totals, non_blocking=True)
         if self._arrival is not None:
             self._arrival.record(torch.cuda.current_stream(self._totals.device))
@@ -91,7 +91,7 @@ class LossStatistics:
         return statistics, bad_iteration == NO_ITERATION
 
     def all_finite(self) -> bool:
-        """Return whether every loss of the run was finite; synchronises."""
+        """Return whether every loss of the run was finite; waits for the device."""
         return int(self._bad[0].item()) == NO_ITERATION
 
     def snapshot(self) -> dict[str, Any]:

@@ -50,7 +50,7 @@ def layer_weights(rules: nn.Module) -> list[Tensor]:
 
 
 class RuleOptimiser:
-    """AdamW, or Muon for weight matrices and AdamW for all else; each repeat resets the moments.
+    """AdamW, or Muon for weight matrices and AdamW for all else; new moments in each of `repeats`.
 
     Muon's steps are orthogonalised momentum, computed in bfloat16 and scaled to the length of
     AdamW's steps (Jordan et al. 2024; Liu et al., arXiv 2502.16982).

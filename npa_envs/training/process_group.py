@@ -65,18 +65,18 @@ class ProcessGroup:
             )
 
     def indices(self, total: int, section: int = 1) -> Tensor:
-        """Return the indices of this process's worlds, cut as by `local`, int64, on the CPU."""
+        """Return indices of this process's worlds, cut as by `local`, int64, on the CPU."""
         return self.local(torch.arange(total), section)
 
     def local(self, worlds: Tensor, section: int) -> Tensor:
-        """Return this process's worlds out of all, cut into sections of `section` worlds."""
+        """Return this process's rows of a tensor of all worlds, in sections of `section` worlds."""
         sections = worlds.view(-1, self.count, section, *worlds.shape[1:])
         return sections[:, self.rank].flatten(0, 1)
 
     def gathered(self, worlds: Tensor, section: int) -> Tensor:
-        """Return all worlds on rank 0, on the CPU, and this process's own on others.
+        """Return all processes' worlds on rank 0, on the CPU, and this process's on others.
 
-        With one process `worlds` is returned unchanged.
+        They are cut as by `local`. With one process `worlds` is returned unchanged.
         """
         if self.count == 1:
             return worlds
@@ -165,15 +165,15 @@ ALONE = ProcessGroup()
 
 
 class RunRandomness:
-    """Random sources of a run.
+    """Random generators of a run, by what they draw.
 
     `schedule`, on the CPU, draws numbers of steps and initial weights; `pool` the first worlds;
     `worlds` which worlds a batch has, their damage and seeds; `masks` which particles are updated.
 
-    By default a batch draws from generators, whose states checkpoints store. With
-    `per_world_streams`, which runs of several processes need, each world has its own streams.
-    They depend on the seed, the world's index among those of all processes, and the iteration, so
-    they are the same for any number of processes, and checkpoints need not store them.
+    By default they are torch generators, whose states checkpoints store. With `per_world_streams`,
+    which runs of several processes need, all but `schedule` have a stream for each world. Streams
+    depend on the seed, the world's index among those of all processes, and the iteration, so they
+    are the same for any number of processes, and checkpoints need not store them.
     """
 
     def __init__(
@@ -198,21 +198,21 @@ class RunRandomness:
         self.masks = streams(2, batch)
         self.pool = streams(0, pool, pool // batch) if per_world_streams else self.worlds
 
-    def _sources(self) -> dict[str, Randomness]:
+    def _by_name(self) -> dict[str, Randomness]:
         return {"schedule": self.schedule, "worlds": self.worlds, "masks": self.masks}
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return the states of all generators, for a checkpoint."""
-        sources = self._sources().items()
-        return {name: one.get_state() for name, one in sources if isinstance(one, torch.Generator)}
+        """Return the states of torch generators by name, for a checkpoint."""
+        randoms = self._by_name().items()
+        return {name: one.get_state() for name, one in randoms if isinstance(one, torch.Generator)}
 
     def load_state_dict(self, states: Mapping[str, Tensor], iteration: int) -> None:
         """Restore what `state_dict` returned after `iteration`."""
-        for name, source in self._sources().items():
-            if isinstance(source, torch.Generator):
-                source.set_state(states[name])
+        for name, random in self._by_name().items():
+            if isinstance(random, torch.Generator):
+                random.set_state(states[name])
             else:
-                source.episodes.fill_(iteration)
+                random.episodes.fill_(iteration)
 
 
 def world_streams(
@@ -223,13 +223,13 @@ def world_streams(
     return WorldRandom.from_keys(torch.from_numpy(keys.view(np.int64))[indices].to(device))
 
 
-def restart(*sources: Randomness) -> None:
-    """Begin the next episode of per-world streams; generators are left unchanged."""
-    for source in sources:
-        if isinstance(source, WorldRandom):
-            source.restart()
+def begin_episodes(*randoms: Randomness) -> None:
+    """Begin the next episode of each `WorldRandom`, in place; torch generators do not change."""
+    for random in randoms:
+        if isinstance(random, WorldRandom):
+            random.restart()
 
 
-def registered(source: Randomness) -> torch.Generator | None:
-    """Return the torch generator that a CUDA graph must register; None: draws are by world."""
-    return source if isinstance(source, torch.Generator) else None
+def generator_to_register(random: Randomness) -> torch.Generator | None:
+    """Return a torch generator, which CUDA graphs must register; None for a `WorldRandom`."""
+    return random if isinstance(random, torch.Generator) else None

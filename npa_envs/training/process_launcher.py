@@ -107,7 +107,7 @@ def requested_processes(gpus: int | None, processes: int | None, device: str) ->
 
 @contextlib.contextmanager
 def print_once(processes: ProcessGroup) -> Iterator[None]:
-    """Print an error on the first process; pass those of others to the launcher."""
+    """Within the block, raise NPAErrors on rank 0 only: others exit with 2, and tell torchrun."""
     try:
         yield
     except NPAError as error:

@@ -308,7 +308,7 @@ def _identity(path: Path) -> tuple[int, int] | None:
 
 
 class JsonlLog:
-    """A log of one JSON object a line."""
+    """A log with one JSON object per line."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

@@ -145,7 +145,7 @@ def tasks_of_codes(
 
 
 def _world_of(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
-    """Return configuration fields of the world in which a search found a rule."""
+    """Return fields of the task's configuration from a rule file of `npa-envs search`."""
     fields = None
     with contextlib.suppress(NPAError):
         fields = parse_json(metadata.get("world", "{}"))
@@ -159,12 +159,15 @@ def _world_of(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
     return fields
 
 
-def sources_of_codes(source: str, codes: Codes) -> dict[str, str]:
-    """Return the source of each code's picture: name -> argument of `load_target`."""
+def targets_of_codes(source: str, codes: Codes) -> dict[str, str]:
+    """Return, by the name of each code, what `load_target` loads its picture from.
+
+    source: The name or file that the rule of these codes was loaded from.
+    """
     path, metadata = _file_of(source)
     targets = trained_config(path, metadata).task.targets if "config" in metadata else ()
-    sources = _named(targets)
-    return {name: sources.get(name, name) for name in codes.names}
+    named = _named(targets)
+    return {name: named.get(name, name) for name in codes.names}
 
 
 def _named(targets: Sequence[str]) -> dict[str, str]:

@@ -80,8 +80,7 @@ class Trainer:
         task_name: The task's name in checkpoints.
         resume: Continue from the checkpoint in `config.out`.
         overwrite: Remove the files of an earlier run in `config.out`.
-        rollout: The function that runs a rule from some `Particles` for some steps and returns them
-            with path lengths; None: that of `npa_envs.rollout`.
+        rollout: Replaces `rollout_particles`, with its arguments; None: that itself.
         processes: The processes of the run; None: those of torch's default group.
         rules: Initial rules of several species, which are copied; None: those of the configuration.
 
@@ -110,12 +109,13 @@ class Trainer:
         self.folder = RunFolder(config.out)
         self._log = RunLog(self.folder)
         self._record: dict[str, Any] = {}
-        self._sent_record: dict[str, Any] | None = None
+        self._unwritten_record: dict[str, Any] | None = None
+        """Number and learning rate of the iteration whose log record is not yet written."""
         self._least_progress = 0.0
         self._seconds_before = 0.0
         self._started: float | None = None
         device = check_device(config.device)
-        # On CUDA a record is finished an iteration later, so that the device does not idle.
+        # On CUDA a record is written an iteration later, so that the device does not idle.
         self._defer_records = device.type == "cuda"
         self._processes = ProcessGroup.current() if processes is None else processes
         check = functools.partial(check_same_run, task_name=task_name, config=config)
@@ -194,10 +194,7 @@ class Trainer:
 
         def step() -> None:
             self.iterate()
-            # Of the iteration before: the device runs this one meanwhile.
-            self._finish_record()
-            if self._due(config.log_interval) or self.iteration == total:
-                self._begin_record()
+            self._update_log()
             interval = config.picture_interval
             if self._due(interval) or self.iteration == FIRST_PICTURE < interval:
                 self._write_picture()
@@ -238,7 +235,7 @@ class Trainer:
         )
 
     def iterate(self, least_progress: float = 0.0) -> None:
-        """Train for one iteration, without synchronising and without writing files.
+        """Train for one iteration, without waiting for the device and without writing files.
 
         Args:
             least_progress: Lower bound on the schedule's progress, in [0, 1]; only "cosine" reads
@@ -272,7 +269,7 @@ class Trainer:
             NPAError: A file cannot be written, or parameters differ between processes; the last
                 checkpoint is intact.
         """
-        self._finish_record()
+        self._write_record()
         self._stop_if_diverged()
         self._processes.check_same(list(self.rule.parameters()))
         progress = {"iteration": self.iteration, "seconds": self._seconds()}
@@ -296,37 +293,42 @@ class Trainer:
         running = 0.0 if self._started is None else time.perf_counter() - self._started
         return self._seconds_before + running
 
-    def _begin_record(self) -> None:
-        """Begin the log record of the interval that ends with this iteration."""
-        self._cycle.statistics.send()
-        rate = self.config.learning_rate_at(self.iteration - 1, self._least_progress)
-        self._sent_record = {"iteration": self.iteration, "learning_rate": rate}
-        if not self._defer_records:
-            self._finish_record()
+    def _update_log(self) -> None:
+        """Begin the record of the interval that ends with this iteration, if one does.
 
-    def _finish_record(self) -> None:
-        """Write the record that `_begin_record` has begun, if any."""
-        sent, self._sent_record = self._sent_record, None
-        if sent is None:
+        It is written at once, or with `_defer_records` after the next iteration was launched.
+        """
+        self._write_record()
+        if self._due(self.config.log_interval) or self.iteration == self.config.total_iterations:
+            self._cycle.statistics.send()
+            rate = self.config.learning_rate_at(self.iteration - 1, self._least_progress)
+            self._unwritten_record = {"iteration": self.iteration, "learning_rate": rate}
+        if not self._defer_records:
+            self._write_record()
+
+    def _write_record(self) -> None:
+        """Write the record that `_update_log` has begun, unless it is written already."""
+        begun, self._unwritten_record = self._unwritten_record, None
+        if begun is None:
             return
         statistics, all_finite = self._cycle.statistics.receive()
         if not all_finite:
             self._stop_if_diverged()
         self._record = {
-            "iteration": sent["iteration"],
+            "iteration": begun["iteration"],
             **statistics,
-            "learning_rate": sent["learning_rate"],
+            "learning_rate": begun["learning_rate"],
             "seconds": round(self._seconds(), 3),
         }
         if self._processes.first:
             self._log.append(self._record)
 
     def _write_picture(self) -> None:
-        self._finish_record()
+        self._write_record()
         if not self._processes.first:
             return
         with torch.no_grad():
-            end = self._cycle.batch.end
+            end = self._cycle.iteration.end
             picture = self._cycle.task.picture(end.x, end.s)
         # Worlds with different goals have no common target picture.
         target = getattr(self.task, "target_picture", None) if end.goal is None else None
@@ -410,7 +412,7 @@ def write_rules(
 
 
 def take_options(rule: NPARule, config: TrainConfig[Any]) -> None:
-    """Set an untrained rule's `moment_inverse` and `dead_zone` from the configuration."""
+    """Set `moment_inverse` and `dead_zone` as configured; equivariant rules get dead zone 0."""
     rule.moment_inverse = config.moment_inverse
     rule.dead_zone = 0.0 if rule.equivariant else config.dead_zone
 

@@ -95,7 +95,7 @@ STATES = world_of(RULE)[1]
         ),
         (lambda: coded(code_names=None, code_dim=0), "must be a list of names, got None"),
         (lambda: coded(equivariant=True), "an equivariant rule .* has no codes"),
-        (lambda: RULE.with_code(STATES, torch.zeros(4)), r"code must have shape \[K\]"),
+        (lambda: RULE.with_code(STATES, torch.zeros(4)), r"code must have shape \[code_dim\]"),
         (lambda: RULE.with_code(STATES, [1.0]), r"code must be a tensor, got \[1\.0\]: for"),
         (lambda: lively_rule("cpu").with_code(STATES, torch.zeros(3)), "has no codes"),
         (lambda: RULE.codes.encode(PICTURES), "has no encoder"),

@@ -190,7 +190,7 @@ class Unfolded(NPARule):
     """The same rule, run as the module that it is."""
 
     def __init__(self, rule):
-        vars(self).update(vars(rule))
+        self.share(rule)
 
     def forward(self, perception):
         return super().forward(perception)

@@ -79,7 +79,7 @@ def test_replayed_operations_train_the_same_rule_as_called_ones(tmp_path, make, 
             cycle.run(iteration)
             cycle.statistics.send()
         assert replayed.statistics.receive() == called.statistics.receive()
-        assert_same(replayed.batch.start, called.batch.start)
+        assert_same(replayed.iteration.start, called.iteration.start)
         assert_same(replayed_rule.state_dict(), called_rule.state_dict())
     assert_same(replayed.state_dict(), called.state_dict())
     assert len(replayed._draw.recorded) > 5

@@ -51,7 +51,7 @@ def test_a_pool_with_lifetimes_draws_one_world_of_each_section():
     ratios = [b / a for a, b in itertools.pairwise(lifetimes)]
     assert ratios == pytest.approx([100 ** (1 / 11)] * 11, rel=0.03)
     generator = torch.Generator().manual_seed(0)
-    drawn = torch.stack([pool.sample(4, generator) for _ in range(60)])
+    drawn = torch.stack([pool.sample_sections(4, generator) for _ in range(60)])
     assert (drawn // 3 == torch.arange(4)).all()
     assert set(drawn.flatten().tolist()) == set(range(12))
 

@@ -212,7 +212,7 @@ def test_worlds_that_are_old_and_never_damaged_are_past_the_minimum_age(tmp_path
     seen = []
 
     def rollout(rule, worlds, steps, **options):
-        seen.append(trainer._cycle.batch.past_min_age.tolist())
+        seen.append(trainer._cycle.iteration.past_min_age.tolist())
         return plain_rollout(rule, worlds, 2, **options)
 
     fields = {"iterations": 6, "world_count": 4, "pool_size": 4, "max_age_range": (200, 6000)}
@@ -282,7 +282,7 @@ def test_an_iteration_follows_the_progress_that_it_is_given(tmp_path):
     # AdamW's first step is as long as the rate.
     rate = 0.01 * config.learning_rate
     assert (parameter.detach() - first).abs().max().item() == pytest.approx(rate, rel=1e-3)
-    trainer._begin_record()
+    trainer._update_log()
     assert log_of(tmp_path)[-1]["learning_rate"] == pytest.approx(rate)
     refused(r"least_progress must lie in \[0, 1\], got 1.5", trainer.iterate, least_progress=1.5)
 
