@@ -12,12 +12,11 @@ from npa_envs.agents.policies import RandomPolicy, RulePolicy, ZeroPolicy
 from npa_envs.checks import is_whole
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.registration import ALL, CODED, GARDEN_IDS
-from npa_envs.render.colours import ColouredWorld, shows_of
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import COLOUR_OFFSET
 from npa_envs.tasks.base import Task
 from npa_envs.tasks.damage import DAMAGE_SIZES
-from npa_envs.web.live_world import LiveWorld
+from npa_envs.web.live_world import ColouredWorld, LiveWorld, shows_of
 from npa_envs.world.brushes import nearest_image
 from npa_envs.world.particles import Particles
 

@@ -19,12 +19,11 @@ from torch import Tensor
 
 from npa_envs.atomic_files import atomic_path, checked_path
 from npa_envs.errors import NPAError, shown
-from npa_envs.render.colours import colour_tables
 from npa_envs.rule.files import load_rule, rule_name
 from npa_envs.rule.rule import NPARule, check_rule
 from npa_envs.tasks.damage import CLUMP_FACTOR, DAMAGE_SIZES
 from npa_envs.tasks.point_classification import PALETTE, UNDECIDED, PointClassification
-from npa_envs.web.live_world import checked_seed
+from npa_envs.web.live_world import checked_seed, colour_tables
 from npa_envs.web.rule_world import MIN_SEED, RuleWorld
 from npa_envs.world.species import AGREEMENTS
 

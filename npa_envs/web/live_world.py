@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,7 +17,8 @@ from torch import Tensor
 
 from npa_envs.checks import is_real, is_whole
 from npa_envs.errors import NPAError, shown, suggest
-from npa_envs.render.colours import ColouredWorld, Colouring
+from npa_envs.ops import species_fields
+from npa_envs.render.colours import GOLDEN_ANGLE, STATE_CHROMA, STATE_GAIN, ramp, srgb
 from npa_envs.tasks.damage import check_damage, damage_worlds
 from npa_envs.world.brushes import clump, cut, inject, push, state_around
 from npa_envs.world.particles import Particles
@@ -309,3 +310,146 @@ def _checked_vector(name: str, value: Any, length: int, like: Tensor) -> Tensor:
     if not fits or max(map(abs, value)) > 1e4:
         raise NPAError(f"{name} must be {length} finite numbers, got {shown(value)}")
     return like.new_tensor([value])
+
+
+# Colours of a live world's particles by state, density, species, speed or update mask.
+
+BALANCE = 0.9
+"""Weight of earlier frames in the moving average of the covariance behind "components"."""
+
+
+class ColouredWorld(NamedTuple):
+    """The values of a world from which `Colouring` computes colours."""
+
+    x: Tensor
+    s: Tensor
+    colours: Callable[[Tensor], Tensor]
+    """Maps states [1, N, C] to the rule's colours [1, N, 3], which may exceed [0, 1]."""
+    eps: float
+    box: tuple[float, ...] | None
+    counts: Sequence[int]
+    """Particles of each species, species after species."""
+    usual_count: int
+    """Particles of a newly seeded world."""
+    travelled: Tensor | None
+    """Distance of each particle in the last step over the largest possible one, [1, N]."""
+    updated: Tensor | None
+    """Which particles the last step updated, bool, shape [1, N]."""
+
+
+class Colouring:
+    """Computes the colours of one world's particles, frame by frame."""
+
+    def __init__(self) -> None:
+        self._average: Tensor | None = None
+        """Moving average of the states' covariance."""
+        self._basis: Tensor | None = None
+
+    def __call__(self, show: str, world: ColouredWorld) -> NDArray[np.uint8]:
+        """Return particles' colours, uint8, shape [N, 3]; `show` is one of `shows_of`."""
+        if world.x.shape[1] == 0:
+            return np.zeros((0, 3), dtype=np.uint8)
+        match show.split():
+            case ["colours"]:
+                return _bytes(world.colours(world.s)[0])
+            case ["density"]:
+                # 1 if the particles fill [-1, 1]^D, or the box, evenly.
+                rho = species_fields(world.x, [world.x.shape[1]], eps=world.eps, box=world.box).rho
+                volume = float(np.prod(world.box or (2.0,) * world.x.shape[2]))
+                crowding = rho[0].sum(dim=-1) * (volume / world.usual_count)
+                # Particles in open space are denser, as they fill only a part of [-1, 1]^D.
+                return _ramp(1.0 - torch.exp2(-crowding / (1.0 if world.box else 4.0)))
+            case ["components"]:
+                return _bytes(self._components(world.s[0]))
+            case ["species"]:
+                return species_colours(len(world.counts)).repeat(world.counts, axis=0)
+            case ["speed"]:
+                speed = _or_zeros(world.travelled, world)
+                return _ramp(speed.clamp(0.0, 1.0).sqrt())
+            case ["mask"]:
+                updated = _or_zeros(world.updated, world).bool()[:, None]
+                tints = ((0.98, 0.78, 0.36), (0.29, 0.33, 0.42))
+                on, off = (updated.new_tensor(tint, dtype=torch.float32) for tint in tints)
+                return _bytes(torch.where(updated, on, off))
+            case _:
+                channel = int(show.removeprefix("state "))
+                return _bytes(signed_colours(world.s[0, :, channel]))
+
+    def _components(self, s: Tensor) -> Tensor:
+        """Return the first three principal components as colours, in a slowly changing basis."""
+        # A NaN would stay in the moving average.
+        known = s[s.isfinite().all(dim=-1)].double()
+        mean = known.mean(dim=0)
+        covariance = (known - mean).T @ (known - mean) / max(len(known), 1)
+        if self._average is None or self._average.shape != covariance.shape:
+            self._average, self._basis = covariance, None
+        self._average = BALANCE * self._average + (1.0 - BALANCE) * covariance
+        values, vectors = torch.linalg.eigh(self._average.cpu())
+        count = min(3, len(values))
+        basis = vectors[:, -count:].flip(-1).to(s.device)
+        if self._basis is not None:
+            # An eigenvector's sign is arbitrary: colours must not flip between frames.
+            sign = (basis * self._basis).sum(dim=0, keepdim=True).sign()
+            basis = basis * torch.where(sign == 0, 1.0, sign)
+        self._basis = basis
+        width = values[-count:].flip(0).clamp_min(1e-12).sqrt().to(s.device)
+        colours = 0.5 + 0.22 * ((s.double() - mean) @ basis) / width
+        return torch.nn.functional.pad(colours, (0, 3 - count), value=0.5)
+
+
+def shows_of(state_dim: int, *, species: bool = True) -> list[str]:
+    """Return all values of `show` for particles with `state_dim` state channels."""
+    last = ("species", "speed", "mask") if species else ("speed",)
+    states = (f"state {k}" for k in range(state_dim))
+    return ["colours", "density", "components", *last, *states]
+
+
+def signed_colours(values: Tensor) -> Tensor:
+    """Return colours [..., 3] of numbers [...]: blue below 0, grey at 0, orange above."""
+    pull = torch.tanh(0.5 * STATE_GAIN * values)
+    lab = (0.62 + 0.18 * pull.abs(), 0.5 * STATE_CHROMA * pull, STATE_CHROMA * pull)
+    return srgb(torch.stack(lab, dim=-1))
+
+
+def species_colours(count: int) -> NDArray[np.uint8]:
+    """Return different colours for `count` species, uint8, shape [count, 3]."""
+    hue = 0.9 + GOLDEN_ANGLE * torch.arange(count, dtype=torch.float64)
+    lab = (torch.full_like(hue, 0.72), 0.13 * hue.cos(), 0.13 * hue.sin())
+    return _bytes(srgb(torch.stack(lab, dim=-1)))
+
+
+def _or_zeros(values: Tensor | None, world: ColouredWorld) -> Tensor:
+    """Return a value of each particle from the last step [N]; zeros if there are none."""
+    if values is None or values.shape[1] != world.x.shape[1]:
+        return torch.zeros(world.x.shape[1], device=world.x.device)
+    return values[0]
+
+
+def colour_tables(species_count: int) -> dict[str, NDArray[np.uint8]]:
+    """Return the colours that colours.js reads, uint8, shape [K, 3]: of densities, states, species.
+
+    `state` has those of `signed_colours` at equal steps of 1 / (1 + exp(-STATE_GAIN value)).
+    """
+    values = torch.logit(torch.linspace(0.0, 1.0, 1025)) / STATE_GAIN
+    state = _bytes(signed_colours(values))
+    return {"ramp": colour_ramp(), "state": state, "species": species_colours(species_count)}
+
+
+def colour_ramp() -> NDArray[np.uint8]:
+    """Return the colours of densities and speeds from low to high, uint8, shape [K, 3]."""
+    table = ramp((0.05, 0.06, 0.09))
+    # The darkest colours are invisible on a dark background.
+    return table[len(table) // 6 :]
+
+
+def _ramp(values: Tensor) -> NDArray[np.uint8]:
+    table = colour_ramp()
+    entry = (values.nan_to_num(0.0) * (len(table) - 1)).round()
+    colours: NDArray[np.uint8] = table[entry.to(torch.int32).cpu().numpy()]
+    return colours
+
+
+def _bytes(colours: Tensor) -> NDArray[np.uint8]:
+    scaled = (colours.detach().nan_to_num(0.0).clamp(0.0, 1.0) * 255.0).round()
+    pixels: NDArray[np.uint8] = scaled.to(torch.uint8).cpu().numpy()
+    return pixels

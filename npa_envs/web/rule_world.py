@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError, shown, suggest
-from npa_envs.render.colours import ColouredWorld, Colouring, shows_of
 from npa_envs.rule.files import load_rule, rule_metadata, rule_name, shipped_rules
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Task
@@ -24,7 +23,7 @@ from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.run_folder import JsonlLog, RunFolder
 from npa_envs.training.task_of_rule import TrainedTask, task_of_rule, trained_config
 from npa_envs.training.task_table import load_config, preset
-from npa_envs.web.live_world import LiveWorld, Range, Touch
+from npa_envs.web.live_world import ColouredWorld, Colouring, LiveWorld, Range, Touch, shows_of
 from npa_envs.world.brushes import inside_ball, wipe_state
 from npa_envs.world.division import living
 from npa_envs.world.particles import Particles

@@ -15,13 +15,12 @@ from torch import Tensor
 
 from npa_envs.cli import main
 from npa_envs.errors import NPAError
-from npa_envs.render.colours import ColouredWorld, Colouring
 from npa_envs.rule.files import load_rule, save_rule
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.damage import DAMAGE_SIZES
 from npa_envs.tasks.point_classification import class_colours
 from npa_envs.web.export import check_browser_rule, export_web, page_rule, page_text
-from npa_envs.web.live_world import TOOLS
+from npa_envs.web.live_world import TOOLS, ColouredWorld, Colouring
 from npa_envs.web.rule_world import RuleWorld
 from npa_envs.world.brushes import nearest_image
 from npa_envs.world.particles import Particles

@@ -13,7 +13,6 @@ import torch
 
 from npa_envs import NPAError, load_rule, rollout, rollout_species, save_rule
 from npa_envs.agents.policies import ZeroPolicy
-from npa_envs.render.colours import ColouredWorld, Colouring, signed_colours, species_colours
 from npa_envs.rule.files import preset_rules, rule_metadata, shipped_rules
 from npa_envs.rule.rule import NPARule, with_division
 from npa_envs.tasks.damage import DAMAGE_SIZES
@@ -21,6 +20,7 @@ from npa_envs.training import config_to_dict, preset
 from npa_envs.training.run_folder import JsonlLog
 from npa_envs.web import rule_world
 from npa_envs.web.environment_world import EnvironmentWorld, make_environment
+from npa_envs.web.live_world import ColouredWorld, Colouring, signed_colours, species_colours
 from npa_envs.web.rule_world import RuleWorld, RunWorld
 from npa_envs.world.division import living
 from npa_envs.world.rollout import rollout_particles
