@@ -68,8 +68,6 @@ class StepReport(NamedTuple):
     """The memory of the fields below, uint8."""
     numbers: Tensor
     """Reward, loss, its terms and their decreases, float32, shape [2 + 2 terms, B]."""
-    named: StepNumbers
-    """The rows of `numbers` by name."""
     endings: Tensor
     """Terminated, truncated, success, diverged, bool, shape [4, B]."""
     all_worlds: Tensor
@@ -90,7 +88,12 @@ class StepReport(NamedTuple):
         numbers, flags = buffer.view(-1, world_count).tensor_split((-FLAG_ROWS,))
         numbers = numbers.flatten().view(torch.float32).view(-1, world_count)
         flags = flags.view(torch.bool)
-        return cls(buffer, numbers, StepNumbers.from_rows(numbers), flags[:-1], flags[-1])
+        return cls(buffer, numbers, flags[:-1], flags[-1])
+
+    @property
+    def named(self) -> StepNumbers:
+        """The rows of `numbers` by name."""
+        return StepNumbers.from_rows(self.numbers)
 
     def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
         # Unpickled views would not share the buffer's memory.
