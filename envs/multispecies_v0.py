@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Any
 
 from npa_envs.envs.multi.parallel import CrowdEnv, in_turns, register
-from npa_envs.envs.multi.tasks import SETTINGS, task_settings
+from npa_envs.envs.multi.shipped_tasks import SETTINGS, task_settings
 from npa_envs.envs.multi.vector import MultiSpeciesVectorEnv
 from npa_envs.registration import SPECIES
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from npa_envs.envs.core.config import as_python
 from npa_envs.envs.multi.parallel import CrowdEnv, in_turns, register
-from npa_envs.envs.multi.tasks import task_type
+from npa_envs.envs.multi.shipped_tasks import task_type
 from npa_envs.errors import NPAError
 from npa_envs.registration import SPECIES
 

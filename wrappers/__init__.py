@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from npa_envs.wrappers.damage import DamageEvents as DamageEvents
     from npa_envs.wrappers.damage import VectorDamageEvents as VectorDamageEvents
+    from npa_envs.wrappers.episode_statistics import (
+        TorchRecordEpisodeStatistics as TorchRecordEpisodeStatistics,
+    )
     from npa_envs.wrappers.normalize import NormalizePerception as NormalizePerception
     from npa_envs.wrappers.normalize import TorchNormalizeObservation as TorchNormalizeObservation
     from npa_envs.wrappers.normalize import TorchNormalizeReward as TorchNormalizeReward
     from npa_envs.wrappers.normalize import VectorNormalizePerception as VectorNormalizePerception
     from npa_envs.wrappers.numeric_infos import NumericInfos as NumericInfos
     from npa_envs.wrappers.particle_rows import ParticleRows as ParticleRows
-    from npa_envs.wrappers.record_episodes import (
-        TorchRecordEpisodeStatistics as TorchRecordEpisodeStatistics,
-    )
     from npa_envs.wrappers.rsl_rl import RslRlParticleEnv as RslRlParticleEnv
     from npa_envs.wrappers.sb3 import ParticleVecEnv as ParticleVecEnv
     from npa_envs.wrappers.sb3 import RowPolicy as RowPolicy
@@ -45,7 +45,7 @@ MODULES = {
     "SpeciesTags": "species_tags",
     "TorchNormalizeObservation": "normalize",
     "TorchNormalizeReward": "normalize",
-    "TorchRecordEpisodeStatistics": "record_episodes",
+    "TorchRecordEpisodeStatistics": "episode_statistics",
     "VectorDamageEvents": "damage",
     "VectorNormalizePerception": "normalize",
     "VectorSpeciesTags": "species_tags",

@@ -16,7 +16,7 @@ from npa_envs.agents.learning.progress import Progress, annealed
 from npa_envs.agents.learning.rule_set import RuleSet, species_of
 from npa_envs.checks import check_fraction
 from npa_envs.envs.core.task import EnvTask
-from npa_envs.envs.multi.task import Population, SpeciesConfig, SpeciesTask
+from npa_envs.envs.multi.species_task import Population, SpeciesConfig, SpeciesTask
 from npa_envs.errors import NPAError, shown
 from npa_envs.rule.folded_network import FoldedRule
 from npa_envs.rule.rule import NPARule

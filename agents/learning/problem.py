@@ -20,9 +20,9 @@ from npa_envs.devices import check_device
 from npa_envs.envs.core.config import EnvConfig, Interface
 from npa_envs.envs.core.task import Controls, EnvTask
 from npa_envs.envs.core.vector import NPAVectorEnv
-from npa_envs.envs.multi.task import SpeciesConfig, SpeciesTask
-from npa_envs.envs.multi.tasks import task_settings
-from npa_envs.envs.multi.tasks import task_type as species_task_type
+from npa_envs.envs.multi.shipped_tasks import task_settings
+from npa_envs.envs.multi.shipped_tasks import task_type as species_task_type
+from npa_envs.envs.multi.species_task import SpeciesConfig, SpeciesTask
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.registration import ALL, SPECIES_SIZES
 from npa_envs.registration import SPECIES as SPECIES_TASKS

@@ -5,7 +5,7 @@ species begin and how far each of them is from its goal; `npa_envs.world.environ
 the particles. Nothing but `parallel` needs PettingZoo.
 """
 
-from npa_envs.envs.multi.task import Population, SpeciesConfig, SpeciesTask
-from npa_envs.envs.multi.tasks import TASKS, task_type
+from npa_envs.envs.multi.shipped_tasks import TASKS, task_type
+from npa_envs.envs.multi.species_task import Population, SpeciesConfig, SpeciesTask
 
 __all__ = ["TASKS", "Population", "SpeciesConfig", "SpeciesTask", "task_type"]

@@ -16,8 +16,8 @@ from npa_envs import world_mean
 from npa_envs.checks import number_tensor
 from npa_envs.envs.core.step_report import named_terms, total
 from npa_envs.envs.core.world_state import OBSERVATION_COPIES, WorldState
-from npa_envs.envs.multi.task import Population, SpeciesTask
-from npa_envs.envs.multi.tasks import task_type
+from npa_envs.envs.multi.shipped_tasks import task_type
+from npa_envs.envs.multi.species_task import Population, SpeciesTask
 from npa_envs.errors import DivergedError
 from npa_envs.world.cuda_graph import (
     GraphedCallable,

@@ -35,7 +35,7 @@ from npa_envs.ops.perception_passes import (
 )
 from npa_envs.ops.physics import ALL_TERMS, Physics, Terms, make_physics
 from npa_envs.ops.sort import plan_kernels, sort_worlds
-from npa_envs.ops.static import StaticRows, StaticWorlds, static_worlds
+from npa_envs.ops.static_worlds import StaticRows, StaticWorlds, static_worlds
 
 
 class PerceptionFields(NamedTuple):

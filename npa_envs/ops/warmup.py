@@ -22,7 +22,7 @@ from npa_envs.ops.pictures.gaussians import render_gaussians
 from npa_envs.ops.pictures.splat import picture_losses, splat
 from npa_envs.ops.pictures.triangles import nearest_triangles
 from npa_envs.ops.rewards_and_ends import EpisodeRules, EpisodeUpdate
-from npa_envs.ops.static import prepare_static, static_rows
+from npa_envs.ops.static_worlds import prepare_static, static_rows
 from npa_envs.ops.update import ActedWorlds, PreparedActions, update_particles
 from npa_envs.ops.world_mean import world_mean
 

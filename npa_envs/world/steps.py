@@ -15,7 +15,7 @@ from npa_envs.checks import constant
 from npa_envs.ops.perceive import Rows, perceive_rows, updates_in_parts
 from npa_envs.ops.physics import Physics
 from npa_envs.ops.species_density import perceive_by_species
-from npa_envs.ops.static import StaticRows, StaticWorlds, prepare_static, static_rows
+from npa_envs.ops.static_worlds import StaticRows, StaticWorlds, prepare_static, static_rows
 from npa_envs.ops.update import bounded, update_particles
 from npa_envs.rule.folded_network import Network
 from npa_envs.rule.rule import LIFE, NPARule

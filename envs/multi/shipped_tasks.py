@@ -12,7 +12,7 @@ from torch import Tensor
 
 from npa_envs import perceive, world_mean
 from npa_envs.checks import check_field
-from npa_envs.envs.multi.task import Population, SpeciesConfig, SpeciesTask
+from npa_envs.envs.multi.species_task import Population, SpeciesConfig, SpeciesTask
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.registration import SPECIES, SPECIES_SIZES
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
