@@ -145,8 +145,8 @@ BUDGETS = {
     "places that draw masks": Budget(places_that_draw_masks, 1, 1),
     "options of npa-envs train": Budget(options_of_train, 76, 76),
     "source files": Budget(lambda: len(files(*PACKAGES, suffixes=SOURCES)), 270, 270),
-    "source lines": Budget(lambda: lines(files(*PACKAGES, suffixes=SOURCES)), 61_400, 58_000),
-    "test lines": Budget(lambda: lines(files("tests")), 32_350, 32_000),
+    "source lines": Budget(lambda: lines(files(*PACKAGES, suffixes=SOURCES)), 59_900, 58_000),
+    "test lines": Budget(lambda: lines(files("tests")), 31_950, 32_000),
     "words of docs": Budget(
         lambda: words([p for p in files("docs", suffixes=(".md",)) if p.parent.name == "docs"]),
         45_000,
