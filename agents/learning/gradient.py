@@ -125,7 +125,7 @@ class BudgetTrainConfig(TrainConfig[Any]):
     """Learning rate at the end, as a fraction of the first (dimensionless)."""
 
     def learning_rate_at(self, iteration: int, fraction: float = 0.0) -> float:
-        """Return the rate by the budget spent, half a cosine; `TrainConfig` needs the arguments."""
+        """Return the learning rate, half a cosine of the budget spent; arguments are not used."""
         return annealed(self.learning_rate, self.last_rate, self.progress.spent_fraction)
 
 

@@ -509,10 +509,10 @@ def particle_means(values: Tensor, weights: Tensor) -> Tensor:
 
 
 def standardised(values: Tensor, weights: Tensor, processes: ProcessGroup = ALONE) -> Tensor:
-    """Return values minus the weighted mean of their step, over the standard deviation of all.
+    """Return values minus their weighted mean at each step t, over one standard deviation of all.
 
-    Means are by step, as the mean over worlds depends on the step of the episode, which a critic
-    learns only slowly; a single world has one mean of all steps. Values have shape [T, B, N] or
+    Each t has its own mean over worlds, as it depends on the step of the episode, which a critic
+    learns only slowly; a single world has one mean over all t. Values have shape [T, B, N] or
     [T, B, 1], weights [T, B, N]. Mean and deviation are over the worlds of all processes.
     """
     weights = weights if values.shape == weights.shape else weights.amax(-1, True)
