@@ -280,7 +280,7 @@ class ClampedRule(NPARule):
         return torch.cat((update[..., :first], state_step), dim=-1)
 
     def is_plain(self) -> bool:
-        """Return whether the other rule computes only its two layers, which `folded` then has."""
+        """Return whether the clamped rule is no more than its two layers, those of `folded`."""
         return self.rule_is_plain
 
     def has_network(self) -> bool:

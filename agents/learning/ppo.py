@@ -371,7 +371,7 @@ class PPOLearner:
         return [value[index] for value in values]
 
     def _rule_rows(self, minibatch: int, values: Sequence[Tensor]) -> list[list[Tensor]]:
-        """Return the rules' minibatch of each tensor, of worlds, or by species of its particles."""
+        """Return a minibatch of each tensor: one of worlds, or one of each species' particles."""
         indices = [group[minibatch] for group in self.minibatches.indices[:-1]]
         if self.options.ratio == "world":
             return [[value[index] for value in values] for index in indices]
