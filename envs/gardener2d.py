@@ -53,7 +53,7 @@ class Gardener2DEnvConfig(GardenConfig):
 
 
 class GardenerTask(GardenTask[Gardener2DEnvConfig]):
-    """A picture that gusts and blights disturb."""
+    """Task: keep a grown picture intact, while gusts push particles and blights wipe states."""
 
     config_type = Gardener2DEnvConfig
 

@@ -141,7 +141,7 @@ class PictureGoals(NamedTuple):
 
 
 class ShapeshifterTask(RuleDrivenTask[Shapeshifter2DEnvConfig]):
-    """A picture that a rule has grown has to become others."""
+    """Task: turn a grown picture into one goal picture after another, by the code of its rule."""
 
     config_type = Shapeshifter2DEnvConfig
     spaces_type = CodeSpaces
@@ -189,7 +189,7 @@ class ShapeshifterTask(RuleDrivenTask[Shapeshifter2DEnvConfig]):
         return (goal + 1 + random.integers(count - 1, 1)[:, 0]) % count
 
     def episode_context(self, start: Start, loss: Tensor, random: WorldRandom) -> PictureGoals:
-        """Return the episodes' first goals, and all their goals, drawn at random, in order."""
+        """Return each episode's first goal, [B], and all its random goals in turn, [B, G]."""
         assert start.goal is not None, "made with goals"
         goals = [start.goal]
         while len(goals) < GOAL_COUNT:

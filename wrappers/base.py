@@ -316,7 +316,7 @@ class RewardSums(EpisodeWrapper):
         return observations, infos
 
     def after_step(self, outcome: VectorStep) -> VectorStep:
-        """Add a step's rewards to the sums, and change rewards and infos by `use_sums`."""
+        """Add a step's rewards to the sums; return it with the rewards and infos of `use_sums`."""
         observations, rewards, terminations, truncations, infos = outcome
         check_tensor(rewards, type(self).__name__)
         sums = rewards.double()

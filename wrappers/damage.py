@@ -106,13 +106,13 @@ class DamageEvents(_DamagesWorlds, AnyWrapper):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Start an episode, as the environment does."""
+        """Start an episode; events at step 0 damage its initial world."""
         observation, info = self.env.reset(seed=seed, options=options)
         self._elapsed = 0
         return self._damaged(observation, info)
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Step the world, as the environment does."""
+        """Step the world; then the events of this step damage it, unless the episode is over."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         self._elapsed += 1
         if not (terminated or truncated):

@@ -102,7 +102,7 @@ def _recorded(env: Any, policy: Callable[[Any], Any], seeds: list[int]) -> list[
 
 
 def _mapped(function: Callable[..., Any], *values: Any) -> Any:
-    """Return `function(*values)`; for dictionaries of arrays a dictionary of its values."""
+    """Return `function(*values)`; of dictionaries a dictionary of its results by key."""
     if isinstance(values[0], dict):
         return {name: _mapped(function, *(v[name] for v in values)) for name in values[0]}
     return function(*values)

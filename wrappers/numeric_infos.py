@@ -14,7 +14,7 @@ Infos = dict[str, dict[str, Any]]
 
 
 class NumericInfos(BaseParallelWrapper):  # type: ignore[misc]
-    """Keep only the infos that `reset` returns, which are numbers, in every step.
+    """Reduce the infos of every step to the entries that `reset` returns, all numbers.
 
     TorchRL's `PettingZooWrapper` expects the entries of `reset` in every step, and makes a tensor
     of each. Losses and their terms stay; entries of steps only (`reward_...`, `reason`) are

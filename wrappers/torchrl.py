@@ -116,7 +116,7 @@ class NPATorchRLEnv(EnvBase):  # type: ignore[misc]
 
 
 def _bounded(space: Any, world_count: int, device: torch.device | None) -> Bounded:
-    """Return TorchRL's spec of `world_count` worlds, for the space of one world."""
+    """Return the space of one world as TorchRL's spec of `world_count` worlds."""
     assert isinstance(space, Box), "environments of this package have boxes"
     low, high = (
         torch.as_tensor(limit, device=device).expand(world_count, *space.shape).clone()

@@ -63,7 +63,7 @@ class Suite:
 
     @property
     def budgets(self) -> dict[str, int]:
-        """Particle-steps of a run by environment id, of all groups."""
+        """Budget of a run [particle-steps] by environment id, for all groups."""
         return {env_id: steps for group in self.groups.values() for env_id, steps in group.items()}
 
     @property
@@ -84,7 +84,7 @@ class Suite:
         return Problem(env_id=env_id, episode_steps=steps, num_envs=worlds, hidden_dim=64)
 
     def leaves_out(self, task: str, method: str) -> bool:
-        """Return whether a method is not run on a task; a user's "module:function" always is."""
+        """Return whether a method is skipped on a task; a user's "module:function" never is."""
         if ":" in method:
             return False
         known = methods_for(self.problem_of(task))
@@ -183,7 +183,7 @@ def check_rows(suite: Suite, plan: ComparisonPlan, folder: Path) -> None:
 def _stored_row(
     suite: Suite, plan: ComparisonPlan, method: str, folder: Path
 ) -> dict[str, Any] | None:
-    """Return the object in METHOD.json, None without the file; raises as `check_rows`."""
+    """Return the object in METHOD.json, None if there is no file; raises as `check_rows`."""
     path = folder / f"{method}.json"
     if not path.exists():
         return None

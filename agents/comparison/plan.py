@@ -160,7 +160,7 @@ class ComparisonPlan:
         return replace(job, method="gradient")
 
     def facts(self, job: Job) -> dict[str, Any]:
-        """Return all settings that the results of a run depend on, of JSON's types."""
+        """Return all settings that the results of a run depend on, in types that JSON has."""
         return {
             "problem": dict(self.tasks[job.task]),
             "budget": self.budgets[job.axis][job.task],

@@ -116,7 +116,7 @@ def mean_of(values: Sequence[float]) -> float:
 
 
 def requested_run(folder: Path) -> RunRecord:
-    """Return the record of the run that a folder requests, which has failed until it is done."""
+    """Return the record of the run that a folder requests, with status "failed" for now."""
     content = json.loads((folder / REQUEST).read_text("utf-8"))
     return RunRecord(**content | {"job": Job(**content["job"])}, status="failed")
 
@@ -202,7 +202,7 @@ def final_picture(
 
 
 def main(folder: Path) -> None:
-    """Load the libraries of the run in `folder`; then do the run of each order."""
+    """Load the libraries of the run in `folder`; then do the runs ordered on standard input."""
     orders: SimpleQueue[tuple[str, str, str]] = SimpleQueue()
 
     def listen() -> None:

@@ -173,7 +173,7 @@ class GaussianRules(nn.Module):
         self.noise_factor = state
 
     def row_log_std(self) -> Tensor:
-        """Return the logarithms of the standard deviations of particles' actions, shape [N, A]."""
+        """Return the logarithm of each action's standard deviation, by particle, shape [N, A]."""
         return self.log_std[self.row_species]
 
     @torch.no_grad()
@@ -289,7 +289,7 @@ def seeded_critic(progress: Progress, input_dim: int, inputs: CriticInput) -> Cr
 
 
 def share_of_worlds(progress: Progress, total: int) -> tuple[list[int], Randomness]:
-    """Return the indices of this process's worlds out of `total`, and what draws their numbers.
+    """Return the indices of this process's worlds out of `total`, and their random source.
 
     That is a torch generator, or with several processes a stream for each world.
     """

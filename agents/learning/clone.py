@@ -87,7 +87,7 @@ def train(progress: Progress, options: CloneOptions = CloneOptions()) -> RuleSet
 def _from_teacher(
     progress: Progress, rules: RuleSet, options: CloneOptions
 ) -> tuple[Callable[[], int], Demonstrations]:
-    """Return a function that adds demonstrations and returns their number, and the buffer."""
+    """Return a function that adds worlds to a buffer and returns how many, and the buffer."""
     problem, device, source = progress.problem, progress.device, options.teacher
     if source is None:
         raise NPAError("teacher must be given to clone, or a dataset: for example teacher='heart'")

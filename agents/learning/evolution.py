@@ -193,7 +193,7 @@ def _strategy(
 
 
 def costs(returns: NDArray[np.float64]) -> list[float]:
-    """Return costs to minimise: minus the mean returns [G]. Not finite ones cost the most."""
+    """Return costs to minimise: minus mean returns [G]; infinite and NaN ones cost the most."""
     finite = np.isfinite(returns)
     worst = returns[finite].min() - 1.0 if finite.any() else 0.0
     minimised: list[float] = (-np.where(finite, returns, worst)).tolist()

@@ -125,7 +125,7 @@ class BudgetTrainConfig(TrainConfig[Any]):
     """Learning rate at the end, as a fraction of the first (dimensionless)."""
 
     def learning_rate_at(self, iteration: int, fraction: float = 0.0) -> float:
-        """Return the rate by the budget spent, half a cosine; `TrainConfig` needs the arguments."""
+        """Return the learning rate, half a cosine of the budget spent; arguments are not used."""
         return annealed(self.learning_rate, self.last_rate, self.progress.spent_fraction)
 
 
@@ -280,7 +280,7 @@ class ClampedRule(NPARule):
         return torch.cat((update[..., :first], state_step), dim=-1)
 
     def is_plain(self) -> bool:
-        """Return whether the other rule computes only its two layers, which `folded` then has."""
+        """Return whether the clamped rule is no more than its two layers, those of `folded`."""
         return self.rule_is_plain
 
     def has_network(self) -> bool:

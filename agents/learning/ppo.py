@@ -371,7 +371,7 @@ class PPOLearner:
         return [value[index] for value in values]
 
     def _rule_rows(self, minibatch: int, values: Sequence[Tensor]) -> list[list[Tensor]]:
-        """Return the rules' minibatch of each tensor, of worlds, or by species of its particles."""
+        """Return a minibatch of each tensor: one of worlds, or one of each species' particles."""
         indices = [group[minibatch] for group in self.minibatches.indices[:-1]]
         if self.options.ratio == "world":
             return [[value[index] for value in values] for index in indices]
@@ -509,10 +509,10 @@ def particle_means(values: Tensor, weights: Tensor) -> Tensor:
 
 
 def standardised(values: Tensor, weights: Tensor, processes: ProcessGroup = ALONE) -> Tensor:
-    """Return values minus the weighted mean of their step, over the standard deviation of all.
+    """Return values minus their weighted mean at each step t, over one standard deviation of all.
 
-    Means are by step, as the mean over worlds depends on the step of the episode, which a critic
-    learns only slowly; a single world has one mean of all steps. Values have shape [T, B, N] or
+    Each t has its own mean over worlds, as it depends on the step of the episode, which a critic
+    learns only slowly; a single world has one mean over all t. Values have shape [T, B, N] or
     [T, B, 1], weights [T, B, N]. Mean and deviation are over the worlds of all processes.
     """
     weights = weights if values.shape == weights.shape else weights.amax(-1, True)

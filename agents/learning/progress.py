@@ -75,7 +75,7 @@ class Learner(Protocol):
 
     @property
     def optimisers(self) -> Mapping[str, torch.optim.Optimizer]:
-        """Their optimisers, Adam or AdamW, by name."""
+        """Optimisers of the `modules`, Adam or AdamW, by name."""
 
     def resume(self, iteration: int, resumption: int) -> None:
         """Resume after `iteration` iterations, for the `resumption`-th time, in new worlds."""

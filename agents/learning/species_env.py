@@ -95,7 +95,7 @@ class ConcatenatedSpeciesEnv(MultiSpeciesVectorEnv):
         return observation, reward, over & ~cut, over & cut, info
 
     def _update_reasons(self, infos: Mapping[str, Mapping[str, Any]]) -> None:
-        """Store why each world ends: the reason of its first species, or that any diverged."""
+        """Store each world's reason: its first species' that ended, or "left the world" of any."""
         for agent in self.agents:
             reasons = infos[agent].get("reason")
             if reasons is not None:

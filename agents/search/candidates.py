@@ -36,7 +36,7 @@ Numbers = NDArray[np.float64]
 
 
 class Axis(NamedTuple):
-    """A descriptor of worlds: name, range and number of the archive's cells."""
+    """A descriptor of worlds: name, range, and number of cells along it in the archive."""
 
     name: str
     lowest: float

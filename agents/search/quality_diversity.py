@@ -134,7 +134,7 @@ draws independent candidates.
 def qualities_and_measures(
     found: Sequence[Found | None], axes: Sequence[Axis]
 ) -> tuple[Numbers, Numbers]:
-    """Return qualities [G] and M descriptors [G, M] of candidates: 0 without a result."""
+    """Return qualities [G] and M descriptors [G, M] of candidates, 0 where a result is None."""
     nothing = Found(0.0, (0.0,) * len(axes))
     qualities, measures = zip(*(one or nothing for one in found), strict=True)
     return np.array(qualities), np.array(measures)
@@ -168,7 +168,7 @@ class Elite(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Name of its files, such as "3-4-1"."""
+        """Indices of its cell as the name of its files, such as "3-4-1"."""
         return "-".join(map(str, self.cell))
 
 

@@ -208,7 +208,7 @@ class ParticleRewards:
         self.reward.index_fill_(0, world_indices, 0.0)
 
     def gains(self, task: EnvTask[Any], particles: Particles) -> Tensor:
-        """Return what each particle gained by the step that ended at `particles`, [B, N]."""
+        """Return each particle's own reward of the step that ended at `particles`, [B, N]."""
         raise NotImplementedError
 
     def write(self, gains: Tensor, reward: Tensor, by_world: Tensor, enabled: Tensor) -> None:

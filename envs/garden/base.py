@@ -270,7 +270,7 @@ class GardenTask(RuleDrivenTask[Config], GrownTask[Config]):
         return particles
 
     def episode_context(self, start: Start, loss: Tensor, random: WorldRandom) -> Any:
-        """Return the loss of each grown picture, and its rise if all states became 0: grey."""
+        """Return each grown picture's loss, and its rise if all states were 0: a grey picture."""
         blank = torch.zeros_like(start.s)
         grey = sum(self.losses(start.x, blank).values(), torch.zeros_like(loss))
         # The loss of a picture that did not grow may not rise at all.

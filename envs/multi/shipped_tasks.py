@@ -137,7 +137,7 @@ class PictureLossTask(SpeciesTask):
 
     @property
     def open_half_width(self) -> float:
-        """Half of a picture's side in open space [length units]: a target fits at each seed."""
+        """Half a picture's side in open space [length units]: holds a target around each seed."""
         return float(1.0 + 0.5 * (self.config.species_count - 1) * self.config.seed_distance)
 
 
@@ -195,12 +195,12 @@ class CoMorphogenesisTask(PictureLossTask):
 
 @dataclass(frozen=True, kw_only=True)
 class InvasionConfig(OnePictureConfig):
-    """`OnePictureConfig` with `opponent`, who plays the invaders; refuses reward="team"."""
+    """`OnePictureConfig` and `opponent`, who acts for invaders; `reward` must be "individual"."""
 
     choices = OnePictureConfig.choices | {"opponent": (None, "random")}
 
     opponent: str | None = None
-    """Who plays the invaders: None: agents; "random": the environment, with actions uniform in
+    """Who acts for the invaders: None: agents; "random": the environment, with actions uniform in
     [-1, 1] for each particle and step."""
 
     @property
@@ -216,7 +216,7 @@ class InvasionConfig(OnePictureConfig):
 
 
 class InvasionTask(PictureLossTask):
-    """Species 0 has the splat loss of its picture; the others get minus its reward, in sum."""
+    """Species 0 grows a picture (splat loss); invaders get equal parts of minus its reward."""
 
     config_type = InvasionConfig
 
@@ -233,7 +233,7 @@ class InvasionTask(PictureLossTask):
         }
 
     def particle_losses(self, population: Population) -> Mapping[str, Tensor]:
-        """Return losses by name, [B, N]; all invaders have the same, in sum minus species 0's."""
+        """Return losses by name, [B, N]: all invaders' are equal, and a world's losses sum to 0."""
         losses = self.task.particle_contributions(*population.of(0))
         count, invader_count = losses.shape[1], sum(population.counts[1:])
         part = world_mean(losses[..., None])[:, 0] * (-count / max(invader_count, 1))

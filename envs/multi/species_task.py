@@ -118,7 +118,7 @@ class SpeciesConfig(WorldConfig):
 
     @property
     def agent_particle_counts(self) -> tuple[int, ...]:
-        """Particles of each species that agents control; the environment plays the others."""
+        """Particles of each species that agents control; the environment acts for the others."""
         return self.counts
 
     @property

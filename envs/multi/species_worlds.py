@@ -33,7 +33,7 @@ from npa_envs.world.randomness import WorldRandom
 LossTerms = dict[str, Tensor]
 """Terms of every agent's loss by name, shape [B, M] each."""
 
-REMOVED, LEFT, ALONE = 1, 2, 3
+REMOVED, LEFT, NO_OPPONENT = 1, 2, 3
 """Causes that terminate an agent's episode; 0: none."""
 REASONS = np.array([None, "removed", "left the world", "no opponent", "time limit"], dtype=object)
 """`info["reason"]` for each cause; the last one is for truncated worlds."""
@@ -326,7 +326,7 @@ class SpeciesWorlds(WorldState):
             present = self.agent_species[staying[world]]
             counts = np.bincount(present, minlength=self.config.species_count)
             if self.task.is_over(tuple(counts.tolist())):
-                endings[world, staying[world]] = ALONE
+                endings[world, staying[world]] = NO_OPPONENT
         return endings
 
     def _divergence_message(self, diverged: NDArray[np.bool_]) -> str:

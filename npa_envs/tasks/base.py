@@ -251,7 +251,7 @@ class ParticleTask(Generic[ConfigT]):
         return value
 
     def with_process_mean(self, mean: Callable[[Tensor], Tensor]) -> Self:
-        """Return the task of one of several training processes, with its `process_mean`."""
+        """Return a copy for one of several training processes; `mean` is its `process_mean`."""
         return self._with(process_mean=mean)
 
     def with_target_code(self, s: Tensor) -> Tensor:

@@ -119,7 +119,7 @@ class CoMorphogenesis2D(ParticleTask[Any]):
         return together([task.damage(each, generator) for task, each in species])
 
     def with_process_mean(self, mean: Callable[[Tensor], Tensor]) -> Self:
-        """Return the task whose species average over all training processes."""
+        """Return a copy in which `mean` is the `process_mean` of each species' task."""
         return self._with(tasks=[task.with_process_mean(mean) for task in self.tasks])
 
     def loss(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:

@@ -189,7 +189,7 @@ def stripes(u: Array, v: Array, _: np.random.Generator) -> Array:
 
 
 def cells(u: Array, v: Array, random: np.random.Generator) -> Array:
-    """Polygons around scattered points, dark between them."""
+    """Voronoi cells of random points in warm colours, with dark walls between them."""
     centres = _scattered(random, 20, 0.17)
     distance = np.stack([np.hypot(*_away(u, v, centre)) for centre in centres])
     order = np.argsort(distance, axis=0)

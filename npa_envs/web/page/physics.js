@@ -7,7 +7,7 @@
 // those of this file, or the WebAssembly ones of kernels_simd.js.
 
 export const MOMENT_THRESHOLD = 1e-3;
-export const MOMENT_SOFTENING = 1e-2 ** 2;
+export const SQUARED_MOMENT_SOFTENING = 1e-2 ** 2;
 
 // The upper triangle of the unit matrix: xx, xy, xz, yy, yz, zz.
 const IDENTITY = [1, 0, 0, 1, 0, 1];
@@ -506,8 +506,8 @@ function momentInverse(dimension, [xx, xy, xz, yy, yz, zz], inverse) {
     determinant = xx * adjugate[0] + xy * adjugate[1] + xz * adjugate[2];
   }
   if (inverse === "smooth") {
-    const divisor = determinant * determinant + MOMENT_SOFTENING;
-    return adjugate.map((entry, k) => (determinant * entry + MOMENT_SOFTENING * IDENTITY[k]) / divisor);
+    const divisor = determinant * determinant + SQUARED_MOMENT_SOFTENING;
+    return adjugate.map((entry, k) => (determinant * entry + SQUARED_MOMENT_SOFTENING * IDENTITY[k]) / divisor);
   }
   if (!(Math.abs(determinant) >= MOMENT_THRESHOLD)) return IDENTITY;
   return adjugate.map((entry) => entry / determinant);

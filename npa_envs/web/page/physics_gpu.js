@@ -2,7 +2,7 @@
 // particles before, and moves them after; both are a small part of the time. The shaders follow
 // `computeDensities`, `perceive` and the kernels of physics.js, whose changes are made here as well.
 
-import { CELLS_PER_RADIUS, MAX_CELLS, MOMENT_SOFTENING, MOMENT_THRESHOLD } from "./physics.js";
+import { CELLS_PER_RADIUS, MAX_CELLS, MOMENT_THRESHOLD, SQUARED_MOMENT_SOFTENING } from "./physics.js";
 
 const GROUP = 64;
 const UNIFORM_BYTES = 96;
@@ -53,8 +53,8 @@ function shaders(rule) {
         let determinant = xx * adjugate[0] + xy * adjugate[1] + xz * adjugate[2];`,
   }[dimension];
   const corrected = smooth
-    ? `let divisor = determinant * determinant + ${MOMENT_SOFTENING};
-       for (var k = 0; k < 6; k++) { m[k] = (determinant * adjugate[k] + ${MOMENT_SOFTENING} * m[k]) / divisor; }`
+    ? `let divisor = determinant * determinant + ${SQUARED_MOMENT_SOFTENING};
+       for (var k = 0; k < 6; k++) { m[k] = (determinant * adjugate[k] + ${SQUARED_MOMENT_SOFTENING} * m[k]) / divisor; }`
     : `if (abs(determinant) >= ${MOMENT_THRESHOLD}) {
          for (var k = 0; k < 6; k++) { m[k] = adjugate[k] / determinant; }
        }`;
