@@ -248,7 +248,7 @@ def _by_damage(records: Sequence[RuleRecord]) -> str:
 
 
 def _by_value(records: Sequence[RuleRecord], condition: str) -> str:
-    """Return a Markdown table of each rule's loss as trained, and its multiple at each value."""
+    """Return a Markdown table: rules' losses as trained; losses / these by value of `condition`."""
     values = list(
         dict.fromkeys(r.value for record in records for r in record.responses_to(condition))
     )

@@ -416,7 +416,7 @@ class LossCurve:
 
 
 def ratio(loss: float, reference: float) -> float:
-    """Return a loss divided by a reference loss; 1 if both are 0."""
+    """Return a loss divided by a reference; 0 / 0 is 1, any other number / 0 infinite."""
     if reference == 0.0:
         return 1.0 if loss == 0.0 else math.nan if math.isnan(loss) else math.inf
     return loss / reference
