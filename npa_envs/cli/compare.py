@@ -262,7 +262,7 @@ def _method_options(
 
 
 def _jobs(options: CompareOptions) -> int:
-    """Return how many runs run at a time; if wall time is equal, a multiple of the devices."""
+    """Return the number of runs at a time; with `learning_seconds`, a multiple of the devices."""
     count = len(options.devices or (options.device,))
     jobs = count if options.jobs is None else options.jobs
     if options.learning_seconds is not None and jobs % count:

@@ -196,7 +196,7 @@ def _option_name(word: str) -> str:
 
 
 def table(runs: Sequence[SweepRun]) -> str:
-    """Return a Markdown table of runs: values, end, wall time [s] and the scores of the reports."""
+    """Return a Markdown table of runs: values, how each ended, wall time [s], reports' scores."""
     from npa_envs.measure.quality import score_line
 
     rows = []

@@ -93,7 +93,7 @@ def starting_configuration(task_name: str, arguments: Sequence[str]) -> TrainCon
 def _check_preset(
     name: str, run: TrainConfig[Any], task_name: str, folder: RunFolder, arguments: Sequence[str]
 ) -> None:
-    """Check that a resumed run has the fields of the preset `name`, except those in `arguments`."""
+    """Raise if the run to resume is not of the preset `name`, options in `arguments` aside."""
     presets = {name: config_to_dict(one) for name, one in task_entry(task_name).presets.items()}
     values = config_to_dict(run)
     changed = {word.partition("=")[0].lstrip("-").replace("-", "_") for word in arguments}

@@ -1,4 +1,4 @@
-// Formulas of `mathematics.py`, which explains them, with fewer instructions than Warp's code.
+// Formulas of perception for mathematics.py, and exp2 for pictures/*.py, in few instructions.
 
 namespace npa {
 

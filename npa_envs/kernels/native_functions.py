@@ -64,8 +64,8 @@ def function(
     """Return a Warp function that calls `npa::name`, a C++ function of the `.cuh` files.
 
     `parameters` are the template parameters that C++ cannot deduce: numbers, booleans, types, names
-    of constants in `npa`. `arguments` are the types of arguments by name. Of functions without a
-    result (`returns` is None) some may have any type: `untyped`, names separated by spaces.
+    of constants in `npa`. `arguments` are the types of arguments by name. `untyped`: names,
+    separated by spaces, of arguments of any type; a function with a result (`returns`) has none.
     """
     arguments = dict.fromkeys(untyped.split(), Any) | arguments
     template = f"<{', '.join(map(_in_cpp, parameters))}>" if parameters else ""

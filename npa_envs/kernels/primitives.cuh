@@ -1,4 +1,4 @@
-// Memory access of up to 16 bytes at a time, and access to other threads' values.
+// Memory access of up to 16 bytes, and to other threads' values, for the kernels of primitives.py.
 //
 // The first half also exists on a CPU, where a particle has one thread and no wide access.
 

@@ -136,7 +136,7 @@ def measured_facts(device: torch.device, commit: str | None, **settings: Any) ->
 
 
 def command_text(name: str, arguments: Sequence[str], *options: str) -> str:
-    """Return a command line as text; after each of `options` OUT replaces a value: "--out OUT".
+    """Return a command line as text, in which values of `options` are replaced: "--out OUT".
 
     Records do not name folders of the machine that they were written on.
     """

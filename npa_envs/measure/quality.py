@@ -326,7 +326,7 @@ def _blank_clouds(runner: RuleRunner, index: Tensor) -> Particles:
 def _cloud_means(
     task: PointClassification, measured: Callable[[Tensor], Iterable[Sequence[Tensor]]]
 ) -> list[list[float]]:
-    """Return a table of means over all clouds; `measured` gives its values [B] for B indices."""
+    """Return a table of means over all clouds; `measured` maps B clouds' indices to cells [B]."""
     count = len(task.clouds.label)
     sums = torch.zeros((), dtype=torch.float64)
     for index in torch.split(torch.arange(count, device=task.clouds.x.device), BATCH):
@@ -337,7 +337,7 @@ def _cloud_means(
 
 
 def _cut(x: Tensor, s: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Return clouds without the particles farthest in a direction, which is random for each."""
+    """Return clouds less `CUT_FRACTION` of their particles: the farthest in a random direction."""
     normal = torch.randn(len(x), 2, generator=generator, device=x.device, dtype=x.dtype)
     order = (x * normal[:, None]).sum(-1).argsort(dim=1)
     indices = order[:, : max(1, round((1.0 - CUT_FRACTION) * x.shape[1])), None]
@@ -564,10 +564,7 @@ def picture_rows(
     checkpoints: Sequence[int] = PICTURE_CHECKPOINTS,
     **options: Any,
 ) -> list[PictureRow]:
-    """Return, at each of `checkpoints`, a row for each picture and one of their medians.
-
-    `options` are others of `grown`.
-    """
+    """Return each picture's row and the medians' at `checkpoints`; `options`: others of `grown`."""
     if len(tasks) < 2:
         raise NPAError(f"pictures must be two or more, got {len(tasks)}: give another")
     worlds = grown(rule, tasks, checkpoints=checkpoints, **options)

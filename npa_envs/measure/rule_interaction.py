@@ -153,7 +153,7 @@ class RuleUnderTest(NamedTuple):
     task: Task
 
     def with_count(self, particle_count: int) -> Task:
-        """Return the task for another number of particles."""
+        """Return the task with `particle_count` particles."""
         return self.task.resized(particle_count).for_rule(self.rule)
 
 
@@ -303,7 +303,7 @@ class InteractionRecord(Record[InteractionRow]):
 
 
 def interaction_map(rows: Sequence[InteractionRow]) -> bytes:
-    """Return a PNG with a matrix for each setting: changes of a rule's loss (rows) by others."""
+    """Return a PNG of heat maps by setting: loss of each rule (row) beside another / alone."""
     names = list(dict.fromkeys([row.rule for row in rows] + [row.beside for row in rows]))
     cells: dict[str, dict[tuple[str, str], float]] = {}
     for row in rows:

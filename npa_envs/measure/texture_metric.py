@@ -37,7 +37,7 @@ DRAWINGS = 4
 
 @dataclass(frozen=True)
 class TextureRow:
-    """Pictures' distances from the target, divided by those of drawings of it; means over worlds.
+    """Pictures' distances from the target, over those of particles that draw it; means over worlds.
 
     `patches` are sliced Wasserstein distances of patches, `spectra` distances of oriented power
     spectra, `colours` those of co-occurring colours; `ratio` is the mean of the three.

@@ -240,7 +240,7 @@ HUGE_WORLD = 2**22
 
 
 def rollout_lists(request: KernelRequest, mean_neighbours: float) -> ListLayout:
-    """Return the lists of rollouts: more threads per particle, so that few worlds fill a GPU."""
+    """Return rollouts' `ListLayout`: more threads per particle, so that few worlds fill a GPU."""
     if request.particle_count <= SHARED_WORLD:
         capacity = 256 if int(mean_neighbours) in CROWD else 128
         tiled = choose("density", request).name == "tiles"
@@ -250,7 +250,7 @@ def rollout_lists(request: KernelRequest, mean_neighbours: float) -> ListLayout:
 
 
 def environment_lists(request: KernelRequest) -> ListLayout:
-    """Return the lists of environments: fewer threads per world, since batches fill a GPU."""
+    """Return environments' `ListLayout`: fewer threads per world, since batches fill a GPU."""
     if request.particle_count <= SMALL_WORLD:
         return ListLayout(64, lanes=1, teams=1)
     tiled = choose("density", request).name == "tiles"

@@ -122,7 +122,7 @@ class DriverLaunch:
         self._config_address = ctypes.byref(self._config)
 
     def run(self, thread_count: int, stream: int) -> bool:
-        """Launch `thread_count` threads on a stream; return False where Warp has to."""
+        """Launch `thread_count` threads on a stream; return False if Warp has to launch them."""
         other_device = torch.cuda.current_device() != self._device.index
         if self._launch is None or thread_count > MAX_THREADS or other_device:
             return False

@@ -265,7 +265,7 @@ class _SteerRows(torch.autograd.Function):
 def read_rows(
     rows: Tensor, mixing: Tensor, sizes: VectorSizes, width: int
 ) -> tuple[Tensor, Tensor]:
-    """Return `invariants` of K particles by kernels: shapes [K, mixed, D] and [K, width].
+    """Return mixed vectors [K, mixed, D] and network inputs [K, width]: `invariants` by kernels.
 
     A row is a perception vector, a one and zeros; inputs are [scalars | products | 1 | 0].
     """
@@ -289,9 +289,10 @@ def signed_gates(weight: Tensor, steering: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def steer_rows(output: Tensor, mixed: Tensor, signs: Tensor, width: int) -> Tensor:
-    """Return `steered` of K particles by kernels: updates [δ | Δs | 0], shape [K, width].
+    """Return displacements δ and state changes Δs of K particles: [δ | Δs | 0], [K, width].
 
-    `output` is [g | Δs | 0] by the weights of `signed_gates`, which also returns `signs`.
+    As `steered`, but by kernels: δ sums `mixed` vectors [K, any] times relu(gates g) and `signs`.
+    `output` is [g | Δs | 0], by the weights of `signed_gates`, which also returns `signs`.
     """
     output = output.contiguous()
     if not (torch.is_grad_enabled() and (output.requires_grad or mixed.requires_grad)):

@@ -354,7 +354,7 @@ def tracing() -> Iterator[None]:
 
 
 def is_traced() -> bool:
-    """Return whether this thread's tensors have shapes but no memory."""
+    """Return whether this thread is in a `tracing` block: its tensors have no memory."""
     return _thread.traced
 
 

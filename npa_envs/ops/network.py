@@ -109,7 +109,10 @@ def _run_network(
     mode: str,
     stored_signs: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
-    """Return outputs [K, out_width] of rows [K, width], and masks; modes: `two_layer_kernel`."""
+    """Return outputs [K, out_width] of rows [K, width], and a bit for each hidden unit: active.
+
+    There are bits if `mode` is "relu_store_mask"; "apply_mask" reads them as `stored_signs`.
+    """
     steps, tiles = -(-int(rows.shape[1]) // 16), -(-out_width // 8)
     words = 4 * -(-unit_count // SIGN_UNITS) if mode == "relu_store_mask" else 0
     signs = rows.new_empty(rows.shape[0], words, dtype=torch.int32)

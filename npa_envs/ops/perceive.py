@@ -232,7 +232,7 @@ def _perceive_rows(
 
 
 class _PerceiveRows(torch.autograd.Function):
-    """The backward pass sums over neighbours."""
+    """Autograd function of `_perceived`; its backward pass is `perceive_rows_backward`."""
 
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
@@ -274,10 +274,7 @@ def _perceived(
     rows: StaticRows | None,
     *options: Any,
 ) -> tuple[SavedPerception, Tensor]:
-    """Return the result of `_perceive_rows`: `SavedPerception`, and the particle of each row, [K].
-
-    `options` are its arguments from `masked` on.
-    """
+    """Return `_perceive_rows` of worlds, static or not; `options`: its arguments from `masked`."""
     if static is None or rows is None:
         *saved_tensors, row_particle = _perceive_rows(x, s, mask, [], *options)
         return SavedPerception(*saved_tensors), row_particle

@@ -47,7 +47,7 @@ neighbours, themselves included, int32, [E], and the end of each particle's part
 
 
 class Densities(NamedTuple):
-    """Results of the density pass, which the perception pass reads."""
+    """Result of the SPH density pass: volumes, density gradients, neighbours; for perception."""
 
     particles: Tensor
     """Sorted positions with volumes 1 / rho, shape [B N, D + 1]; empty if not asked for."""

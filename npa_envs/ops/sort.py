@@ -207,7 +207,7 @@ def mean_neighbours(particle_count: int, eps: float, box: Sequence[float] | None
 
 
 def sorts_at_once(world_count: int, particle_count: int) -> bool:
-    """Return whether one launch on a CPU sorts small worlds, whether there is a mask or not."""
+    """Return whether worlds are so small that one launch on a CPU sorts them, masked or not."""
     return world_count * world_count * particle_count <= MAX_THREAD_MASK
 
 
@@ -291,7 +291,7 @@ def _empty_worlds(plan: KernelPlan, x: Tensor, with_states: bool, with_rows: boo
 
 
 def block_capacity(request: KernelRequest, *tensors: Tensor | None) -> int:
-    """Return for how many particles the CUDA block that sorts a world is made; 0: there is none."""
+    """Return the capacity [particles] of the CUDA block that sorts a world; 0: no block does."""
     aligned = all(tensor is None or is_aligned(tensor) for tensor in tensors)
     if choose("sort", request._replace(aligned=aligned)).name != "block":
         return 0

@@ -175,7 +175,7 @@ def static_rows(
 def static_worlds(
     plan: KernelPlan, worlds: StaticWorlds, rows: StaticRows, x: Tensor, s: Tensor
 ) -> tuple[SortedWorlds, Densities]:
-    """Return a step's sorted worlds and densities: those of the rollout with the step's rows."""
+    """Return `SortedWorlds` and `Densities` of static worlds for a step with active `rows`."""
     lists = None
     if plan.lists_neighbours:
         steps, lengths, records = worlds.lists

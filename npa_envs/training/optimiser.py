@@ -76,7 +76,7 @@ class RuleOptimiser:
         self._optimisers = self._fresh_optimisers()
 
     def step(self, iteration: int, least_progress: float = 0.0) -> None:
-        """Take a step along the prepared gradients; a new repeat begins with zero moments.
+        """Step along the parameters' `grad`; each repeat of the schedule begins with zero moments.
 
         least_progress: Lower bound on the progress of the learning rate's schedule, in [0, 1].
         """

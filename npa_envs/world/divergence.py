@@ -112,7 +112,7 @@ class DivergenceWatch:
 
     @torch.no_grad()
     def check(self, worlds: Particles) -> None:
-        """Count this check; store its number and values for worlds that first diverged in it."""
+        """Keep the number of this check, and x and s, of worlds not finite for the first time."""
         values = torch.cat((worlds.x, worlds.s), dim=2)
         is_first = ~values.isfinite().all(dim=(1, 2)) & (self._first_check < 0)
         self._first_check.masked_fill_(is_first, self._checks)

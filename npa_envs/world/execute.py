@@ -392,10 +392,10 @@ def run_taped(
     steps: int,
     keep_every: int | None,
 ) -> Particles | None:
-    """Run a rollout by replaying taped steps; None: its steps must be launched.
+    """Run a rollout by replaying recorded launches; None if the caller must launch its steps.
 
-    They are launched with gradients, for large worlds, on CUDA, and in the first calls with the
-    same shapes and options.
+    Only small worlds on a CPU are replayed, without gradients, and not in the first
+    `LAUNCHED_FIRST` calls with the same shapes and options.
     """
     x, s, *_ = particles
     if (

@@ -1,4 +1,4 @@
-// Density by tiles of consecutive particles, a warp for each tile: they share candidates.
+// Density of particles, a warp for each tile of consecutive ones, for cuda/density.py.
 
 namespace npa {
 

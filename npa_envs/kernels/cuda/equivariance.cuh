@@ -1,4 +1,4 @@
-// Vectors of equivariant rules: a warp has a few rows. npa_envs/ops/equivariance.py has the formulas.
+// Vectors of equivariant rules, and their gradients, a warp for a few rows: cuda/equivariance.py.
 // Names: `x_bar` = dL/dx, the gradient of the loss L with respect to x.
 
 namespace npa {

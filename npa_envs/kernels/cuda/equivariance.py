@@ -158,7 +158,7 @@ def steering_kernels(space_dim: int, mixed_count: int, chiral: bool) -> SimpleNa
         output_bar: wp.array2d[wp.float32],
         mixed_bar: wp.array[wp.float32],
     ):
-        """Write the cotangents of outputs and mixed vectors from those of updates."""
+        """Write gradients by outputs [g | Δs] and mixed vectors, from those by updates [δ | Δs]."""
         wait_for_previous_kernel()
         pull_back_gates(output, mixed, signs, update_bar, output_bar, mixed_bar)
 

@@ -1,4 +1,4 @@
-// Neighbour lists: the density pass makes them in shared memory and writes them for perception.
+// Neighbour lists, made in shared memory by cuda/density.py and read by cuda/perceive.py.
 
 namespace npa {
 

@@ -1,6 +1,6 @@
-// Matrix products on CUDA's tensor cores of float32 numbers, each split into two of 16 bits.
+// Two-layer network and gradients of its weights on tensor cores, for kernels of cuda/network.py.
 //
-// A number is the sum of a 16-bit number and of the remainder, again in 16 bits. Of the four products
+// A float32 number is split: a 16-bit number and the remainder in 16 bits. Of the four products
 // of two such pairs the three larger ones are summed: 22 bits with float16, 16 with bfloat16. Tensor
 // cores truncate when they add, so long sums are added outside of them.
 //

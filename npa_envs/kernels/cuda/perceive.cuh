@@ -1,4 +1,4 @@
-// Slots: the parts of a block's shared memory, one for each particle's lanes.
+// Perception: slots, the lanes' shared memory for a particle, for the kernels of cuda/perceive.py.
 //
 // A slot contains a short list of neighbours: first only their indices, then each with
 // its weights; at the end, the resulting row of perception, to be written. Votes are of complete

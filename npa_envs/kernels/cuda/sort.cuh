@@ -1,4 +1,4 @@
-// A block sorts a world of up to CAPACITY particles in shared memory.
+// Sorting a world into cells by one block, in shared memory, for the kernels of cuda/sort.py.
 
 namespace npa {
 

@@ -55,7 +55,7 @@ def block_functions(capacity: int) -> SimpleNamespace:
     sizes = capacity, BLOCKS[capacity], MAX_GRID
 
     def of_block(name: str, returns: Any = None, **arguments: Any) -> Any:
-        """Return a function whose first argument is the address of the block's shared memory."""
+        """Return the C++ function `name` for Warp; it takes the block's `block_memory` first."""
         return native.function(name, *sizes, address=wp.uint64, **arguments, returns=returns)
 
     return SimpleNamespace(

@@ -1,4 +1,4 @@
-// A block's tiles in descending order of their numbers of candidates.
+// Order of a picture's tiles by descending numbers of candidates, for the kernels of errors.py.
 
 namespace npa {
 

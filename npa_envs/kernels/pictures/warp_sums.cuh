@@ -1,4 +1,4 @@
-// Values of a block's warps for some pairs, in shared memory.
+// Sums over the warps of a block, in shared memory: for the backward pass of blending.py.
 
 namespace npa {
 

@@ -33,7 +33,7 @@ def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
 
     @wp.func
     def pair_index(a: int, b: int, first: int, count: int):
-        """Return the index of the pair (a, b), b >= a + first, among pairs of `count` vectors."""
+        """Return the index of (a, b) among pairs of `count` vectors; `first` 1: without (a, a)."""
         return a * (count - first) - a * (a - 1) / 2 + b - a - first
 
     @in_ranges(ELEMENTS)

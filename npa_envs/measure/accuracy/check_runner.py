@@ -61,7 +61,7 @@ class CheckResult:
         object.__setattr__(self, "verdict", self.verdict or (default if within else "fail"))
 
     def fraction(self, name: str) -> float:
-        """Return a metric / its limit; above 1 or NaN: it fails. For the limit 0: 0 or infinite."""
+        """Return a metric / its limit; fails above 1 or at NaN. 0 / 0 is 0, others / 0 infinite."""
         value, limit = self.metrics.get(name, math.nan), self.limits[name]
         if limit == 0.0:
             return value if value == 0.0 or math.isnan(value) else math.inf

@@ -229,7 +229,7 @@ def perception_errors(
 def against_reference(
     x: Tensor, s: Tensor, box: Box, device: torch.device
 ) -> tuple[PerceptionOutcome, PerceptionOutcome]:
-    """Return the perception of worlds in float32 on a device, and by the reference in float64."""
+    """Return perception and gradients in float32 on a device, and by the reference in float64."""
     outcome = perceived(x.to(device, torch.float32), s.to(device, torch.float32), box)
     return outcome, perceived(x.cpu().double(), s.cpu().double(), box, by_reference=True)
 

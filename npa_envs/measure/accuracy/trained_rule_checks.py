@@ -200,7 +200,7 @@ def powers_of_two(most: int) -> list[int]:
 def outcome(
     start: RuleWorlds, session: CheckSession, steps: int, dtype: torch.dtype
 ) -> RolloutOutcome:
-    """Return worlds and gradients after a rollout in a dtype, on which masks do not depend."""
+    """Return worlds and gradients after a rollout in `dtype`; each dtype has the same masks."""
     rule = NPARule(**start.rule.hyper_parameters()).to(start.worlds.x.device)
     rule.load_state_dict(start.rule.state_dict())
     rule.to(dtype)

@@ -180,7 +180,7 @@ def grow(
 
 @torch.no_grad()
 def responses(trial: RuleTrial, trained: Response, *, done: int = 0) -> Iterator[Response]:
-    """Yield the response to each value of each condition, without the first `done`."""
+    """Yield losses at each value of each condition of the plan, without the first `done`."""
     every = [(name, value) for name, values in trial.plan.values.items() for value in values]
     as_trained = {"update_prob": trial.task.update_prob, "noise": 0.0, "shape": "trained"}
     for condition, value in every[done:]:
@@ -248,7 +248,7 @@ def _by_damage(records: Sequence[RuleRecord]) -> str:
 
 
 def _by_value(records: Sequence[RuleRecord], condition: str) -> str:
-    """Return a Markdown table of each rule's loss as trained, and its multiple at each value."""
+    """Return a Markdown table: rules' losses as trained; losses / these by value of `condition`."""
     values = list(
         dict.fromkeys(r.value for record in records for r in record.responses_to(condition))
     )

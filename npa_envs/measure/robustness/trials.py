@@ -97,7 +97,7 @@ CONDITIONS = {
 
 @dataclass(frozen=True, kw_only=True)
 class TrialPlan:
-    """How a rule of a task is measured."""
+    """Steps, worlds and values of conditions with which a task's rules are measured."""
 
     grow_steps: int
     """Steps from the seed to the damage, or to the loss under a condition."""
@@ -217,7 +217,7 @@ class RuleTrial:
         return max(2, round(fraction * self.particle_count))
 
     def tasks_of(self, particle_count: int) -> list[Any]:
-        """Return the tasks for a number of particles: one, or one for each picture."""
+        """Return tasks with `particle_count` particles: one, or one for each picture."""
         if particle_count not in self._tasks:
             self._tasks[particle_count] = [
                 task.resized(particle_count).for_rule(self.rule)
@@ -340,7 +340,7 @@ def pull_together(x: Tensor, s: Tensor, random: WorldRandom, box: Box) -> tuple[
 def _around(
     x: Tensor, s: Tensor, centre: Tensor, box: Box, change: Callable[..., tuple[Tensor, Tensor]]
 ) -> tuple[Tensor, Tensor]:
-    """Apply `change` to positions relative to each world's centre, in a box of nearest images."""
+    """Return x and s after `change` of offsets from each world's centre, to nearest images."""
     away, s = change(offsets_from(x, centre, box), s, centre=torch.zeros_like(centre))
     return nearest_image(away + centre[:, None], box), s
 
@@ -416,7 +416,7 @@ class LossCurve:
 
 
 def ratio(loss: float, reference: float) -> float:
-    """Return a loss divided by a reference loss; 1 if both are 0."""
+    """Return a loss divided by a reference; 0 / 0 is 1, any other number / 0 infinite."""
     if reference == 0.0:
         return 1.0 if loss == 0.0 else math.nan if math.isnan(loss) else math.inf
     return loss / reference

@@ -149,7 +149,7 @@ def synchronize(device: torch.device) -> None:
 def timed(
     run: Callable[[], object], device: torch.device, repeats: int, *, calls: int | None = None
 ) -> Timing:
-    """Return the time of a call: `repeats` readings of `calls` calls, by default `MIN_SECONDS`."""
+    """Return a call's time: up to `repeats` readings of `calls` calls, or of `MIN_SECONDS`."""
 
     def reading(count: int) -> float:
         synchronize(device)
