@@ -146,7 +146,7 @@ BUDGETS = {
     "options of npa-envs train": Budget(options_of_train, 76, 76),
     "source files": Budget(lambda: len(files(*PACKAGES, suffixes=SOURCES)), 270, 270),
     "source lines": Budget(lambda: lines(files(*PACKAGES, suffixes=SOURCES)), 59_900, 58_000),
-    "test lines": Budget(lambda: lines(files("tests")), 31_950, 32_000),
+    "test lines": Budget(lambda: lines(files("tests")), 32_000, 32_000),
     "words of docs": Budget(
         lambda: words([p for p in files("docs", suffixes=(".md",)) if p.parent.name == "docs"]),
         45_000,
