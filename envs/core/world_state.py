@@ -17,7 +17,7 @@ from npa_envs.devices import check_device
 from npa_envs.envs.core.config import WorldConfig
 from npa_envs.envs.core.task import WorldTask
 from npa_envs.errors import DivergedError, NPAError
-from npa_envs.world.divergence import MAX_REPORT, term_name
+from npa_envs.world.divergence import first_reports, term_name
 from npa_envs.world.environment_steps import Physics
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import WorldRandom
@@ -155,8 +155,9 @@ class WorldState:
 
     def divergence_error(self, diverged: NDArray[np.int64], elapsed: Tensor) -> DivergedError:
         """Return the error for worlds, by their indices; `elapsed`, [B], are all worlds' ages."""
-        physics, lines = self.physics, []
-        for world in diverged[:MAX_REPORT].tolist():
+        physics = self.physics
+
+        def describe(world: int) -> str:
             numbers = torch.cat((self.x[world], self.s[world]), dim=1)
             outside = self.x[world].abs() >= physics.limits.position
             outside = torch.cat((outside, self.s[world].abs() >= physics.limits.state), dim=1)
@@ -168,12 +169,12 @@ class WorldState:
                     f"{numbers[particle, entry].item():g} "
                     f"({int(outside.any(dim=1).sum())} such particles)"
                 )
-            lines.append(line)
-        if len(diverged) > MAX_REPORT:
-            lines.append(f"and {len(diverged) - MAX_REPORT} more worlds")
+            return line
+
+        reports = first_reports(diverged.tolist(), describe)
         return DivergedError(
             f"numbers must stay within position_limit = {physics.limits.position:g} and "
-            f"observation_limit = {physics.limits.state:g}, but left them in {'; '.join(lines)}: "
+            f"observation_limit = {physics.limits.state:g}, but left them in {'; '.join(reports)}: "
             "take smaller actions, raise the limits, or choose on_divergence='terminate' or 'reset'"
         )
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple, get_args
+from collections.abc import Callable, Sequence
+from typing import Literal, NamedTuple, TypeVar, get_args
 
 import torch
 from torch import Tensor
@@ -16,6 +17,8 @@ OnDivergence = Literal["ignore", "raise"]
 
 RUNAWAY = 1e6
 """Default limit of coordinates [length units] and states (dimensionless)."""
+
+Entry = TypeVar("Entry")
 
 MAX_REPORT = 8
 """Most worlds that a report describes; it counts the others."""
@@ -68,8 +71,8 @@ def describe_divergence(x: Tensor, s: Tensor, *, limit: float = RUNAWAY) -> str:
     """
     flags = divergence(x, s, limit=limit)
     worlds = (flags.non_finite | flags.runaway).nonzero()[:, 0].tolist()
-    lines = []
-    for world in worlds[:MAX_REPORT]:
+
+    def describe(world: int) -> str:
         values = torch.cat((x[world], s[world]), dim=1).cpu()
         bad = ~values.isfinite()
         beyond = ""
@@ -78,14 +81,20 @@ def describe_divergence(x: Tensor, s: Tensor, *, limit: float = RUNAWAY) -> str:
             beyond = f", beyond {limit:g}"
         particle, entry = bad.nonzero()[0].tolist()
         number, particles = int(bad.sum()), int(bad.any(dim=1).sum())
-        lines.append(
+        return (
             f"world {world}: {term_name(entry, x.shape[2])} of particle {particle} is "
             f"{values[particle, entry].item():g}{beyond} ({number} such "
             f"number{'s' * (number > 1)} in {particles} particle{'s' * (particles > 1)})"
         )
-    if len(worlds) > MAX_REPORT:
-        lines.append(f"and {len(worlds) - MAX_REPORT} more worlds")
-    return "\n".join(lines)
+
+    return "\n".join(first_reports(worlds, describe))
+
+
+def first_reports(diverged: Sequence[Entry], describe: Callable[[Entry], str]) -> list[str]:
+    """Return what `describe` says of the first diverged worlds, and the number of the others."""
+    others = len(diverged) - MAX_REPORT
+    count = [f"and {others} more worlds"] if others > 0 else []
+    return [describe(entry) for entry in diverged[:MAX_REPORT]] + count
 
 
 def term_name(entry: int, space_dim: int) -> str:
@@ -125,20 +134,20 @@ class DivergenceWatch:
         worlds = sorted((step, world) for world, step in enumerate(first_checks) if step >= 0)
         if not worlds:
             return
-        lines = []
-        for step, world in worlds[:MAX_REPORT]:
+
+        def describe(step_and_world: tuple[int, int]) -> str:
+            step, world = step_and_world
             values = self._values[world].cpu()
             particle, entry = (~values.isfinite()).nonzero()[0].tolist()
             when = f"in step {step}" if step > 0 else "before the first step"
-            lines.append(
+            return (
                 f"world {world}: {term_name(entry, self._space_dim)} of particle {particle} was "
                 f"{values[particle, entry].item():g} {when}"
             )
-        if len(worlds) > MAX_REPORT:
-            lines.append(f"and {len(worlds) - MAX_REPORT} more worlds")
+
         raise DivergedError(
             f"worlds must stay finite, but {len(worlds)} of {len(first_checks)} did not, "
-            f"{'; '.join(lines)}: "
+            f"{'; '.join(first_reports(worlds, describe))}: "
             "take smaller steps (dt) or states, or find such worlds with npa_envs.divergence and "
             "replace them (on_divergence='ignore')"
         )

@@ -258,8 +258,10 @@ def rollout(
     return returned_fields(after)
 
 
-PHYSICS_OPTIONS = ("eps", "box", "boundary", "dt", "position_noise")
-"""Options of a rollout that are constants of its physics, the same for all species."""
+def take_physics(options: dict[str, Any]) -> dict[str, Any]:
+    """Remove and return the constants of physics, the same for all species, of a rollout."""
+    names = ("eps", "box", "boundary", "dt", "position_noise")
+    return {name: options.pop(name) for name in names if name in options}
 
 
 def rollout_particles(
@@ -267,7 +269,7 @@ def rollout_particles(
 ) -> Particles:
     """Run a rule as `rollout`, whose options these are; return worlds with all their fields."""
     _check_rule_of_one_species(rule)
-    physics = {name: options.pop(name) for name in PHYSICS_OPTIONS if name in options}
+    physics = take_physics(options)
     constants = checked_physics(rule, worlds, update_prob=update_prob, **physics)
     box = physics.get("box")
     if rule.divides and box is not None:

@@ -17,7 +17,7 @@ from npa_envs.world.execute import Memory
 from npa_envs.world.graphed_rollouts import CudaGraph
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness
-from npa_envs.world.rollout import PHYSICS_OPTIONS, checked_physics, returned_fields, run_rules
+from npa_envs.world.rollout import checked_physics, returned_fields, run_rules, take_physics
 from npa_envs.world.steps import SpeciesSpec
 
 SpeciesPerception = Literal["shared", "per_species"]
@@ -140,7 +140,7 @@ def species_particles(
         "density_counts", particle_count if density_counts is None else density_counts, len(sizes)
     )
     divisors = [checked_positive("an entry of density_counts", count) for count in divisors]
-    physics = {name: options.pop(name) for name in PHYSICS_OPTIONS if name in options}
+    physics = take_physics(options)
     constants = [
         checked_physics(rule, worlds, update_prob=probability, **physics)
         for rule, probability in zip(species_rules, probabilities, strict=True)
