@@ -22,8 +22,8 @@ from npa_envs.world.environment_steps import (
 )
 from npa_envs.world.particles import Particles
 
-FLAG_ROWS = 5
-"""Rows of flags in a report: the four of `StepReport.endings`, and `all_worlds`."""
+FLAG_ROWS = 2
+"""Rows of float32 in a report whose bytes are the eight rows of `StepReport.flags`."""
 
 
 def total(terms: Tensor) -> Tensor:
@@ -65,30 +65,30 @@ class StepReport(NamedTuple):
     """Rewards, losses and flags of each world, as views of one buffer that is copied at once."""
 
     buffer: Tensor
-    """The memory of the fields below, uint8."""
+    """The memory of the fields below, float32, shape [rows, B]."""
     numbers: Tensor
     """Reward, loss, its terms and their decreases, float32, shape [2 + 2 terms, B]."""
-    endings: Tensor
-    """Terminated, truncated, success, diverged, bool, shape [4, B]."""
-    all_worlds: Tensor
-    """True for every world, bool, shape [B]: the mask of infos that all worlds have."""
+    flags: Tensor
+    """Terminated, truncated, success, diverged, True, and unused rows, bool, shape [8, B]."""
 
     @classmethod
     def empty(cls, world_count: int, term_count: int, device: torch.device) -> StepReport:
         """Return a `StepReport` of zeros, for B worlds whose loss has some terms."""
-        rows = 4 * (2 + 2 * term_count) + FLAG_ROWS
-        buffer = torch.zeros(rows * world_count, dtype=torch.uint8, device=device)
-        report = cls.from_buffer(buffer, world_count)
-        report.all_worlds.fill_(True)
+        rows = 2 + 2 * term_count + FLAG_ROWS
+        report = cls.from_buffer(torch.zeros(rows, world_count, device=device, dtype=torch.float32))
+        report.flags[4].fill_(True)
         return report
 
     @classmethod
-    def from_buffer(cls, buffer: Tensor, world_count: int) -> StepReport:
-        """Return a `StepReport` whose tensors are views of `buffer`, uint8."""
-        numbers, flags = buffer.view(-1, world_count).tensor_split((-FLAG_ROWS,))
-        numbers = numbers.flatten().view(torch.float32).view(-1, world_count)
-        flags = flags.view(torch.bool)
-        return cls(buffer, numbers, flags[:-1], flags[-1])
+    def from_buffer(cls, buffer: Tensor) -> StepReport:
+        """Return a `StepReport` whose tensors are views of `buffer`, float32."""
+        flags = buffer[-FLAG_ROWS:].view(torch.bool).view(-1, buffer.shape[1])
+        return cls(buffer, buffer[:-FLAG_ROWS], flags)
+
+    @property
+    def endings(self) -> Tensor:
+        """Terminated, truncated, success, diverged, bool, shape [4, B]."""
+        return self.flags[:4]
 
     @property
     def named(self) -> StepNumbers:
@@ -97,11 +97,11 @@ class StepReport(NamedTuple):
 
     def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
         # Unpickled views would not share the buffer's memory.
-        return StepReport.from_buffer, (self.buffer, len(self.all_worlds))
+        return StepReport.from_buffer, (self.buffer,)
 
     def copy(self) -> StepReport:
         """Return a copy of the report, which later steps do not overwrite."""
-        return self.from_buffer(self.buffer.clone(), len(self.all_worlds))
+        return self.from_buffer(self.buffer.clone())
 
 
 class WorldEpisodes:

@@ -209,8 +209,9 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
         worlds = self.worlds
         report = worlds.episodes.report.copy() if copy else worlds.episodes.report
         rows = self._report_rows(report)
-        terminated, truncated, success, diverged = self._out(report.endings)
-        all_worlds = self._out(report.all_worlds if copy else report.all_worlds.clone())
+        terminated, truncated, success, diverged, all_worlds, *_ = unbound(self._out(report.flags))
+        if not copy:
+            all_worlds = self._out(report.flags[4].clone())
         which = all_worlds if stepped is None else self._mask(stepped)
         of_all = self.losses_of(rows) | self._returned_values(worlds.extra_info(), copy=copy)
         of_step = self._improvements(rows) | {"success": success, "diverged": diverged}
@@ -221,14 +222,19 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
     def _returned_values(self, values: dict[str, Tensor], *, copy: bool = True) -> dict[str, Any]:
         return {n: self._out(v.clone() if copy else v) for n, v in values.items()}
 
-    def _report_rows(self, report: StepReport) -> list[Any]:
+    def _report_rows(self, report: StepReport) -> Sequence[Any]:
         """Return rewards, losses, terms, their decreases, [B] each: tensors or float64 arrays."""
         rows = self._out(report.numbers)
-        return list(rows if isinstance(rows, Tensor) else rows.astype(np.float64))
+        return unbound(rows if isinstance(rows, Tensor) else rows.astype(np.float64))
 
     def _mask(self, mask: NDArray[np.bool_]) -> Any:
         """Return a copy of a mask of worlds as array or tensor, as `output` says."""
         return self._out(mask.copy())
+
+
+def unbound(values: Any) -> Sequence[Any]:
+    """Return the rows of an array or tensor; `list` of a tensor takes longer than `unbind`."""
+    return values.unbind() if isinstance(values, Tensor) else list(values)
 
 
 def with_masks(values: dict[str, Any], which: Any) -> dict[str, Any]:
