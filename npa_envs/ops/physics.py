@@ -140,7 +140,7 @@ class Physics(NamedTuple):
 
     def scale(self) -> float:
         """Return c = eps / eps0, the factor on perceived gradients."""
-        return constant(self.eps / self.eps0)
+        return self.eps / self.eps0
 
     def constants(self) -> Physics:
         """Return a copy whose numbers torch.compile takes for constants."""
