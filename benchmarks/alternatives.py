@@ -32,7 +32,7 @@ from torch import Tensor
 
 from npa_envs import reference
 from npa_envs.atomic_files import read_json, write_bytes, write_text
-from npa_envs.devices import check_device
+from npa_envs.checks import check_device
 from npa_envs.errors import NPAError, shown
 from npa_envs.measure.plots import new_figure, number_plainly, png
 from npa_envs.measure.quality import psnr

@@ -13,7 +13,7 @@ import torch
 from scripts import script_parser
 from torch import Tensor
 
-from npa_envs.devices import check_device
+from npa_envs.checks import check_device
 from npa_envs.measure.benchmark_records import table_text
 from npa_envs.measure.speed.suites import PROFILED
 from npa_envs.measure.speed.timing import TimingSession, Workload

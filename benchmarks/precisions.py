@@ -16,7 +16,7 @@ from scripts import script_parser
 from torch import Tensor
 from torch.nn import functional
 
-from npa_envs.devices import check_device
+from npa_envs.checks import check_device
 from npa_envs.ops.equivariance import invariants, steered
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.folded_network import without_small

@@ -28,7 +28,7 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
-from npa_envs.devices import check_device
+from npa_envs.checks import check_device
 from npa_envs.training import Trainer, preset, task_entry
 from npa_envs.training.process_group import ALONE, ProcessGroup
 from npa_envs.training.process_launcher import joined_processes

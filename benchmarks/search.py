@@ -26,7 +26,7 @@ from scripts import script_facts, script_parser
 from npa_envs.agents.search.candidates import SearchWorld
 from npa_envs.agents.search.quality_diversity import METHODS, RESULTS, Growth, Search, tried_again
 from npa_envs.atomic_files import read_json, write_bytes
-from npa_envs.devices import check_device
+from npa_envs.checks import check_device
 from npa_envs.measure.benchmark_records import markdown_table, write_record
 from npa_envs.measure.plots import draw_band, legend_of, new_figure, png
 

@@ -15,8 +15,7 @@ import gymnasium
 import torch
 
 from npa_envs.agents.learning.species_env import ConcatenatedSpeciesEnv
-from npa_envs.checks import check_positive, is_whole
-from npa_envs.devices import check_device
+from npa_envs.checks import check_device, check_positive, is_whole
 from npa_envs.envs.core.config import EnvConfig, Interface
 from npa_envs.envs.core.task import Controls, EnvTask
 from npa_envs.envs.core.vector import NPAVectorEnv

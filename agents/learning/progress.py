@@ -17,8 +17,7 @@ from npa_envs.agents.evaluation import checked_seeds, evaluate_policy
 from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.learning.rule_set import RuleSet
 from npa_envs.atomic_files import json_text, write_text
-from npa_envs.checks import check_count, check_positive
-from npa_envs.devices import check_device
+from npa_envs.checks import check_count, check_device, check_positive
 from npa_envs.errors import DivergedError, NPAError, shown
 from npa_envs.training.checkpoint import check_entries, unusable_checkpoint
 from npa_envs.training.optimiser import load_moments

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from npa_envs.checks import (
     MomentInverse,
+    check_device,
     check_field,
     check_flag,
     check_fraction,
@@ -20,7 +21,6 @@ from npa_envs.checks import (
     check_word,
     is_real,
 )
-from npa_envs.devices import check_device
 from npa_envs.errors import NPAError, UnknownKeywordError, shown, suggest
 from npa_envs.render import STYLES
 from npa_envs.world.environment_steps import Boundary, Limits, Physics, Terms

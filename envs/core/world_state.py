@@ -12,8 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.checks import number_tensor
-from npa_envs.devices import check_device
+from npa_envs.checks import check_device, number_tensor
 from npa_envs.envs.core.config import WorldConfig
 from npa_envs.envs.core.task import WorldTask
 from npa_envs.errors import DivergedError, NPAError

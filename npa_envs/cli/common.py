@@ -61,7 +61,7 @@ class DeviceOptions:
 
     def checked_device(self) -> torch.device:
         """Return `device`; raise NPAError if this machine has no such device."""
-        from npa_envs.devices import check_device
+        from npa_envs.checks import check_device
 
         return check_device(self.device)
 

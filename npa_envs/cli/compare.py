@@ -275,7 +275,7 @@ def _jobs(options: CompareOptions) -> int:
 
 def _settings(options: CompareOptions) -> dict[str, Any]:
     """Return the record's entries on machine, versions and CPU threads."""
-    from npa_envs.devices import check_device
+    from npa_envs.checks import check_device
     from npa_envs.measure.benchmark_records import installed_version, machine, measured_facts
 
     devices = [check_device(name) for name in (options.devices or (options.device,))]

@@ -13,7 +13,7 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from npa_envs.devices import check_device
+from npa_envs.checks import check_device
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.measure.texture_metric import TextureMetric, TextureRow
 from npa_envs.rule.files import shipped_rules

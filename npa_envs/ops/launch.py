@@ -296,12 +296,12 @@ def _described(kernel: Any, size: tuple[int, ...]) -> Launch:
 
 
 class _ThreadState(threading.local):
-    """A thread's prepared launches, and whether it tapes or traces launches."""
+    """A thread's prepared launches, and whether it records or traces launches."""
 
     def __init__(self) -> None:
         self.by_kernel: dict[tuple[Any, torch.device, int], _PreparedLaunch] = {}
-        self.tape: Tape | None = None
-        """The tape of this thread's launches, if any."""
+        self.recording: RecordedLaunches | None = None
+        """What this thread's launches are appended to, if it records them."""
         self.traced = False
         """Whether tensors have no memory, so that nothing is launched."""
 
@@ -329,8 +329,8 @@ def launch(
         return
     for noted in _observers:
         noted.append(_described(kernel, size))
-    if _thread.tape is not None:
-        _thread.tape.add(kernel, size, device, *arguments, block_dim=block_dim).run(size)
+    if _thread.recording is not None:
+        _thread.recording.add(kernel, size, device, *arguments, block_dim=block_dim).run(size)
         return
     if kernel in MIN_RANGES:
         arguments = (0, *arguments)
@@ -369,12 +369,12 @@ def aligned(tensor: Tensor) -> Tensor:
     return tensor if is_aligned(tensor) else tensor.clone()
 
 
-def is_taped() -> bool:
-    """Return whether this thread's launches are put on a tape."""
-    return _thread.tape is not None
+def is_recording() -> bool:
+    """Return whether this thread records its launches."""
+    return _thread.recording is not None
 
 
-class Tape:
+class RecordedLaunches:
     """A sequence of launches that is replayed on the same tensors in the same memory."""
 
     def __init__(self) -> None:
@@ -402,11 +402,11 @@ class Tape:
     @contextlib.contextmanager
     def recording(self) -> Iterator[None]:
         """Make this thread's launches in the block, and append them."""
-        _thread.tape, before = self, _thread.tape
+        _thread.recording, before = self, _thread.recording
         try:
             yield
         finally:
-            _thread.tape = before
+            _thread.recording = before
 
     def __len__(self) -> int:
         """Return the number of launches."""

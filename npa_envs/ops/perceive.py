@@ -24,7 +24,7 @@ from npa_envs.checks import (
 )
 from npa_envs.ops.backend import environment_lists
 from npa_envs.ops.custom_op import check_derivatives, custom_op, once_differentiable
-from npa_envs.ops.launch import Tape, is_aligned, launch
+from npa_envs.ops.launch import RecordedLaunches, is_aligned, launch
 from npa_envs.ops.perception_passes import (
     SavedPerception,
     compute_densities,
@@ -414,7 +414,7 @@ class NeighbourState:
         self._shape = *x.shape[:2], physics.perception_dim
         self._like = x
         self._perceived = False
-        self._tape: Tape | None = None
+        self._recorded: RecordedLaunches | None = None
 
     def perceive(self, out: Tensor | None = None) -> Tensor:
         """Return every particle's perception, clipped to `Limits.perception`, shape [B, N, P].
@@ -426,16 +426,16 @@ class NeighbourState:
             out = self._like.new_empty(self._shape)
         rows = out.view(-1, self._shape[-1])
         if not self._perceived:
-            # Many worlds are perceived once: a tape would cost more than it saves.
+            # Many worlds are perceived once: recorded launches would cost more than they save.
             self._perceived = True
             launch(*self._launch_of(rows))
             return out
         layout = rows.shape, rows.dtype, rows.device, rows.is_contiguous()
-        if self._tape is None:
-            self._tape, self._layout = Tape(), layout
-            self._tape.add(*self._launch_of(rows))
-            self._slots = self._tape.argument_slots(rows)
+        if self._recorded is None:
+            self._recorded, self._layout = RecordedLaunches(), layout
+            self._recorded.add(*self._launch_of(rows))
+            self._slots = self._recorded.argument_slots(rows)
         assert layout == self._layout, "only the address may change"
-        self._tape.move(self._slots, rows)
-        self._tape.replay()
+        self._recorded.move(self._slots, rows)
+        self._recorded.replay()
         return out

@@ -22,7 +22,7 @@ from npa_envs.ops.backend import (
     multiprocessor_count,
     rollout_lists,
 )
-from npa_envs.ops.launch import SCALARS, channel_width, is_aligned, is_taped, launch
+from npa_envs.ops.launch import SCALARS, channel_width, is_aligned, is_recording, launch
 from npa_envs.ops.physics import Physics
 
 MAX_INDEX = 2**31 - 1
@@ -229,7 +229,7 @@ def sort_worlds(
     if plan.runs("sort") == "world" and earlier <= MAX_THREAD_MASK:
         _sort_by_threads(plan, x, s, mask, ordered)
         return ordered
-    assert not is_taped(), "a tape would miss torch's operations between these launches"
+    assert not is_recording(), "torch's operations between these launches would not be recorded"
     kernels = sort_kernels(plan.space_dim, plan.scalar, plan.width)
     device, total = x.device, plan.total
     cell, arrival = torch.empty(2, total, dtype=torch.int32, device=device).unbind()

@@ -22,7 +22,7 @@ from npa_envs.kernels.portable.update import (
     update_kernels,
 )
 from npa_envs.ops.custom_op import check_derivatives, custom_op, once_differentiable
-from npa_envs.ops.launch import SCALARS, Tape, is_aligned, launch
+from npa_envs.ops.launch import SCALARS, RecordedLaunches, is_aligned, launch
 from npa_envs.ops.perceive import Rows
 from npa_envs.ops.physics import Physics
 from npa_envs.ops.sort import MAX_INDEX
@@ -314,13 +314,13 @@ class PreparedActions:
         self._buffer = worlds.s.new_zeros(*worlds.s.shape[:2], physics.action_dim)
         self._worlds = worlds
         self._physics = physics
-        self._tape: Tape | None = None
+        self._recorded: RecordedLaunches | None = None
         self._action_slots: Any = None
         worlds.check(self._buffer, physics)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out the tape, which cannot be pickled."""
-        return self.__dict__ | {"_tape": None, "_action_slots": None}
+        """Leave out the recorded launches, which cannot be pickled."""
+        return self.__dict__ | {"_recorded": None, "_action_slots": None}
 
     def __call__(self, action: Tensor) -> None:
         """Apply actions, shape [B, N, A], of any dtype, on any device."""
@@ -350,13 +350,13 @@ class PreparedActions:
         self._run(self._buffer)
 
     def _run(self, action: Tensor) -> None:
-        if self._tape is None:
-            self._tape = Tape()
+        if self._recorded is None:
+            self._recorded = RecordedLaunches()
             x, s = self._worlds[:2]
             threads = -(-action.numel() // VALUES_PER_THREAD)
             check = flag_not_finite(SCALARS[x.dtype])
-            self._tape.add(check, threads, x.device, threads, action, self._worlds.enabled)
-            self._tape.add(*self._worlds.launch_of(action, self._physics, is_aligned(s)))
-            self._action_slots = self._tape.argument_slots(action)
-        self._tape.move(self._action_slots, action)
-        self._tape.replay()
+            self._recorded.add(check, threads, x.device, threads, action, self._worlds.enabled)
+            self._recorded.add(*self._worlds.launch_of(action, self._physics, is_aligned(s)))
+            self._action_slots = self._recorded.argument_slots(action)
+        self._recorded.move(self._action_slots, action)
+        self._recorded.replay()

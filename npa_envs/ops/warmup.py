@@ -8,8 +8,7 @@ from typing import Any
 
 import torch
 
-from npa_envs.checks import DTYPES, as_list
-from npa_envs.devices import check_device
+from npa_envs.checks import DTYPES, as_list, check_device
 from npa_envs.errors import NPAError, shown
 from npa_envs.ops.backend import SHARED_WORLD
 from npa_envs.ops.draws import draw

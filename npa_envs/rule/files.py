@@ -20,7 +20,7 @@ from safetensors.torch import save as serialise
 from torch import Tensor
 
 from npa_envs.atomic_files import checked_path, open_regular, parse_json, read_bytes, write_bytes
-from npa_envs.devices import check_device
+from npa_envs.checks import check_device
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.rule.paper_formats import (
     ZIP_MARK,

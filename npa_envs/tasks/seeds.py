@@ -5,8 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from npa_envs.checks import DTYPES, as_list, checked_count, checked_finite
-from npa_envs.devices import check_device
+from npa_envs.checks import DTYPES, as_list, check_device, checked_count, checked_finite
 from npa_envs.errors import NPAError, shown
 from npa_envs.ops.sort import MAX_INDEX
 from npa_envs.world.randomness import (

@@ -22,8 +22,8 @@ from npa_envs.checks import (
     check_word,
     is_real,
     is_whole,
+    parse_device,
 )
-from npa_envs.devices import parse_device
 from npa_envs.errors import NPAError, shown
 from npa_envs.world.rollout import Memory
 

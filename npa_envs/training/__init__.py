@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
-from npa_envs.devices import check_device
+from npa_envs.checks import check_device
 from npa_envs.errors import DivergedError, NPAError, shown
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import ParticleTask, PictureTask, Task

@@ -17,8 +17,7 @@ from torch import nn
 from tqdm import tqdm
 
 from npa_envs.atomic_files import write_text
-from npa_envs.checks import is_real
-from npa_envs.devices import check_device
+from npa_envs.checks import check_device, is_real
 from npa_envs.errors import DivergedError, NPAError, shown
 from npa_envs.rule.files import load_rule, preset_rules, rule_like, save_rule
 from npa_envs.rule.rule import NPARule, with_codes, with_division

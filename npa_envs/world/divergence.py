@@ -99,9 +99,8 @@ def first_reports(diverged: Sequence[Entry], describe: Callable[[Entry], str]) -
 
 def term_name(entry: int, space_dim: int) -> str:
     """Return the name of number `entry` of a particle's D coordinates and then C channels."""
-    if entry < space_dim:
-        return f"positions coordinate {entry}"
-    return f"states channel {entry - space_dim}"
+    is_position = entry < space_dim
+    return f"positions coordinate {entry}" if is_position else f"states channel {entry - space_dim}"
 
 
 class DivergenceWatch:
@@ -132,19 +131,17 @@ class DivergenceWatch:
         """Raise an error that says when and where worlds diverged, if any; waits for the device."""
         first_checks = self._first_check.tolist()
         worlds = sorted((step, world) for world, step in enumerate(first_checks) if step >= 0)
-        if not worlds:
-            return
 
         def describe(step_and_world: tuple[int, int]) -> str:
             step, world = step_and_world
             values = self._values[world].cpu()
             particle, entry = (~values.isfinite()).nonzero()[0].tolist()
             when = f"in step {step}" if step > 0 else "before the first step"
-            return (
-                f"world {world}: {term_name(entry, self._space_dim)} of particle {particle} was "
-                f"{values[particle, entry].item():g} {when}"
-            )
+            name, number = term_name(entry, self._space_dim), values[particle, entry].item()
+            return f"world {world}: {name} of particle {particle} was {number:g} {when}"
 
+        if not worlds:
+            return
         raise DivergedError(
             f"worlds must stay finite, but {len(worlds)} of {len(first_checks)} did not, "
             f"{'; '.join(first_reports(worlds, describe))}: "

@@ -1,38 +1,26 @@
-"""Execution of rollouts: resting worlds, CUDA graph, CPU tape or loop, with the same results."""
+"""Execution of rollouts: by CUDA graphs, recorded launches or a loop, with the same results."""
 
 from __future__ import annotations
 
-import dataclasses
-import threading
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
-from torch.utils._python_dispatch import is_in_torch_dispatch_mode
 from torch.utils.checkpoint import checkpoint
 
 from npa_envs.checks import check_finite_positions
 from npa_envs.errors import NPAError
-from npa_envs.ops.launch import Tape
 from npa_envs.ops.physics import Physics
-from npa_envs.ops.sort import sorts_at_once
-from npa_envs.rule.folded_network import Network
 from npa_envs.rule.rule import NPARule
 from npa_envs.world.cuda_graph import draws_alone
 from npa_envs.world.divergence import DivergenceWatch
-from npa_envs.world.graphed_rollouts import (
-    LAUNCHED_FIRST,
-    CallGroups,
-    CudaGraph,
-    run_captured,
-)
+from npa_envs.world.graphed_rollouts import CudaGraph, run_captured
 from npa_envs.world.particles import Particles, combined
 from npa_envs.world.randomness import Randomness
-from npa_envs.world.rule_settings import rule_form
+from npa_envs.world.recorded_rollout import run_recorded
 from npa_envs.world.steps import (
     DivisionStep,
-    Draws,
     RuleStep,
     SpeciesSpec,
     SpeciesStep,
@@ -52,15 +40,8 @@ MIN_STATIC = 3
 MIN_RESTING = 256
 """Fewest steps of a rollout that is checked for worlds at rest."""
 
-MAX_TAPED_PARTICLES = 4096
-"""Most particles of a batch whose steps are on a tape: in larger ones kernels take most time."""
-
-MAX_TAPED_GROUPS = 32
-"""Most groups of calls whose tapes are cached."""
-
 FIRST_PART = {"cpu": 64, "cuda": 1024}
-"""Steps until the first check for resting worlds, by device; each further part is twice as long. A
-GPU idles during a check."""
+"""Steps until the first check for resting worlds, by device; each later part has twice as many."""
 
 
 class RolloutSpec(NamedTuple):
@@ -104,12 +85,12 @@ class RolloutSpec(NamedTuple):
         generator: Randomness | None,
         watch: DivergenceWatch | None = None,
     ) -> Particles:
-        """Launch the rollout of checked worlds: from a tape on a CPU, step by step otherwise."""
+        """Launch the rollout of checked worlds: recorded ones on a CPU, else step by step."""
         step = self.make_step(rules, particles)
         if type(step) is RuleStep and watch is None:
-            taped = run_taped(step, particles, generator, self.steps, self.keep_every)
-            if taped is not None:
-                return taped
+            replayed = run_recorded(step, particles, generator, self.steps, self.keep_every)
+            if replayed is not None:
+                return replayed
         # Worlds keep their dtype under autocast, as kernels read the rules' outputs.
         with torch.autocast(particles.x.device.type, enabled=False):
             after = self._launch_steps(step, rules, particles, generator, watch)
@@ -309,124 +290,3 @@ def _can_rest(spec: RolloutSpec, rules: Sequence[NPARule], x: Tensor) -> bool:
         and not torch.compiler.is_compiling()
         and not (x.is_cuda and torch.cuda.is_current_stream_capturing())
     )
-
-
-# Small worlds on a CPU: a step takes some 50 µs in kernels and several times as much in Python, for
-# checks, memory and arguments of launches. From the third call with the same shapes and options on,
-# a rollout without gradients replays launches from a tape, which go back and forth between two
-# buffers. The same kernels run on the same numbers, as in captured rollouts on CUDA.
-
-
-class _TapedStep:
-    """A tape of the launches of one step, which reads one buffer of worlds and writes another.
-
-    While the tape is recorded, this object is called in place of the network.
-    """
-
-    def __init__(self, step: RuleStep, particles: Particles, mask: Tensor | None) -> None:
-        assert step.network is not None
-        self.row_width = step.network.row_width
-        self._update_width = step.network.update_width
-        self.tape = Tape()
-        stand_in: Any = self
-        with self.tape.recording():
-            step = dataclasses.replace(step, network=stand_in)
-            self.after = step.advance(particles, Draws(mask, None))
-        self.slots = self.tape.argument_slots(self._updates)
-
-    def __call__(self, rows: Tensor) -> Tensor:
-        """Store the network's input rows, [B N, row_width], and where on the tape it runs."""
-        self.rows = rows
-        self.split = len(self.tape)
-        self._updates = rows.new_zeros(len(rows), self._update_width)
-        return self._updates
-
-
-class TapedSteps:
-    """Two taped steps of worlds of one shape: from a first buffer to a second one, and back."""
-
-    def __init__(self, step: RuleStep, particles: Particles) -> None:
-        # With all particles active there is a row for each.
-        masked = step.physics.update_prob < 1.0
-        self._mask = torch.ones(particles.x.shape[:2], dtype=torch.uint8) if masked else None
-        # Contiguous: a copy that a step would have to make is not on the tape.
-        first = particles.map(lambda value: value.clone(memory_format=torch.contiguous_format))
-        there = _TapedStep(step, first, self._mask)
-        back = _TapedStep(step, there.after, self._mask)
-        for old, new in zip(back.after.tensors(), first.tensors(), strict=True):
-            back.tape.move(back.tape.argument_slots(old), new)
-        self._buffers = first, there.after
-        self._steps = there, back
-
-    def run(
-        self, network: Network, particles: Particles, masks: Iterable[Tensor | None], every: int
-    ) -> list[Particles]:
-        """Step worlds once with each update mask; return copies after `every` steps each."""
-        self._buffers[0].copy_(particles)
-        trajectory: list[Particles] = []
-        for number, mask in enumerate(masks):
-            step = self._steps[number % 2]
-            count = len(step.rows)
-            if self._mask is not None and mask is not None:
-                self._mask.copy_(mask)
-                count = max(int(mask.sum()), 1)
-            step.tape.replay(0, step.split, last_count=count)
-            # Kept alive until the launch has read it.
-            updates = network(step.rows[:count])
-            step.tape.move(step.slots, updates)
-            step.tape.replay(step.split)
-            if (number + 1) % every == 0:
-                trajectory.append(self._buffers[(number + 1) % 2].map(torch.clone))
-        return trajectory
-
-
-_groups = CallGroups()
-
-_groups_lock = threading.Lock()
-
-
-def run_taped(
-    step: RuleStep,
-    particles: Particles,
-    generator: Randomness | None,
-    steps: int,
-    keep_every: int | None,
-) -> Particles | None:
-    """Run a rollout by replaying recorded launches; None if the caller must launch its steps.
-
-    Only small worlds on a CPU are replayed, without gradients, and not in the first
-    `LAUNCHED_FIRST` calls with the same shapes and options.
-    """
-    x, s, *_ = particles
-    if (
-        torch.compiler.is_compiling()
-        or torch.is_grad_enabled()
-        or x.device.type != "cpu"
-        or x.shape[0] * x.shape[1] > MAX_TAPED_PARTICLES
-        or step.network is None
-        or step.physics.position_noise > 0.0
-        or steps == 0
-        or not sorts_at_once(*x.shape[:2])
-        or type(x) is not Tensor
-        or type(s) is not Tensor
-        or is_in_torch_dispatch_mode()
-    ):
-        return None
-    key = (step.physics, rule_form(step.rule), x.shape, s.shape[2], x.dtype)
-    with _groups_lock:
-        group = _groups.count(key, MAX_TAPED_GROUPS)
-    if group.calls <= LAUNCHED_FIRST:
-        return None
-    # Another thread may have taken the last one in the meantime.
-    try:
-        taped = group.free.pop()
-    except IndexError:
-        with torch.inference_mode(False), torch.no_grad():
-            taped = TapedSteps(step, particles)
-    masks = (draws.mask for draws in step.draw(x, steps, generator))
-    try:
-        with torch.autocast("cpu", enabled=False):
-            trajectory = taped.run(step.network, particles, masks, keep_every or steps)
-    finally:
-        group.free.append(taped)
-    return trajectory[0] if keep_every is None else combined(torch.stack, trajectory)

@@ -158,16 +158,15 @@ def _run_and_compare(call: RolloutCall, group: CallGroup, use: CaptureUse) -> Pa
 
 
 class CallGroup:
-    """Calls with the same shapes and options: their number, and their captures or tapes."""
+    """Calls with the same shapes and options: their number, and captures or recorded steps."""
 
     def __init__(self) -> None:
-        self.calls = 0
+        self.calls, self.failed_captures = 0, 0
+        # Captures, or recorded steps, that are not in use.
         self.free: collections.deque[Any] = collections.deque()
-        """Captures, or taped steps, that are not in use."""
         self.captures: list[CapturedRollout] = []
-        self.failed_captures = 0
+        # Whether calls of this group cannot be captured.
         self.launched_only = False
-        """Whether calls of this group cannot be captured."""
 
 
 class CallGroups(collections.OrderedDict[Hashable, CallGroup]):
@@ -264,7 +263,7 @@ def _reserve_capture(group: CallGroup, call: RolloutCall) -> CaptureUse | None:
 def _make_room(device: torch.device) -> bool:
     """Delete captures until a device has room for another; return whether it has."""
     limit = MEMORY_FRACTION * torch.cuda.get_device_properties(device).total_memory
-    for key in list(_groups)[:-1]:
+    for key in [*_groups][:-1]:
         if captured_memory(device) < limit:
             break
         if any(other.device == device for other in _groups[key].captures):

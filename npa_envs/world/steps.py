@@ -31,14 +31,11 @@ from npa_envs.world.randomness import (
     uniform_draws,
 )
 
-ROWS_TOGETHER = 2**24
-"""Most rows of static worlds that are assigned at once, for several steps."""
-
-ROWS_KEPT = 2**24
-"""Most rows of perception that are stored for the network at once."""
+MAX_STORED_ROWS = 2**24
+"""Maximum number of rows of perception, or of assigned rows of static worlds, stored at once."""
 
 MAX_AHEAD = 4
-"""Most steps whose random draws a CUDA graph makes in advance: they take memory."""
+"""Maximum number of steps whose random numbers a CUDA graph draws ahead, as these take memory."""
 
 OVERFLOW_LOG_PROBABILITY = 34.5
 """Row capacities suffice with probability 1 - exp(-34.5), about 1 - 1e-15, for each step."""
@@ -188,7 +185,7 @@ class RuleStep(Step):
         network = self.network or rule
         width = self.network.row_width if self.network else rule.perception_dim
         total = row_count(mask, x, physics.update_prob) if rows is None else len(rows.row_particle)
-        huge = total > ROWS_KEPT and not torch.is_grad_enabled() and self.static is None
+        huge = total > MAX_STORED_ROWS and not torch.is_grad_enabled() and self.static is None
         if huge and not torch.compiler.is_compiling():
             update, active = updates_in_parts(x, s, physics, mask, network.__call__, total, width)
         else:
@@ -224,7 +221,7 @@ class StaticStep(RuleStep):
         """Yield each step's draws; few launches assign the rows of several steps together."""
         total = like.shape[0] * like.shape[1]
         physics = self.physics
-        together = max(min(16, ROWS_TOGETHER // total), 1)
+        together = max(min(16, MAX_STORED_ROWS // total), 1)
         for first in range(0, steps, together):
             count = min(together, steps - first)
             drawn = [draw_step(like, physics, generator) for _ in range(count)]

@@ -35,7 +35,6 @@ LAYERS = {
     "npa_envs.errors": Layer(0),
     "npa_envs.registration": Layer(0, "gymnasium"),
     "npa_envs.checks": Layer(1, "torch"),
-    "npa_envs.devices": Layer(1, "torch"),
     "npa_envs.atomic_files": Layer(1),
     "npa_envs.thread_lock": Layer(0),
     "npa_envs.runtime": Layer(1, "warp"),

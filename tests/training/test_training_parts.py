@@ -9,7 +9,7 @@ from support.circle_task import CircleTask, circle_config, plain_rollout
 from support.refusals import Trap, refused
 from torch import nn
 
-from npa_envs.devices import check_device, parse_device
+from npa_envs.checks import check_device, parse_device
 from npa_envs.rule.rule import NPARule, fate_parameters
 from npa_envs.training.checkpoint import load_checkpoint, save_checkpoint
 from npa_envs.training.cycle import WorldPool

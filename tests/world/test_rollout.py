@@ -238,7 +238,7 @@ def test_rows_some_at_a_time_give_the_same_worlds(monkeypatch, device, box, upda
 
     # The check of each step takes the steps that are launched one by one.
     expected = grown(on_divergence="raise")
-    monkeypatch.setattr(sys.modules["npa_envs.world.steps"], "ROWS_KEPT", 100)
+    monkeypatch.setattr(sys.modules["npa_envs.world.steps"], "MAX_STORED_ROWS", 100)
     monkeypatch.setattr(sys.modules["npa_envs.ops.perceive"], "ROWS_TOGETHER", 96)
     for ours, theirs in zip(grown(on_divergence="raise"), expected, strict=True):
         torch.testing.assert_close(ours, theirs, rtol=1e-5, atol=1e-6)

@@ -52,7 +52,7 @@ def one_by_one(rule, x, s, **options):
 
 @torch.no_grad()
 def repeated(rule, x, s, *, generator, **options):
-    """The last of several calls, which is taped on a CPU and recorded on CUDA."""
+    """The last of several calls, which is recorded on a CPU and captured on CUDA."""
     state = generator.get_state()
     for _ in range(4):
         generator.set_state(state)

@@ -1,0 +1,146 @@
+"""On a CPU, repeated rollouts of small worlds replay recorded launches.
+
+In a step of such worlds Python takes several times as long as kernels. From the third call with the
+same shapes and options on, a rollout without gradients replays the launches of two steps, which go
+back and forth between two buffers.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+from collections.abc import Iterable
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import is_in_torch_dispatch_mode
+
+from npa_envs.ops.launch import RecordedLaunches
+from npa_envs.ops.sort import sorts_at_once
+from npa_envs.rule.folded_network import Network
+from npa_envs.world.graphed_rollouts import LAUNCHED_FIRST, CallGroups
+from npa_envs.world.particles import Particles, combined
+from npa_envs.world.randomness import Randomness
+from npa_envs.world.rule_settings import rule_form
+from npa_envs.world.steps import Draws, RuleStep
+
+MAX_RECORDED_PARTICLES = 4096
+"""Maximum number of particles of a batch; the steps of larger ones take most time in kernels."""
+
+MAX_RECORDED_GROUPS = 32
+"""Maximum number of groups of calls whose launches are kept."""
+
+
+class _RecordedStep:
+    """The recorded launches of one step, which reads one buffer of worlds and writes another.
+
+    During the recording this object is called in place of the network.
+    """
+
+    def __init__(self, step: RuleStep, particles: Particles, mask: Tensor | None) -> None:
+        assert step.network is not None
+        self.row_width = step.network.row_width
+        self._update_width = step.network.update_width
+        self.launches = RecordedLaunches()
+        stand_in: Any = self
+        with self.launches.recording():
+            step = dataclasses.replace(step, network=stand_in)
+            self.after = step.advance(particles, Draws(mask, None))
+        self.slots = self.launches.argument_slots(self._updates)
+
+    def __call__(self, rows: Tensor) -> Tensor:
+        """Store the network's input rows, [B N, row_width], and before which launch it runs."""
+        self.rows = rows
+        self.split = len(self.launches)
+        self._updates = rows.new_zeros(len(rows), self._update_width)
+        return self._updates
+
+
+class RecordedSteps:
+    """Two recorded steps of worlds of one shape: from a first buffer to a second one, and back."""
+
+    def __init__(self, step: RuleStep, particles: Particles) -> None:
+        # With all particles active there is a row for each.
+        masked = step.physics.update_prob < 1.0
+        self._mask = torch.ones(particles.x.shape[:2], dtype=torch.uint8) if masked else None
+        # Contiguous: a copy that a step would have to make is not recorded.
+        first = particles.map(lambda value: value.clone(memory_format=torch.contiguous_format))
+        there = _RecordedStep(step, first, self._mask)
+        back = _RecordedStep(step, there.after, self._mask)
+        for old, new in zip(back.after.tensors(), first.tensors(), strict=True):
+            back.launches.move(back.launches.argument_slots(old), new)
+        self._buffers = first, there.after
+        self._steps = there, back
+
+    def run(
+        self, network: Network, particles: Particles, masks: Iterable[Tensor | None], every: int
+    ) -> list[Particles]:
+        """Step worlds once with each update mask; return copies after `every` steps each."""
+        self._buffers[0].copy_(particles)
+        trajectory: list[Particles] = []
+        for number, mask in enumerate(masks):
+            step = self._steps[number % 2]
+            count = len(step.rows)
+            if self._mask is not None and mask is not None:
+                self._mask.copy_(mask)
+                count = max(int(mask.sum()), 1)
+            step.launches.replay(0, step.split, last_count=count)
+            # Kept alive until the launch has read it.
+            updates = network(step.rows[:count])
+            step.launches.move(step.slots, updates)
+            step.launches.replay(step.split)
+            if (number + 1) % every == 0:
+                trajectory.append(self._buffers[(number + 1) % 2].map(torch.clone))
+        return trajectory
+
+
+_groups = CallGroups()
+_groups_lock = threading.Lock()
+
+
+def run_recorded(
+    step: RuleStep,
+    particles: Particles,
+    generator: Randomness | None,
+    steps: int,
+    keep_every: int | None,
+) -> Particles | None:
+    """Run a rollout by replaying recorded launches; None if the caller must launch its steps.
+
+    Only small worlds on a CPU are replayed, without gradients, and not in the first
+    `LAUNCHED_FIRST` calls with the same shapes and options.
+    """
+    x, s, *_ = particles
+    if (
+        torch.compiler.is_compiling()
+        or torch.is_grad_enabled()
+        or x.device.type != "cpu"
+        or x.shape[0] * x.shape[1] > MAX_RECORDED_PARTICLES
+        or step.network is None
+        or step.physics.position_noise > 0.0
+        or steps == 0
+        or not sorts_at_once(*x.shape[:2])
+        or type(x) is not Tensor
+        or type(s) is not Tensor
+        or is_in_torch_dispatch_mode()
+    ):
+        return None
+    key = (step.physics, rule_form(step.rule), x.shape, s.shape[2], x.dtype)
+    with _groups_lock:
+        group = _groups.count(key, MAX_RECORDED_GROUPS)
+    if group.calls <= LAUNCHED_FIRST:
+        return None
+    # Another thread may have taken the last one in the meantime.
+    try:
+        recorded = group.free.pop()
+    except IndexError:
+        with torch.inference_mode(False), torch.no_grad():
+            recorded = RecordedSteps(step, particles)
+    try:
+        masks = (draws.mask for draws in step.draw(x, steps, generator))
+        with torch.autocast("cpu", enabled=False):
+            trajectory = recorded.run(step.network, particles, masks, keep_every or steps)
+    finally:
+        group.free.append(recorded)
+    return trajectory[0] if keep_every is None else combined(torch.stack, trajectory)
