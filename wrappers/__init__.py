@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from npa_envs.wrappers.normalize import TorchNormalizeReward as TorchNormalizeReward
     from npa_envs.wrappers.normalize import VectorNormalizePerception as VectorNormalizePerception
     from npa_envs.wrappers.numeric_infos import NumericInfos as NumericInfos
-    from npa_envs.wrappers.particle_rows import ParticleRows as ParticleRows
+    from npa_envs.wrappers.particles_as_envs import ParticleRows as ParticleRows
     from npa_envs.wrappers.rsl_rl import RslRlParticleEnv as RslRlParticleEnv
     from npa_envs.wrappers.sb3 import ParticleVecEnv as ParticleVecEnv
     from npa_envs.wrappers.sb3 import RowPolicy as RowPolicy
@@ -41,7 +41,7 @@ ON_REQUEST = {
 MODULES = {
     "DamageEvents": "damage",
     "NormalizePerception": "normalize",
-    "ParticleRows": "particle_rows",
+    "ParticleRows": "particles_as_envs",
     "SpeciesTags": "species_tags",
     "TorchNormalizeObservation": "normalize",
     "TorchNormalizeReward": "normalize",

@@ -141,7 +141,7 @@ def finish(
         print(f"  rule        {rule}")
     print(f"  log         {folder.log}\n  pictures    {folder.pictures}/")
     if options.report and result.iteration > 0 and not result.interrupted:
-        from npa_envs.cli.train_report import write_report
+        from npa_envs.cli.final_report import write_report
 
         seconds = result.record.get("seconds", 0.0)
         command = shlex.join(["npa-envs", "train", *arguments])

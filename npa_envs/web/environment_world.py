@@ -17,6 +17,7 @@ from npa_envs.rule.rule import COLOUR_OFFSET
 from npa_envs.tasks.base import Task
 from npa_envs.tasks.damage import DAMAGE_SIZES
 from npa_envs.web.live_world import ColouredWorld, LiveWorld, shows_of
+from npa_envs.web.messages import WorldEvent
 from npa_envs.world.brushes import nearest_image
 from npa_envs.world.particles import Particles
 
@@ -86,10 +87,10 @@ class EnvironmentWorld(LiveWorld):
         box: tuple[float, ...] | None = self._physics.periodic_box
         return box
 
-    def describe(self) -> dict[str, Any]:
-        """Return the event "world", which describes the environment's world to the page."""
+    def describe(self) -> WorldEvent:
+        """Return the event "world"; the note has the number and the end of episodes."""
         task = self._inner.task
-        return super().describe() | {
+        event: WorldEvent = super().describe() | {
             "title": self._env.spec.id if self._env.spec is not None else type(self._env).__name__,
             "note": f"episode {self._episode}{self._ended}",
             "dimension": self._physics.space_dim,
@@ -98,6 +99,7 @@ class EnvironmentWorld(LiveWorld):
             "damages": list(DAMAGE_SIZES) if self._physics.moving else ["wipe"],
             "capabilities": ["film", "loss"],
         }
+        return event
 
     def _allowed(self) -> set[str]:
         return {"positions", "states"} if self._physics.moving else {"states"}

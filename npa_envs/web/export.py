@@ -23,7 +23,8 @@ from npa_envs.rule.files import load_rule, rule_name
 from npa_envs.rule.rule import NPARule, check_rule
 from npa_envs.tasks.damage import CLUMP_FACTOR, DAMAGE_SIZES
 from npa_envs.tasks.point_classification import PALETTE, UNDECIDED, PointClassification
-from npa_envs.web.live_world import checked_seed, colour_tables
+from npa_envs.web.live_world import colour_tables
+from npa_envs.web.messages import checked_seed
 from npa_envs.web.rule_world import MIN_SEED, RuleWorld
 from npa_envs.world.species import AGREEMENTS
 
@@ -152,10 +153,9 @@ def page_rule(source: str, *, particle_count: int | None = None) -> dict[str, An
             f"a page grows rules from a ball, a box or a point cloud, {shown(source)} begins with "
             f"a {type(task).__name__}: watch it with npa-envs view"
         )
-    world = live.describe()
     # rule_world.js adds these itself.
-    for name in ("type", "rules", "rule", "others", "species", "show", "playing", "seed"):
-        del world[name]
+    added = ("type", "rules", "rule", "others", "species", "show", "playing", "seed")
+    world = {name: value for name, value in live.describe().items() if name not in added}
     classes = {"palette": PALETTE, "undecided": UNDECIDED}
     return {
         **rule.hyper_parameters(),

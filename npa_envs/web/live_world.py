@@ -1,7 +1,4 @@
-"""Worlds that a page shows and changes while they run: messages, frames, brushes.
-
-The head of `npa_envs/web/page/page.js` lists the messages and the events.
-"""
+"""The base class of worlds that a page shows and changes while they run, and particles' colours."""
 
 from __future__ import annotations
 
@@ -15,82 +12,21 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.checks import is_real, is_whole
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.ops import species_fields
 from npa_envs.render.colours import GOLDEN_ANGLE, STATE_CHROMA, STATE_GAIN, ramp, srgb
 from npa_envs.tasks.damage import check_damage, damage_worlds
+from npa_envs.web.messages import (
+    BRUSHES,
+    Brush,
+    BrushUse,
+    FrameEvent,
+    Range,
+    WorldEvent,
+    checked_seed,
+)
 from npa_envs.world.brushes import clump, cut, inject, push, state_around
 from npa_envs.world.particles import Particles
-
-
-class Tool(NamedTuple):
-    """A brush: its button on the page, when a stroke of it sends messages, and what it does."""
-
-    changes: str
-    """What a world must let it change, see `LiveWorld._allowed`."""
-    label: str
-    sends: str
-    """When a stroke sends messages: "frame", in each frame; "motion", in frames in which the
-    pointer moves; "position", at each new position; "once", at its start; "line", at its end."""
-    takes: str | None = None
-    """A further field of its messages: "source" or "rule"."""
-    amounts: tuple[float, float] = (0.0, 1.0)
-    """The amount of its effect at strength 0, and what strength 1 adds to it; 1 at most."""
-
-
-TOOLS = {
-    "remove": Tool("removal", "Remove", "frame"),
-    "push": Tool("positions", "Push with the pointer", "motion", amounts=(0.5, 1.0)),
-    "clump": Tool("positions", "Clump", "frame", amounts=(0.0, 0.25)),
-    "cut": Tool("positions", "Cut along a line", "line"),
-    "inject": Tool(
-        "states",
-        "Inject: the state of where you press spreads to where you drag",
-        "frame",
-        takes="source",
-        amounts=(0.0, 0.5),
-    ),
-    "graft": Tool("species", "Graft: particles take another rule", "position", takes="rule"),
-    "add": Tool("growth", "Add a seed of another rule", "once", takes="rule", amounts=(0.0, 0.5)),
-}
-"""All brushes, in the order of their buttons and keys. `LiveWorld._brush` applies those that change
-positions or states, `RuleWorld._brush` the others, and `BRUSHES` of rule_world.js all. Icons are in
-page.js."""
-
-
-class WorldView(NamedTuple):
-    """What a page shows of a world at one step."""
-
-    step: int
-    """Steps from the seed."""
-    positions: NDArray[np.float32]
-    """Positions [length units], shape [N, D]."""
-    colours: NDArray[np.uint8]
-    """Red, green and blue, shape [N, 3]."""
-    milliseconds: float
-    """Moving average of the time of a step [ms]."""
-    loss: float | None
-    """The metric of the world's task; None: not computed for this frame."""
-
-
-class Range(NamedTuple):
-    """The allowed values of a setting, and the scale of its slider."""
-
-    low: float
-    high: float
-    scale: str | None = None
-    whole: bool = False
-
-    def checked(self, name: str, value: Any) -> float:
-        """Return `value` if it lies in the range; raises NPAError."""
-        valid = is_whole(value) if self.whole else is_real(value)
-        if not valid or not self.low <= value <= self.high:
-            what = "a whole number" if self.whole else "a number"
-            raise NPAError(
-                f"{name} must be {what} in [{self.low:g}, {self.high:g}], got {shown(value)}"
-            )
-        return int(value) if self.whole else float(value)
 
 
 class LiveWorld(ABC):
@@ -107,13 +43,13 @@ class LiveWorld(ABC):
         self.show = "colours"
         self._loss_wanted = False
         self._colouring = Colouring()
-        self._events: list[dict[str, Any]] = []
+        self._events: list[Mapping[str, Any]] = []
 
-    def describe(self) -> dict[str, Any]:
-        """Return the event "world" of page.js: brushes, settings and colourings of this world."""
+    def describe(self) -> WorldEvent:
+        """Return the event "world"; subclasses add the fields of their worlds."""
         return {
             "type": "world",
-            "tools": [{"name": name} | tool._asdict() for name, tool in self.tools.items()],
+            "tools": [{"name": name} | brush._asdict() for name, brush in self.brushes.items()],
             "shows": self._shows(),
             "show": self.show,
             "settings": {
@@ -126,10 +62,10 @@ class LiveWorld(ABC):
         }
 
     @property
-    def tools(self) -> dict[str, Tool]:
+    def brushes(self) -> dict[str, Brush]:
         """The brushes that the world offers, by name."""
         allowed = self._allowed()
-        return {name: tool for name, tool in TOOLS.items() if tool.changes in allowed}
+        return {name: brush for name, brush in BRUSHES.items() if brush.changes in allowed}
 
     def handle(self, message: Mapping[str, Any]) -> bool:
         """Apply a message of the page; return whether `describe` returns something else now."""
@@ -147,7 +83,7 @@ class LiveWorld(ABC):
             case "set":
                 return self._set(str(message.get("name")), message.get("value"))
             case "brush":
-                return self._brush(Touch.read(message, self.tools, self.particles.x))
+                return self._use_brush(BrushUse.read(message, self.brushes, self.particles.x))
             case "damage":
                 check_damage(name := message.get("name"))
                 self._damage(str(name))
@@ -161,15 +97,15 @@ class LiveWorld(ABC):
         self._run_timed(self.speed)
 
     @torch.no_grad()
-    def frame(self) -> WorldView:
+    def frame(self) -> FrameEvent:
         """Return what the page shows now."""
         world = self._coloured()
         colours = self._colouring(self.show, world)
         loss = self._loss() if self._loss_wanted else None
         positions: NDArray[np.float32] = world.x[0].cpu().numpy()
-        return WorldView(self.step, positions, colours, self._milliseconds, loss)
+        return FrameEvent(self.step, positions, colours, self._milliseconds, loss)
 
-    def take_events(self) -> list[dict[str, Any]]:
+    def take_events(self) -> list[Mapping[str, Any]]:
         """Return the events since the last call: curves, errors, changed descriptions."""
         events, self._events = self._events, []
         return events
@@ -204,7 +140,7 @@ class LiveWorld(ABC):
 
     @abstractmethod
     def _allowed(self) -> set[str]:
-        """Return what brushes may change: some of the values of `Tool.changes`."""
+        """Return what brushes may change: some of the values of `Brush.changes`."""
 
     @abstractmethod
     def _shows(self) -> list[str]: ...
@@ -212,25 +148,25 @@ class LiveWorld(ABC):
     def _damage(self, name: str) -> None:
         self.particles = damage_worlds(self.particles, kind=name, box=self.box)
 
-    def _brush(self, touch: Touch) -> bool:
+    def _use_brush(self, use: BrushUse) -> bool:
         """Apply a brush; return whether `describe` returns something else now."""
         x, s, *_ = self.particles
-        disk: dict[str, Any] = {"radius": touch.radius, "box": self.box}
-        match touch.tool:
+        disk: dict[str, Any] = {"radius": use.radius, "box": self.box}
+        match use.brush:
             case "push":
-                x = push(x, centre=touch.at, move=touch.move, strength=touch.amount, **disk)
+                x = push(x, centre=use.at, move=use.move, strength=use.amount, **disk)
             case "clump":
-                x, s = clump(x, s, centre=touch.at, factor=touch.amount, **disk)
+                x, s = clump(x, s, centre=use.at, factor=use.amount, **disk)
             case "cut":
-                space_dim, half = x.shape[2], 0.5 * touch.move
-                move = torch.nn.functional.pad(touch.move, (0, 3 - space_dim))
-                normal = torch.linalg.cross(touch.view, move)[:, :space_dim]
-                line: dict[str, Any] = {"centre": touch.at + half, "normal": normal, "along": half}
-                x, s = cut(x, s, gap=touch.radius, box=self.box, **line)
+                space_dim, half = x.shape[2], 0.5 * use.move
+                move = torch.nn.functional.pad(use.move, (0, 3 - space_dim))
+                normal = torch.linalg.cross(use.view, move)[:, :space_dim]
+                line: dict[str, Any] = {"centre": use.at + half, "normal": normal, "along": half}
+                x, s = cut(x, s, gap=use.radius, box=self.box, **line)
             case "inject":
-                state, exists = state_around(x, s, centre=touch.source, **disk)
-                weight = touch.amount * exists.to(x.dtype)
-                s = inject(x, s, centre=touch.at, state=state, strength=weight, **disk)
+                state, exists = state_around(x, s, centre=use.source, **disk)
+                weight = use.amount * exists.to(x.dtype)
+                s = inject(x, s, centre=use.at, state=state, strength=weight, **disk)
         self.particles = self.particles._replace(x=x, s=s)
         return False
 
@@ -259,57 +195,6 @@ class LiveWorld(ABC):
         each = 1000.0 * (time.perf_counter() - start) / steps
         # A moving average, as single steps may compile kernels or be interrupted.
         self._milliseconds += (0.2 if self._milliseconds else 1.0) * (each - self._milliseconds)
-
-
-class Touch(NamedTuple):
-    """One use of a brush, from a message of the page."""
-
-    tool: str
-    at: Tensor
-    """Position [length units], shape [1, D]."""
-    move: Tensor
-    """Its movement [length units], shape [1, D]."""
-    radius: float
-    """Radius of the brush [length units]."""
-    amount: float
-    """From 0 to 1, dimensionless, by `Tool.amounts`."""
-    source: Tensor
-    """Position whose state the brush `inject` spreads [length units], shape [1, D]."""
-    view: Tensor
-    """The unit vector towards the viewer, shape [1, 3]."""
-    rule: Any
-    """Name of another rule in the message, unchecked."""
-
-    @classmethod
-    def read(cls, message: Mapping[str, Any], tools: Mapping[str, Tool], x: Tensor) -> Touch:
-        """Return the brush of a message to a world with positions x [1, N, D]."""
-        name, at, space_dim = message.get("tool"), message.get("at"), x.shape[2]
-        if not isinstance(name, str) or name not in tools:
-            raise NPAError(f"unknown tool {shown(name)}: {suggest(name, tools)}")
-        strength = Range(0.0, 1.0).checked("strength", message.get("strength", 1.0))
-        least, added = tools[name].amounts
-        return cls(
-            name,
-            _checked_vector("at", at, space_dim, x),
-            _checked_vector("move", message.get("move", [0.0] * space_dim), space_dim, x),
-            Range(1e-4, 10.0).checked("radius", message.get("radius")),
-            min(1.0, least + added * strength),
-            _checked_vector("source", message.get("source", at), space_dim, x),
-            _checked_vector("view", message.get("view", [0.0, 0.0, 1.0]), 3, x),
-            message.get("rule"),
-        )
-
-
-def checked_seed(value: Any) -> int:
-    """Return `value` if it is a valid seed; raises NPAError."""
-    return int(Range(0, 2**53, whole=True).checked("seed", value))
-
-
-def _checked_vector(name: str, value: Any, length: int, like: Tensor) -> Tensor:
-    fits = isinstance(value, list) and len(value) == length and all(map(is_real, value))
-    if not fits or max(map(abs, value)) > 1e4:
-        raise NPAError(f"{name} must be {length} finite numbers, got {shown(value)}")
-    return like.new_tensor([value])
 
 
 # Colours of a live world's particles by state, density, species, speed or update mask.

@@ -23,7 +23,8 @@ from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.run_folder import JsonlLog, RunFolder
 from npa_envs.training.task_of_rule import TrainedTask, task_of_rule, trained_config
 from npa_envs.training.task_table import load_config, preset
-from npa_envs.web.live_world import ColouredWorld, Colouring, LiveWorld, Range, Touch, shows_of
+from npa_envs.web.live_world import ColouredWorld, Colouring, LiveWorld, shows_of
+from npa_envs.web.messages import BrushUse, Range, WorldEvent
 from npa_envs.world.brushes import inside_ball, wipe_state
 from npa_envs.world.division import living
 from npa_envs.world.particles import Particles
@@ -139,8 +140,8 @@ class RuleWorld(LiveWorld):
         """Sides of the periodic box [length units]; None: open space."""
         return self.task.box
 
-    def describe(self) -> dict[str, Any]:
-        """Return the event "world" of page.js: rules, view, brushes and settings of this world."""
+    def describe(self) -> WorldEvent:
+        """Return the event "world", all its fields."""
         frame = self.task.frame
         return super().describe() | {
             "title": self.main.name,
@@ -303,11 +304,11 @@ class RuleWorld(LiveWorld):
             self.particles = damaged._replace(s=self._all_coded(damaged.s))
 
     @torch.no_grad()
-    def _brush(self, touch: Touch) -> bool:
+    def _use_brush(self, use: BrushUse) -> bool:
         before = [live_rule.name for live_rule in self.live_rules]
         x, s, *_ = self.particles
-        ball: dict[str, Any] = {"centre": touch.at, "radius": touch.radius}
-        match touch.tool:
+        ball: dict[str, Any] = {"centre": use.at, "radius": use.radius}
+        match use.brush:
             case "remove" if self.main.rule.divides:
                 self.particles = self.particles._replace(s=wipe_state(x, s, **ball))
             case "remove":
@@ -315,36 +316,36 @@ class RuleWorld(LiveWorld):
                 kept = self.particles.map(lambda value: value[:, outside])
                 self._arrange(kept, self._species()[outside])
             case "graft":
-                self._graft(touch)
+                self._graft(use)
             case "add":
-                self._add(touch)
+                self._add(use)
             case _:
-                return super()._brush(touch)
+                return super()._use_brush(use)
         return before != [live_rule.name for live_rule in self.live_rules]
 
-    def _graft(self, touch: Touch) -> None:
+    def _graft(self, use: BrushUse) -> None:
         x, s, *_ = self.particles
-        inside = inside_ball(x, centre=touch.at, radius=touch.radius, box=self.box)
+        inside = inside_ball(x, centre=use.at, radius=use.radius, box=self.box)
         # Grafted particles divide densities by the same number as their neighbours.
-        index = self._species_index(touch.rule, float(self.count))
+        index = self._species_index(use.rule, float(self.count))
         s = torch.where(inside[..., None], self._coded(self.live_rules[index], s), s)
         species = torch.where(inside[0], index, self._species())
         self._arrange(self.particles._replace(s=s), species)
 
-    def _add(self, touch: Touch) -> None:
-        count = max(MIN_SEED, round(touch.amount * self.count))
+    def _add(self, use: BrushUse) -> None:
+        count = max(MIN_SEED, round(use.amount * self.count))
         room = MAX_PARTICLES[self._device.type] - self.particles.x.shape[1]
         if count > room:
             raise NPAError(f"the world has room for {max(room, 0)} particles more, got {count}")
         # A new species divides densities by its own number of particles, as in a world alone.
-        index = self._species_index(touch.rule, float(count))
+        index = self._species_index(use.rule, float(count))
         zeros = self.particles.map(lambda value: value.new_zeros(1, count, *value.shape[2:]))
         ball = uniform_ball(
-            1, count, zeros.x.shape[2], touch.radius, generator=self._generator,
+            1, count, zeros.x.shape[2], use.radius, generator=self._generator,
             device=self._device, dtype=zeros.x.dtype,
         )  # fmt: skip
         s = self._coded(self.live_rules[index], zeros.s)
-        added = zeros._replace(x=ball + touch.at[:, None], s=s)
+        added = zeros._replace(x=ball + use.at[:, None], s=s)
         species = torch.nn.functional.pad(self._species(), (0, count), value=index)
         self._arrange(together([self.particles, added]), species)
 
@@ -445,8 +446,8 @@ class RunWorld(RuleWorld):
         self.particles = together(worlds)
         self.count = sum(self.counts)
 
-    def describe(self) -> dict[str, Any]:
-        """Return the event "world" of page.js; the page cannot choose between rules."""
+    def describe(self) -> WorldEvent:
+        """Return the event "world", in which the page has no rules to choose from."""
         return super().describe() | {
             "title": self._run_folder.path.resolve().name,
             "note": f"a training run, iteration {self._iteration}",
@@ -460,7 +461,7 @@ class RunWorld(RuleWorld):
             del ranges["count"]
         return ranges
 
-    def take_events(self) -> list[dict[str, Any]]:
+    def take_events(self) -> list[Mapping[str, Any]]:
         """Return the events since the last call, once a second also of new losses and rules."""
         if time.monotonic() >= self._poll_due:
             self._poll_due = time.monotonic() + 1.0

@@ -30,7 +30,8 @@ from npa_envs.atomic_files import made_folder
 from npa_envs.errors import MissingDependencyError, NPAError, shown
 from npa_envs.render import write_gif, write_mp4
 from npa_envs.web.export import PAGE
-from npa_envs.web.live_world import LiveWorld, WorldView
+from npa_envs.web.live_world import LiveWorld
+from npa_envs.web.messages import FrameEvent
 
 try:
     import uvicorn
@@ -191,7 +192,7 @@ def _refused(reason: str) -> Response:
     return PlainTextResponse(f"refused: {reason}", 403)
 
 
-def frame_bytes(frame: WorldView) -> bytes:
+def frame_bytes(frame: FrameEvent) -> bytes:
     """Return a frame as bytes: header, positions, colours."""
     count, dimension = frame.positions.shape
     loss = float("nan") if frame.loss is None else frame.loss

@@ -19,8 +19,9 @@ from npa_envs.rule.files import load_rule, save_rule
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.damage import DAMAGE_SIZES
 from npa_envs.tasks.point_classification import class_colours
+from npa_envs.web import messages
 from npa_envs.web.export import check_browser_rule, export_web, page_rule, page_text
-from npa_envs.web.live_world import TOOLS, ColouredWorld, Colouring
+from npa_envs.web.live_world import ColouredWorld, Colouring
 from npa_envs.web.rule_world import RuleWorld
 from npa_envs.world.brushes import nearest_image
 from npa_envs.world.particles import Particles
@@ -193,7 +194,7 @@ def test_settings_reach_the_world_and_wrong_messages_are_reported(run, settings)
         "nothing to show is called nothing", "no damage is called luck", "no brush is called luck",
         "no message is called fly"
     ]  # fmt: skip
-    assert {name.split()[0] for name in BRUSHES} | {"add"} == set(TOOLS)
+    assert {name.split()[0] for name in BRUSHES} | {"add"} == set(messages.BRUSHES)
     whole = live(run, settings, *[ADVANCE] * 3)
     x = unpacked(whole["x"], (300, 2))
     farthest_moves = {"wipe": 0.0, "cut": 0.05, "clump": 0.18, "noise": 0.25}

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from npa_envs.web.live_world import TOOLS
+from npa_envs.web.messages import BRUSHES
 
-SENT_TOOLS = [{"name": name} | tool._asdict() for name, tool in TOOLS.items()]
+SENT_TOOLS = [{"name": name} | brush._asdict() for name, brush in BRUSHES.items()]
 SETUP = """
 const world = { type: "world", title: "t", dimension: 2, tools, capabilities: ["film"] };
 const frame = (step, places = [0, 0, 1, 1]) => ({

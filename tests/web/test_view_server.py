@@ -15,7 +15,7 @@ import pytest
 from PIL import Image
 
 from npa_envs.errors import MissingDependencyError, NPAError
-from npa_envs.web.live_world import WorldView
+from npa_envs.web.messages import FrameEvent
 
 pytest.importorskip("uvicorn")
 testclient = pytest.importorskip("starlette.testclient")
@@ -57,7 +57,7 @@ class Counter:
     def frame(self):
         positions = np.array([[self.step, 0.5], [-1.0, 0.25]], dtype=np.float32)
         colours = np.array([[255, 0, 1], [2, 3, 4]], dtype=np.uint8)
-        return WorldView(self.step, positions, colours, 1.5, 0.125 if self.step == 2 else None)
+        return FrameEvent(self.step, positions, colours, 1.5, 0.125 if self.step == 2 else None)
 
     def take_events(self):
         return []

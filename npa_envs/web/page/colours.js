@@ -1,9 +1,9 @@
-// Colours of particles by state, density, species, speed or update mask. This file follows `Colouring` of
-// npa_envs/render/colours.py.
+// Colours of particles by state, density, species, speed or update mask, by the formulas of `Colouring` of
+// npa_envs/web/live_world.py: a change there is made here as well.
 
 import { inner } from "./brushes.js";
 
-// Of npa_envs/render/colours.py.
+// As in npa_envs/rule/rule.py, npa_envs/render/colours.py and npa_envs/web/live_world.py.
 const COLOUR_OFFSET = 0.5;
 const STATE_GAIN = 2.8;
 const BALANCE = 0.9;
@@ -15,7 +15,7 @@ const JACOBI_SWEEPS = 12;
 
 // Computes red, green and blue bytes of each particle, frame by frame.
 export class Colouring {
-  // tables: those of `colour_tables` of npa_envs/render/colours.py, each a Uint8Array of red, green and blue.
+  // tables: those of `colour_tables` of npa_envs/web/live_world.py, each a Uint8Array of red, green and blue.
   constructor(tables) {
     this.tables = tables;
     this.average = null; // moving average of the states' covariance

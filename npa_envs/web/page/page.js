@@ -1,65 +1,17 @@
-// The page: a canvas, brushes, controls and plots. An engine runs the world: its function `connect` is
-// that of `server_connection.js`, for a server in Python, or of `worker_connection.js`, for a worker in the page.
-//
-//   const engine = await connect(settings, listener);   // settings: those of `start`
-//   engine.send(message);                               // page -> engine, a JSON object
-//   listener(event);                                    // engine -> page, an object
-//
-// Messages:
-//   {type: "play", on}                 run or pause
-//   {type: "step"}                     one step, while paused
-//   {type: "reset", seed}              a new world; without seed the next one
-//   {type: "set", name, value}         name: a key of the world's `settings`, or "rule", "show",
-//                                      "loss" (true while its plot is open: else it is not computed)
-//   {type: "brush", tool, at, move, radius, strength, source?, rule?, view?}
-//                                      tool: the name of one of the world's `tools`, whose `sends` says
-//                                      when; at, move: [x, y] or [x, y, z] [length units];
-//                                      radius: of cut, whose line leads from `at` to `at + move`,
-//                                      its half-width; strength in [0, 1]; source (inject): where the
-//                                      state comes from; rule (graft, add): a name of `rules`;
-//                                      view (3D): the unit vector towards the viewer
-//   {type: "damage", name}             one of the world's `damages`, at a random position
-//   {type: "drawn"}                    the page has drawn a frame. An engine sends at most two frames
-//                                      that are not drawn yet: it waits for a slow or hidden page.
-//   {type: "film", action}             "start" or "stop", if capabilities contain "film"; between them
-//                                      the page sends pictures as Blob objects by engine.send(blob)
-//
-// Events:
-//   {type: "world", title, note, dimension, box, centre, half_width, spot, rules, rule, others,
-//    species, shows, show, tools, damages, settings, capabilities, playing, seed}
-//       once, and after changes. note: a sentence for the user, or ""; box: sides [length units] or
-//       null; centre, half_width: the first view; spot: standard deviation of a particle's spot
-//       [length units]; rules: choices of `rule`; others: choices of graft and add; species: names of
-//       the rules of the world's particles; settings: {name: {value, low, high, scale: "log" or
-//       null, whole: true or false}}, names: eps, update_prob, noise, count, speed (steps a frame);
-//       tools: the brushes that the world offers, {name, label, sends, takes, ...} as `Tool` of
-//       npa_envs/web/live_world.py describes them; capabilities: some of "film", "loss".
-//       `BLANK` below has the defaults of missing keys.
-//   {type: "frame", step, positions, colours, milliseconds, loss?}
-//       positions: Float32Array, count * dimension; colours: Uint8Array, count * 3 (red, green, blue);
-//       milliseconds: time of a step; loss: if it was computed
-//   {type: "reordered"}                                            particles have other indices
-//   {type: "curve", name, points: [[x, y], ...], append?}          a plot of a training run
-//   {type: "film", action: "stop"}                                 the film has its greatest length
-//   {type: "file", name, url}                                      a file of a film is ready
-//   {type: "error", message}
-//
-// index.html loads server_connection.js. npa_envs/web/export.py joins worker_connection.js and its imports into one
-// script, and rule_world.js and its imports into that of the worker.
-//
-// `show`: "colours", "density", "species", "speed", "mask", "components" (the first three principal
-// components of the state as red, green and blue), "state 0", "state 1", ...
+// The page: a canvas, brushes, controls and plots. Its engine runs the world; npa_envs/web/messages.py describes
+// engines, and has all messages to them and events from them.
 
 import { Camera, Tracers, makePainter } from "./drawing.js";
 import { Plot, make, short } from "./plots.js";
 
+// What missing fields of the event "world" count as.
 const BLANK = {
   title: "npa-envs", note: "", dimension: 2, box: null, half_width: 1.1, spot: 0.015, rules: [], rule: null,
   centre: [0, 0, 0], others: [], species: [], shows: ["colours"], show: "colours", tools: [], damages: [], settings: {},
   capabilities: [], playing: true, seed: 0,
 };
 
-// The tool that all worlds have; it sends no messages.
+// The tools are this one, which sends no messages, and the world's brushes.
 const LOOK = { name: "look", label: "Look: drag to move, wheel or pinch to zoom, double click to see all" };
 
 // SVG paths on a square of side 24, by the names of tools and controls.
@@ -88,7 +40,8 @@ function icon(name) {
   return `<svg viewBox="0 0 24 24" aria-hidden="true"><path d="${ICONS[name]}"/></svg>`;
 }
 
-// Starts the page over an engine; the page is also `document.page`, for the console.
+// Starts the page, which is also `document.page`, for the console. `connect(settings, listener)` returns a promise of
+// an engine: engine.send(message) takes the page's messages, and listener(event) gets the engine's events.
 export async function start(connect, settings) {
   const page = (document.page = new Page());
   try {
@@ -250,7 +203,8 @@ class Tools {
     this.chosen = LOOK;
     this.pointers = new Map();
     this.looking = false; // whether pressed pointers move the camera
-    this.stroke = null; // that of the pressed brush
+    // A brush from press to release: nearness of what it touches, and pixels where it began, is now, and last acted.
+    this.stroke = null;
     const canvas = (this.canvas = page.canvas);
     canvas.onpointerdown = (event) => this.press(event);
     canvas.onpointermove = (event) => this.move(event);

@@ -1,5 +1,5 @@
-// The world of the exported page, which follows RuleWorld of npa_envs/web/rule_world.py. page.js lists messages
-// and events.
+// The world of an exported page, which follows RuleWorld of npa_envs/web/rule_world.py. npa_envs/web/messages.py has
+// its messages and events.
 
 import { clump, cut, wipeState, inject, insideBall, push, stateAround } from "./brushes.js";
 import { Colouring, RuleColours } from "./colours.js";
@@ -7,15 +7,15 @@ import { fastestKernels } from "./kernels_simd.js";
 import { padded, Physics, prepareRule, wrap } from "./physics.js";
 import { GpuPhysics, openDevice } from "./physics_gpu.js";
 
-// Most frames that the page has not drawn yet: the world waits for a slow or hidden page.
+// Maximum number of frames that the page has not drawn yet: the world waits for a slow or hidden page.
 const FRAMES_AHEAD = 2;
 
-// Steps for which the GPU is tried, and the largest difference from the CPU's results.
+// The number of steps in which the GPU is compared with the CPU, and the largest difference of right results.
 const TRIAL_STEPS = 4;
 const TRIAL_TOLERANCE = 1e-3;
 
-// Brushes by the names of `TOOLS` of npa_envs/web/live_world.py. Each applies a message of page.js, whose
-// strength has become an `amount`, to a RuleWorld.
+// What brushes do, by the names of `BRUSHES` of npa_envs/web/messages.py: functions of a RuleWorld and a message
+// "brush", whose `strength` has become an `amount`.
 const BRUSHES = {
   remove(live, { at, radius }) {
     const removed = new Set(insideBall(live.world, at, radius));
@@ -56,7 +56,8 @@ const BRUSHES = {
   },
 };
 
-// Damage by name, as `damage_worlds` of npa_envs/tasks/damage.py. `centre`: the position of a random particle.
+// What the kinds of damage do, as `damage_worlds` of npa_envs/tasks/damage.py: functions of a RuleWorld, the kind's
+// size [length units], and the position of a random particle.
 const DAMAGES = {
   wipe: ({ world }, size, centre) => wipeState(world, centre, size),
   cut: ({ world, random }, size) => cut(world, meanOf(world), random.direction(world.dimension), size),
@@ -237,12 +238,12 @@ export class RuleWorld {
     else this.announce();
   }
 
-  // Applies a brush; page.js describes the message.
+  // Applies a message "brush".
   brush(message) {
-    const tool = this.rule.world.tools.find(({ name }) => name === message.tool);
-    if (tool === undefined) throw Error(`no brush is called ${message.tool}`);
-    const [least, added] = tool.amounts;
-    BRUSHES[tool.name](this, { ...message, amount: Math.min(1, least + added * message.strength) });
+    const brush = this.rule.world.tools.find(({ name }) => name === message.tool);
+    if (brush === undefined) throw Error(`no brush is called ${message.tool}`);
+    const [least, added] = brush.amounts;
+    BRUSHES[brush.name](this, { ...message, amount: Math.min(1, least + added * message.strength) });
     this.wrapPositions();
   }
 

@@ -1,4 +1,4 @@
-// The engine of the viewer, as page.js describes engines: a server, npa_envs/web/server.py, over a WebSocket.
+// The engine of the viewer: the server of npa_envs/web/server.py, over a WebSocket.
 
 import { start } from "./page.js";
 

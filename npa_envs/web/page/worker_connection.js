@@ -1,5 +1,5 @@
-// The engine of an exported page, as page.js describes engines: a worker in the page, which runs the RuleWorld of
-// rule_world.js. Also the gallery to choose a rule.
+// The engine of an exported page: a worker in the page, which runs the RuleWorld of rule_world.js. Also the gallery
+// to choose a rule. npa_envs/web/export.py joins this file and its imports into one script.
 
 import { start } from "./page.js";
 

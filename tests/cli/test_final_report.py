@@ -9,8 +9,8 @@ import pytest
 from PIL import Image
 from support.small_digits import write_idx
 
+from npa_envs.cli import final_report as report
 from npa_envs.cli import main
-from npa_envs.cli import train_report as report
 from npa_envs.errors import MissingDependencyError
 from npa_envs.render import world_film
 from npa_envs.training import TASKS

@@ -1,0 +1,194 @@
+"""What a page and its engine send each other: messages of the page, events of the engine, brushes.
+
+An engine runs the world of a page. That of the viewer is server.py over live_world.py, which the
+page reaches by server_connection.js; that of an exported page is rule_world.js in a worker, which
+it reaches by worker_connection.js. Messages are JSON objects with a `type` and these fields:
+
+    play    on                run the world (true) or pause it
+    step                      one step, while the world is paused
+    reset   seed?             a new world; without a seed from the next one
+    set     name, value       name: a key of the world's `settings`, "rule", "show", or "loss" (true
+                              while its plot is open; otherwise no loss is computed)
+    brush                     one use of a brush: `BrushUse.read` has the fields
+    damage  name              one of the world's `damages`, at a random position
+    drawn                     the page has drawn a frame; at most two frames are sent and not drawn,
+                              so the engine waits for a slow or hidden page
+    film    action            "start" or "stop", if `capabilities` has "film"; in between the page
+                              sends pictures, JPEG files as Blob objects
+
+Events are objects with a `type` and these fields:
+
+    world                     at first, and after changes: `WorldEvent` has the fields
+    frame                     the world at one step: `FrameEvent` has the fields
+    reordered                 the particles have new indices
+    curve   name, points, append?    points [[x, y], ...] of the plot of a training run; they
+                              replace those before unless `append` is true
+    film    action            "stop": the film has its greatest length
+    file    name, url         a file of a film is ready
+    error   message           a sentence for the user
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Literal, NamedTuple, Required, TypedDict
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from npa_envs.checks import is_real, is_whole
+from npa_envs.errors import NPAError, shown, suggest
+
+
+class WorldEvent(TypedDict, total=False):
+    """The event "world"; the page has values for missing fields, `BLANK` of page.js."""
+
+    type: Required[Literal["world"]]
+    title: str
+    note: str  # A sentence for the user, or "".
+    dimension: int
+    box: list[float] | None  # Sides of the periodic box [length units]; None: open space.
+    centre: list[float]  # Centre of the first view [length units].
+    half_width: float  # Half the width of the first view [length units].
+    spot: float  # Standard deviation of a particle's spot [length units].
+    rules: list[str]  # Values of the setting "rule".
+    rule: str | None  # The rule of a newly seeded world.
+    others: list[str]  # Rules that the brushes graft and add can put into the world.
+    species: list[str]  # Rules of the world's particles.
+    shows: list[str]  # Values of the setting "show".
+    show: str  # What colours mean; `Colouring` of live_world.py makes them.
+    tools: list[dict[str, Any]]  # The world's brushes: `name`, and the fields of `Brush`.
+    damages: list[str]  # Kinds of damage, as the page's buttons name them.
+    settings: dict[str, dict[str, Any]]  # By name: `value`, and the fields of `Range`.
+    capabilities: list[str]  # Some of "film", "loss".
+    playing: bool
+    seed: int
+
+
+class FrameEvent(NamedTuple):
+    """The event "frame": what a page shows of a world at one step."""
+
+    step: int
+    """Steps from the seed."""
+    positions: NDArray[np.float32]
+    """Positions [length units], shape [N, D]; flat in JavaScript."""
+    colours: NDArray[np.uint8]
+    """Red, green and blue, shape [N, 3]; flat in JavaScript."""
+    milliseconds: float
+    """Moving average of the time of a step [ms]."""
+    loss: float | None
+    """The metric of the world's task; None: not computed for this frame."""
+
+
+class Range(NamedTuple):
+    """The allowed values of a setting, and the scale of its slider."""
+
+    low: float
+    high: float
+    scale: str | None = None
+    """"log": equal movements of the slider multiply the value equally; None: they add equally."""
+    whole: bool = False
+    """Whether only whole numbers are allowed."""
+
+    def checked(self, name: str, value: Any) -> float:
+        """Return `value` if it lies in the range; raise NPAError, which names it `name`, if not."""
+        valid = is_whole(value) if self.whole else is_real(value)
+        if not valid or not self.low <= value <= self.high:
+            what = "a whole number" if self.whole else "a number"
+            raise NPAError(
+                f"{name} must be {what} in [{self.low:g}, {self.high:g}], got {shown(value)}"
+            )
+        return int(value) if self.whole else float(value)
+
+
+class Brush(NamedTuple):
+    """A brush of the viewer: its button, and when it sends messages."""
+
+    changes: str
+    """What a world must let it change, see `LiveWorld._allowed`."""
+    label: str
+    """Text of its button on the page."""
+    sends: str
+    """When a stroke, from press to release of the pointer, sends messages: "frame", in each frame;
+    "motion", in frames in which the pointer moves; "position", at each new position; "once", at its
+    start; "line", at its end."""
+    takes: str | None = None
+    """A further field of its messages: "source" or "rule"."""
+    amounts: tuple[float, float] = (0.0, 1.0)
+    """The amount of its effect at strength 0, and what strength 1 adds to it; 1 at most."""
+
+
+BRUSHES = {
+    "remove": Brush("removal", "Remove", "frame"),
+    "push": Brush("positions", "Push with the pointer", "motion", amounts=(0.5, 1.0)),
+    "clump": Brush("positions", "Clump", "frame", amounts=(0.0, 0.25)),
+    "cut": Brush("positions", "Cut along a line", "line"),
+    "inject": Brush(
+        "states",
+        "Inject: the state of where you press spreads to where you drag",
+        "frame",
+        takes="source",
+        amounts=(0.0, 0.5),
+    ),
+    "graft": Brush("species", "Graft: particles take another rule", "position", takes="rule"),
+    "add": Brush("growth", "Add a seed of another rule", "once", takes="rule", amounts=(0.0, 0.5)),
+}
+"""All brushes, in the order of their buttons and keys. `LiveWorld._use_brush` applies those that
+change positions or states, `RuleWorld._use_brush` the others, and `BRUSHES` of rule_world.js all.
+Icons are in page.js."""
+
+
+class BrushUse(NamedTuple):
+    """One use of a brush, read from a message "brush"."""
+
+    brush: str
+    """Its name; `tool` in the message."""
+    at: Tensor
+    """Position [length units], shape [1, D]."""
+    move: Tensor
+    """Movement from there [length units], shape [1, D]; zeros if it is missing."""
+    radius: float
+    """Radius of the brush, of `cut` half the width of the gap [length units]."""
+    amount: float
+    """Amount of the effect by `Brush.amounts`, from 0 to 1; the message has `strength`, 0 to 1."""
+    source: Tensor
+    """Position whose state `inject` spreads [length units], shape [1, D]; `at` if it is missing."""
+    view: Tensor
+    """Unit vector towards the viewer, shape [1, 3]; the z axis if it is missing, as in 2D."""
+    rule: Any
+    """Name of the rule for `graft` or `add`, unchecked."""
+
+    @classmethod
+    def read(cls, message: Mapping[str, Any], brushes: Mapping[str, Brush], x: Tensor) -> BrushUse:
+        """Return the use in a message; tensors have dimension, device and dtype of x [1, N, D].
+
+        `brushes` are those of the world. Raises NPAError for a wrong field.
+        """
+        name, at, space_dim = message.get("tool"), message.get("at"), x.shape[2]
+        if not isinstance(name, str) or name not in brushes:
+            raise NPAError(f"unknown tool {shown(name)}: {suggest(name, brushes)}")
+        strength = Range(0.0, 1.0).checked("strength", message.get("strength", 1.0))
+        least, added = brushes[name].amounts
+        return cls(
+            name,
+            _checked_vector("at", at, space_dim, x),
+            _checked_vector("move", message.get("move", [0.0] * space_dim), space_dim, x),
+            Range(1e-4, 10.0).checked("radius", message.get("radius")),
+            min(1.0, least + added * strength),
+            _checked_vector("source", message.get("source", at), space_dim, x),
+            _checked_vector("view", message.get("view", [0.0, 0.0, 1.0]), 3, x),
+            message.get("rule"),
+        )
+
+
+def _checked_vector(name: str, value: Any, length: int, like: Tensor) -> Tensor:
+    fits = isinstance(value, list) and len(value) == length and all(map(is_real, value))
+    if not fits or max(map(abs, value)) > 1e4:
+        raise NPAError(f"{name} must be {length} finite numbers, got {shown(value)}")
+    return like.new_tensor([value])
+
+
+def checked_seed(value: Any) -> int:
+    """Return `value` if it is a valid seed, a whole number from 0 to 2^53; else raise NPAError."""
+    return int(Range(0, 2**53, whole=True).checked("seed", value))
