@@ -119,8 +119,8 @@ export class RuleColours {
     if (outputs === 0) return;
     // Only the read-out's outputs that are colours or classes.
     const width = this.outputs;
-    this.first = kernels.layer(weights["readout.0.weight"], weights["readout.0.bias"], this.channels, hidden);
-    this.second = kernels.layer(
+    this.first = kernels.makeLayer(weights["readout.0.weight"], weights["readout.0.bias"], this.channels, hidden);
+    this.second = kernels.makeLayer(
       weights["readout.2.weight"].slice((outputs - width) * hidden), weights["readout.2.bias"].slice(outputs - width), hidden, width,
     );
     this.rows = kernels.floats(ROWS_TOGETHER * this.channels);
@@ -138,8 +138,8 @@ export class RuleColours {
     const block = [];
     const flush = () => {
       block.forEach((i, row) => this.rows.set(s.subarray(i * channels, (i + 1) * channels), row * channels));
-      this.kernels.product(this.first, block.length, this.rows, channels, this.hidden, true);
-      this.kernels.product(this.second, block.length, this.hidden, this.first.width, this.results, false);
+      this.kernels.applyLayer(this.first, block.length, this.rows, channels, this.hidden, true);
+      this.kernels.applyLayer(this.second, block.length, this.hidden, this.first.width, this.results, false);
       block.forEach((i, row) => writeColour(bytes, i, this.tint(this.results, row * this.second.width)));
       block.length = 0;
     };

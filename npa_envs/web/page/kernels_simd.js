@@ -1,16 +1,14 @@
-// The kernels of physics.js in WebAssembly with 128-bit vectors, assembled here: no compiler, no
-// binary file. Four channels, or four hidden units, are added up at a time, in float32. Each kernel follows its
-// namesake in `plainKernels`, whose changes are made here as well.
-//
-// The kernels are written with the assembler's functions. Instructions and module format:
-// https://webassembly.github.io/spec/core/binary/.
+// The kernels of `plainKernels` of physics.js in WebAssembly, because its vectors of four float32 are several times as
+// fast as JavaScript. The page builds the module when it starts: `xCode` writes kernel x by functions that return the
+// bytes of instructions (the assembler below), and `assemble` joins the kernels. So no compiler is needed, and sizes
+// are constants in the code. Instructions and format: https://webassembly.github.io/spec/core/binary/.
 
 import { plainKernels, TILE_OUTPUTS, tiledLayer } from "./physics.js";
 
 const MEMORY_PAGES = 512;
 const PAGE_BYTES = 65536;
 
-// Rows that a step of the product computes together, in registers.
+// Rows that `applyLayer` computes at a time, in registers.
 const TILE_ROWS = 4;
 
 // The assembler: functions return the bytes of an instruction and of its operands.
@@ -77,9 +75,10 @@ function namedLocals(parameters, integers, vectors) {
   };
 }
 
-// gather(states, own, listBytes, stateAt, a, kx, ky, kz, sums): as in plainKernels, addresses in bytes.
-function gatherCode(width, dimension) {
-  const all = ["a", "kx", "ky", "kz"], lists = all.slice(0, dimension + 1);
+// sumNeighbours(states, own, listBytes, stateAt, smoothing, slopeX, slopeY, slopeZ, sums): addresses in bytes; `own` is
+// that of the particle's state.
+function sumNeighboursCode(width, dimension) {
+  const all = ["smoothing", "slopeX", "slopeY", "slopeZ"], lists = all.slice(0, dimension + 1);
   const { local, value, put, counts } = namedLocals(
     ["states", "own", "listBytes", "stateAt", ...all, "sums"],
     ["done", "at"],
@@ -94,7 +93,7 @@ function gatherCode(width, dimension) {
     const parts = first + 4 < width ? [0, 1] : [0];
     const byte = (part) => 4 * first + 16 * part;
     const addNeighbour = (list, part) => {
-      const sum = `sum ${list} ${part}`, factor = value(list === "a" ? "other" : "offset");
+      const sum = `sum ${list} ${part}`, factor = value(list === "smoothing" ? "other" : "offset");
       return put(sum, plus(value(sum), times(value(`spread ${list}`), factor)));
     };
     const neighbour = [
@@ -121,36 +120,73 @@ function gatherCode(width, dimension) {
   return { ...counts, code };
 }
 
-// Numbers that `listNeighbours` reads, each of them a word in memory.
-const PROBE = ["x", "y", "z", "eps", "square", "weight", "slope", "sideX", "sideY", "sideZ", "perX", "perY", "perZ"];
+// The particle whose neighbours `listNeighbours` lists, and constants of the step: each a word in memory.
+const SCALARS = ["x", "y", "z", "eps", "square", "weight", "slope", "sideX", "sideY", "sideZ", "perX", "perY", "perZ"];
 
-// listNeighbours(probe, order, x, y, z, volume, ranges, rangesEnd, width, stateAt, a, kx, ky, kz, out): as in
-// plainKernels. `order` holds, for each set of lanes, the bytes that bring them to the front; `out` gets
-// the number of neighbours, and from its 16th byte on six vectors, the lanes of the moment matrix.
-function listCode(dimension) {
-  const { local, value, put, counts } = namedLocals(
-    ["probe", "order", "x", "y", "z", "volume", "ranges", "rangesEnd", "width", "stateAt", "a", "kx", "ky", "kz", "out"],
+const AXES = ["X", "Y", "Z"];
+
+// listNeighbours(scalars, order, X, Y, Z, volume, ranges, rangesEnd, width, stateAt, smoothing, slopeX, slopeY, slopeZ,
+// out): `order` has for each set of lanes the bytes that bring them to the front; `out` gets the number of neighbours,
+// and from its 16th byte on six vectors, whose lanes add up to the entries of the moment matrix.
+function listNeighboursCode(dimension) {
+  const names = namedLocals(
+    [
+      "scalars", "order", ...AXES, "volume", "ranges", "rangesEnd", "width",
+      "stateAt", "smoothing", ...AXES.map((axis) => `slope${axis}`), "out",
+    ],
     ["byte", "end", "count", "hits", "at"],
     [
-      "lanes", "dx", "dy", "dz", "squared", "inside", "rest", "distance", "factor", "front",
-      "xx", "xy", "xz", "yy", "yz", "zz", "sx", "sy", "sz",
-      ...PROBE.map((name) => `probe ${name}`),
+      "lanes", "dX", "dY", "dZ", "squared", "inside", "left", "distance", "factor", "front",
+      "XX", "XY", "XZ", "YY", "YZ", "ZZ", "sX", "sY", "sZ",
+      ...SCALARS.map((name) => `scalar ${name}`),
     ],
   );
-  const probed = (name) => value(`probe ${name}`);
-  const axes = ["x", "y", "z"].slice(0, dimension);
-  const large = { x: "X", y: "Y", z: "Z" };
-  const offset = (axis) => [
-    ...put(`d${axis}`, minus(load(add(value(axis), value("byte"))), probed(axis))),
-    ...put(`d${axis}`, minus(value(`d${axis}`), times(probed(`side${large[axis]}`), nearest(times(value(`d${axis}`), probed(`per${large[axis]}`)))))),
+  const { local, value, put, counts } = names;
+  const scalar = (name) => value(`scalar ${name}`);
+  const axes = AXES.slice(0, dimension);
+  const offset = (axis) => {
+    const difference = value(`d${axis}`);
+    return [
+      ...put(`d${axis}`, minus(load(add(value(axis), value("byte"))), scalar(axis.toLowerCase()))),
+      ...put(`d${axis}`, minus(difference, times(scalar(`side${axis}`), nearest(times(difference, scalar(`per${axis}`)))))),
+    ];
+  };
+  const squares = axes.map((axis) => times(value(`d${axis}`), value(`d${axis}`)));
+  const four = [
+    ...axes.flatMap(offset),
+    ...put("squared", squares.reduce((sum, square) => plus(sum, square))),
+    ...put("inside", and(less(value("squared"), scalar("square")), lessIntegers(value("lanes"), spreadInteger(value("end"))))),
+    ...put("hits", bits(value("inside"))),
+    ...when(value("hits"), appendNeighboursCode(names, axes)),
+    ...put("byte", add(value("byte"), number(16))),
+    ...put("lanes", plusIntegers(value("lanes"), spreadInteger(number(4)))),
   ];
-  const sum = (terms) => terms.reduce((left, right) => plus(left, right));
+  const firstLanes = constant([0, 0, 0, 0, 1, 0, 0, 0, 2, 0, 0, 0, 3, 0, 0, 0]);
+  const range = [
+    ...put("byte", multiply(loadInteger(value("ranges")), number(4))),
+    ...put("lanes", plusIntegers(spreadInteger(loadInteger(value("ranges"))), firstLanes)),
+    ...put("end", loadInteger(add(value("ranges"), number(4)))),
+    ...loopBelow(local("byte"), multiply(value("end"), number(4)), four),
+    ...put("ranges", add(value("ranges"), number(8))),
+  ];
+  const code = [
+    ...SCALARS.flatMap((name, k) => put(`scalar ${name}`, loadSplat(value("scalars"), 4 * k))),
+    ...loopBelow(local("ranges"), value("rangesEnd"), range),
+    ...storeInteger(value("out"), value("count")),
+    ...["XX", "XY", "XZ", "YY", "YZ", "ZZ"].flatMap((name, k) => store(value("out"), value(name), 16 + 16 * k)),
+  ];
+  return { ...counts, code };
+}
+
+// The part of `listNeighbours` that appends those of four particles that are neighbours.
+function appendNeighboursCode({ value, put }, axes) {
+  const scalar = (name) => value(`scalar ${name}`);
   const append = (list, code) => store(add(value(list), value("at")), shuffled(code, value("front")));
-  const hit = [
+  return [
     ...put("distance", root(value("squared"))),
-    ...put("rest", minus(probed("square"), value("squared"))),
-    ...put("factor", minus(probed("eps"), value("distance"))),
-    ...put("factor", over(times(probed("slope"), times(value("factor"), value("factor"))), value("distance"))),
+    ...put("left", minus(scalar("square"), value("squared"))),
+    ...put("factor", minus(scalar("eps"), value("distance"))),
+    ...put("factor", over(times(scalar("slope"), times(value("factor"), value("factor"))), value("distance"))),
     ...put("factor", times(value("factor"), load(add(value("volume"), value("byte"))))),
     // Masks the NaN of the particle itself, and lanes behind the last particle.
     ...put("factor", and(value("factor"), and(value("inside"), less(zeros, value("squared"))))),
@@ -160,36 +196,13 @@ function listCode(dimension) {
     ...put("front", load(add(value("order"), multiply(value("hits"), number(16))))),
     ...put("at", multiply(value("count"), number(4))),
     ...append("stateAt", timesIntegers(value("lanes"), spreadInteger(value("width")))),
-    ...append("a", times(
-      times(probed("weight"), times(value("rest"), times(value("rest"), value("rest")))),
+    ...append("smoothing", times(
+      times(scalar("weight"), times(value("left"), times(value("left"), value("left")))),
       load(add(value("volume"), value("byte"))),
     )),
-    ...axes.flatMap((axis) => append(`k${axis}`, value(`s${axis}`))),
+    ...axes.flatMap((axis) => append(`slope${axis}`, value(`s${axis}`))),
     ...put("count", add(value("count"), ones(value("hits")))),
   ];
-  const four = [
-    ...axes.flatMap(offset),
-    ...put("squared", sum(axes.map((axis) => times(value(`d${axis}`), value(`d${axis}`))))),
-    ...put("inside", and(less(value("squared"), probed("square")), lessIntegers(value("lanes"), spreadInteger(value("end"))))),
-    ...put("hits", bits(value("inside"))),
-    ...when(value("hits"), hit),
-    ...put("byte", add(value("byte"), number(16))),
-    ...put("lanes", plusIntegers(value("lanes"), spreadInteger(number(4)))),
-  ];
-  const range = [
-    ...put("byte", multiply(loadInteger(value("ranges")), number(4))),
-    ...put("lanes", plusIntegers(spreadInteger(loadInteger(value("ranges"))), constant([0, 0, 0, 0, 1, 0, 0, 0, 2, 0, 0, 0, 3, 0, 0, 0]))),
-    ...put("end", loadInteger(add(value("ranges"), number(4)))),
-    ...loopBelow(local("byte"), multiply(value("end"), number(4)), four),
-    ...put("ranges", add(value("ranges"), number(8))),
-  ];
-  const code = [
-    ...PROBE.flatMap((name, k) => put(`probe ${name}`, loadSplat(value("probe"), 4 * k))),
-    ...loopBelow(local("ranges"), value("rangesEnd"), range),
-    ...storeInteger(value("out"), value("count")),
-    ...["xx", "xy", "xz", "yy", "yz", "zz"].flatMap((name, k) => store(value("out"), value(name), 16 + 16 * k)),
-  ];
-  return { ...counts, code };
 }
 
 // For each set of four lanes the bytes that bring them to the front, in order: [16, 16].
@@ -204,9 +217,9 @@ function lanesToFront() {
   return order;
 }
 
-// product(rows, rowBytes, rowEnd, weights, bias, outputs, outputBytes, inputBytes, limit, tiles): for all
+// applyLayer(rows, rowBytes, rowEnd, weights, bias, outputs, outputBytes, inputBytes, limit, tiles): for all
 // rows out = W in + b, and max(out, 0) where `limit` is 1. Weights lie tile by tile: [tiles, inputs, 8].
-function productCode() {
+function applyLayerCode() {
   const four = [0, 1, 2, 3];
   const { local, value, put, counts } = namedLocals(
     ["rows", "rowBytes", "rowEnd", "weights", "bias", "outputs", "outputBytes", "inputBytes", "limit", "tiles"],
@@ -286,33 +299,38 @@ export function fastestKernels(width, dimension) {
   }
 }
 
-export function simdKernels(width, dimension) {
-  const memory = new WebAssembly.Memory({ initial: MEMORY_PAGES });
-  const code = assemble({
-    gather: gatherCode(width, dimension),
-    listNeighbours: listCode(dimension),
-    product: productCode(),
-  });
-  const instance = new WebAssembly.Instance(new WebAssembly.Module(code), { page: { memory } });
-  const { gather: gatherAt, listNeighbours: listAt, product: multiplyAt } = instance.exports;
+// Returns a function that makes an array of a kind, for example Float32Array, in unused memory.
+function reserveIn(memory) {
   let used = 16;
-  const reserve = (Kind, length) => {
+  return (Kind, length) => {
     const at = used;
     used += 16 * Math.ceil((Kind.BYTES_PER_ELEMENT * length) / 16);
     if (used > MEMORY_PAGES * PAGE_BYTES) throw new RangeError("the world is too large for the kernels' memory");
     return new Kind(memory.buffer, at, length);
   };
+}
+
+export function simdKernels(width, dimension) {
+  const memory = new WebAssembly.Memory({ initial: MEMORY_PAGES });
+  const code = assemble({
+    sumNeighbours: sumNeighboursCode(width, dimension),
+    listNeighbours: listNeighboursCode(dimension),
+    applyLayer: applyLayerCode(),
+  });
+  const instance = new WebAssembly.Instance(new WebAssembly.Module(code), { page: { memory } });
+  const run = instance.exports;
+  const reserve = reserveIn(memory);
   const floats = (length) => reserve(Float32Array, length);
 
-  function gather({ states, list: { count, stateAt, a, slopes }, sums }, i) {
+  function sumNeighbours({ states, list: { count, stateAt, smoothing, slopes }, sums }, i) {
     const at = states.byteOffset;
-    gatherAt(
-      at, at + 4 * i * width, 4 * count, stateAt.byteOffset, a.byteOffset,
+    run.sumNeighbours(
+      at, at + 4 * i * width, 4 * count, stateAt.byteOffset, smoothing.byteOffset,
       slopes[0].byteOffset, slopes[1].byteOffset, slopes[2].byteOffset, sums.byteOffset,
     );
   }
 
-  const probe = floats(PROBE.length);
+  const scalars = floats(SCALARS.length);
   const order = reserve(Uint8Array, 256);
   order.set(lanesToFront());
   const out = floats(4 + 6 * 4);
@@ -321,15 +339,14 @@ export function simdKernels(width, dimension) {
   function listNeighbours(physics, i) {
     const { ranges, rangesEnd, eps, weight, slope, sides, perSide, list } = physics;
     const { x, y, z, volume } = physics.points;
-    const scalars = [x[i], y[i], z[i], eps, eps * eps, weight, slope];
-    probe.set(scalars);
-    probe.set(sides, scalars.length);
-    probe.set(perSide, scalars.length + 3);
+    scalars.set([x[i], y[i], z[i], eps, eps * eps, weight, slope]);
+    scalars.set(sides, 7);
+    scalars.set(perSide, 10);
     const at = ranges.byteOffset;
-    const { stateAt, a, slopes } = list;
-    listAt(
-      probe.byteOffset, order.byteOffset, x.byteOffset, y.byteOffset, z.byteOffset, volume.byteOffset,
-      at, at + 4 * rangesEnd, width, stateAt.byteOffset, a.byteOffset,
+    const { stateAt, smoothing, slopes } = list;
+    run.listNeighbours(
+      scalars.byteOffset, order.byteOffset, x.byteOffset, y.byteOffset, z.byteOffset, volume.byteOffset,
+      at, at + 4 * rangesEnd, width, stateAt.byteOffset, smoothing.byteOffset,
       slopes[0].byteOffset, slopes[1].byteOffset, slopes[2].byteOffset, out.byteOffset,
     );
     list.count = neighbourCount[0];
@@ -337,9 +354,9 @@ export function simdKernels(width, dimension) {
   }
 
   // Rows are taken four at a time: arrays have room for a multiple of them.
-  function product({ inputs, width, weights, offset }, count, rows, rowWidth, out, rectified) {
+  function applyLayer({ inputs, width, weights, offset }, count, rows, rowWidth, out, rectified) {
     const end = rows.byteOffset + 4 * rowWidth * TILE_ROWS * Math.ceil(count / TILE_ROWS);
-    multiplyAt(
+    run.applyLayer(
       rows.byteOffset, 4 * rowWidth, end, weights.byteOffset, offset.byteOffset,
       out.byteOffset, 4 * width, 4 * inputs, rectified ? 1 : 0, width / TILE_OUTPUTS,
     );
@@ -349,9 +366,9 @@ export function simdKernels(width, dimension) {
     name: "WebAssembly",
     floats,
     integers: (length) => reserve(Int32Array, length),
-    gather,
+    sumNeighbours,
     listNeighbours,
-    layer: (...matrix) => tiledLayer(floats, ...matrix),
-    product,
+    makeLayer: (...matrix) => tiledLayer(floats, ...matrix),
+    applyLayer,
   };
 }

@@ -1,10 +1,19 @@
 // The step of Neural Particle Automata in plain JavaScript: the same formulas, in the same order, as
-// npa_envs/reference.py and docs/mathematics.md, which this file follows. kernels_simd.js and physics_gpu.js
-// follow this file. tests/web/test_export.py and test_export_browser.py compare all three with Python.
+// npa_envs/reference.py and docs/mathematics.md. A change of a formula is made in its whole row:
 //
-// Particles are sorted by cell, densities are summed over pairs in double precision, and only active
-// particles perceive. Most of the time goes into sums over neighbours and the network, the `kernels`:
-// those of this file, or the WebAssembly ones of kernels_simd.js.
+//                          this file            kernels_simd.js       shaders of physics_gpu.js
+//   density                computeDensities                           density
+//   list of neighbours     listNeighbours       listNeighboursCode    visitNeighbours
+//   sums over neighbours   sumNeighbours        sumNeighboursCode     advance
+//   perception             perceive                                   advance, stateGradient
+//   network                applyLayer           applyLayerCode        advance
+//   new positions, states  update
+//
+// tests/web/test_export.py compares a step by this file, and one with the kernels of kernels_simd.js, with Python's;
+// test_export_browser.py compares one by physics_gpu.js.
+//
+// Particles are sorted by cell, densities are summed over pairs in double precision, and only active particles
+// perceive. The functions that take most of the time are `kernels`, in plain JavaScript or in WebAssembly.
 
 export const MOMENT_THRESHOLD = 1e-3;
 export const SQUARED_MOMENT_SOFTENING = 1e-2 ** 2;
@@ -12,14 +21,14 @@ export const SQUARED_MOMENT_SOFTENING = 1e-2 ** 2;
 // The upper triangle of the unit matrix: xx, xy, xz, yy, yz, zz.
 const IDENTITY = [1, 0, 0, 1, 0, 1];
 
-// Rows in a batch of the network.
+// Perception vectors to which the network is applied at a time.
 const BLOCK_ROWS = 64;
 
 // States, and a layer's outputs, are padded to multiples of these.
 const LANES = 4;
 export const TILE_OUTPUTS = 8;
 
-// Most cells on each side of the grid. Beyond it cells are reused; distances are checked in any case.
+// Maximum number of cells on each side of the grid. Beyond it cells are reused; distances are checked in any case.
 export const MAX_CELLS = { 2: 256, 3: 64 };
 
 export const CELLS_PER_RADIUS = 2;
@@ -35,123 +44,124 @@ export function prepareRule(description, kernels) {
   // The length P of the perception vector, as NPARule.perception_dim.
   rule.inputs = 2 * channels + (rule.state_gradient ? channels * dimension : 0) + (rule.density_gradient ? dimension : 0);
   rule.outputs = channels + (rule.static ? 0 : rule.space_dim);
-  rule.hidden = kernels.layer(weights["hidden.weight"], weights["hidden.bias"], rule.inputs, hidden);
-  rule.output = kernels.layer(weights["output.weight"], null, hidden, rule.outputs);
+  rule.hidden = kernels.makeLayer(weights["hidden.weight"], weights["hidden.bias"], rule.inputs, hidden);
+  rule.output = kernels.makeLayer(weights["output.weight"], null, hidden, rule.outputs);
   return rule;
 }
 
 // The kernels in plain JavaScript. `floats` and `integers` return zeroed arrays for them.
 export function plainKernels() {
-  // Sums over the neighbours of sorted particle i, which `listNeighbours` has listed, into `sums` [1 + D, width]
-  // of a Physics: Σ a s_j, and Σ k (s_j - s_i) for each axis.
-  function gather(physics, i) {
-    const { states, width, sums, dimension, list: { count, stateAt, a, slopes: [kx, ky, kz] } } = physics;
-    for (let c = 0; c < width; c++) {
-      const mine = states[i * width + c];
-      let smoothed = 0, x = 0, y = 0, z = 0;
-      for (let n = 0; n < count; n++) {
-        const other = states[stateAt[n] + c], offset = other - mine;
-        smoothed += a[n] * other;
-        x += kx[n] * offset;
-        y += ky[n] * offset;
-        if (dimension === 3) z += kz[n] * offset;
-      }
-      sums[c] = smoothed;
-      sums[width + c] = x;
-      sums[2 * width + c] = y;
-      if (dimension === 3) sums[3 * width + c] = z;
-    }
-  }
-
-  // Fills `list` of a Physics with the neighbours of sorted particle i among the particles of `ranges`.
-  function listNeighbours(physics, i) {
-    const { ranges, rangesEnd, eps, weight, slope, width, list } = physics;
-    const { x, y, z, volume } = physics.points;
-    const { stateAt, a, slopes: [kx, ky, kz] } = list;
-    const [sideX, sideY, sideZ] = physics.sides;
-    const [halfX, halfY, halfZ] = physics.halfSides;
-    const squaredRadius = eps * eps;
-    const ownX = x[i], ownY = y[i], ownZ = z[i];
-    let xx = 0, xy = 0, xz = 0, yy = 0, yz = 0, zz = 0;
-    let count = 0;
-    for (let r = 0; r < rangesEnd; r += 2) {
-      const last = ranges[r + 1];
-      for (let j = ranges[r]; j < last; j++) {
-        const dx = toNearest(x[j] - ownX, sideX, halfX);
-        const dy = toNearest(y[j] - ownY, sideY, halfY);
-        const dz = toNearest(z[j] - ownZ, sideZ, halfZ);
-        const squared = dx * dx + dy * dy + dz * dz;
-        if (!(squared < squaredRadius)) continue;
-        const left = squaredRadius - squared;
-        const distance = Math.sqrt(squared);
-        const k = squared > 0 ? (slope * (eps - distance) * (eps - distance)) / distance : 0;
-        const factor = k * volume[j];
-        stateAt[count] = j * width;
-        a[count] = weight * left * left * left * volume[j];
-        kx[count] = factor * dx;
-        ky[count] = factor * dy;
-        kz[count] = factor * dz;
-        count++;
-        xx += factor * dx * dx;
-        xy += factor * dx * dy;
-        xz += factor * dx * dz;
-        yy += factor * dy * dy;
-        yz += factor * dy * dz;
-        zz += factor * dz * dz;
-      }
-    }
-    list.count = count;
-    list.moment.set([xx, xy, xz, yy, yz, zz]);
-  }
-
-  // Writes W row + b for `count` rows to `out`; max(., 0) of it where `rectified`.
-  function product({ inputs, width, weights, offset }, count, rows, rowWidth, out, rectified) {
-    for (let tile = 0; tile < width; tile += TILE_OUTPUTS) {
-      for (let row = 0; row < count; row++) {
-        const from = row * rowWidth;
-        let s0 = offset[tile], s1 = offset[tile + 1], s2 = offset[tile + 2], s3 = offset[tile + 3];
-        let s4 = offset[tile + 4], s5 = offset[tile + 5], s6 = offset[tile + 6], s7 = offset[tile + 7];
-        for (let p = 0, at = tile * inputs; p < inputs; p++, at += TILE_OUTPUTS) {
-          const value = rows[from + p];
-          s0 += value * weights[at];
-          s1 += value * weights[at + 1];
-          s2 += value * weights[at + 2];
-          s3 += value * weights[at + 3];
-          s4 += value * weights[at + 4];
-          s5 += value * weights[at + 5];
-          s6 += value * weights[at + 6];
-          s7 += value * weights[at + 7];
-        }
-        const to = row * width + tile;
-        out[to] = s0;
-        out[to + 1] = s1;
-        out[to + 2] = s2;
-        out[to + 3] = s3;
-        out[to + 4] = s4;
-        out[to + 5] = s5;
-        out[to + 6] = s6;
-        out[to + 7] = s7;
-      }
-    }
-    if (rectified) {
-      for (let k = 0; k < count * width; k++) if (out[k] < 0) out[k] = 0;
-    }
-  }
-
   const floats = (length) => new Float32Array(length);
   return {
     name: "JavaScript",
     floats,
     integers: (length) => new Int32Array(length),
-    gather,
+    sumNeighbours,
     listNeighbours,
-    layer: (...matrix) => tiledLayer(floats, ...matrix),
-    product,
+    makeLayer: (...matrix) => tiledLayer(floats, ...matrix),
+    applyLayer,
   };
 }
 
-// A matrix [outputs, inputs], row by row, and a bias or null, as products read them: eight outputs at a
-// time are contiguous, [tiles, inputs, 8].
+// Sums over the neighbours of sorted particle i, which `listNeighbours` has listed, into `sums` [1 + D, width]
+// of a Physics: Σ smoothing s_j, and Σ slope (s_j - s_i) for each axis.
+function sumNeighbours(physics, i) {
+  const { states, width, sums, dimension, list } = physics;
+  const { count, stateAt, smoothing, slopes: [slopeX, slopeY, slopeZ] } = list;
+  for (let c = 0; c < width; c++) {
+    const mine = states[i * width + c];
+    let smoothed = 0, x = 0, y = 0, z = 0;
+    for (let n = 0; n < count; n++) {
+      const other = states[stateAt[n] + c], offset = other - mine;
+      smoothed += smoothing[n] * other;
+      x += slopeX[n] * offset;
+      y += slopeY[n] * offset;
+      if (dimension === 3) z += slopeZ[n] * offset;
+    }
+    sums[c] = smoothed;
+    sums[width + c] = x;
+    sums[2 * width + c] = y;
+    if (dimension === 3) sums[3 * width + c] = z;
+  }
+}
+
+// Fills `list` of a Physics with the neighbours of sorted particle i among the particles of `ranges`.
+function listNeighbours(physics, i) {
+  const { ranges, rangesEnd, eps, weight, slope, width, list } = physics;
+  const { x, y, z, volume } = physics.points;
+  const { stateAt, smoothing, slopes: [slopeX, slopeY, slopeZ] } = list;
+  const [sideX, sideY, sideZ] = physics.sides;
+  const [halfX, halfY, halfZ] = physics.halfSides;
+  const squaredRadius = eps * eps;
+  const ownX = x[i], ownY = y[i], ownZ = z[i];
+  let xx = 0, xy = 0, xz = 0, yy = 0, yz = 0, zz = 0;
+  let count = 0;
+  for (let r = 0; r < rangesEnd; r += 2) {
+    const last = ranges[r + 1];
+    for (let j = ranges[r]; j < last; j++) {
+      const dx = toNearest(x[j] - ownX, sideX, halfX);
+      const dy = toNearest(y[j] - ownY, sideY, halfY);
+      const dz = toNearest(z[j] - ownZ, sideZ, halfZ);
+      const squared = dx * dx + dy * dy + dz * dz;
+      if (!(squared < squaredRadius)) continue;
+      const left = squaredRadius - squared;
+      const distance = Math.sqrt(squared);
+      const k = squared > 0 ? (slope * (eps - distance) * (eps - distance)) / distance : 0;
+      const factor = k * volume[j];
+      stateAt[count] = j * width;
+      smoothing[count] = weight * left * left * left * volume[j];
+      slopeX[count] = factor * dx;
+      slopeY[count] = factor * dy;
+      slopeZ[count] = factor * dz;
+      count++;
+      xx += factor * dx * dx;
+      xy += factor * dx * dy;
+      xz += factor * dx * dz;
+      yy += factor * dy * dy;
+      yz += factor * dy * dz;
+      zz += factor * dz * dz;
+    }
+  }
+  list.count = count;
+  list.moment.set([xx, xy, xz, yy, yz, zz]);
+}
+
+// Writes W row + b of a layer for `count` rows to `out`; max(., 0) of it where `rectified`.
+function applyLayer({ inputs, width, weights, offset }, count, rows, rowWidth, out, rectified) {
+  for (let tile = 0; tile < width; tile += TILE_OUTPUTS) {
+    for (let row = 0; row < count; row++) {
+      const from = row * rowWidth;
+      let s0 = offset[tile], s1 = offset[tile + 1], s2 = offset[tile + 2], s3 = offset[tile + 3];
+      let s4 = offset[tile + 4], s5 = offset[tile + 5], s6 = offset[tile + 6], s7 = offset[tile + 7];
+      for (let p = 0, at = tile * inputs; p < inputs; p++, at += TILE_OUTPUTS) {
+        const value = rows[from + p];
+        s0 += value * weights[at];
+        s1 += value * weights[at + 1];
+        s2 += value * weights[at + 2];
+        s3 += value * weights[at + 3];
+        s4 += value * weights[at + 4];
+        s5 += value * weights[at + 5];
+        s6 += value * weights[at + 6];
+        s7 += value * weights[at + 7];
+      }
+      const to = row * width + tile;
+      out[to] = s0;
+      out[to + 1] = s1;
+      out[to + 2] = s2;
+      out[to + 3] = s3;
+      out[to + 4] = s4;
+      out[to + 5] = s5;
+      out[to + 6] = s6;
+      out[to + 7] = s7;
+    }
+  }
+  if (rectified) {
+    for (let k = 0; k < count * width; k++) if (out[k] < 0) out[k] = 0;
+  }
+}
+
+// A layer of a matrix [outputs, inputs], row by row, and a bias or null, as `applyLayer` reads it: eight outputs at
+// a time are contiguous, [tiles, inputs, 8].
 export function tiledLayer(floats, weight, bias, inputs, outputs) {
   const width = TILE_OUTPUTS * Math.ceil(outputs / TILE_OUTPUTS);
   const weights = floats(width * inputs), offset = floats(width);
@@ -167,7 +177,7 @@ export function tiledLayer(floats, weight, bias, inputs, outputs) {
 
 // Memory and methods of a step: sorted copies, densities, lists. Made once for each size.
 export class Physics {
-  // rules: prepared, all of one dimension and number of channels. capacity: particles at most.
+  // rules: prepared, all of one dimension and number of channels. capacity: maximum number of particles.
   constructor(rules, capacity, kernels) {
     this.rules = rules;
     this.kernels = kernels;
@@ -189,12 +199,12 @@ export class Physics {
     this.cellOf = new Int32Array(capacity);
     this.starts = new Int32Array(1);
     this.states = kernels.floats(capacity * this.width);
-    // The neighbours of one particle: indices of their first channels, their factors in the sums of `gather`, and
-    // their moment matrix: xx, xy, xz, yy, yz, zz.
+    // The neighbours of one particle: indices of their first channels, their factors in the sums of `sumNeighbours`,
+    // and their moment matrix: xx, xy, xz, yy, yz, zz.
     this.list = {
       count: 0,
       stateAt: kernels.integers(room),
-      a: floats(),
+      smoothing: floats(),
       slopes: [floats(), floats(), floats()],
       moment: new Float64Array(6),
     };
@@ -235,8 +245,23 @@ export class Physics {
 
   // Sorts a world's particles by cell, and sets what a step with a perception radius in a box needs.
   sort({ count, x, s }, eps, box) {
-    const { dimension, channels, width, order, cellOf, states, points } = this;
-    const three = dimension === 3;
+    const inverse = this.setGrid(x, count, eps, box);
+    this.orderByCell(x, count, inverse);
+    const { dimension, channels, width, order, states, points } = this;
+    const [sideX, sideY, sideZ] = this.sides;
+    const inBox = (position, side) => (side > 0 ? position - side * Math.floor(position / side + 0.5) : position);
+    for (let k = 0; k < count; k++) {
+      const i = order[k];
+      points.x[k] = inBox(x[i * dimension], sideX);
+      points.y[k] = inBox(x[i * dimension + 1], sideY);
+      points.z[k] = dimension === 3 ? inBox(x[i * dimension + 2], sideZ) : 0;
+      for (let c = 0; c < channels; c++) states[k * width + c] = s[i * channels + c];
+    }
+  }
+
+  // Sets the constants of a step and the numbers of cells along the axes; returns cells in a length unit of each.
+  setGrid(x, count, eps, box) {
+    const { dimension } = this;
     const cells = [1, 1, 1], inverse = [0, 0, 0];
     this.eps = eps;
     this.weight = smoothingNorm(eps, dimension);
@@ -263,8 +288,15 @@ export class Physics {
       }
     }
     this.halfSides = this.perSide.map((per) => 0.5 / per);
-    const [nx, ny, nz] = cells;
     this.cells = cells;
+    return inverse;
+  }
+
+  // Writes particles' indices, sorted by cell, to `order`, and where each cell's particles begin to `starts`.
+  orderByCell(x, count, inverse) {
+    const { dimension, order, cellOf, cells } = this;
+    const three = dimension === 3;
+    const [nx, ny, nz] = cells;
     const total = nx * ny * nz;
     if (this.starts.length < total + 1) this.starts = new Int32Array(total + 1);
     const starts = this.starts.fill(0, 0, total + 1);
@@ -284,15 +316,6 @@ export class Physics {
     for (let i = count - 1; i >= 0; i--) order[--starts[cellOf[i] + 1]] = i;
     for (let cell = 0; cell < total; cell++) starts[cell] = starts[cell + 1];
     starts[total] = count;
-    const [sideX, sideY, sideZ] = this.sides;
-    const inBox = (position, side) => (side > 0 ? position - side * Math.floor(position / side + 0.5) : position);
-    for (let k = 0; k < count; k++) {
-      const i = order[k];
-      points.x[k] = inBox(x[i * dimension], sideX);
-      points.y[k] = inBox(x[i * dimension + 1], sideY);
-      points.z[k] = three ? inBox(x[i * dimension + 2], sideZ) : 0;
-      for (let c = 0; c < channels; c++) states[k * width + c] = s[i * channels + c];
-    }
   }
 
   // Fills `ranges` with the runs of sorted particles that may be neighbours of those of a cell.
@@ -386,8 +409,8 @@ export class Physics {
     let filled = 0;
     const flush = () => {
       if (filled === 0) return;
-      kernels.product(rule.hidden, filled, rows, rowWidth, hidden, true);
-      kernels.product(rule.output, filled, hidden, rule.hidden.width, updates, false);
+      kernels.applyLayer(rule.hidden, filled, rows, rowWidth, hidden, true);
+      kernels.applyLayer(rule.output, filled, hidden, rule.hidden.width, updates, false);
       for (let row = 0; row < filled; row++) {
         this.update(world, rule, order[blockRows[row]], updates, row * rule.output.width);
       }
@@ -412,7 +435,7 @@ export class Physics {
   perceive(rule, i, at, divisor) {
     const { width, dimension, channels, rows, sums, states, kernels } = this;
     kernels.listNeighbours(this, i);
-    kernels.gather(this, i);
+    kernels.sumNeighbours(this, i);
 
     let to = at;
     for (let c = 0; c < channels; c++) rows[to++] = states[i * width + c];

@@ -1,6 +1,6 @@
 // The step of physics.js with densities, perception and networks on the GPU, through WebGPU. The CPU sorts the
-// particles before, and moves them after; both are a small part of the time. The shaders follow
-// `computeDensities`, `perceive` and the kernels of physics.js, whose changes are made here as well.
+// particles before, and moves them after; both are a small part of the time. The head of physics.js says which
+// formulas are here as well.
 
 import { CELLS_PER_RADIUS, MAX_CELLS, MOMENT_THRESHOLD, SQUARED_MOMENT_SOFTENING } from "./physics.js";
 
@@ -13,14 +13,10 @@ export async function openDevice() {
   return adapter ? adapter.requestDevice() : null;
 }
 
-// Shaders for one rule: sizes are constants in them.
-function shaders(rule) {
-  const { space_dim: dimension, state_dim: channels, inputs, hidden_dim: hidden, outputs } = rule;
+// Code that visits all j in the cells around sorted particle i: d is the vector to j, square its squared length.
+function visitNeighbours(body) {
   const span = CELLS_PER_RADIUS;
-  const axes = ["x", "y", "z"].slice(0, dimension);
-  const smooth = rule.moment_inverse === "smooth";
-  // Visits all j in the cells around sorted particle i: d is the vector to it, square its squared length.
-  const around = (body) => `
+  return `
     let own = points[i].xyz;
     let cell = home[i];
     let at = vec3u(cell % world.cells.x, (cell / world.cells.x) % world.cells.y, cell / (world.cells.x * world.cells.y));
@@ -46,19 +42,23 @@ function shaders(rule) {
         }
       }
     }`;
+}
+
+// Code that writes L(∇s) of all channels, from the sums `slopes` and the moment matrix, to `z`.
+function stateGradient(rule, axes) {
   const inverse = {
     2: "let adjugate = array<f32, 6>(yy, -xy, 0.0, xx, 0.0, 0.0); let determinant = xx * yy - xy * xy;",
     3: `let adjugate = array<f32, 6>(yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy,
           xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy);
         let determinant = xx * adjugate[0] + xy * adjugate[1] + xz * adjugate[2];`,
-  }[dimension];
-  const corrected = smooth
+  }[axes.length];
+  const corrected = rule.moment_inverse === "smooth"
     ? `let divisor = determinant * determinant + ${SQUARED_MOMENT_SOFTENING};
        for (var k = 0; k < 6; k++) { m[k] = (determinant * adjugate[k] + ${SQUARED_MOMENT_SOFTENING} * m[k]) / divisor; }`
     : `if (abs(determinant) >= ${MOMENT_THRESHOLD}) {
          for (var k = 0; k < 6; k++) { m[k] = adjugate[k] / determinant; }
        }`;
-  const stateGradient = `
+  return `
     var m = array<f32, 6>(1.0, 0.0, 0.0, 1.0, 0.0, 1.0);
     ${rule.moment_correction ? `{ ${inverse} ${corrected} }` : ""}
     for (var c = 0u; c < CHANNELS; c++) {
@@ -67,6 +67,12 @@ function shaders(rule) {
         g.x * m[0] + g.y * m[1] + g.z * m[2], g.x * m[1] + g.y * m[3] + g.z * m[4], g.x * m[2] + g.y * m[4] + g.z * m[5]));
       ${axes.map((axis) => `z[to] = v.${axis}; to++;`).join(" ")}
     }`;
+}
+
+// The shaders `density` and `advance` of one rule: sizes are constants in them.
+function shaders(rule) {
+  const { space_dim: dimension, state_dim: channels, inputs, hidden_dim: hidden, outputs } = rule;
+  const axes = ["x", "y", "z"].slice(0, dimension);
   return `
   struct World {
     sides: vec4f, per: vec4f, cells: vec4u,
@@ -101,7 +107,7 @@ function shaders(rule) {
     if (i >= world.count) { return; }
     var rho = 0.0;
     var gradient = vec3f(0.0);
-    ${around("rho += w; gradient += k * d;")}
+    ${visitNeighbours("rho += w; gradient += k * d;")}
     fields[i] = vec4f(gradient, 1.0 / rho);
   }
 
@@ -114,7 +120,7 @@ function shaders(rule) {
     var smoothed: array<f32, ${channels}>;
     var slopes: array<vec3f, ${channels}>;
     var xx = 0.0; var xy = 0.0; var xz = 0.0; var yy = 0.0; var yz = 0.0; var zz = 0.0;
-    ${around(`
+    ${visitNeighbours(`
             let volume = fields[j].w;
             let s = k * volume * d;
             xx += s.x * d.x; xy += s.x * d.y; xz += s.x * d.z; yy += s.y * d.y; yz += s.y * d.z; zz += s.z * d.z;
@@ -126,7 +132,7 @@ function shaders(rule) {
     var to = 0u;
     for (var c = 0u; c < CHANNELS; c++) { z[to] = states[i * WIDTH + c]; to++; }
     for (var c = 0u; c < CHANNELS; c++) { z[to] = smoothed[c]; to++; }
-    ${rule.state_gradient ? stateGradient : ""}
+    ${rule.state_gradient ? stateGradient(rule, axes) : ""}
     ${rule.density_gradient ? `{
       let v = logScaled(world.densityScale * fields[i].xyz);
       ${axes.map((axis) => `z[to] = v.${axis}; to++;`).join(" ")}
