@@ -151,14 +151,20 @@ def writable_folder(path: Path, name: str = "out") -> Path:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PartOptions:
+class TimeLimitOptions:
+    """The option of commands that start several runs or measurements."""
+
+    max_seconds: float = math.inf
+    """Start nothing more after this time [s]; what is done is kept."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PartOptions(TimeLimitOptions):
     """Options of commands that distribute runs over devices and machines."""
 
     part: Annotated[str | None, tyro.conf.arg(metavar="K/N")] = None
     """Run only the K-th of N parts: several machines, or tasks of a scheduler's array, run one part
     each, all with the same --out on a shared disk."""
-    max_seconds: float = math.inf
-    """No run starts after this time [s]; the next call continues."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -179,25 +185,26 @@ class SharedRunOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class MeasureOptions(RunOptions):
+class MeasureOptions(RunOptions, TimeLimitOptions):
     """Options of the commands that measure and keep records."""
 
     threads: int = 1
     """CPU threads of torch and the kernels in each run; they change times, not other results."""
     commit: str | None = None
     """The measured commit, for the record; default: that of the checkout."""
-    max_seconds: float | None = None
-    """Start no measurement after this time [s]; those done are kept. Default: never."""
 
 
 def check_numbers(options: Any, **least: int) -> None:
-    """Check that options, if given, are at least as large as in `least`, and `max_seconds` > 0."""
+    """Raise NPAError for an option that is neither None nor at least its number in `least`.
+
+    Also for `max_seconds`, if there is this option, unless it is positive.
+    """
     for name, smallest in least.items():
         value = getattr(options, name)
         if value is not None and value < smallest:
             raise NPAError(f"{name} must be at least {smallest}, got {value}")
-    seconds = getattr(options, "max_seconds", None)
-    if seconds is not None and not seconds > 0.0:
+    seconds = getattr(options, "max_seconds", math.inf)
+    if not seconds > 0.0:
         raise NPAError(f"max_seconds must be positive, got {seconds}: leave it out for no limit")
 
 
@@ -225,7 +232,10 @@ def problem_of(options: Any, num_envs: int, steps: int | None = None) -> Problem
 
 
 def first_options(arguments: Sequence[str]) -> argparse.Namespace:
-    """Parse only those options of a run that decide the defaults of others, such as `--preset`."""
+    """Parse only the options that decide the defaults of others, such as `--preset`.
+
+    By argparse: tyro, which parses all options, takes the defaults first.
+    """
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     for name in ("preset", "device", "gpus"):
         parser.add_argument(f"--{name}")
@@ -240,10 +250,10 @@ def first_options(arguments: Sequence[str]) -> argparse.Namespace:
 
 
 def resolve_run(arguments: Sequence[str], out_of: Callable[[Sequence[str]], Path]) -> list[str]:
-    """Return a run's arguments after replacing `--resume auto`, and adding the device of `--gpus`.
+    """Return a run's arguments with `--device cuda` if `--gpus` is given without a device.
 
-    `--resume auto` becomes `--resume` if there is a checkpoint in the run's folder, which `out_of`
-    returns; else it is removed.
+    `--resume auto` becomes `--resume` if there is a checkpoint in the run's folder; otherwise it is
+    removed. `out_of` returns that folder for arguments.
     """
     first = first_options(arguments)
     resolved = list(arguments)
@@ -275,7 +285,7 @@ def chosen_names(noun: str, names: Sequence[str], known: Iterable[str]) -> list[
 
 @contextlib.contextmanager
 def torch_threads(count: int) -> Iterator[None]:
-    """Set torch's number of CPU threads within a `with` block."""
+    """Set torch's number of CPU threads to `count` within a `with` block."""
     import torch
 
     before = torch.get_num_threads()

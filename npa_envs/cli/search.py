@@ -1,7 +1,8 @@
-"""`npa-envs search`: rules that nobody asked for, laid out by what they do."""
+"""`npa-envs search`: a search for rules that differ from each other and stay alive."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -38,8 +39,8 @@ class SearchOptions(common.RunOptions, SearchWorld):
     """Seed of the proposals; all candidates run in the same worlds."""
     threads: int = 1
     """CPU threads of torch and of the kernels."""
-    max_seconds: float | None = None
-    """Stop after this time [s]; the same command continues. Default: never."""
+    max_seconds: float = math.inf
+    """Stop after this time [s]; the same command continues."""
     out: Path = Path("runs/search")
     """Folder to write to; created where missing."""
 
@@ -57,7 +58,7 @@ def main(arguments: Sequence[str]) -> int:
     enough = time_limit(options.max_seconds)
     world = SearchWorld(**{f.name: getattr(options, f.name) for f in fields(SearchWorld)})
     least = options.batch_size * world.particle_steps
-    if not least <= options.budget < float("inf"):
+    if not least <= options.budget < math.inf:
         raise NPAError(
             f"budget must be finite and at least that of one batch, {least} particle-steps, got "
             f"{options.budget:g}: raise it"

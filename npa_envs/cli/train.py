@@ -83,8 +83,7 @@ def run(
 
     The report prints `arguments`, those after `npa-envs train`.
     """
-    if options.max_seconds is not None and not 0 < options.max_seconds < math.inf:
-        raise NPAError(f"max_seconds must be positive and finite, got {options.max_seconds}")
+    common.check_numbers(options)
     folder = RunFolder(config.out)
     resume_command = f"npa-envs train {task_name} --out {shlex.quote(str(config.out))} --resume"
     if processes.count > 1 or options.processes is not None:
@@ -136,7 +135,7 @@ def finish(
         print(f"finished: {result.iteration} iterations{last_loss}")
     else:
         print(f"stopped at iteration {result.iteration}{last_loss}")
-        print(f"  checkpoint  {folder.checkpoint}\n  go on       {resume_command}")
+        print(f"  checkpoint  {folder.checkpoint}\n  continue    {resume_command}")
     for rule in rules:
         print(f"  rule        {rule}")
     print(f"  log         {folder.log}\n  pictures    {folder.pictures}/")
@@ -216,11 +215,11 @@ def announcement(
         time = f"the progress bar shows the time on {config.device}"
     else:
         time = f"about {common.duration(expected)} on an idle CPU"
-    if options.max_seconds is not None:
+    if options.max_seconds < math.inf:
         time += f", at most {common.duration(options.max_seconds)}"
     where = config.device if process_count == 1 else f"{process_count} processes ({config.device})"
     return (
-        f"{task_name}: learns {' and '.join(goals)} ({'goes on' if options.resume else source})",
+        f"{task_name}: learns {' and '.join(goals)} ({'continues' if options.resume else source})",
         f"{config.total_iterations} iterations, each of {config.world_count} worlds of "
         f"{particles} particles, on {where}: {time}",
     )

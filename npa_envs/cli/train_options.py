@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, make_dataclass, replace
 from pathlib import Path
@@ -36,7 +37,7 @@ class TrainOptions(common.SharedRunOptions):
     default `best` on CUDA if the task has it, else `fast`."""
     config: Path | None = None
     """YAML, TOML or JSON file of fields and values, also `preset`; overrides the preset."""
-    max_seconds: float | None = None
+    max_seconds: float = math.inf
     """Stop after this time [s]; the run can be resumed."""
     progress: bool = True
     """Show a progress bar."""
@@ -49,10 +50,16 @@ def parse_run(task_name: str, arguments: Sequence[str]) -> tuple[TrainOptions, T
 
     Ends the process after `--help`, which shows the most used options, and `--help-all`.
     """
-    base = starting_configuration(task_name, arguments)
-    if isinstance(base, JointTrainConfig):
-        return parse_joint(task_name, base, arguments)
-    return _parse_over(base, task_name, arguments)
+    return _parse_over(starting_configuration(task_name, arguments), task_name, arguments)
+
+
+def _parse_over(
+    base: TrainConfig[Any], task_name: str, arguments: Sequence[str]
+) -> tuple[TrainOptions, TrainConfig[Any]]:
+    """Return the options of the run, and `base` with the values of the options that are given."""
+    parse: Any = _parse_joint if isinstance(base, JointTrainConfig) else _parse_fields
+    parsed: tuple[TrainOptions, TrainConfig[Any]] = parse(base, task_name, arguments)
+    return parsed
 
 
 def default_preset(task_name: str, device: str) -> str:
@@ -93,17 +100,19 @@ def starting_configuration(task_name: str, arguments: Sequence[str]) -> TrainCon
 def _check_preset(
     name: str, run: TrainConfig[Any], task_name: str, folder: RunFolder, arguments: Sequence[str]
 ) -> None:
-    """Raise if the run to resume is not of the preset `name`, options in `arguments` aside."""
-    presets = {name: config_to_dict(one) for name, one in task_entry(task_name).presets.items()}
-    values = config_to_dict(run)
-    changed = {word.partition("=")[0].lstrip("-").replace("-", "_") for word in arguments}
-    changed |= {word.removeprefix("no_") for word in changed} | {"out", "device", "task"}
+    """Raise NPAError if the run to resume is not of the preset `name`, except for given options."""
+    presets = task_entry(task_name).presets
+    # A given option has the same value over the run as over the preset.
+    over_run, over_preset = (
+        config_to_dict(_parse_over(base, task_name, arguments)[1]) for base in (run, presets[name])
+    )
+    values, *of_presets = map(config_to_dict, (run, *presets.values()))
     others = [
         f"{key}: {shown(values.get(key))}"
-        for key, value in presets[name].items()
-        if key not in changed
-        and values.get(key) != value
-        and any(one.get(key) != value for one in presets.values())
+        for key, value in config_to_dict(presets[name]).items()
+        if key not in ("out", "device", "task")
+        and over_run.get(key) != over_preset[key]
+        and any(preset_values.get(key) != value for preset_values in of_presets)
     ]
     if others:
         raise NPAError(
@@ -123,10 +132,10 @@ class Command(Generic[ConfigT]):
     training: ConfigT
 
 
-def _parse_over(
+def _parse_fields(
     defaults: ConfigT, task_name: str, arguments: Sequence[str]
 ) -> tuple[TrainOptions, ConfigT]:
-    """Parse arguments to the options of the run, and to `defaults` with the options' changes."""
+    """Parse options that have the names of the fields of `defaults`, a task of one species."""
     description = f"Train on {task_name}. Defaults shown are those of the preset."
     if {"-h", "--help"} & set(arguments):
         description += f" All options: npa-envs train {task_name} --help-all"
@@ -192,18 +201,18 @@ class JointOptions(JointTrainConfig[SpeciesOptions]):
     initial_rule: tyro.conf.Suppress[str] = ""
 
 
-def parse_joint(
-    task_name: str, base: JointTrainConfig[CoMorphogenesis2DConfig], arguments: Sequence[str]
+def _parse_joint(
+    base: JointTrainConfig[CoMorphogenesis2DConfig], task_name: str, arguments: Sequence[str]
 ) -> tuple[TrainOptions, JointTrainConfig[CoMorphogenesis2DConfig]]:
-    """Return the options of a run of several species, and `base` with the options' changes."""
+    """Parse options that change the fields of all species of `base`."""
     task = base.task
     targets = tuple(species.target for species in task.species)
     species_options: list[SpeciesOptions] = []
     # Parsed over the values of each species, which an option that is not given does not change.
     for species in task.species:
-        own = _of_type(SpeciesOptions, species, targets=targets, distance=task.distance)
-        defaults: JointOptions = _of_type(JointOptions, base, task=own)
-        options, parsed = _parse_over(defaults, task_name, arguments)
+        fields_of_one = _of_type(SpeciesOptions, species, targets=targets, distance=task.distance)
+        defaults: JointOptions = _of_type(JointOptions, base, task=fields_of_one)
+        options, parsed = _parse_fields(defaults, task_name, arguments)
         species_options.append(parsed.task)
     targets, distance = parsed.task.targets, parsed.task.distance
     if len(targets) < 2:

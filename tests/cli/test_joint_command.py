@@ -58,7 +58,7 @@ def test_a_run_stopped_by_time_resumes_to_the_same_rules(tmp_path, capsys):
         assert f"rule        {tmp_path / 'whole' / name}" in text
     assert "--distances 0.8 --particle-count 256" in text
     assert main([*words, str(tmp_path / "parts"), "--max-seconds", "1e-9"]) == 0
-    (command,) = re.findall(r"go on +npa-envs (train .*--resume)", capsys.readouterr().out)
+    (command,) = re.findall(r"continue +npa-envs (train .*--resume)", capsys.readouterr().out)
     assert main([*command.split(), "--no-progress", "--no-report"]) == 0
     assert "finished: 4 iterations" in capsys.readouterr().out
     for number, target in enumerate(("ring", "flower")):

@@ -80,6 +80,9 @@ def test_a_run_goes_on_with_its_own_preset_only(tmp_path):
     assert starting_configuration(TASK, words) == config
     same = [*words, "--preset", "fast", "--iterations", "9"]
     assert starting_configuration(TASK, same) == config
+    # A value is no option.
+    with pytest.raises(NPAError, match="'fast' differs from it .iterations: 9 there"):
+        starting_configuration(TASK, [*words, "--preset", "fast", "--target", "iterations"])
     for name in ("tiny", "best"):
         with pytest.raises(NPAError, match=f"preset must be the one .* but '{name}' differs"):
             starting_configuration(TASK, [*words, "--preset", name, "--iterations=9"])
