@@ -71,13 +71,9 @@ def main(arguments: Sequence[str]) -> int:
         from npa_envs.measure.speed.explain import explain
 
         workload = timing.Workload(
-            options.space_dim,
-            options.world_count,
-            options.particle_count,
-            steps=1,
-            state_dim=options.state_dim,
-            update_prob=options.update_prob,
-        )
+            options.space_dim, options.world_count, options.particle_count, steps=1,
+            state_dim=options.state_dim, update_prob=options.update_prob,
+        )  # fmt: skip
         dtype, gradients = getattr(torch, options.dtype), options.gradients
         print(explain(workload, device, dtype, periodic=options.periodic, gradients=gradients))
         return 0
@@ -86,12 +82,9 @@ def main(arguments: Sequence[str]) -> int:
         plots.check_matplotlib()
     with common.measuring(options, None, "row") as advance:
         session = timing.TimingSession(
-            device=device,
-            repeats=options.repeats,
-            small=options.quick,
-            progress=advance,
+            device=device, repeats=options.repeats, small=options.quick, progress=advance,
             enough=benchmark_records.time_limit(options.max_seconds),
-        )
+        )  # fmt: skip
         tables = suites.SUITES[name](session)
     command = benchmark_records.command_text("bench", arguments)
     commit = options.commit or benchmark_records.current_commit()

@@ -104,14 +104,9 @@ def main(arguments: Sequence[str]) -> int:
     slots = Slots((options.devices or (options.device,)), _jobs(options), options.threads)
     with common.progress_bar(len(missing), show=options.progress, unit="run") as advance:
         run_jobs(
-            plan,
-            missing,
-            folder,
-            slots,
-            command=command,
-            max_seconds=options.max_seconds,
+            plan, missing, folder, slots, command=command, max_seconds=options.max_seconds,
             written=add_record,
-        )
+        )  # fmt: skip
     done = done_records()
     lines = [write_table(plan, done, folder, command), *write_pictures(done, folder)]
     if options.suite is not None:
@@ -186,15 +181,10 @@ def make_plan(options: CompareOptions) -> ComparisonPlan:
         seeds, episodes = 3, 32
     return ComparisonPlan(
         tasks={name: json.loads(problem.to_json()) for name, problem in problems.items()},
-        methods=methods,
-        seeds=tuple(range(options.seed_count or seeds)),
-        budgets=budgets,
-        options=changed_options,
-        own=own,
-        left_out=left_out,
-        episodes=options.episodes or (4 if quick else episodes),
-        settings=_settings(options),
-    )
+        methods=methods, seeds=tuple(range(options.seed_count or seeds)), budgets=budgets,
+        options=changed_options, own=own, left_out=left_out,
+        episodes=options.episodes or (4 if quick else episodes), settings=_settings(options),
+    )  # fmt: skip
 
 
 def _budgets(options: CompareOptions) -> dict[Axis, float]:

@@ -110,14 +110,9 @@ def _measure_task(options: EvaluateOptions, rule: NPARule, **worlds: Any) -> Res
     total = None if changed else max(options.checkpoints or quality.CHECKPOINTS)
     with common.progress_bar(total, show=options.progress) as advance:
         tables = quality.tables_of(
-            rule,
-            task,
-            checkpoints=options.checkpoints,
-            changed=changed,
-            texture_metric=options.judge,
-            progress=advance,
-            **worlds,
-        )
+            rule, task, checkpoints=options.checkpoints, changed=changed,
+            texture_metric=options.judge, progress=advance, **worlds,
+        )  # fmt: skip
     what = f"{options.seed_count} worlds"
     if task.classifies:
         clouds = cast("PointClassification", task)

@@ -1,11 +1,11 @@
-"""The report that `npa-envs train` ends with: metrics, a film and a model card of the rule."""
+"""The last part of `npa-envs train`: measures and films the trained rule, writes its model card."""
 
 from __future__ import annotations
 
 import json
 import math
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -39,6 +39,7 @@ from npa_envs.training.task_of_rule import task_for_film, task_of_rule, tasks_of
 
 if TYPE_CHECKING:
     from npa_envs.rule.rule import NPARule
+    from npa_envs.tasks.base import Task
 
 FILM_STEPS = 512
 """Steps of the film."""
@@ -55,11 +56,12 @@ TITLES: Mapping[str, str] = {
 def write_report(
     path: Path, folder: Path, task_name: str, training: str, device: torch.device, *, progress: bool
 ) -> tuple[Path, str]:
-    """Measure and film the rule in a file; return the report's path and one line of scores.
+    """Measure and film the rule in the file `path`; return the model card's path and its scores.
 
-    `training` tells how it was trained: iterations, time and command.
+    The scores are one line of text. `training` tells how the rule was trained: iterations, time and
+    command.
 
-    The folder gets the report STEM.md, STEM.json as of `npa-envs evaluate --json`, STEM.gif,
+    The folder gets the model card STEM.md, STEM.json as of `npa-envs evaluate --json`, STEM.gif,
     STEM.mp4 and STEM-filmstrip.png, for a 3D rule also a turntable and point files. On a CPU fewer
     worlds are measured, for fewer steps and without damage, as they are slow there.
     """
@@ -70,37 +72,12 @@ def write_report(
     clouds = task.classifies
     checkpoints = (CLOUD_CHECKPOINTS if clouds else CHECKPOINTS)[: None if thorough else 5]
     seeds = range(FIRST_SEED, FIRST_SEED + (8 if thorough else 2))
-    not_filmed = ""
     with common.progress_bar(None, show=progress) as advance:
         tables = tables_of(
-            rule,
-            task,
-            checkpoints=checkpoints,
-            seeds=seeds,
-            changed=thorough and (clouds or task.aligned),
-            device=device,
-            progress=advance,
-            texture_metric=task.has_texture_metric,
-        )
-        generator = torch.Generator(device).manual_seed(FIRST_SEED)
-        worlds = task.seed(1, generator=generator, device=device)
-        film_task = task_for_film(task, str(path), rule, device, least=SCREEN)
-        damages = (DamageEvent(200, "cut"), DamageEvent(350, "wipe")) if task.aligned else ()
-        worlds, film = film_world(
-            rule,
-            film_task,
-            worlds,
-            FILM_STEPS,
-            generator=generator,
-            damages=damages,
-            progress=advance,
-        )
-        try:
-            if task.has_views:
-                write_3d_world(task, worlds, folder, drawn_by=task)
-            film.write(folder, path.stem)
-        except MissingDependencyError as error:
-            not_filmed = f"; not all films: {error}"
+            rule, task, checkpoints=checkpoints, seeds=seeds, device=device, progress=advance,
+            changed=thorough and (clouds or task.aligned), texture_metric=task.has_texture_metric,
+        )  # fmt: skip
+        missing_films = _write_films(rule, task, path, folder, advance)
     if len(tasks := tasks_of_codes(str(path), rule, device)) > 1:
         tables["pictures"] = picture_rows(rule, tasks, seeds=seeds, device=device)
     command = f"npa-envs evaluate {shlex.quote(str(path))} --device {device.type}"
@@ -115,18 +92,44 @@ def write_report(
     strip = folder / f"{path.stem}-filmstrip.png"
     picture = f"\n![A world from the seed on.]({strip.name})\n" if strip.exists() else ""
     write_text(model_card, _model_card(rule, task, task_name, training, facts, tables) + picture)
+    return model_card, score_line(json.loads(text)) + _stability(tables) + missing_films
+
+
+def _write_films(
+    rule: NPARule, task: Task, path: Path, folder: Path, advance: Callable[[int], Any]
+) -> str:
+    """Film a world of the rule in `path`; return text that says which films are missing, or ""."""
+    device = rule.hidden.weight.device
+    generator = torch.Generator(device).manual_seed(FIRST_SEED)
+    seed_world = task.seed(1, generator=generator, device=device)
+    film_task = task_for_film(task, str(path), rule, device, least=SCREEN)
+    damages = (DamageEvent(200, "cut"), DamageEvent(350, "wipe")) if task.aligned else ()
+    grown, film = film_world(
+        rule, film_task, seed_world, FILM_STEPS, generator=generator, damages=damages,
+        progress=advance,
+    )  # fmt: skip
+    try:
+        if task.has_views:
+            write_3d_world(task, grown, folder, drawn_by=task)
+        film.write(folder, path.stem)
+    except MissingDependencyError as error:
+        return f"; not all films: {error}"
+    return ""
+
+
+def _stability(tables: Mapping[str, Sequence[Any]]) -> str:
+    """Return text that says that the last loss is far above the least one, or ""."""
     rows = tables.get("growth", ())
     least = min(filter(math.isfinite, (row.loss for row in rows)), default=math.nan)
-    scores = score_line(json.loads(text))
     # Written so that a last loss of NaN also counts as unstable.
     if rows and not rows[-1].loss <= 4.0 * least:
-        scores += f"; unstable: at step {rows[-1].step} the loss is many times the least"
-    return model_card, scores + not_filmed
+        return f"; unstable: at step {rows[-1].step} the loss is many times the least"
+    return ""
 
 
 def _model_card(
     rule: NPARule,
-    task: Any,
+    task: Task,
     task_name: str,
     training: str,
     facts: Mapping[str, str],

@@ -120,21 +120,13 @@ def run(options: LearnOptions, processes: ProcessGroup) -> int:
     budget = Budget(
         seconds=options.learning_seconds, particle_steps=None if steps is None else int(steps)
     )
+    problem = common.problem_of(options, options.num_envs or 16, options.episode_steps)
     train(
-        options.method,
-        common.problem_of(options, options.num_envs or 16, options.episode_steps),
-        budget,
-        options.seed,
-        device=options.device,
+        options.method, problem, budget, options.seed, device=options.device,
         evaluation_seeds=range(FIRST_EVALUATION_SEED, FIRST_EVALUATION_SEED + options.episodes),
-        curve_points=options.curve_points,
-        on_point=show,
-        on_stop=lambda: stopped.append(True),
-        out=options.out,
-        resume=options.resume,
-        overwrite=options.overwrite,
-        **kwargs,
-    )
+        curve_points=options.curve_points, on_point=show, on_stop=lambda: stopped.append(True),
+        out=options.out, resume=options.resume, overwrite=options.overwrite, **kwargs,
+    )  # fmt: skip
     if processes.first:
         end = "stopped; the same arguments with --resume continue" if stopped else "finished"
         print(f"{end}: rules, curve and checkpoint are in {options.out}/")

@@ -66,13 +66,9 @@ def main(arguments: Sequence[str]) -> int:
     device = options.checked_device()
     folder = common.writable_folder(options.out)
     search = Search(
-        world,
-        method=options.method,
-        seed=options.seed,
-        batch_size=options.batch_size,
-        device=device,
-        path=folder / RESULTS,
-    )
+        world, method=options.method, seed=options.seed, batch_size=options.batch_size,
+        device=device, path=folder / RESULTS,
+    )  # fmt: skip
     if search.evaluations:
         print(f"{search.evaluations} candidates were tried before")
     budget = int(options.budget)

@@ -70,12 +70,9 @@ def main(arguments: Sequence[str]) -> int:
         print(f"{done} of {len(chosen)} checks were done before")
     with common.measuring(options, len(chosen), "check") as advance:
         check_runner.run_checks(
-            chosen,
-            check_runner.CheckSession(device, quick=options.quick),
-            record,
-            max_seconds=options.max_seconds,
-            progress=advance,
-        )
+            chosen, check_runner.CheckSession(device, quick=options.quick), record,
+            max_seconds=options.max_seconds, progress=advance,
+        )  # fmt: skip
     print(record.text())
     if path is not None:
         maps = path.with_name(f"{path.stem}_*.png")

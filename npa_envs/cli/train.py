@@ -98,14 +98,9 @@ def run(
     try:
         with common.torch_threads(thread_count(config)):
             result = train(
-                config,
-                task_name,
-                resume=options.resume,
-                overwrite=options.overwrite,
-                progress=options.progress,
-                max_seconds=options.max_seconds,
-                begun=begun,
-            )
+                config, task_name, resume=options.resume, overwrite=options.overwrite,
+                progress=options.progress, max_seconds=options.max_seconds, begun=begun,
+            )  # fmt: skip
     except KeyboardInterrupt:
         print(f"interrupted; the last checkpoint is {folder.checkpoint}\nresume: {resume_command}")
         raise

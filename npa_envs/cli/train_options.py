@@ -53,13 +53,10 @@ def parse_run(task_name: str, arguments: Sequence[str]) -> tuple[TrainOptions, T
     return _parse_over(starting_configuration(task_name, arguments), task_name, arguments)
 
 
-def _parse_over(
-    base: TrainConfig[Any], task_name: str, arguments: Sequence[str]
-) -> tuple[TrainOptions, TrainConfig[Any]]:
+def _parse_over(base: Any, task_name: str, arguments: Sequence[str]) -> tuple[TrainOptions, Any]:
     """Return the options of the run, and `base` with the values of the options that are given."""
-    parse: Any = _parse_joint if isinstance(base, JointTrainConfig) else _parse_fields
-    parsed: tuple[TrainOptions, TrainConfig[Any]] = parse(base, task_name, arguments)
-    return parsed
+    parse = _parse_joint if isinstance(base, JointTrainConfig) else _parse_fields
+    return parse(base, task_name, arguments)
 
 
 def default_preset(task_name: str, device: str) -> str:

@@ -67,18 +67,13 @@ class WorldEvent(TypedDict, total=False):
 
 
 class FrameEvent(NamedTuple):
-    """The event "frame": what a page shows of a world at one step."""
+    """The event "frame": what a page shows of a world at a step; arrays are flat in JavaScript."""
 
-    step: int
-    """Steps from the seed."""
-    positions: NDArray[np.float32]
-    """Positions [length units], shape [N, D]; flat in JavaScript."""
-    colours: NDArray[np.uint8]
-    """Red, green and blue, shape [N, 3]; flat in JavaScript."""
-    milliseconds: float
-    """Moving average of the time of a step [ms]."""
-    loss: float | None
-    """The metric of the world's task; None: not computed for this frame."""
+    step: int  # Steps from the seed.
+    positions: NDArray[np.float32]  # Positions [length units], shape [N, D].
+    colours: NDArray[np.uint8]  # Red, green and blue, shape [N, 3].
+    milliseconds: float  # Moving average of the time of a step [ms].
+    loss: float | None  # Metric of the world's task; None: not computed for this frame.
 
 
 class Range(NamedTuple):
@@ -86,13 +81,11 @@ class Range(NamedTuple):
 
     low: float
     high: float
-    scale: str | None = None
-    """"log": equal movements of the slider multiply the value equally; None: they add equally."""
-    whole: bool = False
-    """Whether only whole numbers are allowed."""
+    scale: str | None = None  # "log", or None for a linear slider.
+    whole: bool = False  # Whether only whole numbers are allowed.
 
     def checked(self, name: str, value: Any) -> float:
-        """Return `value` if it lies in the range; raise NPAError, which names it `name`, if not."""
+        """Return `value` if it lies in the range; raise NPAError, which calls it `name`, if not."""
         valid = is_whole(value) if self.whole else is_real(value)
         if not valid or not self.low <= value <= self.high:
             what = "a whole number" if self.whole else "a number"
@@ -105,16 +98,13 @@ class Range(NamedTuple):
 class Brush(NamedTuple):
     """A brush of the viewer: its button, and when it sends messages."""
 
-    changes: str
-    """What a world must let it change, see `LiveWorld._allowed`."""
-    label: str
-    """Text of its button on the page."""
+    changes: str  # What a world must let it change, see `LiveWorld._allowed`.
+    label: str  # Text of its button.
     sends: str
     """When a stroke, from press to release of the pointer, sends messages: "frame", in each frame;
     "motion", in frames in which the pointer moves; "position", at each new position; "once", at its
     start; "line", at its end."""
-    takes: str | None = None
-    """A further field of its messages: "source" or "rule"."""
+    takes: str | None = None  # A further field of its messages: "source" or "rule".
     amounts: tuple[float, float] = (0.0, 1.0)
     """The amount of its effect at strength 0, and what strength 1 adds to it; 1 at most."""
 
@@ -140,24 +130,16 @@ Icons are in page.js."""
 
 
 class BrushUse(NamedTuple):
-    """One use of a brush, read from a message "brush"."""
+    """One use of a brush; it is read from a message "brush"."""
 
-    brush: str
-    """Its name; `tool` in the message."""
-    at: Tensor
-    """Position [length units], shape [1, D]."""
-    move: Tensor
-    """Movement from there [length units], shape [1, D]; zeros if it is missing."""
-    radius: float
-    """Radius of the brush, of `cut` half the width of the gap [length units]."""
-    amount: float
-    """Amount of the effect by `Brush.amounts`, from 0 to 1; the message has `strength`, 0 to 1."""
-    source: Tensor
-    """Position whose state `inject` spreads [length units], shape [1, D]; `at` if it is missing."""
-    view: Tensor
-    """Unit vector towards the viewer, shape [1, 3]; the z axis if it is missing, as in 2D."""
-    rule: Any
-    """Name of the rule for `graft` or `add`, unchecked."""
+    brush: str  # Name of the brush, `tool` in the message.
+    at: Tensor  # Position [length units], shape [1, D].
+    move: Tensor  # Movement from there [length units], shape [1, D]; by default zeros.
+    radius: float  # Radius of the brush, or width of the gap of `cut` [length units].
+    amount: float  # Amount by `Brush.amounts`, in [0, 1], of `strength` in the message, in [0, 1].
+    source: Tensor  # Position whose state `inject` spreads [length units], [1, D]; by default `at`.
+    view: Tensor  # Unit vector towards the viewer, shape [1, 3]; by default along z.
+    rule: Any  # Name of the rule of `graft` or `add`, unchecked.
 
     @classmethod
     def read(cls, message: Mapping[str, Any], brushes: Mapping[str, Brush], x: Tensor) -> BrushUse:

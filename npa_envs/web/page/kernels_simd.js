@@ -75,16 +75,21 @@ function namedLocals(parameters, integers, vectors) {
   };
 }
 
+const AXES = ["X", "Y", "Z"];
+
+// The factors of a particle's neighbours in the sums.
+const LISTS = ["smoothing", "slopeX", "slopeY", "slopeZ"];
+
 // sumNeighbours(states, own, listBytes, stateAt, smoothing, slopeX, slopeY, slopeZ, sums): addresses in bytes; `own` is
 // that of the particle's state.
 function sumNeighboursCode(width, dimension) {
-  const all = ["smoothing", "slopeX", "slopeY", "slopeZ"], lists = all.slice(0, dimension + 1);
+  const lists = LISTS.slice(0, dimension + 1);
   const { local, value, put, counts } = namedLocals(
-    ["states", "own", "listBytes", "stateAt", ...all, "sums"],
+    ["states", "own", "listBytes", "stateAt", ...LISTS, "sums"],
     ["done", "at"],
     [
-      "other", "offset", ...all.map((list) => `spread ${list}`), "mine 0", "mine 1",
-      ...all.flatMap((list) => [`sum ${list} 0`, `sum ${list} 1`]),
+      "other", "offset", ...LISTS.map((list) => `spread ${list}`), "mine 0", "mine 1",
+      ...LISTS.flatMap((list) => [`sum ${list} 0`, `sum ${list} 1`]),
     ],
   );
   const code = [];
@@ -123,17 +128,12 @@ function sumNeighboursCode(width, dimension) {
 // The particle whose neighbours `listNeighbours` lists, and constants of the step: each a word in memory.
 const SCALARS = ["x", "y", "z", "eps", "square", "weight", "slope", "sideX", "sideY", "sideZ", "perX", "perY", "perZ"];
 
-const AXES = ["X", "Y", "Z"];
-
 // listNeighbours(scalars, order, X, Y, Z, volume, ranges, rangesEnd, width, stateAt, smoothing, slopeX, slopeY, slopeZ,
 // out): `order` has for each set of lanes the bytes that bring them to the front; `out` gets the number of neighbours,
 // and from its 16th byte on six vectors, whose lanes add up to the entries of the moment matrix.
 function listNeighboursCode(dimension) {
   const names = namedLocals(
-    [
-      "scalars", "order", ...AXES, "volume", "ranges", "rangesEnd", "width",
-      "stateAt", "smoothing", ...AXES.map((axis) => `slope${axis}`), "out",
-    ],
+    ["scalars", "order", ...AXES, "volume", "ranges", "rangesEnd", "width", "stateAt", ...LISTS, "out"],
     ["byte", "end", "count", "hits", "at"],
     [
       "lanes", "dX", "dY", "dZ", "squared", "inside", "left", "distance", "factor", "front",

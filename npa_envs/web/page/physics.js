@@ -9,11 +9,9 @@
 //   network                applyLayer           applyLayerCode        advance
 //   new positions, states  update
 //
-// tests/web/test_export.py compares a step by this file, and one with the kernels of kernels_simd.js, with Python's;
-// test_export_browser.py compares one by physics_gpu.js.
-//
-// Particles are sorted by cell, densities are summed over pairs in double precision, and only active particles
-// perceive. The functions that take most of the time are `kernels`, in plain JavaScript or in WebAssembly.
+// Tests compare steps with Python's: tests/web/test_export.py by this file and by kernels_simd.js,
+// test_export_browser.py by physics_gpu.js. Here particles are sorted by cell, densities are summed over pairs in
+// double precision, and only active particles perceive.
 
 export const MOMENT_THRESHOLD = 1e-3;
 export const SQUARED_MOMENT_SOFTENING = 1e-2 ** 2;
@@ -110,16 +108,10 @@ function listNeighbours(physics, i) {
       const factor = k * volume[j];
       stateAt[count] = j * width;
       smoothing[count] = weight * left * left * left * volume[j];
-      slopeX[count] = factor * dx;
-      slopeY[count] = factor * dy;
-      slopeZ[count] = factor * dz;
+      slopeX[count] = factor * dx; slopeY[count] = factor * dy; slopeZ[count] = factor * dz;
       count++;
-      xx += factor * dx * dx;
-      xy += factor * dx * dy;
-      xz += factor * dx * dz;
-      yy += factor * dy * dy;
-      yz += factor * dy * dz;
-      zz += factor * dz * dz;
+      xx += factor * dx * dx; xy += factor * dx * dy; xz += factor * dx * dz;
+      yy += factor * dy * dy; yz += factor * dy * dz; zz += factor * dz * dz;
     }
   }
   list.count = count;
@@ -135,24 +127,14 @@ function applyLayer({ inputs, width, weights, offset }, count, rows, rowWidth, o
       let s4 = offset[tile + 4], s5 = offset[tile + 5], s6 = offset[tile + 6], s7 = offset[tile + 7];
       for (let p = 0, at = tile * inputs; p < inputs; p++, at += TILE_OUTPUTS) {
         const value = rows[from + p];
-        s0 += value * weights[at];
-        s1 += value * weights[at + 1];
-        s2 += value * weights[at + 2];
-        s3 += value * weights[at + 3];
-        s4 += value * weights[at + 4];
-        s5 += value * weights[at + 5];
-        s6 += value * weights[at + 6];
-        s7 += value * weights[at + 7];
+        s0 += value * weights[at]; s1 += value * weights[at + 1];
+        s2 += value * weights[at + 2]; s3 += value * weights[at + 3];
+        s4 += value * weights[at + 4]; s5 += value * weights[at + 5];
+        s6 += value * weights[at + 6]; s7 += value * weights[at + 7];
       }
       const to = row * width + tile;
-      out[to] = s0;
-      out[to + 1] = s1;
-      out[to + 2] = s2;
-      out[to + 3] = s3;
-      out[to + 4] = s4;
-      out[to + 5] = s5;
-      out[to + 6] = s6;
-      out[to + 7] = s7;
+      out[to] = s0; out[to + 1] = s1; out[to + 2] = s2; out[to + 3] = s3;
+      out[to + 4] = s4; out[to + 5] = s5; out[to + 6] = s6; out[to + 7] = s7;
     }
   }
   if (rectified) {
@@ -192,9 +174,7 @@ export class Physics {
     const floats = () => kernels.floats(room);
     this.points = { x: floats(), y: floats(), z: floats(), volume: floats() };
     this.density = doubles();
-    this.gradientX = doubles();
-    this.gradientY = doubles();
-    this.gradientZ = doubles();
+    [this.gradientX, this.gradientY, this.gradientZ] = [doubles(), doubles(), doubles()];
     this.order = new Int32Array(capacity);
     this.cellOf = new Int32Array(capacity);
     this.starts = new Int32Array(1);
@@ -354,9 +334,7 @@ export class Physics {
     const [sideX, sideY, sideZ] = this.sides;
     const [halfX, halfY, halfZ] = this.halfSides;
     const squaredRadius = eps * eps;
-    gradientX.fill(0, 0, count);
-    gradientY.fill(0, 0, count);
-    gradientZ.fill(0, 0, count);
+    for (const gradient of [gradientX, gradientY, gradientZ]) gradient.fill(0, 0, count);
     // The particle itself.
     density.fill(weight * squaredRadius ** 3, 0, count);
     const total = this.cells[0] * this.cells[1] * this.cells[2];
@@ -384,18 +362,12 @@ export class Physics {
             if (squared === 0) continue;
             const distance = Math.sqrt(squared);
             const k = (slope * (eps - distance) * (eps - distance)) / distance;
-            sumX += k * dx;
-            sumY += k * dy;
-            sumZ += k * dz;
-            gradientX[j] -= k * dx;
-            gradientY[j] -= k * dy;
-            gradientZ[j] -= k * dz;
+            sumX += k * dx; sumY += k * dy; sumZ += k * dz;
+            gradientX[j] -= k * dx; gradientY[j] -= k * dy; gradientZ[j] -= k * dz;
           }
         }
         density[i] += sum;
-        gradientX[i] += sumX;
-        gradientY[i] += sumY;
-        gradientZ[i] += sumZ;
+        gradientX[i] += sumX; gradientY[i] += sumY; gradientZ[i] += sumZ;
       }
     }
     for (let i = 0; i < count; i++) volume[i] = 1 / density[i];
@@ -457,9 +429,7 @@ export class Physics {
     if (rule.density_gradient) {
       to = logScaled(
         rows, to, dimension,
-        densityScale * this.gradientX[i],
-        densityScale * this.gradientY[i],
-        densityScale * this.gradientZ[i],
+        densityScale * this.gradientX[i], densityScale * this.gradientY[i], densityScale * this.gradientZ[i],
       );
     }
   }
