@@ -16,8 +16,7 @@ import torch
 from PIL import Image
 
 from npa_envs.cli import COMMANDS, demo, doctor, main
-from npa_envs.cli.train import announcement
-from npa_envs.cli.train_options import parse_run, starting_configuration
+from npa_envs.cli.train import announcement, parse_run, starting_configuration
 from npa_envs.errors import NPAError
 from npa_envs.render.world_film import WorldFilm
 from npa_envs.rule.files import load_rule, save_rule

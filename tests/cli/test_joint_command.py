@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from npa_envs.cli import main
-from npa_envs.cli.train_options import parse_run
+from npa_envs.cli.train import parse_run
 from npa_envs.errors import NPAError
 from npa_envs.rule.files import load_rule, rule_metadata
 from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2DConfig

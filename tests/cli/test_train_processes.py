@@ -7,10 +7,9 @@ import torch
 from support.circle_task import circle_config
 from support.training_runs import trainer_of
 
-from npa_envs.cli import main
+from npa_envs.cli import main, train
 from npa_envs.cli.common import resolve_run, torch_threads
-from npa_envs.cli.train import process_count, thread_count
-from npa_envs.cli.train_options import TrainOptions, parse_run, starting_configuration
+from npa_envs.cli.train import TrainOptions, parse_run, process_count, thread_count
 from npa_envs.errors import NPAError
 from npa_envs.training import RunFolder, config_to_dict, preset
 from npa_envs.training.checkpoint import load_checkpoint, save_checkpoint
@@ -77,15 +76,13 @@ def test_a_run_goes_on_with_its_own_preset_only(tmp_path):
     config = preset("fast", out=tmp_path, target="ring", iterations=9)
     (tmp_path / "checkpoint.pt").touch()
     (tmp_path / "config.json").write_text(json.dumps(config_to_dict(config)), "utf-8")
-    assert starting_configuration(TASK, words) == config
-    same = [*words, "--preset", "fast", "--iterations", "9"]
-    assert starting_configuration(TASK, same) == config
-    # A value is no option.
-    with pytest.raises(NPAError, match="'fast' differs from it .iterations: 9 there"):
-        starting_configuration(TASK, [*words, "--preset", "fast", "--target", "iterations"])
+    assert train.starting_configuration(TASK, words) == config
+    assert train.starting_configuration(TASK, [*words, "--preset=fast", "--iterations=9"]) == config
+    with pytest.raises(NPAError, match=r"'fast' differs from it \(.*iterations: 9"):
+        train.starting_configuration(TASK, [*words, "--preset", "fast", "--target", "iterations"])
     for name in ("tiny", "best"):
         with pytest.raises(NPAError, match=f"preset must be the one .* but '{name}' differs"):
-            starting_configuration(TASK, [*words, "--preset", name, "--iterations=9"])
+            train.starting_configuration(TASK, [*words, "--preset", name, "--iterations", "9"])
 
 
 def test_gpus_are_processes_that_have_a_gpu_each():
