@@ -3,8 +3,8 @@
 There are two backends. `kernels/portable/` is plain Warp for a CPU and for CUDA, in float32 and
 float64; it reads like `reference.py`. `kernels/cuda/` is for CUDA in float32 on compute capability
 8.0 and above: neighbour lists in 16 bits, sums shared by threads, tensor cores. An operator takes
-the first implementation in `TABLE` whose condition holds for a call; perception is in the backend
-of the density pass, and there is one update. `npa-envs bench --explain` prints what was chosen. The
+the first implementation in `TABLE` whose condition holds for a call. Perception has no row: it is in
+the backend of the density pass, and `list_layout` follows the row of density. There is one update. `npa-envs bench --explain` prints what was chosen. The
 operators of `ops/pictures/` choose by the device alone.
 """
 
@@ -65,6 +65,8 @@ class KernelRequest(NamedTuple):
     """Hidden units of the rule, H."""
     vectors: tuple[int, int, int, int, bool] | None = None
     """The `VectorSizes` of an equivariant rule."""
+    for_environments: bool = False
+    """Whether environments perceive, whose batches fill a GPU, and not rollouts."""
 
 
 class Implementation(NamedTuple):
@@ -107,6 +109,7 @@ def _tiles(request: KernelRequest) -> bool:
         _cuda(request)
         and request.space_dim == 2
         and request.particle_count <= SHARED_WORLD
+        and not (request.for_environments and request.particle_count <= SMALL_WORLD)
         and request.smallest_side >= MIN_SIDE
     )
 
@@ -239,19 +242,18 @@ HUGE_WORLD = 2**22
 """Particles of the largest world whose neighbour lists may take more memory than its rows."""
 
 
-def rollout_lists(request: KernelRequest, mean_neighbours: float) -> ListLayout:
-    """Return rollouts' `ListLayout`: more threads per particle, so that few worlds fill a GPU."""
+def list_layout(request: KernelRequest, mean_neighbours: float) -> ListLayout:
+    """Return the `ListLayout` of a call, for worlds of about `mean_neighbours` neighbours.
+
+    Rollouts have more threads for a particle than environments, so that few worlds fill a GPU.
+    """
+    tiled = choose("density", request).name == "tiles"
+    if request.for_environments:
+        if request.particle_count <= SMALL_WORLD:
+            return ListLayout(64, lanes=1, teams=1)
+        return ListLayout(128, lanes=4 if tiled else 1, teams=1, tiled=tiled)
     if request.particle_count <= SHARED_WORLD:
         capacity = 256 if int(mean_neighbours) in CROWD else 128
-        tiled = choose("density", request).name == "tiles"
         return ListLayout(capacity, lanes=4, teams=2, tiled=tiled)
     # The lists of worlds that fill a device's memory would be the largest part of it.
     return ListLayout(96 if request.particle_count > HUGE_WORLD else 128, lanes=1, teams=1)
-
-
-def environment_lists(request: KernelRequest) -> ListLayout:
-    """Return environments' `ListLayout`: fewer threads per world, since batches fill a GPU."""
-    if request.particle_count <= SMALL_WORLD:
-        return ListLayout(64, lanes=1, teams=1)
-    tiled = choose("density", request).name == "tiles"
-    return ListLayout(128, lanes=4 if tiled else 1, teams=1, tiled=tiled)

@@ -22,7 +22,6 @@ from npa_envs.checks import (
     checked_eps,
     checked_flag,
 )
-from npa_envs.ops.backend import environment_lists
 from npa_envs.ops.custom_op import check_derivatives, custom_op, once_differentiable
 from npa_envs.ops.launch import RecordedLaunches, is_aligned, launch
 from npa_envs.ops.perception_passes import (
@@ -384,16 +383,14 @@ class NeighbourState:
         self, x: Tensor, s: Tensor, physics: Physics, world_indices: Tensor | None = None
     ) -> None:
         x, s = x.contiguous(), s.contiguous()
-        plan = plan_kernels(x, x.shape, s.shape[2], x.shape[0] * x.shape[1], False, physics)
+        total = x.shape[0] * x.shape[1]
+        plan = plan_kernels(x, x.shape, s.shape[2], total, False, physics, for_environments=True)
         with_lists = plan.lists_neighbours
         in_place = with_lists and plan.state_dim % plan.width == 0 and is_aligned(s)
         ordered = sort_worlds(plan, x, None if in_place else s, None, with_rows=not with_lists)
-        # World k of a batch equals that world alone, bit for bit: the lists must not depend on the
-        # number of worlds.
         densities = compute_densities(
             plan,
             ordered,
-            environment_lists(plan.request),
             state_index=ordered.original_index if in_place else None,
             with_particles=False,
         )

@@ -19,8 +19,8 @@ from npa_envs.ops.backend import (
     ListLayout,
     Operator,
     choose,
+    list_layout,
     multiprocessor_count,
-    rollout_lists,
 )
 from npa_envs.ops.launch import SCALARS, channel_width, is_aligned, is_recording, launch
 from npa_envs.ops.physics import Physics
@@ -40,23 +40,31 @@ MIN_SLICE = 128
 
 
 class KernelPlan(NamedTuple):
-    """Sizes, constants and cell grid of an operator call; none depends on values of tensors."""
+    """Sizes of an operator's launches, with its cell grid and constants.
+
+    It follows from shapes, dtype, device and `Physics`, not from the values of tensors.
+    """
 
     scalar: Any
+    """Warp's scalar type of positions and states."""
     width: int
+    """State channels of a group, which one thread sums."""
     world_count: int
     particle_count: int
     space_dim: int
     state_dim: int
     row_capacity: int
+    """Number K of rows: the maximum number of active particles in all worlds together."""
     masked: bool
+    """Whether some particles may be inactive."""
     physics: Physics
-    """Constants of the worlds; its sizes may be 0, those of the plan count."""
+    """Constants of the worlds; its D and C may be 0: read those of the plan."""
     domain: Any
+    """Radius, box and cell grid: a struct that kernels read."""
     request: KernelRequest
-    """Properties by which the backend table chooses."""
+    """Properties by which the backend table chooses kernels."""
     list_layout: ListLayout
-    """Neighbour lists of rollouts on CUDA."""
+    """Layout of neighbour lists on CUDA."""
 
     def runs(
         self, operator: Operator, *, aligned: bool = True, position_gradient: bool = False
@@ -153,11 +161,13 @@ def plan_kernels(
     row_capacity: int,
     masked: bool,
     physics: Physics,
+    *,
+    for_environments: bool = False,
 ) -> KernelPlan:
     """Return the `KernelPlan` of a call on positions of shape [B, N, D] and `state_dim` channels.
 
-    `like` has the worlds' dtype and device; `row_capacity` is the largest number of active
-    particles in all worlds together.
+    `like` is a tensor of the worlds' dtype and device. `row_capacity` is the maximum number K of
+    active particles in all worlds together. `masked`: some particles may be inactive.
     """
     # As integers: symbolic sizes of torch.compile become constants, and other sizes recompile.
     world_count, particle_count, space_dim = (int(size) for size in shape)
@@ -173,6 +183,7 @@ def plan_kernels(
         int(domain.cell_count),
         space_dim,
         smallest_side=min(cell_grid(space_dim, particle_count, eps, sides, cells_per_eps)),
+        for_environments=for_environments,
     )
     plan = KernelPlan(
         scalar=scalar,
@@ -186,7 +197,7 @@ def plan_kernels(
         physics=physics,
         domain=domain,
         request=request,
-        list_layout=rollout_lists(request, mean_neighbours(particle_count, eps, sides)),
+        list_layout=list_layout(request, mean_neighbours(particle_count, eps, sides)),
     )
     largest = max(2 * plan.cell_total, plan.total * (1 + plan.state_dim))
     if largest >= MAX_INDEX:
