@@ -14,10 +14,10 @@ MAPPED_PACKAGES = ("envs", "wrappers", "agents")
 
 
 def extend_path(package_path: list[str], package_file: str) -> None:
-    """Add the repository's root to the search path of `npa_envs` if it is imported from there.
+    """Append the repository's root to `package_path`, if `package_file` is in a checkout of it.
 
-    An installed package is left unchanged, so that a folder `envs` of another project in
-    site-packages is never imported.
+    These are `npa_envs.__path__` and `npa_envs.__file__`. The path of an installed package does not
+    change, so that a folder `envs` of another project in site-packages is never imported.
     """
     package = Path(package_file).resolve().parent
     root = package.parent

@@ -19,7 +19,7 @@ from typing import Any
 import torch
 
 RANGES_PER_THREAD = 4
-"""Ranges per thread, at most: a thread that is delayed, as by another process, runs fewer."""
+"""Maximum number of ranges per thread: several, so that a delayed thread can run fewer."""
 
 _Task = ctypes.CFUNCTYPE(None, ctypes.c_void_p)
 
@@ -31,7 +31,7 @@ _DEFAULT_THREADS = torch.get_num_threads()
 
 @functools.cache
 def _team() -> Any:
-    """Return the function of GNU's OpenMP that runs a task on each thread of a team, or None."""
+    """Return GNU OpenMP's function that runs a task on several threads; None: it is not there."""
     try:
         parallel = ctypes.CDLL(None).GOMP_parallel if sys.platform == "linux" else None
     except AttributeError:
@@ -47,11 +47,8 @@ def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="npa_envs")
 
 
-def _leave_threads() -> None:
-    """Use one thread in a forked process, in which the parent's threads do not run.
-
-    Torch would wait for its threads for ever.
-    """
+def _use_one_thread() -> None:
+    """Use one thread in a forked process: torch would wait for threads that its parent has."""
     global _forked
     _forked = True
     _pool.cache_clear()
@@ -59,11 +56,11 @@ def _leave_threads() -> None:
 
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_leave_threads)
+    os.register_at_fork(after_in_child=_use_one_thread)
 
 
 def thread_count() -> int:
-    """Return how many CPU threads run a kernel: torch's number.
+    """Return the number of CPU threads that run a kernel: torch's number.
 
     In a process started by Python's `multiprocessing` it is one, unless the number was set: such
     processes, for example of vector environments, share the cores.
@@ -74,7 +71,7 @@ def thread_count() -> int:
 
 
 def even_ranges(count: int, smallest: int) -> list[range]:
-    """Split [0, count) for the CPU threads into ranges of at least `smallest` indices each."""
+    """Return even ranges that divide [0, count) among CPU threads, each of at least `smallest`."""
     if count < 2 * smallest:
         return [range(count)]
     threads = thread_count()
@@ -84,7 +81,10 @@ def even_ranges(count: int, smallest: int) -> list[range]:
 
 
 def run_together(calls: Sequence[Callable[[], object]]) -> None:
-    """Call functions in parallel, which must release the GIL; raise the first error at the end."""
+    """Call functions on CPU threads, in parallel while they release the GIL, and wait for all.
+
+    The first error is raised after the last call.
+    """
     pending = iter(calls)
     errors: list[BaseException] = []
 

@@ -45,7 +45,7 @@ GROUP_WIDTHS = (4, 8, 16)
 
 
 def channel_width(state_dim: int) -> int:
-    """Return how many of a particle's `state_dim` channels one thread sums: a `GROUP_WIDTHS`."""
+    """Return how many of `state_dim` channels one thread sums: one of `GROUP_WIDTHS`."""
     return next((width for width in GROUP_WIDTHS if width >= state_dim), GROUP_WIDTHS[-1])
 
 
@@ -106,7 +106,7 @@ def launch(
 
 @contextlib.contextmanager
 def tracing() -> Iterator[None]:
-    """Make `launch` do nothing in the block, in this thread: torch needs only results' shapes."""
+    """Make `launch` do nothing in this thread's block: torch asks only for shapes of results."""
     _thread.traced, before = True, _thread.traced
     try:
         yield
@@ -115,7 +115,7 @@ def tracing() -> Iterator[None]:
 
 
 def is_traced() -> bool:
-    """Return whether this thread is in a `tracing` block: its tensors have no memory."""
+    """Return whether this thread is in a `tracing` block, where tensors have no memory."""
     return _thread.traced
 
 
@@ -307,7 +307,7 @@ class _ArrayArgument:
         self._dtype: torch.dtype | None = None
 
     def set(self, tensor: Tensor | None) -> None:
-        """Write a tensor's descriptor; None stands for an absent array."""
+        """Write a tensor's address, and its shape if that changed; None: an absent array."""
         if tensor is None:
             # Kernels read the size of an absent array.
             if self._size is not None:
@@ -322,7 +322,7 @@ class _ArrayArgument:
 
 
 def _null(tensor: Tensor) -> int:
-    """Return 0, the address of an empty tensor; raise for tensor subclasses without memory."""
+    """Return 0, the address of an empty tensor; raise NPAError if the tensor is not empty."""
     if tensor.numel():
         raise NPAError(
             "tensors must have memory of their own, got a tensor subclass that wraps others "
@@ -376,7 +376,7 @@ def is_recording() -> bool:
 
 
 class RecordedLaunches:
-    """A sequence of launches that is replayed on the same tensors in the same memory."""
+    """A sequence of launches to replay with the same arguments, but for tensors that are moved."""
 
     def __init__(self) -> None:
         self._launches: list[tuple[_PreparedLaunch, tuple[int, ...]]] = []
@@ -391,7 +391,7 @@ class RecordedLaunches:
         *arguments: Any,
         block_dim: int = CUDA_BLOCK,
     ) -> _PreparedLaunch:
-        """Append a launch with the arguments of `launch`, and return it; it is not made yet."""
+        """Append a launch, with the arguments of `launch`, and return it; nothing is launched."""
         size = (size,) if isinstance(size, int) else size
         arguments = (0, *arguments) if kernel in MIN_RANGES else arguments
         prepared = _prepare(kernel, size, device, block_dim, arguments)
@@ -402,7 +402,7 @@ class RecordedLaunches:
 
     @contextlib.contextmanager
     def recording(self) -> Iterator[None]:
-        """Make this thread's launches in the block, and append them."""
+        """Append the launches that this thread makes in the block."""
         _thread.recording, before = self, _thread.recording
         try:
             yield
@@ -414,7 +414,10 @@ class RecordedLaunches:
         return len(self._launches)
 
     def argument_slots(self, tensor: Tensor) -> list[tuple[_PreparedLaunch, int]]:
-        """Return where a tensor is an argument: launch and index. The caller keeps it alive."""
+        """Return the launches and indices whose argument is a tensor, for `move`.
+
+        From now on the caller has to keep the tensor alive.
+        """
         slots, address = [], tensor.data_ptr()
         for (prepared, _), arguments in zip(self._launches, self._tensors, strict=True):
             for k, value in enumerate(arguments):
@@ -424,14 +427,17 @@ class RecordedLaunches:
         return slots
 
     def move(self, slots: list[tuple[_PreparedLaunch, int]], tensor: Tensor) -> None:
-        """Put a tensor of the same shape and dtype at these slots; the caller keeps it alive."""
+        """Replace the argument at `slots` by a tensor that the caller keeps alive.
+
+        Shape and dtype must be those of the tensor of `argument_slots`.
+        """
         for prepared, index in slots:
             prepared.set_address(index, tensor)
 
     def replay(
         self, begin: int = 0, end: int | None = None, *, last_count: int | None = None
     ) -> None:
-        """Repeat launches [begin, end); `last_count`: size of the last one's first dimension."""
+        """Launch [begin, end) of the sequence again; `last_count`: first size of the last one."""
         launches = self._launches[begin:end]
         for prepared, size in launches[:-1]:
             prepared.run(size)

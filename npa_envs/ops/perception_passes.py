@@ -23,7 +23,7 @@ from npa_envs.ops.physics import Physics
 from npa_envs.ops.sort import MAX_INDEX, KernelPlan, SortedWorlds, plan_kernels
 
 INTERLEAVED_LISTS = 32
-"""Neighbour lists that are interleaved in memory."""
+"""Number of neighbour lists that are interleaved in memory."""
 
 
 class NeighbourLists(NamedTuple):
@@ -61,7 +61,7 @@ class Densities(NamedTuple):
 
 
 def portable_kernels(plan: KernelPlan, with_lists: bool = False) -> Any:
-    """Return the portable perception kernels; `with_lists`: those that read neighbour lists."""
+    """Return the portable perception kernels; `with_lists`: they read neighbour lists."""
     terms = plan.physics.terms
     return perception_kernels(
         plan.space_dim,
@@ -286,7 +286,7 @@ def perceive_rows_backward(
     masked: bool,
     physics: Physics,
 ) -> tuple[Tensor, Tensor]:
-    """Return gradients with respect to states, [B N, C], and positions, [B N, D] or empty.
+    """Return gradients of states, [B N, C], and positions, [B N, D] or empty, from those of rows.
 
     The tensors are those of a `SavedPerception` and of `StaticNeighbours`, or none. Positions get a
     gradient if states were saved.
@@ -379,10 +379,10 @@ def _unscaled_cotangents(
     with_positions: bool,
     bar: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return cotangents of each row's sums, before they are scaled, with the portable kernels.
+    """Return gradients of each row's smoothed states, state gradients and density gradients.
 
-    They are those of smoothed states, of state gradients and, `with_positions`, of density
-    gradients.
+    These are sums before their scaling by `Physics.scale` and the logarithm; the last ones are
+    empty unless `with_positions`.
     """
     entries, space_dim, width = plan.row_capacity * group_count, plan.space_dim, plan.width
     largest = entries * space_dim * width

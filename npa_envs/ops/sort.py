@@ -1,4 +1,4 @@
-"""Sorting worlds into cells: the first half of every SPH operator."""
+"""Sorting worlds into cells, the first half of every SPH operator, and the sizes of launches."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ MAX_INDEX = 2**31 - 1
 """Largest index of an array in a kernel: indices have 32 bits."""
 
 MAX_MASK = 2**28
-"""Largest worlds times entries of a mask that CUDA blocks sort: each block counts the active
-particles of all earlier worlds."""
+"""Maximum product of worlds and entries of a mask that CUDA blocks sort: each block counts the
+active particles of all earlier worlds."""
 
 MAX_THREAD_MASK = 2**22
 """The same for masks that CPU threads sort."""
 
 MIN_SLICE = 128
-"""Fewest particles of a slice."""
+"""Minimum number of particles of a slice."""
 
 
 class KernelPlan(NamedTuple):
@@ -69,7 +69,7 @@ class KernelPlan(NamedTuple):
     def runs(
         self, operator: Operator, *, aligned: bool = True, position_gradient: bool = False
     ) -> str:
-        """Return the name of the implementation in the backend table that runs an operator."""
+        """Return the name of the implementation in `backend.TABLE` that runs an operator."""
         request = self.request
         if not aligned or position_gradient:
             request = request._replace(aligned=aligned, position_gradient=position_gradient)
@@ -218,7 +218,7 @@ def mean_neighbours(particle_count: int, eps: float, box: Sequence[float] | None
 
 
 def sorts_at_once(world_count: int, particle_count: int) -> bool:
-    """Return whether worlds are so small that one launch on a CPU sorts them, masked or not."""
+    """Return whether worlds are so small that one launch sorts them on a CPU, even with a mask."""
     return world_count * world_count * particle_count <= MAX_THREAD_MASK
 
 
@@ -227,8 +227,8 @@ def sort_worlds(
 ) -> SortedWorlds:
     """Return worlds sorted into cells; active particles (`mask`, uint8, [B, N]) get rows.
 
-    Inputs are contiguous. Without `s` the sorted states are empty, without `with_rows` all tensors
-    of rows.
+    Arguments are contiguous. `s` None: sorted states are empty. `mask` None: all particles are
+    active. Without `with_rows` tensors of rows are empty.
     """
     # Mask entries that are read if each world counts the rows of earlier worlds.
     earlier = plan.world_count * plan.total if plan.masked else 0
@@ -302,7 +302,10 @@ def _empty_worlds(plan: KernelPlan, x: Tensor, with_states: bool, with_rows: boo
 
 
 def block_capacity(request: KernelRequest, *tensors: Tensor | None) -> int:
-    """Return the capacity [particles] of the CUDA block that sorts a world; 0: no block does."""
+    """Return the maximum number of particles of the CUDA block that sorts a world; 0: none does.
+
+    `tensors` are those that it reads.
+    """
     aligned = all(tensor is None or is_aligned(tensor) for tensor in tensors)
     if choose("sort", request._replace(aligned=aligned)).name != "block":
         return 0
@@ -310,7 +313,7 @@ def block_capacity(request: KernelRequest, *tensors: Tensor | None) -> int:
 
 
 def slice_count(device: torch.device, world_count: int, particle_count: int) -> int:
-    """Return into how many slices to split each world, so that few worlds fill a GPU too."""
+    """Return the number of slices of a world, one CUDA block each: several if worlds are few."""
     idle = multiprocessor_count(device) // world_count
     return max(min(idle, particle_count // MIN_SLICE), 1)
 

@@ -25,7 +25,7 @@ from npa_envs.ops.physics import Physics
 from npa_envs.ops.sort import KernelPlan, SortedWorlds, plan_kernels, sort_worlds
 
 MAX_LISTS = 2**31
-"""Largest bytes of all lists on a CPU; with more neighbours, each step searches again."""
+"""Maximum number of bytes of all lists on a CPU; with more neighbours, each step searches again."""
 
 
 class StaticWorlds(NamedTuple):
@@ -109,9 +109,9 @@ def prepare_static(x: Tensor, physics: Physics) -> StaticWorlds:
 
 
 class StaticRows(NamedTuple):
-    """The particles of static worlds that are active in one step, as in `SortedWorlds`.
+    """The particles of static worlds that are active in one step: fields of `SortedWorlds`.
 
-    Indices are those of sorted particles, for the caller's order is that order.
+    Static worlds stay in sorted order, so indices of particles are sorted ones.
     """
 
     row_of: Tensor
