@@ -81,10 +81,7 @@ def even_ranges(count: int, smallest: int) -> list[range]:
 
 
 def run_together(calls: Sequence[Callable[[], object]]) -> None:
-    """Call functions on CPU threads, in parallel while they release the GIL, and wait for all.
-
-    The first error is raised after the last call.
-    """
+    """Call functions on CPU threads, in parallel if they release the GIL; raise the first error."""
     pending = iter(calls)
     errors: list[BaseException] = []
 

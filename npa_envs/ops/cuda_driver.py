@@ -41,15 +41,12 @@ class _Attribute(ctypes.Structure):
     _fields_ = [("id", ctypes.c_int), ("unused", ctypes.c_int), ("value", _AttributeValue)]
 
 
+_SIZES = ("grid_x", "grid_y", "grid_z", "block_x", "block_y", "block_z", "shared_bytes")
+
+
 class _Config(ctypes.Structure):
     _fields_ = [
-        ("grid_x", ctypes.c_uint),
-        ("grid_y", ctypes.c_uint),
-        ("grid_z", ctypes.c_uint),
-        ("block_x", ctypes.c_uint),
-        ("block_y", ctypes.c_uint),
-        ("block_z", ctypes.c_uint),
-        ("shared_bytes", ctypes.c_uint),
+        *((name, ctypes.c_uint) for name in _SIZES),
         ("stream", ctypes.c_void_p),
         ("attributes", ctypes.POINTER(_Attribute)),
         ("attribute_count", ctypes.c_uint),

@@ -98,8 +98,7 @@ def launch(
     key = (kernel, device, block_dim)
     prepared = _thread.by_kernel.get(key)
     if prepared is None:
-        prepared = _prepare(kernel, size, device, block_dim, arguments)
-        _thread.by_kernel[key] = prepared
+        prepared = _thread.by_kernel[key] = _prepare(kernel, size, device, block_dim, *arguments)
     prepared.set(arguments)
     prepared.run(size)
 
@@ -131,17 +130,12 @@ def aligned(tensor: Tensor) -> Tensor:
 
 
 def _prepare(
-    kernel: Any,
-    size: tuple[int, ...],
-    device: torch.device,
-    block_dim: int,
-    arguments: tuple[Any, ...],
+    kernel: Any, size: tuple[int, ...], device: torch.device, block_dim: int, *arguments: Any
 ) -> _PreparedLaunch:
     """Return a prepared launch of a kernel with these arguments; nothing is launched yet."""
-    types = [_type_of(argument) for argument in kernel.adj.args]
     values = [
-        _description(value, declared) if isinstance(value, Tensor) else value
-        for value, declared in zip(arguments, types, strict=True)
+        _description(value, _type_of(declared)) if isinstance(value, Tensor) else value
+        for value, declared in zip(arguments, kernel.adj.args, strict=True)
     ]
     warp_place = warp_device(device)
     loaded = (kernel.module, device) in loaded_modules
@@ -158,8 +152,7 @@ def _prepare(
             record_cmd=True,
         )
         loaded_modules.add((kernel.module, device))
-    prepared = _CudaLaunch if warp_place.is_cuda else _CpuLaunch
-    return prepared(packed, size, device, types, arguments)
+    return (_CudaLaunch if warp_place.is_cuda else _CpuLaunch)(packed, device, *arguments)
 
 
 loaded_modules: set[tuple[Any, torch.device]] = set()
@@ -178,17 +171,10 @@ class _PreparedLaunch:
     fields of Warp's `Launch` that it does not document: `bounds`, `params`, `params_addr`, `hooks`.
     """
 
-    def __init__(
-        self,
-        packed: Any,
-        size: tuple[int, ...],
-        device: torch.device,
-        types: list[Any],
-        arguments: tuple[Any, ...],
-    ) -> None:
+    def __init__(self, packed: Any, device: torch.device, *arguments: Any) -> None:
         self._launch = packed
         self._device = device
-        self._bounds = {size: packed.bounds}
+        self._bounds: dict[tuple[int, ...], Any] = {}
         parameters = packed.params[1:]
         fields = [(f"a{k}", type(value)) for k, value in enumerate(parameters)]
         self._memory: Any = _struct(tuple(fields))(*parameters)
@@ -197,8 +183,8 @@ class _PreparedLaunch:
         self._writers: list[tuple[int, Callable[[Any], None]]] = []
         """Index of each argument that is an array or a struct, and the function that writes it."""
         self._number_indices: list[int] = []
-        for k, (name, declared) in enumerate(zip(self._names, types, strict=True)):
-            memory = getattr(self._memory, name)
+        for k, (name, argument) in enumerate(zip(self._names, packed.kernel.adj.args, strict=True)):
+            memory, declared = getattr(self._memory, name), _type_of(argument)
             if isinstance(declared, wp.array):
                 self._writers.append((k, _ArrayArgument(memory, declared).set))
             elif hasattr(arguments[k], "__ctype__"):
@@ -268,10 +254,8 @@ class _CpuLaunch(_PreparedLaunch):
 class _CudaLaunch(_PreparedLaunch):
     """A launch on torch's current stream, by CUDA's driver or, where that cannot, by Warp."""
 
-    def __init__(
-        self, packed: Any, size: tuple[int, ...], device: torch.device, *details: Any
-    ) -> None:
-        super().__init__(packed, size, device, *details)
+    def __init__(self, packed: Any, device: torch.device, *arguments: Any) -> None:
+        super().__init__(packed, device, *arguments)
         begin, layout = ctypes.addressof(self._memory), type(self._memory)
         addresses = [begin + getattr(layout, name).offset for name in self._names]
         self._addresses = (ctypes.c_void_p * (1 + len(addresses)))(0, *addresses)
@@ -394,7 +378,7 @@ class RecordedLaunches:
         """Append a launch, with the arguments of `launch`, and return it; nothing is launched."""
         size = (size,) if isinstance(size, int) else size
         arguments = (0, *arguments) if kernel in MIN_RANGES else arguments
-        prepared = _prepare(kernel, size, device, block_dim, arguments)
+        prepared = _prepare(kernel, size, device, block_dim, *arguments)
         prepared.set(arguments)
         self._launches.append((prepared, size))
         self._tensors.append(list(arguments))
@@ -414,10 +398,7 @@ class RecordedLaunches:
         return len(self._launches)
 
     def argument_slots(self, tensor: Tensor) -> list[tuple[_PreparedLaunch, int]]:
-        """Return the launches and indices whose argument is a tensor, for `move`.
-
-        From now on the caller has to keep the tensor alive.
-        """
+        """Return launches and indices whose argument is `tensor`, which the caller keeps alive."""
         slots, address = [], tensor.data_ptr()
         for (prepared, _), arguments in zip(self._launches, self._tensors, strict=True):
             for k, value in enumerate(arguments):
@@ -427,10 +408,7 @@ class RecordedLaunches:
         return slots
 
     def move(self, slots: list[tuple[_PreparedLaunch, int]], tensor: Tensor) -> None:
-        """Replace the argument at `slots` by a tensor that the caller keeps alive.
-
-        Shape and dtype must be those of the tensor of `argument_slots`.
-        """
+        """Replace the tensor at `slots` by one of equal shape and dtype, which the caller keeps alive."""
         for prepared, index in slots:
             prepared.set_address(index, tensor)
 
@@ -455,7 +433,7 @@ class Launch(NamedTuple):
     threads: str
     """Threads along each dimension."""
     purpose: str
-    """First line of its docstring."""
+    """First line of the kernel's docstring."""
 
 
 @contextlib.contextmanager

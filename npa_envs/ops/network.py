@@ -32,10 +32,7 @@ class ArrangedWeights(NamedTuple):
 
 
 def _arrange_layers(first: Tensor, second: Tensor) -> list[Tensor]:
-    """Return weights [H, width] and [outputs, H], scaled, as tensor-core tiles in float16.
-
-    The third tensor has the factors that undo the scaling of outputs, float32.
-    """
+    """Return weights [H, width], [outputs, H] as scaled tiles, float16, and factors of outputs."""
     hidden, width = first.shape
     steps, tiles = -(-width // 16), -(-second.shape[0] // 8)
     half = functools.partial(torch.empty, dtype=torch.float16, device=first.device)

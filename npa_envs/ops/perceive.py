@@ -217,17 +217,9 @@ def _perceive_rows(
     launch(*perception_launch(plan, ordered, densities, perception, row_kernel_sum=written))
     if static:
         return [perception, kernel_sum]
-    return [
-        perception,
-        kernel_sum,
-        ordered.row_of,
-        ordered.starts,
-        ordered.original_index,
-        densities.particles,
-        ordered.row_positions,
-        ordered.states,
-        ordered.row_particle,
-    ]
+    sorted_worlds = ordered.row_of, ordered.starts, ordered.original_index, densities.particles
+    of_rows = ordered.row_positions, ordered.states, ordered.row_particle
+    return [perception, kernel_sum, *sorted_worlds, *of_rows]
 
 
 class _PerceiveRows(torch.autograd.Function):

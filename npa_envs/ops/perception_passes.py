@@ -94,18 +94,9 @@ def compute_densities(
     list_shape = -(-plan.row_capacity // INTERLEAVED_LISTS), layout.capacity, INTERLEAVED_LISTS
     steps = positions.new_empty(list_shape, dtype=torch.int16)
     lengths = positions.new_empty(plan.row_capacity, dtype=torch.int32)
-    arrays = (
-        ordered.starts,
-        ordered.cell,
-        positions,
-        state_index,
-        ordered.original_index,
-        ordered.row_of,
-        particles,
-        records,
-        steps,
-        lengths,
-    )
+    cells = ordered.starts, ordered.cell, positions
+    indices = state_index, ordered.original_index, ordered.row_of
+    arrays = (*cells, *indices, particles, records, steps, lengths)
     if layout.tiled:
         launch(
             tiled_density(plan.periodic, layout.capacity, plan.masked),
@@ -184,7 +175,7 @@ def perception_launch(
         if lists is not None:
             steps = lists.steps[first_row // INTERLEAVED_LISTS :]
             lists = lists._replace(steps=steps, lengths=lists.lengths[first_row:])
-    group_count = plan.group_count
+    group_count, rows, outputs = plan.group_count, (row_index, destination), (out, row_kernel_sum)
     numbers = (
         plan.state_dim,
         int(plan.physics.terms.density_gradient),
@@ -194,6 +185,7 @@ def perception_launch(
     )
     if lists is None:
         neighbours, ends = densities.static_neighbours or (None, None)
+        cells = ordered.starts, ends, neighbours, densities.particles
         return (
             portable_kernels(plan, neighbours is not None).perceive,
             (row_count, group_count),
@@ -203,19 +195,15 @@ def perception_launch(
             *numbers,
             group_count,
             limit,
-            ordered.starts,
-            ends,
-            neighbours,
-            densities.particles,
+            *cells,
             ordered.states,
             ordered.states.view(plan.total, -1),
-            row_index,
-            destination,
+            *rows,
             densities.density_gradient,
-            out,
-            row_kernel_sum,
+            *outputs,
         )
     variant = _perception_variant(plan, lists, group_count > 1, row_kernel_sum is not None)
+    cells = ordered.starts, ordered.cell, ordered.positions, lists.records
     return (
         listed_perception(variant),
         -(-row_count * group_count * variant.lanes // WARP) * WARP,
@@ -225,25 +213,20 @@ def perception_launch(
         row_count,
         group_count,
         limit,
-        ordered.starts,
-        ordered.cell,
-        ordered.positions,
-        lists.records,
+        *cells,
         ordered.states if states is None else states,
         None if states is None else ordered.original_index,
-        row_index,
-        destination,
+        *rows,
         lists.steps,
         lists.lengths,
-        out,
-        row_kernel_sum,
+        *outputs,
     )
 
 
 def _perception_variant(
     plan: KernelPlan, lists: NeighbourLists, grouped: bool, for_adjoint: bool
 ) -> PerceptionVariant:
-    terms = plan.physics.terms
+    terms, layout = plan.physics.terms, lists.layout
     return PerceptionVariant(
         space_dim=plan.space_dim,
         width=plan.width,
@@ -251,11 +234,11 @@ def _perception_variant(
         moment_inverse=terms.correction,
         periodic=plan.periodic,
         grouped=grouped,
-        capacity=lists.layout.capacity,
+        capacity=layout.capacity,
         for_adjoint=for_adjoint,
-        teams=lists.layout.teams,
+        teams=layout.teams,
         per_particle=lists.per_particle,
-        tiled=lists.layout.tiled,
+        tiled=layout.tiled,
     )
 
 
@@ -323,9 +306,11 @@ def _gather_by_cells(
         terms.state_gradient,
         bool(static_neighbours),
     )
-    row_bars = _unscaled_cotangents(plan, saved, kernels, group_count, with_positions, bar)
+    row_bars = _unscaled_cotangents(plan, saved, kernels, bar)
     smoothed_bar, gradient_bar, _ = row_bars
     states_bar = bar.new_empty(plan.total, plan.state_dim)
+    cells = saved.starts, ends, neighbours, saved.particles, saved.original_index
+    rows = saved.row_of, saved.row_positions, saved.row_kernel_sum
     launch(
         kernels.gather_state_cotangents,
         (plan.total, group_count),
@@ -335,14 +320,8 @@ def _gather_by_cells(
         plan.state_dim,
         *plan.row_arguments,
         group_count,
-        saved.starts,
-        ends,
-        neighbours,
-        saved.particles,
-        saved.original_index,
-        saved.row_of,
-        saved.row_positions,
-        saved.row_kernel_sum,
+        *cells,
+        *rows,
         bar,
         smoothed_bar,
         # Twice: in the kernel's matrices, and as its flat array of numbers.
@@ -354,37 +333,24 @@ def _gather_by_cells(
         return states_bar, bar.new_empty(0)
     density_bar = bar.new_empty(plan.total)
     positions_bar = bar.new_empty(plan.total, space_dim)
-    common = (
-        plan.total,
-        bar.device,
-        plan.domain,
-        plan.particle_count,
-        group_count,
-        saved.starts,
-        saved.particles,
-        saved.states,
-        saved.original_index,
-        saved.row_of,
-    )
+    sizes = plan.total, bar.device, plan.domain, plan.particle_count, group_count
+    world = saved.starts, saved.particles, saved.states, saved.original_index, saved.row_of
+    common = (*sizes, *world)
     launch(kernels.gather_density_cotangents, *common, smoothed_bar, gradient_bar, density_bar)
     launch(kernels.gather_position_cotangents, *common, density_bar, *row_bars, positions_bar)
     return states_bar, positions_bar
 
 
 def _unscaled_cotangents(
-    plan: KernelPlan,
-    saved: SavedPerception,
-    kernels: Any,
-    group_count: int,
-    with_positions: bool,
-    bar: Tensor,
+    plan: KernelPlan, saved: SavedPerception, kernels: Any, bar: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return gradients of each row's smoothed states, state gradients and density gradients.
 
-    These are sums before their scaling by `Physics.scale` and the logarithm; the last ones are
-    empty unless `with_positions`.
+    These are sums before their scaling by `Physics.scale` and the logarithm. The last gradients are
+    empty if positions get none.
     """
-    entries, space_dim, width = plan.row_capacity * group_count, plan.space_dim, plan.width
+    group_count, space_dim, width = plan.group_count, plan.space_dim, plan.width
+    entries = plan.row_capacity * group_count
     largest = entries * space_dim * width
     if largest >= MAX_INDEX:
         raise NPAError(
@@ -393,7 +359,8 @@ def _unscaled_cotangents(
         )
     smoothed_bar = bar.new_empty(entries, width)
     gradient_bar = bar.new_empty(entries, space_dim, width)
-    density_gradient_bar = bar.new_empty(plan.row_capacity if with_positions else 0, space_dim)
+    density_rows = 0 if saved.states is None else plan.row_capacity
+    density_gradient_bar = bar.new_empty(density_rows, space_dim)
     launch(
         kernels.unscale_cotangents,
         (plan.row_capacity, group_count * width),
@@ -442,6 +409,8 @@ def _gather_by_tiles(plan: KernelPlan, saved: SavedPerception, bar: Tensor) -> T
     )
     states_bar = bar.new_empty(plan.total, plan.state_dim)
     tile_count = -(-plan.particle_count // ADJOINT_PARTICLES)
+    cells = saved.starts, saved.particles, saved.original_index
+    rows = saved.row_of, saved.row_positions, saved.row_kernel_sum
     launch(
         kernels.gather_state_cotangents,
         plan.world_count * tile_count * plan.group_count * WARP,
@@ -453,12 +422,8 @@ def _gather_by_tiles(plan: KernelPlan, saved: SavedPerception, bar: Tensor) -> T
         plan.state_dim,
         *plan.row_arguments,
         plan.group_count,
-        saved.starts,
-        saved.particles,
-        saved.original_index,
-        saved.row_of,
-        saved.row_positions,
-        saved.row_kernel_sum,
+        *cells,
+        *rows,
         bar,
         # Twice: in the kernel's vectors of channels, and as its flat array of numbers.
         cotangents,

@@ -246,19 +246,8 @@ def sort_worlds(
     cell, arrival = torch.empty(2, total, dtype=torch.int32, device=device).unbind()
     arrived = torch.empty(total, 2, dtype=torch.int32, device=device)
     counts = torch.zeros(plan.start_count, dtype=torch.int32, device=device)
-    launch(
-        kernels.count_cells,
-        total,
-        device,
-        plan.domain,
-        x,
-        mask,
-        plan.particle_count,
-        plan.active_offset,
-        cell,
-        arrival,
-        counts,
-    )
+    sizes, counted = (plan.particle_count, plan.active_offset), (cell, arrival, counts)
+    launch(kernels.count_cells, total, device, plan.domain, x, mask, *sizes, *counted)
     torch.cumsum(counts, 0, dtype=torch.int32, out=ordered.starts)
     launch(kernels.place_by_arrival, total, device, mask, cell, arrival, ordered.starts, arrived)
 
@@ -302,10 +291,7 @@ def _empty_worlds(plan: KernelPlan, x: Tensor, with_states: bool, with_rows: boo
 
 
 def block_capacity(request: KernelRequest, *tensors: Tensor | None) -> int:
-    """Return the maximum number of particles of the CUDA block that sorts a world; 0: none does.
-
-    `tensors` are those that it reads.
-    """
+    """Return the capacity [particles] of the CUDA block that sorts such worlds; 0: none does."""
     aligned = all(tensor is None or is_aligned(tensor) for tensor in tensors)
     if choose("sort", request._replace(aligned=aligned)).name != "block":
         return 0

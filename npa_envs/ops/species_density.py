@@ -58,10 +58,7 @@ def checked_counts(counts: Sequence[int], particle_count: int) -> tuple[int, ...
 def _gather_species(
     x: Tensor, counts: list[int], physics: Physics, scaled: bool
 ) -> tuple[Tensor, Tensor]:
-    """Return each species' densities [B, N, S] and gradients [B, N, S, D].
-
-    `scaled`: as in `perceive_by_species`.
-    """
+    """Return species' densities [B, N, S] and gradients [B, N, S, D]; `scaled`: for perception."""
     world_count, particle_count, space_dim = map(int, x.shape)
     plan = plan_kernels(x, x.shape, 1, world_count * particle_count, False, physics)
     ordered = sort_worlds(plan, x, None, None, with_rows=False)

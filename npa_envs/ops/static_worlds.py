@@ -135,17 +135,9 @@ def _static_rows(
         cell_starts.new_empty(step_count, 2 * cell_starts.shape[0] - 1),
         x.new_empty(step_count, row_capacity, space_dim),
     )
-    launch(
-        give_rows(space_dim, SCALARS[x.dtype]),
-        (step_count, max(total, rows[2].shape[1])),
-        x.device,
-        total,
-        cell_starts.shape[0] - 1,
-        active_before,
-        cell_starts,
-        x,
-        *rows,
-    )
+    kernel, size = give_rows(space_dim, SCALARS[x.dtype]), max(total, rows[2].shape[1])
+    read = total, cell_starts.shape[0] - 1, active_before, cell_starts, x
+    launch(kernel, (step_count, size), x.device, *read, *rows)
     return [*rows, active_before.view(step_count, total)[:, -1].diff(prepend=rows[0].new_zeros(1))]
 
 

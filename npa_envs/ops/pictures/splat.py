@@ -101,21 +101,11 @@ def sort_splats(splats: Splats, view: Any) -> tuple[Tensor, Tensor, Tensor]:
     if capacity:
         starts = original_index.new_empty(cell_total + 1)
         slices = slice_count(x.device, world_count, particle_count)
-        block = BLOCKS[capacity]
-        launch(
-            sort_small_splats(capacity),
-            world_count * slices * block,
-            x.device,
-            view,
-            slices,
-            *splats.arguments(),
-            splats.goal,
-            starts,
-            footprints,
-            original_index,
-            block_dim=block,
-        )
-        return starts, footprints, original_index
+        kernel, block = sort_small_splats(capacity), BLOCKS[capacity]
+        threads, written = world_count * slices * block, (starts, footprints, original_index)
+        contents = (slices, *splats.arguments(), splats.goal)
+        launch(kernel, threads, x.device, view, *contents, *written, block_dim=block)
+        return written
     kernels, contents, moves = device_kernels(x), splats.arguments(), splats.means_and_goal()
     cell, arrival, arrived = torch.empty(3, total, dtype=torch.int32, device=x.device).unbind()
     counts = torch.zeros(cell_total + 1, dtype=torch.int32, device=x.device)
