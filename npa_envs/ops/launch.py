@@ -408,7 +408,7 @@ class RecordedLaunches:
         return slots
 
     def move(self, slots: list[tuple[_PreparedLaunch, int]], tensor: Tensor) -> None:
-        """Replace the tensor at `slots` by one of equal shape and dtype, which the caller keeps alive."""
+        """Put a tensor of the same shape and dtype at these `slots`; the caller keeps it alive."""
         for prepared, index in slots:
             prepared.set_address(index, tensor)
 
