@@ -5,9 +5,9 @@ so that the import loads neither torch nor Warp and the command line starts fast
 """
 
 from importlib import import_module as _import_module
+from pathlib import Path as _Path
 from typing import TYPE_CHECKING, Any
 
-from npa_envs._checkout_imports import extend_path as _extend_path
 from npa_envs.registration import register_environments as _register_environments
 
 if TYPE_CHECKING:
@@ -32,6 +32,26 @@ if TYPE_CHECKING:
     from npa_envs.world.rollout import rollout as rollout
     from npa_envs.world.rollout import step as step
     from npa_envs.world.species import rollout_species as rollout_species
+
+_MAPPED_PACKAGES = ("envs", "wrappers", "agents")
+"""Sub-packages that are next to `npa_envs/` in the repository, and inside of it once installed."""
+
+
+def _extend_path(package_path: list[str], package_file: str) -> None:
+    """Append the repository's root to `package_path`, if `package_file` is in a checkout of it.
+
+    These are `npa_envs.__path__` and `npa_envs.__file__`. Python started in the repository's root
+    imports the folder `npa_envs/` before an installed package. The path of an installed package
+    does not change, so that a folder `envs` of another project in site-packages is never imported.
+    """
+    package = _Path(package_file).resolve().parent
+    root = package.parent
+    installed = any((package / name).is_dir() for name in _MAPPED_PACKAGES)
+    if installed or not (root / "pyproject.toml").is_file() or str(root) in package_path:
+        return
+    if all((root / name / "__init__.py").is_file() for name in _MAPPED_PACKAGES):
+        package_path.append(str(root))
+
 
 _extend_path(__path__, __file__)
 _register_environments()

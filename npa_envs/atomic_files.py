@@ -75,7 +75,7 @@ def open_regular(path: str | Path, *, limit: int, what: str = "the file") -> IO[
 
 
 def read_bytes(path: str | Path, *, limit: int, what: str = "the file") -> bytes:
-    """Return the bytes of a file that `open_regular` opens."""
+    """Return the bytes of a file, at most `limit`, opened by `open_regular`."""
     with open_regular(path, limit=limit, what=what) as file:
         try:
             # Some system files contain more than their size says.
@@ -85,7 +85,7 @@ def read_bytes(path: str | Path, *, limit: int, what: str = "the file") -> bytes
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Return the Python value of a JSON text."""
+    """Return the Python value of a JSON text; raise NPAError if it is none."""
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -98,7 +98,7 @@ def read_json(path: str | Path, *, limit: int = 16 * _MIB) -> Any:
 
 
 def check_torch_archive(file: IO[bytes], *, checksums: bool = True) -> None:
-    """Check the checksums of a file of `torch.save` before torch, which does not, unpacks it.
+    """Check a file of `torch.save` before torch unpacks it: its checksums, unless False, and sizes.
 
     Compressed content, which torch does not write, is rejected: it could take any amount of memory.
     """

@@ -1,4 +1,8 @@
-"""Checks of arguments, device names and configuration fields; each error says how to correct it."""
+"""Checks of arguments, device names and configuration fields; each error says how to correct it.
+
+`check_...` raises NPAError if the check fails, `checked_...` also returns the checked value. `name`
+is what the error calls the value.
+"""
 
 from __future__ import annotations
 
@@ -99,7 +103,7 @@ def check_world(x: Tensor, s: Tensor) -> None:
 
 
 def check_finite_positions(x: Tensor) -> None:
-    """Check that every position is finite; skipped while compiled or captured."""
+    """Check that every position is finite, except while torch compiles or captures a CUDA graph."""
     # In this order: torch.compile cannot trace the second call.
     if torch.compiler.is_compiling():
         return
@@ -131,7 +135,7 @@ def parse_device(name: str) -> torch.device:
 
 
 def check_device(name: str | torch.device) -> torch.device:
-    """Return the torch.device called `name`, a CUDA one with its number; it must exist."""
+    """Return the torch.device called `name`, if CUDA with its number; torch must see it."""
     device = parse_device(str(name) if isinstance(name, torch.device) else name)
     if device.type != "cuda":
         return device
@@ -189,7 +193,7 @@ class FiniteCheck:
 
 @functools.lru_cache(maxsize=64)
 def _side_stream(device: torch.device, thread: int) -> torch.cuda.Stream:
-    """Return a thread's stream for checks: a stream is a context of one thread at a time."""
+    """Return a thread's stream for checks: one thread at a time can enter a stream's context."""
     return torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
 
 
@@ -241,7 +245,7 @@ def checked_count(name: str, value: Any) -> int:
 
 
 def checked_positive(name: str, value: Any, unit: str = "") -> float:
-    """Return a positive, finite number as a float."""
+    """Return a positive, finite number as a float; errors name its `unit`."""
     number = checked_number(name, value)
     if not (math.isfinite(number) and number > 0.0):
         raise NPAError(f"{name} must be positive and finite{unit}, got {number:g}")
@@ -249,7 +253,7 @@ def checked_positive(name: str, value: Any, unit: str = "") -> float:
 
 
 def checked_finite(name: str, value: Any, unit: str = "") -> float:
-    """Return a finite number as a float."""
+    """Return a finite number as a float; errors name its `unit`."""
     number = checked_number(name, value)
     if not math.isfinite(number):
         raise NPAError(f"{name} must be finite{unit}, got {number:g}")
@@ -274,7 +278,7 @@ def as_list(value: Any) -> list[Any] | None:
 
 
 def number_tensor(name: str, value: Any) -> Tensor:
-    """Return real numbers, as NumPy arrays or lists have them, as a dense tensor."""
+    """Return an array, a list or a tensor of real numbers as a dense tensor."""
     try:
         numbers = torch.as_tensor(value)
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:
@@ -298,7 +302,7 @@ def checked_eps(name: str, eps: float, space_dim: int, dtype: torch.dtype) -> fl
 
 
 def check_scale(eps: float, eps0: float, space_dim: int, dtype: torch.dtype) -> None:
-    """Check that (eps / eps0)^(1+D), a factor of density gradients, is finite in the dtype."""
+    """Check that (eps / eps0)^(1+D), a factor of density gradients, does not leave the dtype."""
     limits = torch.finfo(dtype)
     # By logarithms, as the power may overflow.
     scale = (1 + space_dim) * (math.log(eps) - math.log(eps0))
@@ -367,7 +371,7 @@ def _check_fields(
 def check_positive(
     config: object, cls: type, *names: str, at_least: int = 1, at_most: int = sys.maxsize
 ) -> None:
-    """Check that fields are ints in [`at_least`, `at_most`]; if `cls` is float, finite and > 0."""
+    """Check that fields are, if `cls` is float, finite and > 0; else ints within the bounds."""
     if cls is float:
         rule = "be a finite number greater than 0"
         _check_fields(config, names, lambda v: is_real(v) and v > 0, rule, 1.0)
@@ -390,7 +394,7 @@ def check_fraction(config: object, *names: str) -> None:
 
 
 def check_word(config: object, name: str, choices: Sequence[str | None]) -> None:
-    """Check that a field is one of `choices`, among which None may be."""
+    """Check that a field is one of `choices`, which may include None."""
     value, known = getattr(config, name), [choice for choice in choices if choice is not None]
     check_field(config, name, value in choices, "be a known word", suggest(value, known))
 

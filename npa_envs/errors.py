@@ -8,7 +8,7 @@ import reprlib
 from collections.abc import Iterable, Iterator
 
 SHOWN_LENGTH = 200
-"""Largest number of characters of a value in an error, about."""
+"""Maximum number of characters of a value in an error, about."""
 
 _brief = reprlib.Repr()
 _brief.maxlevel = 3

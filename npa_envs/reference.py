@@ -172,7 +172,10 @@ def splat(
     hi: float = 1.0,
     patch_sigmas: float = 3.0,
 ) -> Tensor:
-    """Return pictures of 2D worlds, shape [B, R, R, 4]; arguments as `npa_envs.ops.splat`."""
+    """Return pictures of 2D worlds, shape [B, R, R, 4]; arguments as `npa_envs.ops.splat`.
+
+    A particle's square patch reaches `patch_sigmas` standard deviations to each side.
+    """
     pixels = resolution * pixel_size / (hi - lo)
     deviation = sigma * pixels
     radius = math.ceil(patch_sigmas * deviation)

@@ -60,10 +60,8 @@ SMALL = (
 )  # fmt: skip
 """Gardens with few particles; their settings never change under the same version."""
 
-
 GARDEN_IDS = tuple(garden.id for garden in (*GARDENS, *SMALL))
 """Ids of gardens, of any size."""
-
 
 _STATES: Mapping[str, Any] = {"state_dim": 4, "state_scale": 0.1}
 
@@ -98,7 +96,6 @@ GPU. Settings never change under the same version."""
 ALL = (*ENVIRONMENTS, *GARDENS, *CODED, *SMALL, *SIZES)
 """All entries that are registered with Gymnasium."""
 
-
 SPECIES = {
     "npa/Mixing-v0": "mixing",
     "npa/Segregation-v0": "segregation",
@@ -107,7 +104,6 @@ SPECIES = {
     "npa/Symbiosis-v0": "symbiosis",
 }
 """Ids for `pettingzoo.make` -> tasks of several species."""
-
 
 _PERCEIVED: Mapping[str, Any] = {"perception": "per_species", "max_cycles": 32}
 _SMALL_SPECIES: Mapping[str, Any] = {**_FEW, "species_count": 2, "eps0": 0.2, **_PERCEIVED}

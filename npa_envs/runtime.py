@@ -102,7 +102,7 @@ def in_turn(module: str) -> Iterator[None]:
 
 
 def _remove_header_folders() -> None:
-    """Remove Warp's folders of precompiled headers, of which the interpreter would warn."""
+    """Remove Warp's folders of precompiled headers: Python would warn of them at its exit."""
     runtime = getattr(sys.modules.get("warp._src.context"), "runtime", None)
     for folder in getattr(runtime, "_pch_dirs", {}).values():
         folder.cleanup()

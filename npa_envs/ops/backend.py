@@ -3,9 +3,10 @@
 There are two backends. `kernels/portable/` is plain Warp for a CPU and for CUDA, in float32 and
 float64; it reads like `reference.py`. `kernels/cuda/` is for CUDA in float32 on compute capability
 8.0 and above: neighbour lists in 16 bits, sums shared by threads, tensor cores. An operator takes
-the first implementation in `TABLE` whose condition holds for a call; perception is in the backend
-of the density pass, and there is one update. `npa-envs bench --explain` prints what was chosen. The
-operators of `ops/pictures/` choose by the device alone.
+the first implementation in `TABLE` whose condition holds for a call. Perception has no row: it
+reads what the density pass writes, by the `list_layout` that follows the row of density. The update
+has one implementation; operators of `ops/pictures/` choose by the device only. `npa-envs bench
+--explain` prints what was chosen.
 """
 
 from __future__ import annotations
@@ -24,20 +25,21 @@ from npa_envs.kernels.cuda.sort import BLOCKS, MAX_GRID
 Operator = Literal["sort", "density", "adjoint", "vectors", "network"]
 
 MAX_ROW, MAX_UPDATE, MAX_HIDDEN = 128, 32, 512
-"""Widest rows and updates, and most hidden units, that the fused network takes."""
+"""Maximum numbers of columns of rows, of columns of updates, and of hidden units, that the CUDA
+kernels of the network take."""
 
 MAX_THREAD_WORLD = 4096
-"""Particles of the largest world that one CPU thread sorts."""
+"""Maximum number of particles of a world that one CPU thread sorts."""
 
 MAX_BLOCK_WORLD = max(BLOCKS)
-"""Particles of the largest world that one CUDA block sorts."""
+"""Maximum number of particles of a world that one CUDA block sorts."""
 
 SMALL_WORLD = 2048
-"""Particles of the largest world that environments take as small."""
+"""Maximum number of particles of a world that environments perceive without tiles."""
 
 SHARED_WORLD = 4096
-"""Particles of the largest world for which several threads share a particle: batches of such worlds
-may be too small to fill a GPU."""
+"""Maximum number of particles of a world in which several threads share a particle: batches of such
+worlds may be too small to fill a GPU."""
 
 
 class KernelRequest(NamedTuple):
@@ -65,6 +67,8 @@ class KernelRequest(NamedTuple):
     """Hidden units of the rule, H."""
     vectors: tuple[int, int, int, int, bool] | None = None
     """The `VectorSizes` of an equivariant rule."""
+    for_environments: bool = False
+    """Whether environments perceive, whose batches fill a GPU, and not rollouts."""
 
 
 class Implementation(NamedTuple):
@@ -107,6 +111,7 @@ def _tiles(request: KernelRequest) -> bool:
         _cuda(request)
         and request.space_dim == 2
         and request.particle_count <= SHARED_WORLD
+        and not (request.for_environments and request.particle_count <= SMALL_WORLD)
         and request.smallest_side >= MIN_SIDE
     )
 
@@ -206,7 +211,7 @@ def choose(operator: Operator, request: KernelRequest) -> Implementation:
 
 
 def describe(request: KernelRequest) -> list[str]:
-    """Return a text line for each operator: the chosen implementation, its file, when it runs."""
+    """Return a text line for each operator: name, file and condition of what `choose` returns."""
     chosen = {row.operator: row for row in reversed(TABLE) if row.holds(request)}
     return [
         f"{row.operator:8}  {row.name:8}  {row.where:28}  {row.condition}"
@@ -218,12 +223,12 @@ def describe(request: KernelRequest) -> list[str]:
 class ListLayout(NamedTuple):
     """Length of neighbour lists on CUDA, and how many threads compute a particle together.
 
-    It depends on the device and on one world's size and box, never on the number of worlds: it
-    decides the order in which a world's sums are added, which must be the same in every batch.
+    It depends on the device and on one world's size and box, never on the number of worlds: the
+    order of a world's sums follows from it, and must be the same in every batch.
     """
 
     capacity: int
-    """Longest list; perception searches again for the neighbours of particles with more."""
+    """Maximum length of a list; perception searches again for neighbours of particles with more."""
     lanes: int
     """Threads that share a particle in the density pass."""
     teams: int
@@ -236,22 +241,21 @@ CROWD = range(80, 200)
 """Mean neighbours at which many lists are longer than 128, and few longer than 256."""
 
 HUGE_WORLD = 2**22
-"""Particles of the largest world whose neighbour lists may take more memory than its rows."""
+"""Maximum number of particles of a world whose neighbour lists may take more memory than rows."""
 
 
-def rollout_lists(request: KernelRequest, mean_neighbours: float) -> ListLayout:
-    """Return rollouts' `ListLayout`: more threads per particle, so that few worlds fill a GPU."""
+def list_layout(request: KernelRequest, mean_neighbours: float) -> ListLayout:
+    """Return the `ListLayout` of a call whose particles have about `mean_neighbours` neighbours.
+
+    Rollouts use more threads for a particle than environments, so that few worlds fill a GPU.
+    """
+    tiled = choose("density", request).name == "tiles"
+    if request.for_environments:
+        if request.particle_count <= SMALL_WORLD:
+            return ListLayout(64, lanes=1, teams=1)
+        return ListLayout(128, lanes=4 if tiled else 1, teams=1, tiled=tiled)
     if request.particle_count <= SHARED_WORLD:
         capacity = 256 if int(mean_neighbours) in CROWD else 128
-        tiled = choose("density", request).name == "tiles"
         return ListLayout(capacity, lanes=4, teams=2, tiled=tiled)
     # The lists of worlds that fill a device's memory would be the largest part of it.
     return ListLayout(96 if request.particle_count > HUGE_WORLD else 128, lanes=1, teams=1)
-
-
-def environment_lists(request: KernelRequest) -> ListLayout:
-    """Return environments' `ListLayout`: fewer threads per world, since batches fill a GPU."""
-    if request.particle_count <= SMALL_WORLD:
-        return ListLayout(64, lanes=1, teams=1)
-    tiled = choose("density", request).name == "tiles"
-    return ListLayout(128, lanes=4 if tiled else 1, teams=1, tiled=tiled)

@@ -24,7 +24,7 @@ OVERLAPPING_CAPABILITY = 90
 """Lowest compute capability, times ten, with programmatic dependent launch."""
 
 MAX_THREADS = 2**31 - 1
-"""Largest number of threads of a launch: kernels number them along one dimension of a grid."""
+"""Maximum number of threads of a launch: kernels number them along one dimension of a grid."""
 
 # Constants and structs of CUDA's driver API, cuda.h.
 
@@ -41,15 +41,12 @@ class _Attribute(ctypes.Structure):
     _fields_ = [("id", ctypes.c_int), ("unused", ctypes.c_int), ("value", _AttributeValue)]
 
 
+_SIZES = ("grid_x", "grid_y", "grid_z", "block_x", "block_y", "block_z", "shared_bytes")
+
+
 class _Config(ctypes.Structure):
     _fields_ = [
-        ("grid_x", ctypes.c_uint),
-        ("grid_y", ctypes.c_uint),
-        ("grid_z", ctypes.c_uint),
-        ("block_x", ctypes.c_uint),
-        ("block_y", ctypes.c_uint),
-        ("block_z", ctypes.c_uint),
-        ("shared_bytes", ctypes.c_uint),
+        *((name, ctypes.c_uint) for name in _SIZES),
         ("stream", ctypes.c_void_p),
         ("attributes", ctypes.POINTER(_Attribute)),
         ("attribute_count", ctypes.c_uint),
@@ -70,10 +67,10 @@ def _driver() -> Any:
 
 
 def new_stream(device: torch.device) -> torch.cuda.Stream:
-    """Return a CUDA stream that torch does not use elsewhere; it lives as long as the process.
+    """Return a new CUDA stream, which torch uses nowhere else; it lives as long as the process.
 
-    `torch.cuda.Stream` returns the same 32 streams in turn, so a captured one could also be in use
-    by another thread.
+    `torch.cuda.Stream` returns the same 32 streams in turn, so another thread could use one that is
+    being captured.
     """
     driver, handle = _driver(), ctypes.c_void_p()
     with torch.cuda.device(device):
@@ -99,7 +96,7 @@ def _follows_kernel(stream: int) -> bool:
 
 
 class DriverLaunch:
-    """A CUDA launch prepared by Warp, to be repeated through the driver API."""
+    """Repeats Warp's `launch` through the driver API, with parameters at `addresses` in memory."""
 
     def __init__(self, launch: Any, device: torch.device, addresses: Any) -> None:
         capability = launch.device.get_cuda_compile_arch() or 0
@@ -122,7 +119,7 @@ class DriverLaunch:
         self._config_address = ctypes.byref(self._config)
 
     def run(self, thread_count: int, stream: int) -> bool:
-        """Launch `thread_count` threads on a stream; return False if Warp has to launch them."""
+        """Launch `thread_count` threads on a stream; return False if nothing was launched."""
         other_device = torch.cuda.current_device() != self._device.index
         if self._launch is None or thread_count > MAX_THREADS or other_device:
             return False

@@ -34,9 +34,10 @@ HINT = "or take small worlds with the slow operators of npa_envs.reference, whic
 
 
 def check_derivatives(**arguments: Any) -> None:
-    """Check that no forward-mode derivative and no function of `torch.func` uses these arguments.
+    """Raise NPAError within a function of `torch.func`, or if an argument has a tangent.
 
-    Forward-mode derivatives would be lost silently where no tensor requires a gradient.
+    A tangent is a derivative of forward mode. It would be lost silently where no tensor requires a
+    gradient. Arguments are given by their names.
     """
     # In this order: a compiler cannot trace the second condition.
     if not torch.compiler.is_compiling() and _transforms_active():
@@ -51,7 +52,7 @@ def check_derivatives(**arguments: Any) -> None:
 
 
 def _check_tangents(arguments: dict[str, Any]) -> None:
-    """Check that no tensor in the arguments carries a tangent of forward-mode derivatives."""
+    """Raise NPAError if a tensor in the arguments, by name, has a tangent of forward mode."""
     if torch.compiler.is_compiling():
         # Tangents are visible only to calls that a compiler does not trace.
         torch.compiler.disable(_check_tangents)(arguments)  # type: ignore[no-untyped-call]
@@ -86,10 +87,10 @@ def _tensors(value: Any) -> Iterator[Tensor]:
 class CustomOp(Generic[Arguments, Result]):
     """A function of tensors that is called directly, or as a torch operator where torch needs one.
 
-    It needs one under torch.compile, in dispatch modes and for tensor subclasses; elsewhere its
-    call would cost as much CPU time as several launches. Arguments are positional. Results share no
-    memory with each other or with arguments. The operator takes a `Physics` as the list
-    `Physics.numbers`. With torch's fake tensors, which have no memory, no kernel is launched.
+    It needs one under torch.compile, in dispatch modes and for tensor subclasses. Elsewhere an
+    operator's call would cost as much CPU time as several launches. Arguments are positional.
+    Results share no memory with each other or with arguments. The operator takes a `Physics` as the
+    list `Physics.numbers`. With torch's fake tensors, which have no memory, nothing is launched.
     """
 
     def __init__(self, name: str, function: Callable[Arguments, Result]) -> None:
@@ -139,9 +140,9 @@ def custom_op(name: str) -> Callable[[Callable[Arguments, Result]], CustomOp[Arg
 
 
 def without_autocast(backward: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """Wrap the backward pass of an autograd function, so that it runs without autocast.
+    """Return the backward pass of an autograd function, made to run without autocast.
 
-    Forward passes run without autocast; `backward()` may be called within it.
+    Forward passes run without autocast, but `backward()` may be called within it.
     """
 
     @functools.wraps(backward)
@@ -156,7 +157,7 @@ def without_autocast(backward: Callable[Arguments, Result]) -> Callable[Argument
 
 
 def once_differentiable(backward: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """Wrap a backward pass, so that it rejects second derivatives and several cotangents at once.
+    """Return a backward pass that rejects second derivatives and several cotangents at once.
 
     Torch's own `once_differentiable` raises no error where the incoming gradient requires none, as
     that of a sum: second derivatives are then silently zero. Compiled functions reject them

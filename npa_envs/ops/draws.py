@@ -1,4 +1,4 @@
-"""Random numbers of batched worlds as torch operators; no draw depends on another world."""
+"""Random numbers of batched worlds; a world's numbers do not depend on the other worlds."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ def draw(
     """Return random numbers of each world, [B, count], from a counter-based generator.
 
     They depend only on the world's entries of `keys`, `episodes` and `steps`, shape [B], and on
-    `number`, the index of the draw within the step. Distributions are "uniform" in [0, 1), with 24
-    or 53 random bits; standard "normal", always finite; "bernoulli", ones with a probability of
+    `number`, which numbers the calls of a step. Distributions are "uniform" in [0, 1), with 24 or
+    53 random bits; standard "normal", always finite; "bernoulli", ones with a probability of
     bound / 2^32; "integers" in [0, bound).
     """
     values = keys.new_empty(keys.shape[0], count, dtype=dtype)

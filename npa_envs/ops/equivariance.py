@@ -1,9 +1,12 @@
 """The vectors of equivariant rules: rotation-invariant inputs, and displacements from vectors.
 
-v are a particle's perceived gradients, u = mixing^T v linear combinations of them. A rotation of
-the world rotates all of them and leaves u_a · u_b unchanged, in 2D also u_a × u_b, whose sign
-changes in a mirror. Each formula exists twice: in plain torch, for any tensors (`invariants`,
-`steered`), and as kernels with hand-written adjoints, for rollouts (`read_rows`, `steer_rows`).
+Perceived vectors v are a particle's gradients; mixed vectors u = mixing^T v are linear combinations
+of them. A rotation of the world rotates all vectors. It leaves the products u_a · u_b unchanged, in
+2D also u_a × u_b, whose sign changes in a mirror. The rule's network reads these products. For each
+mixed vector its output has a gate g_a, and the displacement is Σ_a relu(g_a) steering_a u_a, where
+`steering` are trained factors. Each formula exists twice: in plain torch, for any tensors
+(`invariants`, `steered`), and as kernels with hand-written adjoints, for rollouts (`read_rows`,
+`steer_rows`).
 """
 
 from __future__ import annotations
@@ -34,11 +37,11 @@ MIXED_VECTORS = 8
 """Default number of mixed vectors of an equivariant rule."""
 
 MIN_STEERING = 1e-19
-"""Displacement of a gate of 1 whose steering is 0, dimensionless: small, so that it can learn."""
+"""Value that replaces a steering of 0, dimensionless: small, but it gets a gradient."""
 
 
 class VectorSizes(NamedTuple):
-    """Numbers of scalars and vectors that an equivariant rule perceives, and of mixed vectors."""
+    """Numbers of scalars and vectors of an equivariant rule; `invariants` has the mixed ones."""
 
     space_dim: int
     """Space dimension D."""
@@ -80,10 +83,11 @@ class VectorSizes(NamedTuple):
 
 
 def invariants(perception: Tensor, mixing: Tensor, sizes: VectorSizes) -> tuple[Tensor, Tensor]:
-    """Return mixed vectors u, [..., mixed, D], and the network's inputs, [..., input_dim].
+    """Return an equivariant rule's mixed vectors, [..., mixed, D], and inputs, [..., input_dim].
 
-    u = mixing^T v, where v are the perceived vectors and `mixing` has shape [perceived, mixed].
-    Inputs do not change with rotations: they are the scalars and the products of mixed vectors.
+    Mixed vectors u = mixing^T v are linear combinations of the perceived vectors v; `mixing` has
+    shape [perceived, mixed]. The network's inputs do not change with rotations: they are the
+    perceived scalars and the products of mixed vectors.
     """
     shape = (*perception.shape[:-1], sizes.perceived, sizes.space_dim)
     vectors = perception[..., sizes.scalars :].reshape(shape)
@@ -97,10 +101,11 @@ def invariants(perception: Tensor, mixing: Tensor, sizes: VectorSizes) -> tuple[
 
 
 def steered(output: Tensor, mixed: Tensor, steering: Tensor, sizes: VectorSizes) -> Tensor:
-    """Return updates [δ (D) ; Δs (C)] from a network's gates g and state changes Δs.
+    """Return an equivariant rule's updates [δ (D) ; Δs (C)] from its network's `output` [g ; Δs].
 
-    δ = Σ_a relu(g_a) steering_a u_a, over mixed vectors u_a and, where chiral, those turned by 90
-    degrees. `output` is [g ; Δs], shape [..., gate_count + C]; `steering` has shape [gate_count].
+    The displacement is δ = Σ_a relu(g_a) steering_a u_a: mixed vectors u_a, where chiral also those
+    turned by 90 degrees, times gates g_a, times trained factors `steering`, shape [gate_count]. Δs
+    are the changes of states; `output` has shape [..., gate_count + C].
     """
     gates = torch.relu(output[..., : sizes.gate_count]) * steering
     along = torch.cat((mixed, _turned(mixed)), dim=-2) if sizes.chiral else mixed
@@ -119,7 +124,7 @@ def _kernels(like: Tensor, space_dim: int) -> Any:
 
 
 def _cuda_runs(like: Tensor, sizes: VectorSizes) -> bool:
-    """Return whether CUDA kernels run these `sizes` on the device and dtype of `like`."""
+    """Return whether CUDA kernels support these `sizes` on the device and dtype of `like`."""
     return choose("vectors", KernelRequest(like.device, like.dtype, vectors=sizes)).name == "cuda"
 
 
@@ -188,26 +193,28 @@ def _read_rows_backward(
     return rows_bar, pairs.diagonal(dim1=1, dim2=3).sum(dim=-1)
 
 
-def _cuda_steering(mixed: Tensor, gate_count: int) -> tuple[int, int, bool] | None:
-    """Return D, number of mixed vectors and chirality if CUDA runs `steer_rows`, else None."""
+def _launch_steering(name: str, threads: int, *tensors: Tensor) -> None:
+    """Launch a kernel of steering on network outputs, mixed vectors, signs and further tensors.
+
+    `name` is "steer" or "pull_back_steering", `threads` the number of those of a portable kernel.
+    """
+    output, mixed, signs, *_ = tensors
     count, space_dim = map(int, mixed.shape[1:])
-    chiral = gate_count > count
-    # Steering needs no shared memory, so it runs wherever the smallest rows fit.
-    least = VectorSizes(space_dim, 0, 1, count, chiral)
-    return (space_dim, count, chiral) if _cuda_runs(mixed, least) else None
+    chiral = len(signs) > count
+    # Steering needs no shared memory, so CUDA runs it wherever the smallest rows fit.
+    if _cuda_runs(mixed, VectorSizes(space_dim, 0, 1, count, chiral)):
+        blocks = -(-output.shape[0] // (STEERED_ROWS * STEER_WARPS))
+        kernel = getattr(steering_kernels(space_dim, count, chiral), name)
+        _launch_blocks(kernel, blocks, STEER_WARPS, *tensors)
+    else:
+        kernel = getattr(_kernels(output, space_dim), name)
+        launch(kernel, threads, output.device, len(signs), *tensors)
 
 
 @custom_op("npa::steer_rows")
 def _steer_rows(output: Tensor, mixed: Tensor, signs: Tensor, width: int) -> Tensor:
     update = output.new_empty(output.shape[0], width)
-    sizes = _cuda_steering(mixed, len(signs))
-    if sizes is not None:
-        blocks = -(-output.shape[0] // (STEERED_ROWS * STEER_WARPS))
-        kernel = steering_kernels(*sizes).steer
-        _launch_blocks(kernel, blocks, STEER_WARPS, output, mixed, signs, update)
-        return update
-    kernel = _kernels(output, int(mixed.shape[2])).steer
-    launch(kernel, update.numel(), output.device, len(signs), output, mixed, signs, update)
+    _launch_steering("steer", update.numel(), output, mixed, signs, update)
     return update
 
 
@@ -215,16 +222,10 @@ def _steer_rows(output: Tensor, mixed: Tensor, signs: Tensor, width: int) -> Ten
 def _steer_rows_backward(
     output: Tensor, mixed: Tensor, signs: Tensor, update_bar: Tensor
 ) -> tuple[Tensor, Tensor]:
-    output_bar, mixed_bar = torch.empty_like(output), torch.empty_like(mixed)
-    tensors = output, mixed, signs, update_bar, output_bar, mixed_bar
-    sizes = _cuda_steering(mixed, len(signs))
-    if sizes is not None:
-        blocks = -(-output.shape[0] // (STEERED_ROWS * STEER_WARPS))
-        _launch_blocks(steering_kernels(*sizes).pull_back_steering, blocks, STEER_WARPS, *tensors)
-        return output_bar, mixed_bar
-    kernel = _kernels(output, int(mixed.shape[2])).pull_back_steering
-    launch(kernel, output.numel(), output.device, len(signs), *tensors)
-    return output_bar, mixed_bar
+    bars = torch.empty_like(output), torch.empty_like(mixed)
+    tensors = output, mixed, signs, update_bar, *bars
+    _launch_steering("pull_back_steering", output.numel(), *tensors)
+    return bars
 
 
 class _ReadRows(torch.autograd.Function):
@@ -267,7 +268,7 @@ def read_rows(
 ) -> tuple[Tensor, Tensor]:
     """Return mixed vectors [K, mixed, D] and network inputs [K, width]: `invariants` by kernels.
 
-    A row is a perception vector, a one and zeros; inputs are [scalars | products | 1 | 0].
+    A row is a perception vector, a one and zeros; inputs are [scalars | products | 1 | zeros].
     """
     tensors = rows.contiguous(), mixing.contiguous()
     if not (torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)):
@@ -277,11 +278,11 @@ def read_rows(
 
 
 def signed_gates(weight: Tensor, steering: Tensor) -> tuple[Tensor, Tensor]:
-    """Return output weights [gate_count + C, H], gates times |steering|, and signs of steering.
+    """Return output weights for `steer_rows`, [gate_count + C, H], and the signs of `steering`.
 
-    relu(g) steering = sign(steering) relu(|steering| g), so the gradient of `steering` follows from
-    that of the weights, without a sum over rows. A steering of 0 is replaced by a tiny one, so that
-    it still gets a gradient.
+    Weights of gates g are multiplied by |steering|: relu(g) steering is sign(steering) times
+    relu(|steering| g). So the gradient of `steering` follows from that of the weights, without a
+    sum over particles. A steering of 0 is replaced by `MIN_STEERING`, to get a gradient.
     """
     steering = torch.where(steering == 0.0, steering + MIN_STEERING, steering)
     factors = torch.nn.functional.pad(steering.abs(), (0, len(weight) - len(steering)), value=1.0)
@@ -289,10 +290,10 @@ def signed_gates(weight: Tensor, steering: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def steer_rows(output: Tensor, mixed: Tensor, signs: Tensor, width: int) -> Tensor:
-    """Return displacements δ and state changes Δs of K particles: [δ | Δs | 0], [K, width].
+    """Return updates of K particles, [K, width]: [displacement δ | state changes Δs | zeros].
 
-    As `steered`, but by kernels: δ sums `mixed` vectors [K, any] times relu(gates g) and `signs`.
-    `output` is [g | Δs | 0], by the weights of `signed_gates`, which also returns `signs`.
+    As `steered`, by kernels: δ sums `mixed` vectors, [K, mixed, D], times relu(g) and `signs`. The
+    `output` [gates g | Δs | zeros] is by the weights of `signed_gates`, which also returns `signs`.
     """
     output = output.contiguous()
     if not (torch.is_grad_enabled() and (output.requires_grad or mixed.requires_grad)):

@@ -26,13 +26,13 @@ class ArrangedWeights(NamedTuple):
     """Weights W1 and W2 of a rule's network in the memory layout of the CUDA kernels."""
 
     forward: list[Tensor]
-    """Fragments (tiles of tensor cores) of W1 and W2, float16, and scales of updates, float32."""
+    """Fragments (tiles of tensor cores) of W1 and W2, float16, and factors of outputs, float32."""
     backward: list[Tensor]
     """The same of W1ᵀ and W2ᵀ, then fragments of both, bfloat16; empty without gradients."""
 
 
 def _arrange_layers(first: Tensor, second: Tensor) -> list[Tensor]:
-    """Return weights [H, width] and [outputs, H] in tensor-core tiles, and factors of outputs."""
+    """Return weights [H, width], [outputs, H] as scaled tiles, float16, and factors of outputs."""
     hidden, width = first.shape
     steps, tiles = -(-width // 16), -(-second.shape[0] // 8)
     half = functools.partial(torch.empty, dtype=torch.float16, device=first.device)
@@ -64,7 +64,7 @@ def _arrange_weights(
 
 
 def arrange_weights(hidden_weight: Tensor, output_weight: Tensor) -> ArrangedWeights | None:
-    """Return a rule's weights in the layout of `run_network`; None if no kernel supports them.
+    """Return a rule's weights in the layout of `run_network`; None if no CUDA kernel takes them.
 
     Where gradients are enabled they are also laid out for the backward pass, even if the weights
     require no gradient: once, instead of in every step whose perception requires one.
@@ -96,8 +96,8 @@ BLOCKS_PER_PROCESSOR = 2
 FEW_ROWS = 160
 """Rows per multiprocessor up to which one block sums them: adding partial sums takes longer."""
 
-SIGN_UNITS = 128
-"""Hidden units whose ReLU masks four threads store, in 32 bits each."""
+MASK_UNITS = 128
+"""Number of hidden units whose activity four threads store, in 32 bits each."""
 
 
 @custom_op("npa::run_network")
@@ -107,15 +107,16 @@ def _run_network(
     out_width: int,
     unit_count: int,
     mode: str,
-    stored_signs: Tensor | None,
+    stored_bits: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
-    """Return outputs [K, out_width] of rows [K, width], and a bit for each hidden unit: active.
+    """Return a network's outputs [K, out_width] of rows [K, width], and which units are active.
 
-    There are bits if `mode` is "relu_store_mask"; "apply_mask" reads them as `stored_signs`.
+    The latter are bits, one for each hidden unit, written if `mode` is "relu_store_mask". The
+    backward pass, "apply_mask", reads them as `stored_bits`.
     """
     steps, tiles = -(-int(rows.shape[1]) // 16), -(-out_width // 8)
-    words = 4 * -(-unit_count // SIGN_UNITS) if mode == "relu_store_mask" else 0
-    signs = rows.new_empty(rows.shape[0], words, dtype=torch.int32)
+    words = 4 * -(-unit_count // MASK_UNITS) if mode == "relu_store_mask" else 0
+    bits = rows.new_empty(rows.shape[0], words, dtype=torch.int32)
     output = rows.new_empty(rows.shape[0], out_width)
     warps = -(-rows.shape[0] // ROW_GROUP)
     launch(
@@ -125,22 +126,22 @@ def _run_network(
         unit_count,
         aligned(rows),
         *arranged[:3],
-        signs if stored_signs is None else stored_signs,
+        bits if stored_bits is None else stored_bits,
         output,
         block_dim=LAYER_BLOCK,
     )
-    return output, signs
+    return output, bits
 
 
 @custom_op("npa::network_weight_gradients")
 def _weight_gradients(
-    rows: Tensor, update_bar: Tensor, signs: Tensor, arranged: list[Tensor], unit_count: int
+    rows: Tensor, update_bar: Tensor, bits: Tensor, arranged: list[Tensor], unit_count: int
 ) -> Tensor:
     count, width, out_width = rows.shape[0], int(rows.shape[1]), int(update_bar.shape[1])
     warps = next(n for n in (4, 3, 2, 1) if unit_count // WARP_UNITS % n == 0)
     unit_blocks = unit_count // WARP_UNITS // warps
     kernels = weight_gradient_kernels(
-        -(-width // 16), -(-width // 8), -(-out_width // 8), warps, unit_blocks, int(signs.shape[1])
+        -(-width // 16), -(-width // 8), -(-out_width // 8), warps, unit_blocks, int(bits.shape[1])
     )
     processors = multiprocessor_count(rows.device)
     blocks_each = 1 if count <= FEW_ROWS * processors else BLOCKS_PER_PROCESSOR
@@ -156,7 +157,7 @@ def _weight_gradients(
         part_rows,
         aligned(rows),
         aligned(update_bar),
-        signs,
+        bits,
         *arranged[3:],
         partial_sums,
         block_dim=warps * WARP,
@@ -184,35 +185,35 @@ class _Network(torch.autograd.Function):
         arranged: ArrangedWeights,
     ) -> Tensor:
         update: Tensor
-        update, signs = _run_network(
+        update, bits = _run_network(
             rows, arranged.forward, out_width, unit_count, "relu_store_mask", None
         )
-        ctx.save_for_backward(rows, signs, *arranged.backward)
+        ctx.save_for_backward(rows, bits, *arranged.backward)
         ctx.unit_count = unit_count
         return update
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, update_bar: Tensor) -> tuple[Tensor | None, ...]:
-        rows, signs, *arranged = ctx.saved_tensors
+        rows, bits, *arranged = ctx.saved_tensors
         unit_count, width = ctx.unit_count, rows.shape[1]
         rows_bar = weights_bar = None
         if ctx.needs_input_grad[0]:
-            rows_bar, _ = _run_network(update_bar, arranged, width, unit_count, "apply_mask", signs)
+            rows_bar, _ = _run_network(update_bar, arranged, width, unit_count, "apply_mask", bits)
         if ctx.needs_input_grad[1]:
-            weights_bar = _weight_gradients(rows, update_bar, signs, arranged, unit_count)
+            weights_bar = _weight_gradients(rows, update_bar, bits, arranged, unit_count)
         return rows_bar, weights_bar, None, None, None
 
 
 def run_network(
     rows: Tensor, weights: Tensor, output_shape: tuple[int, ...], arranged: ArrangedWeights
 ) -> Tensor:
-    """Return relu(rows W1ᵀ) W2ᵀ, [K, A'], as accurate as matrix products in float32.
+    """Return relu(rows W1ᵀ) W2ᵀ, K rows of A' outputs, as accurate as products in float32.
 
     A row's result depends only on that row and the weights, not on the other rows. `rows` are
-    padded perception vectors, [K, row_width]; `weights` are W1 [H, row_width] and W2 [A', H],
-    concatenated; `output_shape` is A' and H. `arranged` has the same weights by `arrange_weights`;
-    they are arranged again if gradients are needed that were disabled then.
+    padded perception vectors, [K, row_width]. `weights` are W1 [H, row_width] and W2 [A', H] in one
+    vector; `output_shape` is (A', H). `arranged` are the same weights by `arrange_weights`; if they
+    were arranged without gradients, and these are needed, it is done again.
     """
     out_width, unit_count = output_shape
     needs_gradient = torch.is_grad_enabled() and (rows.requires_grad or weights.requires_grad)

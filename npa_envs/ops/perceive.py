@@ -22,7 +22,6 @@ from npa_envs.checks import (
     checked_eps,
     checked_flag,
 )
-from npa_envs.ops.backend import environment_lists
 from npa_envs.ops.custom_op import check_derivatives, custom_op, once_differentiable
 from npa_envs.ops.launch import RecordedLaunches, is_aligned, launch
 from npa_envs.ops.perception_passes import (
@@ -118,7 +117,7 @@ def perceive(
 def checked_physics(
     x: Tensor, s: Tensor, eps: float, eps0: float | None, box: Box, terms: Terms = ALL_TERMS
 ) -> Physics:
-    """Return the constants of worlds to perceive, after checking these and the worlds."""
+    """Check worlds to perceive and constants; return the constants as a `Physics`."""
     check_world(x, s)
     check_derivatives(x=x, s=s)
     space_dim, state_dim = x.shape[2], s.shape[2]
@@ -178,7 +177,7 @@ def perception_fields(
 
 
 class Rows(NamedTuple):
-    """Which row of a matrix has which particle's perception; only active particles have rows."""
+    """Which row of a perception matrix is of which particle; only active particles have rows."""
 
     row_of: Tensor
     """Row of each particle, -1 for none, int32, shape [B N]."""
@@ -201,9 +200,9 @@ def _perceive_rows(
     physics: Physics,
     for_adjoint: bool,
 ) -> list[Tensor]:
-    """Return the tensors of a `SavedPerception`, and then the particle of each row, [K].
+    """Return the tensors of a `SavedPerception`, and then `Rows.row_particle`.
 
-    For static worlds only the first two, as the others are in `static`.
+    For static worlds only the first two: the others are in `static`, [] for worlds that move.
     """
     plan = plan_kernels(x, x.shape, s.shape[2], row_capacity, masked, physics)
     if static:
@@ -218,17 +217,9 @@ def _perceive_rows(
     launch(*perception_launch(plan, ordered, densities, perception, row_kernel_sum=written))
     if static:
         return [perception, kernel_sum]
-    return [
-        perception,
-        kernel_sum,
-        ordered.row_of,
-        ordered.starts,
-        ordered.original_index,
-        densities.particles,
-        ordered.row_positions,
-        ordered.states,
-        ordered.row_particle,
-    ]
+    sorted_worlds = ordered.row_of, ordered.starts, ordered.original_index, densities.particles
+    of_rows = ordered.row_positions, ordered.states, ordered.row_particle
+    return [perception, kernel_sum, *sorted_worlds, *of_rows]
 
 
 class _PerceiveRows(torch.autograd.Function):
@@ -274,7 +265,7 @@ def _perceived(
     rows: StaticRows | None,
     *options: Any,
 ) -> tuple[SavedPerception, Tensor]:
-    """Return `_perceive_rows` of worlds, static or not; `options`: its arguments from `masked`."""
+    """Return the results of `_perceive_rows`; `options` are its arguments from `masked` on."""
     if static is None or rows is None:
         *saved_tensors, row_particle = _perceive_rows(x, s, mask, [], *options)
         return SavedPerception(*saved_tensors), row_particle
@@ -310,7 +301,7 @@ def perceive_rows(
         row_width: Columns of a row, at least P: the perception vector, a one, then zeros.
         static: Result of `prepare_static` for worlds whose particles do not move. Then x and s are
             in its sorted order, no gradient flows into x, and the mask is not read.
-        static_rows: Rows of the active particles of static worlds, or None for all.
+        static_rows: Active particles of static worlds, a result of `static_rows`; None: all.
 
     Returns:
         The rows, shape [K, row_width], zero beyond the last active particle's, and the indices
@@ -332,7 +323,7 @@ def perceive_rows(
 
 
 ROWS_TOGETHER = 2**22
-"""Rows of huge worlds that are perceived and mapped to updates at a time."""
+"""Number of rows of huge worlds that are perceived and mapped to updates at a time."""
 
 
 def updates_in_parts(
@@ -344,11 +335,10 @@ def updates_in_parts(
     row_capacity: int,
     row_width: int,
 ) -> tuple[Tensor, Rows]:
-    """Return updates of huge worlds' active particles, [K, A'], and `Rows`; computed in parts.
+    """Return updates of huge worlds' active particles, [K, A'], and `Rows`; not differentiable.
 
-    All rows of `perceive_rows` together would take most of the memory. The network maps rows
-    [any, row_width] to updates [any, A'], each row independently, so results are the same. Not
-    differentiable.
+    They are computed in parts, as all rows of `perceive_rows` would take most of the memory. The
+    network maps rows [any, row_width] to A' outputs each, independently, so results are the same.
     """
     x, s = x.detach().contiguous(), s.detach().contiguous()
     plan = plan_kernels(x, x.shape, s.shape[2], row_capacity, mask is not None, physics)
@@ -374,26 +364,24 @@ def updates_in_parts(
 
 
 class NeighbourState:
-    """Worlds x and s, unchecked, sorted into cells with densities; valid until one changes.
+    """Worlds x and s, sorted into cells with densities; neither is checked, or may change.
 
     `world_indices`, int64, shape [B], are the worlds' indices in a larger batch, into which
-    perception is written; default: the worlds are the whole batch.
+    perception is written; None: the worlds are the whole batch.
     """
 
     def __init__(
         self, x: Tensor, s: Tensor, physics: Physics, world_indices: Tensor | None = None
     ) -> None:
         x, s = x.contiguous(), s.contiguous()
-        plan = plan_kernels(x, x.shape, s.shape[2], x.shape[0] * x.shape[1], False, physics)
+        total = x.shape[0] * x.shape[1]
+        plan = plan_kernels(x, x.shape, s.shape[2], total, False, physics, for_environments=True)
         with_lists = plan.lists_neighbours
         in_place = with_lists and plan.state_dim % plan.width == 0 and is_aligned(s)
         ordered = sort_worlds(plan, x, None if in_place else s, None, with_rows=not with_lists)
-        # World k of a batch equals that world alone, bit for bit: the lists must not depend on the
-        # number of worlds.
         densities = compute_densities(
             plan,
             ordered,
-            environment_lists(plan.request),
             state_index=ordered.original_index if in_place else None,
             with_particles=False,
         )
@@ -419,8 +407,8 @@ class NeighbourState:
     def perceive(self, out: Tensor | None = None) -> Tensor:
         """Return every particle's perception, clipped to `Limits.perception`, shape [B, N, P].
 
-        Later calls read the current values of the same tensors and cost less CPU time. For worlds
-        with `world_indices` in a larger batch, `out` must be given, of that batch's shape.
+        It is written to `out`, with `world_indices` of the larger batch's shape; None: to a new
+        tensor. Later calls take less CPU time.
         """
         if out is None:
             out = self._like.new_empty(self._shape)

@@ -23,7 +23,7 @@ from npa_envs.ops.physics import Physics
 from npa_envs.ops.sort import MAX_INDEX, KernelPlan, SortedWorlds, plan_kernels
 
 INTERLEAVED_LISTS = 32
-"""Neighbour lists that are interleaved in memory."""
+"""Number of neighbour lists that are interleaved in memory."""
 
 
 class NeighbourLists(NamedTuple):
@@ -61,7 +61,7 @@ class Densities(NamedTuple):
 
 
 def portable_kernels(plan: KernelPlan, with_lists: bool = False) -> Any:
-    """Return the portable perception kernels; `with_lists`: those that read neighbour lists."""
+    """Return the portable perception kernels; `with_lists`: they read neighbour lists."""
     terms = plan.physics.terms
     return perception_kernels(
         plan.space_dim,
@@ -77,37 +77,26 @@ def portable_kernels(plan: KernelPlan, with_lists: bool = False) -> Any:
 def compute_densities(
     plan: KernelPlan,
     ordered: SortedWorlds,
-    layout: ListLayout | None = None,
     *,
     state_index: Tensor | None = None,
     with_particles: bool = True,
 ) -> Densities:
     """Return densities, with neighbour lists (CUDA) or density gradients (elsewhere).
 
-    `layout` of the lists is by default that of rollouts. `state_index` has the index of each sorted
-    particle's state, by default in order. `with_particles`: also `particles`, for the adjoint.
+    `state_index` is the index of each sorted particle's state, int32, shape [B N]; None: states are
+    sorted too. `with_particles`: also return `Densities.particles` on CUDA, for the adjoint.
     """
     if not plan.lists_neighbours:
         return compute_densities_in_cells(plan, ordered)
-    layout = layout or plan.list_layout
-    positions = ordered.positions
+    layout, positions = plan.list_layout, ordered.positions
     records = positions.new_empty(plan.total, 4)
     particles = positions.new_empty(plan.total if with_particles else 0, plan.space_dim + 1)
     list_shape = -(-plan.row_capacity // INTERLEAVED_LISTS), layout.capacity, INTERLEAVED_LISTS
     steps = positions.new_empty(list_shape, dtype=torch.int16)
     lengths = positions.new_empty(plan.row_capacity, dtype=torch.int32)
-    arrays = (
-        ordered.starts,
-        ordered.cell,
-        positions,
-        state_index,
-        ordered.original_index,
-        ordered.row_of,
-        particles,
-        records,
-        steps,
-        lengths,
-    )
+    cells = ordered.starts, ordered.cell, positions
+    indices = state_index, ordered.original_index, ordered.row_of
+    arrays = (*cells, *indices, particles, records, steps, lengths)
     if layout.tiled:
         launch(
             tiled_density(plan.periodic, layout.capacity, plan.masked),
@@ -168,88 +157,88 @@ def perception_launch(
     first_row: int = 0,
     row_count: int | None = None,
 ) -> tuple[Any, ...]:
-    """Return the arguments of a `launch` that writes active particles' perception to `out`.
+    """Return the arguments of a `launch` that writes active particles' perception vectors to `out`.
 
     Args:
-        states: States in the caller's order, where `ordered` has none.
-        destination: Row of `out` for each active particle, int32, shape [K]; default: its own.
+        states: States in the caller's order, [B, N, C], where `ordered` has none; CUDA only.
+        destination: Row of `out` for each active particle, int32, shape [K]; None: in their order.
         limit: Entries are clipped to plus and minus this; 0: not clipped.
         row_kernel_sum: Output: sums over neighbours of volume times kernel gradient, shape [K, D].
         first_row: First active particle to write, a multiple of `INTERLEAVED_LISTS`.
-        row_count: Number of active particles to write, without gaps; None: all.
+        row_count: Number of active particles to write, one after the other; None: all.
     """
-    has_part = row_count is not None
-    row_count = plan.row_capacity if row_count is None else row_count
-    row_index = ordered.row_index[first_row:] if plan.masked or has_part else None
-    terms = plan.physics.terms
+    row_index, lists = ordered.row_index if plan.masked else None, densities.lists
+    if row_count is None:
+        row_count = plan.row_capacity
+    else:
+        row_index = ordered.row_index[first_row:]
+        if lists is not None:
+            steps = lists.steps[first_row // INTERLEAVED_LISTS :]
+            lists = lists._replace(steps=steps, lengths=lists.lengths[first_row:])
+    group_count, rows, outputs = plan.group_count, (row_index, destination), (out, row_kernel_sum)
     numbers = (
         plan.state_dim,
-        int(terms.density_gradient),
+        int(plan.physics.terms.density_gradient),
         plan.physics.scale(),
         plan.density_scale,
         plan.row_base + first_row,
     )
-    lists = densities.lists
-    if lists is not None and has_part:
-        shifted = lists.steps[first_row // INTERLEAVED_LISTS :], lists.lengths[first_row:]
-        lists = lists._replace(steps=shifted[0], lengths=shifted[1])
-    if lists is not None:
-        variant = PerceptionVariant(
-            space_dim=plan.space_dim,
-            width=plan.width,
-            state_gradient=terms.state_gradient,
-            moment_inverse=terms.correction,
-            periodic=plan.periodic,
-            grouped=plan.group_count > 1,
-            capacity=lists.layout.capacity,
-            for_adjoint=row_kernel_sum is not None,
-            teams=lists.layout.teams,
-            per_particle=lists.per_particle,
-            tiled=lists.layout.tiled,
-        )
+    if lists is None:
+        neighbours, ends = densities.static_neighbours or (None, None)
+        cells = ordered.starts, ends, neighbours, densities.particles
         return (
-            listed_perception(variant),
-            -(-row_count * plan.group_count * variant.lanes // WARP) * WARP,
+            portable_kernels(plan, neighbours is not None).perceive,
+            (row_count, group_count),
             out.device,
             plan.domain,
+            plan.particle_count,
             *numbers,
-            row_count,
-            plan.group_count,
+            group_count,
             limit,
-            ordered.starts,
-            ordered.cell,
-            ordered.positions,
-            lists.records,
-            ordered.states if states is None else states,
-            None if states is None else ordered.original_index,
-            row_index,
-            destination,
-            lists.steps,
-            lists.lengths,
-            out,
-            row_kernel_sum,
+            *cells,
+            ordered.states,
+            ordered.states.view(plan.total, -1),
+            *rows,
+            densities.density_gradient,
+            *outputs,
         )
-    neighbours, ends = densities.static_neighbours or (None, None)
+    variant = _perception_variant(plan, lists, group_count > 1, row_kernel_sum is not None)
+    cells = ordered.starts, ordered.cell, ordered.positions, lists.records
     return (
-        portable_kernels(plan, neighbours is not None).perceive,
-        (row_count, plan.group_count),
+        listed_perception(variant),
+        -(-row_count * group_count * variant.lanes // WARP) * WARP,
         out.device,
         plan.domain,
-        plan.particle_count,
         *numbers,
-        plan.group_count,
+        row_count,
+        group_count,
         limit,
-        ordered.starts,
-        ends,
-        neighbours,
-        densities.particles,
-        ordered.states,
-        ordered.states.view(plan.total, -1),
-        row_index,
-        destination,
-        densities.density_gradient,
-        out,
-        row_kernel_sum,
+        *cells,
+        ordered.states if states is None else states,
+        None if states is None else ordered.original_index,
+        *rows,
+        lists.steps,
+        lists.lengths,
+        *outputs,
+    )
+
+
+def _perception_variant(
+    plan: KernelPlan, lists: NeighbourLists, grouped: bool, for_adjoint: bool
+) -> PerceptionVariant:
+    terms, layout = plan.physics.terms, lists.layout
+    return PerceptionVariant(
+        space_dim=plan.space_dim,
+        width=plan.width,
+        state_gradient=terms.state_gradient,
+        moment_inverse=terms.correction,
+        periodic=plan.periodic,
+        grouped=grouped,
+        capacity=layout.capacity,
+        for_adjoint=for_adjoint,
+        teams=layout.teams,
+        per_particle=lists.per_particle,
+        tiled=layout.tiled,
     )
 
 
@@ -280,7 +269,7 @@ def perceive_rows_backward(
     masked: bool,
     physics: Physics,
 ) -> tuple[Tensor, Tensor]:
-    """Return gradients with respect to states, [B N, C], and positions, [B N, D] or empty.
+    """Return gradients of states, [B N, C], and positions, [B N, D] or empty, from those of rows.
 
     The tensors are those of a `SavedPerception` and of `StaticNeighbours`, or none. Positions get a
     gradient if states were saved.
@@ -307,56 +296,32 @@ def _gather_by_cells(
 ) -> tuple[Tensor, Tensor]:
     """Return both gradients of `perceive_rows_backward`, with the portable kernels."""
     neighbours, ends = static_neighbours or (None, None)
-    entries, space_dim, width = plan.row_capacity * plan.group_count, plan.space_dim, plan.width
-    largest = entries * space_dim * width
-    if largest >= MAX_INDEX:
-        raise NPAError(
-            f"gradients must stay below {MAX_INDEX} numbers in one batch, got {largest}: split "
-            "the batch, or take float32 and detach_positions=True"
-        )
+    space_dim, group_count = plan.space_dim, plan.group_count
     terms, with_positions = plan.physics.terms, saved.states is not None
     kernels = adjoint_kernels(
-        space_dim, plan.scalar, width, plan.on_cpu, terms.state_gradient, neighbours is not None
+        space_dim,
+        plan.scalar,
+        plan.width,
+        plan.on_cpu,
+        terms.state_gradient,
+        bool(static_neighbours),
     )
-    # Cotangents of each row's sums: of smoothed states, and of gradients before they are scaled.
-    smoothed_bar = bar.new_empty(entries, width)
-    gradient_bar = bar.new_empty(entries, space_dim, width)
-    density_gradient_bar = bar.new_empty(plan.row_capacity if with_positions else 0, space_dim)
-    launch(
-        kernels.unscale_cotangents,
-        (plan.row_capacity, plan.group_count * width),
-        bar.device,
-        plan.state_dim,
-        int(terms.density_gradient),
-        plan.physics.scale(),
-        plan.density_scale,
-        plan.row_base,
-        plan.group_count,
-        saved.starts,
-        saved.perception,
-        bar,
-        smoothed_bar,
-        gradient_bar,
-        density_gradient_bar,
-    )
+    row_bars = _unscaled_cotangents(plan, saved, kernels, bar)
+    smoothed_bar, gradient_bar, _ = row_bars
     states_bar = bar.new_empty(plan.total, plan.state_dim)
+    cells = saved.starts, ends, neighbours, saved.particles, saved.original_index
+    rows = saved.row_of, saved.row_positions, saved.row_kernel_sum
     launch(
         kernels.gather_state_cotangents,
-        (plan.total, plan.group_count),
+        (plan.total, group_count),
         bar.device,
         plan.domain,
         plan.particle_count,
         plan.state_dim,
         *plan.row_arguments,
-        plan.group_count,
-        saved.starts,
-        ends,
-        neighbours,
-        saved.particles,
-        saved.original_index,
-        saved.row_of,
-        saved.row_positions,
-        saved.row_kernel_sum,
+        group_count,
+        *cells,
+        *rows,
         bar,
         smoothed_bar,
         # Twice: in the kernel's matrices, and as its flat array of numbers.
@@ -368,22 +333,52 @@ def _gather_by_cells(
         return states_bar, bar.new_empty(0)
     density_bar = bar.new_empty(plan.total)
     positions_bar = bar.new_empty(plan.total, space_dim)
-    common = (
-        plan.total,
-        bar.device,
-        plan.domain,
-        plan.particle_count,
-        plan.group_count,
-        saved.starts,
-        saved.particles,
-        saved.states,
-        saved.original_index,
-        saved.row_of,
-    )
+    sizes = plan.total, bar.device, plan.domain, plan.particle_count, group_count
+    world = saved.starts, saved.particles, saved.states, saved.original_index, saved.row_of
+    common = (*sizes, *world)
     launch(kernels.gather_density_cotangents, *common, smoothed_bar, gradient_bar, density_bar)
-    rows = density_bar, smoothed_bar, gradient_bar, density_gradient_bar
-    launch(kernels.gather_position_cotangents, *common, *rows, positions_bar)
+    launch(kernels.gather_position_cotangents, *common, density_bar, *row_bars, positions_bar)
     return states_bar, positions_bar
+
+
+def _unscaled_cotangents(
+    plan: KernelPlan, saved: SavedPerception, kernels: Any, bar: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return gradients of each row's smoothed states, state gradients and density gradients.
+
+    These are sums before their scaling by `Physics.scale` and the logarithm. The last gradients are
+    empty if positions get none.
+    """
+    group_count, space_dim, width = plan.group_count, plan.space_dim, plan.width
+    entries = plan.row_capacity * group_count
+    largest = entries * space_dim * width
+    if largest >= MAX_INDEX:
+        raise NPAError(
+            f"gradients must stay below {MAX_INDEX} numbers in one batch, got {largest}: split "
+            "the batch, or take float32 and detach_positions=True"
+        )
+    smoothed_bar = bar.new_empty(entries, width)
+    gradient_bar = bar.new_empty(entries, space_dim, width)
+    density_rows = 0 if saved.states is None else plan.row_capacity
+    density_gradient_bar = bar.new_empty(density_rows, space_dim)
+    launch(
+        kernels.unscale_cotangents,
+        (plan.row_capacity, group_count * width),
+        bar.device,
+        plan.state_dim,
+        int(plan.physics.terms.density_gradient),
+        plan.physics.scale(),
+        plan.density_scale,
+        plan.row_base,
+        group_count,
+        saved.starts,
+        saved.perception,
+        bar,
+        smoothed_bar,
+        gradient_bar,
+        density_gradient_bar,
+    )
+    return smoothed_bar, gradient_bar, density_gradient_bar
 
 
 def _gather_by_tiles(plan: KernelPlan, saved: SavedPerception, bar: Tensor) -> Tensor:
@@ -414,6 +409,8 @@ def _gather_by_tiles(plan: KernelPlan, saved: SavedPerception, bar: Tensor) -> T
     )
     states_bar = bar.new_empty(plan.total, plan.state_dim)
     tile_count = -(-plan.particle_count // ADJOINT_PARTICLES)
+    cells = saved.starts, saved.particles, saved.original_index
+    rows = saved.row_of, saved.row_positions, saved.row_kernel_sum
     launch(
         kernels.gather_state_cotangents,
         plan.world_count * tile_count * plan.group_count * WARP,
@@ -425,12 +422,8 @@ def _gather_by_tiles(plan: KernelPlan, saved: SavedPerception, bar: Tensor) -> T
         plan.state_dim,
         *plan.row_arguments,
         plan.group_count,
-        saved.starts,
-        saved.particles,
-        saved.original_index,
-        saved.row_of,
-        saved.row_positions,
-        saved.row_kernel_sum,
+        *cells,
+        *rows,
         bar,
         # Twice: in the kernel's vectors of channels, and as its flat array of numbers.
         cotangents,

@@ -31,11 +31,12 @@ class Terms(NamedTuple):
 
     state_gradient: bool = True
     moment_inverse: str | None = "threshold"
+    """How the moment matrix is inverted to correct state gradients; None: no correction."""
     density_gradient: bool = True
 
     @property
     def correction(self) -> str | None:
-        """Correction of the state gradient, "threshold" or "smooth"; None: no correction."""
+        """`moment_inverse`, "threshold" or "smooth", if there is a state gradient; else None."""
         return self.moment_inverse if self.state_gradient else None
 
     def perception_dim(self, space_dim: int, state_dim: int) -> int:
@@ -49,7 +50,7 @@ ALL_TERMS = Terms()
 BOUNDARIES: tuple[Boundary, ...] = get_args(Boundary)
 
 INVERSES = (None, "threshold", "smooth")
-"""Inversions of the moment matrix; torch operators take the index, and that of `BOUNDARIES`."""
+"""Values of `Terms.moment_inverse`; torch operators take the index, and that of `BOUNDARIES`."""
 
 
 class Limits(NamedTuple):
@@ -116,7 +117,7 @@ class Physics(NamedTuple):
 
     @classmethod
     def from_list(cls, numbers: list[float]) -> Physics:
-        """Return the constants in a list by `numbers`: all but limits, D and C."""
+        """Return the constants in a list by `numbers`; D and C are 0, and there are no limits."""
         count = len(NUMBER_FIELDS)
         inverse, boundary, state_gradient, density_gradient, moving, *sides = numbers[count:]
         return cls(
@@ -143,7 +144,7 @@ class Physics(NamedTuple):
         return self.eps / self.eps0
 
     def constants(self) -> Physics:
-        """Return a copy whose numbers torch.compile takes for constants."""
+        """Return the constants, while torch.compile traces in a form that it takes for constant."""
         if not torch.compiler.is_compiling():
             return self
         # Compilers lose fields that `_replace` or a default would fill in.
@@ -168,7 +169,7 @@ Arguments = ParamSpec("Arguments")
 
 
 def _cached(make: Callable[Arguments, Physics]) -> Callable[Arguments, Physics]:
-    """Cache a function's results by its arguments; not if one is mutable or torch compiles."""
+    """Return a function that caches results, unless an argument is mutable or torch compiles."""
     remembered = cast("Callable[Arguments, Physics]", functools.lru_cache(256, typed=True)(make))
 
     @functools.wraps(make)

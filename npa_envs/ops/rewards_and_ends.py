@@ -70,29 +70,22 @@ class EpisodeUpdate:
         self._rules = (rules.last_step or 0, rules.rewarded_step or 0, on_divergence)
         self._read = (enabled, diverged, first_loss, success_loss)
         self._written = (elapsed, numbers, flags.view(torch.uint8), endings)
+        self._world_count = len(elapsed)
 
-    def __call__(self, parts: Tensor, broken: Tensor | None = None) -> None:
-        """Compute this step's rewards and endings.
+    def __call__(self, loss_terms: Tensor, broken: Tensor | None = None) -> None:
+        """Write this step's rewards and endings.
 
-        The sum of the `parts`, float32, contiguous, [L, B], is each world's loss. `broken`, uint8,
-        [B]: another loss of a world is not finite; read with `on_divergence="ignore"` only.
+        A world's loss is the sum of its `loss_terms`, float32, contiguous, [L, B]. `broken`, uint8,
+        [B], is 1 for worlds with another loss that is not finite; only "ignore" reads it.
         """
-        elapsed, numbers, flags, endings = self._written
-        enabled, diverged, first_loss, success_loss = self._read
         launch(
             update_episodes,
-            len(elapsed),
-            parts.device,
-            len(parts),
+            self._world_count,
+            loss_terms.device,
+            len(loss_terms),
             *self._rules,
-            parts,
-            enabled,
-            diverged,
-            first_loss,
-            success_loss,
+            loss_terms,
+            *self._read,
             broken,
-            elapsed,
-            numbers,
-            flags,
-            endings,
+            *self._written,
         )

@@ -1,4 +1,4 @@
-"""Sorting worlds into cells: the first half of every SPH operator."""
+"""Sorting worlds into cells, the first half of every SPH operator, and the sizes of launches."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from npa_envs.ops.backend import (
     ListLayout,
     Operator,
     choose,
+    list_layout,
     multiprocessor_count,
-    rollout_lists,
 )
 from npa_envs.ops.launch import SCALARS, channel_width, is_aligned, is_recording, launch
 from npa_envs.ops.physics import Physics
@@ -29,39 +29,47 @@ MAX_INDEX = 2**31 - 1
 """Largest index of an array in a kernel: indices have 32 bits."""
 
 MAX_MASK = 2**28
-"""Largest worlds times entries of a mask that CUDA blocks sort: each block counts the active
-particles of all earlier worlds."""
+"""Maximum product of worlds and entries of a mask that CUDA blocks sort: each block counts the
+active particles of all earlier worlds."""
 
 MAX_THREAD_MASK = 2**22
 """The same for masks that CPU threads sort."""
 
 MIN_SLICE = 128
-"""Fewest particles of a slice."""
+"""Minimum number of particles of a slice."""
 
 
 class KernelPlan(NamedTuple):
-    """Sizes, constants and cell grid of an operator call; none depends on values of tensors."""
+    """Sizes of an operator's launches, with its cell grid and constants.
+
+    It follows from shapes, dtype, device and `Physics`, not from the values of tensors.
+    """
 
     scalar: Any
+    """Warp's scalar type of positions and states."""
     width: int
+    """State channels of a group, which one thread sums."""
     world_count: int
     particle_count: int
     space_dim: int
     state_dim: int
     row_capacity: int
+    """Number K of rows: the maximum number of active particles in all worlds together."""
     masked: bool
+    """Whether some particles may be inactive."""
     physics: Physics
-    """Constants of the worlds; its sizes may be 0, those of the plan count."""
+    """Constants of the worlds; its D and C may be 0: read those of the plan."""
     domain: Any
+    """Radius, box and cell grid: a struct that kernels read."""
     request: KernelRequest
-    """Properties by which the backend table chooses."""
+    """Properties by which the backend table chooses kernels."""
     list_layout: ListLayout
-    """Neighbour lists of rollouts on CUDA."""
+    """Layout of neighbour lists on CUDA."""
 
     def runs(
         self, operator: Operator, *, aligned: bool = True, position_gradient: bool = False
     ) -> str:
-        """Return the name of the implementation in the backend table that runs an operator."""
+        """Return the name of the implementation in `backend.TABLE` that runs an operator."""
         request = self.request
         if not aligned or position_gradient:
             request = request._replace(aligned=aligned, position_gradient=position_gradient)
@@ -153,11 +161,13 @@ def plan_kernels(
     row_capacity: int,
     masked: bool,
     physics: Physics,
+    *,
+    for_environments: bool = False,
 ) -> KernelPlan:
     """Return the `KernelPlan` of a call on positions of shape [B, N, D] and `state_dim` channels.
 
-    `like` has the worlds' dtype and device; `row_capacity` is the largest number of active
-    particles in all worlds together.
+    `like` is a tensor of the worlds' dtype and device. `row_capacity` is the maximum number K of
+    active particles in all worlds together. `masked`: some particles may be inactive.
     """
     # As integers: symbolic sizes of torch.compile become constants, and other sizes recompile.
     world_count, particle_count, space_dim = (int(size) for size in shape)
@@ -173,6 +183,7 @@ def plan_kernels(
         int(domain.cell_count),
         space_dim,
         smallest_side=min(cell_grid(space_dim, particle_count, eps, sides, cells_per_eps)),
+        for_environments=for_environments,
     )
     plan = KernelPlan(
         scalar=scalar,
@@ -186,7 +197,7 @@ def plan_kernels(
         physics=physics,
         domain=domain,
         request=request,
-        list_layout=rollout_lists(request, mean_neighbours(particle_count, eps, sides)),
+        list_layout=list_layout(request, mean_neighbours(particle_count, eps, sides)),
     )
     largest = max(2 * plan.cell_total, plan.total * (1 + plan.state_dim))
     if largest >= MAX_INDEX:
@@ -207,7 +218,7 @@ def mean_neighbours(particle_count: int, eps: float, box: Sequence[float] | None
 
 
 def sorts_at_once(world_count: int, particle_count: int) -> bool:
-    """Return whether worlds are so small that one launch on a CPU sorts them, masked or not."""
+    """Return whether worlds are so small that one launch sorts them on a CPU, even with a mask."""
     return world_count * world_count * particle_count <= MAX_THREAD_MASK
 
 
@@ -216,8 +227,8 @@ def sort_worlds(
 ) -> SortedWorlds:
     """Return worlds sorted into cells; active particles (`mask`, uint8, [B, N]) get rows.
 
-    Inputs are contiguous. Without `s` the sorted states are empty, without `with_rows` all tensors
-    of rows.
+    Arguments are contiguous. `s` None: sorted states are empty. `mask` None: all particles are
+    active. Without `with_rows` tensors of rows are empty.
     """
     # Mask entries that are read if each world counts the rows of earlier worlds.
     earlier = plan.world_count * plan.total if plan.masked else 0
@@ -235,19 +246,8 @@ def sort_worlds(
     cell, arrival = torch.empty(2, total, dtype=torch.int32, device=device).unbind()
     arrived = torch.empty(total, 2, dtype=torch.int32, device=device)
     counts = torch.zeros(plan.start_count, dtype=torch.int32, device=device)
-    launch(
-        kernels.count_cells,
-        total,
-        device,
-        plan.domain,
-        x,
-        mask,
-        plan.particle_count,
-        plan.active_offset,
-        cell,
-        arrival,
-        counts,
-    )
+    sizes, counted = (plan.particle_count, plan.active_offset), (cell, arrival, counts)
+    launch(kernels.count_cells, total, device, plan.domain, x, mask, *sizes, *counted)
     torch.cumsum(counts, 0, dtype=torch.int32, out=ordered.starts)
     launch(kernels.place_by_arrival, total, device, mask, cell, arrival, ordered.starts, arrived)
 
@@ -291,7 +291,7 @@ def _empty_worlds(plan: KernelPlan, x: Tensor, with_states: bool, with_rows: boo
 
 
 def block_capacity(request: KernelRequest, *tensors: Tensor | None) -> int:
-    """Return the capacity [particles] of the CUDA block that sorts a world; 0: no block does."""
+    """Return the capacity [particles] of the CUDA block that sorts such worlds; 0: none does."""
     aligned = all(tensor is None or is_aligned(tensor) for tensor in tensors)
     if choose("sort", request._replace(aligned=aligned)).name != "block":
         return 0
@@ -299,7 +299,7 @@ def block_capacity(request: KernelRequest, *tensors: Tensor | None) -> int:
 
 
 def slice_count(device: torch.device, world_count: int, particle_count: int) -> int:
-    """Return into how many slices to split each world, so that few worlds fill a GPU too."""
+    """Return the number of slices of a world, one CUDA block each: several if worlds are few."""
     idle = multiprocessor_count(device) // world_count
     return max(min(idle, particle_count // MIN_SLICE), 1)
 

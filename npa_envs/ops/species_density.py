@@ -19,7 +19,7 @@ from npa_envs.ops.physics import Physics
 from npa_envs.ops.sort import plan_kernels, sort_worlds
 
 MAX_SPECIES = 64
-"""Most species of a world: a thread has a sum for each."""
+"""Maximum number of species of a world: a thread has a sum for each."""
 
 
 class SpeciesFields(NamedTuple):
@@ -32,7 +32,7 @@ class SpeciesFields(NamedTuple):
 
 
 def checked_counts(counts: Sequence[int], particle_count: int) -> tuple[int, ...]:
-    """Return how many particles each species has, integers of at least 1 that sum to N."""
+    """Return the particles of each species as ints, after checking that they are N in sum."""
     numbers = as_list(counts)
     if numbers is None:
         raise NPAError(
@@ -58,7 +58,7 @@ def checked_counts(counts: Sequence[int], particle_count: int) -> tuple[int, ...
 def _gather_species(
     x: Tensor, counts: list[int], physics: Physics, scaled: bool
 ) -> tuple[Tensor, Tensor]:
-    """Return densities [B, N, S] and their gradients [B, N, S, D]; `scaled`: as in perception."""
+    """Return species' densities [B, N, S] and gradients [B, N, S, D]; `scaled`: for perception."""
     world_count, particle_count, space_dim = map(int, x.shape)
     plan = plan_kernels(x, x.shape, 1, world_count * particle_count, False, physics)
     ordered = sort_worlds(plan, x, None, None, with_rows=False)

@@ -25,7 +25,7 @@ from npa_envs.ops.physics import Physics
 from npa_envs.ops.sort import KernelPlan, SortedWorlds, plan_kernels, sort_worlds
 
 MAX_LISTS = 2**31
-"""Largest bytes of all lists on a CPU; with more neighbours, each step searches again."""
+"""Maximum number of bytes of all lists on a CPU; with more neighbours, each step searches again."""
 
 
 class StaticWorlds(NamedTuple):
@@ -109,9 +109,9 @@ def prepare_static(x: Tensor, physics: Physics) -> StaticWorlds:
 
 
 class StaticRows(NamedTuple):
-    """The particles of static worlds that are active in one step, as in `SortedWorlds`.
+    """The particles of static worlds that are active in one step: fields of `SortedWorlds`.
 
-    Indices are those of sorted particles, for the caller's order is that order.
+    Static worlds stay in sorted order, so indices of particles are sorted ones.
     """
 
     row_of: Tensor
@@ -135,17 +135,9 @@ def _static_rows(
         cell_starts.new_empty(step_count, 2 * cell_starts.shape[0] - 1),
         x.new_empty(step_count, row_capacity, space_dim),
     )
-    launch(
-        give_rows(space_dim, SCALARS[x.dtype]),
-        (step_count, max(total, rows[2].shape[1])),
-        x.device,
-        total,
-        cell_starts.shape[0] - 1,
-        active_before,
-        cell_starts,
-        x,
-        *rows,
-    )
+    kernel, size = give_rows(space_dim, SCALARS[x.dtype]), max(total, rows[2].shape[1])
+    read = total, cell_starts.shape[0] - 1, active_before, cell_starts, x
+    launch(kernel, (step_count, size), x.device, *read, *rows)
     return [*rows, active_before.view(step_count, total)[:, -1].diff(prepend=rows[0].new_zeros(1))]
 
 

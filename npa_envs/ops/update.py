@@ -154,7 +154,8 @@ def update_particles(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return positions, states and path lengths after a rule's updates of the active particles.
 
-    `update` has a row [δ (D) ; Δs (C)] for each, shape [K, A]; further columns are not read.
+    `update` has a row [displacement δ (D) ; change of states Δs (C)] for each, shape [K, A];
+    further columns are not read.
     """
     x, s = x.contiguous(), s.contiguous()
     tensors = (update, x, s, path_length)
@@ -165,13 +166,13 @@ def update_particles(
 
 
 def _images(x: Tensor, sides: tuple[float, ...]) -> Tensor:
-    """Return in which periodic image of the box each coordinate lies; 0 is the box itself."""
+    """Return the number of the box's periodic image that each coordinate is in; 0: the box."""
     images = [torch.floor(x.detach()[..., d] / side + 0.5) for d, side in enumerate(sides)]
     return torch.stack(images, dim=-1)
 
 
 def _mirror_signs(x: Tensor, sides: tuple[float, ...]) -> Tensor:
-    """Return -1 for coordinates in odd images of the box, which walls mirror, and 1 for others."""
+    """Return -1 for coordinates in odd images of the box, which walls mirror; 1 for others."""
     return 1.0 - 2.0 * (_images(x, sides) % 2.0)
 
 
@@ -293,7 +294,7 @@ def apply_actions(
     s ← s + m dt state_scale clip(a_s, -1, 1), each computed in float64 and rounded once. NaN
     becomes 0, and a value beyond its limit is clipped; both mark the world as diverged.
 
-    Actions are [a_x (D) ; a_s (C)], shape [B, N, A], or a_s alone where particles do not move.
+    Actions are [a_x (D) ; a_s (C)], shape [B, N, A], or only a_s where particles do not move.
     Particles in `mask` (uint8, [B, N]) act, by default all. `noise`, shape [B, N, D], is added to
     every position. Nothing changes if `enabled` (uint8, [1]) is 0. `diverged` (uint8, [B]) is set
     to 1 for worlds that diverged and not changed for others.
@@ -304,7 +305,7 @@ def apply_actions(
 
 
 class PreparedActions:
-    """`apply_actions` to worlds in fixed tensors, with launches prepared once.
+    """Applies actions as `apply_actions`, to worlds in fixed tensors, by recorded launches.
 
     The values of mask and noise may change before each call. `enabled` is set to 0 if an action is
     not finite, and never set to 1.

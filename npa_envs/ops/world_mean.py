@@ -15,7 +15,7 @@ from npa_envs.ops.launch import SCALARS, launch
 
 
 def average_sums(partial_sums: Tensor, value_count: int, like: Tensor) -> Tensor:
-    """Return means [B, F] of `value_count` values from partial sums [B, any, F]."""
+    """Return means [B, F]: float64 sums [B, any, F] in total, by `value_count`, typed as `like`."""
     world_count, _, width = partial_sums.shape
     lanes = _lanes(like.device)
     kernels = mean_kernels(SCALARS[like.dtype], lanes)
@@ -68,8 +68,8 @@ class _WorldMean(torch.autograd.Function):
 def world_mean(values: Tensor) -> Tensor:
     """Return the mean over each world; differentiable, bit for bit independent of other worlds.
 
-    It is accumulated in float64 in an order that depends on M alone. The order of torch's own means
-    may change with the number of worlds, and with it their last bit.
+    It is summed in float64 in an order that depends only on M. The order of torch's own means may
+    change with the number of worlds, and with it their last bit.
 
     Args:
         values: Values to average over M, shape [B, M, F], float32 or float64.

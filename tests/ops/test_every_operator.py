@@ -17,9 +17,8 @@ from torch.testing._internal.two_tensor import TwoTensor
 
 import npa_envs
 from npa_envs import reference
-from npa_envs.ops import launch as threads
-from npa_envs.ops import orbit, render_gaussians, splat
-from npa_envs.ops.launch import even_ranges, run_together
+from npa_envs.ops import launch, orbit, render_gaussians, splat
+from npa_envs.ops.cpu_threads import RANGES_PER_THREAD, even_ranges, run_together
 from npa_envs.ops.perceive import NeighbourState
 from npa_envs.ops.physics import Limits, Physics
 from npa_envs.ops.pictures.splat import picture_losses
@@ -231,8 +230,8 @@ def test_results_are_the_same_bits_for_every_number_of_threads(name, world_count
         cuts.append(len(calls))
         run_together(calls)
 
-    monkeypatch.setattr(threads, "even_ranges", lambda count, _: even_ranges(count, 1))
-    monkeypatch.setattr(threads, "run_together", counted)
+    monkeypatch.setattr(launch, "even_ranges", lambda count, _: even_ranges(count, 1))
+    monkeypatch.setattr(launch, "run_together", counted)
     worlds = random_world(world_count, 31, 3, 5, dtype=torch.float32, device="cpu")
     worlds = [value.requires_grad_() for value in worlds]
     own_rule(worlds[0].device)  # Made here, as making it draws random numbers.
@@ -255,7 +254,7 @@ def test_results_are_the_same_bits_for_every_number_of_threads(name, world_count
             cuts.clear()
             torch.set_num_threads(thread_count)
             assert_same(results(), expected)
-            assert world_count == 1 or max(cuts) == thread_count * threads.RANGES_PER_THREAD
+            assert world_count == 1 or max(cuts) == thread_count * RANGES_PER_THREAD
     finally:
         torch.set_num_threads(default)
 

@@ -10,8 +10,8 @@ import time
 import pytest
 import torch
 
-from npa_envs.ops import launch as threads
-from npa_envs.ops.launch import run_together
+from npa_envs.ops import cpu_threads
+from npa_envs.ops.cpu_threads import run_together
 from npa_envs.thread_lock import kernel_lock
 
 needs_fork = pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
@@ -27,8 +27,8 @@ def set_threads():
 
 def test_threads_of_torch_and_of_a_pool_are_both_used(set_threads, monkeypatch):
     set_threads(2)
-    for team in (threads._team, lambda: None):
-        monkeypatch.setattr(threads, "_team", team)
+    for team in (cpu_threads._team, lambda: None):
+        monkeypatch.setattr(cpu_threads, "_team", team)
         meeting = threading.Barrier(2, timeout=60.0)
         run_together([meeting.wait, meeting.wait])
 
@@ -52,14 +52,14 @@ def test_an_error_in_another_thread_is_raised_after_every_call(set_threads):
 
 def threads_of_a_worker():
     """Return the number of threads of a new process, then whether it can be set."""
-    default = threads.thread_count()
+    default = cpu_threads.thread_count()
     torch.set_num_threads(torch.get_num_threads() + 1)
-    return default, threads.thread_count() == torch.get_num_threads()
+    return default, cpu_threads.thread_count() == torch.get_num_threads()
 
 
 def test_worker_processes_use_one_thread_unless_told_otherwise(set_threads, monkeypatch):
     set_threads(3)
-    assert threads.thread_count() == 3
+    assert cpu_threads.thread_count() == 3
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     with multiprocessing.get_context("spawn").Pool(1) as pool:
         assert pool.apply(threads_of_a_worker) == (1, True)

@@ -31,7 +31,6 @@ INSIDES = ("npa_envs.kernels", "npa_envs.ops", "npa_envs.reference")
 """Not for users of worlds and operators, who take `npa_envs.world` and the public names."""
 ORACLES = ("npa_envs.kernels", "npa_envs.reference")
 LAYERS = {
-    "npa_envs._checkout_imports": Layer(0),
     "npa_envs.errors": Layer(0),
     "npa_envs.registration": Layer(0, "gymnasium"),
     "npa_envs.checks": Layer(1, "torch"),

@@ -12,11 +12,11 @@ from pathlib import Path
 import pytest
 
 import npa_envs
-from npa_envs._checkout_imports import MAPPED_PACKAGES, extend_path
+from npa_envs import _MAPPED_PACKAGES, _extend_path
 from npa_envs.cli.doctor import EXTRAS
 
 ROOT = Path(__file__).resolve().parents[2]
-SHIPPED = ("pyproject.toml", "MANIFEST.in", "README.md", "LICENSE", "npa_envs", *MAPPED_PACKAGES)
+SHIPPED = ("pyproject.toml", "MANIFEST.in", "README.md", "LICENSE", "npa_envs", *_MAPPED_PACKAGES)
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 IGNORE = shutil.ignore_patterns("__pycache__", "*.egg-info")
 PRINT_FILES = """
@@ -61,7 +61,7 @@ def test_wheel_holds_every_source_file_the_rules_and_the_license(site: Path) -> 
     for folder in ("rule/shipped", "rule/initial", *targets, "web/page"):
         sources += (ROOT / "npa_envs" / folder).glob("*.*")
     kinds = ("*.py", "*.schema.json")
-    mapped = [p for name in MAPPED_PACKAGES for k in kinds for p in (ROOT / name).rglob(k)]
+    mapped = [p for name in _MAPPED_PACKAGES for k in kinds for p in (ROOT / name).rglob(k)]
     expected = {"py.typed", *(p.relative_to(ROOT / "npa_envs").as_posix() for p in sources)}
     expected |= {p.relative_to(ROOT).as_posix() for p in mapped}
     package = site / "npa_envs"
@@ -104,15 +104,15 @@ def test_all_packages_are_found_in_one_place(site: Path, tmp_path: Path, install
 def test_folders_called_envs_in_site_packages_are_not_taken_for_ours(tmp_path: Path) -> None:
     package = tmp_path / "npa_envs"
     package.mkdir()
-    for name in MAPPED_PACKAGES:
+    for name in _MAPPED_PACKAGES:
         (tmp_path / name).mkdir()
         (tmp_path / name / "__init__.py").touch()
     path = [str(package)]
-    extend_path(path, str(package / "__init__.py"))
+    _extend_path(path, str(package / "__init__.py"))
     assert path == [str(package)]
     (tmp_path / "pyproject.toml").touch()
-    extend_path(path, str(package / "__init__.py"))
-    extend_path(path, str(package / "__init__.py"))
+    _extend_path(path, str(package / "__init__.py"))
+    _extend_path(path, str(package / "__init__.py"))
     assert path == [str(package), str(tmp_path)]
 
 

@@ -77,7 +77,7 @@ class Cameras:
         return self.world_to_camera.shape[0] if self.world_to_camera.ndim == 4 else None
 
     def to(self, like: Tensor | torch.device | torch.dtype | str) -> Cameras:
-        """Return the cameras on another device or in another dtype."""
+        """Return the cameras on another device or in another dtype, for a tensor in both of its."""
         motions, intrinsics = self.world_to_camera.to(like), self.intrinsics.to(like)
         return dataclasses.replace(self, world_to_camera=motions, intrinsics=intrinsics)
 
@@ -199,7 +199,7 @@ def orbit(
     """Return cameras evenly spaced on a circle around the vertical axis: a turntable.
 
     Angles are those of `npa_envs.render.draw_worlds`: y is up; azimuth 0 has x to the right and z
-    towards the viewer; seen from above, azimuth goes round against the clock.
+    towards the viewer; seen from above, azimuth increases counterclockwise.
 
     Args:
         count: Cameras V, 1 or more.

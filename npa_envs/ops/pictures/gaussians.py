@@ -74,7 +74,7 @@ def _check_tensor(name: str, tensor: Tensor, means: Tensor, shape: str) -> None:
 def check_cameras(
     cameras: Cameras, means: Tensor, background: Tensor | None, channels: int
 ) -> None:
-    """Check that cameras and a background fit the worlds."""
+    """Check that cameras and a background fit worlds of particles at `means` with F `channels`."""
     if not isinstance(cameras, Cameras):
         raise NPAError(
             f"cameras must be Cameras, got {type(cameras).__name__}: "
@@ -131,10 +131,10 @@ class Pairs(NamedTuple):
 def sort_pairs(
     frame: Any, footprints: Tensor, depths: Tensor, counts: Tensor, pairs_per_particle: int
 ) -> Pairs:
-    """Return the pairs of all pictures, sorted by tile and depth.
+    """Return the pairs of all pictures, sorted by tile and depth; equal depths stay in order.
 
-    `counts` are the numbers of tiles that Gaussians cover; both they and `depths` have shape
-    [B V, N]. Gaussians of equal depth stay in the order of their indices.
+    `footprints`, [B V N, 12], describe Gaussians on the pictures. `depths` and `counts`, the number
+    of tiles that each covers, have shape [B V, N]. `pairs_per_particle` 0: as many as there are.
     """
     device, images = depths.device, depths.shape[0]
     tile_end = images * frame.tile_count
@@ -241,7 +241,7 @@ def _gaussians(
     dilation: float,
     pairs_per_particle: int,
 ) -> list[Tensor]:
-    """Return pictures, whether each had too few pairs, and tensors for the backward pass."""
+    """Return pictures, whether each lacked room for pairs, and tensors for the backward pass."""
     scene = GaussianScene(*tensors)
     means, frame = scene.means, scene.frame(int(width), int(height), near, dilation)
     worlds, views = means.shape[0], frame.view_count
@@ -369,7 +369,7 @@ def render_gaussians(
             wait for the device, and as many as needed on the CPU. A pair takes about 60 bytes.
 
     Returns:
-        Image, alpha, and for each picture whether it had too few pairs.
+        Image, alpha, and for each picture whether it lacked room for pairs.
 
     Raises:
         NPAError: A shape, dtype or device does not fit, or a number is out of its range; signs of

@@ -38,7 +38,7 @@ from npa_envs.ops.sort import MAX_INDEX, block_capacity, slice_count
 from npa_envs.ops.world_mean import average_sums, world_mean
 
 MAX_SPOT = 1e6
-"""Largest standard deviation of a Gaussian [pixels], and of its inverse."""
+"""Largest standard deviation of a Gaussian [pixels], and largest inverse of one."""
 
 
 class Splats(NamedTuple):
@@ -86,7 +86,10 @@ def _check_size(largest: int, world_count: int, view: Any) -> None:
 
 
 def sort_splats(splats: Splats, view: Any) -> tuple[Tensor, Tensor, Tensor]:
-    """Return each cell's first splat, and, sorted by cell, footprints [B N, 8], particles [B N]."""
+    """Return each cell's first splat, and by cell footprints [B N, 8] and particles [B N].
+
+    A footprint is a splat in pixels; `view` is the window and its pixels, by `make_view`.
+    """
     x, total = splats.x, splats.total
     world_count, particle_count, _ = x.shape
     cell_total = world_count * view.cell_count
@@ -98,21 +101,11 @@ def sort_splats(splats: Splats, view: Any) -> tuple[Tensor, Tensor, Tensor]:
     if capacity:
         starts = original_index.new_empty(cell_total + 1)
         slices = slice_count(x.device, world_count, particle_count)
-        block = BLOCKS[capacity]
-        launch(
-            sort_small_splats(capacity),
-            world_count * slices * block,
-            x.device,
-            view,
-            slices,
-            *splats.arguments(),
-            splats.goal,
-            starts,
-            footprints,
-            original_index,
-            block_dim=block,
-        )
-        return starts, footprints, original_index
+        kernel, block = sort_small_splats(capacity), BLOCKS[capacity]
+        threads, written = world_count * slices * block, (starts, footprints, original_index)
+        contents = (slices, *splats.arguments(), splats.goal)
+        launch(kernel, threads, x.device, view, *contents, *written, block_dim=block)
+        return written
     kernels, contents, moves = device_kernels(x), splats.arguments(), splats.means_and_goal()
     cell, arrival, arrived = torch.empty(3, total, dtype=torch.int32, device=x.device).unbind()
     counts = torch.zeros(cell_total + 1, dtype=torch.int32, device=x.device)
@@ -126,7 +119,7 @@ def sort_splats(splats: Splats, view: Any) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def scatter_splats(splats: Splats, view: Any) -> tuple[Tensor, Tensor, Tensor]:
-    """Return pictures [B, R, R, 4], footprints (splats in pixels) [B N, 8], particles [B N]."""
+    """Return pictures [B, R, R, 4], and footprints and particles as `sort_splats`, on a CPU."""
     x, total = splats.x, splats.total
     picture = x.new_zeros(x.shape[0], view.resolution, view.resolution, CHANNELS)
     footprints = x.new_empty(total, FOOTPRINT)
@@ -252,7 +245,7 @@ def splat(
 
 
 def check_particles(x: Tensor, colour: Tensor, width: int | None) -> None:
-    """Check x [B, N, 2] and colours [B, N, width], or states if the width is None."""
+    """Check x [B, N, 2] and colours [B, N, width]; `width` None: states of 3 channels or more."""
     check_world(x, colour)
     check_derivatives(x=x, colour=colour)
     fits = colour.shape[2] >= 3 if width is None else colour.shape[2] == width
@@ -268,7 +261,7 @@ def check_particles(x: Tensor, colour: Tensor, width: int | None) -> None:
 def checked_window(
     resolution: int, pixel_size: float, sigma: float, low: float, high: float
 ) -> tuple[int, float, float, float, float]:
-    """Return the arguments of `splat` with these names as Python numbers, after checking them."""
+    """Return these arguments of `splat`, where `low` is `lo`, as checked Python numbers."""
     if checked_count("resolution", resolution) < 2:
         raise NPAError(f"resolution must be at least 2 pixels, got {resolution}")
     side = checked_side("resolution", resolution)
@@ -304,8 +297,8 @@ def periodic_splat(
     """Draw 2D worlds in a periodic box as pictures that tile without a seam; differentiable.
 
     As `splat`, but the R pixels of a row divide the box evenly: pixel q is centred at
-    lo + (q + 1/2) (hi - lo) / R, and the first pixel follows the last. Of positions outside the box
-    the images inside it are drawn. Pictures are bit for bit the same in every batch.
+    lo + (q + 1/2) (hi - lo) / R, and the first pixel follows the last. Particles outside the box
+    are drawn at their images inside it. Pictures are bit for bit the same in every batch.
 
     Worlds are drawn by the kernels of `splat` on a canvas with margins. Pixels of a margin are then
     added to those on the opposite side. Arguments, results and errors are those of `splat`; `lo`
@@ -338,7 +331,7 @@ def periodic_splat(
 
 
 def _sum_periods(canvas: Tensor, dim: int, margin: int, period: int) -> Tensor:
-    """Return sums of pixels that are a period apart along `dim`, the first after the margin."""
+    """Return sums of pixels a `period` apart along `dim`, in order from the end of the margin."""
     length = canvas.shape[dim]
     shape = list(canvas.shape)
     shape[dim] = period
@@ -405,7 +398,7 @@ def picture_losses(
     lo: float = -1.0,
     hi: float = 1.0,
 ) -> tuple[Tensor, Tensor]:
-    """Compare worlds with a target picture; without gradient.
+    """Return errors of worlds' pictures, which are compared with a target; without gradient.
 
     Each world's mean position is moved to `goal` and drawn as by `splat`; colours are the last
     three states plus `shift`. With d the difference from the target and e = |d| + d^2, a pixel's

@@ -19,9 +19,9 @@ def nearest_triangles(
     width: int,
     height: int,
 ) -> Tensor:
-    """Return pictures [V, H, W, 4]: colour of the nearest triangle at a pixel, and 1; else 0.
+    """Return pictures [V, H, W, 4] of triangles, on the CPU in float64.
 
-    Everything is on the CPU, in float64. A triangle covers a pixel if it covers the centre. Q
+    A pixel has the colour of the nearest triangle over its centre, and 1; without one it is 0. Q
     corners have `positions` in the pictures of V cameras [pixels], [V, Q, 2], `nearness` 1 / depth
     [1 / length units], [V, Q], and `colours`, [Q, 3]. `faces`, [F, 3], are the corners of
     triangles, and `visible`, [V, F], says which cameras see them.
