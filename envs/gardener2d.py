@@ -1,4 +1,4 @@
-"""`npa/Gardener2D-v0`, an environment with brushes: an agent keeps a grown picture intact."""
+"""`npa/Gardener2D-v0`: the agent keeps one grown picture intact, with brushes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from npa_envs.world.randomness import StreamId, WorldRandom
 
 @dataclass(frozen=True, kw_only=True)
 class Gardener2DEnvConfig(GardenConfig):
-    """`GardenConfig` with gusts, which move particles, and blights, which wipe states."""
+    """`GardenConfig` with disturbances: gusts move particles, blights wipe states."""
 
     position_noise: float = 0.002
     """Standard deviation of the noise added to every position in a step of the rule
@@ -53,12 +53,12 @@ class Gardener2DEnvConfig(GardenConfig):
 
 
 class GardenerTask(GardenTask[Gardener2DEnvConfig]):
-    """Task: keep a grown picture intact, while gusts push particles and blights wipe states."""
+    """The task of keeping a grown picture intact while gusts push and blights wipe particles."""
 
     config_type = Gardener2DEnvConfig
 
     def disturb(self, particles: Particles, random: WorldRandom) -> Particles:
-        """Return worlds after a gust and a blight, drawn from a separate random stream."""
+        """Return worlds after a random gust and a random blight, of the given chances."""
         x, s, *_ = particles
         config, draws = self.config, random.substream(StreamId.DAMAGE)
         chance, angle = draws.uniform(2), 2.0 * math.pi * draws.uniform(1)
@@ -75,7 +75,7 @@ class GardenerTask(GardenTask[Gardener2DEnvConfig]):
         return particles._replace(x=x, s=s)
 
     def reward(self, particles: Particles, loss: Tensor, context: StartLosses) -> Tensor:
-        """Return rewards, [B]: 1 for a picture as at its start, 0 for one as bad as grey."""
+        """Return rewards, [B]: 1 for the loss at the start, 0 for that of a grey picture."""
         return (1.0 - self.lost_fraction(loss, context)).clamp_min(-1.0)
 
 
@@ -105,7 +105,7 @@ class Gardener2DEnv(GardenEnv):
 
     ## Starting state
 
-    The rule has grown an intact picture in `grow_steps` steps from a disk of blank particles. With
+    The rule has grown an intact picture in `grow_steps` steps from a disk of grey particles. With
     the default `seed_pool=16` there are sixteen grown worlds, made at the first reset, which takes
     some seconds on a CPU. Disturbances differ between episodes.
     """

@@ -21,10 +21,10 @@ AGENTS = ("keeper_0", "raider_0")
 
 
 class _BothSpaces(BrushSpaces):
-    """Spaces of one gardener, and conversion of both gardeners' actions."""
+    """Spaces of one gardener; `action` takes a dict with both gardeners' actions."""
 
     def action(self, action: Any, world_count: int | None) -> Tensor:
-        """Return the rows of both gardeners' brushes, shape [B, 2 J, W]."""
+        """Return checked rows of both gardeners' brushes, float32, shape [B, 2 J, W]."""
         both = [super(_BothSpaces, self).action(action[agent], world_count) for agent in AGENTS]
         return torch.cat(both, dim=1)
 
@@ -48,7 +48,7 @@ class GardenersEnv(KnownAgents):
     their effects add up.
 
     `parallel_env`, `env` and `raw_env` are as for [several species](MultiSpecies.md); in turn, the
-    world moves on after the raider. Once `npa_envs.envs.gardeners_v0` is imported,
+    world is stepped after the raider acts. Once `npa_envs.envs.gardeners_v0` is imported,
     `pettingzoo.make`, of PettingZoo 1.27 or newer, takes the id `npa/Gardeners-v0`.
 
     `garden` is the world as a Gymnasium environment. Policies of `npa_envs.agents.garden_policies`
@@ -104,7 +104,7 @@ class GardenersEnv(KnownAgents):
         return _for_both(observation), {agent: dict(info) for agent in AGENTS}
 
     def step(self, actions: Mapping[str, Any]) -> Outcome:
-        """Apply both agents' actions, and make the rule's steps."""
+        """Apply both agents' actions and step the rule; return an `Outcome`."""
         if not self.agents and not actions:
             return {}, {}, {}, {}, {}
         if not self.agents or set(actions) != set(self.agents):
@@ -124,7 +124,7 @@ class GardenersEnv(KnownAgents):
         )
 
     def render(self) -> Any:
-        """Return the world's picture, shape [R, R, 3], with the render mode "rgb_array"."""
+        """Return the world's picture, uint8, [R, R, 3]; None unless `render_mode="rgb_array"`."""
         return self.garden.render()
 
     def close(self) -> None:
@@ -139,7 +139,7 @@ def _for_both(observation: Any) -> dict[str, Any]:
 
 
 def parallel_env(max_cycles: int = 32, **config: Any) -> GardenersEnv:
-    """Return the environment in which both agents act at once; arguments: of `GardenersEnv`."""
+    """Return an environment whose two agents act at once; arguments: those of `GardenersEnv`."""
     return GardenersEnv(max_cycles, **config)
 
 

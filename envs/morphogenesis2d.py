@@ -1,4 +1,4 @@
-"""`npa/Morphogenesis2D-v0`: a disk of blank particles grows into a picture."""
+"""`npa/Morphogenesis2D-v0`: a disk of grey particles grows into a picture."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from npa_envs.tasks.targets.images import MAX_POINT_COUNT
 
 @dataclass(frozen=True, kw_only=True)
 class PictureConfig(EnvConfig):
-    """`EnvConfig` with seed and loss of `Morphogenesis2DConfig`, which documents the fields."""
+    """`EnvConfig` with fields of start and loss, which `Morphogenesis2DConfig` documents."""
 
     task_config_type = Morphogenesis2DConfig
 
@@ -51,7 +51,7 @@ Config = TypeVar("Config", bound=PictureConfig)
 
 
 class PictureEnvTask(TargetEnvTask[Config]):
-    """A picture to grow, compared by the splat loss of `npa_envs.tasks.morphogenesis2d`."""
+    """The task of growing a picture, by the splat loss of `npa_envs.tasks.morphogenesis2d`."""
 
     config_type: ClassVar[type[PictureConfig]] = Morphogenesis2DEnvConfig
     task: Morphogenesis2D
@@ -65,7 +65,7 @@ class PictureEnvTask(TargetEnvTask[Config]):
 
 
 class Morphogenesis2DEnv(NPAEnv):
-    """Grow a picture from a disk of blank particles.
+    """Grow a picture from a disk of grey particles.
 
     ## Description
 

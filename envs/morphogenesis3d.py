@@ -1,4 +1,4 @@
-"""`npa/Morphogenesis3D-v0`: a ball of blank particles grows into a 3D object."""
+"""`npa/Morphogenesis3D-v0`: a ball of grey particles grows into a 3D object."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import EnvTask, TargetEnvTask
 from npa_envs.envs.core.vector import vector_class
-from npa_envs.envs.grown_worlds import load_readout_rule
+from npa_envs.envs.trained_rules import load_readout_rule
 from npa_envs.render import turntable_frames
 from npa_envs.tasks.morphogenesis3d import Morphogenesis3D, Morphogenesis3DConfig
 from npa_envs.world.particles import Particles
 
 PIXEL_BYTES = 200
-"""Memory for comparing one pixel of a view, about [bytes]."""
+"""About how much memory comparing one pixel of a view takes [bytes]."""
 
 PARTICLE_BYTES = 700
-"""Memory for drawing one particle in one view, about [bytes]."""
+"""About how much memory drawing one particle in one view takes [bytes]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,7 +47,7 @@ class Morphogenesis3DEnvConfig(EnvConfig):
     last three channels are the colour, and particles are round."""
 
     view_count: int = 6
-    """Largest number of views from all sides that the loss compares."""
+    """Maximum number of views from all sides that the loss compares."""
 
     opacity: float = 0.5
     """Opacity of a particle, in (0, 1); with a read-out, its opacity where the read-out is 0."""
@@ -63,15 +63,12 @@ class Morphogenesis3DEnvConfig(EnvConfig):
     def task_config(self) -> Morphogenesis3DConfig:
         """Configuration of the training task, whose held-out views the loss compares."""
         return self.as_config(
-            Morphogenesis3DConfig,
-            training_views=1,
-            held_out_views=self.view_count,
-            ssim_weight=0.0,
+            Morphogenesis3DConfig, training_views=1, held_out_views=self.view_count, ssim_weight=0.0
         )
 
 
 class SolidTask(TargetEnvTask[Morphogenesis3DEnvConfig]):
-    """A 3D object to grow; the loss, of `npa_envs.tasks.morphogenesis3d`, compares views."""
+    """The task of growing a 3D object, by the loss of `npa_envs.tasks.morphogenesis3d`."""
 
     config_type = Morphogenesis3DEnvConfig
     training_task = Morphogenesis3D
@@ -100,7 +97,7 @@ class SolidTask(TargetEnvTask[Morphogenesis3DEnvConfig]):
     def draw_particles(
         self, particles: Particles, style: str, azimuth: float = 0.0
     ) -> NDArray[np.uint8]:
-        """Return pictures as the base class; with a read-out, of the particles' Gaussians."""
+        """Return pictures, uint8, [B, R, R, 3]; with a read-out, of the particles' Gaussians."""
         if not self.config.readout or style != "particles":
             return super().draw_particles(particles, style, azimuth)
         frames = turntable_frames(
@@ -114,7 +111,7 @@ class SolidTask(TargetEnvTask[Morphogenesis3DEnvConfig]):
 
 
 class Morphogenesis3DEnv(NPAEnv):
-    """Grow a 3D object from a ball of blank particles.
+    """Grow a 3D object from a ball of grey particles.
 
     ## Description
 

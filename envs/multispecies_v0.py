@@ -13,7 +13,7 @@ from npa_envs.envs.multi.vector import MultiSpeciesVectorEnv
 from npa_envs.registration import SPECIES
 
 ENVIRONMENTS = SPECIES
-"""Tasks by the ids that `pettingzoo.make` takes."""
+"""Names of tasks by the ids that `pettingzoo.make` takes."""
 
 
 class MultiSpeciesEnv(CrowdEnv):
@@ -199,7 +199,7 @@ raw_env, env = in_turns(parallel_env)
 
 
 def settings(task: str, species_count: int | None, config: dict[str, Any]) -> dict[str, Any]:
-    """Return all keywords for a task's name or an id; those in `config` replace the id's own."""
+    """Return keywords of `MultiSpeciesEnv`: those of a task or an id, replaced by `config`."""
     name, keywords = task_settings(task)
     if species_count is not None:
         keywords["species_count"] = species_count

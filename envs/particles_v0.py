@@ -14,13 +14,13 @@ from npa_envs.errors import NPAError
 from npa_envs.registration import SPECIES
 
 ENVIRONMENTS = {name.replace("-v0", "Particles-v0"): task for name, task in SPECIES.items()}
-"""Tasks by the ids that `pettingzoo.make` takes."""
+"""Names of tasks by the ids that `pettingzoo.make` takes."""
 
 PARTICLE_COUNT = 64
 """Default number of particles."""
 
 MAX_CROWD = 512
-"""Largest number of agents: each has an entry in five dicts per step."""
+"""Maximum number of agents; each has an entry in five dicts per step."""
 
 
 class ParticlesEnv(CrowdEnv):
@@ -105,7 +105,7 @@ class ParticlesEnv(CrowdEnv):
 def parallel_env(task: str = "mixing", species_count: int = 2, **config: Any) -> ParticlesEnv:
     """Return an environment in which all particles act at once.
 
-    Arguments are those of `multispecies_v0.parallel_env`, but that `task` cannot be an id.
+    Arguments are those of `multispecies_v0.parallel_env`, except that `task` cannot be an id.
     """
     if not as_python(config.get("particle_counts")):
         config.setdefault("particle_count", PARTICLE_COUNT)

@@ -80,7 +80,7 @@ class Pictures2DEnvConfig(PictureConfig):
 
 
 class PicturesTask(PictureEnvTask[Pictures2DEnvConfig]):
-    """Several pictures to grow, one target in each world."""
+    """The task of growing pictures; each world has one of several targets."""
 
     config_type = Pictures2DEnvConfig
     task: ManyPictures
@@ -109,12 +109,12 @@ class PicturesTask(PictureEnvTask[Pictures2DEnvConfig]):
         return self.task.target.pixel_size
 
     def extra_info(self, s: Tensor) -> dict[str, Tensor]:
-        """Return the index of each world's picture, int64, shape [B]."""
+        """Return as `target` the index of each world's target, int64, shape [B]."""
         return {"target": self.task.goal.clone()}
 
 
 class Pictures2DEnv(NPAEnv):
-    """Grow the episode's target picture from a disk of blank particles.
+    """Grow the episode's target picture from a disk of grey particles.
 
     ## Description
 

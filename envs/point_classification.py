@@ -17,7 +17,7 @@ from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import TargetEnvTask
 from npa_envs.envs.core.vector import vector_class
-from npa_envs.envs.grown_worlds import load_readout_rule
+from npa_envs.envs.trained_rules import load_readout_rule
 from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
 from npa_envs.tasks.point_classification import (
     PICTURE_MARGIN,
@@ -36,7 +36,7 @@ class PointClassificationEnvConfig(EnvConfig):
     """`EnvConfig` with fields of `PointClassificationConfig`, which documents them."""
 
     task_config_type = PointClassificationConfig
-
+    fixed = EnvConfig.fixed | {"boundary": "for point clouds"}
     choices = EnvConfig.choices | {"score": get_args(Score), "split": get_args(Split)}
 
     particle_count: int = PointClassificationConfig.particle_count
@@ -65,8 +65,6 @@ class PointClassificationEnvConfig(EnvConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        is_open, rule = self.boundary == "open", "be 'open' for point clouds"
-        check_field(self, "boundary", is_open, rule, "leave it out")
         check_field(self, "rule", isinstance(self.rule, str), "be the path of a rule as a string")
         check_positive(self, float, "sharpness")
         check_positive(self, int, "state_dim", at_least=3 if self.rule else self.class_count)
@@ -80,7 +78,7 @@ class _WorldByWorld(NPARule):
 
 
 class PointClassificationTask(TargetEnvTask[PointClassificationEnvConfig]):
-    """Particles in the shape of a digit, with the error of their outputs as the loss."""
+    """The task of naming the digit that particles form; the loss is their outputs' error."""
 
     config_type = PointClassificationEnvConfig
     task: PointClassification
@@ -99,7 +97,7 @@ class PointClassificationTask(TargetEnvTask[PointClassificationEnvConfig]):
         return task.for_rule(rule.requires_grad_(False))
 
     def losses(self, x: Tensor, s: Tensor) -> Mapping[str, Tensor]:
-        """Return each world's mean score and weighted overflow of states, by name, [B] each."""
+        """Return each world's mean score and mean weighted overflow, by name, [B] each."""
         overflow = self.config.overflow_weight * world_mean(self.task.overflows(s)[..., None])[:, 0]
         score = world_mean(self._scores(s)[..., None])[:, 0]
         return {self.config.score: score, "overflow": overflow}
@@ -118,25 +116,25 @@ class PointClassificationTask(TargetEnvTask[PointClassificationEnvConfig]):
         return {"label": self.task.goal.clone(), "accuracy": 1.0 - wrong}
 
     def _scores(self, s: Tensor) -> Tensor:
-        """Return the loss of each particle's outputs that `score` names, shape [B, N]."""
+        """Return each particle's loss of the kind that `config.score` names, shape [B, N]."""
         if self.config.score == "cross_entropy":
             return self.task.cross_entropies(s, self.config.sharpness)
         return self.task.mistakes(s) if self.config.score == "accuracy" else self.task.errors(s)
 
     def draw(self, particles: Particles, steps: NDArray[np.int64]) -> NDArray[np.uint8]:
-        """Return pictures of the unit square with a margin, in the colours of predicted classes."""
+        """Return pictures of the unit square with a margin, coloured by predicted class."""
         x, s, *_ = particles
         s = torch.cat((s[..., :-3], class_colours(self.task.outputs(s)) - COLOUR_OFFSET), dim=-1)
         return super().draw(particles._replace(x=MAGNIFICATION * (x - 0.5), s=s), steps)
 
     @property
     def pixel_size(self) -> float:
-        """Size of a particle in pictures, which show the unit square magnified."""
+        """Size of a particle in pictures, in which the unit square is magnified [length units]."""
         return MAGNIFICATION * super().pixel_size
 
 
 MAGNIFICATION = 2.0 / (1.0 + 2.0 * PICTURE_MARGIN)
-"""Scale of pictures, which span two length units."""
+"""Factor of lengths in pictures, which span two length units."""
 
 
 class PointClassificationEnv(NPAEnv):
@@ -172,7 +170,7 @@ class PointClassificationEnv(NPAEnv):
     ## Reward
 
     The loss L is the mean squared difference of all particles' outputs and the right ones, plus
-    `overflow_weight` times the mean of |s − clip(s, −1, 1)|. Blank states have
+    `overflow_weight` times the mean of |s − clip(s, −1, 1)|. Zero states have
     L = 1 / `class_count`. With `score="cross_entropy"` or `"accuracy"` the first term is the mean
     cross-entropy of softmax(`sharpness` × outputs), or the fraction of particles whose largest
     output is of another class; ties go to the first class. A particle's reward is the decrease of

@@ -12,8 +12,8 @@ from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.step_report import total
 from npa_envs.envs.core.task import Start
 from npa_envs.envs.core.vector import vector_class
-from npa_envs.envs.grown_worlds import GrownConfig, GrownTask
 from npa_envs.envs.morphogenesis2d import PictureEnvTask
+from npa_envs.envs.trained_rules import GrownConfig, GrownTask
 from npa_envs.errors import shown
 from npa_envs.rule.rule import COLOUR_OFFSET
 from npa_envs.tasks.damage import DAMAGE_SIZES, damage_worlds
@@ -21,29 +21,29 @@ from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import StreamId, WorldRandom
 
 RANDOM_DAMAGE = "random"
-"""Value of `damage` with which each episode draws its kind."""
+"""Value of `damage` for a random kind in each episode."""
 
 RANDOM_KINDS = ("wipe", "cut", "clump")
-"""Kinds that "random" draws from."""
+"""Kinds of damage that "random" chooses among."""
 
-SIZES = DAMAGE_SIZES | {"wipe": 0.3}
-"""Default sizes of damage [length units]. A wipe is larger than the usual one, whose radius is that
-which rules of the training preset "best" learn to heal."""
+DEFAULT_SIZES = DAMAGE_SIZES | {"wipe": 0.3}
+"""Default sizes of damage [length units]. A wipe is larger than `DAMAGE_SIZES` has it, which rules
+of the training preset "best" learn to heal."""
 
-MIN_RISE = 0.02
-"""Damage that raises the loss by a smaller fraction than this has no success threshold."""
+MIN_DAMAGE_RISE = 0.02
+"""Minimum rise of the loss by damage, as a fraction, with which an episode can succeed."""
 
-PICTURE = "picture"
-"""Value of `rule` with which worlds start as the target's own points."""
+PICTURE_POINTS = "picture"
+"""Value of `rule` for worlds that start as the target's own points."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Regeneration2DEnvConfig(GrownConfig):
-    """`GrownConfig` with the damage."""
+    """`GrownConfig` with the damage, and when it counts as healed."""
 
-    choices = GrownConfig.choices | {"damage": (*SIZES, RANDOM_DAMAGE)}
+    choices = GrownConfig.choices | {"damage": (*DEFAULT_SIZES, RANDOM_DAMAGE)}
 
-    without_rule = f", or rule={shown(PICTURE)} to start from the target's own points"
+    without_rule = f", or rule={shown(PICTURE_POINTS)} to start from the target's own points"
 
     damage: str = RANDOM_DAMAGE
     """Kind of damage: "wipe", "cut", "clump", "noise", or "random" for one of the first three."""
@@ -55,7 +55,7 @@ class Regeneration2DEnvConfig(GrownConfig):
     rule: str | None = None
     """What grows the worlds: a rule of the package or a rule's file; None: `heart-first` for the
     target "heart", `gecko-v0` for "gecko", and the shipped rule of its name for another one.
-    "picture" starts from the target's own points instead, with blank hidden states."""
+    "picture" starts from the target's own points instead, with hidden states of zero."""
 
     seed_pool: int = 256
 
@@ -75,30 +75,30 @@ class Regeneration2DEnvConfig(GrownConfig):
 
 
 class RegenerationTask(GrownTask[Regeneration2DEnvConfig]):
-    """A grown picture that has been damaged and has to heal."""
+    """The task of healing a grown picture that was damaged."""
 
     config_type = Regeneration2DEnvConfig
 
     def __init__(self, config: Regeneration2DEnvConfig, device: torch.device) -> None:
         super().__init__(config, device)
-        self.grows = config.rule != PICTURE
+        self.grows = config.rule != PICTURE_POINTS
         if self.grows:
             _ = self.rule
 
     def fresh(self, random: WorldRandom) -> Start:
-        """Return grown worlds without damage; if `rule` is "picture", the target's points."""
+        """Return grown worlds without damage, or the target's points if `rule` is "picture"."""
         if self.grows:
             return super().fresh(random)
-        blank = PictureEnvTask.fresh(self, random)
+        start = PictureEnvTask.fresh(self, random)
         points, colours = self.task.target.points, self.task.target.colours
         # The numbers of points and particles differ a little: some points repeat or are skipped.
-        chosen = torch.linspace(0, len(points) - 1, blank.x.shape[1], device=self.device)
+        chosen = torch.linspace(0, len(points) - 1, start.x.shape[1], device=self.device)
         chosen = chosen.round().long()
-        blank.s[..., -3:] = colours[chosen] - COLOUR_OFFSET
-        return blank._replace(x=points[chosen].expand_as(blank.x).clone())
+        start.s[..., -3:] = colours[chosen] - COLOUR_OFFSET
+        return start._replace(x=points[chosen].expand_as(start.x).clone())
 
     def start(self, random: WorldRandom) -> Start:
-        """Return damaged worlds, with the loss at which each counts as healed."""
+        """Return damaged worlds with the losses at which they count as healed."""
         start = super().start(random)
         if self.config.split_damage and self.config.split == "test":
             random = random.substream(StreamId.TEST)
@@ -106,7 +106,7 @@ class RegenerationTask(GrownTask[Regeneration2DEnvConfig]):
         chosen, box = random.integers(len(kinds), 1, 1), self.periodic_sides
         damaged, intact = start, Particles(start.x, start.s)
         for k, kind in enumerate(kinds):
-            size = SIZES[kind] if self.config.damage_size is None else self.config.damage_size
+            size = self.config.damage_size or DEFAULT_SIZES[kind]
             hurt = damage_worlds(intact, kind=kind, size=size, box=box, generator=random)
             damaged = damaged._replace(
                 x=torch.where(chosen == k, hurt.x, damaged.x),
@@ -117,7 +117,7 @@ class RegenerationTask(GrownTask[Regeneration2DEnvConfig]):
         before, after = (self._loss(worlds) for worlds in (start, damaged))
         healed = before + (1.0 - self.config.healed_share) * (after - before)
         never = torch.full_like(before, -torch.inf)
-        is_damaged = after - before >= MIN_RISE * before
+        is_damaged = after - before >= MIN_DAMAGE_RISE * before
         return damaged._replace(success_loss=torch.where(is_damaged, healed, never))
 
     def _loss(self, worlds: Start) -> Tensor:
@@ -138,12 +138,12 @@ class Regeneration2DEnv(NPAEnv):
     so their hidden states mean something to it:
     `npa_envs.agents.RulePolicy(npa_envs.load_rule("gecko-v0"), env)` shows what it can do.
     Another policy cannot read these hidden states. With `rule="picture"` episodes start from the
-    target's own points instead, with blank hidden states.
+    target's own points instead, with hidden states of zero.
     Spaces, reward and `info` are those of `Morphogenesis2DEnv`.
 
     ## Starting state
 
-    The rule grows a world for `grow_steps` steps from a disk of blank particles. Then one kind of
+    The rule grows a world for `grow_steps` steps from a disk of grey particles. Then one kind of
     damage is applied. The worlds are made once: with the default `seed_pool=256` there are 256. On
     a CPU each is grown when an episode first starts from it, which takes 0.4 s of CPU time with
     1024 particles; on CUDA the first reset grows all of them. Each episode draws its damage.

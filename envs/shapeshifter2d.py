@@ -1,6 +1,6 @@
-"""`npa/Shapeshifter2D-v0`: a rule moves the particles, and the agent chooses its code.
+"""`npa/Shapeshifter2D-v0`: the agent chooses the code of a rule of many pictures.
 
-The rule has a code for each of many pictures; the goal picture changes from time to time.
+The code decides which picture the rule grows; the goal picture changes from time to time.
 """
 
 from __future__ import annotations
@@ -16,14 +16,20 @@ from torch import Tensor
 
 from npa_envs.checks import check_positive
 from npa_envs.envs.core.base import ParticleSpaces, batch_tensor
-from npa_envs.envs.core.config import EnvConfig
+from npa_envs.envs.core.config import EnvConfig, check_picture_size
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import Start
 from npa_envs.envs.core.vector import vector_class
-from npa_envs.envs.garden.base import RuleDrivenTask, coarse
+from npa_envs.envs.garden.base import coarse
 from npa_envs.envs.garden.brushes import OBSERVATION_LIMIT, GardenReward
-from npa_envs.envs.grown_worlds import check_matches_rule, check_rule_driven, grow, run_rule
 from npa_envs.envs.morphogenesis2d import PictureConfig
+from npa_envs.envs.trained_rules import (
+    OF_PARTICLES,
+    RuleDrivenTask,
+    check_matches_rule,
+    grow,
+    run_rule,
+)
 from npa_envs.errors import NPAError
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.picture_codes import Codes
@@ -36,15 +42,16 @@ from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import WorldRandom
 
 GOAL_COUNT = 8
-"""Goals of an episode; after the last one follows the first."""
+"""Number of goals of an episode; the first one follows the last."""
 
 CodeActions = Literal["code", "choice"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Shapeshifter2DEnvConfig(PictureConfig):
-    """`PictureConfig` with the rule of many pictures, and how its goals change."""
+    """`PictureConfig` with the rule of many pictures, and how goals change."""
 
+    fixed = PictureConfig.fixed | OF_PARTICLES
     choices = EnvConfig.choices | {
         "reward": get_args(GardenReward),
         "actions": get_args(CodeActions),
@@ -83,11 +90,11 @@ class Shapeshifter2DEnvConfig(PictureConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_positive(self, int, "rule_steps", "hold_steps", "grow_steps", "picture_size")
-        check_rule_driven(self)
+        check_picture_size(self)
 
 
 def load_coded_rule(config: Shapeshifter2DEnvConfig, device: torch.device) -> tuple[NPARule, Codes]:
-    """Return the rule of many pictures that a configuration names, and its codes."""
+    """Return the rule of many pictures that `config.rule` names, and its codes."""
     rule = load_rule(config.rule, device=device).float().requires_grad_(False)
     if rule.codes is None or len(rule.codes) < 2:
         raise NPAError(
@@ -99,7 +106,7 @@ def load_coded_rule(config: Shapeshifter2DEnvConfig, device: torch.device) -> tu
 
 
 class CodeSpaces(ParticleSpaces):
-    """Spaces: coarse pictures of world and goal as observations; codes or indices as actions."""
+    """Spaces with coarse pictures of world and goal as observations, and codes as actions."""
 
     def __init__(self, physics: Physics, config: Shapeshifter2DEnvConfig) -> None:
         _, codes = load_coded_rule(config, torch.device("cpu"))
@@ -115,7 +122,7 @@ class CodeSpaces(ParticleSpaces):
         )
 
     def action(self, action: Any, world_count: int | None) -> Tensor:
-        """Return the codes for checked actions, float32, shape [B, 1, code_dim]."""
+        """Return checked actions as codes, float32, shape [B, 1, code_dim]."""
         count, dim = self._table.shape
         if not self._chosen:
             code = batch_tensor(action, world_count, (dim,), "code_dim")
@@ -126,22 +133,21 @@ class CodeSpaces(ParticleSpaces):
         return self._table.to(chosen.device)[chosen[:, None]]
 
     def actions_of_codes(self) -> Tensor:
-        """Return actions="code" that give each of the rule's codes, [codes, code_dim]."""
+        """Return the action that stands for each of the rule's codes, [T, code_dim]."""
         return self._table / self._limit
 
 
 class PictureGoals(NamedTuple):
-    """The `context` of B episodes: their goals, as indices of the rule's pictures, int64."""
+    """The `context` of B episodes: goals, as indices of the rule's pictures, int64."""
 
     goal: Tensor
     """The current goal, shape [B]."""
-
     in_turn: Tensor
-    """All goals of the episode in their order, shape [B, G]."""
+    """All goals of each episode in their order, shape [B, `GOAL_COUNT`]."""
 
 
 class ShapeshifterTask(RuleDrivenTask[Shapeshifter2DEnvConfig]):
-    """Task: turn a grown picture into one goal picture after another, by the code of its rule."""
+    """The task of choosing codes that make a grown picture become one goal after another."""
 
     config_type = Shapeshifter2DEnvConfig
     spaces_type = CodeSpaces
@@ -164,8 +170,8 @@ class ShapeshifterTask(RuleDrivenTask[Shapeshifter2DEnvConfig]):
         return ManyPictures(task_config, device=self.device)
 
     @cached_property
-    def blank_losses(self) -> Tensor:
-        """Loss of an empty world for each goal, shape [T]."""
+    def empty_losses(self) -> Tensor:
+        """Loss of a world without particles for each goal, shape [T]."""
         goals = torch.arange(len(self.codes), device=self.device)
         x = torch.full((len(goals), 1, 2), 1e3, device=self.device)
         s = x.new_zeros(len(goals), 1, self.config.state_dim)
@@ -176,7 +182,7 @@ class ShapeshifterTask(RuleDrivenTask[Shapeshifter2DEnvConfig]):
         return error.flatten(1).mean(dim=1)
 
     def fresh(self, random: WorldRandom) -> Start:
-        """Return grown worlds of random pictures, with another picture as their goal."""
+        """Return grown worlds of random pictures, with other pictures as their goals."""
         x, s, *_, picture = self.task.seed(random.world_count, generator=random, device=self.device)
         assert picture is not None, "worlds of many pictures have goals"
         seeds = Particles(x, self.rule.with_code(s, self.codes.table[picture][:, None]))
@@ -184,12 +190,12 @@ class ShapeshifterTask(RuleDrivenTask[Shapeshifter2DEnvConfig]):
         return Start(x, s, goal=self._another(picture, random))
 
     def _another(self, goal: Tensor, random: WorldRandom) -> Tensor:
-        """Return random goals that differ from the given ones, int64, shape [B]."""
+        """Return random goals, each other than `goal`, int64, shape [B]."""
         count = len(self.codes)
         return (goal + 1 + random.integers(count - 1, 1)[:, 0]) % count
 
     def episode_context(self, start: Start, loss: Tensor, random: WorldRandom) -> PictureGoals:
-        """Return each episode's first goal, [B], and all its random goals in turn, [B, G]."""
+        """Return the first goal of each episode, and all its random goals in order."""
         assert start.goal is not None, "made with goals"
         goals = [start.goal]
         while len(goals) < GOAL_COUNT:
@@ -201,28 +207,28 @@ class ShapeshifterTask(RuleDrivenTask[Shapeshifter2DEnvConfig]):
     def step(
         self, x: Tensor, s: Tensor, action: Tensor, random: WorldRandom
     ) -> tuple[Tensor, Tensor]:
-        """Write codes, [B, 1, code_dim], into all states and run the rule; return x and s."""
+        """Return positions and states after steps of the rule with the codes of `action`."""
         coded = Particles(x, self.rule.with_code(s, action))
         x, s, *_ = run_rule(self.rule, self.config, coded, self.config.rule_steps, random)
         return x, s
 
     def reward(self, particles: Particles, loss: Tensor, context: PictureGoals) -> Tensor:
-        """Return rewards, [B]: 1 for a loss of 0, 0 for the loss of an empty picture."""
-        blank = self.blank_losses.index_select(0, context.goal)
-        return (1.0 - loss / blank).clamp_min(-1.0)
+        """Return rewards, [B]: 1 for a loss of 0, 0 for the loss without particles."""
+        empty = self.empty_losses.index_select(0, context.goal)
+        return (1.0 - loss / empty).clamp_min(-1.0)
 
     def next_goals(self, elapsed: Tensor, context: PictureGoals, goal: Tensor) -> None:
-        """Write each world's goal, which changes every `hold_steps` steps, into `goal`."""
+        """Write each world's goal into `goal`, [B]; it changes every `hold_steps` steps."""
         turn = (elapsed.long() // self.config.hold_steps) % GOAL_COUNT
         context.goal.copy_(context.in_turn.gather(1, turn[:, None])[:, 0])
         goal.copy_(context.goal)
 
     def context_info(self, particles: Particles, context: PictureGoals) -> dict[str, Tensor]:
-        """Return the index of each world's goal, shape [B]."""
+        """Return as `goal` the index of each world's goal, int64, shape [B]."""
         return {"goal": context.goal.clone()}
 
     def observe(self, particles: Particles, loss: Tensor, context: PictureGoals) -> Tensor:
-        """Return coarse pictures of worlds and of their goals, shape [B, 8 G²]."""
+        """Return coarse pictures of worlds and then of their goals, shape [B, 8 G²]."""
         goal_task = self.task.with_goal(context.goal)
         picture = goal_task.picture(particles.x, particles.s)
         both = torch.cat((picture, goal_task.target_picture), dim=-1)
@@ -273,7 +279,7 @@ class Shapeshifter2DEnv(NPAEnv):
     ## Starting state
 
     The rule has grown one of its pictures, drawn at random, for `grow_steps` steps from a disk of
-    blank particles. The first goal is another one. With the default `seed_pool=16` there are
+    grey particles. The first goal is another one. With the default `seed_pool=16` there are
     sixteen such worlds, made at the first reset.
 
     ## Info
@@ -285,7 +291,7 @@ class Shapeshifter2DEnv(NPAEnv):
     | `loss_density`, `loss_colour` | reset, step | the terms of the loss |
     | `reward_density`, `reward_colour` | step | decrease of each term, whatever the goals were |
     | `success`, `diverged` | step | whether the world succeeded or diverged in it, bool |
-    | `reason` | last step | why the episode ended, see above; None for worlds that go on |
+    | `reason` | last step | why the episode ended, see above; None for other worlds |
     """
 
     task_type = ShapeshifterTask

@@ -1,7 +1,4 @@
-"""`npa/Shepherd2D-v0`, an environment with brushes: an agent moves a grown picture to a goal.
-
-A trained rule moves the particles; the picture may also have to be turned or reshaped.
-"""
+"""`npa/Shepherd2D-v0`: the agent moves, turns or reshapes one grown picture, with brushes."""
 
 from __future__ import annotations
 
@@ -31,7 +28,7 @@ Aim = Literal["move", "turn", "reshape"]
 
 @dataclass(frozen=True, kw_only=True)
 class Shepherd2DEnvConfig(GardenConfig):
-    """`GardenConfig` with the goals."""
+    """`GardenConfig` with the goals of a grown picture, the creature."""
 
     choices = GardenConfig.choices | {"aim": get_args(Aim)}
 
@@ -39,9 +36,7 @@ class Shepherd2DEnvConfig(GardenConfig):
     """"dense": minus the distance to the goal; "sparse": 0 at the goal and -1 elsewhere."""
 
     place_count: int = 2
-
     place_reach: float = 0.4
-
     push_length: float = 0.1
 
     aim: Aim = "move"
@@ -49,14 +44,14 @@ class Shepherd2DEnvConfig(GardenConfig):
     axis by an angle, or "reshape" its width and height."""
 
     goal_reach: float = 0.6
-    """Largest distance of goals from the creature's start: length units to "move", the tangent of
+    """Maximum distance of goals from the creature's start: length units to "move", the tangent of
     an angle to "turn", a fraction of width and height to "reshape"."""
 
     tolerance: float = 0.1
     """Distance at which a goal is reached; to "turn", between (cos 2φ, sin 2φ) of both angles φ."""
 
     lost_limit: float = 0.5
-    """Largest lost fraction of a creature that counts as intact (dimensionless)."""
+    """Maximum lost fraction of a creature that counts as intact (dimensionless)."""
 
     reward_weight: float = 1.0
     """Weight in the dense reward of the fraction lost beyond `lost_limit` (dimensionless)."""
@@ -70,7 +65,7 @@ class Shepherd2DEnvConfig(GardenConfig):
 
 
 class GoalBrushes(BrushSpaces):
-    """`BrushSpaces` with Gymnasium's goal dictionaries as observations."""
+    """`BrushSpaces` whose observations are Gymnasium's dictionaries with goals."""
 
     def __init__(self, physics: Physics, config: Shepherd2DEnvConfig) -> None:
         super().__init__(physics, config)
@@ -83,7 +78,7 @@ class GoalBrushes(BrushSpaces):
         )
 
     def observation_output(self, observation: Tensor) -> Any:
-        """Split flat observations, [..., O + 6], into a goal dictionary in the user's type."""
+        """Return observations, [..., O + 6], as a dictionary with both goals, [..., 3] each."""
         parts = torch.split(observation, [self._count, 3, 3], dim=-1)
         names = ("observation", "achieved_goal", "desired_goal")
         return {
@@ -92,7 +87,7 @@ class GoalBrushes(BrushSpaces):
         }
 
     def final_observation_output(self, observation: Tensor, ended: NDArray[np.bool_]) -> Any:
-        """Return `final_obs`: for NumPy an array with a dictionary or None for each world."""
+        """Return `infos["final_obs"]`; for NumPy an array of dictionaries and None, [B]."""
         batched = self.observation_output(observation)
         if self._output == "torch":
             return batched
@@ -103,20 +98,18 @@ class GoalBrushes(BrushSpaces):
 
 
 class ShepherdEpisode(NamedTuple):
-    """The `context` of B episodes: `StartLosses` and moments of the creature, and its goal."""
+    """The `context` of B episodes: `StartLosses`, the creature's goal, its moments at the start."""
 
     intact_loss: Tensor
     rise: Tensor
-
     goal: Tensor
     """First two values of the desired goal, shape [B, 2]."""
-
     moments: Tensor
-    """The creature's `moments_of`, shape [B, 5]."""
+    """The creature's `moments_of` at the start, shape [B, 5]."""
 
 
 class ShepherdTask(GardenTask[Shepherd2DEnvConfig]):
-    """A grown picture, the creature, with a position, an angle or a shape as its goal."""
+    """The task of bringing a grown picture, the creature, to a position, an angle or a shape."""
 
     config_type = Shepherd2DEnvConfig
     spaces_type = GoalBrushes
@@ -124,7 +117,7 @@ class ShepherdTask(GardenTask[Shepherd2DEnvConfig]):
     rewards_last_step_only = False
 
     def episode_context(self, start: Start, loss: Tensor, random: WorldRandom) -> ShepherdEpisode:
-        """Return losses and moments of the creatures at the start, and a random goal of each."""
+        """Return losses and moments of the creatures at `start`, and a random goal of each."""
         moments, reach = moments_of(start.x), self.config.goal_reach
         drawn = uniform_ball(len(loss), 1, 2, reach, generator=random, device=self.device)[:, 0]
         if self.config.aim == "move":
@@ -158,7 +151,7 @@ class ShepherdTask(GardenTask[Shepherd2DEnvConfig]):
         return torch.cat((context.goal, limit), dim=1)
 
     def goal_reward(self, achieved: Tensor, desired: Tensor) -> Tensor:
-        """Return the rewards, shape [...], for achieved and desired goals, [..., 3]."""
+        """Return the rewards, [...], for goals that were achieved and desired, [..., 3] each."""
         distance = (achieved[..., :2] - desired[..., :2]).square().sum(dim=-1).sqrt()
         excess = achieved[..., 2] - desired[..., 2]
         if self.config.reward == "sparse":
@@ -168,12 +161,12 @@ class ShepherdTask(GardenTask[Shepherd2DEnvConfig]):
         return nearness - self.config.reward_weight * excess.clamp(min=0.0)
 
     def reward(self, particles: Particles, loss: Tensor, context: ShepherdEpisode) -> Tensor:
-        """Return rewards [B] of a step, from the particles after it and the goals in `context`."""
+        """Return the rewards of a step, [B], for the goals that `particles` achieve after it."""
         achieved = self.achieved(particles, context)
         return self.goal_reward(achieved, self.desired(context)).to(torch.float32)
 
     def context_info(self, particles: Particles, context: ShepherdEpisode) -> dict[str, Tensor]:
-        """Return whether worlds are intact at their goals, distances, and lost fractions, [B]."""
+        """Return `is_success`, `distance` to the goal and `lost` fraction, [B] each."""
         achieved, desired = self.achieved(particles, context), self.desired(context)
         distance = (achieved - desired)[:, :2].square().sum(dim=1).sqrt()
         success = (distance <= self.config.tolerance) & (achieved[:, 2] <= desired[:, 2])
@@ -194,7 +187,7 @@ def double_angle(tangent: Tensor) -> Tensor:
 
 
 def axis_turn(first: Tensor, now: Tensor) -> Tensor:
-    """Return (cos 2φ, sin 2φ), [B, 2]; the longer axis turned by φ between two `moments_of`."""
+    """Return (cos 2φ, sin 2φ), [B, 2], of how far φ the longer axis turned; of `moments_of`."""
 
     def axis(moments: Tensor) -> tuple[Tensor, Tensor]:
         across, slant = moments[:, 2] - moments[:, 4], 2.0 * moments[:, 3]
@@ -206,7 +199,7 @@ def axis_turn(first: Tensor, now: Tensor) -> Tensor:
 
 
 def turned_back(x: Tensor, middle: Tensor, turn: Tensor) -> Tensor:
-    """Return positions rotated about `middle` by −φ, [B, N, 2]; `turn`: (cos 2φ, sin 2φ)."""
+    """Return positions rotated about `middle`, [B, 2], by −φ; `turn`: (cos 2φ, sin 2φ), [B, 2]."""
     cosine = (0.5 * (1.0 + turn[:, 0])).clamp_min(0.0).sqrt()[:, None]
     sine = (0.5 * (1.0 - turn[:, 0])).clamp_min(0.0).sqrt()[:, None]
     sine = torch.where(turn[:, 1:] < 0.0, -sine, sine)
@@ -223,7 +216,7 @@ class _GoalReward:
     def compute_reward(
         self, achieved_goal: Any, desired_goal: Any, info: Mapping[str, Any] | Any
     ) -> NDArray[np.float64] | Any:
-        """Return the rewards for any achieved and desired goals, shape [3] or [..., 3]."""
+        """Return the rewards, float32, [...], for any achieved and desired goals, [..., 3]."""
         # By torch, as in steps: NumPy's square roots round differently on some processors.
         achieved = torch.tensor(np.asarray(achieved_goal))
         desired = torch.tensor(np.asarray(desired_goal))
@@ -280,7 +273,7 @@ class Shepherd2DEnv(_GoalReward, GardenEnv):
 
     ## Starting state
 
-    The rule has grown an intact creature in `grow_steps` steps from a disk of blank particles. With
+    The rule has grown an intact creature in `grow_steps` steps from a disk of grey particles. With
     the default `seed_pool=16` there are sixteen grown worlds. Each episode draws its goal uniformly
     in a disk of radius `goal_reach` around the creature's own position or shape; tangents of angles
     are at most `goal_reach`.

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from npa_envs.checks import check_field
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import TargetEnvTask
@@ -21,6 +20,7 @@ class TextureEnvConfig(EnvConfig):
     """`EnvConfig` with target and loss of `TextureConfig`, which documents the fields."""
 
     task_config_type = TextureConfig
+    fixed = EnvConfig.fixed | {"boundary": "for textures"}
 
     boundary: Boundary = "periodic"
     """A texture has no edge: only "periodic", a box into which positions are wrapped."""
@@ -36,21 +36,16 @@ class TextureEnvConfig(EnvConfig):
     colour_weight: float = TextureConfig.colour_weight
     density_weight: float = TextureConfig.density_weight
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        is_periodic, rule = self.boundary == "periodic", "be 'periodic' for textures"
-        check_field(self, "boundary", is_periodic, rule, "leave it out")
-
 
 class TextureTask(TargetEnvTask[TextureEnvConfig]):
-    """A texture, compared by a loss of `npa_envs.tasks.losses.texture`."""
+    """The task of forming a texture, by a loss of `npa_envs.tasks.losses.texture`."""
 
     config_type = TextureEnvConfig
     training_task = Texture
     pixel_bytes = 4000
 
     def losses(self, x: Tensor, s: Tensor) -> Mapping[str, Tensor]:
-        """Return the weighted losses of colour image and density image, by name, [B] each."""
+        """Return the weighted losses of the colour and density images, by name, [B] each."""
         colour, density = self.task.texture_losses(x, s)
         colour_weight, density_weight = self.task.weights
         return {"colour": colour_weight * colour, "density": density_weight * density}
@@ -65,7 +60,7 @@ class TextureEnv(NPAEnv):
     other. Each has a position and a state of C numbers. The last three numbers, plus 0.5, are
     its colour. An episode begins with grey particles scattered over the box. At its end they should
     look like the target. It does not matter where the parts of the pattern lie. For dots, bubbles
-    and meshes particles gather and leave places empty; cells and stripes are made of colours alone.
+    and meshes particles gather and leave places empty; cells and stripes are made only of colours.
 
     Particles perceive and policies act as in `npa/Morphogenesis2D-v0`. Rules trained by gradient
     with `npa-envs train texture` are policies, as there.

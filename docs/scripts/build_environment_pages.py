@@ -37,7 +37,8 @@ from npa_envs.envs.core.base import ParticleSpaces
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.vector import NPAVectorEnv
-from npa_envs.envs.garden.base import GardenEnv, RuleDrivenWorlds
+from npa_envs.envs.garden.base import GardenEnv
+from npa_envs.envs.trained_rules import RuleDrivenWorlds
 from npa_envs.registration import CODED, ENVIRONMENTS, GARDENS, SIZES, SMALL, Registration
 
 DOCS = Path(__file__).resolve().parents[1]

@@ -20,7 +20,7 @@ from npa_envs.checks import number_tensor
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.step_report import StepNumbers, named_terms
 from npa_envs.envs.core.task import EnvTask
-from npa_envs.envs.core.worlds import BatchedWorlds
+from npa_envs.envs.core.worlds import ParticleWorlds
 from npa_envs.errors import NPAError
 from npa_envs.render import Window, show
 from npa_envs.render.display import side_by_side
@@ -28,11 +28,11 @@ from npa_envs.world.cuda_graph import to_device_async
 from npa_envs.world.environment_steps import Physics
 
 SHOWN_ACROSS = 4
-"""Worlds in a row of the window, at most; it shows at most as many rows."""
+"""Maximum number of worlds side by side in a window, and of rows of worlds."""
 
 
 class ParticleSpaces:
-    """Spaces and conversions of observations and actions that have a row for each particle."""
+    """Spaces with a row for each particle; converts users' actions, and observations for them."""
 
     def __init__(self, physics: Physics, config: EnvConfig) -> None:
         count, limit = config.particle_count, physics.limits.perception
@@ -45,15 +45,15 @@ class ParticleSpaces:
         self._output = config.output
 
     def action(self, action: Any, world_count: int | None) -> Tensor:
-        """Return checked actions, float32, [B, N, A]; `world_count` None: of one world, [N, A]."""
+        """Return checked actions, float32, [B, N, A]; `world_count` None: [N, A] of one world."""
         return batch_tensor(action, world_count, self._shape, "N, A")
 
     def observation_output(self, observation: Tensor) -> Any:
-        """Return an observation, [B, N, P] or [N, P], as array or tensor, as `output` says."""
+        """Return observations, [B, N, P] or [N, P], as `config.output`: NumPy array or tensor."""
         return to_output(observation, self._output)
 
     def final_observation_output(self, observation: Tensor, ended: NDArray[np.bool_]) -> Any:
-        """Return `final_obs`, [B, ...], as array or tensor; `ended`: which episodes ended, [B]."""
+        """Return `infos["final_obs"]`, [B, ...]; `ended`: in which worlds an episode ended, [B]."""
         return self.observation_output(observation)
 
 
@@ -70,10 +70,10 @@ def batch_tensor(
     *,
     discrete: bool = False,
 ) -> Tensor:
-    """Return checked actions, float32, [B, *shape]; `world_count` None: of one world, [*shape].
+    """Return checked actions of `world_count` worlds, float32, [B, *shape].
 
-    `letters` names the dimensions of `shape` in the error message, such as "N, A". `discrete`
-    actions are whole numbers, int64.
+    `world_count` None: `action` is that of one world, [*shape], and B is 1. `letters` names the
+    dimensions of `shape` in the error message, such as "N, A". `discrete` actions are int64.
     """
     expected = shape
     if world_count is not None:
@@ -93,7 +93,7 @@ def batch_tensor(
 def action_tensor(
     name: str, action: Any, expected: tuple[int, ...], space: str, letters: str = ""
 ) -> Tensor:
-    """Return an action of shape `expected`, checked, as float32; a tensor keeps its device.
+    """Return an action as float32 after a check of its shape; a tensor keeps its device.
 
     The error message calls the action `name`, and refers to the space called `space`.
     """
@@ -127,7 +127,7 @@ class ShownEnv:
     """The environment's configuration."""
     worlds: Any
     """The batch of worlds."""
-    metadata: Any
+    metadata: Any = {"render_modes": ["rgb_array", "human"], "render_fps": 25}  # noqa: RUF012
     _is_batch: ClassVar[bool] = False
     _started = False
     _window: Window | None = None
@@ -194,10 +194,10 @@ class WorldsEnv(ShownEnv):
     spec: Any
 
     def _make_worlds(self, keywords: dict[str, Any], world_count: int, steps: int | None) -> None:
-        """Set `config`, `worlds`, `task` and `spaces`; `steps`: the longest episode, if limited."""
+        """Set `config`, `worlds`, `task` and `spaces`; `steps`: maximum of an episode, or None."""
         self.config = self.task_type.config_type.from_keywords(keywords)
         self.render_mode = self.config.render_mode
-        worlds_type = self.task_type.worlds_type or BatchedWorlds
+        worlds_type = self.task_type.worlds_type or ParticleWorlds
         self.worlds = worlds_type(self.task_type, self.config, world_count, steps)
         self.task = self.worlds.task
         spaces_type = self.task_type.spaces_type or ParticleSpaces
@@ -210,7 +210,7 @@ class WorldsEnv(ShownEnv):
         values: Any,
         buffer: Tensor | None = None,
     ) -> Tensor:
-        """Call `change(world_indices, values)`; return all observations, in `buffer` if given."""
+        """Call `change(world_indices, values)`; return all observations after it, in `buffer`."""
         with self.worlds.device_context():
             change(world_indices, values)
             observation: Tensor = self.worlds.perceive(buffer)
@@ -219,7 +219,7 @@ class WorldsEnv(ShownEnv):
         return observation
 
     def losses_of(self, numbers: Any) -> dict[str, Any]:
-        """Return the loss and its terms by their names in infos, from `StepReport.numbers`."""
+        """Return the loss and its terms as in infos; `numbers`: rows of `StepReport.numbers`."""
         named, names = StepNumbers.from_rows(numbers), self.worlds.episodes.term_names
         return {"loss": named.loss} | named_terms("loss", names, named.terms)
 

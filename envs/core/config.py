@@ -29,11 +29,11 @@ Reward = Literal["dense", "sparse", "particle", "marginal"]
 Output = Literal["numpy", "torch"]
 OnDivergence = Literal["terminate", "reset", "raise", "ignore"]
 
-LARGEST = 1e9
-"""Largest value of a field, so that products of fields are finite in float32."""
+MAX_VALUE = 1e9
+"""Maximum of a field; so products of fields are finite in float32."""
 
 MAX_RATIO = 1e7
-"""Largest ratio of eps to eps0, and its inverse; its fourth power is finite in float32."""
+"""Maximum of eps / eps0 and of eps0 / eps; its fourth power is finite in float32."""
 
 TaskConfig = TypeVar("TaskConfig")
 
@@ -56,7 +56,7 @@ class Interface(NamedTuple):
 
     @property
     def shared_dim(self) -> int:
-        """Length of a perception without each species' own density and density gradient."""
+        """Length of a perception without the densities and density gradients of single species."""
         return self.state_dim * (2 + self.space_dim) + self.space_dim
 
     @property
@@ -98,7 +98,7 @@ class Interface(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class WorldConfig:
-    """Fields of all environments; lengths are in length units: pictures show [-1, 1] x [-1, 1]."""
+    """Configuration fields of all environments; pictures show [-1, 1] x [-1, 1] length units."""
 
     choices: ClassVar[dict[str, tuple[str | None, ...]]] = {
         "moment_inverse": get_args(MomentInverse),
@@ -106,16 +106,19 @@ class WorldConfig:
         "output": get_args(Output),
         "render_mode": (None, "rgb_array", "human"),
     }
-    """Fields that take one of a few values, with these values."""
+    """Values of the fields that take one of a few."""
 
     elsewhere: ClassVar[dict[str, str]] = {"seed": "give it to reset(seed=...)"}
-    """Keywords that are no fields, with hints for the error message."""
+    """Hints in the error message for keywords that are no fields."""
+
+    fixed: ClassVar[dict[str, str]] = {}
+    """Fields that keep their default; where and why, as the end of an error message."""
 
     taken_by_make: ClassVar[tuple[str, ...]] = ()
     """Keywords that Gymnasium itself takes, for suggestions in error messages."""
 
     task_config_type: ClassVar[type | None] = None
-    """Training task's configuration, which documents the fields without a docstring."""
+    """Class of the training task's configuration, which documents fields without a docstring."""
 
     particle_count: int = 1024
     """Particles in a world, N."""
@@ -195,11 +198,11 @@ class WorldConfig:
         check_field(self, "position_limit", fits, rule, hint)
         for field in fields(self):
             value = getattr(self, field.name)
-            if is_real(value) and value > LARGEST:
-                raise NPAError(f"{field.name} must be at most {LARGEST:g}, got {shown(value)}")
+            if is_real(value) and value > MAX_VALUE:
+                raise NPAError(f"{field.name} must be at most {MAX_VALUE:g}, got {shown(value)}")
         for name in ("eps", "eps0"):
-            rule = f"be at least {1.0 / LARGEST:g} length units"
-            fits = getattr(self, name) >= 1.0 / LARGEST
+            rule = f"be at least {1.0 / MAX_VALUE:g} length units"
+            fits = getattr(self, name) >= 1.0 / MAX_VALUE
             check_field(self, name, fits, rule, "choose another unit of length")
         if not 1.0 / MAX_RATIO <= self.eps / self.eps0 <= MAX_RATIO:
             raise NPAError(
@@ -207,6 +210,10 @@ class WorldConfig:
                 f"{self.eps:g} / {self.eps0:g}: perceive at a radius nearer to the rule's own"
             )
         check_device(self.device)
+        for name, where in self.fixed.items():
+            default = getattr(type(self), name)
+            is_default, rule = getattr(self, name) == default, f"be {default!r} {where}"
+            check_field(self, name, is_default, rule, "leave it out")
 
     @property
     def box(self) -> float | None:
@@ -248,7 +255,7 @@ class WorldConfig:
 
     @classmethod
     def from_keywords(cls, keywords: dict[str, Any]) -> Self:
-        """Return the configuration with these keywords as its fields; NumPy types are converted."""
+        """Return a configuration with `keywords` as fields; NumPy values become Python's."""
         known = [field.name for field in fields(cls)]
         for name in keywords:
             if name not in known:
@@ -257,13 +264,13 @@ class WorldConfig:
         return cls(**{name: as_python(value) for name, value in keywords.items()})
 
     def as_config(self, config_type: type[TaskConfig], **changes: Any) -> TaskConfig:
-        """Return a training task's configuration: the fields that both have, and `changes`."""
+        """Return a training task's configuration with the fields that both have, and `changes`."""
         names = [field.name for field in fields(config_type)]  # type: ignore[arg-type]
         shared = {name: getattr(self, name) for name in names if hasattr(self, name)}
         return config_type(**(shared | changes))
 
     def check_seed_radius(self, radius: float) -> None:
-        """Check that particles that start within a radius are within `position_limit`."""
+        """Check that `radius`, within which particles start, is below `position_limit`."""
         rule = f"be below position_limit = {self.position_limit:g}"
         hint = "worlds would begin out of bounds"
         check_field(self, "seed_radius", radius < self.position_limit, rule, hint)
@@ -271,7 +278,7 @@ class WorldConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class EnvConfig(WorldConfig):
-    """Fields of all environments of one species; a task adds its own."""
+    """Configuration fields of all environments of one species; each task adds its own."""
 
     choices = WorldConfig.choices | {
         "reward": get_args(Reward),
@@ -309,7 +316,7 @@ class EnvConfig(WorldConfig):
     """The episode ends in success once the loss is at most this; None: as the task decides."""
 
     seed_pool: int = 0
-    """Number of worlds, made once, that episodes start from; 0: each episode starts from a fresh
+    """Number of worlds, made once, that episodes start from; 0: each episode starts from a new
     one."""
 
     def __post_init__(self) -> None:
@@ -335,12 +342,12 @@ class EnvConfig(WorldConfig):
         return 0
 
     def interface(self, physics: Physics) -> Interface:
-        """Return what action and observation columns mean; observations end with the target's."""
+        """Return what each column of observations and of actions means, target columns included."""
         return super().interface(physics)._replace(target_dim=self.target_dim)
 
     @property
     def per_particle_reward(self) -> bool:
-        """Whether `info` has a reward for each particle, by `PARTICLE_REWARDS`."""
+        """Whether `info` has a reward for each particle."""
         return self.reward not in ("dense", "sparse")
 
 

@@ -21,19 +21,20 @@ from npa_envs.world.cuda_graph import (
 from npa_envs.world.environment_steps import Actions, NeighbourState, Physics
 from npa_envs.world.particles import Particles
 
-FEW_PARTICLES = 8192
-"""Particles of all worlds up to which a step on CUDA is one graph; larger steps hide launches."""
+MAX_GRAPHED_PARTICLES = 8192
+"""Maximum number of particles in all worlds with which a step on CUDA is one graph. The kernels of
+larger steps take longer than their launches."""
 
-GROWTH = 4
-"""Factor between the numbers of worlds that captured starts serve."""
+SIZE_RATIO = 4
+"""Ratio of the numbers of worlds of captured starts: 1, 4, 16, ..."""
 
 
 class GraphedSteps:
     """Applies actions to worlds, evaluates them and perceives, without waiting for the device.
 
-    `actions` moves `particles` in place. `evaluate` writes their losses, on CUDA while neighbours
-    are searched; the reference to it is weak. `to_host`: a graph of a step, which worlds of few
-    particles have, also copies the perception to the host.
+    `actions` moves `particles` in place. `evaluate` writes their losses, on CUDA on `side_stream`
+    while neighbours are searched; the reference to it is weak. With `to_host` steps that are one
+    graph also copy the perception to the host.
     """
 
     def __init__(
@@ -42,44 +43,46 @@ class GraphedSteps:
         physics: Physics,
         actions: Actions,
         evaluate: Callable[[], None],
+        side_stream: SideStream | None,
         *,
         to_host: bool,
     ) -> None:
         self._particles, self._physics, self._actions = particles, physics, actions
+        self._side_stream = side_stream
         self._evaluate, self._to_host = WeakFunction(evaluate), to_host
         x = particles.x
-        device, is_cuda = x.device, x.is_cuda
-        self._is_one_graph = is_cuda and x.shape[:2].numel() <= FEW_PARTICLES
+        device = x.device
+        self._is_one_graph = x.is_cuda and x.shape[:2].numel() <= MAX_GRAPHED_PARTICLES
         self._draw = GraphedCallable(actions.draw, device)
         self._evaluate_graph = GraphedCallable(self._evaluate_and_sort, device)
         self._step_graph = GraphedCallable(self._act_and_perceive, device)
-        self._side_stream = SideStream(device) if is_cuda else None
         self._neighbours: NeighbourState | None = None
         self._perceived: Tensor | None = None
         """Perception, shape [B, N, P], that the graph of a step writes; None without one."""
-        self._host_perceived: Tensor | None = None
-        """Its copy in pinned memory, if `to_host`."""
+        self.host_perceived: Tensor | None = None
+        """The copy of `_perceived` in pinned memory, if `to_host`."""
         self.host_is_current = False
-        """Whether the copy belongs to the last step, and no world restarted since."""
+        """Whether `host_perceived` is of the last step, and no world restarted since."""
 
     def __getstate__(self) -> dict[str, Any]:
         # The next step makes these again.
-        none = dict.fromkeys(("_neighbours", "_perceived", "_host_perceived"))
+        none = dict.fromkeys(("_neighbours", "_perceived", "host_perceived"))
         return self.__dict__ | none | {"host_is_current": False}
 
     def act(self, action: Tensor) -> None:
-        """Apply actions, [B, N, A], and evaluate; `wait` waits until the host can read results."""
+        """Apply actions, [B, N, A], and evaluate; the host can wait for the side stream's mark."""
         if self._is_one_graph:
             # Copying actions costs less than the launches that the graph replaces.
             self._actions.load(action)
             self._step_graph()
-            self.host_is_current = self._host_perceived is not None
+            self.host_is_current = self.host_perceived is not None
         else:
             self._draw()
             self._actions.apply(action)
             self._evaluate_graph()
         # The host reads the endings while the device perceives.
-        self.mark()
+        if self._side_stream is not None:
+            self._side_stream.mark()
 
     def perceive(self, out: Tensor | None = None) -> Tensor:
         """Return what particles perceive after `act`, [B, N, P], in `out` if it is given."""
@@ -92,24 +95,6 @@ class GraphedSteps:
         # The next step overwrites what the graph writes; the host's copy is returned instead.
         return self._perceived if self.host_is_current else self._perceived.clone()
 
-    def host_observation(self, observation: Tensor) -> Tensor:
-        """Return the last observation, on the host if the step has copied it there."""
-        if not self.host_is_current or self._host_perceived is None:
-            return observation
-        # The next step overwrites it. NumPy copies in this thread; torch would wake others, which
-        # can take milliseconds.
-        return torch.from_numpy(self._host_perceived.numpy().copy())
-
-    def mark(self) -> None:
-        """Mark the point on the device that the next `wait` waits for; nothing on a CPU."""
-        if self._side_stream is not None:
-            self._side_stream.mark()
-
-    def wait(self) -> None:
-        """Block the host until the device has reached the mark."""
-        if self._side_stream is not None:
-            self._side_stream.wait()
-
     def _act_and_perceive(self) -> None:
         self._actions.draw()
         self._actions.apply_loaded()
@@ -118,10 +103,10 @@ class GraphedSteps:
             if self._perceived is None:
                 self._perceived = x.new_empty(*x.shape[:2], self._physics.perception_dim)
                 if self._to_host:
-                    self._host_perceived = pinned_like(self._perceived)
+                    self.host_perceived = pinned_like(self._perceived)
             NeighbourState(x, s, self._physics).perceive(self._perceived)
-            if self._host_perceived is not None:
-                self._host_perceived.copy_(self._perceived, non_blocking=True)
+            if self.host_perceived is not None:
+                self.host_perceived.copy_(self._perceived, non_blocking=True)
 
     def _evaluate_and_sort(self) -> None:
         x, s, *_ = self._particles
@@ -130,7 +115,7 @@ class GraphedSteps:
 
     @contextlib.contextmanager
     def _evaluating_on_side(self) -> Iterator[None]:
-        """Evaluate the worlds, on CUDA at the same time as what the `with` block launches."""
+        """Evaluate the worlds, on CUDA while the kernels of the `with` block run."""
         with contextlib.nullcontext() if self._side_stream is None else self._side_stream.overlap():
             self._evaluate()()
         yield
@@ -139,9 +124,9 @@ class GraphedSteps:
 
 
 class GraphedStarts:
-    """Starts episodes by CUDA graphs, each for a number of worlds, instead of hundreds of launches.
+    """Starts episodes by CUDA graphs, one for each number of worlds, not by hundreds of launches.
 
-    `start` starts the worlds of indices [B'] on the device; the reference to it is weak.
+    `start` starts worlds, by their indices [B']; the reference to it is weak.
     """
 
     def __init__(self, start: Callable[[Tensor], NeighbourState], world_count: int) -> None:
@@ -155,7 +140,7 @@ class GraphedStarts:
         """Start the next episodes of worlds, [B']; write their perception into `observation`."""
         size = 1
         while size < len(world_indices):
-            size = min(size * GROWTH, self._world_count)
+            size = min(size * SIZE_RATIO, self._world_count)
         if size not in self._graphs:
             self._graphs[size] = GraphedStart(self._start(), size, observation.device)
         padded = np.pad(world_indices, (0, size - len(world_indices)), mode="edge")
@@ -163,7 +148,7 @@ class GraphedStarts:
 
 
 class GraphedStart:
-    """Starts `size` worlds by a CUDA graph; a world whose index is repeated starts the same way."""
+    """Starts `size` worlds by a CUDA graph; worlds may repeat, and start the same way again."""
 
     def __init__(
         self, start: Callable[[Tensor], NeighbourState], size: int, device: torch.device
@@ -173,7 +158,7 @@ class GraphedStart:
         self._replay = GraphedCallable(self._run, device)
 
     def __call__(self, world_indices: NDArray[np.int64]) -> NeighbourState:
-        """Start the next episodes of worlds, [size]; return what finds their neighbours."""
+        """Start the next episodes of worlds, [size]; return their `NeighbourState`."""
         self._world_indices.copy_(to_device_async(world_indices, self._world_indices.device))
         self._replay()
         return self._neighbours

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -42,7 +42,7 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
     With `"marginal"` a particle's reward is −N times its change in the step, times the gradient of
     L in the middle of the step: to second order, N times what its action contributed to the
     decrease of L, averaged over being the first and the last to act. The remainder of the dense
-    reward is spread equally. So a particle is rewarded for its own action alone; with `"particle"`
+    reward is spread equally. So a particle is rewarded only for its own action; with `"particle"`
     also for what the actions of others do to its pixels.
 
     ## Starting state
@@ -68,7 +68,7 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
     |---|---|---|
     | `loss` | reset, step | the current loss L |
     | `success`, `diverged` | step | whether the world succeeded or diverged in it, bool |
-    | `reason` | last step | why the episode ended, see above; None for worlds that go on |
+    | `reason` | last step | why the episode ended, see above; None for other worlds |
     | `particle_reward` | step, with two `reward`s | each particle's reward, shape [N] |
     | `updated` | step, with `tell_updated=True` | which particles it updated, bool, shape [N] |
 
@@ -112,18 +112,13 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
     - v0: first version.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {  # type: ignore[misc]
-        "render_modes": ["rgb_array", "human"],
-        "render_fps": 25,
-    }
-
     def __init__(self, **keywords: Any) -> None:
         self._make_worlds(keywords, 1, None)
         self.observation_space = self.spaces.observation_space
         self.action_space = self.spaces.action_space
         self._world = torch.zeros(1, dtype=torch.int64, device=self.task.device)
-        self._keyed_from: np.random.Generator | None = None
-        self._is_unrewarded = False
+        self._key_generator: np.random.Generator | None = None
+        self._lacks_reward = False
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -136,18 +131,18 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
         seed = as_python(seed)
         check_options(options, ())
         super().reset(seed=seed)
-        if self._is_unrewarded:
+        if self._lacks_reward:
             warnings.warn(
                 "an episode ended before its sparse reward, which comes in step episode_steps="
                 f"{self.config.episode_steps}: give that number to gymnasium.make as "
                 "max_episode_steps as well",
                 stacklevel=2,
             )
-        self._is_unrewarded = False
+        self._lacks_reward = False
         # A new generator, by `seed` or because the caller set `np_random`, begins a new sequence.
         keys = None
-        if seed is not None or self.np_random is not self._keyed_from:
-            self._keyed_from = self.np_random
+        if seed is not None or self.np_random is not self._key_generator:
+            self._key_generator = self.np_random
             keys = rng_keys(None, 1, self.np_random)
         observation = self._change_worlds(self.worlds.start, self._world, keys)
         info = self.losses_of(self.worlds.episodes.report.numbers[:, 0].tolist())
@@ -155,7 +150,7 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
         return self.spaces.observation_output(observation[0]), info
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Apply an action, shape [N, A]; return what Gymnasium's environments return.
+        """Apply an action, [N, A]; return observation, reward, terminated, truncated and info.
 
         Raises:
             NPAError: The action has another shape; the world is not changed.
@@ -177,9 +172,9 @@ class NPAEnv(WorldsEnv, gymnasium.Env[Any, Any]):
         if terminated or truncated:
             info["reason"] = reason(ending)
         info |= self._of_world(worlds.extra_info() | worlds.step_info())
-        self._is_unrewarded = self.task.rewards_last_step_only and not (terminated or truncated)
+        self._lacks_reward = self.task.rewards_last_step_only and not (terminated or truncated)
         self._show()
-        returned = self.spaces.observation_output(worlds.steps.host_observation(observation)[0])
+        returned = self.spaces.observation_output(worlds.host_observation(observation)[0])
         return returned, numbers[0], terminated, truncated, info
 
     def particles(self) -> tuple[Tensor, Tensor]:

@@ -23,27 +23,27 @@ from npa_envs.world.environment_steps import (
 from npa_envs.world.particles import Particles
 
 FLAG_ROWS = 2
-"""Rows of float32 in a report whose bytes are the eight rows of `StepReport.flags`."""
+"""Rows of a report's buffer, float32, whose bytes are the eight rows of `StepReport.flags`."""
 
 
 def total(terms: Tensor) -> Tensor:
-    """Return the sum of the terms, [terms, B]; the order of `torch.sum` would depend on B."""
+    """Return the sum of the terms, [terms, B], in their order; that of `torch.sum` depends on B."""
     return functools.reduce(torch.add, terms.unbind())
 
 
 def named_terms(prefix: str, names: tuple[str, ...], rows: Any) -> dict[str, Any]:
-    """Return rows, one for each term of a loss, by their names in infos: `prefix_name`."""
+    """Return the row of each term of a loss by its name in infos, `prefix_name`."""
     return {f"{prefix}_{name}": row for name, row in zip(names, rows, strict=True)}
 
 
 def reason(ending: int) -> str | None:
-    """Return `info["reason"]` for the flags of an ending; None if the episode goes on."""
+    """Return `info["reason"]` for bits such as `SUCCESS`; None for 0, an episode that continues."""
     names = {DIVERGED: "diverged", SUCCESS: "success", TIME_LIMIT: "time limit"}
     return next((name for bit, name in names.items() if ending & bit), None)
 
 
 class StepNumbers(NamedTuple):
-    """Reward and losses of worlds, as tensors or arrays of shape [B], or of a single world."""
+    """Reward and losses after a step: tensors or arrays [B], or numbers of a single world."""
 
     reward: Any
     """Reward of the last step."""
@@ -56,13 +56,13 @@ class StepNumbers(NamedTuple):
 
     @classmethod
     def from_rows(cls, rows: Any) -> StepNumbers:
-        """Return the rows of `StepReport.numbers` by name, or those of one of its columns."""
+        """Return by name the rows of `StepReport.numbers`, or of one of its columns."""
         term_count = len(rows) // 2 - 1
         return cls(rows[0], rows[1], rows[2 : 2 + term_count], rows[2 + term_count :])
 
 
 class StepReport(NamedTuple):
-    """Rewards, losses and flags of each world, as views of one buffer that is copied at once."""
+    """Rewards, losses and flags of B worlds after a step: views of one buffer, to copy at once."""
 
     buffer: Tensor
     """The memory of the fields below, float32, shape [rows, B]."""
@@ -73,7 +73,7 @@ class StepReport(NamedTuple):
 
     @classmethod
     def empty(cls, world_count: int, term_count: int, device: torch.device) -> StepReport:
-        """Return a `StepReport` of zeros, for B worlds whose loss has some terms."""
+        """Return a `StepReport` of zeros for B worlds; their loss has `term_count` terms."""
         rows = 2 + 2 * term_count + FLAG_ROWS
         report = cls.from_buffer(torch.zeros(rows, world_count, device=device, dtype=torch.float32))
         report.flags[4].fill_(True)
@@ -105,10 +105,10 @@ class StepReport(NamedTuple):
 
 
 class WorldEpisodes:
-    """The current episodes of B worlds: ages, losses, rewards, endings, and the host's copies.
+    """Current episodes of B worlds: their steps, losses, rewards and endings, also on the host.
 
-    `enabled`, uint8 [1], says whether the last step was made, and `diverged`, uint8 [B], in which
-    worlds it diverged; each `update` reads both.
+    After a step `update` computes them. It reads `enabled`, uint8 [1]: whether the step was made;
+    and `diverged`, uint8 [B]: in which worlds it diverged.
     """
 
     def __init__(self, rules: EpisodeRules, enabled: Tensor, diverged: Tensor) -> None:
@@ -134,7 +134,7 @@ class WorldEpisodes:
 
     @makes_plain_tensors
     def _attach(self) -> None:
-        """Make `update`, and what the host reads, for the memory of the current `report`."""
+        """Make `update` and the host's tensors, which refer to the current `report`."""
         read = (self._endings, self.report.numbers)
         self.host_endings, self.host_numbers = (
             map(pinned_like, read) if self._endings.is_cuda else read
@@ -152,7 +152,7 @@ class WorldEpisodes:
         )
 
     def put_losses(self, world_indices: Tensor, names: tuple[str, ...], terms: Tensor) -> None:
-        """Store the named terms, [terms, B'], of the losses of replaced worlds, unrewarded."""
+        """Store terms, [terms, B'], of the losses of worlds that were replaced; rewards are 0."""
         if not self.term_names:
             self.term_names = names
             self.report = StepReport.empty(len(self.elapsed), len(names), terms.device)
@@ -163,7 +163,7 @@ class WorldEpisodes:
         self.report.endings.index_fill_(1, world_indices, False)
 
     def begin(self, world_indices: Tensor, success_loss: Tensor | None) -> None:
-        """Begin episodes of worlds, int64 [B'], that succeed at a loss, [B'], or never (None)."""
+        """Begin episodes of worlds, int64 [B'], to succeed at `success_loss`, [B']; None: never."""
         self.elapsed.index_fill_(0, world_indices, 0)
         self._start_loss[world_indices] = self.report.named.loss[world_indices]
         if success_loss is None:
@@ -172,8 +172,8 @@ class WorldEpisodes:
             self._success_loss[world_indices] = success_loss
 
     @contextlib.contextmanager
-    def unrewarded(self, world_indices: Tensor) -> Iterator[None]:
-        """Keep ages, rewards and endings while the `with` block begins episodes of worlds."""
+    def continued(self, world_indices: Tensor) -> Iterator[None]:
+        """Keep steps, rewards and endings while the `with` block restarts worlds, int64 [B']."""
         before, elapsed = self.report.copy(), self.elapsed.clone()
         yield
         self.elapsed.copy_(elapsed)
@@ -182,11 +182,11 @@ class WorldEpisodes:
         now.improvements[:, world_indices] = earlier.improvements[:, world_indices]
         self.report.endings.copy_(before.endings)
         if len(self.elapsed) == 1:
-            # The host reads the numbers of a single world alone; this synchronises.
+            # The host reads the numbers of a single world only; this synchronises.
             self.host_numbers.copy_(self.report.numbers)
 
     def copy_to_host(self) -> None:
-        """Copy endings, and the numbers of a single world, to the host without waiting."""
+        """Begin to copy endings, and the numbers of a single world, to the host."""
         if self._endings.is_cuda:
             self.host_endings.copy_(self._endings, non_blocking=True)
             if len(self.elapsed) == 1:
@@ -194,7 +194,7 @@ class WorldEpisodes:
 
 
 class ParticleRewards:
-    """Base class: rewards of the particles of B worlds; a step calls `gains`, then `write`."""
+    """Base class: a reward for each particle; a step calls `gains`, then `write`."""
 
     loss: Tensor | None = None
     """Each particle's loss, shape [B, N], if it is stored."""
@@ -204,18 +204,18 @@ class ParticleRewards:
         """Each particle's reward of the last step, shape [B, N]."""
 
     def place(self, world_indices: Tensor, task: EnvTask[Any], placed: Particles) -> None:
-        """Set rewards to 0 in worlds, int64 [B'], whose particles `placed` replaces."""
+        """Set rewards to 0 in worlds, int64 [B'], of `task`, whose particles `placed` replaces."""
         self.reward.index_fill_(0, world_indices, 0.0)
 
     def gains(self, task: EnvTask[Any], particles: Particles) -> Tensor:
-        """Return each particle's own reward of the step that ended at `particles`, [B, N]."""
+        """Return each particle's reward before `write`, [B, N]; `particles` are after the step."""
         raise NotImplementedError
 
     def write(self, gains: Tensor, reward: Tensor, by_world: Tensor, enabled: Tensor) -> None:
-        """Write the rewards of a step from `gains`, [B, N], and the worlds' rewards, [B].
+        """Store `gains`, [B, N], as the particles' rewards of a step.
 
-        Particles of worlds in `by_world`, bool [B], get the world's reward. Nothing changes unless
-        `enabled`, uint8 [1].
+        In worlds of `by_world`, bool [B], each particle gets the world's `reward`, [B], instead.
+        Nothing is stored if `enabled`, uint8 [1], is 0.
         """
         rewards = torch.where(by_world[:, None], reward[:, None], gains)
         self.reward.copy_(torch.where(enabled.bool(), rewards, self.reward))
@@ -234,7 +234,7 @@ class LossDecreases(ParticleRewards):
         self.loss[world_indices] = self._losses(task, placed)
 
     def gains(self, task: EnvTask[Any], particles: Particles) -> Tensor:
-        """Return the decrease of each particle's loss, [B, N]; store the new losses."""
+        """Return each particle's reward, the decrease of its loss, [B, N]; store the new losses."""
         losses = self._losses(task, particles)
         gains = self.loss - losses
         self.loss.copy_(losses)
@@ -258,14 +258,14 @@ class MarginalGains(ParticleRewards):
         self._before.put_(world_indices, placed)
 
     def gains(self, task: EnvTask[Any], particles: Particles) -> Tensor:
-        """Return the task's `particle_gains`, [B, N]; store the new particles."""
+        """Return each particle's reward, the task's `particle_gains`, [B, N]; store `particles`."""
         gains = task.particle_gains(self._before[:2], particles[:2])
         gains = checked_tensor(task, "particle_gains", "gains", gains, self.reward.shape)
         self._before.copy_(particles)
         return gains
 
     def write(self, gains: Tensor, reward: Tensor, by_world: Tensor, enabled: Tensor) -> None:
-        """Write gains, shifted by a constant in each world so that their mean is its reward."""
+        """Store rewards: `gains` plus a number for each world, so that their mean is its reward."""
         missed = reward - world_mean(gains[..., None])[:, 0]
         super().write(gains + missed[:, None], reward, by_world, enabled)
 
@@ -274,4 +274,4 @@ PARTICLE_REWARDS: dict[str, type[ParticleRewards]] = {
     "particle": LossDecreases,
     "marginal": MarginalGains,
 }
-"""How single particles are rewarded, by `reward=`; "dense" and "sparse" reward worlds alone."""
+"""How single particles are rewarded, by `reward=`; "dense" and "sparse" reward only worlds."""

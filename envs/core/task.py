@@ -30,31 +30,28 @@ Config = TypeVar("Config", bound=EnvConfig)
 Controls = Literal["particles", "species", "brushes", "codes"]
 """What the actions of an environment control."""
 
-SHARPNESS = 0.7
-"""Standard deviation of a particle's Gaussian in pictures, in distances between particles."""
+PICTURE_SIGMA = 0.7
+"""Standard deviation of a particle's Gaussian in pictures, as a multiple of `pixel_size`."""
 
-TURN = 2.0
-"""Degrees by which the camera turns around a 3D world in one step."""
+CAMERA_TURN = 2.0
+"""Angle by which the camera turns around a 3D world in one step [degrees]."""
 
 
 class Start(NamedTuple):
-    """Worlds at the beginning of their episodes."""
+    """B worlds at the beginning of their episodes."""
 
     x: Tensor
     """Positions [length units], shape [B, N, D]."""
-
     s: Tensor
     """States, dimensionless, shape [B, N, C]."""
-
     success_loss: Tensor | None = None
     """Loss at which each world's episode ends in success, shape [B]; None: never."""
-
     goal: Tensor | None = None
     """Index of each world's goal, such as its target picture, int64, shape [B]; None: one goal."""
 
 
 class WorldTask(Generic[AnyConfig]):
-    """Base class of all tasks: constants of the class, and pictures of worlds."""
+    """Base class of all tasks: what all worlds of a task have in common, and pictures of them."""
 
     config_type: ClassVar[type[WorldConfig]] = WorldConfig
     """The configuration's class: its fields are the environment's keywords."""
@@ -91,14 +88,14 @@ class WorldTask(Generic[AnyConfig]):
     def draw_particles(
         self, particles: Particles, style: str, azimuth: float = 0.0
     ) -> NDArray[np.uint8]:
-        """Return pictures in one of `STYLES`, [B, R, R, 3]; `azimuth`: of 3D cameras [degrees]."""
+        """Return pictures, uint8, [B, R, R, 3]; `azimuth`: angle of 3D cameras [degrees]."""
         return draw_worlds(
             particles.x,
             particles.s,
             style=style,
             resolution=self.config.render_size,
             pixel_size=self.pixel_size,
-            sigma=SHARPNESS,
+            sigma=PICTURE_SIGMA,
             half_width=self.half_width,
             periodic=self.space_dim == 2 and (self.config.periodic_box or 0.0) >= 2.0,
             azimuth=azimuth,
@@ -108,30 +105,35 @@ class WorldTask(Generic[AnyConfig]):
 class EnvTask(WorldTask[Config]):
     """The task of an environment; subclass it, and set `task_type` of an `NPAEnv` to the subclass.
 
-    A task must define `seed` and `losses`. No method may synchronise with the device (no `.item()`,
-    no branch on a tensor's value), and the result for one world must not depend on the others: take
-    means over particles or pixels with `npa_envs.world_mean`. In all methods x are positions
-    [length units], shape [B, N, D], and s states, dimensionless, shape [B, N, C].
+    A task must define `losses`, and `seed` or `fresh`. `seed` returns positions and states of new
+    worlds. `fresh` returns new worlds with goals; by default it calls `seed`. `start` returns the
+    worlds of episodes: new ones of `fresh`, or some of a pool that `fresh` has filled; a task can
+    change these, for example damage them.
+
+    No method may synchronise with the device (no `.item()`, no branch on a tensor's value), and the
+    result for one world must not depend on the others: take means over particles or pixels with
+    `npa_envs.world_mean`. In all methods x are positions [length units], shape [B, N, D], and s
+    states, dimensionless, shape [B, N, C]. `random` has a stream of random numbers for each world.
     """
 
     config_type: ClassVar[type[EnvConfig]] = EnvConfig
 
     worlds_type: ClassVar[type[BatchedWorlds] | None] = None
-    """Class that steps and observes the worlds; None: `BatchedWorlds`, particles act and perceive.
-    Tasks whose particles a rule moves take `RuleDrivenWorlds`."""
+    """Class that steps and observes the worlds; None: `ParticleWorlds`, where particles act and
+    perceive. Tasks whose particles a rule moves take `RuleDrivenWorlds`."""
 
     spaces_type: ClassVar[type[ParticleSpaces] | None] = None
     """Class of the spaces; None: `ParticleSpaces`, a row for each particle."""
 
     grows: bool = False
-    """Whether a rule grows fresh worlds, step by step."""
+    """Whether a rule grows each new world, in many steps."""
 
     def __init__(self, config: Config, device: torch.device) -> None:
         super().__init__(config, device)
         self._pool: Particles | None = None
         self._pooled: set[int] = set()
         self.target_rows: Tensor | None = None
-        """Columns after perception in each row, for each goal, [goals, T]; None: there are none."""
+        """Last columns of observations by goal, [goals, T]; None: they end with perception."""
 
     @classmethod
     def extra_bytes(cls, config: Any, world_count: int) -> int:
@@ -145,18 +147,15 @@ class EnvTask(WorldTask[Config]):
         return 0
 
     def seed(self, random: WorldRandom) -> tuple[Tensor, Tensor]:
-        """Return fresh worlds: positions [B, N, D] and states [B, N, C].
-
-        `random` has one stream of random numbers for each world; B is `random.world_count`.
-        """
+        """Return positions and states of B new worlds; B is `random.world_count`."""
         raise NotImplementedError
 
     def fresh(self, random: WorldRandom) -> Start:
-        """Return fresh worlds, with goals if the task has several; by default those of `seed`."""
+        """Return new worlds, with goals if the task has several; by default those of `seed`."""
         return self._as_start("seed", self.seed(random))
 
     def _as_start(self, method: str, result: Any) -> Start:
-        """Return `result`, the tuple that `method` of the task returned, as a `Start`."""
+        """Return as a `Start` the tuple `result`, which the task's `method` returned."""
         if not isinstance(result, tuple | list) or not 2 <= len(result) <= len(Start._fields):
             raise NPAError(
                 f"{type(self).__name__}.{method} must return positions and states, got a "
@@ -165,7 +164,7 @@ class EnvTask(WorldTask[Config]):
         return Start(*result)
 
     def with_goal(self, goal: Tensor) -> Self:
-        """Return a task whose losses are for worlds of these goals; by default the task itself.
+        """Return the task with losses for worlds of these goals; by default the task itself.
 
         Goals are int64, shape [B]; each call of `losses` reads their values.
         """
@@ -176,7 +175,7 @@ class EnvTask(WorldTask[Config]):
         raise NotImplementedError
 
     def extra_info(self, s: Tensor) -> dict[str, Tensor]:
-        """Return what the task adds to infos, by name, [B, ...] each; by default nothing."""
+        """Return values that the task adds to infos, by name, [B, ...] each; by default none."""
         return {}
 
     def particle_losses(self, x: Tensor, s: Tensor) -> Tensor:
@@ -232,7 +231,7 @@ class EnvTask(WorldTask[Config]):
         return self.config.reward == "sparse"
 
     def start(self, random: WorldRandom) -> Start:
-        """Return worlds at the beginning of their episodes: fresh ones, or some from the pool."""
+        """Return the worlds of B episodes: new ones of `fresh`, or random ones of the pool."""
         if self.config.seed_pool == 0:
             start = self._as_start("fresh", self.fresh(random))
         else:
@@ -248,7 +247,7 @@ class EnvTask(WorldTask[Config]):
         return 0
 
     def pooled(self, indices: Tensor) -> Start:
-        """Return worlds of the pool by indices below `seed_pool`, int64 [B], made if needed."""
+        """Return the worlds of the pool with these indices, int64 [B]; make them if needed."""
         if self.device.type == "cpu":
             missing = sorted(set(indices.tolist()) - self._pooled)
         else:
@@ -269,13 +268,13 @@ class EnvTask(WorldTask[Config]):
         return Start(taken.x, taken.s, goal=taken.goal)
 
     def draw(self, particles: Particles, steps: NDArray[np.int64]) -> NDArray[np.uint8]:
-        """Return pictures, [B, R, R, 3]; 3D cameras turn with `steps` since worlds began, [B]."""
+        """Return pictures, uint8, [B, R, R, 3]; `steps` since each start, [B], turn 3D cameras."""
         style = self.config.render_style
         if self.space_dim == 2:
             return self.draw_particles(particles, style)
         indices = torch.split(torch.arange(len(steps), device=self.device), 1)
         pictures = [
-            self.draw_particles(particles.take(world), style, TURN * float(step))
+            self.draw_particles(particles.take(world), style, CAMERA_TURN * float(step))
             for world, step in zip(indices, steps, strict=True)
         ]
         return np.concatenate(pictures)
@@ -325,7 +324,7 @@ class TargetEnvTask(EnvTask[Config]):
         return Start(worlds.x, s, goal=worlds.goal)
 
     def with_goal(self, goal: Tensor) -> Self:
-        """Return a task whose losses are for worlds of these goals."""
+        """Return the task with losses for worlds of these goals, int64 [B]."""
         goal_task = copy.copy(self)
         goal_task.task = self.task.with_goal(goal)
         return goal_task
@@ -340,13 +339,13 @@ class TargetEnvTask(EnvTask[Config]):
 
 
 def start_method(task: EnvTask[Any]) -> str:
-    """Return the name of the method that makes a task's worlds: start, fresh or seed."""
+    """Return which method the task's class overrides to make worlds: start, fresh or seed."""
     names = ("start", "fresh")
     return next((n for n in names if getattr(type(task), n) != getattr(EnvTask, n)), "seed")
 
 
 def check_start(task: EnvTask[Any], start: Start, world_count: int, shapes: Any) -> None:
-    """Check starts of some worlds without synchronising; `shapes`: [B, N, D] and [B, N, C]."""
+    """Check shapes and types of start worlds, without synchronising; `shapes`: of all x and s."""
     name = start_method(task)
     if not isinstance(start, Start):
         raise NPAError(
@@ -366,7 +365,7 @@ def check_start(task: EnvTask[Any], start: Start, world_count: int, shapes: Any)
 def checked_losses(
     task: EnvTask[Any], losses: Any, world_count: int, names: tuple[str, ...]
 ) -> list[Tensor]:
-    """Return the checked terms of `losses`, shape [B] each; `names`: those of earlier calls."""
+    """Return the terms of `losses`, [B] each, checked; `names`: of earlier terms, () at first."""
     name = f"{type(task).__name__}.losses"
     if not isinstance(losses, Mapping) or not losses or not all(type(n) is str for n in losses):
         actual = list(losses) if isinstance(losses, Mapping) else type(losses).__name__
@@ -408,7 +407,7 @@ def checked_tensor(
 
 
 def check_finite(task: EnvTask[Any], method: str, values: Mapping[str, Tensor]) -> None:
-    """Check that tensors with one row for each world are finite; synchronises."""
+    """Check that tensors, [B, ...], by their names in the error, are finite; synchronises."""
     for field, value in values.items():
         bad = ~torch.isfinite(value.flatten(1) if value.ndim > 1 else value[:, None]).all(dim=1)
         if bool(bad.any()):
@@ -436,7 +435,7 @@ def global_rng_states(device: torch.device) -> dict[str, Any]:
 
 
 def check_no_draws(task: EnvTask[Any], method: str, before: dict[str, Any]) -> None:
-    """Check that `method` has left the global random generators in the states `before`."""
+    """Check that `method` drew from no global generator: states are still those `before`."""
     now = global_rng_states(task.device)
     moved = [name for name, state in before.items() if state != now[name]]
     if moved:

@@ -32,7 +32,7 @@ REASONS = np.array([reason(ending) for ending in range(2 * TIME_LIMIT)], dtype=o
 
 
 class BatchedSpaces(VectorEnv[Any, Any, Any]):
-    """Base class of vector environments that make their large spaces at the first use."""
+    """Base class of vector environments; the spaces of all worlds, large, are made when used."""
 
     @cached_property
     def observation_space(self) -> Space[Any]:  # type: ignore[override]
@@ -61,12 +61,7 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
         keywords: Fields of the task's configuration.
     """
 
-    metadata: dict[str, Any] = {  # noqa: RUF012 (each instance gets a dictionary of its own)
-        "render_modes": ["rgb_array", "human"],
-        "render_fps": 25,
-        "autoreset_mode": AutoresetMode.SAME_STEP,
-    }
-
+    metadata = WorldsEnv.metadata | {"autoreset_mode": AutoresetMode.SAME_STEP}
     _is_batch = True
 
     def __init__(
@@ -94,10 +89,7 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
         self._ended = np.zeros(num_envs, dtype=bool)
 
     def reset(
-        self,
-        *,
-        seed: int | Sequence[int] | None = None,
-        options: dict[str, Any] | None = None,
+        self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         """Start episodes; return all observations, [B, N, P], and the losses with their terms.
 
@@ -205,7 +197,10 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
     def _report(
         self, stepped: NDArray[np.bool_] | None, *, copy: bool
     ) -> tuple[Any, Any, Any, dict[str, Any]]:
-        """Return rewards, terminations, truncations and infos; `stepped`: worlds that acted."""
+        """Return rewards, terminations, truncations and infos.
+
+        `stepped`, [B]: worlds that made the step; None: all. `copy`: later steps change nothing.
+        """
         worlds = self.worlds
         report = worlds.episodes.report.copy() if copy else worlds.episodes.report
         rows = self._report_rows(report)
@@ -223,22 +218,22 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
         return {n: self._out(v.clone() if copy else v) for n, v in values.items()}
 
     def _report_rows(self, report: StepReport) -> Sequence[Any]:
-        """Return rewards, losses, terms, their decreases, [B] each: tensors or float64 arrays."""
+        """Return the rows of `report.numbers`, [B] each, as tensors or float64 arrays."""
         rows = self._out(report.numbers)
         return unbound(rows if isinstance(rows, Tensor) else rows.astype(np.float64))
 
     def _mask(self, mask: NDArray[np.bool_]) -> Any:
-        """Return a copy of a mask of worlds as array or tensor, as `output` says."""
+        """Return a copy of a mask of worlds, [B], as `config.output`: array or tensor."""
         return self._out(mask.copy())
 
 
 def unbound(values: Any) -> Sequence[Any]:
-    """Return the rows of an array or tensor; `list` of a tensor takes longer than `unbind`."""
+    """Return the rows of an array or tensor; for tensors `unbind` is faster than `list`."""
     return values.unbind() if isinstance(values, Tensor) else list(values)
 
 
 def with_masks(values: dict[str, Any], which: Any) -> dict[str, Any]:
-    """Return infos: each value by its name, and by `_name` the mask of worlds that have it."""
+    """Return infos: each value by its name, and `which` worlds have it, [B], by `_name`."""
     infos = {}
     for name, value in values.items():
         infos[name], infos[f"_{name}"] = value, which
@@ -246,7 +241,7 @@ def with_masks(values: dict[str, Any], which: Any) -> dict[str, Any]:
 
 
 def vector_class(env_type: type[WorldsEnv], *mixins: type[Any]) -> type[NPAVectorEnv]:
-    """Return the vector environment's class for the class of a single one, with mixins."""
+    """Return the class of vector environments of the task of `env_type`, with `mixins` as bases."""
     name = env_type.__name__
     attributes = {
         "__doc__": f"Worlds of `{name}`, batched on one device; its docstring describes both.",
@@ -260,14 +255,14 @@ def vector_class(env_type: type[WorldsEnv], *mixins: type[Any]) -> type[NPAVecto
 
 
 def checked_count(name: str, value: Any) -> int:
-    """Return the argument of this name, checked: a whole number of at least 1."""
+    """Return `value`, a whole number of at least 1, after a check; `name`: the argument's."""
     count = as_python(value)
     check_count(name, count, f": for example {name}=8")
     return int(count)
 
 
 def checked_mode(mode: str | AutoresetMode) -> AutoresetMode:
-    """Return Gymnasium's `AutoresetMode` for its name or for itself."""
+    """Return the `AutoresetMode` of this name; Gymnasium's own modes are returned as they are."""
     if isinstance(mode, AutoresetMode):
         return mode
     by_name = AUTORESET_MODES | {known.value: known for known in AutoresetMode}
@@ -295,7 +290,7 @@ def check_options(options: Any, known: tuple[str, ...]) -> None:
 def worlds_to_reset(
     options: dict[str, Any] | None, world_count: int, *, started: bool = True
 ) -> NDArray[np.int64]:
-    """Return the indices of the worlds that `options["reset_mask"]` chooses, else of all."""
+    """Return the indices of worlds in `options["reset_mask"]`, int64 [B']; without it, of all."""
     check_options(options, ("reset_mask",))
     mask = (options or {}).get("reset_mask")
     if mask is None:
@@ -314,7 +309,7 @@ def worlds_to_reset(
 
 
 def checked_worlds(worlds: Any, world_count: int) -> Tensor:
-    """Return checked indices of worlds, without repetition, on the CPU, int64, shape [B']."""
+    """Return checked indices of worlds, each once, on the CPU, int64, shape [B']."""
     indices = number_tensor("worlds", worlds).cpu()
     # A mask is refused: it would be read as the indices 0 and 1.
     whole = not indices.is_floating_point() and indices.dtype != torch.bool
@@ -330,9 +325,9 @@ def checked_worlds(worlds: Any, world_count: int) -> Tensor:
 def rng_keys(
     seed: int | Sequence[int] | None, world_count: int, np_random: np.random.Generator
 ) -> Tensor:
-    """Return the key of each world's random stream, int64, shape [B].
+    """Return the key of each world's stream of random numbers, int64, shape [B].
 
-    World k gets that of seed + k, or of the k-th seed given; None: drawn from `np_random`.
+    World k gets the key of seed + k, or of the k-th seed; None: a random one of `np_random`.
     """
     if seed is None:
         keys = np_random.integers(2**64, size=world_count, dtype=np.uint64)

@@ -22,23 +22,23 @@ from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import WorldRandom
 
 OBSERVATION_COPIES = 4
-"""Observations in memory at once: the rows, the returned arrays, the final ones, and one spare."""
+"""Copies of the observation in memory at once: perceived, returned, final, and one spare."""
 
 MAX_INDEX = 2**31 - 1
-"""Kernels index the particles' states with 32 bits."""
+"""Maximum index of numbers in all particles' states, of 32 bits in kernels."""
 
 LISTED_BYTES = 320
-"""Bytes on CUDA for a particle's neighbours, at most: a list of 128, and sorted copies."""
+"""Maximum memory of a particle's neighbours on CUDA: a list of 128, and sorted copies [bytes]."""
 
 CAPTURED_STARTS = 4 / 3
-"""Particles of all captured starts, which have their own lists, as a multiple of a batch:
+"""Particles of all captured starts, whose neighbours take memory as well, as a multiple of B N:
 1 + 1/4 + 1/16 + ..."""
 
 
 def needed_bytes(
     world_count: int, particle_count: int, physics: Physics, device: torch.device
 ) -> int:
-    """Return an estimate of the memory that worlds take while they are stepped [bytes]."""
+    """Return an estimate of the memory that steps of B worlds need on a device [bytes]."""
     particles = world_count * particle_count
     worlds = 6 * (physics.space_dim + physics.state_dim)
     floats = OBSERVATION_COPIES * physics.perception_dim + 2 * physics.action_dim + worlds + 16
@@ -67,7 +67,7 @@ def free_bytes(device: torch.device) -> int | None:
 def check_memory(
     world_count: int, particle_count: int, physics: Physics, device: torch.device, extra_bytes: int
 ) -> None:
-    """Check that B worlds fit into a device's memory and into the kernels' indices."""
+    """Check that B worlds and `extra_bytes` fit into a device's memory and the kernels' indices."""
     what = f"{world_count} world(s) of {particle_count} particles"
     hint = "choose a smaller particle_count or fewer worlds"
     if world_count * particle_count * (1 + physics.state_dim) > MAX_INDEX:
@@ -119,9 +119,9 @@ class WorldState:
         """One random stream for each world."""
 
     def next_streams(self, world_indices: Tensor, keys: Tensor | None) -> WorldRandom:
-        """Return random streams for the next episodes of worlds, int64 [B'].
+        """Return streams of random numbers for the next episodes of worlds, int64 [B'].
 
-        `keys`, int64 [B'], begin new sequences of episodes; None: the current sequences go on.
+        `keys`, int64 [B'], begin new sequences of episodes; None: the current ones continue.
         """
         if keys is not None:
             return WorldRandom.from_keys(keys.to(self.device))
@@ -130,7 +130,7 @@ class WorldState:
         return random
 
     def checked_particles(self, x: Any, s: Any, world_count: int, particle_count: int) -> Particles:
-        """Return positions and states of `world_count` worlds, checked, float32 on the device."""
+        """Return `x` and `s`, [B', N', ...], after a check, as float32 on the device."""
         checked, physics = [], self.physics
         for name, value, width, limit, limit_name in (
             ("x", x, physics.space_dim, physics.limits.position, "position_limit"),
@@ -153,7 +153,7 @@ class WorldState:
         return Particles(*checked)
 
     def divergence_error(self, diverged: NDArray[np.int64], elapsed: Tensor) -> DivergedError:
-        """Return the error for worlds, by their indices; `elapsed`, [B], are all worlds' ages."""
+        """Return the error that names diverged worlds, [B']; `elapsed`: all worlds' steps, [B]."""
         physics = self.physics
 
         def describe(world: int) -> str:
@@ -185,7 +185,7 @@ class WorldState:
 
 
 def not_finite(action: Tensor) -> DivergedError:
-    """Return the error for actions, shape [B, rows, W], with a value that is not finite."""
+    """Return the error for actions, [B, rows, columns], with a number that is not finite."""
     bad = ~torch.isfinite(action)
     world, particle, entry = (int(k) for k in bad.nonzero()[0])
     return DivergedError(

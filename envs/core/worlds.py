@@ -1,4 +1,4 @@
-"""The batch of worlds of an environment: starts, steps, evaluation and observation.
+"""The batch of worlds of an environment: episode starts, steps, rewards and observations.
 
 A single environment is a batch of one. Results of a world do not depend on the others, bit for bit.
 """
@@ -27,7 +27,7 @@ from npa_envs.envs.core.task import (
 )
 from npa_envs.envs.core.world_state import WorldState, check_default_dtype, not_finite
 from npa_envs.errors import NPAError, shown
-from npa_envs.world.cuda_graph import makes_plain_tensors, to_device_async
+from npa_envs.world.cuda_graph import SideStream, makes_plain_tensors, to_device_async
 from npa_envs.world.environment_steps import (
     DIVERGED,
     NOT_FINITE,
@@ -39,11 +39,10 @@ from npa_envs.world.particles import Particles
 
 
 class BatchedWorlds(WorldState):
-    """B worlds of one task, stepped together, with their losses, rewards and episode ends.
+    """Base class: B worlds of one task, with their steps, losses, rewards and episode ends.
 
-    Each particle moves and changes its state by its row of an action. Its row of the observation is
-    what it perceives, then the columns of the task's `target_rows` for the world's goal. All
-    tensors keep their memory between steps, as CUDA graphs need.
+    Subclasses define what actions do (`queue`) and what is observed (`perceive`). All tensors keep
+    their memory between steps, as CUDA graphs need.
     """
 
     @makes_plain_tensors
@@ -60,13 +59,15 @@ class BatchedWorlds(WorldState):
         device = self.device
         self.task: EnvTask[Any] = task_type(config, device)
         self.goal = torch.zeros(world_count, dtype=torch.int64, device=device)
-        """Index of each world's goal, shape [B]; zeros where the task has one goal."""
+        """Index of each world's goal, int64, [B]; zeros where the task has one goal."""
         self.goal_task: EnvTask[Any] = self.task.with_goal(self.goal)
         """The task with losses for the worlds' goals."""
 
         limits = [steps for steps in (episode_steps, config.episode_steps) if steps is not None]
         self.episode_steps = min(limits, default=None)
         """Steps after which an episode is truncated; None: never."""
+        self.side_stream = SideStream(device) if device.type == "cuda" else None
+        """CUDA stream of evaluations; the host waits for its mark to read a step's results."""
         rewards_last = self.task.rewards_last_step_only
         if rewards_last and self.episode_steps is None:
             raise NPAError(
@@ -86,24 +87,10 @@ class BatchedWorlds(WorldState):
         if config.per_particle_reward:
             self.particle_rewards = PARTICLE_REWARDS[config.reward](self.particles)
 
-        self._actions = Actions(
-            self.x, self.s, self.physics, self.random, enabled=self.enabled, diverged=self.diverged
-        )
-        returns_arrays = world_count == 1 and config.output == "numpy"
-        self.steps = GraphedSteps(
-            self.particles,
-            self.physics,
-            self._actions,
-            self.evaluate,
-            to_host=returns_arrays and self.task.target_rows is None,
-        )
-        """Applies the actions of a step, on CUDA by graphs."""
-        self._graphed_starts = GraphedStarts(self._start_and_sort, world_count)
-
     @torch.no_grad()
     @makes_plain_tensors
     def start(self, world_indices: Tensor, keys: Tensor | None = None) -> Start:
-        """Start episodes in worlds, int64 [B'], and return these; `keys`: see `next_streams`."""
+        """Start episodes in worlds, int64 [B'], and return these; `keys`: as in `next_streams`."""
         random = self.next_streams(world_indices, keys)
         check_default_dtype()
         # The first start is not captured as a graph, so that it can synchronise for checks.
@@ -123,7 +110,7 @@ class BatchedWorlds(WorldState):
         return start
 
     def begin(self, world_indices: Tensor, start: Start, *, check: bool) -> None:
-        """Begin episodes with `start` in worlds, int64 [B']; `check` that losses are finite."""
+        """Begin episodes of worlds, int64 [B'], at `start`; `check`: whether losses are finite."""
         self.place(world_indices, Particles(start.x, start.s, goal=start.goal))
         if check:
             self.check_losses(world_indices)
@@ -132,7 +119,7 @@ class BatchedWorlds(WorldState):
     @torch.no_grad()
     @makes_plain_tensors
     def place(self, world_indices: Tensor, placed: Particles) -> None:
-        """Replace particles of worlds, int64 [B'], unrewarded; and goals, if `placed` has any."""
+        """Replace particles, and goals if `placed` has any, of worlds, int64 [B']; no reward."""
         task, goal = self.task, placed.goal
         placed = placed._replace(goal=None).map(Tensor.contiguous)
         if self.goal_task is not task:
@@ -146,50 +133,23 @@ class BatchedWorlds(WorldState):
         if self.particle_rewards is not None:
             self.particle_rewards.place(world_indices, task, placed)
 
-    def _start_and_sort(self, world_indices: Tensor) -> NeighbourState:
-        start = self.start(world_indices)
-        return NeighbourState(start.x, start.s, self.physics, world_indices=world_indices)
-
-    @makes_plain_tensors
     def restart(self, world_indices: NDArray[np.int64], observation: Tensor) -> None:
         """Start the next episodes of worlds, [B']; write their rows of `observation`, [B, ...]."""
-        if self.task.target_rows is not None:
-            index = to_device_async(world_indices, self.device)
-            start = self.start(index)
-            rows = NeighbourState(start.x, start.s, self.physics).perceive()
-            observation[index] = self._with_target(rows, self.goal[index])
-        elif self.x.is_cuda and self.task.start_is_short:
-            self._graphed_starts(world_indices, observation)
-        else:
-            index = to_device_async(world_indices, self.device)
-            self._start_and_sort(index).perceive(observation)
+        index = to_device_async(world_indices, self.device)
+        self.start(index)
+        observation[index] = self.perceive()[index]
 
-    @torch.no_grad()
-    @makes_plain_tensors
     def perceive(self, out: Tensor | None = None) -> Tensor:
         """Return all worlds' current observations, shape [B, ...], in `out` if it is given."""
-        return self._observed(NeighbourState(self.x, self.s, self.physics), out)
-
-    def _observed(self, perceived: NeighbourState | GraphedSteps, out: Tensor | None) -> Tensor:
-        """Return all worlds' observations from what particles have perceived."""
-        if self.task.target_rows is None:
-            return perceived.perceive(out)
-        rows = self._with_target(perceived.perceive(), self.goal)
-        return rows if out is None else out.copy_(rows)
-
-    def _with_target(self, rows: Tensor, goal: Tensor) -> Tensor:
-        assert self.task.target_rows is not None, "only of tasks that observe their targets"
-        columns = self.task.target_rows[goal][:, None].expand(-1, rows.shape[1], -1)
-        return torch.cat((rows, columns), dim=-1)
+        raise NotImplementedError
 
     @torch.no_grad()
     @makes_plain_tensors
     def reseed(self, world_indices: NDArray[np.int64], observation: Tensor) -> None:
-        """Place new particles in worlds, [B'], within their episodes; update `observation`."""
-        self.steps.host_is_current = False
+        """Restart worlds, [B'], within their episodes; write their rows of `observation`."""
         rewards = self.particle_rewards
         before = None if rewards is None else rewards.reward.clone()
-        with self.episodes.unrewarded(to_device_async(world_indices, self.device)):
+        with self.episodes.continued(to_device_async(world_indices, self.device)):
             self.restart(world_indices, observation)
         if rewards is not None and before is not None:
             rewards.reward.copy_(before)
@@ -197,16 +157,18 @@ class BatchedWorlds(WorldState):
     def step(self, action: Tensor, out: Tensor | None = None) -> tuple[NDArray[np.uint8], Tensor]:
         """Apply actions; return endings, [B], and observations, [B, ...], in `out` if it is given.
 
-        An ending has bits such as `SUCCESS`. On CUDA the device perceives while the host reads it.
+        An ending has bits such as `SUCCESS`, and is 0 if the episode continues.
 
         Raises:
             DivergedError: An action is not finite; worlds and report are not changed.
             NPAError: The task's losses are not finite.
         """
         observation = self.queue(action, out)
-        self.steps.wait()
+        if self.side_stream is not None:
+            self.side_stream.wait()
         read: NDArray[np.uint8] = self.episodes.host_endings.numpy()
         if not read[-1]:
+            # The step was not made: the next one draws its random numbers again.
             self.random.steps -= 1
             raise not_finite(action)
         endings = read[:-1].copy()
@@ -218,12 +180,13 @@ class BatchedWorlds(WorldState):
             )
         return endings, observation
 
-    @torch.no_grad()
-    @makes_plain_tensors
     def queue(self, action: Tensor, out: Tensor | None = None) -> Tensor:
-        """Apply actions as `step` does, without synchronising; return observations, [B, ...]."""
-        self.steps.act(action)
-        return self._observed(self.steps, out)
+        """Make a step, mark `side_stream`; return observations, [B, ...], in `out` if given."""
+        raise NotImplementedError
+
+    def host_observation(self, observation: Tensor) -> Tensor:
+        """Return the last step's observation, or its copy on the host if the step made one."""
+        return observation
 
     def evaluate(self) -> None:
         """Write rewards, losses and endings for the current particles into `episodes.report`."""
@@ -234,7 +197,7 @@ class BatchedWorlds(WorldState):
         self.enabled.fill_(1)
 
     def write_rewards(self, terms: Tensor) -> None:
-        """Write rewards and endings of worlds, and of particles; `terms`: losses, [terms, B]."""
+        """Write rewards and endings for new losses, whose terms are `terms`, [terms, B]."""
         rewards = self.particle_rewards
         if rewards is None:
             self.episodes.update(terms)
@@ -261,20 +224,15 @@ class BatchedWorlds(WorldState):
         return loss
 
     def extra_info(self) -> dict[str, Tensor]:
-        """Return what the task adds to infos of resets and steps, by name, [B, ...] each."""
+        """Return values that the task adds to infos of resets and steps, by name, [B, ...] each."""
         return self.goal_task.extra_info(self.s)
 
     def step_info(self) -> dict[str, Tensor]:
-        """Return `particle_reward` and `updated` for infos, if configured, [B, N] each."""
-        info: dict[str, Tensor] = {}
-        if self.particle_rewards is not None:
-            info["particle_reward"] = self.particle_rewards.reward
-        if self.task.config.tell_updated:
-            info["updated"] = self._actions.updated()
-        return info
+        """Return values of particles for infos of steps, by name, [B, N] each."""
+        return {}
 
     def handle_diverged(self, endings: NDArray[np.uint8], observation: Tensor) -> NDArray[np.uint8]:
-        """Apply `on_divergence` to worlds that diverged; return the endings, [B], that remain."""
+        """Apply `on_divergence` to worlds that diverged; return the endings, [B], after that."""
         on_divergence = self.task.config.on_divergence
         diverged = endings & DIVERGED != 0
         if on_divergence == "terminate" or not diverged.any():
@@ -292,3 +250,97 @@ class BatchedWorlds(WorldState):
         """Return pictures of the first worlds, uint8, shape [count, R, R, 3]."""
         first = self.particles.map(lambda value: value[:count])
         return self.task.draw(first, self.episodes.elapsed[:count].cpu().numpy())
+
+
+class ParticleWorlds(BatchedWorlds):
+    """Worlds in which each particle moves and changes its state by its row of an action.
+
+    A particle's row of the observation is what it perceives, then the columns of the task's
+    `target_rows` for its world's goal, if the task has them.
+    """
+
+    @makes_plain_tensors
+    def __init__(
+        self,
+        task_type: type[EnvTask[Any]],
+        config: EnvConfig,
+        world_count: int,
+        episode_steps: int | None = None,
+    ) -> None:
+        super().__init__(task_type, config, world_count, episode_steps)
+        self._actions = Actions(
+            self.x, self.s, self.physics, self.random, enabled=self.enabled, diverged=self.diverged
+        )
+        returns_arrays = world_count == 1 and config.output == "numpy"
+        self.steps = GraphedSteps(
+            self.particles,
+            self.physics,
+            self._actions,
+            self.evaluate,
+            self.side_stream,
+            to_host=returns_arrays and self.task.target_rows is None,
+        )
+        """Applies the actions of a step, on CUDA by graphs."""
+        self._graphed_starts = GraphedStarts(self._start_and_sort, world_count)
+
+    @torch.no_grad()
+    @makes_plain_tensors
+    def queue(self, action: Tensor, out: Tensor | None = None) -> Tensor:
+        """Step the worlds without synchronising; return observations, [B, N, P], in `out`."""
+        self.steps.act(action)
+        return self._observed(self.steps, out)
+
+    @torch.no_grad()
+    @makes_plain_tensors
+    def perceive(self, out: Tensor | None = None) -> Tensor:
+        """Return all worlds' current observations, shape [B, N, P], in `out` if it is given."""
+        return self._observed(NeighbourState(self.x, self.s, self.physics), out)
+
+    def _observed(self, perceived: NeighbourState | GraphedSteps, out: Tensor | None) -> Tensor:
+        """Return all worlds' observations, with target columns, in `out` if it is given."""
+        if self.task.target_rows is None:
+            return perceived.perceive(out)
+        rows = self._with_target(perceived.perceive(), self.goal)
+        return rows if out is None else out.copy_(rows)
+
+    def _with_target(self, rows: Tensor, goal: Tensor) -> Tensor:
+        assert self.task.target_rows is not None, "only of tasks that observe their targets"
+        columns = self.task.target_rows[goal][:, None].expand(-1, rows.shape[1], -1)
+        return torch.cat((rows, columns), dim=-1)
+
+    @makes_plain_tensors
+    def restart(self, world_indices: NDArray[np.int64], observation: Tensor) -> None:
+        """Start the next episodes of worlds, [B']; write their rows of `observation`, [B, N, P]."""
+        self.steps.host_is_current = False
+        if self.task.target_rows is not None:
+            index = to_device_async(world_indices, self.device)
+            start = self.start(index)
+            rows = NeighbourState(start.x, start.s, self.physics).perceive()
+            observation[index] = self._with_target(rows, self.goal[index])
+        elif self.x.is_cuda and self.task.start_is_short:
+            self._graphed_starts(world_indices, observation)
+        else:
+            index = to_device_async(world_indices, self.device)
+            self._start_and_sort(index).perceive(observation)
+
+    def _start_and_sort(self, world_indices: Tensor) -> NeighbourState:
+        start = self.start(world_indices)
+        return NeighbourState(start.x, start.s, self.physics, world_indices=world_indices)
+
+    def host_observation(self, observation: Tensor) -> Tensor:
+        """Return the last step's observation, or its copy on the host if the step made one."""
+        copied = self.steps.host_perceived
+        if not self.steps.host_is_current or copied is None:
+            return observation
+        # The next step overwrites it. NumPy copies in this thread; torch would wake others, which
+        # can take milliseconds.
+        return torch.from_numpy(copied.numpy().copy())
+
+    def step_info(self) -> dict[str, Tensor]:
+        """Return `particle_reward` and `updated` for infos, if configured, [B, N] each."""
+        info: dict[str, Tensor] = {}
+        if self.particle_rewards is not None:
+            info["particle_reward"] = self.particle_rewards.reward
+        if self.task.config.tell_updated:
+            info["updated"] = self._actions.updated()
+        return info

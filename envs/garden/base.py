@@ -1,24 +1,17 @@
-"""Environments with brushes: a trained rule moves the particles, and agents brush over them.
-
-Also the worlds and the base class of all tasks whose particles a rule moves.
-"""
+"""Base classes of gardens: a rule moves the particles of a picture, and agents have brushes."""
 
 from __future__ import annotations
 
 from functools import partial
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
-import numpy as np
 import torch
 import torch.nn.functional as F
-from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs import world_mean
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import Start
-from npa_envs.envs.core.world_state import not_finite
-from npa_envs.envs.core.worlds import BatchedWorlds
 from npa_envs.envs.garden.brushes import (
     OBSERVATION_LIMIT,
     VALUES_PER_PLACE,
@@ -29,112 +22,24 @@ from npa_envs.envs.garden.brushes import (
     grid_places,
     offsets,
 )
-from npa_envs.envs.grown_worlds import GrownTask, check_matches_rule, run_rule
-from npa_envs.envs.morphogenesis2d import PictureConfig, PictureEnvTask
+from npa_envs.envs.trained_rules import GrownTask, RuleDrivenTask, check_matches_rule, run_rule
 from npa_envs.rule.rule import COLOUR_OFFSET
 from npa_envs.tasks.targets.picture_points import PointTarget
 from npa_envs.world.brushes import nearest_image
-from npa_envs.world.cuda_graph import makes_plain_tensors, to_device_async
 from npa_envs.world.particles import Particles
-from npa_envs.world.randomness import StreamId, WorldRandom
+from npa_envs.world.randomness import WorldRandom
 
 DEFICIT_SCALES = (2.0, 4.0, 4.0, 4.0, 4.0, 4.0)
-"""Factors of a place's values, which bring them to about the same size (dimensionless)."""
+"""Factors of the six values of a place; all values then have about the same size."""
 
-MIN_RISE = 0.1
-"""Smallest rise of the loss by turning grey, as a fraction of the loss (dimensionless)."""
+MIN_GREY_RISE = 0.1
+"""Minimum rise of the loss by turning grey, as a fraction of the loss (dimensionless)."""
 
-AnyPicture = TypeVar("AnyPicture", bound=PictureConfig)
 Config = TypeVar("Config", bound=GardenConfig)
 
 
-class RuleDrivenWorlds(BatchedWorlds):
-    """Worlds whose particles a rule steps; a `RuleDrivenTask` applies actions, observes, rewards.
-
-    On a CPU worlds are stepped one by one, as a rule's matrix products depend in the last bit on
-    the number of worlds.
-    """
-
-    task: RuleDrivenTask[Any]
-
-    context: Any = None
-    """The `context` of all worlds' episodes, as `RuleDrivenTask` explains it."""
-
-    @torch.no_grad()
-    @makes_plain_tensors
-    def queue(self, action: Tensor, out: Tensor | None = None) -> Tensor:
-        """Check that actions are finite, then step the worlds; return observations, [B, O]."""
-        if not bool(torch.isfinite(action).all()):
-            raise not_finite(action)
-        action = action.to(self.device)
-        diverged = torch.zeros_like(self.diverged, dtype=torch.bool)
-        limits = self.physics.limits.position, self.physics.limits.state
-        for value, new, limit in zip((self.x, self.s), self._stepped(action), limits, strict=True):
-            # NaN is not within any limit.
-            diverged |= ~(new.abs() < limit).flatten(1).all(dim=1)
-            value.copy_(torch.nan_to_num(new, nan=0.0).clamp(-limit, limit))
-        self.diverged.copy_(diverged)
-        self.evaluate()
-        self.steps.mark()
-        return self.perceive(out)
-
-    def _stepped(self, action: Tensor) -> tuple[Tensor, Tensor]:
-        x, s = self.x, self.s
-        if x.is_cuda or len(x) == 1:
-            return self.task.step(x, s, action, self.random)
-        each = [slice(k, k + 1) for k in range(len(x))]
-        streams = [self.random.take(one) for one in each]
-        worlds = [
-            self.task.step(x[one], s[one], action[one], random)
-            for one, random in zip(each, streams, strict=True)
-        ]
-        # All streams have advanced by as many draws.
-        self.random.sync_with(streams[-1], self.task.config.rule_steps)
-        x, s = (torch.cat(part) for part in zip(*worlds, strict=True))
-        return x, s
-
-    @torch.no_grad()
-    @makes_plain_tensors
-    def perceive(self, out: Tensor | None = None) -> Tensor:
-        """Return all worlds' current observations, shape [B, O], in `out` if it is given."""
-        observed = self.task.observe(self.particles, self.loss, self.context)
-        return observed if out is None else out.copy_(observed)
-
-    def restart(self, world_indices: NDArray[np.int64], observation: Tensor) -> None:
-        """Start the next episodes of worlds, [B']; write their rows of `observation`, [B, O]."""
-        index = to_device_async(world_indices, self.device)
-        self.start(index)
-        observation[index] = self.perceive()[index]
-
-    def begin(self, world_indices: Tensor, start: Start, *, check: bool) -> None:
-        """Begin episodes with `start` in worlds, int64 [B'], and store their `context`."""
-        super().begin(world_indices, start, check=check)
-        draws = self.random.take(world_indices).substream(StreamId.GOAL)
-        context = self.task.episode_context(start, self.loss[world_indices], draws)
-        if self.context is None:
-            shapes = ((self.world_count, *value.shape[1:]) for value in context)
-            self.context = type(context)(*map(Tensor.new_zeros, context, shapes))
-        for stored, value in zip(self.context, context, strict=True):
-            stored[world_indices] = value
-
-    def write_rewards(self, terms: Tensor) -> None:
-        """Write the task's own rewards and the endings; then let the task change the goals."""
-        super().write_rewards(terms)
-        rewards = self.task.reward(self.particles, self.loss, self.context)
-        report = self.episodes.report
-        if self.task.rewards_last_step_only:
-            terminated, truncated, *_ = report.endings
-            rewards = torch.where(terminated | truncated, rewards, 0.0)
-        report.named.reward.copy_(rewards)
-        self.task.next_goals(self.episodes.elapsed, self.context, self.goal)
-
-    def extra_info(self) -> dict[str, Tensor]:
-        """Return what the task's `context_info` adds to infos, by name, [B, ...] each."""
-        return self.task.context_info(self.particles, self.context)
-
-
 class TargetDeficit:
-    """Sums over a target's particles minus sums over a world's, weighted by brushes at places."""
+    """What worlds lack near each of some places: brush-weighted sums of the target minus theirs."""
 
     def __init__(self, places: Tensor, target: PointTarget, config: GardenConfig) -> None:
         self.places, self._config = places, config
@@ -148,10 +53,10 @@ class TargetDeficit:
         self._target_sums = self._scale * target_sums
 
     def __call__(self, particles: Particles, middle: Tensor) -> Tensor:
-        """Return the target's sums minus the worlds' own at each place, [B, places, 6].
+        """Return the target's sums minus the worlds' sums at each place, [B, places, 6].
 
         Sums are over particles, dimensionless: of 1, of x and y from the place in brush radii, and
-        of red, green and blue. They are multiples of the target's mean sum of 1 over all places,
+        of red, green and blue. They are in units of the target's mean sum of 1 over all places,
         times `DEFICIT_SCALES`. `middle`, [B, 2], is the origin of the places.
         """
         return self._target_sums - self._weighted(particles, middle)
@@ -167,60 +72,24 @@ class TargetDeficit:
         return self._scale * mean.view(len(x), len(self.places), VALUES_PER_PLACE)
 
 
-class RuleDrivenTask(PictureEnvTask[AnyPicture]):
-    """Base class of tasks whose worlds a rule steps while an agent acts on them.
-
-    A `context` is what `episode_context` returned for the worlds' current episodes: a named tuple
-    of tensors, [B, ...], that observations and rewards need besides the particles.
-    """
-
-    worlds_type: ClassVar[type[BatchedWorlds] | None] = RuleDrivenWorlds
-
-    def step(
-        self, x: Tensor, s: Tensor, action: Tensor, random: WorldRandom
-    ) -> tuple[Tensor, Tensor]:
-        """Return positions and states after the action and the steps of the rule."""
-        raise NotImplementedError
-
-    def observe(self, particles: Particles, loss: Tensor, context: Any) -> Tensor:
-        """Return observations, [B, O]; `loss`, [B], is that of the particles."""
-        raise NotImplementedError
-
-    def episode_context(self, start: Start, loss: Tensor, random: WorldRandom) -> Any:
-        """Return the `context` of B episodes that begin; `loss`, [B], are the losses of `start`."""
-        raise NotImplementedError
-
-    def reward(self, particles: Particles, loss: Tensor, context: Any) -> Tensor:
-        """Return the rewards of a step, [B]; particles and losses, [B], are those after it."""
-        raise NotImplementedError
-
-    def next_goals(self, elapsed: Tensor, context: Any, goal: Tensor) -> None:
-        """Change `goal`, [B], in place after step `elapsed`, [B], of episodes; by default not."""
-
-    def context_info(self, particles: Particles, context: Any) -> dict[str, Tensor]:
-        """Return what the task adds to infos, by name, [B, ...] each; by default nothing."""
-        return {}
-
-
 def coarse(pictures: Tensor, size: int) -> Tensor:
-    """Return pictures, [B, R, R, channels], as observations: means over squares of pixels."""
+    """Return pictures, [B, R, R, channels], as coarse observations, [B, channels size²]."""
     pixels = pictures.shape[1] // size
     observed = F.avg_pool2d(pictures.permute(0, 3, 1, 2), pixels).flatten(1)
     return observed.clamp(-OBSERVATION_LIMIT, OBSERVATION_LIMIT)
 
 
 class StartLosses(NamedTuple):
-    """The `context` of gardens: losses of the grown pictures at the start of B episodes."""
+    """The `context` of B episodes in gardens: losses of the grown pictures they start from."""
 
     intact_loss: Tensor
     """Loss of the intact picture, shape [B]."""
-
     rise: Tensor
-    """Rise of this loss if the picture turns grey, shape [B]."""
+    """How much more the loss of the same picture is with all states 0, grey, shape [B]."""
 
 
 class GardenTask(RuleDrivenTask[Config], GrownTask[Config]):
-    """A grown picture that its rule keeps stepping; `step` is differentiable in the action."""
+    """Base class of tasks with brushes on a grown picture, which its rule keeps stepping."""
 
     config_type: ClassVar[type[GardenConfig]] = GardenConfig
     spaces_type: ClassVar[Any] = BrushSpaces
@@ -235,14 +104,14 @@ class GardenTask(RuleDrivenTask[Config], GrownTask[Config]):
 
     @classmethod
     def bytes_per_world(cls, config: Any) -> int:
-        """Return about how much memory the loss and the brushes of one world take [bytes]."""
+        """Return about how much memory the loss and the brushes of one world need [bytes]."""
         values = VALUES_PER_PLACE * config.place_count**2 * config.particle_count
         return super().bytes_per_world(config) + 3 * 4 * int(values)
 
     def step(
         self, x: Tensor, s: Tensor, action: Tensor, random: WorldRandom
     ) -> tuple[Tensor, Tensor]:
-        """Return positions and states after a step: brushes, rule, `disturb`; differentiable."""
+        """Return x and s after brushes, steps of the rule and `disturb`; differentiable."""
         rolled = self.brush_and_roll(Particles(x, s), action, random)
         x, s, *_ = self.disturb(rolled, random)
         return x, s
@@ -266,23 +135,23 @@ class GardenTask(RuleDrivenTask[Config], GrownTask[Config]):
         return particles
 
     def disturb(self, particles: Particles, random: WorldRandom) -> Particles:
-        """Return worlds after the disturbances at the end of a step; by default none."""
+        """Return worlds after disturbances, which end a step; by default there are none."""
         return particles
 
     def episode_context(self, start: Start, loss: Tensor, random: WorldRandom) -> Any:
-        """Return each grown picture's loss, and its rise if all states were 0: a grey picture."""
-        blank = torch.zeros_like(start.s)
-        grey = sum(self.losses(start.x, blank).values(), torch.zeros_like(loss))
+        """Return for rewards the losses of the grown pictures, as they are and as if grey."""
+        zeros = torch.zeros_like(start.s)
+        grey = sum(self.losses(start.x, zeros).values(), torch.zeros_like(loss))
         # The loss of a picture that did not grow may not rise at all.
-        return StartLosses(loss, (grey - loss).maximum(MIN_RISE * loss))
+        return StartLosses(loss, (grey - loss).maximum(MIN_GREY_RISE * loss))
 
     def lost_fraction(self, loss: Tensor, context: Any) -> Tensor:
-        """Return each picture's lost fraction, [B]: 0 as at its start, 1 as with all states 0."""
+        """Return lost fractions, [B]: 0 for the loss at the start, 1 for that of a grey picture."""
         fraction: Tensor = (loss - context.intact_loss) / context.rise
         return fraction
 
     def middle(self, x: Tensor) -> Tensor:
-        """Return the origin of the brushes: the mean position minus the target's, [B, 2]."""
+        """Return the origin of the places: particles' mean position minus the target's, [B, 2]."""
         return world_mean(x) - self.task.target.points.mean(dim=0)
 
     def observe(self, particles: Particles, loss: Tensor, context: Any) -> Tensor:
@@ -296,14 +165,14 @@ class GardenTask(RuleDrivenTask[Config], GrownTask[Config]):
         return observed.clamp(-OBSERVATION_LIMIT, OBSERVATION_LIMIT)
 
     def observed_picture(self, particles: Particles) -> Tensor:
-        """Return pictures, [B, R, R, 4]; with `observe_error` also the target's minus them."""
+        """Return pictures, [B, R, R, 4]; with `observe_error` then target minus picture, 8."""
         picture = self.task.picture(particles.x, particles.s)
         if not self.config.observe_error:
             return picture
         return torch.cat((picture, self.task.target_picture - picture), dim=-1)
 
     def moments(self, particles: Particles) -> Tensor:
-        """Return `moments_of` x, then means of s, x s, y s (x, y from the mean), [B, 5 + 3 C]."""
+        """Return `moments_of` x, and means of s, x s, y s; x, y from the mean, [B, 5 + 3 C]."""
         x, s, *_ = particles
         away = x - world_mean(x)[:, None]
         values = torch.cat((s, away[..., :1] * s, away[..., 1:] * s), dim=-1)
@@ -319,7 +188,7 @@ def moments_of(x: Tensor) -> Tensor:
 
 
 class GardenEnv(NPAEnv):
-    """One rule-driven world as a Gymnasium environment; subclasses set `task_type`.
+    """Base class of one garden as a Gymnasium environment; subclasses set `task_type`.
 
     The page of each subclass has the sections below, each after its own section of the same name.
 
@@ -357,7 +226,7 @@ class GardenEnv(NPAEnv):
     | 1 a channel, of `"inject"` | change of the state | `state_scale` | s ← s + w `state_scale` a |
     | 1, of `"rate"` | speed of the rule | twice as fast | steps of the rule count 1 + w a times |
 
-    `tools` chooses the columns; the default is `"push"` alone. `"inject"` has one column for each
+    `tools` chooses the columns; the default is only `"push"`. `"inject"` has one column for each
     of `inject_channels`. w = (1 − r²)² at r brush radii from the brush, and 0 outside. The wiped
     fraction is clipped to [0, 1], rates to [0, 2], actions to [-1, 1]. An action that is not finite
     raises `NPAError` and does not change the world. `env.unwrapped.task.step(x, s, action, random)`
@@ -380,7 +249,7 @@ class GardenEnv(NPAEnv):
     | `loss_density`, `loss_colour` | reset, step | the terms of the loss |
     | `reward_density`, `reward_colour` | step | decrease of each term in this step |
     | `success`, `diverged` | step | whether the world succeeded or diverged in it, bool |
-    | `reason` | last step | why the episode ended, see above; None for worlds that go on |
+    | `reason` | last step | why the episode ended, see above; None for other worlds |
 
     ## Vectorized environment
 

@@ -13,7 +13,8 @@ from torch import Tensor
 from npa_envs import world_mean
 from npa_envs.checks import check_field, check_flag, check_positive, is_whole
 from npa_envs.envs.core.base import ParticleSpaces, batch_tensor
-from npa_envs.envs.grown_worlds import GrownConfig, check_rule_driven
+from npa_envs.envs.core.config import check_picture_size
+from npa_envs.envs.trained_rules import OF_PARTICLES, GrownConfig
 from npa_envs.errors import NPAError, shown
 from npa_envs.world.brushes import offsets_from, softness
 from npa_envs.world.environment_steps import Physics
@@ -23,20 +24,21 @@ OBSERVATION_LIMIT = 8.0
 """Observations are clipped to plus and minus this (dimensionless, or length units)."""
 
 VALUES_PER_PLACE = 6
-"""Observed values at a place of the grid: count, x, y, red, green, blue."""
+"""Number of values observed at a place of the grid: count, x, y, red, green, blue."""
 
 BrushActions = Literal["grid", "free", "discrete"]
 Observe = Literal["grid", "picture", "moments"]
 GardenReward = Literal["dense", "sparse"]
 
-TOOLS = ("push", "wipe", "inject", "rate")
-"""Effects that a brush can have."""
+BRUSH_TOOLS = ("push", "wipe", "inject", "rate")
+"""Effects that a brush of an agent can have."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class GardenConfig(GrownConfig):
-    """`GrownConfig` with the brushes and the form of observations."""
+    """`GrownConfig` with the brushes of agents and what is observed."""
 
+    fixed = GrownConfig.fixed | OF_PARTICLES
     choices = GrownConfig.choices | {
         "reward": get_args(GardenReward),
         "actions": get_args(BrushActions),
@@ -48,7 +50,6 @@ class GardenConfig(GrownConfig):
 
     target: str = "heart"
     particle_count: int = 512
-
     resolution: int = 32
     seed_pool: int = 16
 
@@ -102,11 +103,11 @@ class GardenConfig(GrownConfig):
         check_positive(self, int, "rule_steps", "brush_count", "strength_count", "picture_size")
         check_positive(self, int, "place_count", at_least=2)
         check_positive(self, float, "brush_radius", "push_length", "place_reach")
-        check_rule_driven(self)
+        check_picture_size(self)
         check_flag(self, "observe_error")
         tools, channels, count = self.tools, self.inject_channels, self.state_dim
-        known = isinstance(tools, tuple) and tools == tuple(t for t in TOOLS if t in tools)
-        rule = f"be some of {TOOLS}, in this order"
+        known = isinstance(tools, tuple) and tools == tuple(t for t in BRUSH_TOOLS if t in tools)
+        rule = f"be some of {BRUSH_TOOLS}, in this order"
         check_field(self, "tools", known and bool(tools), rule, "try ('push',)")
         whole = isinstance(channels, tuple) and bool(channels) and all(map(is_whole, channels))
         differ = whole and len({channel % count for channel in channels}) == len(channels)
@@ -116,12 +117,12 @@ class GardenConfig(GrownConfig):
         check_field(self, "inject_channels", exist, rule, hint)
 
 
-DIRECTIONS = ((1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1))
+PUSH_DIRECTIONS = ((1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1))
 """Directions of pushes of the "discrete" form."""
 
 
 class BrushLayout(NamedTuple):
-    """Columns of each tool in a brush's row of an action; empty for tools that are not used."""
+    """Columns of the place and of each tool in a brush's row of an action; empty if not used."""
 
     place: slice
     push: slice
@@ -132,7 +133,7 @@ class BrushLayout(NamedTuple):
 
     @classmethod
     def for_config(cls, config: GardenConfig) -> BrushLayout:
-        """Return the columns for a configuration; brushes of a grid have none for their place."""
+        """Return the columns for a configuration; brushes of the grid have no columns of places."""
         widths = {"place": 0 if config.actions == "grid" else 2}
         widths |= {"push": 2, "wipe": 1, "inject": len(config.inject_channels), "rate": 1}
         first, columns = 0, {}
@@ -143,7 +144,7 @@ class BrushLayout(NamedTuple):
 
 
 def grid_places(config: GardenConfig, device: torch.device | None = None) -> Tensor:
-    """Return the P² places of the grid [length units], from the bottom row up, shape [P², 2]."""
+    """Return the places of the grid [length units], row by row from the bottom up, [P², 2]."""
     fraction = torch.arange(config.place_count, device=device) / (config.place_count - 1)
     steps = config.place_reach * (2.0 * fraction - 1.0)
     up, across = torch.meshgrid(steps, steps, indexing="ij")
@@ -151,14 +152,14 @@ def grid_places(config: GardenConfig, device: torch.device | None = None) -> Ten
 
 
 def offsets(x: Tensor, places: Tensor, config: GardenConfig) -> Tensor:
-    """Return the vector from each place to each particle [length units], shape [B, J, N, 2]."""
+    """Return the vectors from `places`, [B, J, 2], to `x`, [B, N, 2], shape [B, J, N, 2]."""
     spread = x[:, None].expand(-1, places.shape[1], -1, -1)
     box = None if config.periodic_box is None else (config.periodic_box, config.periodic_box)
     return offsets_from(spread.flatten(0, 1), places.flatten(0, 1), box).view(spread.shape)
 
 
 def brush_weights(away: Tensor, config: GardenConfig) -> Tensor:
-    """Return each brush's weight in [0, 1] at particles `away` from it, shape [B, J, N]."""
+    """Return each brush's weight in [0, 1], [B, J, N], at offsets `away`, [B, J, N, 2]."""
     origin = away.new_zeros(away.shape[0] * away.shape[1], 2)
     weights = softness(away.flatten(0, 1), centre=origin, radius=config.brush_radius)
     return weights.view(away.shape[:3])
@@ -169,8 +170,9 @@ def apply_brushes(
 ) -> tuple[Particles, Tensor | None]:
     """Return particles after all brushes at once, whose effects add up, and rates; differentiable.
 
-    With the tool "rate" also return by how much to multiply each particle's change in a step of
-    the rule, dimensionless, shape [B, N, 1]; else None.
+    A rate multiplies a particle's change in each step of the rule, dimensionless, [B, N, 1]; None
+    without the tool "rate". `action` has a row for each brush, [B, J, W]; `middle`, [B, 2], is the
+    origin of places.
     """
     x, s, *_ = particles
     columns, action = BrushLayout.for_config(config), action.clamp(-1.0, 1.0)
@@ -196,13 +198,13 @@ def apply_brushes(
 
 
 def tool_table(config: GardenConfig) -> Tensor:
-    """Return the actions of all choices of a "discrete" brush at full strength, [choices, W - 2].
+    """Return the tool columns of each choice of a "discrete" brush, at full strength, [choices, W].
 
     Choices: nothing; pushes in eight directions; wipe; each channel up, down; rates 0 and 2.
     """
     columns, choices = BrushLayout.for_config(config), list[tuple[slice, Tensor]]()
     if "push" in config.tools:
-        directions = torch.tensor(DIRECTIONS).float()
+        directions = torch.tensor(PUSH_DIRECTIONS).float()
         lengths = directions.square().sum(dim=1, keepdim=True).sqrt()
         choices += [(columns.push, direction) for direction in directions / lengths]
     if "wipe" in config.tools:
@@ -219,7 +221,7 @@ def tool_table(config: GardenConfig) -> Tensor:
 
 
 class BrushSpaces(ParticleSpaces):
-    """Spaces for observations of a whole world and actions of brushes, with conversions."""
+    """Spaces with one observation of a whole world and with actions of brushes."""
 
     def __init__(self, physics: Physics, config: GardenConfig) -> None:
         self._config = config
@@ -242,7 +244,7 @@ class BrushSpaces(ParticleSpaces):
             self.action_space = MultiDiscrete(self._choices * config.brush_count)
 
     def action(self, action: Any, world_count: int | None) -> Tensor:
-        """Return checked actions as rows of brushes, float32, shape [B, J, W]."""
+        """Return checked actions as a row for each brush, float32, shape [B, J, W]."""
         if self._config.actions != "discrete":
             return batch_tensor(action, world_count, self.rows_shape, "J, W")
         brushes = self._config.brush_count

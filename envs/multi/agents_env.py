@@ -1,4 +1,4 @@
-"""Base class of environments with several agents, of one world or many, and checks of actions."""
+"""Base class of environments with several agents, in one world or many; checks of actions."""
 
 from __future__ import annotations
 
@@ -20,14 +20,9 @@ from npa_envs.errors import DivergedError, NPAError, shown
 
 
 class AgentsEnv(ShownEnv):
-    """Base class of environments with several agents, of one world or many."""
+    """Base class of environments with several agents: species, or particles with `by_particle`."""
 
-    metadata: Any = {  # noqa: RUF012 (nobody writes to it)
-        "name": "npa_multispecies_v0",
-        "render_modes": ["rgb_array", "human"],
-        "render_fps": 25,
-        "is_parallelizable": True,
-    }
+    metadata = ShownEnv.metadata | {"name": "npa_multispecies_v0", "is_parallelizable": True}
     worlds: SpeciesWorlds
 
     def __init__(
@@ -62,9 +57,9 @@ class AgentsEnv(ShownEnv):
         self.np_random: np.random.Generator | None = None
 
     def _start(self, worlds: NDArray[np.int64], seed: Any, key_seed: Any) -> Tensor:
-        """Start episodes in worlds, indices [B']; return all worlds' perception, [B, N, P].
+        """Start episodes in worlds, int64 [B']; return all worlds' perception, [B, N, P].
 
-        `seed` is that of `reset`; `key_seed` seeds `np_random`, which draws keys without a seed.
+        `seed` is that of `reset`. `key_seed` seeds `np_random`, for random streams without a seed.
         """
         keys, batch = None, self.worlds
         # The first reset may have failed, so that there are no sequences of episodes yet.
@@ -91,7 +86,10 @@ class AgentsEnv(ShownEnv):
 def joined_actions(
     actions: Any, agents: Sequence[str], shapes: Sequence[tuple[int, ...]], device: torch.device
 ) -> Tensor:
-    """Return the checked actions of `agents`, joined by rows, float32, [N, A] or [B, N, A]."""
+    """Return the actions of `agents`, of these shapes, as rows of one tensor, [N, A] or [B, N, A].
+
+    Actions must be finite, and given for exactly these agents.
+    """
     if not isinstance(actions, Mapping):
         raise NPAError(
             f"actions must be a dict with an action for each live agent, got "

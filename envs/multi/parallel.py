@@ -69,7 +69,7 @@ class CrowdEnv(AgentsEnv, KnownAgents):
         return self._by_agent(observation), infos
 
     def step(self, actions: Mapping[str, Any]) -> Outcome:
-        """Apply an action of each live agent; return the results of these agents.
+        """Apply an action of each live agent; return an `Outcome` for these agents.
 
         Raises:
             NPAError: There is no world yet, or an action is missing, superfluous, or of another
@@ -106,12 +106,12 @@ class CrowdEnv(AgentsEnv, KnownAgents):
         return self._out(self._state()[0])
 
     def particles(self) -> tuple[Tensor, Tensor]:
-        """Return copies of positions [length units], [N', 2], and states, [N', C]; N' are left."""
+        """Return copies of positions [length units], [N', 2], and states, [N', C]; N' remain."""
         population = self.worlds.population(0)
         return population.x[0], population.s[0]
 
     def place_particles(self, x: Any, s: Any) -> dict[str, Any]:
-        """Replace `particles`, [N', 2] and [N', C], without a reward; return the observations."""
+        """Replace what `particles` returns, without a reward; return all agents' observations."""
         if not self.agents:
             raise NPAError("particles need live agents: call reset first")
         with self.worlds.device_context():
@@ -124,7 +124,7 @@ class CrowdEnv(AgentsEnv, KnownAgents):
         self.agents = [self.possible_agents[k] for k in self._live]
 
     def _with_zeros(self, action: Tensor) -> Tensor:
-        """Return all particles' actions, [1, N, A]: the live agents', [N', A], else zeros."""
+        """Return all particles' actions, [1, N, A], from the live agents', [N', A], and zeros."""
         count = self.worlds.particle_count
         if len(action) == count:
             return action[None]
@@ -134,7 +134,7 @@ class CrowdEnv(AgentsEnv, KnownAgents):
         return all_rows
 
     def _infos(self, numbers: dict[str, Tensor]) -> Infos:
-        """Return the infos of live agents, with their species and `numbers`, [1, M] each."""
+        """Return infos of live agents: their species, and theirs of `numbers`, [1, M] each."""
         rows = torch.stack(list(numbers.values()))[:, 0].tolist()
         columns = dict(zip(numbers, rows, strict=True))
         species = self.worlds.agent_species
@@ -144,7 +144,7 @@ class CrowdEnv(AgentsEnv, KnownAgents):
         }
 
     def _by_agent(self, observation: Tensor) -> dict[str, Any]:
-        """Split the perception of all particles, [1, N, P], into the `agents`' observations."""
+        """Return each live agent's observation from all particles' perception, [1, N, P]."""
         rows, spans = self._out(observation[0]), self.worlds.spans
         return {
             agent: rows[spans[k].start] if self.worlds.by_particle else rows[spans[k]]
@@ -155,14 +155,14 @@ class CrowdEnv(AgentsEnv, KnownAgents):
 def in_turns(
     parallel_env: Callable[Arguments, KnownAgents],
 ) -> tuple[Callable[Arguments, Any], Callable[Arguments, Any]]:
-    """Return functions `raw_env` and `env`, whose agents act in turn, for a `parallel_env`."""
+    """Return functions `raw_env` and `env` for a `parallel_env`; their agents act in turn."""
 
     def raw_env(*args: Arguments.args, **config: Arguments.kwargs) -> Any:
-        """Return `parallel_env` with agents that act in turn; a step runs after the last one."""
+        """Return `parallel_env` with agents that act in turn; the world steps after the last."""
         return parallel_to_aec(parallel_env(*args, **config))
 
     def env(*args: Arguments.args, **config: Arguments.kwargs) -> Any:
-        """Return `raw_env` in a checked order, with actions clipped into spaces that are boxes."""
+        """Return `raw_env` with a check of the order, and actions clipped to their box."""
         turns = raw_env(*args, **config)
         is_box = isinstance(turns.action_space(turns.possible_agents[0]), Box)
         return OrderEnforcingWrapper(ClipOutOfBoundsWrapper(turns)) if is_box else turns
@@ -171,7 +171,7 @@ def in_turns(
 
 
 def register(name: str, module: str, keywords: dict[str, Any]) -> None:
-    """Register an id with PettingZoo as parallel and as AEC environment, unless it is known."""
+    """Register the id `name` of functions of `module` with PettingZoo, parallel and AEC."""
     for api, function in (("parallel", "parallel_env"), ("aec", "env")):
         # PettingZoo before 1.27 has no registries.
         if name not in getattr(pettingzoo, f"{api}_registry", {name}):

@@ -20,10 +20,10 @@ from npa_envs.world.randomness import StreamId, WorldRandom
 
 
 class MixingTask(SpeciesTask):
-    """Mix the species: a particle's loss is 1 minus the entropy of species around it."""
+    """The task of mixing species: a particle's loss is 1 minus the entropy of species around it."""
 
     def losses(self, population: Population) -> Mapping[str, Tensor]:
-        """Return each species' mean of its particles' losses, by name, shape [B, S]."""
+        """Return the mean loss of each species' particles, by name, shape [B, S]."""
         spans = [population.spans[k] for k in _present(population)]
         return {
             name: by_species([world_mean(loss[:, span, None])[:, 0] for span in spans], population)
@@ -71,7 +71,7 @@ class SegregationConfig(SpeciesConfig):
 
 
 class SegregationTask(MixingTask):
-    """Separate the species: a particle's loss is the entropy of species around it."""
+    """The task of separating species: a particle's loss is the entropy of species around it."""
 
     config_type = SegregationConfig
 
@@ -80,16 +80,15 @@ class SegregationTask(MixingTask):
         return {"mixture": self._entropy(population)}
 
 
-USUAL = ("gecko", "heart", "butterfly", "flower", "octopus", "ring")
-"""Default targets of species 0, 1, ..., repeated."""
+DEFAULT_TARGETS = ("gecko", "heart", "butterfly", "flower", "octopus", "ring")
+"""Default targets of species 0, 1, ...; the first one follows the last."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PictureLossConfig(SpeciesConfig):
-    """`SpeciesConfig` with the loss of `Morphogenesis2DConfig`, which documents the fields."""
+    """`SpeciesConfig` with fields of the loss, which `Morphogenesis2DConfig` documents."""
 
     task_config_type = Morphogenesis2DConfig
-
     resolution: int = 64
     sigma: float = Morphogenesis2DConfig.sigma
     colour_weight: float = Morphogenesis2DConfig.colour_weight
@@ -100,7 +99,7 @@ class PictureLossConfig(SpeciesConfig):
         _ = self.task_config()
 
     def task_config(self, particle_count: int = 1, **changes: Any) -> Morphogenesis2DConfig:
-        """Return the training task's configuration for a number of particles, with `changes`."""
+        """Return the training task's configuration for so many particles, with `changes`."""
         counts = {"target_point_count": particle_count, "particle_count": particle_count}
         return self.as_config(Morphogenesis2DConfig, **counts, **changes)
 
@@ -113,7 +112,7 @@ class OnePictureConfig(PictureLossConfig):
 
 
 class PictureLossTask(SpeciesTask):
-    """Pictures to grow, each compared by the splat loss of `npa_envs.tasks.morphogenesis2d`."""
+    """Base class: the task of growing `pictures`, each a target and its number of particles."""
 
     def __init__(self, config: Any, device: torch.device, *pictures: tuple[str, int]) -> None:
         super().__init__(config, device)
@@ -121,12 +120,12 @@ class PictureLossTask(SpeciesTask):
             Morphogenesis2D(config.task_config(count, target=target), device=device)
             for target, count in pictures
         ]
-        """Training tasks, with target and loss, of each picture."""
+        """Training task of each picture, with its target and loss."""
         self.task = self.tasks[0]
         """The first of them, whose target scripted policies use."""
 
     def picture_terms(self, k: int, x: Tensor, s: Tensor) -> dict[str, Tensor]:
-        """Return density error and weighted colour error against picture k, shape [B] each."""
+        """Return density error and weighted colour error from target k, by name, [B] each."""
         density, colour = self.tasks[k].splat_losses(x, s)
         return {"density": density, "colour": self.config.colour_weight * colour}
 
@@ -137,13 +136,13 @@ class PictureLossTask(SpeciesTask):
 
     @property
     def open_half_width(self) -> float:
-        """Half a picture's side in open space [length units]: holds a target around each seed."""
+        """Half of a picture's side in open space [length units]; each start's target fits in."""
         return float(1.0 + 0.5 * (self.config.species_count - 1) * self.config.seed_distance)
 
 
 @dataclass(frozen=True, kw_only=True)
 class CoMorphogenesisConfig(PictureLossConfig):
-    """`PictureLossConfig` with a target for each species, and the distance of their seeds."""
+    """`PictureLossConfig` with a target for each species."""
 
     targets: tuple[str, ...] = ()
     """Target of each species: built-in names (`npa-envs list`), emoji, or paths of pictures; empty:
@@ -159,20 +158,20 @@ class CoMorphogenesisConfig(PictureLossConfig):
         named = isinstance(names, tuple) and all(isinstance(n, str) and n for n in names)
         fits = not names or (named and len(names) == count)
         rule = f"be {count} names, emoji or paths, one for each of species_count = {count}"
-        check_field(self, "targets", fits, rule, f"for example targets={self._usual}")
+        check_field(self, "targets", fits, rule, f"for example targets={self._default_targets}")
 
     @property
     def target_names(self) -> tuple[str, ...]:
-        """Target of each species: `targets`, or the usual ones if that is empty."""
-        return self.targets or self._usual
+        """Target of each species: `targets`, or default ones if that is empty."""
+        return self.targets or self._default_targets
 
     @property
-    def _usual(self) -> tuple[str, ...]:
-        return tuple(USUAL[k % len(USUAL)] for k in range(self.species_count))
+    def _default_targets(self) -> tuple[str, ...]:
+        return tuple(DEFAULT_TARGETS[k % len(DEFAULT_TARGETS)] for k in range(self.species_count))
 
 
 class CoMorphogenesisTask(PictureLossTask):
-    """A splat loss for each species, of its own particles against its own target."""
+    """The task of growing a picture from each species, of its own target."""
 
     config_type = CoMorphogenesisConfig
     least_species = 1
@@ -195,9 +194,10 @@ class CoMorphogenesisTask(PictureLossTask):
 
 @dataclass(frozen=True, kw_only=True)
 class InvasionConfig(OnePictureConfig):
-    """`OnePictureConfig` and `opponent`, who acts for invaders; `reward` must be "individual"."""
+    """`OnePictureConfig` with what acts for the invaders, which are all species but 0."""
 
     choices = OnePictureConfig.choices | {"opponent": (None, "random")}
+    fixed = OnePictureConfig.fixed | {"reward": "in invasion, where the sum of all rewards is zero"}
 
     opponent: str | None = None
     """Who acts for the invaders: None: agents; "random": the environment, with actions uniform in
@@ -208,15 +208,9 @@ class InvasionConfig(OnePictureConfig):
         """Particles of each species that agents control."""
         return self.counts if self.opponent is None else self.counts[:1]
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        rule = "be 'individual' in invasion"
-        hint = "the sum of all rewards is zero, so there is nothing to share"
-        check_field(self, "reward", self.reward == "individual", rule, hint)
-
 
 class InvasionTask(PictureLossTask):
-    """Species 0 grows a picture (splat loss); invaders get equal parts of minus its reward."""
+    """Species 0 grows a picture; the others, invaders, share minus its reward in equal parts."""
 
     config_type = InvasionConfig
 
@@ -224,7 +218,7 @@ class InvasionTask(PictureLossTask):
         super().__init__(config, device, (config.target, config.counts[0]))
 
     def losses(self, population: Population) -> Mapping[str, Tensor]:
-        """Return the terms of the losses by name, [B, S]; invaders share minus species 0's loss."""
+        """Return the terms of losses by name, [B, S]; invaders share minus that of species 0."""
         invaders = population.counts[1:]
         present = max(sum(count > 0 for count in invaders), 1)
         return {
@@ -233,7 +227,7 @@ class InvasionTask(PictureLossTask):
         }
 
     def particle_losses(self, population: Population) -> Mapping[str, Tensor]:
-        """Return losses by name, [B, N]: all invaders' are equal, and a world's losses sum to 0."""
+        """Return losses by name, [B, N]; invaders have equal ones, and a world's sum is 0."""
         losses = self.task.particle_contributions(*population.of(0))
         count, invader_count = losses.shape[1], sum(population.counts[1:])
         part = world_mean(losses[..., None])[:, 0] * (-count / max(invader_count, 1))
@@ -247,7 +241,7 @@ class InvasionTask(PictureLossTask):
         return torch.where((population.species > 0)[:, None], drawn, action)
 
     def final_rewards(self, rewards: Tensor, live: Tensor, species: Tensor) -> Tensor:
-        """Return rewards, [B, M]: live invaders lose in equal parts what species 0 gains."""
+        """Return rewards, [B, M]: `live` invaders lose in equal parts what species 0 gains."""
         invading = species > 0
         gained = torch.where(invading, 0.0, rewards).sum(dim=1, keepdim=True)
         payers = live & invading
@@ -275,7 +269,7 @@ class SymbiosisTask(PictureLossTask):
         super().__init__(config, device, (config.target, sum(config.counts)))
 
     def losses(self, population: Population) -> Mapping[str, Tensor]:
-        """Return density error and weighted colour error by name, [B, S]: species have the same."""
+        """Return density error and weighted colour error by name, [B, S], equal for all species."""
         terms = self.picture_terms(0, population.x, population.s)
         count = len(population.counts)
         return {name: loss[:, None].expand(-1, count) for name, loss in terms.items()}
@@ -293,7 +287,7 @@ def _present(population: Population) -> list[int]:
 
 
 def by_species(losses: list[Tensor], population: Population) -> Tensor:
-    """Return losses of the present species as one tensor, shape [B, S], 0 for the others."""
+    """Return the losses of species with particles, [B] each, as [B, S], 0 for the others."""
     present, zeros = iter(losses), population.x.new_zeros(len(population.x))
     return torch.stack([next(present) if n else zeros for n in population.counts], dim=1)
 
@@ -311,11 +305,11 @@ SETTINGS: dict[str, tuple[str, Mapping[str, Any]]] = {
     **{name: (task, {}) for name, task in SPECIES.items()},
     **{size.id: (size.task, size.keywords) for size in SPECIES_SIZES},
 }
-"""Name and keywords of a task by all ids."""
+"""Name and keywords of the task of each id."""
 
 
 def task_settings(name: str) -> tuple[str, dict[str, Any]]:
-    """Return the task and the keywords that an id stands for; a task's name has no keywords."""
+    """Return a task's name and keywords for its name, without keywords, or for an id."""
     task, keywords = SETTINGS.get(name, (name, {})) if isinstance(name, str) else (name, {})
     return task, dict(keywords)
 

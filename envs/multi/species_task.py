@@ -1,4 +1,4 @@
-"""Tasks of several species: configuration, population, losses, pictures."""
+"""Base classes of tasks of several species: configuration, population, losses, pictures."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ SpeciesOnDivergence = Literal["terminate", "raise", "ignore"]
 SPECIES_STYLE = "species"
 """Style of pictures that draws each species in its own colour."""
 
-MAX_COUNT = 64
-"""Largest number of species."""
+MAX_SPECIES = 64
+"""Maximum number of species."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SpeciesConfig(WorldConfig):
-    """Fields of all tasks of several species; a task adds its own."""
+    """Configuration fields of all tasks of several species; each task adds its own."""
 
     choices = WorldConfig.choices | {
         "perception": get_args(Perception),
@@ -91,7 +91,7 @@ class SpeciesConfig(WorldConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_positive(self, int, "max_cycles")
-        check_positive(self, int, "species_count", at_most=MAX_COUNT)
+        check_positive(self, int, "species_count", at_most=MAX_SPECIES)
         self._check_counts()
         check_positive(self, float, "seed_radius")
         check_non_negative(self, "seed_distance")
@@ -104,7 +104,7 @@ class SpeciesConfig(WorldConfig):
             )
 
     def interface(self, physics: Physics) -> Interface:
-        """Return the meaning of the columns, those of each species' density included."""
+        """Return what each column of observations and of actions means, also by species."""
         count = self.species_count if self.perception == "per_species" else 0
         return super().interface(physics)._replace(species_count=count)
 
@@ -123,12 +123,12 @@ class SpeciesConfig(WorldConfig):
 
     @property
     def seed_span(self) -> float:
-        """Largest distance from the origin at which particles start [length units]."""
+        """Maximum distance from the origin at which particles start [length units]."""
         return self.seed_radius + 0.5 * (self.species_count - 1) * self.seed_distance
 
     @classmethod
     def from_keywords(cls, keywords: dict[str, Any]) -> Self:
-        """As `WorldConfig.from_keywords`; refuse `particle_count` next to `particle_counts`."""
+        """Return a configuration with `keywords` as fields; only one gives particle counts."""
         if "particle_count" in keywords and as_python(keywords.get("particle_counts")):
             raise NPAError(
                 "particle_count and particle_counts exclude each other: "
@@ -163,17 +163,14 @@ class SpeciesConfig(WorldConfig):
 
 
 class Population(NamedTuple):
-    """Particles of B worlds, sorted by species; if agents were removed, the same in every world."""
+    """Particles of B worlds, sorted by species; removed particles are the same in all worlds."""
 
     x: Tensor
     """Positions [length units], shape [B, N, 2]."""
-
     s: Tensor
     """States, dimensionless, shape [B, N, C]."""
-
     counts: tuple[int, ...]
-    """Remaining particles of each species in each world, on the host."""
-
+    """Remaining particles of each species in a world."""
     species: Tensor
     """Species of each particle, int64, shape [N]."""
 
@@ -190,19 +187,19 @@ class Population(NamedTuple):
 
 
 class SpeciesTask(WorldTask[Any]):
-    """A task of several species; an agent's reward is the decrease of its loss in a step."""
+    """Base class of tasks of several species; an agent's reward is its loss's decrease."""
 
     config_type: ClassVar[type[SpeciesConfig]] = SpeciesConfig
     controls = "species"
 
     least_species: ClassVar[int] = 2
-    """Smallest number of species."""
+    """Minimum number of species."""
 
     def __init__(self, config: Any, device: torch.device) -> None:
         if config.species_count < self.least_species:
             raise NPAError(
                 f"species_count must be at least {self.least_species} in this task, got "
-                f"{config.species_count}: one species alone has no task here"
+                f"{config.species_count}: one species has no task here"
             )
         super().__init__(config, device)
         middle = 0.5 * (config.species_count - 1)
@@ -212,7 +209,7 @@ class SpeciesTask(WorldTask[Any]):
         self._shift = torch.tensor(centres).repeat_interleave(counts).to(device)
 
     def start(self, random: WorldRandom) -> tuple[Tensor, Tensor]:
-        """Return positions and states of fresh worlds: a disk of blank particles per species."""
+        """Return positions and states of new worlds: a disk of particles for each species."""
         config = self.config
         shape = random.world_count, sum(config.counts)
         x = uniform_ball(*shape, 2, config.seed_radius, generator=random, device=self.device)
@@ -220,7 +217,7 @@ class SpeciesTask(WorldTask[Any]):
         return x, x.new_zeros(*shape, config.state_dim)
 
     def losses(self, population: Population) -> Mapping[str, Tensor]:
-        """Return the terms of each species' loss by name, shape [B, S] each; their sum is its loss.
+        """Return the terms of each species' loss by name, [B, S] each; their sum is its loss.
 
         The losses of a world must not depend on the others, and nothing may synchronise. Losses of
         removed species are not read.
@@ -232,11 +229,11 @@ class SpeciesTask(WorldTask[Any]):
         raise NotImplementedError
 
     def with_opponent(self, action: Tensor, population: Population, random: WorldRandom) -> Tensor:
-        """Return `action`, [B, N, A]; a task with an opponent replaces its particles' rows."""
+        """Return `action`, [B, N, A], with the rows of an opponent's particles; by default none."""
         return action
 
     def final_rewards(self, rewards: Tensor, live: Tensor, species: Tensor) -> Tensor:
-        """Return `rewards`, [B, M], which a task may change; by default unchanged."""
+        """Return rewards, [B, M], which a task may change for `live` agents, [B, M]."""
         return rewards
 
     def is_over(self, counts: tuple[int, ...]) -> bool:
@@ -245,16 +242,16 @@ class SpeciesTask(WorldTask[Any]):
 
     @property
     def pixel_size(self) -> float:
-        """Size of a particle in pictures: the spacing of all of them in the unit disk."""
+        """Size of a particle in pictures: the spacing of all particles in the unit disk."""
         return math.sqrt(math.pi / sum(self.config.counts))
 
     @property
     def open_half_width(self) -> float:
-        """Half a rendered picture's side in open space [length units]; if below 1, 1 is used."""
+        """Half of a picture's side in open space [length units], raised to 1 if it is less."""
         return 1.25 * float(self.config.seed_span)
 
     def draw(self, population: Population) -> NDArray[np.uint8]:
-        """Return a picture of each world, shape [B, R, R, 3]; white without particles."""
+        """Return a picture of each world, uint8, [B, R, R, 3]; white without particles."""
         config, x, s = self.config, population.x, population.s
         if x.shape[1] == 0:
             return np.full((len(x), config.render_size, config.render_size, 3), 255, np.uint8)

@@ -1,4 +1,4 @@
-"""Worlds of several species: episodes, rewards, and removal of agents' particles.
+"""Worlds of several species, as a batch: episodes, agents' rewards, and removal of particles.
 
 A single world is a batch of one. Results of a world do not depend on the others, bit for bit.
 """
@@ -31,40 +31,35 @@ from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import WorldRandom
 
 LossTerms = dict[str, Tensor]
-"""Terms of every agent's loss by name, shape [B, M] each."""
+"""Terms of all M agents' losses by name, shape [B, M] each."""
 
-REMOVED, LEFT, NO_OPPONENT = 1, 2, 3
-"""Causes that terminate an agent's episode; 0: none."""
-REASONS = np.array([None, "removed", "left the world", "no opponent", "time limit"], dtype=object)
-"""`info["reason"]` for each cause; the last one is for truncated worlds."""
+REMOVED, LEFT, NO_OPPONENT, TIME_LIMIT = 1, 2, 3, 4
+"""Causes that end an agent's episode; the last one truncates it. 0: none."""
+AGENT_REASONS = np.array((None, "removed", "left the world", "no opponent", "time limit"), object)
+"""`info["reason"]` for each cause."""
 
 
 class AgentOutcome(NamedTuple):
-    """Results of a step for all agents of all worlds."""
+    """Results of a step for all M agents of B worlds."""
 
     observation: Tensor
-    """Perception of all particles, [B, N, P]; the last one of agents that ended."""
-
+    """Perception of all particles, [B, N, P]; of agents that ended in the step, their last."""
     rewards: Tensor
     """Rewards, 0 for agents that did not act, float64, shape [B, M]."""
-
     numbers: dict[str, Tensor]
     """Losses, their terms, and the decrease of each term, float64, shape [B, M] each."""
-
     acted: NDArray[np.bool_]
     """Whether each agent acted in this step, shape [B, M]."""
-
     endings: NDArray[np.uint8]
     """Cause that terminated each agent's episode, 0 for none, shape [B, M]."""
-
     truncated: NDArray[np.bool_]
     """Whether each world is truncated, shape [B]."""
 
     @property
     def reasons(self) -> NDArray[Any]:
         """`info["reason"]` of agents whose episodes ended in this step, else None, [B, M]."""
-        truncated = np.where(self.acted & self.truncated[:, None], len(REASONS) - 1, 0)
-        return REASONS[np.where(self.endings > 0, self.endings, truncated)]
+        truncated = np.where(self.acted & self.truncated[:, None], TIME_LIMIT, 0)
+        return AGENT_REASONS[np.where(self.endings > 0, self.endings, truncated)]
 
 
 class AgentReturns:
@@ -80,50 +75,52 @@ class AgentReturns:
         zeros = torch.zeros(shape, dtype=torch.float64, device=species.device)
         self.loss = zeros
         """Every agent's loss, float64, shape [B, M]."""
-        self._terms = self._before = zeros[None]
-        self._at_start = self._carried = zeros
+        self._terms = self._terms_before = zeros[None]
+        self._start_loss = zeros
+        self._unrewarded = zeros
+        """Changes of each loss in its episode that gave no reward, float64, shape [B, M]."""
 
     def begin(self, terms: LossTerms, worlds: Tensor) -> None:
-        """Begin episodes in worlds of int64 indices [B']; `terms`: of the first losses, [B', M]."""
+        """Begin episodes in worlds, int64 [B']; `terms`: of the first losses, [B', M] each."""
         first = _stacked(terms)
         if not self.term_names:
             self.term_names = tuple(terms)
-            self._terms = self._before = self.loss.expand(len(terms), -1, -1)
+            self._terms = self._terms_before = self.loss.expand(len(terms), -1, -1)
         loss = total(first)
         self._terms = self._terms.index_copy(1, worlds, first)
-        self._before = self._before.index_copy(1, worlds, first)
+        self._terms_before = self._terms_before.index_copy(1, worlds, first)
         self.loss = self.loss.index_copy(0, worlds, loss)
-        self._at_start = self._at_start.index_copy(0, worlds, loss)
-        self._carried = self._carried.index_fill(0, worlds, 0.0)
+        self._start_loss = self._start_loss.index_copy(0, worlds, loss)
+        self._unrewarded = self._unrewarded.index_fill(0, worlds, 0.0)
 
     def replace(self, terms: LossTerms) -> None:
-        """Replace the losses without a reward, after particles were removed or placed."""
-        self._terms = self._before = _stacked(terms)
+        """Store losses, after particles were removed or placed, without a reward."""
+        self._terms = self._terms_before = _stacked(terms)
         loss = total(self._terms)
-        self._carried = self._carried + (loss - self.loss)
+        self._unrewarded = self._unrewarded + (loss - self.loss)
         self.loss = loss
 
     def step_rewards(self, terms: LossTerms, live: Tensor, diverged: Tensor) -> Tensor:
-        """Store the losses after a step; return rewards, float64, [B, M], 0 for ended agents."""
+        """Store losses after a step; return rewards, float64, [B, M]: 0 for agents not `live`."""
         now = _stacked(terms)
         loss = total(now)
         # Leaving the world must not be rewarded, even if an empty picture is better than the start;
         # nor may it undo what a death added without a reward.
-        least = self._at_start + self._carried.clamp_min(0.0)
+        least = self._start_loss + self._unrewarded.clamp_min(0.0)
         loss = torch.where(diverged, torch.maximum(loss, least), loss)
         rewards = torch.where(live, self.loss - loss, 0.0)
         if self._team:
             agents_per_live = live.shape[1] / live.sum(dim=1).clamp_min(1)
             mean = world_mean(rewards[..., None])[:, 0] * agents_per_live
             rewards = torch.where(live, mean[:, None], 0.0)
-        self._terms, self._before, self.loss = now, self._terms, loss
+        self._terms, self._terms_before, self.loss = now, self._terms, loss
         return self._task.final_rewards(rewards, live, self._species)
 
     def loss_infos(self, *, stepped: bool = False) -> dict[str, Tensor]:
-        """Return losses and terms, and after a step their decrease, as in `info`, [B, M]."""
+        """Return losses and terms, and if `stepped` each term's decrease, as in infos, [B, M]."""
         numbers = {"loss": self.loss} | named_terms("loss", self.term_names, self._terms)
         if stepped:
-            numbers |= named_terms("reward", self.term_names, self._before - self._terms)
+            numbers |= named_terms("reward", self.term_names, self._terms_before - self._terms)
         return numbers
 
 
@@ -132,10 +129,10 @@ def _stacked(terms: LossTerms) -> Tensor:
 
 
 class SpeciesWorlds(WorldState):
-    """B worlds of a task with their agents; particles are sorted by species.
+    """B worlds of a task with their M agents; particles are sorted by species.
 
     Removed particles are not computed. Worlds with the same remaining particles are stepped
-    together, as a `Cohort`: the whole batch as long as no agent has been removed. Agents are
+    together, as a `WorldGroup`: all of them as long as no agent has been removed. Agents are
     species, or particles with `by_particle`.
     """
 
@@ -170,7 +167,7 @@ class SpeciesWorlds(WorldState):
         self.present = np.zeros_like(self.live)
         """Whether each agent's particles are in its world, shape [B, M]."""
         self.running = np.zeros(world_count, dtype=bool)
-        """Whether each world's episode goes on; the others are not stepped, shape [B]."""
+        """Whether each world's episode continues; the others are not stepped, shape [B]."""
         self.elapsed = np.zeros(world_count, dtype=np.int64)
         """Steps since the start of each episode, shape [B]."""
         device = self.device
@@ -180,15 +177,15 @@ class SpeciesWorlds(WorldState):
         """The agents' losses and rewards."""
         self._owner = to_device_async(self.owner, device)
         deaths = dict(config.deaths)
-        self._last_step = np.array([deaths.get(int(k), 0) for k in self.agent_species])
+        self._death_step = np.array([deaths.get(int(k), 0) for k in self.agent_species])
         self._side_stream = SideStream(device) if device.type == "cuda" else None
         self._host_diverged = torch.zeros(
             self.live.shape, dtype=torch.bool, device="cpu", pin_memory=device.type == "cuda"
         )
         # Its graphs are kept on CUDA: worlds return to it when their next episodes start.
         everything = np.arange(world_count), np.arange(count)
-        self._whole = Cohort(self, *everything, self.particles, self.random)
-        self._cohorts: list[Cohort] | None = None
+        self._all_worlds = WorldGroup(self, *everything, self.particles, self.random)
+        self._groups: list[WorldGroup] | None = None
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         # Pickled memory is not pinned.
@@ -199,8 +196,8 @@ class SpeciesWorlds(WorldState):
     @torch.no_grad()
     @makes_plain_tensors
     def start(self, worlds: NDArray[np.int64], keys: Tensor | None = None) -> Tensor:
-        """Start episodes in worlds, [B']; return what they perceive; keys: see `next_streams`."""
-        self._disband()
+        """Start episodes in worlds, [B']; return their perception; `keys`: as in `next_streams`."""
+        self._ungroup()
         index = to_device_async(worlds, self.device)
         random = self.next_streams(index, keys)
         x, s = self.task.start(random)
@@ -209,9 +206,9 @@ class SpeciesWorlds(WorldState):
         self.s.index_copy_(0, index, s)
         self.live[worlds] = self.present[worlds] = self.running[worlds] = True
         self.elapsed[worlds] = 0
-        population = self._whole.population._replace(x=x.contiguous(), s=s)
-        self.agent_returns.begin(self._whole.loss_terms(population), index)
-        return self._whole.perception(population)
+        population = self._all_worlds.population._replace(x=x.contiguous(), s=s)
+        self.agent_returns.begin(self._all_worlds.loss_terms(population), index)
+        return self._all_worlds.perception(population)
 
     @torch.no_grad()
     @makes_plain_tensors
@@ -223,10 +220,10 @@ class SpeciesWorlds(WorldState):
         """
         acted = self.live.copy()
         diverged = torch.zeros_like(self._host_diverged, device=self.device)
-        for cohort in self.cohorts:
-            cohort.act(action if cohort is self._whole else action[cohort.indices])
+        for group in self.groups:
+            group.act(action if group is self._all_worlds else action[group.indices])
             if self.config.on_divergence != "ignore":
-                diverged.index_copy_(0, cohort.worlds, cohort.diverged)
+                diverged.index_copy_(0, group.worlds, group.diverged)
         self.elapsed[self.running] += 1
         self._host_diverged.copy_(diverged, non_blocking=True)
         if self._side_stream is not None:
@@ -245,41 +242,41 @@ class SpeciesWorlds(WorldState):
         truncated = self.running & (self.elapsed >= self.config.max_cycles)
         self.live &= endings == 0
         if endings.any():
-            observation = self._without_ended(endings, observation)
+            observation = self._remove_ended(endings, observation)
         self.live[truncated] = False
-        self._close_deserted()
+        self._stop_finished()
         return AgentOutcome(observation, rewards, numbers, acted, endings, truncated)
 
     @torch.no_grad()
     @makes_plain_tensors
     def perception(self, *, stepped: bool = False) -> Tensor:
-        """Return what particles perceive, shape [B, N, P]; zeros where they or their world ended.
+        """Return what particles perceive, [B, N, P]; zeros where they or their world ended.
 
         `stepped`: particles are as the last step left them, so its neighbour search is reused.
         """
-        if self.cohorts == [self._whole]:
-            return self._whole.perception(stepped=stepped)
+        if self.groups == [self._all_worlds]:
+            return self._all_worlds.perception(stepped=stepped)
         perceived = self.x.new_zeros(self.world_count, self.particle_count, self.perception_dim)
-        for cohort in self.cohorts:
-            perceived[cohort.indices] = cohort.perception(stepped=stepped)
+        for group in self.groups:
+            perceived[group.indices] = group.perception(stepped=stepped)
         return perceived
 
     def loss_terms(self, *, stepped: bool = False) -> LossTerms:
-        """Return the terms of every agent's loss, float32, [B, M] each; 0 for ended agents."""
+        """Return the terms of all agents' losses, [B, M] each; `stepped`: of the last step."""
         terms: LossTerms = {}
-        for cohort in self.cohorts:
-            for name, term in (cohort.terms if stepped else cohort.loss_terms()).items():
+        for group in self.groups:
+            for name, term in (group.terms if stepped else group.loss_terms()).items():
                 if name not in terms:
                     terms[name] = term.new_zeros(self.live.shape)
-                terms[name].index_copy_(0, cohort.worlds, term)
+                terms[name].index_copy_(0, group.worlds, term)
         return terms
 
     @torch.no_grad()
     @makes_plain_tensors
     def place(self, x: Any, s: Any) -> Tensor:
         """Replace a single world's particles without a reward; return perception, [1, N, P]."""
-        (cohort,) = self.cohorts
-        population = cohort.population
+        (group,) = self.groups
+        population = group.population
         x, s = number_tensor("x", x)[None], number_tensor("s", s)[None]
         placed = self.checked_particles(x, s, 1, population.x.shape[1])
         population.x.copy_(placed.x)
@@ -288,8 +285,8 @@ class SpeciesWorlds(WorldState):
         return self.perception()
 
     def population(self, world: int) -> Population:
-        """Return the remaining particles of the world of this index."""
-        self._collect()
+        """Return the remaining particles of one world, whose index is `world`."""
+        self._copy_from_groups()
         columns = np.flatnonzero(self.present[world][self.owner])
         index = to_device_async(columns, self.device)
         particles = self.particles.map(lambda value: value[world : world + 1, index])
@@ -299,7 +296,7 @@ class SpeciesWorlds(WorldState):
     @makes_plain_tensors
     def state(self) -> Tensor:
         """Return [position; state; 1] of each particle, zeros if removed, [B, N, 2 + C + 1]."""
-        self._collect()
+        self._copy_from_groups()
         present = to_device_async(self.present[:, self.owner], self.device)[..., None]
         rows = torch.cat((self.x, self.s, present.float()), dim=-1)
         return torch.where(present, rows, 0.0)
@@ -308,18 +305,18 @@ class SpeciesWorlds(WorldState):
         """Return pictures of the first worlds, uint8, shape [count, R, R, 3]."""
         return np.concatenate([self.task.draw(self.population(k)) for k in range(count)])
 
-    def _close_deserted(self) -> None:
-        """Stop stepping worlds that have no live agent, until their next episodes start."""
-        deserted = self.running & ~self.live.any(axis=1)
-        if deserted.any():
-            self._disband()
-            self.running &= ~deserted
+    def _stop_finished(self) -> None:
+        """Stop stepping worlds without a live agent, until their next episodes start."""
+        finished = self.running & ~self.live.any(axis=1)
+        if finished.any():
+            self._ungroup()
+            self.running &= ~finished
 
     def _endings(self, diverged: NDArray[np.bool_]) -> NDArray[np.uint8]:
-        """Return the cause that terminates each agent's episode in this step, 0: none, [B, M]."""
+        """Return the cause that terminates each agent's episode in this step, or 0, [B, M]."""
         live = self.live
         endings = np.zeros(live.shape, dtype=np.uint8)
-        endings[live & (self._last_step == self.elapsed[:, None])] = REMOVED
+        endings[live & (self._death_step == self.elapsed[:, None])] = REMOVED
         endings[live & diverged] = LEFT
         staying = live & (endings == 0)
         for world in np.flatnonzero((live & ~staying).any(axis=1)):
@@ -341,10 +338,10 @@ class SpeciesWorlds(WorldState):
             "limits, or choose on_divergence='terminate'"
         )
 
-    def _without_ended(self, endings: NDArray[np.uint8], observation: Tensor) -> Tensor:
-        """Remove particles of agents that ended; return what the others perceive then."""
-        self._close_deserted()
-        self._disband()
+    def _remove_ended(self, endings: NDArray[np.uint8], observation: Tensor) -> Tensor:
+        """Remove ended agents' particles; return what the others perceive without them."""
+        self._stop_finished()
+        self._ungroup()
         self.present &= (endings != REMOVED) & (endings != LEFT)
         if not self.running.any():
             return observation
@@ -355,47 +352,47 @@ class SpeciesWorlds(WorldState):
         return torch.where(where, self.perception(), observation)
 
     @property
-    def cohorts(self) -> list[Cohort]:
-        """The worlds whose episodes go on, grouped by their remaining particles."""
-        if self._cohorts is None:
+    def groups(self) -> list[WorldGroup]:
+        """The worlds whose episodes continue, grouped by their remaining particles."""
+        if self._groups is None:
             if self.running.all() and self.present.all():
-                self._cohorts = [self._whole]
+                self._groups = [self._all_worlds]
             else:
-                self._cohorts = self._gathered()
-        return self._cohorts
+                self._groups = self._grouped()
+        return self._groups
 
     @makes_plain_tensors
-    def _gathered(self) -> list[Cohort]:
+    def _grouped(self) -> list[WorldGroup]:
         running = np.flatnonzero(self.running & self.present.any(axis=1))
         if not len(running):
             return []
-        groups, group_of = np.unique(self.present[running], axis=0, return_inverse=True)
-        cohorts = []
-        for k, present in enumerate(groups):
-            worlds = running[group_of.reshape(-1) == k]
+        patterns, pattern_of = np.unique(self.present[running], axis=0, return_inverse=True)
+        groups = []
+        for k, present in enumerate(patterns):
+            worlds = running[pattern_of.reshape(-1) == k]
             columns = np.flatnonzero(present[self.owner])
             index = to_device_async(worlds, self.device)
             indices = index[:, None], to_device_async(columns, self.device)
             particles = Particles(self.x[indices], self.s[indices])
-            cohorts.append(Cohort(self, worlds, columns, particles, self.random.take(index)))
-        return cohorts
+            groups.append(WorldGroup(self, worlds, columns, particles, self.random.take(index)))
+        return groups
 
-    def _disband(self) -> None:
-        """Copy the cohorts' particles to the batch; group the worlds again at the next use."""
-        self._collect()
-        self._cohorts = None
+    def _ungroup(self) -> None:
+        """Copy particles from the groups; the next use of `groups` makes new ones."""
+        self._copy_from_groups()
+        self._groups = None
 
-    def _collect(self) -> None:
-        """Copy the cohorts' particles and random streams to the batch."""
-        for cohort in self._cohorts or ():
-            if cohort is not self._whole:
-                self.x[cohort.indices] = cohort.population.x
-                self.s[cohort.indices] = cohort.population.s
-                self.random.put(cohort.worlds, cohort.random)
+    def _copy_from_groups(self) -> None:
+        """Copy particles and random streams from the groups to the tensors of all worlds."""
+        for group in self._groups or ():
+            if group is not self._all_worlds:
+                self.x[group.indices] = group.population.x
+                self.s[group.indices] = group.population.s
+                self.random.put(group.worlds, group.random)
 
 
-class Cohort:
-    """Worlds of a batch with the same remaining particles, stepped together, on CUDA by graphs."""
+class WorldGroup:
+    """Those of a batch's worlds that have the same particles left, stepped together."""
 
     def __init__(
         self,
@@ -411,12 +408,12 @@ class Cohort:
         self.worlds = to_device_async(worlds, device)
         self._columns = to_device_async(columns, device)
         self.indices = self.worlds[:, None], self._columns
-        """Index of the particles in tensors of the batch, [B, N, ...]."""
+        """Indices of the group's particles in tensors of all worlds, [B, N, ...]."""
         species_count = batch.config.species_count
         self.population = population_of(particles, batch.species[columns], species_count)
-        """The particles."""
+        """The group's particles."""
         self.terms: LossTerms = {}
-        """Terms of every agent's loss after the last step, shape [B', M] each."""
+        """Terms of all agents' losses after the last step, shape [B', M] each."""
         self._agent_count = len(batch.agent_species)
         self.diverged = torch.zeros(len(worlds), self._agent_count, dtype=torch.bool, device=device)
         """Which agents have no particle within bounds after the last step, shape [B', M]."""
@@ -442,7 +439,7 @@ class Cohort:
         self._evaluate_graph()
 
     def loss_terms(self, population: Population | None = None) -> LossTerms:
-        """Return the terms of every agent's loss, float32, [B', M] each; 0 for removed agents.
+        """Return the terms of all agents' losses, float32, [B', M] each; 0 for removed agents.
 
         `population`: other positions and states of the same particles; None: the current ones.
         """
@@ -457,7 +454,7 @@ class Cohort:
         }
 
     def perception(self, population: Population | None = None, *, stepped: bool = False) -> Tensor:
-        """Return their perception, [B', N', P]; `stepped`: see `SpeciesWorlds.perception`."""
+        """Return what particles perceive, [B', N', P]; arguments: of `loss_terms`, `perception`."""
         x, s, counts, _ = population or self.population
         neighbours = self._neighbours if stepped else None
         rows = (neighbours or NeighbourState(x, s, self._physics)).perceive()
@@ -481,7 +478,7 @@ class Cohort:
 def population_of(
     particles: Particles, species: NDArray[np.int64], species_count: int
 ) -> Population:
-    """Return particles as a `Population`; `species` has the species of each, int64 [N]."""
+    """Return particles as a `Population`; `species`: of each particle, int64 [N]."""
     counts = tuple(np.bincount(species, minlength=species_count).tolist())
     index = to_device_async(species, particles.x.device)
     return Population(particles.x, particles.s, counts, index)

@@ -105,7 +105,7 @@ class MultiSpeciesVectorEnv(AgentsEnv):
         return self._rows(observation), self._infos(worlds.agent_returns.loss_infos(), worlds.live)
 
     def step(self, actions: Mapping[str, Any]) -> BatchOutcome:
-        """Apply every species' actions, shape [B, N_k, A]; return a `BatchOutcome`.
+        """Apply the actions of all species, [B, N_k, A] each; return a `BatchOutcome`.
 
         Rewards are float32. Errors are those of `CrowdEnv.step`.
         """
@@ -142,7 +142,7 @@ class MultiSpeciesVectorEnv(AgentsEnv):
         return self._out(self._state())
 
     def _infos(self, numbers: dict[str, Tensor], acted: NDArray[np.bool_]) -> Infos:
-        """Return the infos of all species: `numbers`, [B, M] each, 0 where not `acted`, [B, M]."""
+        """Return all species' infos with their `numbers`, [B, M] each; 0 if not `acted`, [B, M]."""
         mask = to_device_async(acted, self.worlds.device)
         all_numbers = torch.stack(list(numbers.values())).float()
         rows = self._out(torch.where(mask, all_numbers, 0.0).movedim(2, 0).contiguous())
@@ -171,12 +171,12 @@ class MultiSpeciesVectorEnv(AgentsEnv):
         return infos
 
     def _rows(self, observation: Tensor) -> ByAgent:
-        """Split what particles perceive, [B, N, P], by agent."""
+        """Return each agent's observations, [B, N_k, P], from all particles' perception."""
         rows, spans = self._out(observation), self.worlds.spans
         return {agent: rows[:, spans[k]] for k, agent in enumerate(self.possible_agents)}
 
     def _columns(self, values: Any) -> ByAgent:
-        """Split values, [B, M], by agent, shape [B] each."""
+        """Return each agent's column, [B], of `values`, [B, M]."""
         rows = values.T.contiguous() if isinstance(values, Tensor) else values.T.copy()
         columns = self._out(rows)
         return {agent: columns[k] for k, agent in enumerate(self.possible_agents)}

@@ -347,7 +347,7 @@ def test_a_step_is_paid_by_the_goal_that_was_seen_before_it(coded):
         _, reward, _, _, info = env.step(action)
         x, s = (part[None] for part in env.unwrapped.particles())
         loss = sum(task.with_goal(torch.tensor([goal])).losses(x, s).values())
-        blank = float(task.blank_losses[goal])
+        blank = float(task.empty_losses[goal])
         assert reward == pytest.approx(max(-1.0, 1.0 - float(loss) / blank), rel=1e-5)
 
 
@@ -355,7 +355,7 @@ def test_an_empty_picture_has_the_loss_of_the_goals_density(coded):
     task = make(SHAPESHIFTER, **coded, resolution=32).unwrapped.task
     density = task.task.with_goal(torch.tensor([1])).target_picture[..., 3]
     loss = float((density + density * density).mean())
-    assert float(task.blank_losses[1]) == pytest.approx(loss, rel=1e-6)
+    assert float(task.empty_losses[1]) == pytest.approx(loss, rel=1e-6)
 
 
 def test_the_goals_picture_is_seen_beside_the_worlds(coded):

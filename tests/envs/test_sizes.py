@@ -10,8 +10,8 @@ from pettingzoo.test import parallel_api_test
 
 from npa_envs.agents.learning import Problem
 from npa_envs.envs import multispecies_v0
-from npa_envs.envs.grown_worlds import GrownConfig, growing_rule
 from npa_envs.envs.regeneration2d import Regeneration2DEnvConfig
+from npa_envs.envs.trained_rules import GrownConfig, growing_rule
 from npa_envs.registration import ALL, SIZES, SMALL, SPECIES_SIZES
 from npa_envs.rule.files import rule_file, shipped_rules
 
