@@ -40,8 +40,7 @@ except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
 ONE_REQUEST = 1.0
-"""Signals within this time are one request to stop [s]: a scheduler may signal both a run and its
-launcher, which forwards it."""
+"""Signals within this time are one request to stop [s]: a run's launcher may forward its own."""
 
 
 def check_choice(*, resume: bool, overwrite: bool) -> None:
@@ -128,11 +127,8 @@ class Run:
         `begin` to `end`, which is called with whether the run was stopped. Returns whether a
         signal came.
         """
-        requests: contextlib.AbstractContextManager[threading.Event]
-        requests = stop_flag(patient=self._processes.distributed)
-        if self.folder is None:
-            requests = contextlib.nullcontext(threading.Event())
-        with requests as stop:
+        caught, patient = self.folder is not None, self._processes.distributed
+        with stop_flag(caught=caught, patient=patient) as stop:
             begin()
             stopped = False
             while not stopped and not is_over():
@@ -150,15 +146,15 @@ class Run:
 
 
 @contextlib.contextmanager
-def stop_flag(*, patient: bool = False) -> Iterator[threading.Event]:
+def stop_flag(*, caught: bool = True, patient: bool = False) -> Iterator[threading.Event]:
     """Within the block, the first SIGINT or SIGTERM sets the event; later ones act as usual.
 
     Signals within `ONE_REQUEST` of the first one are ignored; with `patient` all later ones, as
-    torchrun forwards those that a terminal has sent already. In a thread other than the main one,
-    where signals cannot be caught, the event stays unset.
+    torchrun forwards signals that a terminal has sent already. The event stays unset without
+    `caught`, and in a thread other than the main one, where signals cannot be caught.
     """
     requested = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
+    if not caught or threading.current_thread() is not threading.main_thread():
         yield requested
         return
     first = 0.0
@@ -184,8 +180,6 @@ def stop_flag(*, patient: bool = False) -> Iterator[threading.Event]:
     finally:
         restore()
 
-
-# Files.
 
 MAX_LOG = 2**29
 """Largest log of a run [bytes]."""

@@ -155,8 +155,6 @@ def preset(name: str, task_name: str = "morphogenesis2d", /, **fields: Any) -> T
     return override(presets[name], **fields)
 
 
-# Overrides, by field names or by a file.
-
 MAX_FILE = 2**20
 """Largest configuration file [bytes]."""
 
