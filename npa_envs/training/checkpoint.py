@@ -122,7 +122,7 @@ def check_same_run(
 
 
 def check_entries(content: Mapping[str, Any], types: Mapping[str, type], path: Path) -> None:
-    """Raise NPAError unless a checkpoint has entries of these types; numbers are at least 0."""
+    """Raise NPAError unless `content` has an entry of each type in `types`, numbers at least 0."""
     for name, cls in types.items():
         value: Any = content.get(name)
         noun, right = cls.__name__, isinstance(value, cls)
@@ -135,7 +135,7 @@ def check_entries(content: Mapping[str, Any], types: Mapping[str, type], path: P
 
 
 def unusable_checkpoint(path: Path, reason: str) -> NPAError:
-    """Return the error for a checkpoint that cannot be resumed, for a `reason`."""
+    """Return the error for a checkpoint file that cannot be resumed, with the reason."""
     return NPAError(
         f"the checkpoint {str(path)!r} must hold all that a run needs, but {reason}: "
         "start a new run with overwrite, or put a copy of it in its place"

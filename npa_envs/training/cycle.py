@@ -89,7 +89,7 @@ class WorldPool:
         return torch.rand(len(self.worlds.x), generator=generator, device=self.worlds.x.device)
 
     def ages_of(self, index: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the ages [steps] of the worlds `index`, and which lifetimes are over, [B] each."""
+        """Return ages [steps] of worlds by index, and which have reached their lifetimes, [B]."""
         assert self.age is not None
         assert self.lifetime is not None
         age = self.age.index_select(0, index)
@@ -182,7 +182,7 @@ class TrainingCycle:
         return WorldPool(worlds, max_age_range=ages, indices=indices, total=config.pool_size)
 
     def run(self, number: int, least_progress: float = 0.0) -> int:
-        """Train for one iteration, after `number` others; return the steps of its rollout.
+        """Train for iteration `number`, from 0 on, and return the number of its rollout's steps.
 
         least_progress: Lower bound on the progress of the learning rate's schedule, in [0, 1].
         """

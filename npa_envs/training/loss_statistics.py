@@ -46,14 +46,14 @@ class LossStatistics:
         self._arrival = torch.cuda.Event() if on_cuda else None  # type: ignore[no-untyped-call]
 
     def begin(self, number: int, steps: int) -> None:
-        """Set the number and the rollout's steps of the iteration that `add` adds next."""
+        """Set the number, from 1 on, and the steps of the iteration that `add` adds next."""
         self._now[0].fill_(number)
         self._now[1].fill_(steps)
         self._count += 1
         self._step_sum += steps
 
     def add(self, replaced: Tensor) -> None:
-        """Add the iteration's loss terms and its number of replaced worlds; before its step."""
+        """Add an iteration's loss terms and `replaced` worlds, before the optimiser's step."""
         terms = self._iteration.terms
         self._sums += terms
         self._replaced += replaced.sum()
@@ -65,7 +65,7 @@ class LossStatistics:
             torch.where(first, value, self._snapshot[name], out=self._snapshot[name])
 
     def send(self) -> None:
-        """Start to copy the interval's statistics to the CPU, and begin the next interval."""
+        """Start to copy the sums since the last `send` to the CPU, and set them to 0."""
         self._sent.copy_(self._totals, non_blocking=True)
         if self._arrival is not None:
             self._arrival.record(torch.cuda.current_stream(self._totals.device))

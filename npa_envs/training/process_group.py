@@ -65,18 +65,18 @@ class ProcessGroup:
             )
 
     def indices(self, total: int, section: int = 1) -> Tensor:
-        """Return the indices of this process's worlds by `local`, int64, 1D, on the CPU."""
+        """Return the indices of this process's worlds among `total`, by `local`, on the CPU."""
         return self.local(torch.arange(total), section)
 
     def local(self, worlds: Tensor, section: int) -> Tensor:
-        """Return this process's rows of a tensor of all worlds, in sections of `section` rows."""
+        """Return this process's rows of all worlds: every `count`-th section, of `section` rows."""
         sections = worlds.view(-1, self.count, section, *worlds.shape[1:])
         return sections[:, self.rank].flatten(0, 1)
 
     def gathered(self, worlds: Tensor, section: int) -> Tensor:
-        """Return all processes' rows on rank 0, and this process's on others, on the CPU.
+        """Return all processes' rows on rank 0, and this process's on other ranks, on the CPU.
 
-        It undoes `local`. With one process `worlds` is returned unchanged.
+        It is the inverse of `local`. With one process `worlds` is returned unchanged.
         """
         if self.count == 1:
             return worlds
@@ -219,7 +219,7 @@ class RunRandomness:
 def world_streams(
     seed: Sequence[int], total: int, indices: Tensor, device: torch.device
 ) -> WorldRandom:
-    """Return streams of the worlds at `indices` of `total`, each from `seed` and its index only."""
+    """Return the random streams of worlds at `indices` of `total`, by `seed` and their indices."""
     keys = np.random.default_rng(seed).integers(2**64, size=total, dtype=np.uint64)
     return WorldRandom.from_keys(torch.from_numpy(keys.view(np.int64))[indices].to(device))
 

@@ -44,7 +44,7 @@ ONE_REQUEST = 1.0
 
 
 def check_choice(*, resume: bool, overwrite: bool) -> None:
-    """Check that a run is not both resumed and overwritten."""
+    """Raise NPAError if a run is to be both resumed and overwritten."""
     if resume and overwrite:
         raise NPAError(
             "resume and overwrite exclude each other: resume continues the run in the folder, "
@@ -182,7 +182,7 @@ def stop_flag(*, caught: bool = True, patient: bool = False) -> Iterator[threadi
 
 
 MAX_LOG = 2**29
-"""Largest log of a run [bytes]."""
+"""Maximum size of a run's log [bytes]."""
 
 
 class RunFolder:
@@ -209,7 +209,7 @@ class RunFolder:
         self._known: tuple[int, int] | None = None
 
     def prepare(self, byte_count: int, *, pictures: bool = True) -> None:
-        """Create the folder; check that the disk has room for two checkpoints of `byte_count`."""
+        """Create the folder; NPAError without room for two checkpoints of `byte_count` bytes."""
         # The old checkpoint exists until the new one is complete.
         needed = 2 * byte_count
         try:
@@ -330,7 +330,7 @@ class JsonlLog:
             ) from error
 
     def truncate(self, iteration: int | None = None) -> None:
-        """Drop an incomplete last line, and the lines after an iteration, if given."""
+        """Rewrite the log without an incomplete last line, and without lines after `iteration`."""
         write_text(self.path, "".join(json.dumps(r) + "\n" for r in self.records(iteration)))
         self._is_complete = True
 
@@ -372,7 +372,7 @@ def _parsed_record(line: str) -> dict[str, Any] | None:
 
 
 PICTURE_HEIGHT = 256
-"""Least height of the pictures [pixels]; pixels of smaller ones are repeated."""
+"""Minimum height of the pictures [pixels]; pixels of smaller ones are repeated."""
 
 PICTURE_GAP = 8
 """Pixels between the worlds of a picture."""
@@ -390,7 +390,7 @@ class RunLog(JsonlLog):
     def opened(self, tensorboard: bool, iteration: int) -> Iterator[None]:
         """Within the block, also write to TensorBoard, if `tensorboard`.
 
-        Events of an earlier process after `iteration` are hidden.
+        TensorBoard hides what an earlier process wrote after `iteration`.
         """
         if tensorboard:
             # TensorBoard imports TensorFlow if it is installed; this silences it.
@@ -407,7 +407,7 @@ class RunLog(JsonlLog):
                 self._board = None
 
     def append(self, record: dict[str, Any]) -> None:
-        """Write a line of numbers, one of them the `iteration`, also to TensorBoard."""
+        """Write a record with its `iteration` as a line, and while opened to TensorBoard."""
         super().append(record)
         if self._board is not None:
             for name, value in record.items():
@@ -415,7 +415,7 @@ class RunLog(JsonlLog):
                     self._board.add_scalar(name, value, record["iteration"])
 
     def add_picture(self, picture: Tensor, iteration: int) -> None:
-        """Add target and worlds of a batch side by side: a PNG file, for TensorBoard a JPEG."""
+        """Write pictures [K, H, W, 3] side by side, as a PNG file and for TensorBoard as a JPEG."""
         repeats = math.ceil(PICTURE_HEIGHT / picture.shape[1])
         frames = to_uint8(picture).repeat(repeats, axis=1).repeat(repeats, axis=2)
         frames = np.pad(frames, ((0, 0), (0, 0), (0, PICTURE_GAP), (0, 0)), constant_values=255)

@@ -145,7 +145,7 @@ class Trainer:
         checkpoint: dict[str, Any] | None,
         rules: Sequence[NPARule] | None,
     ) -> NPARule | JointRules:
-        """Return the module to train, with initial weights or in the form of a checkpoint's."""
+        """Return the module to train: with initial weights, or of the shape of a checkpoint's."""
         saved = None if checkpoint is None else checkpoint["rule_hyper_parameters"]
         if self.task.species_counts:
             each = self.task.make_rules(generator)
@@ -417,7 +417,7 @@ def write_rules(
 
 
 def take_options(rule: NPARule, config: TrainConfig[Any]) -> None:
-    """Set a rule's `moment_inverse` and `dead_zone` as configured; equivariant rules get zone 0."""
+    """Set a rule's `moment_inverse` and `dead_zone` as configured, but 0 if it is equivariant."""
     rule.moment_inverse = config.moment_inverse
     rule.dead_zone = 0.0 if rule.equivariant else config.dead_zone
 

@@ -140,7 +140,7 @@ class CapturedRollout:
         return [*call.particles.with_zero_paths(self._zero_paths).tensors(), *call.weights]
 
     def capture(self, steps: int, call: RolloutCall) -> None:
-        """Capture `steps` steps as CUDA graphs; before the first, run some of `call` eagerly."""
+        """Capture `steps` steps as CUDA graphs; before the first capture, launch a few of them."""
         if not self.graphs:
             self._warm_up(min(steps, CAPTURE_WARM_UP_STEPS), call)
         elif len(self.graphs) >= MAX_GRAPHS:
@@ -185,7 +185,7 @@ class CapturedRollout:
         self.bytes += max(torch.cuda.memory_reserved(self.device) - bytes_before, 0)
 
     def _warm_up(self, steps: int, call: RolloutCall) -> None:
-        """Run `steps` steps of a call eagerly, and count the random numbers that they draw."""
+        """Launch `steps` steps of a call, and count the random numbers that a step draws."""
         spec = self._spec._replace(steps=steps, keep_every=None)
         with torch.no_grad():
             torch._foreach_copy_(self._inputs, self._inputs_of(call))
@@ -210,7 +210,7 @@ class CapturedRollout:
     def _check_unchanged(
         self, settings: dict[tuple[int, str], Hashable], versions: list[int]
     ) -> None:
-        """Check that a capture has changed no settings, and its backward pass no inputs."""
+        """Raise NPAError if a capture has changed settings, or its backward pass inputs."""
         after = self._settings()
         keys = settings.keys() | after.keys()
         changed = {key[1] for key in keys if settings.get(key) != after.get(key)}
@@ -275,7 +275,7 @@ class CapturedRollout:
         return [gradient.contiguous() for gradient in gradients]
 
     def replay(self, call: RolloutCall, use: object) -> Particles:
-        """Replay a call's graphs, and return copies of the worlds; `use` outlives all passes."""
+        """Replay a call's graphs; return copies of the worlds. `use` lives until the last pass."""
         generator = call.generator
         inputs = self._inputs_of(call)
         self.ready.record(current_stream(self.device))
@@ -313,7 +313,7 @@ class CapturedRollout:
         return combined(torch.cat, results)
 
     def _check_positions(self, x: Tensor, generator: Randomness | None, steps: int) -> None:
-        """Check that positions are finite; otherwise the generator returns to its former state."""
+        """Raise NPAError, with the generator as before the replay, unless positions are finite."""
         try:
             FiniteCheck(x, self.ready).wait()
         except NPAError:

@@ -98,7 +98,7 @@ def first_reports(diverged: Sequence[Entry], describe: Callable[[Entry], str]) -
 
 
 def term_name(entry: int, space_dim: int) -> str:
-    """Return the name of number `entry` of a particle's D coordinates and then C channels."""
+    """Return the name of entry `entry` of a particle's D coordinates followed by its C channels."""
     is_position = entry < space_dim
     return f"positions coordinate {entry}" if is_position else f"states channel {entry - space_dim}"
 
@@ -128,7 +128,7 @@ class DivergenceWatch:
         self._checks += 1
 
     def raise_diverged(self) -> None:
-        """Raise DivergedError, which says when and where, if a world has diverged; waits for it."""
+        """Raise DivergedError if a world has diverged, with its step; waits for the device."""
         first_checks = self._first_check.tolist()
         worlds = sorted((step, world) for world, step in enumerate(first_checks) if step >= 0)
 

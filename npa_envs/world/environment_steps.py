@@ -78,6 +78,6 @@ class Actions(PreparedActions):
                 buffer.copy_(values)
 
     def updated(self) -> Tensor:
-        """Return which particles the last draw updates, bool, shape [B, N]."""
+        """Return which particles the last `draw` selected for an update, bool, shape [B, N]."""
         mask = self._worlds.mask
         return self._everyone if mask is None else mask.bool()

@@ -271,7 +271,7 @@ def _make_room(device: torch.device) -> bool:
 
 
 def _always_launch(group: CallGroup, reason: object, level: int) -> None:
-    """Launch all further calls of a group, without captures; log the reason."""
+    """Launch all calls of a group from now on, and delete its captures; log the reason."""
     logger.log(level, "rollouts of this kind are launched, not captured: %s", reason)
     with capture_lock:
         group.launched_only = True

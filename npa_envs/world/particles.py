@@ -73,7 +73,7 @@ class Particles(NamedTuple):
         return fields._replace(goal=self.goal)
 
     def split(self, counts: Sequence[int]) -> list[Particles]:
-        """Return the worlds of each species' particles: `counts[k]` consecutive ones of each k."""
+        """Return each species' worlds, of `counts[k]` consecutive particles for species k."""
         fields = [
             [None] * len(counts) if value is None else torch.split(value, [*counts], dim=1)
             for value in self.per_particle()

@@ -299,14 +299,14 @@ def check_generator(generator: Randomness | None, device: torch.device, world_co
 
 
 def uniform_draws(generator: Randomness | None, shape: Sequence[int], like: Tensor) -> Tensor:
-    """Return uniform numbers in [0, 1), shape [B, ...], of `like`'s dtype and device."""
+    """Return random numbers uniform in [0, 1), shape [B, ...], of `like`'s dtype and device."""
     if isinstance(generator, WorldRandom):
         return generator.uniform(*shape[1:], dtype=like.dtype)
     return torch.rand(tuple(shape), generator=generator, device=like.device, dtype=like.dtype)
 
 
 def normal_draws(generator: Randomness | None, shape: Sequence[int], like: Tensor) -> Tensor:
-    """Return standard normal numbers, shape [B, ...], of `like`'s dtype and device."""
+    """Return standard normal random numbers, shape [B, ...], of `like`'s dtype and device."""
     if isinstance(generator, WorldRandom):
         return generator.normal(*shape[1:], dtype=like.dtype)
     return torch.randn(tuple(shape), generator=generator, device=like.device, dtype=like.dtype)

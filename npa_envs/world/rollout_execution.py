@@ -93,7 +93,7 @@ def execute(
 
 
 def _can_rest(spec: RolloutSpec, rules: Sequence[NPARule], x: Tensor) -> bool:
-    """Return whether a rollout can skip the steps of worlds at rest."""
+    """Return whether a rollout may skip its steps once all worlds are at rest."""
     return (
         len(rules) == 1
         and not spec.species
@@ -116,7 +116,7 @@ def _run_until_rest(
     generator: Randomness | None,
     cuda_graph: CudaGraph,
 ) -> Particles:
-    """Run a rollout in parts, and skip the steps after all worlds are at rest."""
+    """Run a rollout in parts of several steps, until all worlds are at rest or steps are done."""
     remaining, steps = spec.steps, FIRST_PART[particles.x.device.type]
     while remaining and not resting(rules, particles, spec.physics, cuda_graph).all():
         part = spec._replace(steps=min(steps, remaining))

@@ -58,7 +58,7 @@ def rule_settings(rule: nn.Module, device: torch.device) -> dict[str, Hashable]:
 
 
 def _setting(value: Any, device: torch.device, *, in_container: bool = False) -> Hashable:
-    """Return what to compare an attribute's value by, or with `in_container` an entry of one."""
+    """Return a key that changes if an attribute's value does, or an entry of a container."""
     if isinstance(value, NUMBERS):
         return type(value), value
     if isinstance(value, Tensor):

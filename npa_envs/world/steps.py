@@ -158,7 +158,7 @@ class Step:
 def _updated(
     particles: Particles, update: Tensor, active: Rows, draws: Draws, physics: Physics
 ) -> Particles:
-    """Return the worlds after updates [K, A] of their active particles, and noise of all."""
+    """Return the worlds after updates [K, A] of active particles, and position noise of all."""
     if draws.noise is not None:
         particles = particles._replace(x=particles.x + draws.noise)
     fields = update_particles(update, *particles.per_particle(), active, physics)
