@@ -76,7 +76,7 @@ def train(
         resume: Continue from the checkpoint in `config.out`.
         overwrite: Remove the files of an earlier run in `config.out` and start a new one.
         progress: Show a progress bar.
-        max_seconds: Stop after this time [s]; the run can be resumed.
+        max_seconds: Stop after this time [s]; the run can be resumed. None: no limit.
         begun: Called once after all checks, before the first iteration.
         rules: For a joint task: see `train_together`.
 
@@ -109,8 +109,8 @@ def train_together(
 ) -> TrainResult:
     """Train one rule for each species of a common world.
 
-    Each rule perceives densities divided by the number of its own particles, as it would alone. A
-    rule whose parameters do not require gradients does not change.
+    Each rule perceives densities divided by the number of its own particles, as in a world of one
+    species. A rule whose parameters do not require gradients does not change.
 
     Args:
         config: The run's configuration, for example `preset("fast", "co_morphogenesis2d")` or

@@ -1,4 +1,4 @@
-"""Checkpoints: written completely or not at all, and checked before a run is resumed."""
+"""Checkpoint files: written completely or not at all, and checked before a run is resumed."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from npa_envs.training.task_table import config_to_dict
 CHECKPOINT_FORMAT = "npa-envs checkpoint"
 
 CHECKPOINT_VERSION = 1
-"""Incremented when the content of checkpoints changes."""
+"""Version of the content of checkpoints; a file of another version is an error."""
 
 MAY_DIFFER = {"out", "repeats", "tensorboard", "cuda_graph"}
 MAY_DIFFER |= {"log_interval", "picture_interval", "checkpoint_interval"}
@@ -34,11 +34,11 @@ READ_FIRST = {
     "iteration": int,
     "seconds": float,
 }
-"""Types of the entries that are needed before the run is built."""
+"""Types, by key, of the entries that are needed before the run is built."""
 
 
 def save_checkpoint(path: Path, content: dict[str, Any]) -> None:
-    """Write a checkpoint, completely or not at all."""
+    """Write a checkpoint file, completely or not at all."""
     # Torch itself would hide the reason of an error of writing, such as a full disk.
     buffer = io.BytesIO()
     header = {"format": CHECKPOINT_FORMAT, "format_version": CHECKPOINT_VERSION}
@@ -47,7 +47,7 @@ def save_checkpoint(path: Path, content: dict[str, Any]) -> None:
 
 
 def load_checkpoint(path: Path) -> dict[str, Any]:
-    """Read a checkpoint onto the CPU; no code in it is run."""
+    """Return the content of a checkpoint file, with tensors on the CPU; no code in it is run."""
     if not os.path.exists(path):
         raise NPAError(
             f"there is no checkpoint to resume from at {str(path)!r}: give the folder of an "
@@ -76,13 +76,13 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
 
 
 def has_per_world_streams(content: Mapping[str, Any]) -> bool:
-    """Return whether a checkpoint is of a run with random streams of each world."""
+    """Return whether a checkpoint is of a run with `per_world_streams` (`RunRandomness`)."""
     states = content.get("random_states")
     return isinstance(states, dict) and states.keys() == {"schedule"}
 
 
 def check_task(content: Mapping[str, Any], task_name: str, path: Path) -> None:
-    """Check that a checkpoint is of a task."""
+    """Raise NPAError unless a checkpoint is of the task `task_name`."""
     if content.get("task_name") != task_name:
         raise NPAError(
             f"the checkpoint {str(path)!r} is of task {shown(content.get('task_name'))}, "
@@ -93,7 +93,7 @@ def check_task(content: Mapping[str, Any], task_name: str, path: Path) -> None:
 def check_same_run(
     content: dict[str, Any], path: Path, task_name: str, config: TrainConfig[Any]
 ) -> None:
-    """Check that a checkpoint belongs to the run that is to be resumed."""
+    """Raise NPAError unless a checkpoint is of the run of this task and configuration."""
     check_entries(content, READ_FIRST, path)
     check_task(content, task_name, path)
     try:
@@ -122,7 +122,7 @@ def check_same_run(
 
 
 def check_entries(content: Mapping[str, Any], types: Mapping[str, type], path: Path) -> None:
-    """Check that a checkpoint has entries of these types; numbers must be finite and >= 0."""
+    """Raise NPAError unless `content` has an entry of each type in `types`, numbers at least 0."""
     for name, cls in types.items():
         value: Any = content.get(name)
         noun, right = cls.__name__, isinstance(value, cls)
@@ -135,7 +135,7 @@ def check_entries(content: Mapping[str, Any], types: Mapping[str, type], path: P
 
 
 def unusable_checkpoint(path: Path, reason: str) -> NPAError:
-    """Return the error about a checkpoint that cannot be resumed."""
+    """Return the error for a checkpoint file that cannot be resumed, with the reason."""
     return NPAError(
         f"the checkpoint {str(path)!r} must hold all that a run needs, but {reason}: "
         "start a new run with overwrite, or put a copy of it in its place"

@@ -1,7 +1,7 @@
 """The training cycle: worlds from the pool, rollout, gradients, worlds back, optimiser step.
 
-No method waits for the device. An iteration runs eagerly or as CUDA graphs; its statistics
-stay on the device until a line of the log needs them.
+No method waits for the device. An iteration is launched kernel by kernel or replayed as CUDA
+graphs; its statistics stay on the device until a line of the log needs them.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-import npa_envs.world.rollout
 from npa_envs.errors import NPAError
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Task
@@ -31,9 +30,10 @@ from npa_envs.training.process_group import (
 from npa_envs.world.cuda_graph import GraphedCallable
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness, WorldRandom, uniform_draws
+from npa_envs.world.rollout import rollout_particles
 
 LARGEST_VALUE = 10.0
-"""A world with a larger |x| or |s| has diverged and is replaced by a seed."""
+"""A world with a larger |x| [length units] or |s| has diverged; a start world replaces it."""
 
 
 class WorldPool:
@@ -41,9 +41,10 @@ class WorldPool:
 
     Args:
         worlds: The W worlds of this process.
-        max_age_range: Lifetimes of the first and the last world [steps]; those between are spaced
-            geometrically. None: worlds have no lifetime.
-        indices: Indices of these worlds among the `total` of all processes, int64, shape [W].
+        max_age_range: Lifetimes of the first and the last world [steps]; lifetimes between them are
+            spaced geometrically. None: worlds have no lifetime.
+        indices: Indices of these worlds among those of all processes, int64, shape [W].
+        total: Number of worlds of all processes; None: W.
     """
 
     def __init__(
@@ -56,10 +57,9 @@ class WorldPool:
     ) -> None:
         self.worlds = worlds
         self.age: Tensor | None = None
-        """Steps since the seed, or since the damage before another lifetime, int64, [W], or
-        None."""
+        """Steps since the start world, or the last damage that ended a lifetime, int64, [W]."""
         self.lifetime: Tensor | None = None
-        """Age at which each world is replaced or damaged [steps], int64, shape [W], or None."""
+        """Age at which each world is replaced or damaged [steps], int64, shape [W]."""
         x = worlds.x
         if max_age_range is not None:
             self.age = torch.zeros_like(x[:, 0, 0], dtype=torch.int64)
@@ -73,12 +73,12 @@ class WorldPool:
         return {name: value for name, value in tensors.items() if value is not None}
 
     def sample(self, world_count: int, generator: torch.Generator) -> Tensor:
-        """Return indices of B different worlds, drawn from the whole pool, shape [B]."""
+        """Return indices of B different worlds, drawn from the whole pool, int64, shape [B]."""
         # The largest of random numbers: unlike randperm, one short kernel and no host copy.
         return self._keys(generator).topk(world_count).indices
 
     def sample_sections(self, world_count: int, random: Randomness) -> Tensor:
-        """Return indices of B worlds, one drawn from each of B equal sections, shape [B]."""
+        """Return indices of B worlds, one drawn from each of B equal sections, int64, shape [B]."""
         size = len(self.worlds.x) // world_count
         first = torch.arange(0, size * world_count, size, device=self.worlds.x.device)
         if isinstance(random, WorldRandom):
@@ -89,16 +89,16 @@ class WorldPool:
         return torch.rand(len(self.worlds.x), generator=generator, device=self.worlds.x.device)
 
     def ages_of(self, index: Tensor) -> tuple[Tensor, Tensor]:
-        """Return ages [steps] of worlds, and whether their lifetimes are over, shape [B] each."""
+        """Return ages [steps] of worlds by index, and which have reached their lifetimes, [B]."""
         assert self.age is not None
         assert self.lifetime is not None
         age = self.age.index_select(0, index)
         return age, age >= self.lifetime.index_select(0, index)
 
     def write(
-        self, index: Tensor, worlds: Particles, fresh: Particles, age: Tensor | None = None
+        self, index: Tensor, worlds: Particles, replacements: Particles, age: Tensor | None = None
     ) -> Tensor:
-        """Store worlds and their ages, or `fresh` worlds in place of those that have diverged.
+        """Store B worlds and their ages at `index`, and replacements where a world has diverged.
 
         Returns which worlds were replaced, bool, shape [B].
         """
@@ -108,17 +108,17 @@ class WorldPool:
         )
         # A comparison with NaN is false, so worlds that are not finite are replaced too.
         diverged = ~(torch.maximum(largest_x, largest_s) <= LARGEST_VALUE)
-        self.worlds.put_(index, fresh.where(diverged, worlds))
+        self.worlds.put_(index, replacements.where(diverged, worlds))
         if self.age is not None and age is not None:
             self.age.index_copy_(0, index, age.masked_fill(diverged, 0))
         return diverged
 
 
 class TrainingCycle:
-    """One iteration of training, and all of its state but the rule.
+    """The iterations of a training run, and all of their state except the rule.
 
-    `per_world_streams`: see `RunRandomness`. Each world of the batch then comes from its own
-    section of the pool.
+    `run_generator` draws numbers of steps. With `per_world_streams`, see `RunRandomness`, each
+    world of the batch comes from its own section of the pool.
     """
 
     def __init__(
@@ -127,7 +127,7 @@ class TrainingCycle:
         rule: nn.Module,
         config: TrainConfig[Any],
         device: torch.device,
-        schedule: torch.Generator,
+        run_generator: torch.Generator,
         rollout: Rollout | None = None,
         *,
         processes: ProcessGroup = ALONE,
@@ -144,21 +144,12 @@ class TrainingCycle:
             processes.check(config)
             self._section = config.pool_size // config.world_count
         self.random = RunRandomness(
-            config, device, schedule, processes, per_world_streams=per_world_streams
+            config, device, run_generator, processes, per_world_streams=per_world_streams
         )
-        pool_indices = processes.indices(config.pool_size, self._section)
+        self.pool = self._make_pool()
         batch_indices = processes.indices(config.world_count)
-        self._pool_indices = pool_indices.to(device)
         self._batch_indices = batch_indices.to(device)
-        seeds = self._seeds(len(pool_indices), self.random.pool)
-        self.pool = WorldPool(
-            seeds,
-            max_age_range=config.max_age_range if config.ages else None,
-            indices=pool_indices,
-            total=config.pool_size,
-        )
-        count = len(batch_indices)
-        batch = seeds.map(lambda value: value[:count])
+        batch = self.pool.worlds.map(lambda value: value[: len(batch_indices)])
         graphed = device.type == "cuda" and config.cuda_graph
         cls = GraphedIteration if graphed else EagerIteration
         self.iteration: EagerIteration = cls(
@@ -167,34 +158,42 @@ class TrainingCycle:
             config,
             batch,
             self.random.masks,
-            npa_envs.world.rollout.rollout_particles if rollout is None else rollout,
+            rollout_particles if rollout is None else rollout,
             take_means=None if processes.count == 1 else processes.reduce,
         )
         self.optimiser = RuleOptimiser(self.iteration.parameters, config, rule)
         self.statistics = LossStatistics(self.iteration)
-        self._index = torch.zeros(count, dtype=torch.int64, device=device)
-        self._age = torch.zeros_like(self._index)
-        self._steps = torch.zeros_like(self._index[0])
-        self._replaced = torch.zeros_like(self._index[0])
-        self._fresh_worlds = batch.map(torch.empty_like)
+        # Indices in the pool and ages of the batch's worlds, which graphs write.
+        self._index, self._age = (torch.zeros_like(self._batch_indices) for _ in range(2))
+        self._steps, self._replaced = (torch.zeros_like(self._index[0]) for _ in range(2))
+        self._start_worlds = batch.map(torch.empty_like)
         graph = functools.partial(GraphedCallable, device=device, captured=graphed)
         self._draw = graph(self._draw_worlds, generator=generator_to_register(self.random.worlds))
         self._store = graph(self._store_worlds)
         self._record = graph(self._record_iteration)
 
+    def _make_pool(self) -> WorldPool:
+        """Return the pool, filled with start worlds."""
+        config = self._config
+        indices = self._processes.indices(config.pool_size, self._section)
+        worlds = self._make_start_worlds(len(indices), self.random.pool)
+        self._pool_indices = indices.to(worlds.x.device)
+        ages = config.max_age_range if config.ages else None
+        return WorldPool(worlds, max_age_range=ages, indices=indices, total=config.pool_size)
+
     def run(self, number: int, least_progress: float = 0.0) -> int:
-        """Train for one iteration, after `number` others; return the steps of its rollout.
+        """Train for iteration `number`, from 0 on, and return the number of its rollout's steps.
 
         least_progress: Lower bound on the progress of the learning rate's schedule, in [0, 1].
         """
         iteration = self.iteration
         lo, hi = self._config.steps
-        steps = int(torch.randint(lo, hi, (), generator=self.random.schedule))
+        steps = int(torch.randint(lo, hi, (), generator=self.random.run))
         self.task.begin(number)
         self._draw()
-        is_fresh = self._seeded_worlds(number)
-        if is_fresh is not None:
-            iteration.start.copy_(self._fresh_worlds.where(is_fresh, iteration.start))
+        restarted = self._restarted_worlds(number)
+        if restarted is not None:
+            iteration.start.copy_(self._start_worlds.where(restarted, iteration.start))
         iteration.run(steps)
         self.statistics.begin(number + 1, steps)
         self._steps.fill_(steps)
@@ -205,13 +204,13 @@ class TrainingCycle:
         self.optimiser.step(number, least_progress)
         return steps
 
-    def _seeded_worlds(self, number: int) -> Tensor | None:
-        """Return which worlds of the batch start as fresh seeds, bool, shape [B]; None: none.
+    def _restarted_worlds(self, number: int) -> Tensor | None:
+        """Return which worlds of the batch a start world replaces, bool, shape [B]; None: none.
 
         Every `seed_interval` iterations there are `fresh_count` of them: the first of the batch.
         With per-world streams each world of the batch stays in its own section of the pool. Then
-        the seeds are the first `fresh_count` worlds, the next time the next `fresh_count`, and so
-        on, so that seeds come into all sections.
+        they are the first `fresh_count` worlds, the next time the next `fresh_count`, and so on, so
+        that start worlds come into all sections.
         """
         config = self._config
         if config.ages or number % config.seed_interval != 0:
@@ -223,11 +222,9 @@ class TrainingCycle:
         return (self._batch_indices - first) % config.world_count < config.fresh_count
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the state for a checkpoint without the rule, on rank 0 of all processes."""
-        pool = {
-            name: self._processes.gathered(local, self._section)
-            for name, local in self.pool.tensors().items()
-        }
+        """Return the state without the rule for a checkpoint; on rank 0 with the whole pool."""
+        local = self.pool.tensors().items()
+        pool = {name: self._processes.gathered(each, self._section) for name, each in local}
         return {
             "optimiser": self.optimiser.state_dict(),
             "pool": pool,
@@ -236,7 +233,7 @@ class TrainingCycle:
         }
 
     def load_state_dict(self, state: dict[str, Any], iteration: int) -> None:
-        """Restore what `state_dict` returned after `iteration` iterations; call before `run`."""
+        """Restore the result of `state_dict` after `iteration` iterations; call it before `run`."""
         self.optimiser.load_state_dict(state["optimiser"])
         for name, local in self.pool.tensors().items():
             local.copy_(self._processes.local(state["pool"][name], self._section))
@@ -245,37 +242,43 @@ class TrainingCycle:
 
     @torch.no_grad()
     def _draw_worlds(self) -> None:
-        """Copy worlds from the pool to the batch, some damaged or replaced by fresh seeds."""
-        config, worlds = self._config, self.random.worlds
-        begin_episodes(worlds, self.random.masks)
-        by_section = config.ages or isinstance(worlds, WorldRandom)
+        """Copy worlds from the pool to the batch, some damaged or replaced by start worlds."""
+        config, random = self._config, self.random.worlds
+        begin_episodes(random, self.random.masks)
+        by_section = config.ages or isinstance(random, WorldRandom)
         sample: Any = self.pool.sample_sections if by_section else self.pool.sample
-        self._index.copy_(sample(len(self._index), worlds))
-        start = self.pool.worlds.take(self._index)
-        damaged = self._pool_indices[self._index] < config.damage_share * config.pool_size
-        expired = None
-        if config.ages:
-            age, expired = self.pool.ages_of(self._index)
-            self._age.copy_(age.masked_fill(expired, 0))
-            self.iteration.past_min_age.copy_((self._age >= config.stillness_min_age) & ~damaged)
-            if config.damage_and_keep_share > 0.0:
-                chance = uniform_draws(worlds, (len(expired), 1), start.x)[:, 0]
-                renewed = expired & (chance < config.damage_and_keep_share)
-                expired, damaged = expired & ~renewed, damaged | renewed
+        self._index.copy_(sample(len(self._index), random))
+        worlds = self.pool.worlds.take(self._index)
+        damaged, expired = self._damaged_and_expired(worlds)
         if config.damages:
-            after = self.task.damage(start, worlds)
-            start = after if config.damage_share == 1.0 else after.where(damaged, start)
+            after = self.task.damage(worlds, random)
+            worlds = after if config.damage_share == 1.0 else after.where(damaged, worlds)
         # Drawn in every iteration: the CPU does not know which worlds will diverge.
-        fresh = self._seeds(len(self._index), worlds)
-        self._fresh_worlds.copy_(fresh)
+        start_worlds = self._make_start_worlds(len(self._index), random)
+        self._start_worlds.copy_(start_worlds)
         if expired is not None:
-            start = fresh.where(expired, start)
-        self.iteration.start.copy_(start)
+            worlds = start_worlds.where(expired, worlds)
+        self.iteration.start.copy_(worlds)
+
+    def _damaged_and_expired(self, worlds: Particles) -> tuple[Tensor, Tensor | None]:
+        """Return which worlds of the batch to damage, and which to replace; set all ages."""
+        config = self._config
+        damaged = self._pool_indices[self._index] < config.damage_share * config.pool_size
+        if not config.ages:
+            return damaged, None
+        age, expired = self.pool.ages_of(self._index)
+        self._age.copy_(age.masked_fill(expired, 0))
+        self.iteration.past_min_age.copy_((self._age >= config.stillness_min_age) & ~damaged)
+        if config.damage_and_keep_share > 0.0:
+            chance = uniform_draws(self.random.worlds, (len(expired), 1), worlds.x)[:, 0]
+            kept = expired & (chance < config.damage_and_keep_share)
+            expired, damaged = expired & ~kept, damaged | kept
+        return damaged, expired
 
     @torch.no_grad()
     def _store_worlds(self) -> None:
         age = self._age + self._steps if self._config.ages else None
-        replaced = self.pool.write(self._index, self.iteration.end, self._fresh_worlds, age)
+        replaced = self.pool.write(self._index, self.iteration.end, self._start_worlds, age)
         self._replaced += replaced.sum()
 
     @torch.no_grad()
@@ -285,15 +288,15 @@ class TrainingCycle:
         self._replaced.zero_()
         normalise_gradients(self.iteration.gradients)
 
-    def _seeds(self, world_count: int, random: Randomness) -> Particles:
+    def _make_start_worlds(self, world_count: int, random: Randomness) -> Particles:
         dtype = self._config.torch_dtype
-        seeds = self.task.seed(world_count, generator=random, device=random.device)
+        worlds = self.task.seed(world_count, generator=random, device=random.device)
         lo, hi = map(math.log, self._config.vary_eps)
         if (lo, hi) != (0.0, 0.0):
             # Dividing positions by a factor is equivalent to multiplying ε by it.
-            fraction = uniform_draws(random, (world_count, 1), seeds.x)[:, :, None]
-            seeds = seeds._replace(x=seeds.x * torch.exp(-lo - (hi - lo) * fraction))
-        return seeds._replace(x=seeds.x.to(dtype), s=seeds.s.to(dtype))
+            fraction = uniform_draws(random, (world_count, 1), worlds.x)[:, :, None]
+            worlds = worlds._replace(x=worlds.x * torch.exp(-lo - (hi - lo) * fraction))
+        return worlds._replace(x=worlds.x.to(dtype), s=worlds.s.to(dtype))
 
 
 def _check_varied_eps(task: Task, rule: nn.Module, config: TrainConfig[Any]) -> None:
@@ -304,7 +307,7 @@ def _check_varied_eps(task: Task, rule: nn.Module, config: TrainConfig[Any]) -> 
     reasons = {
         "a periodic box": task.box is not None,
         "particles that stay": rule.static,
-        "a rule that divides, whose seeds are single particles": rule.divides,
+        "a rule that divides, whose start worlds are single particles": rule.divides,
     }
     for reason, applies in reasons.items():
         if applies:

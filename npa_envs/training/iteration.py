@@ -1,4 +1,4 @@
-"""Rollout, loss and gradients of one iteration, eager or as a CUDA graph."""
+"""Rollout, loss and gradients of one training iteration, launched or as a CUDA graph."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness, WorldRandom
 
 WARM_UP_STEPS = 2
-"""Steps of the eager rollout that loads every kernel before the first capture."""
+"""Number of steps of the launched rollout that loads every kernel before the first capture."""
 
 Rollout = Callable[..., Particles]
-"""Type of `rollout_particles` in training, of a rule, worlds and the number of steps."""
+"""A function as `rollout_particles`: of a rule, worlds and the number of steps."""
 
 
 def power_mean(values: Tensor, power: float) -> Tensor:
-    """Return (mean |a|^power)^(1/power) of each world's values [B, ...], shape [B]."""
+    """Return (mean |a|^power)^(1/power) over each world's values a, [B, ...]; shape [B]."""
     each = values.flatten(1)
     # The gradient of a vector's norm is 0 at 0.
     norm: Tensor = torch.linalg.vector_norm(each, power, dim=1)
@@ -35,18 +35,18 @@ def power_mean(values: Tensor, power: float) -> Tensor:
 
 
 def _process_mean(take_means: Callable[[Sequence[Tensor]], None], value: Tensor) -> Tensor:
-    """Return the mean of a tensor over all processes, computed between two graphs."""
+    """Return the mean of a tensor over all processes; in a capture, computed between two graphs."""
     mean = value.detach().clone()
     host_call(lambda: take_means([mean]))
     return mean
 
 
 class EagerIteration:
-    """One iteration up to the gradients, launched kernel by kernel.
+    """One iteration from its start worlds to the gradients, launched kernel by kernel.
 
-    Reads `start`; writes `end`, `terms` and the `.grad` of every parameter, always in the same
-    tensors: write to `start` with `copy_`. `take_means` replaces tensors by their means over all
-    processes; None: there is one process.
+    `run` reads the worlds `start`, and writes the worlds `end`, the losses `terms` and the `.grad`
+    of every parameter, always the same tensors: write to `start` with `copy_`. `take_means`
+    replaces tensors by their means over all processes; None: there is one process.
     """
 
     def __init__(
@@ -80,12 +80,10 @@ class EagerIteration:
         self.gradients = [torch.zeros_like(p) for p in self.parameters]
         for parameter, buffer in zip(self.parameters, self.gradients, strict=True):
             parameter.grad = buffer
-        self._rule = rule
-        self._generator = generator
-        self._rollout = rollout
+        self._rule, self._generator, self._rollout = rule, generator, rollout
 
     def run(self, steps: int) -> None:
-        """Run the rollout, the loss and the backward pass."""
+        """Run a rollout of `steps` steps, the loss and the backward pass."""
         # Gradients of codes flow through these states; `start` keeps their values.
         first_states = self._task.with_target_code(self.start.s)
         if first_states is not self.start.s:
@@ -112,7 +110,7 @@ class EagerIteration:
         self.end._replace(goal=None).copy_(kept)
 
     def _loss(self, end: Particles) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the task's loss plus the stillness loss, and its terms by name."""
+        """Return the task's loss of worlds `end` plus the stillness loss, and the terms by name."""
         total, parts = self._task.loss(end)
         if self._config.stillness_weight > 0.0:
             x, s, path, *_ = end
@@ -146,7 +144,7 @@ class GraphedIteration(EagerIteration):
         self._memory_pool = torch.cuda.graph_pool_handle()
 
     def run(self, steps: int) -> None:
-        """Replay the graph for this number of steps, captured at the first use."""
+        """Replay the graph of this number of steps, which the first use captures."""
         run_eagerly = super().run
         with torch.cuda.device(self.start.x.device):
             if steps not in self._graphs:
@@ -160,8 +158,8 @@ class GraphedIteration(EagerIteration):
             self._graphs[steps].replay()
 
     def _warm_up(self) -> None:
-        """Run eagerly once, to load kernels and allocate workspaces, which a capture cannot do."""
-        # A resumed run warms up again and must draw the same masks: so these draws do not count.
+        """Launch once, to load kernels and allocate workspaces, which a capture cannot do."""
+        # A resumed run warms up again and must draw the same masks: so the generator is reset.
         generator = self._generator
         if isinstance(generator, WorldRandom):
             streams = generator.take(slice(None))

@@ -17,7 +17,7 @@ from npa_envs.training.iteration import EagerIteration
 from npa_envs.world.particles import Particles
 
 NO_ITERATION = -1
-"""Number of the bad iteration while every loss was finite."""
+"""Stands for the number of the first iteration with a bad loss, while all are finite."""
 
 
 class LossStatistics:
@@ -46,14 +46,14 @@ class LossStatistics:
         self._arrival = torch.cuda.Event() if on_cuda else None  # type: ignore[no-untyped-call]
 
     def begin(self, number: int, steps: int) -> None:
-        """Set number and steps of the iteration that `add` adds next."""
+        """Set the number, from 1 on, and the steps of the iteration that `add` adds next."""
         self._now[0].fill_(number)
         self._now[1].fill_(steps)
         self._count += 1
         self._step_sum += steps
 
     def add(self, replaced: Tensor) -> None:
-        """Add the iteration's loss terms and replaced worlds, before its optimiser step."""
+        """Add an iteration's loss terms and `replaced` worlds, before the optimiser's step."""
         terms = self._iteration.terms
         self._sums += terms
         self._replaced += replaced.sum()
@@ -65,7 +65,7 @@ class LossStatistics:
             torch.where(first, value, self._snapshot[name], out=self._snapshot[name])
 
     def send(self) -> None:
-        """Start to copy the interval's statistics to the CPU, and begin the next interval."""
+        """Start to copy the sums since the last `send` to the CPU, and set them to 0."""
         self._sent.copy_(self._totals, non_blocking=True)
         if self._arrival is not None:
             self._arrival.record(torch.cuda.current_stream(self._totals.device))
@@ -97,8 +97,8 @@ class LossStatistics:
     def snapshot(self) -> dict[str, Any]:
         """Return the state of the first iteration whose loss was not finite, on the CPU.
 
-        That is `iteration`, `steps`, `terms` (by name), `x0`, `s0` (before the rollout), `x`, `s`
-        (after it), `parameters` (one flat vector), and `goal` where the task has goals.
+        Its keys are `iteration`, `steps`, `terms` (by name), `x0`, `s0` (before the rollout), `x`,
+        `s` (after it), `parameters` (one flat vector), and `goal` where the task has goals.
         """
         values = {name: value.cpu() for name, value in self._snapshot.items()}
         terms = values.pop("terms").tolist()
@@ -148,7 +148,7 @@ def divergence_error(
 
 @torch.no_grad()
 def diverged_worlds(task: Task, rule: nn.Module, snapshot: dict[str, Any]) -> list[int]:
-    """Return the indices of the batch's worlds whose own loss is not finite."""
+    """Return the indices of the snapshot's worlds for which the loss of a world is not finite."""
     rule = copy.deepcopy(rule).cpu()
     trained = [parameter for parameter in rule.parameters() if parameter.requires_grad]
     nn.utils.vector_to_parameters(snapshot["parameters"], trained)

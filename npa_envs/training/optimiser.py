@@ -1,4 +1,4 @@
-"""Gradient normalisation, and the optimiser of rules."""
+"""The optimiser of rules, and the normalisation of gradients."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from npa_envs.rule.rule import NPARule, fate_parameters
 from npa_envs.tasks.train_config import TrainConfig
 
 FATE_RATE = 0.02
-"""Learning rate of the weights of division and death, as a fraction of that of all others."""
+"""Learning rate of the weights of division and death, divided by that of all others."""
 
 MUON_MOMENTUM = 0.9
 """Muon's momentum; the usual 0.95 trains less well."""
@@ -25,7 +25,7 @@ NORM_FLOOR = 1e-8
 
 
 def normalise_gradients(gradients: Sequence[Tensor]) -> None:
-    """Divide each gradient by its own norm, in place; one that is not finite becomes 0."""
+    """Divide each gradient by its norm, in place; a gradient that is not finite becomes 0."""
     norms = torch.stack([torch.linalg.vector_norm(gradient) for gradient in gradients])
     # A norm is not finite if an entry is not.
     bad = ~(norms < math.inf)
@@ -35,7 +35,7 @@ def normalise_gradients(gradients: Sequence[Tensor]) -> None:
 
 
 def layer_weights(rules: nn.Module) -> list[Tensor]:
-    """Return the weight matrices of all layers of one rule or several in a module.
+    """Return the weight matrices of all layers of a rule, or of several in a module.
 
     Biases, codes and the weights of division are left out.
     """
@@ -50,7 +50,7 @@ def layer_weights(rules: nn.Module) -> list[Tensor]:
 
 
 class RuleOptimiser:
-    """AdamW, or Muon for weight matrices and AdamW for all else; new moments in each of `repeats`.
+    """AdamW, or with optimiser="muon" Muon for weight matrices and AdamW for all else.
 
     Muon's steps are orthogonalised momentum, computed in bfloat16 and scaled to the length of
     AdamW's steps (Jordan et al. 2024; Liu et al., arXiv 2502.16982).
@@ -73,15 +73,15 @@ class RuleOptimiser:
                 others, lambda p: FATE_RATE if id(p) in fates else 1.0
             )
         ]
-        self._optimisers = self._fresh_optimisers()
+        self._optimisers = self._new_optimisers()
 
     def step(self, iteration: int, least_progress: float = 0.0) -> None:
-        """Step along the parameters' `grad`; each repeat of the schedule begins with zero moments.
+        """Update the parameters by their `grad`; where the schedule restarts, moments are 0 again.
 
-        least_progress: Lower bound on the progress of the learning rate's schedule, in [0, 1].
+        `iteration` counts from 0. `least_progress` is that of `TrainConfig.learning_rate_at`.
         """
         if iteration > 0 and iteration % self._config.iterations == 0:
-            self._optimisers = self._fresh_optimisers()
+            self._optimisers = self._new_optimisers()
         rate = self._config.learning_rate_at(iteration, least_progress)
         for optimiser in self._optimisers:
             for group in optimiser.param_groups:
@@ -89,18 +89,18 @@ class RuleOptimiser:
             optimiser.step()
 
     def state_dict(self) -> dict[str, Any]:
-        """Return moments and step counts by the index of a parameter, for a checkpoint."""
+        """Return the moments and step count of each parameter, by its index, for a checkpoint."""
         states = [item for optimiser in self._optimisers for item in optimiser.state.items()]
         return {"state": {self._indices[id(parameter)]: state for parameter, state in states}}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore what `state_dict` returned."""
+        """Restore the moments and step counts that `state_dict` returned."""
         moments, indices = state["state"], self._indices
         for optimiser in self._optimisers:
             order = [indices[id(p)] for group in optimiser.param_groups for p in group["params"]]
             load_moments(optimiser, {k: moments[i] for k, i in enumerate(order) if i in moments})
 
-    def _fresh_optimisers(self) -> list[Optimizer]:
+    def _new_optimisers(self) -> list[Optimizer]:
         optimisers: list[Optimizer] = []
         decay = self._config.weight_decay
         if self._orthogonal:
@@ -122,6 +122,6 @@ class RuleOptimiser:
 
 
 def load_moments(optimiser: Optimizer, state: dict[int, Any]) -> None:
-    """Load an optimiser's state without its parameter groups, which stay as they are."""
+    """Load the `state` of an optimiser's `state_dict`; its parameter groups do not change."""
     groups = optimiser.state_dict()["param_groups"]
     optimiser.load_state_dict({"state": state, "param_groups": groups})

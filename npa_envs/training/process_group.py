@@ -30,7 +30,7 @@ class ProcessGroup:
         self.rank = rank
         self.count = count
         self.distributed = distributed
-        """Whether the processes are torch's default group, even if there is only one."""
+        """Whether the processes are torch's default group, which may have only one process."""
         self._parent = os.getppid()
 
     @classmethod
@@ -46,7 +46,7 @@ class ProcessGroup:
         return self.rank == 0
 
     def check(self, config: TrainConfig[Any]) -> None:
-        """Check that a run can be divided among the processes."""
+        """Raise NPAError unless batch and pool of a run can be divided among the processes."""
         batch, pool = config.world_count, config.pool_size
         self.check_even("world_count", batch)
         if pool % batch:
@@ -56,7 +56,7 @@ class ProcessGroup:
             )
 
     def check_even(self, name: str, worlds: int) -> None:
-        """Check that a number of worlds, called `name` in the error, is divisible by `count`."""
+        """Raise NPAError unless a number of worlds, called `name`, is divisible by `count`."""
         if worlds % self.count:
             nearest = max(worlds // self.count, 1) * self.count
             raise NPAError(
@@ -65,18 +65,18 @@ class ProcessGroup:
             )
 
     def indices(self, total: int, section: int = 1) -> Tensor:
-        """Return indices of this process's worlds, cut as by `local`, int64, on the CPU."""
+        """Return the indices of this process's worlds among `total`, by `local`, on the CPU."""
         return self.local(torch.arange(total), section)
 
     def local(self, worlds: Tensor, section: int) -> Tensor:
-        """Return this process's rows of a tensor of all worlds, in sections of `section` worlds."""
+        """Return this process's rows of all worlds: every `count`-th section, of `section` rows."""
         sections = worlds.view(-1, self.count, section, *worlds.shape[1:])
         return sections[:, self.rank].flatten(0, 1)
 
     def gathered(self, worlds: Tensor, section: int) -> Tensor:
-        """Return all processes' worlds on rank 0, on the CPU, and this process's on others.
+        """Return all processes' rows on rank 0, and this process's on other ranks, on the CPU.
 
-        They are cut as by `local`. With one process `worlds` is returned unchanged.
+        It is the inverse of `local`. With one process `worlds` is returned unchanged.
         """
         if self.count == 1:
             return worlds
@@ -99,7 +99,7 @@ class ProcessGroup:
         return values[0]
 
     def any(self, flag: bool) -> bool:
-        """Return whether the flag is set on any process."""
+        """Return whether `flag` is True on any process."""
         if not self.distributed:
             return flag
         return bool(self._all_reduce(torch.tensor(int(flag)), "MAX"))
@@ -127,7 +127,7 @@ class ProcessGroup:
             mean.copy_(values.view(mean.shape))
 
     def check_same(self, tensors: Sequence[Tensor]) -> None:
-        """Check that tensors are the same on all processes, bit for bit."""
+        """Raise NPAError unless tensors have the same values on all processes."""
         if self.count == 1:
             return
         flat = torch.cat([tensor.detach().reshape(-1).double().cpu() for tensor in tensors])
@@ -162,17 +162,18 @@ class ProcessGroup:
 
 
 ALONE = ProcessGroup()
+"""The only process of a run without a group."""
 
 
 class RunRandomness:
     """Random generators of a run, by what they draw.
 
-    `schedule`, on the CPU, draws numbers of steps and initial weights; `pool` the first worlds;
-    `worlds` which worlds a batch has, their damage and seeds; `masks` which particles are updated.
+    `run`, on the CPU, draws numbers of steps and initial weights; `pool` the first worlds; `worlds`
+    which worlds a batch has, their damage and start worlds; `masks` which particles are updated.
 
     By default they are torch generators, whose states checkpoints store. With `per_world_streams`,
-    which runs of several processes need, all but `schedule` have a stream for each world. Streams
-    depend on the seed, the world's index among those of all processes, and the iteration, so they
+    which runs of several processes need, all but `run` have a stream for each world. Streams depend
+    on the run's seed, the world's index among those of all processes, and the iteration, so they
     are the same for any number of processes, and checkpoints need not store them.
     """
 
@@ -180,7 +181,7 @@ class RunRandomness:
         self,
         config: TrainConfig[Any],
         device: torch.device,
-        schedule: torch.Generator,
+        run_generator: torch.Generator,
         processes: ProcessGroup,
         *,
         per_world_streams: bool,
@@ -193,13 +194,13 @@ class RunRandomness:
             indices = processes.indices(total, section)
             return world_streams((config.seed, purpose), total, indices, device)
 
-        self.schedule = schedule
+        self.run = run_generator
         self.worlds = streams(1, batch)
         self.masks = streams(2, batch)
         self.pool = streams(0, pool, pool // batch) if per_world_streams else self.worlds
 
     def _by_name(self) -> dict[str, Randomness]:
-        return {"schedule": self.schedule, "worlds": self.worlds, "masks": self.masks}
+        return {"schedule": self.run, "worlds": self.worlds, "masks": self.masks}
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return the states of torch generators by name, for a checkpoint."""
@@ -218,7 +219,7 @@ class RunRandomness:
 def world_streams(
     seed: Sequence[int], total: int, indices: Tensor, device: torch.device
 ) -> WorldRandom:
-    """Return random streams of the worlds at `indices`; each depends on its index only."""
+    """Return the random streams of worlds at `indices` of `total`, by `seed` and their indices."""
     keys = np.random.default_rng(seed).integers(2**64, size=total, dtype=np.uint64)
     return WorldRandom.from_keys(torch.from_numpy(keys.view(np.int64))[indices].to(device))
 
@@ -231,5 +232,5 @@ def begin_episodes(*randoms: Randomness) -> None:
 
 
 def generator_to_register(random: Randomness) -> torch.Generator | None:
-    """Return a torch generator, which CUDA graphs must register; None for a `WorldRandom`."""
+    """Return `random` if it is a torch generator, which CUDA graphs must register; else None."""
     return random if isinstance(random, torch.Generator) else None

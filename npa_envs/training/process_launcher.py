@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 def launch(count: int, arguments: Sequence[str], out: Path, device: str) -> int:
-    """Run a command in several processes, and return the exit code once all have ended.
+    """Run `npa-envs` with these arguments in `count` processes; return the exit code at their end.
 
     If one ends early, the others are terminated, and killed after half a minute. On CUDA each
     process gets one device. `out` is the folder of the run, for errors.
@@ -85,7 +85,7 @@ def launch(count: int, arguments: Sequence[str], out: Path, device: str) -> int:
         raise NPAError(
             f"process {rank} of {count} was ended by {name}, and the others with it (SIGKILL is "
             "often a lack of memory): the last checkpoint is intact, "
-            f"{RunFolder(out).checkpoint}; go on from it with --resume"
+            f"{RunFolder(out).checkpoint}; continue from it with --resume"
         ) from error
     return 0
 
@@ -107,7 +107,7 @@ def requested_processes(gpus: int | None, processes: int | None, device: str) ->
 
 @contextlib.contextmanager
 def print_once(processes: ProcessGroup) -> Iterator[None]:
-    """Within the block, raise NPAErrors on rank 0 only: others exit with 2, and tell torchrun."""
+    """Within the block, let only rank 0 raise NPAErrors; other processes exit with code 2."""
     try:
         yield
     except NPAError as error:
@@ -204,7 +204,7 @@ class Heartbeat:
             thread.start()
 
     def end(self, *, finished: bool) -> None:
-        """Stop watching; with `finished`, let the others go on without this process."""
+        """Stop watching; with `finished`, let the others continue without this process."""
         self._finished = finished
         self._ended.set()
         for thread in self._threads:

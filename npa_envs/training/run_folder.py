@@ -40,12 +40,11 @@ except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
 ONE_REQUEST = 1.0
-"""Signals within this time are one request to stop [s]: a scheduler may signal both a run and its
-launcher, which forwards it."""
+"""Signals within this time are one request to stop [s]: a run's launcher may forward its own."""
 
 
 def check_choice(*, resume: bool, overwrite: bool) -> None:
-    """Check that a run is not both resumed and overwritten."""
+    """Raise NPAError if a run is to be both resumed and overwritten."""
     if resume and overwrite:
         raise NPAError(
             "resume and overwrite exclude each other: resume continues the run in the folder, "
@@ -128,11 +127,8 @@ class Run:
         `begin` to `end`, which is called with whether the run was stopped. Returns whether a
         signal came.
         """
-        requests: contextlib.AbstractContextManager[threading.Event]
-        requests = stop_flag(patient=self._processes.distributed)
-        if self.folder is None:
-            requests = contextlib.nullcontext(threading.Event())
-        with requests as stop:
+        caught, patient = self.folder is not None, self._processes.distributed
+        with stop_flag(caught=caught, patient=patient) as stop:
             begin()
             stopped = False
             while not stopped and not is_over():
@@ -150,15 +146,15 @@ class Run:
 
 
 @contextlib.contextmanager
-def stop_flag(*, patient: bool = False) -> Iterator[threading.Event]:
+def stop_flag(*, caught: bool = True, patient: bool = False) -> Iterator[threading.Event]:
     """Within the block, the first SIGINT or SIGTERM sets the event; later ones act as usual.
 
     Signals within `ONE_REQUEST` of the first one are ignored; with `patient` all later ones, as
-    torchrun forwards those that a terminal has sent already. In a thread other than the main one,
-    where signals cannot be caught, the event stays unset.
+    torchrun forwards signals that a terminal has sent already. The event stays unset without
+    `caught`, and in a thread other than the main one, where signals cannot be caught.
     """
     requested = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
+    if not caught or threading.current_thread() is not threading.main_thread():
         yield requested
         return
     first = 0.0
@@ -185,10 +181,8 @@ def stop_flag(*, patient: bool = False) -> Iterator[threading.Event]:
         restore()
 
 
-# Files.
-
 MAX_LOG = 2**29
-"""Largest log of a run [bytes]."""
+"""Maximum size of a run's log [bytes]."""
 
 
 class RunFolder:
@@ -215,7 +209,7 @@ class RunFolder:
         self._known: tuple[int, int] | None = None
 
     def prepare(self, byte_count: int, *, pictures: bool = True) -> None:
-        """Create the folder; check that the disk has room for two checkpoints of `byte_count`."""
+        """Create the folder; NPAError without room for two checkpoints of `byte_count` bytes."""
         # The old checkpoint exists until the new one is complete.
         needed = 2 * byte_count
         try:
@@ -336,7 +330,7 @@ class JsonlLog:
             ) from error
 
     def truncate(self, iteration: int | None = None) -> None:
-        """Drop an incomplete last line, and the lines after an iteration, if given."""
+        """Rewrite the log without an incomplete last line, and without lines after `iteration`."""
         write_text(self.path, "".join(json.dumps(r) + "\n" for r in self.records(iteration)))
         self._is_complete = True
 
@@ -378,7 +372,7 @@ def _parsed_record(line: str) -> dict[str, Any] | None:
 
 
 PICTURE_HEIGHT = 256
-"""Least height of the pictures [pixels]; pixels of smaller ones are repeated."""
+"""Minimum height of the pictures [pixels]; pixels of smaller ones are repeated."""
 
 PICTURE_GAP = 8
 """Pixels between the worlds of a picture."""
@@ -396,7 +390,7 @@ class RunLog(JsonlLog):
     def opened(self, tensorboard: bool, iteration: int) -> Iterator[None]:
         """Within the block, also write to TensorBoard, if `tensorboard`.
 
-        Events of an earlier process after `iteration` are hidden.
+        TensorBoard hides what an earlier process wrote after `iteration`.
         """
         if tensorboard:
             # TensorBoard imports TensorFlow if it is installed; this silences it.
@@ -413,7 +407,7 @@ class RunLog(JsonlLog):
                 self._board = None
 
     def append(self, record: dict[str, Any]) -> None:
-        """Write a line of numbers, one of them the `iteration`, also to TensorBoard."""
+        """Write a record with its `iteration` as a line, and while opened to TensorBoard."""
         super().append(record)
         if self._board is not None:
             for name, value in record.items():
@@ -421,7 +415,7 @@ class RunLog(JsonlLog):
                     self._board.add_scalar(name, value, record["iteration"])
 
     def add_picture(self, picture: Tensor, iteration: int) -> None:
-        """Add target and worlds of a batch side by side: a PNG file, for TensorBoard a JPEG."""
+        """Write pictures [K, H, W, 3] side by side, as a PNG file and for TensorBoard as a JPEG."""
         repeats = math.ceil(PICTURE_HEIGHT / picture.shape[1])
         frames = to_uint8(picture).repeat(repeats, axis=1).repeat(repeats, axis=2)
         frames = np.pad(frames, ((0, 0), (0, 0), (0, PICTURE_GAP), (0, 0)), constant_values=255)

@@ -145,7 +145,7 @@ def tasks_of_codes(
 
 
 def _world_of(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
-    """Return fields of the task's configuration from a rule file of `npa-envs search`."""
+    """Return the fields of the task's configuration that a file of `npa-envs search` names."""
     fields = None
     with contextlib.suppress(NPAError):
         fields = parse_json(metadata.get("world", "{}"))

@@ -55,7 +55,7 @@ class TaskEntry:
     """Whether particles never move."""
 
     def expected_seconds(self, config: TrainConfig[Any]) -> float | None:
-        """Return the estimated duration of a run on a CPU [s], by its particle-steps.
+        """Return the estimated duration of a run on a CPU [s], from its number of particle-steps.
 
         None on other devices, where particle-steps predict little.
         """
@@ -74,7 +74,7 @@ class TaskEntry:
 
 TASKS: Mapping[str, TaskEntry] = {
     "morphogenesis2d": TaskEntry(
-        summary="grow a picture from a disk of blank particles",
+        summary="grow a picture from a disk of particles with zero states",
         presets=MORPHOGENESIS2D_PRESETS,
         make=lambda config, device: (ManyPictures if config.targets else Morphogenesis2D)(
             config, device=device
@@ -97,7 +97,7 @@ TASKS: Mapping[str, TaskEntry] = {
         fast_seconds=340.0,
     ),
     "morphogenesis3d": TaskEntry(
-        summary="grow a 3D object from a ball of blank particles",
+        summary="grow a 3D object from a ball of particles with zero states",
         presets=MORPHOGENESIS3D_PRESETS,
         make=lambda config, device: Morphogenesis3D(config, device=device),
         targets=builtin_meshes,
@@ -155,13 +155,11 @@ def preset(name: str, task_name: str = "morphogenesis2d", /, **fields: Any) -> T
     return override(presets[name], **fields)
 
 
-# Overrides, by field names or by a file.
-
 MAX_FILE = 2**20
-"""Largest configuration file [bytes]."""
+"""Maximum size of a configuration file [bytes]."""
 
 MERGED = 10_000
-"""Largest number of fields that YAML's merge keys may add."""
+"""Maximum number of fields of a YAML mapping, with those that merge keys add."""
 
 
 def override(config: TrainConfig[TaskConfigT], /, **fields: Any) -> TrainConfig[TaskConfigT]:
@@ -302,7 +300,7 @@ def _replaced(name: str, present: Any, fields: Mapping[str, Any]) -> Any:
 
 
 def _convert(name: str, value: Any, cls: Any, present: Any) -> Any:
-    """Convert a value read from a file to a field's type `cls`; `present` is its current value."""
+    """Return a file's value as a field's type `cls`; `present` is the field's current value."""
     origin = typing.get_origin(cls)
     if origin is typing.Literal:
         return value

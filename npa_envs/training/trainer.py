@@ -38,13 +38,13 @@ from npa_envs.training.task_table import config_to_dict
 from npa_envs.world.species import species_particles
 
 JOINT_TASK_NAME = "co_morphogenesis2d"
-"""Name of the task of several rules in checkpoints."""
+"""Name, in checkpoints, of the task that trains several rules together."""
 
 LEFT_OUT = ("out", "device", "initial_rule", "initial_rules", "frozen")
-"""Fields that rule files do not have, as these are shared with others: paths and the device."""
+"""Fields of the configuration that rule files leave out: paths, and the device."""
 
 FIRST_PICTURE = 10
-"""Iteration after which the first picture is written, if the interval is longer."""
+"""Number of iterations before the first picture, if `picture_interval` is longer."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class TrainResult:
     rule: NPARule | JointRules
     """The rule after the last iteration."""
     iteration: int
-    """Iterations done."""
+    """Number of iterations done."""
     finished: bool
     """Whether all iterations are done; if not, the run was stopped and can be resumed."""
     interrupted: bool
@@ -62,7 +62,7 @@ class TrainResult:
     record: dict[str, Any]
     """The last line of the log: loss terms (means over the interval), learning rate, seconds."""
     folder: Path
-    """Folder of log, pictures, checkpoint and rule."""
+    """Folder with log, pictures, checkpoint and rule."""
 
 
 class Trainer:
@@ -79,7 +79,7 @@ class Trainer:
         task_name: The task's name in checkpoints.
         resume: Continue from the checkpoint in `config.out`.
         overwrite: Remove the files of an earlier run in `config.out`.
-        rollout: Replaces `rollout_particles`, with its arguments; None: that itself.
+        rollout: For one rule, a function to call in place of `rollout_particles`; None: that one.
         processes: The processes of the run; None: those of torch's default group.
         rules: Initial rules of several species, which are copied; None: those of the configuration.
 
@@ -102,16 +102,13 @@ class Trainer:
         processes: ProcessGroup | None = None,
         rules: Sequence[NPARule] | None = None,
     ) -> None:
-        self.task = task
-        self.config = config
-        self.task_name = task_name
+        self.task, self.config, self.task_name = task, config, task_name
         self.folder = RunFolder(config.out)
         self._log = RunLog(self.folder)
         self._record: dict[str, Any] = {}
         self._unwritten_record: dict[str, Any] | None = None
         """Number and learning rate of the iteration whose log record is not yet written."""
-        self._least_progress = 0.0
-        self._seconds_before = 0.0
+        self._least_progress, self._seconds_before = 0.0, 0.0
         self._started: float | None = None
         device = check_device(config.device)
         # On CUDA a record is written an iteration later, so that the device does not idle.
@@ -120,32 +117,41 @@ class Trainer:
         check = functools.partial(check_same_run, task_name=task_name, config=config)
         self._run = Run(self.folder, self._processes, check, resume=resume, overwrite=overwrite)
         checkpoint = self._run.take_content()
-        schedule = torch.Generator().manual_seed(config.seed)
-        saved = None if checkpoint is None else checkpoint["rule_hyper_parameters"]
-        self.rule: NPARule | JointRules
+        run_generator = torch.Generator().manual_seed(config.seed)
+        self.rule: NPARule | JointRules = self._make_rule(run_generator, checkpoint, rules)
         """The trained module: one rule, or the rules of all species."""
+        self.rule.to(device, config.torch_dtype)
         if task.species_counts:
             counts = task.species_counts
-            self.rule = JointRules(_species_rules(config, task.make_rules(schedule), saved, rules))
             rollout = functools.partial(species_particles, counts=counts, density_counts=counts)
-        else:
-            untrained = task.make_rule(schedule)
-            self.rule = initial_rule(config, untrained) if saved is None else rule_like(saved)
-        self.rule.to(device, config.torch_dtype)
         self._cycle = TrainingCycle(
             task,
             self.rule,
             config,
             device,
-            schedule,
+            run_generator,
             rollout,
             processes=self._processes,
             # A run of several processes keeps these streams when one process resumes it.
             per_world_streams=self._processes.distributed
-            or (checkpoint is not None and has_per_world_streams(checkpoint)),
+            or has_per_world_streams(checkpoint or {}),
         )
         self.pool = self._cycle.pool
         self._open_folder(checkpoint)
+
+    def _make_rule(
+        self,
+        generator: torch.Generator,
+        checkpoint: dict[str, Any] | None,
+        rules: Sequence[NPARule] | None,
+    ) -> NPARule | JointRules:
+        """Return the module to train: with initial weights, or of the shape of a checkpoint's."""
+        saved = None if checkpoint is None else checkpoint["rule_hyper_parameters"]
+        if self.task.species_counts:
+            each = self.task.make_rules(generator)
+            return JointRules(_species_rules(self.config, each, saved, rules))
+        untrained = self.task.make_rule(generator)
+        return initial_rule(self.config, untrained) if saved is None else rule_like(saved)
 
     def _open_folder(self, checkpoint: dict[str, Any] | None) -> None:
         """Create the folder; then restore the checkpoint of a resumed run, or write a first one."""
@@ -172,20 +178,20 @@ class Trainer:
 
     @property
     def iteration(self) -> int:
-        """Iterations done."""
+        """Number of iterations done."""
         return self._run.iteration
 
     def run(self, *, progress: bool = True, max_seconds: float | None = None) -> TrainResult:
         """Train until the end, or until Ctrl-C, SIGTERM or `max_seconds`; then save.
 
         Args:
-            max_seconds: Stop after this time [s]; the run can be resumed.
+            max_seconds: Stop after this time [s]; the run can be resumed. None: no limit.
 
         Raises:
             DivergedError: The loss is not finite.
-            NPAError: A file cannot be written, or a process of several is lost (the last checkpoint
-                is intact), or another trainer writes to the folder, or has done so since this one
-                was made.
+            NPAError: A file cannot be written, or one of several processes is lost (the last
+                checkpoint is intact), or another trainer writes to the folder, or has done so since
+                this one was made.
         """
         check_seconds(max_seconds)
         config, total, first = self.config, self.config.total_iterations, self._processes.first
@@ -237,9 +243,9 @@ class Trainer:
         """Train for one iteration, without waiting for the device and without writing files.
 
         Args:
-            least_progress: Lower bound on the schedule's progress, in [0, 1]; only "cosine" reads
-                it. `elapsed / seconds` ties the learning rate to a time limit; such a run is not
-                repeatable.
+            least_progress: Lower bound on the progress of the learning rate's schedule, in [0, 1];
+                only the schedule "cosine" reads it. `elapsed / seconds` ties the learning rate to a
+                time limit; such a run is not repeatable.
         """
         if not 0.0 <= least_progress <= 1.0:
             raise NPAError(
@@ -252,7 +258,7 @@ class Trainer:
 
     @property
     def saved_rule(self) -> NPARule | JointRules:
-        """The rule as it is saved: with the encoder's current codes in its table."""
+        """The rule as it is saved; if it has an encoder, a copy with a table of current codes."""
         rule = self.rule
         if isinstance(rule, NPARule) and rule.encoder:
             # The table has the codes of the last iteration, before the optimiser's step.
@@ -293,7 +299,7 @@ class Trainer:
         return self._seconds_before + running
 
     def _update_log(self) -> None:
-        """Begin the record of the interval that ends with this iteration, if one does.
+        """Begin the log record of the interval that ends with this iteration, if one does.
 
         It is written at once, or with `_defer_records` after the next iteration was launched.
         """
@@ -367,7 +373,7 @@ class Trainer:
 
 
 def check_seconds(max_seconds: object) -> None:
-    """Check a time limit [s]; raises NPAError."""
+    """Raise NPAError unless a time limit is a number of at least 0 [s], or None for no limit."""
     if max_seconds is None or max_seconds == math.inf:
         return
     if not is_real(max_seconds) or max_seconds < 0:  # type: ignore[operator]
@@ -378,7 +384,7 @@ def check_seconds(max_seconds: object) -> None:
 
 
 class JointRules(nn.Module):
-    """The rules of one world, one for each species, as a module that the trainer trains."""
+    """A module of several rules in one world, one for each species, which are trained together."""
 
     def __init__(self, rules: Sequence[NPARule]) -> None:
         super().__init__()
@@ -388,7 +394,7 @@ class JointRules(nn.Module):
         return iter(self.rules)
 
     def hyper_parameters(self) -> dict[str, Any]:
-        """Return the hyper-parameters of all rules, for checkpoints."""
+        """Return the hyper-parameters of all rules, as a list "rules", for checkpoints."""
         return {"rules": [dict(rule.hyper_parameters()) for rule in self]}
 
 
@@ -399,7 +405,7 @@ def write_rules(
     task_name: str,
     iteration: int,
 ) -> None:
-    """Write the rule of a run, or each of a `JointRules`, with its task and configuration."""
+    """Write a run's rule, or each of a `JointRules`, to its folder with task and configuration."""
     fields = {k: v for k, v in config_to_dict(config).items() if k not in LEFT_OUT}
     metadata = {"task": task_name, "config": json.dumps(fields), "iteration": str(iteration)}
     if isinstance(rule, NPARule):
@@ -411,7 +417,7 @@ def write_rules(
 
 
 def take_options(rule: NPARule, config: TrainConfig[Any]) -> None:
-    """Set `moment_inverse` and `dead_zone` as configured; equivariant rules get dead zone 0."""
+    """Set a rule's `moment_inverse` and `dead_zone` as configured, but 0 if it is equivariant."""
     rule.moment_inverse = config.moment_inverse
     rule.dead_zone = 0.0 if rule.equivariant else config.dead_zone
 
@@ -444,7 +450,7 @@ def initial_rule(config: TrainConfig[Any], untrained: NPARule) -> NPARule:
 
 
 def _differences(rule: NPARule, untrained: NPARule, config: TrainConfig[Any]) -> str:
-    """Return in what a rule differs from the task's, once it inverts moments as configured."""
+    """Return in which hyper-parameters a rule differs from the task's, as text; "" if in none."""
     if rule.moment_inverse == "threshold":
         rule.moment_inverse = config.moment_inverse
     theirs, ours = rule.hyper_parameters(), untrained.hyper_parameters()
@@ -462,7 +468,7 @@ def _species_rules(
     saved: dict[str, Any] | None,
     rules: Sequence[NPARule] | None,
 ) -> list[NPARule]:
-    """Return a rule for each species, with the shapes of the `untrained` ones."""
+    """Return each species' rule: like a checkpoint's (`saved`), else a copy of `rules` or new."""
     if config.initial_rule:
         raise NPAError(
             f"initial_rule is for one rule, got {shown(config.initial_rule)}: give one for each "

@@ -23,10 +23,7 @@ Sides = tuple[float, ...] | None
 
 
 def offsets_from(x: Tensor, centre: Tensor, box: Sides = None) -> Tensor:
-    """Return the vector from a point to each particle's nearest image in the box, [B, N, D].
-
-    Arguments and errors are those of `push`.
-    """
+    """Return vectors from `centre` to each particle's nearest image in the box, [B, N, D]."""
     check_world(x, x)
     _check_vector("centre", centre, x)
     if box is not None and len(as_list(box) or ()) != x.shape[2]:
@@ -35,7 +32,7 @@ def offsets_from(x: Tensor, centre: Tensor, box: Sides = None) -> Tensor:
 
 
 def nearest_image(vectors: Tensor, box: Sides) -> Tensor:
-    """Return vectors [..., D] replaced by their periodic images nearest to the origin."""
+    """Return the nearest periodic images to the origin of vectors [..., D], in the same shape."""
     if box is None:
         return vectors
     # One side at a time: a tensor of the sides would be copied to the device.
@@ -44,18 +41,15 @@ def nearest_image(vectors: Tensor, box: Sides) -> Tensor:
 
 
 def inside_ball(x: Tensor, *, centre: Tensor, radius: float | Tensor, box: Sides = None) -> Tensor:
-    """Return which particles lie in a ball, bool, shape [B, N].
-
-    Arguments and errors are those of `push`.
-    """
+    """Return which particles are at most `radius` away from `centre`, bool, shape [B, N]."""
     distance = torch.linalg.vector_norm(offsets_from(x, centre, box), dim=-1)
     return torch.le(distance, _per_world("radius", radius, x).squeeze(-1))
 
 
 def softness(x: Tensor, *, centre: Tensor, radius: float | Tensor, box: Sides = None) -> Tensor:
-    """Return the weight of each particle under a soft brush: (1 - r²)², 0 outside, [B, N, 1].
+    """Return each particle's weight under a soft brush, [B, N, 1]: (1 - r²)² for r < 1, else 0.
 
-    r is the distance from the centre in radii. Arguments and errors are those of `push`.
+    r is the particle's distance from `centre`, divided by `radius`.
     """
     size = _per_world("radius", radius, x)
     square = offsets_from(x, centre, box).square().sum(dim=-1, keepdim=True)
@@ -73,12 +67,14 @@ def push(
     strength: float | Tensor = 1.0,
     box: Sides = None,
 ) -> Tensor:
-    """Return positions after a soft brush has moved the particles under it, shape [B, N, D].
+    """Return positions after a brush has moved the particles under it, shape [B, N, D].
+
+    A particle follows the movement by `strength` times its weight by `softness`.
 
     Args:
         x: Particle positions [length units], shape [B, N, D].
         centre: Where the brush is in each world [length units], shape [B, D].
-        move: How it moves [length units], shape [B, D].
+        move: Displacement of the brush [length units], shape [B, D].
         radius: Radius of the brush [length units], at least 0; a number or a tensor of shape [B].
         strength: Fraction of the movement that a particle in the centre follows (dimensionless),
             from 0 to 1; a number or a tensor of shape [B].
@@ -103,15 +99,13 @@ def inject(
     strength: float | Tensor = 1.0,
     box: Sides = None,
 ) -> Tensor:
-    """Return states after a soft brush has blended those under it with a given state, [B, N, C].
-
-    Other arguments and errors are those of `push`.
+    """Return states after a brush has blended those under it with a given state, [B, N, C].
 
     Args:
         s: Particle states (dimensionless), shape [B, N, C].
         state: State to inject in each world (dimensionless), shape [B, C].
         strength: Weight of that state for a particle in the centre (dimensionless), from 0 to 1; a
-            number or a tensor of shape [B].
+            number or a tensor of shape [B]. Elsewhere it is multiplied by `softness`.
     """
     check_world(x, s)
     _check_vector("state", state, s, "C")
@@ -122,9 +116,9 @@ def inject(
 def state_around(
     x: Tensor, s: Tensor, *, centre: Tensor, radius: float | Tensor, box: Sides = None
 ) -> tuple[Tensor, Tensor]:
-    """Return the mean state [B, C] by weights `softness`, and whether any is positive, bool [B].
+    """Return the mean state under a soft brush, [B, C], and whether a particle is there, bool [B].
 
-    Arguments and errors are those of `inject`.
+    `softness` weights the mean. Without a particle it is 0.
     """
     check_world(x, s)
     weights = softness(x, centre=centre, radius=radius, box=box)
@@ -137,10 +131,7 @@ def state_around(
 def wipe_state(
     x: Tensor, s: Tensor, *, centre: Tensor, radius: float | Tensor, box: Sides = None
 ) -> Tensor:
-    """Return new states, zero for the particles inside a ball, shape [B, N, C].
-
-    Arguments and errors are those of `inject`.
-    """
+    """Return a copy of the states with 0 for particles inside a ball, shape [B, N, C]."""
     check_world(x, s)
     inside = inside_ball(x, centre=centre, radius=radius, box=box)
     return s.masked_fill(inside[..., None], 0.0)
@@ -158,10 +149,9 @@ def cut(
 ) -> tuple[Tensor, Tensor]:
     """Open a slit along a line (a plane in 3D) by moving particles apart.
 
-    Particles within `gap` of the line move away from it, those on the line by half the gap and
-    those at the distance `gap` not at all: none is left within half the gap, the bands on both
-    sides of the slit are twice as dense, and particles further away do not move. Other arguments
-    and errors are those of `inject`.
+    A particle on the line moves away from it by half the gap, one at the distance `gap` / 2 by a
+    quarter of the gap, and one at `gap` or further not at all. So no particle is left within half
+    the gap, and the bands on both sides of the slit are twice as dense.
 
     Args:
         centre: A point on the line in each world [length units], shape [B, D].
@@ -202,13 +192,11 @@ def clump(
     factor: float | Tensor,
     box: Sides = None,
 ) -> tuple[Tensor, Tensor]:
-    """Draw the particles inside a ball together.
-
-    Other arguments and errors are those of `inject`.
+    """Move the particles inside a ball towards its centre.
 
     Args:
-        factor: Fraction by which distances from the centre shrink (dimensionless), from 0, nothing
-            moves, to 1, all meet in the centre; a number or a tensor of shape [B].
+        factor: Fraction by which distances from the centre shrink (dimensionless), from 0, where
+            nothing moves, to 1, where all meet in the centre; a number or a tensor of shape [B].
 
     Returns:
         The new positions, shape [B, N, D], and the same states.

@@ -32,17 +32,17 @@ from npa_envs.world.rule_settings import (
 )
 
 if TYPE_CHECKING:
-    from npa_envs.world.execute import RolloutSpec
+    from npa_envs.world.rollout_execution import RolloutSpec
 
 MAX_GRAPHS = 128
-"""Most graphs of a captured rollout, each for one number of steps."""
+"""Maximum number of graphs of a captured rollout, each for one number of steps."""
 
 CAPTURE_WARM_UP_STEPS = 4
-"""Steps that load all kernels: enough for static worlds and every `memory` mode."""
+"""Number of steps that load all kernels: enough for static worlds and every `memory` mode."""
 
 
 def _clone(rule: NPARule, x: Tensor) -> NPARule:
-    """Return a rule of the same shapes and settings, with new memory for weights of x's dtype."""
+    """Return a rule of the same settings; a plain one has new, empty weights of x's dtype."""
     if not rule.has_network():
         return copy.deepcopy(rule)
     form = rule.hyper_parameters() | {"readout_dim": 0, "readout_hidden_dim": 0}
@@ -68,12 +68,12 @@ class RolloutCall(NamedTuple):
     weights: list[Tensor]
     """Tensors of all rules."""
     grad_flags: tuple[bool, ...]
-    """Which worlds and weights require a gradient; (): none does, or gradients are disabled."""
+    """Which tensors of worlds and weights require a gradient; () if none does."""
     generator: Randomness | None
     explicit: bool
     """Whether the caller asked for a capture by `cuda_graph=True`."""
     blocks: list[int]
-    """Steps of each graph to replay, one after the other."""
+    """Numbers of steps of the graphs to replay, one after the other."""
 
 
 class _Graphs(NamedTuple):
@@ -88,7 +88,7 @@ class _Graphs(NamedTuple):
 
 
 class CapturedRollout:
-    """Fixed input tensors, and graphs that run rollouts on them for several numbers of steps.
+    """Fixed input tensors, and graphs that run rollouts on them, one for each number of steps.
 
     All graphs share memory, so only one call can use them at a time.
     """
@@ -97,8 +97,7 @@ class CapturedRollout:
         x = call.particles.x
         self.device = x.device
         worlds = call.particles.with_zero_paths()
-        _, _, self._no_paths, *_ = worlds
-        """Path lengths at the start, zeros."""
+        _, _, self._zero_paths, *_ = worlds
         self.bytes = 0
         """Memory of the graphs [bytes]."""
         self.ready = torch.cuda.Event()  # type: ignore[no-untyped-call]
@@ -124,7 +123,7 @@ class CapturedRollout:
             keys = torch.zeros(len(x), dtype=torch.int64, device=self.device)
             self._streams = WorldRandom.from_keys(keys)
         self._cotangents: dict[int | None, list[Tensor]] = {}
-        """Cotangents of the returned worlds, by the number of worlds returned."""
+        """Buffers for gradients by the returned worlds, by the number of worlds returned."""
         self.graphs: collections.OrderedDict[int, _Graphs] = collections.OrderedDict()
         """Graphs by number of steps, the least recently used first."""
         self.compared: set[int] = set()
@@ -134,14 +133,14 @@ class CapturedRollout:
         self._pool = torch.cuda.graph_pool_handle()
         self.last_stream: torch.cuda.Stream | None = None
         self.token = torch.empty(0, device=self.device)
-        """What autograd saves in the place of tensors for the backward pass."""
+        """An empty tensor that autograd saves in place of those of the backward pass."""
 
     def _inputs_of(self, call: RolloutCall) -> list[Tensor]:
         """Return a call's tensors, in the order of the fixed tensors that they are copied to."""
-        return [*call.particles.with_zero_paths(self._no_paths).tensors(), *call.weights]
+        return [*call.particles.with_zero_paths(self._zero_paths).tensors(), *call.weights]
 
     def capture(self, steps: int, call: RolloutCall) -> None:
-        """Capture `steps` steps as CUDA graphs; before the first, run some of `call` eagerly."""
+        """Capture `steps` steps as CUDA graphs; before the first capture, launch a few of them."""
         if not self.graphs:
             self._warm_up(min(steps, CAPTURE_WARM_UP_STEPS), call)
         elif len(self.graphs) >= MAX_GRAPHS:
@@ -186,7 +185,7 @@ class CapturedRollout:
         self.bytes += max(torch.cuda.memory_reserved(self.device) - bytes_before, 0)
 
     def _warm_up(self, steps: int, call: RolloutCall) -> None:
-        """Run `steps` steps of a call eagerly, and count the random numbers that they draw."""
+        """Launch `steps` steps of a call, and count the random numbers that a step draws."""
         spec = self._spec._replace(steps=steps, keep_every=None)
         with torch.no_grad():
             torch._foreach_copy_(self._inputs, self._inputs_of(call))
@@ -211,7 +210,7 @@ class CapturedRollout:
     def _check_unchanged(
         self, settings: dict[tuple[int, str], Hashable], versions: list[int]
     ) -> None:
-        """Check that a capture has changed no settings, and its backward pass no inputs."""
+        """Raise NPAError if a capture has changed settings, or its backward pass inputs."""
         after = self._settings()
         keys = settings.keys() | after.keys()
         changed = {key[1] for key in keys if settings.get(key) != after.get(key)}
@@ -238,7 +237,7 @@ class CapturedRollout:
         return [tensor._version for tensor in self._inputs]
 
     def _cotangents_of(self, steps: int) -> list[Tensor]:
-        """Return buffers for the gradients by the worlds that a rollout of `steps` returns."""
+        """Return the buffers for gradients by the worlds that a rollout of `steps` returns."""
         interval = self._spec.keep_every
         count = None if interval is None else steps // interval
         if count not in self._cotangents:
@@ -257,7 +256,8 @@ class CapturedRollout:
         generator = self._generator if self._streams is None else self._streams
         hooks = torch.autograd.graph.saved_tensors_hooks(save, lambda tensor: tensor)
         with torch.set_grad_enabled(self.differentiable), hooks:
-            return spec.run(self._rules, self._worlds, generator)
+            step = spec.make_step(self._rules, self._worlds)
+            return spec.launch(step, self._rules, self._worlds, generator)
 
     def _pull_back(self, results: Sequence[Tensor], cotangents: list[Tensor]) -> list[Tensor]:
         """Launch the backward pass, and return the gradients of inputs that require one."""
@@ -275,7 +275,7 @@ class CapturedRollout:
         return [gradient.contiguous() for gradient in gradients]
 
     def replay(self, call: RolloutCall, use: object) -> Particles:
-        """Replay the graphs of a call, and copy buffers that they change back to the rule."""
+        """Replay a call's graphs; return copies of the worlds. `use` lives until the last pass."""
         generator = call.generator
         inputs = self._inputs_of(call)
         self.ready.record(current_stream(self.device))
@@ -299,6 +299,7 @@ class CapturedRollout:
                 generator.sync_with(self._streams, steps)
             written = self.graphs[steps].written
             if written:
+                # Buffers that the network has changed are copied back to the call's rules.
                 with torch.no_grad():
                     torch._foreach_copy_(
                         [inputs[k] for k in written], [self._inputs[k] for k in written]
@@ -312,7 +313,7 @@ class CapturedRollout:
         return combined(torch.cat, results)
 
     def _check_positions(self, x: Tensor, generator: Randomness | None, steps: int) -> None:
-        """Check that positions are finite; otherwise the generator returns to its former state."""
+        """Raise NPAError, with the generator as before the replay, unless positions are finite."""
         try:
             FiniteCheck(x, self.ready).wait()
         except NPAError:
@@ -338,7 +339,7 @@ class CapturedRollout:
     def backward(
         self, steps: int, cotangents: Sequence[Tensor | None], grad_flags: Sequence[bool]
     ) -> list[Tensor | None]:
-        """Replay the backward pass of the last rollout, and return copies of the gradients."""
+        """Replay the last rollout's backward pass; return copies of gradients, None if unneeded."""
         with torch.cuda.device(self.device):
             self._wait_for_last_use()
             for buffer, cotangent in zip(self._cotangents_of(steps), cotangents, strict=True):
@@ -361,7 +362,6 @@ class CapturedRollout:
             self._generator.set_offset(reserve_draws(source, steps * self._draws_per_step))
 
     def _wait_for_last_use(self) -> None:
-        """Make the current stream wait for the stream of the last use."""
         stream = current_stream(self.device)
         if self.last_stream is not stream:
             if self.last_stream is not None:

@@ -22,7 +22,7 @@ from npa_envs.ops.cuda_driver import new_stream
 
 
 def to_device_async(values: NDArray[Any], device: torch.device) -> Tensor:
-    """Return an array as a tensor on a device, copied without synchronizing.
+    """Return a NumPy array as a tensor on a device, copied without synchronising.
 
     On a CPU the tensor shares the array's memory.
     """
@@ -35,7 +35,7 @@ Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 
 ABANDONED_POOLS = 8
-"""Memory pools of deleted graphs after which their memory is freed."""
+"""Number of memory pools of deleted graphs after which their memory is freed."""
 
 capture_lock = threading.RLock()
 """Lock of captures and their preparation: all graphs share one stream and torch's capture state."""
@@ -49,14 +49,14 @@ def can_capture() -> bool:
 
 
 CAPTURE_ATTEMPTS = 3
-"""Attempts at a capture that other threads may have invalidated."""
+"""Maximum number of attempts at a capture that other threads may have invalidated."""
 
 PINNED_OFFSET = 64
-"""Offset [bytes] of returned pinned memory, so that torch's allocator does not recognise it."""
+"""Offset of `pinned_like` [bytes], which makes torch's allocator not recognise the memory."""
 
 
 def pinned_like(tensor: Tensor) -> Tensor:
-    """Return pinned memory of a tensor's shape and dtype, to which captured work may write.
+    """Return a new pinned tensor of a tensor's shape and dtype, to which captured work may write.
 
     Torch's allocator records the streams that use its pinned memory, and queries them when the
     memory is freed. A query of a stream that another thread is capturing would break the capture.
@@ -144,8 +144,8 @@ def prepare_capture(function: Callable[[], object], device: torch.device) -> Non
 class GraphSequence:
     """A captured function: CUDA graphs, one after the other, and Python functions between them.
 
-    Each replay draws new numbers from `generator`. `alone`: torch's own generator is not used, so
-    that other threads may use it during the capture.
+    Each replay draws new random numbers from `generator`. With `alone` the function does not use
+    torch's default generator, so that other threads may use it during the capture.
     """
 
     abandoned = 0
@@ -198,22 +198,22 @@ class GraphSequence:
 
 @contextlib.contextmanager
 def _stand_in(graph: torch.cuda.CUDAGraph) -> Iterator[None]:
-    """Replace torch's own generator within the block, in which a capture begins.
+    """Replace torch's default generator within the block, in which a capture begins.
 
-    Torch registers its own generator with every graph, and then other threads cannot draw from it
-    until the capture ends.
+    Torch registers its default generator with every graph, and then other threads cannot draw from
+    it until the capture ends.
     """
-    own = torch.cuda.default_generators[torch.cuda.current_device()]
-    stand_in = torch.Generator(own.device)
+    default = torch.cuda.default_generators[torch.cuda.current_device()]
+    stand_in = torch.Generator(default.device)
     # Draws of other threads in the meantime must not be the same each time.
     stand_in.seed()
     graph.register_generator_state(stand_in)
-    state = own.graphsafe_get_state()
-    own.graphsafe_set_state(stand_in)
+    state = default.graphsafe_get_state()
+    default.graphsafe_set_state(stand_in)
     try:
         yield
     finally:
-        own.graphsafe_set_state(state)
+        default.graphsafe_set_state(state)
 
 
 _capturing: ContextVar[GraphSequence | None] = ContextVar("capturing", default=None)
@@ -221,7 +221,7 @@ _capturing: ContextVar[GraphSequence | None] = ContextVar("capturing", default=N
 
 
 def host_call(work: Callable[[], object]) -> None:
-    """Call host code; while a CUDA graph is captured, only note it: each replay then calls it.
+    """Call a Python function; during a capture only note it, and each replay then calls it.
 
     `work` must use the same tensors in every replay; the caller keeps them alive.
     """
@@ -233,7 +233,7 @@ def host_call(work: Callable[[], object]) -> None:
 
 
 def draws_alone() -> bool:
-    """Return whether this thread is capturing a `GraphSequence` with `alone`."""
+    """Return whether this thread is capturing a `GraphSequence` made with `alone`."""
     sequence = _capturing.get()
     return sequence is not None and sequence.alone
 
@@ -251,9 +251,9 @@ def capture(
 
     It is one graph, unless the function calls `host_call`. The function must not synchronise, and
     its kernels must be loaded (by `warm_up`, which runs on the capture stream). A `pool` of memory
-    is shared with graphs that never run at the same time. Each replay draws new numbers from a CUDA
-    `generator`; if `alone`, a draw from torch's own generator is an error, and other threads may
-    use that meanwhile. After an error of the function the device is usable.
+    is shared with graphs that never run at the same time. Each replay draws new random numbers from
+    a CUDA `generator`. With `alone`, torch's default generator must not be used by the function,
+    and may be by other threads. After an error of the function the device is usable.
 
     Without `warm_up` nothing synchronises, unlike in `torch.cuda.graph`. A graph's pool cannot use
     cached memory, so the cache is freed after the warm-up, and if a capture runs out of memory.
@@ -304,7 +304,7 @@ def _capture(
 
 
 def may_be_disturbed(attempts: int) -> bool:
-    """Return whether to repeat a failed capture, which another thread may have invalidated.
+    """Return whether to repeat a capture that failed `attempts` times, as threads may break it.
 
     A thread that waits for the whole device (`torch.cuda.synchronize`) breaks all captures.
     """
@@ -334,13 +334,13 @@ class WeakFunction:
 
 
 class GraphedCallable:
-    """A function without arguments that runs as a CUDA graph on CUDA, and as it is on a CPU.
+    """A function without arguments that runs as a CUDA graph on CUDA, and unchanged on a CPU.
 
     The first call runs the function kernel by kernel, which loads the kernels; the second captures
     it. The function must read and write the same tensors in every call and not synchronise; the
-    caller keeps a method's object alive (`WeakFunction`). A `generator` draws the same numbers
-    either way. A memory `pool` is shared with functions that never run at the same time and whose
-    temporary results are not needed any more.
+    caller keeps a method's object alive (`WeakFunction`). A `generator` draws the same numbers in a
+    graph as without. A memory `pool` is shared with functions that never run at the same time and
+    whose temporary results are not needed any more. Without `captured` no graph is used.
     """
 
     def __init__(
@@ -362,7 +362,7 @@ class GraphedCallable:
         self._attempts = 0
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out the graph, which cannot be pickled: it is captured again."""
+        """Return the state without the graph, which cannot be pickled and is captured again."""
         return self.__dict__ | {"_warm": False, "_graph": None, "_attempts": 0}
 
     def __call__(self) -> None:

@@ -21,7 +21,7 @@ RUNAWAY = 1e6
 Entry = TypeVar("Entry")
 
 MAX_REPORT = 8
-"""Most worlds that a report describes; it counts the others."""
+"""Maximum number of worlds that a report describes; it counts the others."""
 
 
 class Divergence(NamedTuple):
@@ -91,14 +91,14 @@ def describe_divergence(x: Tensor, s: Tensor, *, limit: float = RUNAWAY) -> str:
 
 
 def first_reports(diverged: Sequence[Entry], describe: Callable[[Entry], str]) -> list[str]:
-    """Return what `describe` says of the first diverged worlds, and the number of the others."""
+    """Return the lines of `describe` about the first diverged worlds, then a count of the rest."""
     others = len(diverged) - MAX_REPORT
     count = [f"and {others} more worlds"] if others > 0 else []
     return [describe(entry) for entry in diverged[:MAX_REPORT]] + count
 
 
 def term_name(entry: int, space_dim: int) -> str:
-    """Return the name of number `entry` of a particle's D coordinates and then C channels."""
+    """Return the name of entry `entry` of a particle's D coordinates followed by its C channels."""
     is_position = entry < space_dim
     return f"positions coordinate {entry}" if is_position else f"states channel {entry - space_dim}"
 
@@ -120,7 +120,7 @@ class DivergenceWatch:
 
     @torch.no_grad()
     def check(self, worlds: Particles) -> None:
-        """Keep the number of this check, and x and s, of worlds not finite for the first time."""
+        """Keep the number of this check and the values of worlds that are newly not finite."""
         values = torch.cat((worlds.x, worlds.s), dim=2)
         is_first = ~values.isfinite().all(dim=(1, 2)) & (self._first_check < 0)
         self._first_check.masked_fill_(is_first, self._checks)
@@ -128,7 +128,7 @@ class DivergenceWatch:
         self._checks += 1
 
     def raise_diverged(self) -> None:
-        """Raise an error that says when and where worlds diverged, if any; waits for the device."""
+        """Raise DivergedError if a world has diverged, with its step; waits for the device."""
         first_checks = self._first_check.tolist()
         worlds = sorted((step, world) for world, step in enumerate(first_checks) if step >= 0)
 
@@ -151,7 +151,7 @@ class DivergenceWatch:
 
 
 def make_watch(on_divergence: str, worlds: Particles) -> DivergenceWatch | None:
-    """Return the check of a rollout for divergence, None with `on_divergence="ignore"`."""
+    """Return a watch for divergence of these worlds; None with `on_divergence="ignore"`."""
     if checked_choice("on_divergence", on_divergence, get_args(OnDivergence)) == "ignore":
         return None
     if worlds.x.is_cuda and torch.cuda.is_current_stream_capturing():

@@ -16,20 +16,20 @@ from npa_envs.rule.rule import LIFE
 from npa_envs.world.particles import Particles
 
 MIN_OFFSPRING = 1e-3
-"""Expected offspring below which life gets no gradient."""
+"""Lower limit of m in `divided`, below which life gets no gradient."""
 
 CHILD_DISTANCE = 0.5
 """Root mean square distance of a child from its parent, in perception radii."""
 
 PARKING_DISTANCE = 65536.0
-"""Coordinate far away at which dead slots are put, in perception radii."""
+"""Coordinate of the first dead slot during perception, in perception radii."""
 
 PARKING_GAP = 2.5
 """Distance between dead slots, in perception radii: five cells, so each has its own cell."""
 
 
 class Births(NamedTuple):
-    """Random numbers that decide which particles divide or die, and where children are."""
+    """Random numbers that decide which particles divide or die, and where children begin."""
 
     uniform: Tensor
     """Decides whether each particle divides, stays or dies, uniform in [0, 1), shape [B, N]."""
@@ -43,7 +43,7 @@ def living(s: Tensor) -> Tensor:
 
 
 def parked(x: Tensor, alive: Tensor, eps: float) -> Tensor:
-    """Return positions in which dead slots are far from all particles and from each other."""
+    """Return positions x with dead slots moved far from all particles and from each other."""
     count, space_dim = x.shape[1:]
     side = 1
     while side**space_dim < count:
@@ -62,7 +62,7 @@ def divided(
     births: Births,
     eps: float,
 ) -> Particles:
-    """Let updated particles divide, stay or die; differentiable.
+    """Let updated particles divide, stay or die; return new worlds, differentiable.
 
     A child starts with states and a path of 0, except for its life. Parent and child move half of
     their distance each, in opposite directions from the parent's position, which paths do not

@@ -1,6 +1,5 @@
-"""All that environments import of the engine: actions, perception, constants, ends of episodes.
+"""Steps by actions, in place of a rule, and all else that environments import of the layers below.
 
-A step is that of `npa_envs.rollout`, with an action in the place of a rule's bounded output.
 Nothing waits for the device.
 """
 
@@ -31,9 +30,9 @@ from npa_envs.world.steps import draw_step
 
 
 def perceive_each_species(x: Tensor, counts: Sequence[int], physics: Physics) -> Tensor:
-    """Return the densities of S species, then their gradients, clipped, [B, N, S (1 + D)].
+    """Return each species' density, then the gradients, at each particle, [B, N, S (1 + D)].
 
-    Species k has `counts[k]` consecutive particles; an empty one has zeros.
+    All are clipped to the limits of perception. Species k has `counts[k]` consecutive particles.
     """
     limit = physics.limits.perception
     return perceive_by_species(x, tuple(counts), physics).clamp(-limit, limit)
@@ -42,11 +41,11 @@ def perceive_each_species(x: Tensor, counts: Sequence[int], physics: Physics) ->
 class Actions(PreparedActions):
     """Applies actions to worlds in place, with the update masks and the noise of `rollout`.
 
-    Displacements are fractions of α ε (D, norm clipped to 1), state steps fractions of
-    `state_scale` (C, clipped to [-1, 1]). If an action is not finite, no world changes and
-    `enabled` (uint8, [1]) is set to 0; the caller sets it to 1 again. `diverged` (uint8, [B]) is
-    set to 1 for worlds with a value beyond its bounds or not finite, to 0 for others; such values
-    are clipped to the bounds, and NaN becomes 0.
+    An action has D displacements, as fractions of α ε (their norm is clipped to 1), and C state
+    steps, as fractions of `state_scale` (each clipped to [-1, 1]). If an action is not finite, no
+    world changes and `enabled` (uint8, [1]) is set to 0; the caller sets it to 1 again. `diverged`
+    (uint8, [B]) is set to 1 for worlds with a value beyond its bounds or not finite, to 0 for
+    others; such values are clipped to the bounds, and NaN becomes 0.
     """
 
     def __init__(
@@ -70,7 +69,7 @@ class Actions(PreparedActions):
 
     @torch.no_grad()
     def draw(self) -> None:
-        """Draw the next step's masks and noise; may be captured in a CUDA graph."""
+        """Draw the next step's update masks and noise; may be captured in a CUDA graph."""
         x, _, mask, noise, _, diverged = self._worlds
         diverged.zero_()
         drawn = draw_step(x, self._physics, self._random)
@@ -79,6 +78,6 @@ class Actions(PreparedActions):
                 buffer.copy_(values)
 
     def updated(self) -> Tensor:
-        """Return which particles the last draw updates, bool, shape [B, N]."""
+        """Return which particles the last `draw` selected for an update, bool, shape [B, N]."""
         mask = self._worlds.mask
         return self._everyone if mask is None else mask.bool()

@@ -30,7 +30,7 @@ from npa_envs.world.randomness import Randomness, WorldRandom, torch_generator
 from npa_envs.world.rule_settings import settings_and_weights
 
 if TYPE_CHECKING:
-    from npa_envs.world.execute import RolloutSpec
+    from npa_envs.world.rollout_execution import RolloutSpec
 
 CudaGraph = bool | Literal["auto"]
 """Which rollouts are captured on CUDA: those of plain rules ("auto"), all or none."""
@@ -38,19 +38,19 @@ CudaGraph = bool | Literal["auto"]
 CUDA_GRAPH_CHOICES: tuple[CudaGraph, ...] = ("auto", True, False)
 
 LAUNCHED_FIRST = 2
-"""Calls of a group that are launched before the next one is captured."""
+"""Number of calls of a group that are launched before the next one is captured."""
 
 MEMORY_FRACTION = 0.5
 """Largest fraction of a device's memory for captures; the least recently used are deleted."""
 
 BLOCK_STEPS = 64
-"""Steps of a graph without gradients: longer rollouts replay it several times."""
+"""Number of steps of a graph without gradients: longer rollouts replay it several times."""
 
 MAX_STEPS = 1024
-"""Most steps of a graph with gradients: longer rollouts are launched."""
+"""Maximum number of steps of a graph with gradients: longer rollouts are launched."""
 
 MAX_CAPTURED_GROUPS = 256
-"""Most groups of calls that are counted."""
+"""Maximum number of groups of calls that are counted."""
 
 logger = logging.getLogger(__name__)
 
@@ -82,7 +82,7 @@ def run_captured(
     precision = torch.backends.cuda.matmul.fp32_precision
     shape = (x.shape, particles.s.shape[2], x.dtype, x.device)
     key = spec._replace(steps=0), forms, shape, grad_flags, per_world_streams, precision
-    with _lock:
+    with capture_lock:
         group = _groups.count(key, MAX_CAPTURED_GROUPS)
     if group.launched_only or group.calls <= (1 if explicit else LAUNCHED_FIRST):
         return None
@@ -99,7 +99,7 @@ def run_captured(
 
 
 def _grad_flags(particles: Particles, weights: list[Tensor]) -> tuple[bool, ...]:
-    """Return which worlds and weights require a gradient; () if none does or can."""
+    """Return which tensors of worlds and weights require a gradient; () if none does or can."""
     if not torch.is_grad_enabled():
         return ()
     x_flag, s_flag, *others = (tensor.requires_grad for tensor in (*particles.tensors(), *weights))
@@ -109,13 +109,13 @@ def _grad_flags(particles: Particles, weights: list[Tensor]) -> tuple[bool, ...]
 
 
 def _saves_tensors_elsewhere() -> bool:
-    """Return whether the caller has hooks for saved tensors, as checkpoints do."""
+    """Return whether the caller has set torch's hooks for saved tensors, as checkpoints do."""
     hooks = getattr(torch._C._autograd, "_top_saved_tensors_default_hooks", None)
     return hooks is not None and hooks(True) is not None
 
 
 def _blocks(spec: RolloutSpec, *, with_gradients: bool) -> list[int]:
-    """Return the steps of each graph to replay, one after the other; with gradients it is one."""
+    """Return the numbers of steps of the graphs to replay; with gradients there is one graph."""
     if with_gradients:
         return [spec.steps]
     interval = spec.keep_every or 1
@@ -125,9 +125,9 @@ def _blocks(spec: RolloutSpec, *, with_gradients: bool) -> list[int]:
 
 
 def _run_and_compare(call: RolloutCall, group: CallGroup, use: CaptureUse) -> Particles:
-    """Launch a rollout and compare it with its replay, which custom Python code may break.
+    """Launch a rollout, compare it with its replay, and return the launched worlds.
 
-    If results differ, calls with these shapes and options are launched from then on.
+    A custom network's code may make them differ: then later calls of the group are launched.
     """
     particles, weights, generator = call.particles, call.weights, call.generator
     device = particles.x.device
@@ -143,7 +143,8 @@ def _run_and_compare(call: RolloutCall, group: CallGroup, use: CaptureUse) -> Pa
         source = torch.Generator(device).manual_seed(shared.initial_seed())
         source.set_offset(shared.get_offset())
     worlds = particles.map(lambda value: value.view_as(value)).with_zero_paths()
-    launched = call.spec.run(call.rules, worlds, generator)
+    step = call.spec.make_step(call.rules, worlds)
+    launched = call.spec.launch(step, call.rules, worlds, generator)
     with torch.no_grad():
         replayed = use.rollout.replay(call._replace(weights=copies, generator=source), use)
         pairs = zip((*launched.tensors(), *weights), (*replayed.tensors(), *copies), strict=True)
@@ -158,11 +159,11 @@ def _run_and_compare(call: RolloutCall, group: CallGroup, use: CaptureUse) -> Pa
 
 
 class CallGroup:
-    """Calls with the same shapes and options: their number, and captures or recorded steps."""
+    """Calls with the same shapes and options: their number, and their captures or recordings."""
 
     def __init__(self) -> None:
         self.calls, self.failed_captures = 0, 0
-        # Captures, or recorded steps, that are not in use.
+        # Captures, or `RecordedSteps`, that are not in use.
         self.free: collections.deque[Any] = collections.deque()
         self.captures: list[CapturedRollout] = []
         # Whether calls of this group cannot be captured.
@@ -172,12 +173,12 @@ class CallGroup:
 class CallGroups(collections.OrderedDict[Hashable, CallGroup]):
     """All groups of calls by shapes and options, the least recently used first."""
 
-    def count(self, key: Hashable, most: int) -> CallGroup:
-        """Count a call, return its group; beyond `most` groups delete the least recently used."""
+    def count(self, key: Hashable, max_groups: int) -> CallGroup:
+        """Count a call and return its group; delete the group that was used longest ago if full."""
         group = self.get(key)
         if group is None:
             group = self[key] = CallGroup()
-            if len(self) > most:
+            if len(self) > max_groups:
                 self.forget(next(iter(self)))
         else:
             self.move_to_end(key)
@@ -192,7 +193,7 @@ class CallGroups(collections.OrderedDict[Hashable, CallGroup]):
 
 
 class CaptureUse:
-    """Lends a captured rollout to one call, until nothing refers to this object any more."""
+    """A captured rollout that one call uses; it is free again when this object is deleted."""
 
     def __init__(self, rollout: CapturedRollout, group: CallGroup) -> None:
         self.rollout = rollout
@@ -207,29 +208,27 @@ class CaptureUse:
 
 
 _groups = CallGroups()
-
-_lock = capture_lock
-"""Lock of `_groups`: that of captures, as with two locks two threads could wait for each other."""
+"""All groups, locked by `capture_lock`: with two locks, two threads could wait for each other."""
 
 
 def captured_memory(device: torch.device) -> int:
     """Return the bytes of a device's memory that captured rollouts use."""
-    with _lock:
+    with capture_lock:
         captures = [rollout for group in _groups.values() for rollout in group.captures]
         return sum(rollout.bytes for rollout in captures if rollout.device == device)
 
 
 def release_captures() -> None:
     """Delete all captured rollouts and free their memory; later calls are captured again."""
-    with _lock:
+    with capture_lock:
         for key in list(_groups):
             _groups.forget(key)
     torch.cuda.empty_cache()
 
 
 def _reserve_capture(group: CallGroup, call: RolloutCall) -> CaptureUse | None:
-    """Reserve a captured rollout with the graphs for a call; None: the call has to be launched."""
-    with _lock:
+    """Return a captured rollout with all graphs of a call; None if it has to be launched."""
+    with capture_lock:
         # The one used last: it more likely has these numbers of steps.
         use = CaptureUse(group.free.pop(), group) if group.free else None
         try:
@@ -261,7 +260,7 @@ def _reserve_capture(group: CallGroup, call: RolloutCall) -> CaptureUse | None:
 
 
 def _make_room(device: torch.device) -> bool:
-    """Delete captures until a device has room for another; return whether it has."""
+    """Delete captures until a device has room for another one; return whether it has."""
     limit = MEMORY_FRACTION * torch.cuda.get_device_properties(device).total_memory
     for key in [*_groups][:-1]:
         if captured_memory(device) < limit:
@@ -272,9 +271,9 @@ def _make_room(device: torch.device) -> bool:
 
 
 def _always_launch(group: CallGroup, reason: object, level: int) -> None:
-    """Launch all further calls of a group, without captures; log the reason."""
+    """Launch all calls of a group from now on, and delete its captures; log the reason."""
     logger.log(level, "rollouts of this kind are launched, not captured: %s", reason)
-    with _lock:
+    with capture_lock:
         group.launched_only = True
         group.captures.clear()
         group.free.clear()

@@ -1,4 +1,4 @@
-"""Worlds of particles: positions, states, path lengths and goals."""
+"""`Particles`: the positions, states, path lengths and goals of a batch of worlds."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor
 
 
 class Particles(NamedTuple):
-    """B worlds of N particles, with the shapes and units used everywhere."""
+    """The particles of a batch: B worlds of N particles each."""
 
     x: Tensor
     """Positions [length units], shape [B, N, D]."""
@@ -19,7 +19,7 @@ class Particles(NamedTuple):
     path_length: Tensor | None = None
     """Length of each particle's path since the rollout began [length units], shape [B, N]."""
     goal: Tensor | None = None
-    """Index of the target that a world is to become, int64, shape [B]; after all other fields."""
+    """Index of the target that each world is to become, int64, shape [B]; the last field."""
 
     def with_zero_paths(self, zeros: Tensor | None = None) -> Particles:
         """Return the worlds with path lengths of 0: the tensor `zeros` [B, N], or a new one."""
@@ -44,11 +44,11 @@ class Particles(NamedTuple):
         return Particles(x, s, *rest)
 
     def take(self, worlds: Tensor) -> Particles:
-        """Return the worlds with these indices."""
+        """Return copies of the worlds with these indices, int64, 1D."""
         return self.map(lambda value: value.index_select(0, worlds))
 
     def put_(self, worlds: Tensor, other: Particles) -> None:
-        """Overwrite the worlds with these indices by `other`."""
+        """Overwrite the worlds with these indices, int64, 1D, by those of `other`, in place."""
         for field, new in zip(self.tensors(), other.tensors(), strict=True):
             field.index_copy_(0, worlds, new)
 
@@ -60,20 +60,20 @@ class Particles(NamedTuple):
         )
 
     def equal(self, other: Particles) -> Tensor:
-        """Return which worlds are equal but for the lengths of paths, bool, shape [B]."""
-        first, second = (worlds._replace(path_length=None).tensors() for worlds in (self, other))
-        pairs = zip(first, second, strict=True)
+        """Return which worlds equal those of `other`, except path lengths, bool, shape [B]."""
+        ours, theirs = (worlds._replace(path_length=None).tensors() for worlds in (self, other))
+        pairs = zip(ours, theirs, strict=True)
         return torch.stack([(a == b).flatten(1).all(dim=1) for a, b in pairs]).all(dim=0)
 
     def gather(self, order: Tensor) -> Particles:
-        """Return particles in another order: indices into all B N of them; differentiable."""
+        """Return the particles in another order: indices of all B N, int64; differentiable."""
         fields = self._replace(goal=None).map(
             lambda value: value.flatten(0, 1).index_select(0, order).view_as(value)
         )
         return fields._replace(goal=self.goal)
 
     def split(self, counts: Sequence[int]) -> list[Particles]:
-        """Return the particles of each species; species k has `counts[k]` consecutive ones."""
+        """Return each species' worlds, of `counts[k]` consecutive particles for species k."""
         fields = [
             [None] * len(counts) if value is None else torch.split(value, [*counts], dim=1)
             for value in self.per_particle()
@@ -82,11 +82,11 @@ class Particles(NamedTuple):
         return [worlds._replace(goal=self.goal) for worlds in species]
 
     def copy_(self, other: Particles) -> None:
-        """Overwrite these worlds with others, in one kernel."""
+        """Overwrite all these worlds by `other`, in place, by one kernel."""
         torch._foreach_copy_(self.tensors(), other.tensors())
 
 
 def combined(function: Callable[[list[Tensor]], Tensor], parts: Sequence[Particles]) -> Particles:
-    """Combine several worlds field by field, by `torch.stack` or `torch.cat`."""
+    """Return several batches of worlds as one, each field by `torch.stack` or `torch.cat`."""
     fields = zip(*(part.tensors() for part in parts), strict=True)
     return parts[0].map(lambda _: function([*next(fields)]))

@@ -45,24 +45,24 @@ class StreamId(enum.IntEnum):
 class WorldRandom:
     """Random streams of batched worlds.
 
-    A draw is a function of its world's seed, episode, step and the number of draws before it in
-    this step, and never of the other worlds: world k of a batch draws what it draws alone.
-    Integers and uniform numbers are the same on every device, bit for bit; normal numbers up to
-    the last bit. Nothing waits for the device, and a CUDA graph that begins with `advance` draws
-    new numbers at each replay.
+    Random numbers depend on their world's seed, episode and step, and on how many calls in this
+    step came before, but never on other worlds: world k of a batch draws the numbers that it draws
+    as a batch of one. Integers and uniform numbers are the same on every device, bit for bit, and
+    normal numbers up to the last bit. Nothing waits for the device, and a CUDA graph that begins
+    with `advance` draws new numbers at each replay.
 
     Args:
-        seeds: Seed of each world, integers of at least 0; one integer is one world.
-        device: Where the numbers are drawn.
+        seeds: Seed of each world, integers of at least 0; a single integer makes one world.
+        device: Device on which the numbers are drawn.
 
     Raises:
         NPAError: A seed is not an integer of at least 0, there is no seed, or no such device.
 
     Attributes:
         keys: Key of each world, the seed's first 64 random bits, int64, shape [B].
-        episodes: Episode of each world, from 0 on, int32, shape [B].
-        steps: Step of each world within its episode, int32, shape [B]; an episode is seeded in
-            step 0.
+        episodes: Number of each world's episode, from 0 on, int32, shape [B].
+        steps: Number of each world's step in its episode, from 0 on, int32, shape [B]; start worlds
+            are drawn in step 0.
     """
 
     def __init__(self, seeds: int | Sequence[int], *, device: str | torch.device = "cpu") -> None:
@@ -117,10 +117,10 @@ class WorldRandom:
         return self.keys.shape[0]
 
     def advance(self, steps: int = 1) -> None:
-        """Advance every world by a number of steps, in place; the count of draws restarts at 0.
+        """Advance every world by a number of steps, in place.
 
         Args:
-            steps: Number of steps; 0 restarts the current step, which repeats its draws.
+            steps: Number of steps; 0 restarts the current step, whose random numbers are repeated.
 
         Raises:
             NPAError: `steps` is not an integer of at least 0.
@@ -129,7 +129,7 @@ class WorldRandom:
         self._draw_count = 0
 
     def restart(self) -> None:
-        """Begin the next episode of every world at step 0, in place; its draws are new."""
+        """Begin the next episode of every world at step 0, in place, with new random numbers."""
         self.episodes += 1
         self.steps.zero_()
         self._draw_count = 0
@@ -143,10 +143,10 @@ class WorldRandom:
         return taken
 
     def substream(self, purpose: int) -> WorldRandom:
-        """Return streams that are independent of these and of those of other purposes.
+        """Return new streams, independent of these and of those of other purposes.
 
         They begin at these streams' current episode and step, and advance separately. Two calls
-        within a step with one purpose give the same draws. These streams do not change.
+        within a step with one purpose return the same streams. These streams do not change.
 
         Args:
             purpose: Any integer of at least 0; the package uses those of `StreamId`.
@@ -162,9 +162,9 @@ class WorldRandom:
     def put(self, worlds: Tensor | slice, other: WorldRandom) -> None:
         """Write the keys, episodes and steps of other streams into some worlds, in place.
 
-        All worlds share the index of the next draw in a step. So from the next `advance` on, draws
-        equal those of the other streams; until then no number is drawn twice. `worlds` are
-        indices, int64, 1D, or a slice.
+        `worlds` are indices, int64, 1D, or a slice. From the next `advance` on, these worlds draw
+        the numbers of the other streams. Until then they draw others, but none twice, as all worlds
+        share the count of calls in a step.
         """
         self.keys[worlds] = other.keys
         self.episodes[worlds] = other.episodes
@@ -172,7 +172,7 @@ class WorldRandom:
         self._draw_count = max(self._draw_count, other._draw_count)
 
     def sync_with(self, other: WorldRandom, steps: int) -> None:
-        """Take over the state of `other`, which began as a copy and is `steps` ahead, in place."""
+        """Set these streams to the state of `other`, a copy of them that is `steps` ahead."""
         self.steps += steps
         self._draw_count = other._draw_count
 
@@ -196,7 +196,7 @@ class WorldRandom:
         return self._drawn("normal", shape, dtype)
 
     def bernoulli(self, probability: float, *shape: int) -> Tensor:
-        """Return ones with a probability and zeros otherwise, uint8, shape [B, *shape].
+        """Return random ones and zeros, uint8, shape [B, *shape].
 
         Args:
             probability: Probability of a one, in [0, 1], rounded to a multiple of 2^-32.
@@ -243,11 +243,11 @@ class WorldRandom:
 
 
 Randomness = torch.Generator | WorldRandom
-"""Sources of random draws."""
+"""Sources of random numbers."""
 
 
 def torch_generator(generator: Randomness | None, device: torch.device) -> torch.Generator:
-    """Return the torch generator of a CUDA device's draws: the given one, or torch's own."""
+    """Return the given torch generator, or if it is None torch's default one of a CUDA device."""
     if generator is None:
         return torch.cuda.default_generators[device.index]
     assert isinstance(generator, torch.Generator)
@@ -259,7 +259,7 @@ _reserving = threading.Lock()
 
 
 def reserve_draws(source: torch.Generator, count: int) -> int:
-    """Advance a CUDA generator's offset by a number of draws, and return the former offset."""
+    """Increase a CUDA generator's offset by `count`, and return the former offset."""
     with _reserving:
         begin = source.get_offset()
         source.set_offset(begin + count)
@@ -267,30 +267,29 @@ def reserve_draws(source: torch.Generator, count: int) -> int:
 
 
 def give_back_draws(source: torch.Generator, begin: int, count: int) -> None:
-    """Undo `reserve_draws`, unless other draws were made since."""
+    """Undo `reserve_draws`, which returned `begin`, unless the generator was used since."""
     with _reserving:
         if source.get_offset() == begin + count:
             source.set_offset(begin)
 
 
 def check_generator(generator: Randomness | None, device: torch.device, world_count: int) -> None:
-    """Check type, device and number of worlds of a source of randomness."""
+    """Check type, device and number of worlds of a source of random numbers; None is allowed."""
     if generator is None:
         return
     if not isinstance(generator, Randomness):
         raise NPAError(
-            f"generator must be a torch.Generator or a WorldRandom, "
-            f"got {type(generator).__name__}: "
-            f"make it with torch.Generator({shown(device.type)}).manual_seed(0)"
+            f"generator must be a torch.Generator or a WorldRandom, got {type(generator).__name__}"
+            f": make it with torch.Generator({shown(device.type)}).manual_seed(0)"
         )
-    own = generator.device
-    wrong, hint = own.type != device.type, f"torch.Generator({shown(device.type)})"
+    its, hint = generator.device, f"torch.Generator({shown(device.type)})"
+    wrong = its.type != device.type
     if isinstance(generator, WorldRandom):
-        wrong |= None not in (own.index, device.index) and own.index != device.index
+        wrong |= None not in (its.index, device.index) and its.index != device.index
         hint = f"WorldRandom(seeds, device={shown(str(device))})"
     if wrong:
         raise NPAError(
-            f"generator must be on the worlds' device, {device}, got {own}: make it with {hint}"
+            f"generator must be on the worlds' device, {device}, got {its}: make it with {hint}"
         )
     if isinstance(generator, WorldRandom) and generator.world_count != world_count:
         raise NPAError(
@@ -300,14 +299,14 @@ def check_generator(generator: Randomness | None, device: torch.device, world_co
 
 
 def uniform_draws(generator: Randomness | None, shape: Sequence[int], like: Tensor) -> Tensor:
-    """Return uniform numbers in [0, 1), shape [B, ...], of `like`'s dtype and device."""
+    """Return random numbers uniform in [0, 1), shape [B, ...], of `like`'s dtype and device."""
     if isinstance(generator, WorldRandom):
         return generator.uniform(*shape[1:], dtype=like.dtype)
     return torch.rand(tuple(shape), generator=generator, device=like.device, dtype=like.dtype)
 
 
 def normal_draws(generator: Randomness | None, shape: Sequence[int], like: Tensor) -> Tensor:
-    """Return standard normal numbers, shape [B, ...], of `like`'s dtype and device."""
+    """Return standard normal random numbers, shape [B, ...], of `like`'s dtype and device."""
     if isinstance(generator, WorldRandom):
         return generator.normal(*shape[1:], dtype=like.dtype)
     return torch.randn(tuple(shape), generator=generator, device=like.device, dtype=like.dtype)
@@ -318,7 +317,7 @@ MIXERS = ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB), (31, 1))
 
 
 def _mixed(keys: Tensor, number: int) -> Tensor:
-    """Return number `number`, from 0 on, of the SplitMix64 sequence of each key."""
+    """Return the 64 bits at index `number` of each key's SplitMix64 sequence, int64, shape [B]."""
     # Steele, Lea and Flood, "Fast splittable pseudorandom number generators" (OOPSLA 2014).
     bits = keys + _signed((number + 1) * GOLDEN)
     for shift, factor in MIXERS:

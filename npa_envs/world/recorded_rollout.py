@@ -26,7 +26,7 @@ from npa_envs.world.rule_settings import rule_form
 from npa_envs.world.steps import Draws, RuleStep
 
 MAX_RECORDED_PARTICLES = 4096
-"""Maximum number of particles of a batch; the steps of larger ones take most time in kernels."""
+"""Maximum number of particles B N; the steps of larger batches take most time in kernels."""
 
 MAX_RECORDED_GROUPS = 32
 """Maximum number of groups of calls whose launches are kept."""
@@ -35,7 +35,7 @@ MAX_RECORDED_GROUPS = 32
 class _RecordedStep:
     """The recorded launches of one step, which reads one buffer of worlds and writes another.
 
-    During the recording this object is called in place of the network.
+    The network is not recorded: during the recording this object is called in its place.
     """
 
     def __init__(self, step: RuleStep, particles: Particles, mask: Tensor | None) -> None:
@@ -50,7 +50,7 @@ class _RecordedStep:
         self.slots = self.launches.argument_slots(self._updates)
 
     def __call__(self, rows: Tensor) -> Tensor:
-        """Store the network's input rows, [B N, row_width], and before which launch it runs."""
+        """Store the network's input rows and before which launch it runs; return zero updates."""
         self.rows = rows
         self.split = len(self.launches)
         self._updates = rows.new_zeros(len(rows), self._update_width)
@@ -76,7 +76,7 @@ class RecordedSteps:
     def run(
         self, network: Network, particles: Particles, masks: Iterable[Tensor | None], every: int
     ) -> list[Particles]:
-        """Step worlds once with each update mask; return copies after `every` steps each."""
+        """Step worlds once with each update mask; return copies of them every `every` steps."""
         self._buffers[0].copy_(particles)
         trajectory: list[Particles] = []
         for number, mask in enumerate(masks):
@@ -108,7 +108,7 @@ def run_recorded(
 ) -> Particles | None:
     """Run a rollout by replaying recorded launches; None if the caller must launch its steps.
 
-    Only small worlds on a CPU are replayed, without gradients, and not in the first
+    Only small worlds on a CPU are replayed, without gradients and noise, and not in the first
     `LAUNCHED_FIRST` calls with the same shapes and options.
     """
     x, s, *_ = particles

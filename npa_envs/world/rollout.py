@@ -13,10 +13,10 @@ from npa_envs.ops.custom_op import check_derivatives
 from npa_envs.ops.physics import Boundary, Physics, make_physics
 from npa_envs.rule.rule import NPARule, check_rule
 from npa_envs.world.divergence import OnDivergence, make_watch
-from npa_envs.world.execute import Memory, RolloutSpec, execute, resting
 from npa_envs.world.graphed_rollouts import CUDA_GRAPH_CHOICES, CudaGraph
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness, check_generator
+from npa_envs.world.rollout_execution import Memory, RolloutSpec, execute, resting
 from npa_envs.world.steps import SpeciesSpec
 
 __all__ = ["Memory", "at_rest", "rollout", "step"]
@@ -33,7 +33,7 @@ def checked_physics(
     dt: float = 1.0,
     position_noise: float = 0.0,
 ) -> Physics:
-    """Check that worlds fit a rule, and return the constants of its rollouts."""
+    """Check that worlds fit a rule and the options are allowed; return the rollout's constants."""
     x, s, *_ = worlds
     check_world(x, s)
     check_derivatives(x=x, s=s, rule=rule)
@@ -75,7 +75,7 @@ def _check_rule_of_one_species(rule: NPARule) -> None:
 
 
 def returned_fields(after: Particles) -> tuple[Tensor, ...]:
-    """Return x, s and, if they were asked for, path lengths."""
+    """Return x, s and, unless they are None, path lengths."""
     return (after.x, after.s) if after.path_length is None else (*after.per_particle(),)
 
 
@@ -213,8 +213,8 @@ def rollout(
             "minimal" recomputes all but the last step: least memory, and the time of a forward pass
             more. Gradients are the same.
         generator: Source of the masks and the noise, on x's device; default: torch's global one. A
-            `WorldRandom` advances by one step before the draws of each step, so that every world
-            draws the same numbers as alone.
+            `WorldRandom` advances by one step before each step, so that every world draws the same
+            numbers as in a batch of one.
         on_divergence: What to do if values of a world become infinite or NaN. "ignore" costs
             nothing; the next call raises an error for such positions. "raise" checks each step on
             the device, and waits for the result once, at the end.
@@ -259,7 +259,7 @@ def rollout(
 
 
 def take_physics(options: dict[str, Any]) -> dict[str, Any]:
-    """Remove and return the constants of physics, the same for all species, of a rollout."""
+    """Remove a rollout's options of physics that all species share from `options`; return them."""
     names = ("eps", "box", "boundary", "dt", "position_noise")
     return {name: options.pop(name) for name in names if name in options}
 
@@ -267,7 +267,7 @@ def take_physics(options: dict[str, Any]) -> dict[str, Any]:
 def rollout_particles(
     rule: NPARule, worlds: Particles, steps: int, *, update_prob: float = 0.5, **options: Any
 ) -> Particles:
-    """Run a rule as `rollout`, whose options these are; return worlds with all their fields."""
+    """Run a rule as `rollout` does, with its options; return worlds with all their fields."""
     _check_rule_of_one_species(rule)
     physics = take_physics(options)
     constants = checked_physics(rule, worlds, update_prob=update_prob, **physics)
@@ -316,7 +316,7 @@ def run_rules(
         rules,
         Particles(*worlds[:-1]),
         generator,
-        graph=cuda_graph,
+        cuda_graph=cuda_graph,
         watch=make_watch(on_divergence, worlds),
         may_rest=not return_path_length,
     )

@@ -1,4 +1,4 @@
-"""What a captured rollout depends on in a rule: its settings, and the tensors that it reads.
+"""The settings and tensors of a rule that a captured rollout depends on.
 
 A custom network's settings are its modules' attributes, hooks and modes. A capture is replayed only
 as long as all settings are the same.
@@ -21,10 +21,10 @@ NUMBERS = (int, float, complex, bool, str, bytes, type(None), torch.dtype, torch
 """Types of attributes that are compared by value."""
 
 HOOKS = ("_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_pre_hooks")
-"""Attributes of modules that map unique numbers to hooks."""
+"""Names of the attributes of modules that map unique numbers to hooks."""
 
 OF_EVERY_MODULE = frozenset(vars(nn.Module()))
-"""Attributes that torch gives every module, which are compared separately."""
+"""Names of the attributes that torch gives every module, which are compared separately."""
 
 
 def rule_tensors(rule: nn.Module, device: torch.device) -> list[Tensor]:
@@ -40,7 +40,7 @@ def rule_tensors(rule: nn.Module, device: torch.device) -> list[Tensor]:
 
 
 def rule_settings(rule: nn.Module, device: torch.device) -> dict[str, Hashable]:
-    """Return all settings of a rule's network except the values of its tensors on a device.
+    """Return all settings of a rule by name, except the values of its tensors on a device.
 
     These are its modules with their hooks and modes, and their attributes: numbers and strings by
     value, other objects by identity, also within lists, tuples and dictionaries. Other inputs of
@@ -58,7 +58,7 @@ def rule_settings(rule: nn.Module, device: torch.device) -> dict[str, Hashable]:
 
 
 def _setting(value: Any, device: torch.device, *, in_container: bool = False) -> Hashable:
-    """Return what stays equal as long as an attribute, or a value in a container, is the same."""
+    """Return a key that changes if an attribute's value does, or an entry of a container."""
     if isinstance(value, NUMBERS):
         return type(value), value
     if isinstance(value, Tensor):
@@ -88,7 +88,7 @@ rule_form: Callable[[NPARule], Hashable] = operator.attrgetter(
 
 
 def settings_and_weights(rule: NPARule, plain: bool) -> tuple[Hashable, list[Tensor]]:
-    """Return a rule's settings, which a capture depends on, and its weights."""
+    """Return a rule's settings and its tensors; `plain`: it runs with the weights of `NPARule`."""
     if plain:
         weights = rule.network_weights()
         return (rule_form(rule), *map(tensor_form, weights)), weights

@@ -13,11 +13,11 @@ from npa_envs.ops.physics import Boundary
 from npa_envs.ops.species_density import checked_counts
 from npa_envs.rule.rule import NPARule
 from npa_envs.world.divergence import OnDivergence
-from npa_envs.world.execute import Memory
 from npa_envs.world.graphed_rollouts import CudaGraph
 from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness
 from npa_envs.world.rollout import checked_physics, returned_fields, run_rules, take_physics
+from npa_envs.world.rollout_execution import Memory
 from npa_envs.world.steps import SpeciesSpec
 
 SpeciesPerception = Literal["shared", "per_species"]
@@ -67,8 +67,8 @@ def rollout_species(
     several species of the same rule it is `rollout` of all particles, up to rounding.
 
     Perceived densities are divided by the number of particles in the world. So for a rule that was
-    trained alone, particles of other species lower the density that it perceives, at any distance.
-    With `density_counts=counts` each species divides by its own number of particles, as alone.
+    trained without others, their particles lower the density that it perceives, at any distance.
+    With `density_counts=counts` each species divides by its own number, as in training.
 
     All other arguments are those of `rollout`.
 
@@ -130,7 +130,7 @@ def species_particles(
     density_counts: float | Sequence[float] | None = None,
     **options: Any,
 ) -> Particles:
-    """Run rules as `rollout_species`, whose options these are; return worlds with all fields."""
+    """Run rules as `rollout_species` does, with its options; return worlds with all fields."""
     check_world(worlds.x, worlds.s)
     particle_count = worlds.x.shape[1]
     sizes = checked_counts(counts, particle_count)
@@ -163,7 +163,7 @@ def species_particles(
 
 
 def _checked_rules(rules: Any, species_count: int, perception: str) -> list[NPARule]:
-    """Return rules that fit each other, the number of species and the mode of perception."""
+    """Check that rules fit each other, the species' number and `perception`; return their list."""
     checked_choice("perception", perception, get_args(SpeciesPerception))
     checked = None if isinstance(rules, NPARule) else as_list(rules)
     if checked is None or not all(isinstance(rule, NPARule) for rule in checked):
@@ -200,7 +200,7 @@ def _checked_rules(rules: Any, species_count: int, perception: str) -> list[NPAR
 
 
 def _for_each_species(name: str, numbers: Any, species_count: int) -> list[Any]:
-    """Return one number for each species; their values are not checked."""
+    """Return a list of one number for each species, from such a list or one number for all."""
     each = as_list(numbers)
     if each is None:
         return [numbers] * species_count

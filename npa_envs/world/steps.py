@@ -1,4 +1,4 @@
-"""One step of worlds: of a rule, with static or dividing particles, and of several species."""
+"""The kinds of steps of a rollout: of one rule or several, of static or dividing particles."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from npa_envs.checks import constant
 from npa_envs.ops.perceive import Rows, perceive_rows, updates_in_parts
 from npa_envs.ops.physics import Physics
 from npa_envs.ops.species_density import perceive_by_species
-from npa_envs.ops.static_worlds import StaticRows, StaticWorlds, prepare_static, static_rows
+from npa_envs.ops.static_worlds import StaticRows, prepare_static, static_rows
 from npa_envs.ops.update import bounded, update_particles
 from npa_envs.rule.folded_network import Network
 from npa_envs.rule.rule import LIFE, NPARule
@@ -35,16 +35,16 @@ MAX_STORED_ROWS = 2**24
 """Maximum number of rows of perception, or of assigned rows of static worlds, stored at once."""
 
 MAX_AHEAD = 4
-"""Maximum number of steps whose random numbers a CUDA graph draws ahead, as these take memory."""
+"""Maximum number of steps whose random numbers a CUDA graph draws ahead; they take memory."""
 
 OVERFLOW_LOG_PROBABILITY = 34.5
-"""Row capacities suffice with probability 1 - exp(-34.5), about 1 - 1e-15, for each step."""
+"""`row_capacity` is exceeded in a step with probability exp(-34.5), about 1e-15."""
 
 
 def row_capacity(particle_total: int, update_prob: float) -> int:
-    """Return an upper bound on the particles that a step updates, by Bernstein's inequality.
+    """Return how many particles a step updates at most, by Bernstein's inequality.
 
-    On CUDA the number of rows must not depend on the draw: reading it would wait for the device. On
+    On CUDA the number of rows must not depend on the mask: reading it would wait for the device. On
     a CPU the exact number is used instead.
     """
     mean = particle_total * update_prob
@@ -55,7 +55,7 @@ def row_capacity(particle_total: int, update_prob: float) -> int:
 
 
 def row_count(mask: Tensor | None, x: Tensor, update_prob: float) -> int:
-    """Return the number of rows of perception for the particles of a mask; None: all."""
+    """Return how many rows of perception to allocate for an update mask; None: all particles."""
     total = x.shape[0] * x.shape[1]
     if mask is None:
         return total
@@ -64,20 +64,20 @@ def row_count(mask: Tensor | None, x: Tensor, update_prob: float) -> int:
 
 
 class Draws(NamedTuple):
-    """The random numbers of a step, and the rows of the particles that they select."""
+    """The random numbers of a step, and for static particles the rows that they select."""
 
     mask: Tensor | None
     """Update mask, uint8, shape [B, N]; None: all particles are updated."""
     noise: Tensor | None
     """Position noise [length units], shape [B, N, D], or None."""
     rows: StaticRows | None = None
-    """Rows of the active particles, for static particles."""
+    """Rows of perception of active static particles, in place of a mask; None: all are active."""
     births: Births | None = None
     """Random numbers of divisions, for particles that divide."""
 
 
 def draw_step(x: Tensor, physics: Physics, generator: Randomness | None) -> Draws:
-    """Draw a step's update mask and position noise, in this order."""
+    """Return a step's update mask and position noise, drawn in this order."""
     mask = noise = None
     if isinstance(generator, WorldRandom):
         generator.advance()
@@ -94,7 +94,7 @@ def draw_step(x: Tensor, physics: Physics, generator: Randomness | None) -> Draw
 
 
 def skip_draws(x: Tensor, physics: Physics, steps: int, generator: Randomness | None) -> None:
-    """Advance a generator as `steps` steps of worlds at positions x would."""
+    """Advance a generator as far as `steps` steps of worlds with positions x would."""
     if steps == 0:
         return
     if isinstance(generator, WorldRandom):
@@ -111,22 +111,22 @@ def skip_draws(x: Tensor, physics: Physics, steps: int, generator: Randomness | 
 
 
 class Step:
-    """One step of a rollout: its random draws, and `advance`, which draws nothing itself."""
+    """A kind of step: `draw` returns the random numbers of steps, and `advance` does one step."""
 
     physics: Physics
 
     def to_step_order(self, particles: Particles) -> Particles:
-        """Return worlds given in the caller's order in that of `advance`; here it is the same."""
+        """Return the worlds with particles in the order of `advance`; here it is the caller's."""
         return particles
 
     def draw_step(self, like: Tensor, generator: Randomness | None) -> Draws:
-        """Return the draws of the next step, for positions of the shape and dtype of `like`."""
+        """Return the next step's random numbers, for positions of `like`'s shape and dtype."""
         return draw_step(like, self.physics, generator)
 
     def draw(self, like: Tensor, steps: int, generator: Randomness | None) -> Iterator[Draws]:
-        """Yield each step's draws, in the same order on every device.
+        """Yield each step's random numbers, drawn in the same order on every device.
 
-        In a CUDA graph draws are made in advance, in parallel with the steps before.
+        In a CUDA graph they are drawn ahead, in parallel with the steps before.
         """
         # In this order: a compiler cannot trace queries of streams.
         may_capture = not torch.compiler.is_compiling() and like.is_cuda
@@ -135,30 +135,30 @@ class Step:
                 yield self.draw_step(like, generator)
             return
         side_stream = SideStream.of_thread(like.device, threading.get_ident())
-        ready, rest = [self.draw_step(like, generator)], steps - 1
-        while rest > 0:
+        ready, remaining = [self.draw_step(like, generator)], steps - 1
+        while remaining > 0:
             # Draws reuse the memory of earlier steps, so the two streams wait for each other.
-            count = min(3 * len(ready), MAX_AHEAD, rest)
+            count = min(3 * len(ready), MAX_AHEAD, remaining)
             with side_stream.overlap():
                 coming = [self.draw_step(like, generator) for _ in range(count)]
             yield from ready
             side_stream.join()
-            ready, rest = coming, rest - count
+            ready, remaining = coming, remaining - count
         yield from ready
 
     def advance(self, particles: Particles, draws: Draws) -> Particles:
-        """Return the worlds after one step with these draws."""
+        """Return the worlds after one step with these random numbers."""
         raise NotImplementedError
 
     def to_caller_order(self, particles: Particles) -> Particles:
-        """Undo `to_step_order`."""
+        """Return the worlds with particles in the caller's order; undoes `to_step_order`."""
         return particles
 
 
 def _updated(
     particles: Particles, update: Tensor, active: Rows, draws: Draws, physics: Physics
 ) -> Particles:
-    """Return particles after the updates of the active ones and the position noise of all."""
+    """Return the worlds after updates [K, A] of active particles, and position noise of all."""
     if draws.noise is not None:
         particles = particles._replace(x=particles.x + draws.noise)
     fields = update_particles(update, *particles.per_particle(), active, physics)
@@ -174,36 +174,27 @@ class RuleStep(Step):
     """The rule's weights in the form that kernels run; None: the rule runs as its module."""
     physics: Physics
     detach_positions: bool = True
-    static: StaticWorlds | None = None
-    """Sorted worlds of static particles."""
 
     def advance(self, particles: Particles, draws: Draws) -> Particles:
-        """Return the worlds after one step with these draws."""
+        """Return the worlds after one step with these random numbers."""
         x, s, *_ = particles
-        mask, rows = draws.mask, draws.rows
-        rule, physics = self.rule, self.physics
-        network = self.network or rule
-        width = self.network.row_width if self.network else rule.perception_dim
-        total = row_count(mask, x, physics.update_prob) if rows is None else len(rows.row_particle)
-        huge = total > MAX_STORED_ROWS and not torch.is_grad_enabled() and self.static is None
-        if huge and not torch.compiler.is_compiling():
+        mask, physics = draws.mask, self.physics
+        network = self.network or self.rule
+        width = self.network.row_width if self.network else self.rule.perception_dim
+        total = row_count(mask, x, physics.update_prob)
+        too_many = total > MAX_STORED_ROWS and not torch.is_grad_enabled()
+        if too_many and not torch.compiler.is_compiling():
             update, active = updates_in_parts(x, s, physics, mask, network.__call__, total, width)
         else:
+            seen_x = x.detach() if self.detach_positions else x
             perception, active = perceive_rows(
-                x.detach() if self.detach_positions else x,
-                s,
-                physics,
-                mask=mask,
-                row_capacity=total,
-                row_width=width,
-                static=self.static,
-                static_rows=rows,
+                seen_x, s, physics, mask=mask, row_capacity=total, row_width=width
             )
             update = network(perception)
         return _updated(particles, update, active, draws, physics)
 
 
-class StaticStep(RuleStep):
+class StaticStep(Step):
     """The step of a rule with static particles, whose neighbours are searched only once."""
 
     def __init__(self, rule: NPARule, physics: Physics, x: Tensor) -> None:
@@ -211,16 +202,15 @@ class StaticStep(RuleStep):
         self.x = bounded(x, physics)
         # Before all else: the compiler's trace breaks at it.
         self.sorted = prepare_static(self.x, physics)
-        super().__init__(rule, rule.network(), physics, True, self.sorted)
+        self.rule, self.network, self.physics = rule, rule.network(), physics
 
     def to_step_order(self, particles: Particles) -> Particles:
-        """Return the worlds in sorted order."""
+        """Return the worlds with particles in sorted order."""
         return particles._replace(x=self.x).gather(self.sorted.original_index)
 
     def draw(self, like: Tensor, steps: int, generator: Randomness | None) -> Iterator[Draws]:
-        """Yield each step's draws; few launches assign the rows of several steps together."""
-        total = like.shape[0] * like.shape[1]
-        physics = self.physics
+        """Yield each step's rows; a few launches assign those of up to 16 steps together."""
+        total, physics = like.shape[0] * like.shape[1], self.physics
         together = max(min(16, MAX_STORED_ROWS // total), 1)
         for first in range(0, steps, together):
             count = min(together, steps - first)
@@ -232,8 +222,25 @@ class StaticStep(RuleStep):
                 drawn = [Draws(None, None, of_step) for of_step in rows]
             yield from drawn
 
+    def advance(self, particles: Particles, draws: Draws) -> Particles:
+        """Return the worlds after one step of the particles that have a row."""
+        x, s, *_ = particles
+        rows = draws.rows
+        perception, active = perceive_rows(
+            x.detach(),
+            s,
+            self.physics,
+            mask=None,
+            row_capacity=x.shape[0] * x.shape[1] if rows is None else len(rows.row_particle),
+            row_width=self.network.row_width if self.network else self.rule.perception_dim,
+            static=self.sorted,
+            static_rows=rows,
+        )
+        network = self.network or self.rule
+        return _updated(particles, network(perception), active, draws, self.physics)
+
     def to_caller_order(self, particles: Particles) -> Particles:
-        """Return the worlds in the caller's order."""
+        """Return the worlds with particles in the caller's order."""
         return particles.gather(self.sorted.sorted_index)
 
 
@@ -241,7 +248,7 @@ class DivisionStep(RuleStep):
     """The step of a rule whose particles divide: an update of the living, then births, deaths."""
 
     def to_step_order(self, particles: Particles) -> Particles:
-        """Return the worlds with states of zero in dead slots."""
+        """Return the worlds with states of zero in dead slots; the order does not change."""
         # Dead slots must not enter gradients either: 0 times NaN is NaN.
         s = particles.s
         return particles._replace(s=torch.where(living(s)[..., None], s, 0.0))
@@ -253,7 +260,7 @@ class DivisionStep(RuleStep):
         return drawn._replace(births=Births(chance, normal_draws(generator, like.shape, like)))
 
     def advance(self, particles: Particles, draws: Draws) -> Particles:
-        """Return the worlds after one step with these draws."""
+        """Return the worlds after an update of the living, then births and deaths."""
         assert draws.births is not None, "drawn above"
         x, s, *_ = particles
         eps = self.physics.eps
@@ -283,9 +290,9 @@ class SpeciesSpec(NamedTuple):
     size: int
     """Number of its particles in a world."""
     update_prob: float
-    """Probability of each of its particles' updates."""
+    """Probability that a step updates a particle."""
     density_count: float
-    """Number by which it divides densities."""
+    """Number by which its rule's densities are divided."""
 
 
 class Species(NamedTuple):
@@ -295,12 +302,12 @@ class Species(NamedTuple):
     network: Network | None
     """The rule's weights in the form that kernels run; None: the rule runs as its module."""
     particles: slice
-    """Its particles in a world."""
+    """Indices of its particles in a world."""
     spec: SpeciesSpec
     displacement_fraction: float
-    """Its largest displacement as a fraction of the largest of all species."""
+    """Its rule's alpha divided by the largest alpha of all species."""
     count_ratio: float
-    """Number of particles of a world divided by this species' divisor of densities."""
+    """N divided by `spec.density_count`."""
 
     def capacity(self, world_count: int) -> int:
         """Return the number of rows to allocate for its active particles in B worlds."""
@@ -319,7 +326,6 @@ class SpeciesStep(Step):
         specs: Sequence[SpeciesSpec],
         physics: Physics,
         x: Tensor,
-        *,
         per_species: bool,
         detach_positions: bool,
     ) -> None:
@@ -337,7 +343,7 @@ class SpeciesStep(Step):
             self.species.append(Species(rule, rule.network(), particles, spec, fraction, ratio))
             first = particles.stop
         self.update_fraction: Tensor | None = None
-        """Probability p / max p with which a particle keeps a drawn update, shape [N]; None: 1."""
+        """p / max p of each particle, by which the mask is thinned, shape [N]; None: all are 1."""
         specs = [species.spec for species in self.species]
         if min(spec.update_prob for spec in specs) < physics.update_prob:
             fractions = [
@@ -347,7 +353,7 @@ class SpeciesStep(Step):
             self.update_fraction = torch.cat(fractions)
 
     def draw_step(self, like: Tensor, generator: Randomness | None) -> Draws:
-        """Return a step's mask, 1 with each species' own update probability, and its noise."""
+        """Return a step's mask, by each species' update probability, and its position noise."""
         drawn = super().draw_step(like, generator)
         if self.update_fraction is None:
             return drawn
@@ -357,7 +363,7 @@ class SpeciesStep(Step):
         return drawn._replace(mask=kept if mask is None else mask * kept)
 
     def advance(self, particles: Particles, draws: Draws) -> Particles:
-        """Return the worlds after one step with these draws."""
+        """Return the worlds after one step with these random numbers."""
         x, s, *_ = particles
         mask, physics = draws.mask, self.physics
         row_width = physics.perception_dim
@@ -396,9 +402,10 @@ class SpeciesStep(Step):
     def _perceived(
         self, species: Species, z: Tensor, fields: Tensor | None, particle: Tensor
     ) -> Tensor:
-        """Return a species' rows of perception z, with its own divisor of densities, and `fields`.
+        """Return what a species' rule perceives, from its rows of perception z [R, P].
 
-        `fields` has all species' densities and gradients, `particle` [R] the index of a row's.
+        Densities are divided by the species' own number. `fields` has all species' densities and
+        gradients, which are appended, or is None. `particle` [R] has each row's particle.
         """
         ratio, space_dim = species.count_ratio, self.physics.space_dim
         if ratio != 1.0 and self.physics.terms.density_gradient:
@@ -408,12 +415,12 @@ class SpeciesStep(Step):
             z = torch.cat((z[:, :begin], gradient, z[:, end:]), dim=1)
         if fields is None:
             return z
-        own = fields[:, species.particles].flatten(0, 1).index_select(0, particle)
+        appended = fields[:, species.particles].flatten(0, 1).index_select(0, particle)
         if ratio != 1.0:
-            density, gradients = own.tensor_split([len(self.species)], dim=1)
-            gradients = _recounted(gradients.view(len(own), -1, space_dim), ratio).flatten(1)
-            own = torch.cat((ratio * density, gradients), dim=1)
-        return torch.cat((z, own), dim=1)
+            density, gradients = appended.tensor_split([len(self.species)], dim=1)
+            gradients = _recounted(gradients.view(len(z), -1, space_dim), ratio).flatten(1)
+            appended = torch.cat((ratio * density, gradients), dim=1)
+        return torch.cat((z, appended), dim=1)
 
 
 def _rows_of_species(
@@ -421,7 +428,7 @@ def _rows_of_species(
 ) -> tuple[Tensor, Tensor]:
     """Return the rows of perception of a species' active particles, and these particles' indices.
 
-    Both are int64, shape [R]. On CUDA R does not depend on the draw, so that nothing waits for the
+    Both are int64, shape [R]. On CUDA R does not depend on the mask, so that nothing waits for the
     device; unused entries have the row `row_count`.
     """
     row = row_of[:, species.particles].reshape(-1).long()

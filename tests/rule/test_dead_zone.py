@@ -16,7 +16,7 @@ from npa_envs.agents import RulePolicy
 from npa_envs.envs import multispecies_v0
 from npa_envs.training import load_config
 from npa_envs.training.trainer import initial_rule
-from npa_envs.world import execute
+from npa_envs.world import rollout_execution
 from npa_envs.world.randomness import uniform_draws
 
 ZONE = 0.05
@@ -153,7 +153,7 @@ class TestRest:
 
     @pytest.fixture(autouse=True)
     def short_parts_without_gradients(self, monkeypatch):
-        monkeypatch.setattr(execute, "FIRST_PART", {"cpu": 64, "cuda": 64})
+        monkeypatch.setattr(rollout_execution, "FIRST_PART", {"cpu": 64, "cuda": 64})
         with torch.no_grad():
             yield
 
@@ -191,7 +191,7 @@ class TestRest:
     ):
         results = []
         for fewest in (10**9, 256):
-            monkeypatch.setattr(execute, "MIN_RESTING", fewest)
+            monkeypatch.setattr(rollout_execution, "MIN_RESTING", fewest)
             generator = self.generator(device)
             if by_world:
                 generator = npa_envs.WorldRandom([3, 4], device=device)
@@ -205,14 +205,14 @@ class TestRest:
 
     @pytest.fixture
     def parts(self, monkeypatch):
-        """The steps of each part that is run, of which 1 asks whether worlds are at rest."""
-        parts, run_all_steps = [], execute.run_all_steps
+        """The steps of each part without a watch; one of 1 step asks whether worlds are at rest."""
+        parts, run_captured = [], rollout_execution.run_captured
 
         def noted(call, *args, **options):
             parts.append(call.steps)
-            return run_all_steps(call, *args, **options)
+            return run_captured(call, *args, **options)
 
-        monkeypatch.setattr(execute, "run_all_steps", noted)
+        monkeypatch.setattr(rollout_execution, "run_captured", noted)
         return parts
 
     def test_it_runs_no_step_of_worlds_that_begin_at_rest(self, rule, worlds, parts):
@@ -240,7 +240,7 @@ class TestRest:
             {"on_divergence": "raise"},
         ):
             npa_envs.rollout(rule, *worlds, 256, eps=0.3, **options)
-        assert parts == [256] * 6
+        assert parts == [256] * 5
 
     def test_worlds_that_diverge_are_returned_as_without_a_zone(self, rule, worlds, parts, device):
         # Beyond 3 a state grows more from step to step, and takes the particle along.

@@ -98,7 +98,7 @@ def test_a_killed_process_ends_the_run_which_goes_on_from_its_checkpoint(tmp_pat
         assert time.monotonic() - begun < 60
         assert run.returncode == 2
         assert "of 2 was ended by SIGKILL" in output
-        assert "go on from it with --resume" in output
+        assert "continue from it with --resume" in output
         saved = check_left(out, workers, saved)
 
 

@@ -15,7 +15,7 @@ from support.worlds import (
 
 import npa_envs
 from npa_envs.ops import launch, warmup
-from npa_envs.world.execute import MIN_STATIC
+from npa_envs.world.rollout_execution import MIN_STATIC
 
 STEPS = 5
 

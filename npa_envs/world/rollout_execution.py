@@ -1,4 +1,17 @@
-"""Execution of rollouts: by CUDA graphs, recorded launches or a loop, with the same results."""
+"""How a rollout runs: one of several ways, which all have the same results.
+
+`execute` takes the first way whose condition is met:
+
+| way                      | condition                                      | code                 |
+|--------------------------|------------------------------------------------|----------------------|
+| skip steps once at rest  | rule with dead zone, no gradients, many steps  | `_run_until_rest`    |
+| replay CUDA graphs       | CUDA, third call on                            | graphed_rollouts.py  |
+| replay recorded launches | CPU, no gradients, small worlds, third call on | recorded_rollout.py  |
+| launch each step         | none                                           | `RolloutSpec.launch` |
+
+"Third" counts calls with the same shapes and options. What a step is, `RolloutSpec.make_step`
+chooses: one of several species, of static or dividing particles, or of one rule (`steps.py`).
+"""
 
 from __future__ import annotations
 
@@ -32,16 +45,103 @@ from npa_envs.world.steps import (
 Memory = Literal["store", "recompute", "minimal"]
 
 STORED_INTERVAL: dict[Memory, int] = {"store": 1, "recompute": 3, "minimal": 2**31}
-"""The last step and every k-th step before it store the tensors of the backward pass."""
+"""The last step and every k-th step before it store the backward pass's tensors; k by `memory`."""
 
 MIN_STATIC = 3
-"""Fewest steps of a rollout for which static worlds are sorted in advance."""
+"""Minimum number of steps of a rollout for which static worlds are sorted in advance."""
 
 MIN_RESTING = 256
-"""Fewest steps of a rollout that is checked for worlds at rest."""
+"""Minimum number of steps of a rollout that is checked for worlds at rest."""
 
 FIRST_PART = {"cpu": 64, "cuda": 1024}
-"""Steps until the first check for resting worlds, by device; each later part has twice as many."""
+"""Steps between the first two checks for worlds at rest, by device; they double after each."""
+
+
+def execute(
+    spec: RolloutSpec,
+    rules: Sequence[NPARule],
+    particles: Particles,
+    generator: Randomness | None,
+    *,
+    cuda_graph: CudaGraph = "auto",
+    watch: DivergenceWatch | None = None,
+    may_rest: bool = True,
+) -> Particles:
+    """Run a checked rollout in the fastest way that its options allow; return the last worlds.
+
+    With `spec.keep_every` it returns the worlds kept, stacked along a new first dimension. With a
+    watch, each step is launched and then checked for divergence. With `may_rest`, steps may be
+    skipped once all worlds are at rest.
+    """
+    if watch is None:
+        if may_rest and _can_rest(spec, rules, particles.x):
+            return _run_until_rest(spec, rules, particles, generator, cuda_graph)
+        replayed = run_captured(spec, rules, particles, generator, cuda_graph=cuda_graph)
+        if replayed is not None:
+            return replayed
+    check_finite_positions(particles.x)
+    if particles.x.is_cuda and torch.is_grad_enabled():
+        # Gradients are added in the order of a capture: first those of this rollout.
+        particles = particles.map(lambda value: value.view_as(value))
+    particles = particles.with_zero_paths()
+    step = spec.make_step(rules, particles)
+    if watch is None and type(step) is RuleStep:
+        replayed = run_recorded(step, particles, generator, spec.steps, spec.keep_every)
+        if replayed is not None:
+            return replayed
+    return spec.launch(step, rules, particles, generator, watch)
+
+
+def _can_rest(spec: RolloutSpec, rules: Sequence[NPARule], x: Tensor) -> bool:
+    """Return whether a rollout may skip its steps once all worlds are at rest."""
+    return (
+        len(rules) == 1
+        and not spec.species
+        and rules[0].dead_zone > 0.0
+        and rules[0].has_network()
+        and not rules[0].divides
+        and spec.steps >= MIN_RESTING
+        and spec.keep_every is None
+        and spec.physics.position_noise == 0.0
+        and not torch.is_grad_enabled()
+        and not torch.compiler.is_compiling()
+        and not (x.is_cuda and torch.cuda.is_current_stream_capturing())
+    )
+
+
+def _run_until_rest(
+    spec: RolloutSpec,
+    rules: Sequence[NPARule],
+    particles: Particles,
+    generator: Randomness | None,
+    cuda_graph: CudaGraph,
+) -> Particles:
+    """Run a rollout in parts of several steps, until all worlds are at rest or steps are done."""
+    remaining, steps = spec.steps, FIRST_PART[particles.x.device.type]
+    while remaining and not resting(rules, particles, spec.physics, cuda_graph).all():
+        part = spec._replace(steps=min(steps, remaining))
+        particles = execute(
+            part, rules, particles, generator, cuda_graph=cuda_graph, may_rest=False
+        )
+        remaining, steps = remaining - part.steps, 2 * steps
+        if remaining and not particles.x.isfinite().all():
+            # A world has diverged: the next call raises an error for it, this one does not.
+            part, particles = spec._replace(steps=remaining), particles.with_zero_paths()
+            return part.launch(part.make_step(rules, particles), rules, particles, generator)
+    # The generator ends where it would be after all steps.
+    skip_draws(particles.x, spec.physics, remaining, generator)
+    # The caller may write to the results.
+    return particles.map(torch.clone) if remaining == spec.steps else particles
+
+
+def resting(
+    rules: Sequence[NPARule], particles: Particles, physics: Physics, cuda_graph: CudaGraph
+) -> Tensor:
+    """Return which worlds are at rest: an update of all particles changes none, bool, shape [B]."""
+    spec = RolloutSpec(1, physics._replace(update_prob=1.0))
+    with torch.no_grad():
+        after = execute(spec, rules, particles, None, cuda_graph=cuda_graph, may_rest=False)
+    return after.equal(particles)
 
 
 class RolloutSpec(NamedTuple):
@@ -59,38 +159,28 @@ class RolloutSpec(NamedTuple):
     """Whether rules perceive each species' density and density gradient."""
 
     def make_step(self, rules: Sequence[NPARule], particles: Particles) -> Step:
-        """Return the `Step` that advances these worlds."""
+        """Return a new `Step` of the kind that these rules, worlds and options need."""
+        physics, detach_positions = self.physics.constants(), self.detach_positions
         if self.species:
-            return SpeciesStep(
-                rules,
-                self.species,
-                self.physics.constants(),
-                particles.x,
-                per_species=self.per_species,
-                detach_positions=self.detach_positions,
-            )
+            x = particles.x
+            return SpeciesStep(rules, self.species, physics, x, self.per_species, detach_positions)
         (rule,) = rules
-        physics = self.physics.constants()
-        moving = physics.moving or physics.position_noise > 0.0 or not self.detach_positions
+        moving = physics.moving or physics.position_noise > 0.0 or not detach_positions
         if not moving and self.steps >= MIN_STATIC:
             return StaticStep(rule, physics, particles.x)
         # A rule with a custom network runs as its module.
         cls = DivisionStep if rule.divides else RuleStep
-        return cls(rule, rule.network(), physics, self.detach_positions)
+        return cls(rule, rule.network(), physics, detach_positions)
 
-    def run(
+    def launch(
         self,
+        step: Step,
         rules: Sequence[NPARule],
         particles: Particles,
         generator: Randomness | None,
         watch: DivergenceWatch | None = None,
     ) -> Particles:
-        """Launch the rollout of checked worlds: recorded ones on a CPU, else step by step."""
-        step = self.make_step(rules, particles)
-        if type(step) is RuleStep and watch is None:
-            replayed = run_recorded(step, particles, generator, self.steps, self.keep_every)
-            if replayed is not None:
-                return replayed
+        """Launch all steps of checked worlds, and return what `execute` does."""
         # Worlds keep their dtype under autocast, as kernels read the rules' outputs.
         with torch.autocast(particles.x.device.type, enabled=False):
             after = self._launch_steps(step, rules, particles, generator, watch)
@@ -106,7 +196,6 @@ class RolloutSpec(NamedTuple):
         generator: Randomness | None,
         watch: DivergenceWatch | None,
     ) -> Particles:
-        """Launch step by step; return the last worlds, or with `keep_every` those kept, stacked."""
         particles = step.to_step_order(particles)
         interval, restores_random_state = self._recomputation(rules, particles.x)
         recomputed = None
@@ -209,84 +298,3 @@ def _version(value: Any) -> Any:
     if not isinstance(value, Tensor):
         return value
     return value.data_ptr(), None if value.is_inference() else value._version
-
-
-def execute(
-    spec: RolloutSpec,
-    rules: Sequence[NPARule],
-    particles: Particles,
-    generator: Randomness | None,
-    *,
-    graph: CudaGraph = "auto",
-    watch: DivergenceWatch | None = None,
-    may_rest: bool = True,
-) -> Particles:
-    """Run a checked rollout in the fastest way that its options allow.
-
-    With a watch, steps are launched one by one and checked for divergence. With `may_rest`, steps
-    may be skipped once all worlds are at rest.
-    """
-    if watch is not None or not may_rest or not _can_rest(spec, rules, particles.x):
-        return run_all_steps(spec, rules, particles, generator, graph=graph, watch=watch)
-    # In parts, to skip the steps after all worlds are at rest.
-    remaining, part = spec.steps, FIRST_PART[particles.x.device.type]
-    while remaining and not resting(rules, particles, spec.physics, graph).all():
-        steps = min(part, remaining)
-        part_spec = spec._replace(steps=steps)
-        particles = run_all_steps(part_spec, rules, particles, generator, graph=graph)
-        remaining, part = remaining - steps, 2 * part
-        if remaining and not particles.x.isfinite().all():
-            # A world has diverged: the next call raises an error for it, this one does not.
-            return spec._replace(steps=remaining).run(rules, particles.with_zero_paths(), generator)
-    # The generator ends where it would be after all steps.
-    skip_draws(particles.x, spec.physics, remaining, generator)
-    # The caller may write to the results.
-    return particles.map(torch.clone) if remaining == spec.steps else particles
-
-
-def run_all_steps(
-    spec: RolloutSpec,
-    rules: Sequence[NPARule],
-    particles: Particles,
-    generator: Randomness | None,
-    *,
-    graph: CudaGraph = "auto",
-    watch: DivergenceWatch | None = None,
-) -> Particles:
-    """Run a checked rollout as `execute` does, without skipping steps."""
-    if watch is None:
-        replayed = run_captured(spec, rules, particles, generator, cuda_graph=graph)
-        if replayed is not None:
-            return replayed
-    check_finite_positions(particles.x)
-    if particles.x.is_cuda and torch.is_grad_enabled():
-        # Gradients are added in the order of a capture: first those of this rollout.
-        particles = particles.map(lambda value: value.view_as(value))
-    return spec.run(rules, particles.with_zero_paths(), generator, watch)
-
-
-def resting(
-    rules: Sequence[NPARule], particles: Particles, physics: Physics, graph: CudaGraph
-) -> Tensor:
-    """Return which worlds are at rest: an update of all particles changes none, bool, shape [B]."""
-    spec = RolloutSpec(1, physics._replace(update_prob=1.0))
-    with torch.no_grad():
-        after = run_all_steps(spec, rules, particles, None, graph=graph)
-    return after.equal(particles)
-
-
-def _can_rest(spec: RolloutSpec, rules: Sequence[NPARule], x: Tensor) -> bool:
-    """Return whether a rollout can skip the steps of worlds at rest."""
-    return (
-        len(rules) == 1
-        and not spec.species
-        and rules[0].dead_zone > 0.0
-        and rules[0].has_network()
-        and not rules[0].divides
-        and spec.steps >= MIN_RESTING
-        and spec.keep_every is None
-        and spec.physics.position_noise == 0.0
-        and not torch.is_grad_enabled()
-        and not torch.compiler.is_compiling()
-        and not (x.is_cuda and torch.cuda.is_current_stream_capturing())
-    )
