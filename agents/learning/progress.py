@@ -77,7 +77,10 @@ class Learner(Protocol):
         """Optimisers of the `modules`, Adam or AdamW, by name."""
 
     def resume(self, iteration: int, resumption: int) -> None:
-        """Resume after `iteration` iterations, for the `resumption`-th time, in new worlds."""
+        """Begin new worlds, as a run is resumed after `iteration` iterations.
+
+        resumption: How often the run has been resumed, this time included, so that seeds differ.
+        """
 
 
 class Progress:

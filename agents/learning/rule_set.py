@@ -1,11 +1,11 @@
-"""Sets of rules, one for each species of a problem."""
+"""Sets of rules, one for each species of a problem; rules with clamped state steps."""
 
 from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -16,6 +16,7 @@ from npa_envs.checks import checked_count
 from npa_envs.envs.core.config import Interface
 from npa_envs.errors import NPAError, shown
 from npa_envs.rule.files import load_rule, save_rule
+from npa_envs.rule.folded_network import FoldedRule
 from npa_envs.rule.rule import NPARule
 
 if TYPE_CHECKING:
@@ -177,6 +178,66 @@ class RuleSetPolicy(Policy):
                     "was made for"
                 )
         return {agent: known[agent] for agent in counts}
+
+
+class _ClampInward(torch.autograd.Function):
+    """Clamp values to ± `limit`; beyond it, only gradients whose descent leads back inside pass."""
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, limit: float) -> Tensor:
+        ctx.save_for_backward(values)
+        ctx.limit = limit
+        return values.clamp(-limit, limit)
+
+    @staticmethod
+    def backward(ctx: Any, bar: Tensor) -> tuple[Tensor, None]:
+        (values,) = ctx.saved_tensors
+        # Descent moves values against their gradient.
+        leads_out = torch.where(values > 0.0, bar < 0.0, bar > 0.0)
+        return bar.masked_fill((values.abs() > ctx.limit) & leads_out, 0.0), None
+
+
+class ClampedWeights(FoldedRule):
+    """The network of a `ClampedRule` as steps run it: two matrix products, then the clamp."""
+
+    rule: ClampedRule
+
+    def __call__(self, rows: Tensor) -> Tensor:
+        """Map K perceptions, [z | 1 | 0], to K updates, [δ | clamped Δs | 0], row by row."""
+        return self.rule.clamped(super().__call__(rows))
+
+
+class ClampedRule(NPARule):
+    """A rule that shares another rule's parameters and clamps its state steps to ± `limit`.
+
+    In a rollout it acts as the other rule does in an environment with `state_scale` = `limit`
+    (dimensionless).
+    """
+
+    def __init__(self, rule: NPARule, limit: float) -> None:
+        self.share(rule)
+        self.limit = limit
+        self.rule_is_plain = rule.is_plain()
+
+    def forward(self, perception: Tensor) -> Tensor:
+        """Map perceptions [..., P] to raw updates [..., A] with clamped state steps."""
+        return self.clamped(super().forward(perception))
+
+    def clamped(self, update: Tensor) -> Tensor:
+        """Return raw updates [δ | Δs], shape [..., A], with the state steps Δs clamped."""
+        first = self.update_dim - self.state_dim
+        state_step = _ClampInward.apply(update[..., first:], self.limit)  # type: ignore[no-untyped-call]
+        return torch.cat((update[..., :first], state_step), dim=-1)
+
+    def is_plain(self) -> bool:
+        """Return whether the network that is clamped is two layers, so that `folded` has it."""
+        return self.rule_is_plain
+
+    def folded(self) -> FoldedRule:
+        """Return the network as `ClampedWeights`."""
+        clamped = ClampedWeights(*super().folded())
+        clamped.rule = self
+        return clamped
 
 
 def species_of(counts: Sequence[int]) -> Tensor:

@@ -24,7 +24,7 @@ from npa_envs.agents.learning.actor_critic import (
     set_gradients,
     share_of_worlds,
 )
-from npa_envs.agents.learning.gradient import EnvironmentTask
+from npa_envs.agents.learning.problem import DifferentiableTask
 from npa_envs.agents.learning.progress import Progress, annealed
 from npa_envs.agents.learning.rule_set import RuleSet
 from npa_envs.checks import check_fraction, check_non_negative, check_positive, check_word
@@ -114,7 +114,7 @@ class SHACLearner:
         count = -(-problem.episode_steps // options.steps)
         self.window = -(-problem.episode_steps // count)
         """Steps of a window, h."""
-        self.task = EnvironmentTask(problem, device)
+        self.task = DifferentiableTask(problem, device)
         width = problem.physics.space_dim + problem.physics.state_dim + 1
         self.critic = seeded_critic(progress, width, options.critic)
         self.target = copy.deepcopy(self.critic).requires_grad_(False)
@@ -131,7 +131,7 @@ class SHACLearner:
         self.resume(0, 0)
 
     def resume(self, iteration: int, resumption: int) -> None:
-        """Resume after `iteration` windows, for the `resumption`-th time, in new worlds."""
+        """Begin new worlds, as `Learner.resume` says; the arguments are not used."""
         begin_episodes(self.random)
         self.worlds = self._new_worlds(list(range(len(self._indices))))
         self.windows_left = [1 + k % self.window_count for k in self._indices]
