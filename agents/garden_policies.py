@@ -87,9 +87,9 @@ class ScriptedGardener(BrushPolicy):
     the longest push and has no brush yet.
 
     Args:
-        gain: A push has this times the gradient of the deficit at its place (dimensionless) ...
-        share: ... plus this times the deficits of all other places, towards each (dimensionless).
-        width: Standard deviation of the Gaussian weight of these, by distance [length units].
+        gain: Factor on the deficit's gradient, which a brush pushes along (dimensionless).
+        share: Factor on a brush's pushes towards all places, by their deficits (dimensionless).
+        width: Standard deviation of the Gaussian weight of other places [length units].
     """
 
     def __init__(self, env: Any, gain: float = 0.5, share: float = 0.6, width: float = 0.4) -> None:

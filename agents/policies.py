@@ -1,7 +1,4 @@
-"""Policies of particles: of a rule, random, and scripted; and checks that rules fit environments.
-
-They are functions from observations to actions, for arrays and tensors alike.
-"""
+"""Policies of particles: a rule's, random, scripted; and whether a rule fits an environment."""
 
 from __future__ import annotations
 
@@ -275,9 +272,6 @@ class PaintPolicy(SpreadPolicy):
     Args:
         colour: Red, green and blue in [0, 1]; None: the mean colour of the environment's target.
         gain: As of `SpreadPolicy`.
-
-    Raises:
-        NPAError: `colour` is None without a target, or is not three numbers.
     """
 
     def __init__(

@@ -38,10 +38,7 @@ class RecognisingShapeshifter:
         self._goals = observation.chunk(2, dim=1)[1].cpu()
 
     def __call__(self, observation: Any) -> Any:
-        """Return the action for an observation, [8 G²] with G² grid cells, or for B of them.
-
-        It is an array for an array, a tensor for a tensor.
-        """
+        """Return the action for an observation [8 G²], with G² grid cells, or B for [B, 8 G²]."""
         array = torch.as_tensor(observation).cpu()
         goal = array.unflatten(-1, (2, -1))[..., 1, :]  # type: ignore[no-untyped-call]
         away = (goal[..., None, :] - self._goals).square().sum(dim=-1)

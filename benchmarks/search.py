@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from scipy.stats import t as student
 from scripts import script_facts, script_parser
 
-from npa_envs.agents.search.candidates import SearchWorld
+from npa_envs.agents.search.candidate_evaluation import SearchWorld
 from npa_envs.agents.search.quality_diversity import EMITTERS, RESULTS, Growth, Search, tried_again
 from npa_envs.atomic_files import read_json, write_bytes
 from npa_envs.checks import check_device

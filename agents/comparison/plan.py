@@ -23,33 +23,25 @@ GROWTH_KEYWORDS = {
 
 PROBLEMS: Mapping[str, Mapping[str, Any]] = {
     "morphogenesis2d": {
-        "env_id": "npa/Morphogenesis2D-v0",
+        "env_id": "npa/Morphogenesis2D-v0", "episode_steps": 48, "hidden_dim": 64,
         "keywords": {**GROWTH_KEYWORDS, "seed_radius": 0.4},
-        "episode_steps": 48,
-        "hidden_dim": 64,
     },
     "regeneration2d": {
-        "env_id": "npa/Regeneration2D-v0",
+        "env_id": "npa/Regeneration2D-v0", "episode_steps": 32, "hidden_dim": 64,
         "keywords": {**GROWTH_KEYWORDS, "rule": "picture", "damage": "wipe", "damage_size": 0.4},
-        "episode_steps": 32,
-        "hidden_dim": 64,
     },
     "point_classification": {
-        "env_id": "npa/PointClassification-v0",
+        "env_id": "npa/PointClassification-v0", "episode_steps": 24, "hidden_dim": 128,
         "keywords": {
             "particle_count": 256, "state_dim": 16, "state_scale": 0.1, "eps": 0.3, "eps0": 0.3
         },
-        "episode_steps": 24,
-        "hidden_dim": 128,
     },
     "mixing": {
-        "env_id": "npa/Mixing-v0",
+        "env_id": "npa/Mixing-v0", "episode_steps": 48, "hidden_dim": 64,
         "keywords": {
             "species_count": 2, "particle_count": 512, "state_dim": 8, "state_scale": 0.1,
             "perception": "per_species",
         },
-        "episode_steps": 48,
-        "hidden_dim": 64,
     },
 }  # fmt: skip
 """Fields of the task's `Problem` by the name of the task."""
@@ -88,10 +80,7 @@ BUDGET_KINDS: tuple[BudgetKind, ...] = get_args(BudgetKind)
 
 @dataclass(frozen=True)
 class Job:
-    """One run: a method of `npa_envs.agents.learning` on a task of the plan, from a seed.
-
-    `axis` is the kind of its budget.
-    """
+    """One run: a method on a task of the plan, from a seed; `axis` is the kind of its budget."""
 
     axis: BudgetKind
     task: str

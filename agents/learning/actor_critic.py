@@ -198,8 +198,7 @@ class GaussianRules(nn.Module):
         return gaussian_log_prob(self.rules.mean(observation), self.row_log_std(), action)
 
     def row_log_prob(self, species: int, rows: Tensor, action: Tensor) -> Tensor:
-        """Return log-probabilities [K] of actions [K, A] of K particles of one species, by number,
-        at their observations [K, P]."""
+        """Return log-probabilities [K] of one species' actions [K, A] at observations [K, P]."""
         mean = self.rules.mean_by_rule(list(self.rules)[species], rows)
         return gaussian_log_prob(mean, self.log_std[species], action)
 

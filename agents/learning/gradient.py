@@ -1,8 +1,4 @@
-"""Learning by the gradient of the environment's loss, through the environment's own physics.
-
-The worlds, their physics and their loss are those of `DifferentiableTask` in `problem.py`; pool,
-rollout, gradients and optimiser are those of the trainer, `npa_envs.training.cycle`.
-"""
+"""Learning by the gradient of a problem's loss through its physics, by the trainer's cycle."""
 
 from __future__ import annotations
 

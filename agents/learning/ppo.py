@@ -268,7 +268,7 @@ class PPOLearner:
         self.graphed = GraphedParts(self, device)
 
     def resume(self, iteration: int, resumption: int) -> None:
-        """Begin new worlds, as `Learner.resume` says; an iteration is a round."""
+        """Begin new worlds after `iteration` rounds; `resumption`: number of resumes so far."""
         self.rounds = iteration
         self.buffers.observations[-1].copy_(self._reset_worlds(resumption))
 
@@ -335,8 +335,7 @@ class PPOLearner:
 
     @torch.no_grad()
     def compute_values(self) -> None:
-        """Write the critic's `values` of `observations`, in chunks to save memory, as `next_values`
-        too, which are wrong where an episode ended."""
+        """Write `values`, in chunks to save memory, and `next_values` as if no episode ended."""
         buffers, observations = self.buffers, self.buffers.observations.flatten(0, 1)
         size = -(-len(observations) // self.options.minibatches)
         values = torch.cat([self.critic(chunk) for chunk in torch.split(observations, size)])

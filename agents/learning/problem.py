@@ -69,12 +69,12 @@ RESERVED_KEYWORDS = {
     "output": "learners are given tensors",
     "observe_target": "rules read what particles perceive, and no target",
 }
-"""Keywords of environments that problems do not take, and why."""
+"""Keywords of environments that problems do not take: what to do instead, by keyword."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Problem:
-    """An environment to learn in, with its keywords; `to_json` and `from_json` store it."""
+    """An environment to learn in, with its keywords and sizes."""
 
     env_id: str
     """Id of an environment of this library, "npa/Mixing-v0", or of your own that is registered with
@@ -121,7 +121,7 @@ class Problem:
 
     @cached_property
     def registration(self) -> RegisteredEnv:
-        """What `env_id` stands for."""
+        """Task and keywords that `env_id` stands for."""
         return registration_of(self.env_id)
 
     @property
@@ -146,12 +146,12 @@ class Problem:
 
     @property
     def interface(self) -> Interface:
-        """Meaning of the columns of observations and actions."""
+        """Columns of observations and actions."""
         return self.config.interface(self.physics)
 
     @property
     def counts(self) -> tuple[int, ...]:
-        """Numbers of particles of the species that act; one number without species."""
+        """Number of particles of each species that acts; one number without species."""
         config = self.config
         if isinstance(config, SpeciesConfig):
             return config.agent_particle_counts
@@ -163,7 +163,7 @@ class Problem:
         return sum(self.counts)
 
     def make_task(self, device: str | torch.device = "cpu") -> EnvTask[Any] | SpeciesTask:
-        """Return the environment's task, which makes start worlds and their losses, on a device."""
+        """Return the environment's task on a device: it makes start worlds and computes losses."""
         device = check_device(device)
         return self.task_type(replace(self.config, device=str(device)), device)
 
@@ -234,7 +234,7 @@ class Problem:
         return envs
 
     def to_json(self) -> str:
-        """Return the problem as JSON, on one line."""
+        """Return the problem as one line of JSON, for `from_json`."""
         return json.dumps(asdict(self), sort_keys=True)
 
     @classmethod
@@ -320,10 +320,7 @@ class DifferentiableTask(ParticleTask[Any]):
         return total.flatten(1).mean(dim=1) if total.dim() > 1 else total
 
     def rollout(self, rules: Any, worlds: Particles, steps: int, /, **options: Any) -> Particles:
-        """Return worlds after `steps` steps of a `RuleSet` by the environment's physics.
-
-        `options` are those of `npa_envs.rollout`.
-        """
+        """Return worlds after steps of a `RuleSet`; `options` are those of `npa_envs.rollout`."""
         physics, config = self.physics, self.config
         if self._clamped is None or self._clamped[0] is not rules:
             # Made once, as captured rollouts identify rules by `id`.
@@ -366,7 +363,7 @@ class DifferentiableTask(ParticleTask[Any]):
 
 
 class RegisteredEnv(NamedTuple):
-    """What an environment id stands for: a class of tasks and its settings."""
+    """What an environment id stands for: the class of its task, and settings."""
 
     task_type: type[EnvTask[Any]] | type[SpeciesTask]
     keywords: dict[str, Any]
@@ -378,7 +375,7 @@ class RegisteredEnv(NamedTuple):
 
 
 def registration_of(env_id: Any) -> RegisteredEnv:
-    """Return what an environment id stands for; raises NPAError if it has no batched form."""
+    """Return what an environment id stands for; NPAError if it has no form of many worlds."""
     if isinstance(env_id, str) and env_id in SPECIES_IDS:
         name, keywords = task_settings(env_id)
         steps = keywords.pop("max_cycles", DEFAULT_STEPS)
@@ -398,7 +395,7 @@ def registration_of(env_id: Any) -> RegisteredEnv:
 
 
 def check_run_seed(seed: Any) -> None:
-    """Check that the seed of a run is a whole number below `RUN_SEED_COUNT`."""
+    """Check that the seed of a run is a whole number from 0 to below `RUN_SEED_COUNT`."""
     if not is_whole(seed) or not 0 <= seed < RUN_SEED_COUNT:
         raise NPAError(
             f"seed must be a whole number from 0 to {RUN_SEED_COUNT - 1}, as the worlds of "
@@ -407,9 +404,10 @@ def check_run_seed(seed: Any) -> None:
 
 
 def world_seeds(seed: int, count: int, resumption: int = 0) -> list[int]:
-    """Return seeds of `count` worlds, which no run with another seed has.
+    """Return the seeds of `count` worlds of the run with `seed`; no other run has these.
 
-    Each `resumption` of the run has new ones; they repeat after `WORLDS_PER_SEED` worlds.
+    resumption: How often the run was resumed. Each time has new seeds, until `WORLDS_PER_SEED` are
+    used; then they repeat.
     """
     check_run_seed(seed)
     if count > WORLDS_PER_SEED:

@@ -33,8 +33,8 @@ class RuleSet(nn.Module):
 
     Args:
         rules: One for each species; not copied.
-        counts: Particles of each species.
-        interface: `problem.interface`.
+        counts: Number of particles of each species.
+        interface: Columns of observations and actions, `problem.interface`.
     """
 
     def __init__(
@@ -48,14 +48,14 @@ class RuleSet(nn.Module):
             )
         self.rules = nn.ModuleList(rules)
         self.spans = spans_of(counts)
-        """Slice of each species' particles."""
+        """Slice of the particles of each species, among all N."""
         self.counts = tuple(counts)
-        """Particles of each species."""
+        """Number of particles of each species."""
         self.interface = interface
 
     @classmethod
     def new(cls, problem: Problem, seed: int) -> RuleSet:
-        """Return untrained rules, on the CPU; torch's random state does not change."""
+        """Return untrained rules for a problem, on the CPU; torch's random state stays."""
         seed, interface, config = checked_count("seed", seed), problem.interface, problem.config
         with torch.random.fork_rng(devices=()):
             torch.manual_seed(seed)
@@ -75,12 +75,10 @@ class RuleSet(nn.Module):
 
     @classmethod
     def of(cls, problem: Problem, source: Source | Iterable[Source]) -> RuleSet:
-        """Return copies of existing rules for a problem that they fit, on the CPU.
+        """Return copies of existing rules, on the CPU, checked to fit a problem.
 
-        Args:
-            problem: The problem that they are for.
-            source: A rule, or what `npa_envs.load_rule` takes, for all species or one for each; or
-                a folder that `save` wrote.
+        `source` is a rule, or what `npa_envs.load_rule` takes, for all species or one for each; or
+        a folder that `save` wrote.
         """
         if isinstance(source, str | Path) and (Path(source) / _file_name(0)).is_file():
             return cls.load(source, problem)
@@ -100,11 +98,7 @@ class RuleSet(nn.Module):
         return cls.of(problem, [Path(folder) / _file_name(k) for k in range(len(problem.counts))])
 
     def save(self, folder: str | Path) -> list[Path]:
-        """Write `rule-0.safetensors` and so on into a folder, and return their paths.
-
-        Raises:
-            NPAError: A weight is not finite, or a file cannot be written.
-        """
+        """Write each rule, as `rule-0.safetensors` and so on, into a folder; return the paths."""
         paths = [Path(folder) / _file_name(k) for k in range(len(self.rules))]
         try:
             with made_folder(Path(folder)):
@@ -118,26 +112,26 @@ class RuleSet(nn.Module):
         return paths
 
     def __iter__(self) -> Iterator[NPARule]:
-        """Return the rules one by one."""
+        """Return an iterator over the rules, by species."""
         return iter(cast(list[NPARule], list(self.rules)))
 
     def mean(self, observation: Tensor) -> Tensor:
         """Return actions [B, N, A] for observations: a_x = δ / (1 + |δ|), a_s = Δs / state_scale.
 
-        They are differentiable. Unlike those of `policy`, state steps are not clipped to the action
-        space, so that gradients do not vanish.
+        They are differentiable. Unlike in `policy`, a_s is not clipped to the action space, so that
+        gradients do not vanish.
         """
         return self.actions(observation, self.mean_by_rule)
 
     def mean_by_rule(self, rule: NPARule, rows: Tensor) -> Tensor:
-        """Return actions [K, A], as `mean`, of one rule for K rows of observations [K, P]."""
+        """Return what `mean` does, of one rule for K rows of observations, [K, P]: [K, A]."""
         delta, state_step = bounded_update(rule, rows)
         return torch.cat((delta, state_step / self.interface.state_scale), dim=-1)
 
     def actions(
         self, observation: Tensor, action_by_rule: Callable[[NPARule, Tensor], Tensor]
     ) -> Tensor:
-        """Return actions [B, N, A]; `action_by_rule` maps a rule and [K, P] to actions [K, A]."""
+        """Return actions [B, N, A]; `action_by_rule` gives those of K rows [K, P] of one rule."""
         actions = []
         for rule, span in zip(self, self.spans, strict=True):
             rows = observation[:, span]
@@ -146,19 +140,19 @@ class RuleSet(nn.Module):
         return actions[0] if len(actions) == 1 else torch.cat(actions, dim=1)
 
     def policy(self) -> RuleSetPolicy:
-        """Return the rules as a policy; it shares their weights."""
+        """Return the rules, not copied, as a policy."""
         return RuleSetPolicy(self)
 
 
 class RuleSetPolicy(Policy):
-    """A set of rules as a policy, which computes on the rules' device."""
+    """A set of rules as a policy; it computes on the rules' device."""
 
     def __init__(self, rules: RuleSet) -> None:
         super().__init__(rules.interface)
         self.rules = rules
 
     def act(self, observation: Tensor) -> Tensor:
-        """Return the actions [B, N, A] of particles by their species' rules."""
+        """Return the actions of all particles by their species' rules, shape [B, N, A]."""
 
         def action(rule: NPARule, rows: Tensor) -> Tensor:
             return self.interface.action(*bounded_update(rule, rows))

@@ -16,7 +16,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from npa_envs.agents.search.candidates import Axis, Candidates, Found, Numbers, SearchWorld
+from npa_envs.agents.search.candidate_evaluation import (
+    Axis,
+    Candidates,
+    Found,
+    Numbers,
+    SearchWorld,
+)
 from npa_envs.checks import is_whole
 from npa_envs.errors import NPAError, importing, shown, suggest
 from npa_envs.measure.benchmark_records import installed_version, read_record, write_record

@@ -21,11 +21,7 @@ from npa_envs.agents import (
 from npa_envs.agents.learning import EVALUATION_SEEDS, Budget, Problem, RuleSet, train
 from npa_envs.agents.learning.clone import Demonstrations, unexplained_variance
 from npa_envs.agents.learning.evolution import RuleWeights, candidates_actions, costs, fitness
-from npa_envs.agents.learning.problem import (
-    FIRST_EVALUATION_SEED,
-    DifferentiableTask,
-    world_seeds,
-)
+from npa_envs.agents.learning.problem import FIRST_EVALUATION_SEED, DifferentiableTask, world_seeds
 from npa_envs.agents.learning.rule_set import ClampedRule
 from npa_envs.agents.learning.shac import SHACLearner, SHACOptions, td_lambda_targets, world_values
 from npa_envs.envs.core.vector import NPAVectorEnv

@@ -10,7 +10,7 @@ from support.refusals import refused
 
 from npa_envs import load_rule, rollout
 from npa_envs.agents.search import Search, SearchWorld, tried_again
-from npa_envs.agents.search.candidates import (
+from npa_envs.agents.search.candidate_evaluation import (
     SEED_RADIUS,
     UPDATE_PROB,
     Candidates,

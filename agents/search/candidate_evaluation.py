@@ -1,7 +1,4 @@
-"""Evaluation of candidate rules: they run in worlds, which give their quality and descriptors.
-
-Other modules propose the candidates: see `quality_diversity.py`.
-"""
+"""Evaluation of candidate rules that a search proposes: rollouts, quality and descriptors."""
 
 from __future__ import annotations
 

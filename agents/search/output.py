@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from npa_envs.agents.search.candidates import SEED_RADIUS, UPDATE_PROB, Axis
+from npa_envs.agents.search.candidate_evaluation import SEED_RADIUS, UPDATE_PROB, Axis
 from npa_envs.agents.search.quality_diversity import Elite, Search
 from npa_envs.atomic_files import made_folder
 from npa_envs.measure.plots import new_figure, png
