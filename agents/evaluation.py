@@ -23,23 +23,23 @@ _REASONS = {"reason", "diverged", "success"}
 
 
 class Episodes(NamedTuple):
-    """Results of a policy's episodes, one for each seed: arrays of shape [E]."""
+    """Results of a policy's episodes: arrays of shape [E], one entry for each of E seeds."""
 
     returns: NDArray[np.float64]
-    """Sums of the rewards."""
+    """Sum of the rewards of each episode."""
     start_losses: NDArray[np.float64]
-    """Losses before the first step."""
+    """The world's loss before the first step."""
     final_losses: NDArray[np.float64]
-    """Losses after the last step."""
+    """The world's loss after the last step."""
     steps: NDArray[np.int64]
-    """Numbers of steps."""
+    """Number of steps."""
     endings: tuple[str, ...]
-    """Why each ended: "success", "diverged" or "time limit"; with several species the reason of the
-    first one that terminated, or "left the world" if one diverged."""
+    """Why the episode ended: "success", "diverged" or "time limit"; with several species the reason
+    of the first one that terminated, or "left the world" if one diverged."""
 
     @property
     def mean_return(self) -> float:
-        """Mean of the returns."""
+        """Mean of the episodes' returns."""
         return float(self.returns.mean())
 
     @property
@@ -52,8 +52,8 @@ class Episodes(NamedTuple):
 def evaluate_policy(env: Any, policy: Callable[[Any], Any], seeds: Iterable[int]) -> Episodes:
     """Run one episode from each seed, as many at a time as the environment has worlds.
 
-    Each is the first episode after a reset with its seed, so that results do not depend on the
-    number of worlds or on the lengths of episodes.
+    Each is the first episode after a reset with its seed. So results depend neither on the number
+    of worlds nor on the lengths of other episodes.
 
     Args:
         env: A single or a vector environment of `npa_envs`, or Gymnasium's `SyncVectorEnv` or
@@ -62,7 +62,7 @@ def evaluate_policy(env: Any, policy: Callable[[Any], Any], seeds: Iterable[int]
         policy: Maps observations, [B, N, P], to actions, [B, N, A]; B is 1 where `env` is single.
             A policy that reads the worlds instead has `made_for(env)`, which returns the policy
             for an environment.
-        seeds: One for each episode, integers of at least 0.
+        seeds: Seed of each episode, integers of at least 0.
 
     Raises:
         NPAError: Seeds are missing or wrong, or the environment is not of this library.
@@ -91,7 +91,7 @@ def evaluate_policy(env: Any, policy: Callable[[Any], Any], seeds: Iterable[int]
 
 
 def checked_seeds(name: str, seeds: Iterable[int]) -> list[int]:
-    """Return seeds as a list, or raise an NPAError that calls the argument `name`."""
+    """Return seeds as a list, if they are at least one and valid; errors call them `name`."""
     if not isinstance(seeds, Iterable):
         raise NPAError(
             f"{name} must be one for each episode, got {shown(seeds)}: give {name}=range(8)"
@@ -105,13 +105,13 @@ def checked_seeds(name: str, seeds: Iterable[int]) -> list[int]:
 
 
 def bound_to(env: Any, policy: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """Return the policy, or `policy.made_for(env)` if it needs worlds, not only observations."""
+    """Return `policy.made_for(env)` if the policy has that, as it reads worlds; else the policy."""
     make = getattr(policy, "made_for", None)
     return policy if make is None else make(env)
 
 
 def _run(env: Any, policy: Callable[[Any], Any], seeds: list[int]) -> tuple[NDArray[Any], ...]:
-    """Return fields of `Episodes`: those of each world's first episode, from a seed for each."""
+    """Return the fields of `Episodes` for each world's first episode after a reset with `seeds`."""
     observation, infos = env.reset(seed=seeds)
     if "loss" not in infos:
         raise NPAError(
@@ -145,7 +145,7 @@ def _run(env: Any, policy: Callable[[Any], Any], seeds: list[int]) -> tuple[NDAr
 def _run_single(
     env: Any, policy: Callable[[Any], Any], seeds: list[int]
 ) -> tuple[NDArray[Any], ...]:
-    """Return fields of `Episodes`, of length 1: those of a single environment's episode."""
+    """Return the fields of `Episodes`, of length 1, for the episode of a single environment."""
     observation, info = env.reset(seed=seeds[0])
     start_loss, total, steps, over = info["loss"], 0.0, 0, False
     while not over:

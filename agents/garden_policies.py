@@ -1,4 +1,4 @@
-"""Gardeners: policies that use brushes, scripted or planned by the gradient of the world.
+"""Gardeners and shepherds: policies that use brushes; random, scripted, or planned by gradients.
 
 Actions of B worlds have shape [B, J, W]: J brushes, W columns each.
 """
@@ -20,11 +20,11 @@ from npa_envs.errors import NPAError
 from npa_envs.world.randomness import StreamId, WorldRandom
 
 FREE_PLACES = 8
-"""Points on each side of the grid at which scripts place free brushes."""
+"""Points on each side of the grid of places at which `ScriptedGardener` puts free brushes."""
 
 
 class BrushPolicy:
-    """Policy that reads the worlds of `env`, a single or vector environment with brushes."""
+    """Policy of the brushes of a garden `env`, single or vector, whose worlds it reads."""
 
     def __init__(self, env: Any) -> None:
         inner = unwrapped(env)
@@ -41,9 +41,9 @@ class BrushPolicy:
         """Shape of a world's actions, (J, W)."""
 
     def __call__(self, observation: Any) -> Any:
-        """Return actions [J, W] for an observation [O] of one world, [B, J, W] for [B, O].
+        """Return actions, [J, W] for the observation [O] of one world, [B, J, W] for [B, O].
 
-        They are arrays for arrays, tensors for tensors; `act` reads the worlds, not observations.
+        They are arrays for arrays, tensors for tensors. The observation's numbers are not read.
         """
         array = observation["observation"] if isinstance(observation, dict) else observation
         one_world = array.ndim == 1
@@ -51,7 +51,7 @@ class BrushPolicy:
         return actions if isinstance(array, Tensor) else actions.cpu().numpy()
 
     def act(self) -> Tensor:
-        """Return actions of the environment's B worlds as they are now, float32 [B, J, W]."""
+        """Return actions for the environment's B worlds as they are now, float32, [B, J, W]."""
         raise NotImplementedError
 
     def still(self) -> Tensor:
@@ -68,7 +68,7 @@ class StillGardener(BrushPolicy):
 
 
 class RandomGardener(BrushPolicy):
-    """Act at random, uniformly over the action space; world k has the seed `seed + k`."""
+    """Act at random, uniformly over the action space; world k acts by the seed `seed + k`."""
 
     def __init__(self, env: Any, seed: int = 0) -> None:
         super().__init__(env)
@@ -81,15 +81,14 @@ class RandomGardener(BrushPolicy):
 
 
 class ScriptedGardener(BrushPolicy):
-    """Push particles to places with a deficit: where their density is less than the target's.
+    """Push particles to places with a deficit, where their density is less than the target's.
 
-    On a grid pushes are linear in observations. Free brushes go one by one to the place that needs
+    Brushes on a grid push at all places at once. Free brushes go one by one to the place that needs
     the longest push and has no brush yet.
 
     Args:
-        gain: Factor on the deficit's gradient, a brush's push at its place (dimensionless).
-        share: Factor on a brush's pushes towards all other places, by the deficit at each
-            (dimensionless).
+        gain: Factor on the deficit's gradient, which a brush pushes along (dimensionless).
+        share: Factor on a brush's pushes towards all places, by their deficits (dimensionless).
         width: Standard deviation of the Gaussian weight of other places [length units].
     """
 
@@ -110,7 +109,7 @@ class ScriptedGardener(BrushPolicy):
         self._pulls = (checked_positive("share", share) * weight[..., None] * away).double()
 
     def act(self) -> Tensor:
-        """Return pushes by J brushes to where density is below the target's, [B, J, W]."""
+        """Return actions that push particles to places with a deficit, shape [B, J, W]."""
         worlds, action = self.worlds, self.still()
         deficit = self._deficit(worlds.particles, self.task.middle(worlds.x))
         pull = torch.einsum("bq,pqd->bpd", deficit[..., 0].double(), self._pulls).to(deficit.dtype)
@@ -130,7 +129,7 @@ class ScriptedGardener(BrushPolicy):
 
 
 class ScriptedShepherd(BrushPolicy):
-    """Push all particles towards the world's goal, of `aim` "move", "reshape" or "turn".
+    """Push all particles towards the world's goal, whatever the `aim` of the environment.
 
     Args:
         gain: Fraction of the distance to the goal that a push covers (dimensionless).
@@ -153,7 +152,7 @@ class ScriptedShepherd(BrushPolicy):
             self._places = ring * torch.stack((angle.cos(), angle.sin()), dim=1)
 
     def act(self) -> Tensor:
-        """Return pushes by J brushes towards each world's goal, [B, J, W]."""
+        """Return actions that push particles towards each world's goal, shape [B, J, W]."""
         worlds, action = self.worlds, self.still()
         achieved = self.task.achieved(worlds.particles, worlds.context)
         missing = (self.task.desired(worlds.context) - achieved)[:, None, :2]
@@ -174,14 +173,10 @@ class ScriptedShepherd(BrushPolicy):
 class GradientGardener(BrushPolicy):
     """Plan by the gradient of rewards, differentiated through brushes, rule and picture.
 
-    In each step it simulates the worlds for `horizon` steps, with separate update masks and
-    without damage, and improves the actions by Adam, starting from those of `ScriptedGardener` or
+    In each step of a garden `env`, whose brushes push and whose rewards are dense, it simulates the
+    worlds for `horizon` steps, without damage and with update masks of its own. Adam improves the
+    actions of these steps `iterations` times, from those of `ScriptedGardener` or
     `ScriptedShepherd`. It takes the first step of the best plan.
-
-    Args:
-        env: A garden whose brushes push, with dense rewards.
-        horizon: Steps of a plan.
-        iterations: Gradient steps on each plan.
     """
 
     def __init__(
@@ -200,7 +195,7 @@ class GradientGardener(BrushPolicy):
         self._random = PolicyRandom(seed)
 
     def act(self) -> Tensor:
-        """Return the actions of J brushes in the first step of the best plan found, [B, J, W]."""
+        """Return the actions of the first step of the best plan found, shape [B, J, W]."""
         random = self._random.next_step(self.worlds.world_count, self.task.device)
         first = self._scripted.act()
         plan = torch.stack([first] + [self.still()] * (self._horizon - 1))

@@ -1,4 +1,4 @@
-"""Policies: functions from observations to actions, for arrays and tensors alike."""
+"""Policies of particles: a rule's, random, scripted; and whether a rule fits an environment."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Array = TypeVar("Array", NDArray[Any], Tensor)
 
 
 def unwrapped(env: Any) -> Any:
-    """Return the NPA environment inside wrappers; of a `SyncVectorEnv` its first one."""
+    """Return the environment of `npa_envs` inside wrappers; of a `SyncVectorEnv` its first one."""
     inner = getattr(env, "unwrapped", None)
     if isinstance(inner, SyncVectorEnv):
         inner = inner.envs[0].unwrapped
@@ -43,8 +43,7 @@ def unwrapped(env: Any) -> Any:
 def interface_of(env: Any) -> Interface:
     """Return what the columns of an environment's observations and actions mean.
 
-    Args:
-        env: A single or a vector environment of `npa_envs`, wrapped or not.
+    `env` is a single or a vector environment of `npa_envs`, wrapped or not.
     """
     worlds = unwrapped(env).worlds
     interface: Interface = worlds.task.config.interface(worlds.physics)
@@ -66,7 +65,7 @@ def acting_interface(env: Any) -> Interface:
 
 
 def spans_of(counts: Iterable[int]) -> list[slice]:
-    """Return the slices of consecutive groups of particles, for the number in each group."""
+    """Return slices of consecutive groups of particles; `counts` has the size of each group."""
     ends = [0, *accumulate(counts)]
     return [slice(*pair) for pair in pairwise(ends)]
 
@@ -77,10 +76,8 @@ class Policy:
     It maps observations of one world, [N, P], or of several, [B, N, P], to actions [N, A] or
     [B, N, A], float32, within the action space: arrays to arrays, and tensors to tensors on the
     same device. It also maps a dict of agents' observations, as of PettingZoo's parallel
-    environments, to a dict of their actions. It has no gradients.
-
-    Args:
-        interface: `interface_of(env)`.
+    environments, to a dict of their actions. No gradients flow through it. `interface` is that of
+    its environment, `interface_of(env)`.
     """
 
     def __init__(self, interface: Interface) -> None:
@@ -108,7 +105,7 @@ class Policy:
         return self._act_on(torch.from_numpy(writable)).cpu().numpy()
 
     def _act_by_agent(self, observations: Mapping[str, Any]) -> dict[str, Any]:
-        """Return agents' actions by name, for their observations [P], [N_k, P] or [B, N_k, P]."""
+        """Return actions by agent, for observations [P], [N_k, P] or [B, N_k, P] of agent k."""
         if not observations:
             return {}
         rows = {agent: torch.as_tensor(values) for agent, values in observations.items()}
@@ -135,7 +132,7 @@ class Policy:
         return result
 
     def _spans(self, counts: Mapping[str, int]) -> dict[str, slice]:
-        """Return the slice of each agent's particles; counts: their numbers by agent."""
+        """Return the slice of each agent's particles, for the number of its particles."""
         return dict(zip(counts, spans_of(counts.values()), strict=True))
 
     def _act_on(self, observation: Tensor) -> Tensor:
@@ -153,18 +150,17 @@ class Policy:
 class RulePolicy(Policy):
     """An update rule as a policy: a_x = δ / (1 + |δ|) and a_s = Δs / state_scale.
 
-    An episode is then `npa_envs.rollout` of the rule, up to rounding, unless the environment clips
-    state steps at `state_scale` or observations at `observation_limit`. Actions are computed on the
-    rule's device.
+    An episode then equals `npa_envs.rollout` of the rule up to rounding, unless the environment
+    clips state steps to ± `state_scale` or observations to ± `observation_limit`. Actions are
+    computed on the rule's device.
 
     Args:
         rule: The rule, which is not copied.
-        env: The environment, which the rule is checked to fit; None: no check.
-        state_scale: The environment's, if `env` is None (dimensionless).
+        env: The environment, which must fit the rule; None: nothing is checked.
+        state_scale: Largest state step of the environment, if `env` is None (dimensionless).
 
     Raises:
-        NPAError: The rule perceives what no environment offers, has codes, divides, or does not fit
-            `env`.
+        NPAError: The rule has uncorrected gradients or codes, divides, or does not fit `env`.
     """
 
     def __init__(self, rule: NPARule, env: Any = None, state_scale: float = 1.0) -> None:
@@ -197,12 +193,12 @@ class RulePolicy(Policy):
         self.rule = rule
 
     def act(self, observation: Tensor) -> Tensor:
-        """Return the actions [B, N, A] that the rule gives particles."""
+        """Return the rule's actions for all particles, shape [B, N, A]."""
         return self.interface.action(*bounded_update(self.rule, observation.flatten(0, 1))).float()
 
 
 class ZeroPolicy(Policy):
-    """Do nothing, in an environment whose actions are rows of particles."""
+    """Do nothing: all actions are zero."""
 
     def __init__(self, env: Any) -> None:
         super().__init__(acting_interface(env))
@@ -213,14 +209,14 @@ class ZeroPolicy(Policy):
 
 
 class PolicyRandom:
-    """Random streams of a policy: world k has the stream of `seed + k`."""
+    """Random streams of a policy, one for each world: world k has the stream of `seed + k`."""
 
     def __init__(self, seed: Any) -> None:
         self._seed = checked_count("seed", seed)
         self._streams: WorldRandom | None = None
 
     def next_step(self, world_count: int, device: torch.device) -> WorldRandom:
-        """Return the worlds' streams for the next step; another `world_count` restarts them."""
+        """Return the worlds' streams for the next step; a changed `world_count` restarts them."""
         if self._streams is None or self._streams.world_count != world_count:
             seeds = range(self._seed, self._seed + world_count)
             # A substream, as an environment with the same seed uses these streams itself.
@@ -230,14 +226,7 @@ class PolicyRandom:
 
 
 class RandomPolicy(Policy):
-    """Act at random, uniformly over the action space.
-
-    World k of several gets the actions of a policy with `seed + k`.
-
-    Args:
-        env: The environment.
-        seed: An integer of at least 0.
-    """
+    """Act at random, uniformly over the action space; world k acts by the seed `seed + k`."""
 
     def __init__(self, env: Any, seed: int = 0) -> None:
         super().__init__(acting_interface(env))
@@ -253,9 +242,8 @@ class RandomPolicy(Policy):
 class SpreadPolicy(Policy):
     """Move down the density gradient: particles repel each other and spread out.
 
-    Args:
-        env: The environment.
-        gain: Displacement, as a fraction of α ε, for a gradient c^{1+D} ∇ρ / N of 1, c = ε / ε0.
+    The displacement, as a fraction of α ε, is -`gain` times the gradient c^{1+D} ∇ρ / N with
+    c = ε / ε0. With a gain below 0 particles attract each other.
     """
 
     def __init__(self, env: Any, gain: float = 0.03) -> None:
@@ -263,12 +251,12 @@ class SpreadPolicy(Policy):
         self._gain = checked_finite("gain", gain)
 
     def act(self, observation: Tensor) -> Tensor:
-        """Return actions [B, N, A]: displacements down the gradient, and `state_step`."""
+        """Return actions, shape [B, N, A]: displacements down the gradient, and `state_step`."""
         displacement = -self._gain * self.interface.density_gradient(observation)
         return self.interface.action(displacement, self.state_step(observation))
 
     def state_step(self, observation: Tensor) -> Tensor:
-        """Return zeros, shape [B, N, C]: states do not change."""
+        """Return changes of states, shape [B, N, C]: here zeros."""
         return torch.zeros_like(self.interface.states(observation))
 
 
@@ -279,15 +267,11 @@ def target_colour(env: Any) -> Tensor | None:
 
 
 class PaintPolicy(SpreadPolicy):
-    """Spread out and take one colour.
+    """Spread out, and take one colour.
 
     Args:
-        env: The environment.
         colour: Red, green and blue in [0, 1]; None: the mean colour of the environment's target.
-        gain: Displacement by the density gradient, as `SpreadPolicy` defines it.
-
-    Raises:
-        NPAError: Neither a colour nor a target is there, or the colour is not three numbers.
+        gain: As of `SpreadPolicy`.
     """
 
     def __init__(
@@ -305,7 +289,7 @@ class PaintPolicy(SpreadPolicy):
             )
 
     def state_step(self, observation: Tensor) -> Tensor:
-        """Return state steps [B, N, C]: `colour` minus the own one in the last three, else 0."""
+        """Return state steps [B, N, C]: the missing colour in the last three channels, else 0."""
         step = torch.zeros_like(self.interface.states(observation))
         target = self._colour.to(step.device) - COLOUR_OFFSET
         step[..., -3:] = target - self.interface.states(observation)[..., -3:]
@@ -313,12 +297,11 @@ class PaintPolicy(SpreadPolicy):
 
 
 class MendPolicy(SpreadPolicy):
-    """Repair damage: blank particles take the mean state of their neighbours; all spread out.
+    """Repair damage: particles with zero states take the mean state of their neighbours.
 
     Args:
-        env: The environment.
-        blank: Particles with a state of a smaller norm are blank (dimensionless).
-        gain: Displacement by the density gradient, small so that undamaged parts hardly change.
+        blank: States with a norm below this count as zero (dimensionless).
+        gain: As of `SpreadPolicy`; small, so that undamaged parts hardly change.
     """
 
     def __init__(self, env: Any, blank: float = 0.1, gain: float = 0.003) -> None:
@@ -326,23 +309,23 @@ class MendPolicy(SpreadPolicy):
         self._blank = checked_finite("blank", blank)
 
     def state_step(self, observation: Tensor) -> Tensor:
-        """Return state steps [B, N, C]: neighbours' mean minus own states if blank, else 0."""
+        """Return state steps [B, N, C]: to the neighbours' mean from zero states, else 0."""
         states = self.interface.states(observation)
-        blank = states.norm(dim=-1, keepdim=True) < self._blank
-        return torch.where(blank, self.interface.mean_states(observation) - states, 0.0)
+        is_zero = states.norm(dim=-1, keepdim=True) < self._blank
+        return torch.where(is_zero, self.interface.mean_states(observation) - states, 0.0)
 
 
 def rule_interface(rule: NPARule, state_scale: float) -> Interface:
-    """Return the observations' and actions' columns that a rule needs, as an `Interface`."""
+    """Return the columns of observations and actions that a rule needs, as an `Interface`."""
     moving = not rule.static
     return Interface(rule.space_dim, rule.state_dim, moving, state_scale, rule.species_count)
 
 
 def bounded_update(rule: NPARule, observation: Tensor) -> tuple[Tensor, Tensor]:
-    """Return a rule's bounded updates for observations [K, P], on its device; differentiable.
+    """Return what a rule does for K rows of observations, [K, P]: displacements and state steps.
 
-    They are displacements δ / (1 + |δ|) as fractions of α ε, [K, D], or [K, 0] of a static rule,
-    and unbounded state steps Δs (dimensionless), [K, C].
+    Displacements are δ / (1 + |δ|), as fractions of α ε, [K, D], or [K, 0] of a static rule; state
+    steps are Δs, without bounds, [K, C]. They are on the rule's device and differentiable.
     """
     weight = rule.hidden.weight
     rows = columns_read(rule, observation.to(weight.device, weight.dtype))
@@ -366,7 +349,7 @@ def split_update(rule: NPARule, update: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def columns_read(rule: NPARule, rows: Tensor) -> Tensor:
-    """Return those columns of observations [K, P] that a rule reads, in the rule's order."""
+    """Return the columns of observations [K, P] that a rule reads, in the rule's order."""
     if rule.state_gradient and rule.density_gradient:
         return rows
     first, end = 2 * rule.state_dim, rule_interface(rule, 1.0).shared_dim
@@ -381,7 +364,7 @@ def columns_read(rule: NPARule, rows: Tensor) -> Tensor:
 
 
 def check_rule_fits(rule: NPARule, wanted: Interface, config: Any) -> None:
-    """Check that a rule can act in an environment with this interface and configuration."""
+    """Check that a rule can act in an environment: `wanted` is its interface."""
     _check_correction(rule)
     if rule.static == wanted.moving:
         motion, other = ("static", "moving") if rule.static else ("moving", "static")

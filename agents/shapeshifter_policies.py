@@ -1,4 +1,4 @@
-"""A scripted policy that chooses codes of a rule of many pictures."""
+"""A scripted policy for `npa/Shapeshifter2D-v0`, whose agent chooses a rule's codes."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from npa_envs.world.particles import Particles
 
 
 class RecognisingShapeshifter:
-    """Choose the code of the picture nearest to the goal's, for observations as arrays or tensors.
+    """Choose the code whose picture is most like the goal's picture in the observation.
 
-    It knows the picture of each code of `npa/Shapeshifter2D-v0`, single or vector, with either form
-    of actions, and otherwise reads the observation only.
+    It takes the picture of each code from `env`, `npa/Shapeshifter2D-v0`, single or vector, with
+    either form of actions.
     """
 
     def __init__(self, env: Any) -> None:
@@ -38,7 +38,7 @@ class RecognisingShapeshifter:
         self._goals = observation.chunk(2, dim=1)[1].cpu()
 
     def __call__(self, observation: Any) -> Any:
-        """Return the action for an observation [8 G²], G² grid cells, or for those of B worlds."""
+        """Return the action for an observation [8 G²], with G² grid cells, or B for [B, 8 G²]."""
         array = torch.as_tensor(observation).cpu()
         goal = array.unflatten(-1, (2, -1))[..., 1, :]  # type: ignore[no-untyped-call]
         away = (goal[..., None, :] - self._goals).square().sum(dim=-1)

@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 from scipy.stats import t as student
 from scripts import script_facts, script_parser
 
-from npa_envs.agents.search.candidates import SearchWorld
-from npa_envs.agents.search.quality_diversity import METHODS, RESULTS, Growth, Search, tried_again
+from npa_envs.agents.search.candidate_evaluation import SearchWorld
+from npa_envs.agents.search.quality_diversity import EMITTERS, RESULTS, Growth, Search, tried_again
 from npa_envs.atomic_files import read_json, write_bytes
 from npa_envs.checks import check_device
 from npa_envs.measure.benchmark_records import markdown_table, write_record
@@ -131,7 +131,7 @@ def main() -> None:
     parser = script_parser(__doc__)
     parser.add_argument("command", choices=("run", "draw"))
     parser.add_argument("--out", type=Path, default=Path("runs/searches"))
-    parser.add_argument("--methods", nargs="+", choices=list(METHODS), default=list(METHODS))
+    parser.add_argument("--methods", nargs="+", choices=list(EMITTERS), default=list(EMITTERS))
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--particles", type=int, default=128)
     parser.add_argument("--budget", type=float, default=2e7, help="particle-steps of each search")

@@ -1,8 +1,8 @@
 """NPA-Bench v0: frozen problems and budgets, and rows of results as JSON files.
 
-There are two suites, one for a GPU and a small one for a laptop. A row contains the results of one
-method in a suite: for each problem the returns of at least `MIN_SEEDS` runs. It is a JSON file by
-`npa_bench_v0.schema.json`. `docs/scripts/npa_bench_rows.py` checks rows and computes their scores.
+There are two suites, one for a GPU and a small one for a laptop. A row is a JSON file with the
+results of one method in a suite: for each problem the returns of at least `MIN_SEEDS` runs. Its
+format is `npa_bench_v0.schema.json`. `docs/scripts/npa_bench_rows.py` checks and scores rows.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from npa_envs.agents.comparison.plan import Axis, ComparisonPlan
+from npa_envs.agents.comparison.plan import BudgetKind, ComparisonPlan
 from npa_envs.agents.comparison.single_run import RunRecord
 from npa_envs.agents.learning import methods_for
 from npa_envs.agents.learning.problem import Problem, registration_of
@@ -22,9 +22,9 @@ from npa_envs.errors import NPAError, shown
 from npa_envs.measure.benchmark_records import write_record
 from npa_envs.registration import GARDEN_IDS
 
-AXIS: Axis = "particle-steps"
+BUDGET_KIND: BudgetKind = "particle-steps"
 
-METHODS = {
+METHOD_DESCRIPTIONS = {
     "gradient": "descends the loss through the physics; in gardens plans by it, and learns nothing",
     "shac": "short-horizon actor-critic: gradients through few steps, a critic for the rest",
     "ppo": "PPO on the device, a likelihood for each particle",
@@ -36,18 +36,18 @@ METHODS = {
     "random": "acts at random",
     "zero": "does nothing",
 }
-"""Descriptions of the methods; problems that a method cannot learn are left out."""
+"""What each method does, for the tables of rows."""
 
 EPISODES = 32
 """Held-out episodes after a run."""
 
 MIN_SEEDS = 5
-"""Least runs of a method on a problem, from different seeds."""
+"""Minimum number of runs of a method on a problem, from different seeds."""
 
 SCHEMA = Path(__file__).with_name("npa_bench_v0.schema.json")
 
 QUICK_FRACTION = 1e-3
-"""Factor on the budgets of quick runs, which only test that everything runs."""
+"""Factor on the budgets of quick runs, which only test that all methods run."""
 
 LEFT_OUT = frozenset({("npa/PointClassificationSmall-v0", "scripted")})
 """Pairs of a problem and a method that are not run: no scripted policy classifies."""
@@ -55,7 +55,7 @@ LEFT_OUT = frozenset({("npa/PointClassificationSmall-v0", "scripted")})
 
 @dataclass(frozen=True)
 class Suite:
-    """A frozen benchmark: problems and their budgets. A changed one must have another name."""
+    """A benchmark: problems and their budgets. A suite that is changed must have a new name."""
 
     name: str
     groups: Mapping[str, Mapping[str, int]]
@@ -68,17 +68,17 @@ class Suite:
 
     @property
     def tasks(self) -> dict[str, str]:
-        """Environment ids by task name (see `task_name`)."""
+        """Environment id of each problem by its `task_name`."""
         return {task_name(env_id): env_id for env_id in self.budgets}
 
     @property
     def methods(self) -> list[str]:
-        """Names of the methods that can learn at least one of the problems."""
+        """Names of the methods that can learn at least one problem of the suite."""
         known = [methods_for(self.problem_of(task)) for task in self.tasks]
-        return [name for name in METHODS if any(name in table for table in known)]
+        return [name for name in METHOD_DESCRIPTIONS if any(name in table for table in known)]
 
     def problem_of(self, task: str) -> Problem:
-        """Return a task's problem: its registered environment, in 16 worlds, or 64 of a garden."""
+        """Return the problem of a task: the environment with 16 worlds, or a garden with 64."""
         env_id = self.tasks[task]
         steps, worlds = registration_of(env_id).steps, 64 if env_id in GARDEN_IDS else 16
         return Problem(env_id=env_id, episode_steps=steps, num_envs=worlds, hidden_dim=64)
@@ -139,10 +139,10 @@ SUITES: Mapping[str, Suite] = {
 def write_rows(
     suite: Suite, plan: ComparisonPlan, records: Sequence[RunRecord], folder: Path, command: str
 ) -> list[Path]:
-    """Write the runs of each method as METHOD.json (a row of the suite), and return the paths.
+    """Write the runs of each method as a row of the suite, METHOD.json, and return the paths.
 
-    Failed runs are left out. A file that exists keeps its runs of other problems and seeds, and
-    names the commands, commits, machines and versions of all runs, separated by semicolons.
+    Failed runs are left out. A file that exists keeps its runs of other problems and seeds; then it
+    names the commands, commits, machines and versions of all its runs, separated by semicolons.
     """
     paths = []
     ended = [record for record in records if record.status != "failed"]
@@ -151,7 +151,7 @@ def write_rows(
         row = {
             "benchmark": suite.name,
             "method": method,
-            "about": METHODS.get(method) or plan.own[method],
+            "about": METHOD_DESCRIPTIONS.get(method) or plan.own[method],
             "options": dict(plan.options.get(method, {})),
             "command": command,
             "date": max(record.date for record in runs),
@@ -183,7 +183,7 @@ def check_rows(suite: Suite, plan: ComparisonPlan, folder: Path) -> None:
 def _stored_row(
     suite: Suite, plan: ComparisonPlan, method: str, folder: Path
 ) -> dict[str, Any] | None:
-    """Return the object in METHOD.json, None if there is no file; raises as `check_rows`."""
+    """Return the row in METHOD.json, None if there is no file; raises as `check_rows` does."""
     path = folder / f"{method}.json"
     if not path.exists():
         return None
@@ -215,7 +215,7 @@ def _stored_row(
 
 
 def _joined(suite: Suite, stored: Mapping[str, Any], row: dict[str, Any]) -> dict[str, Any]:
-    """Return the new `row` together with those runs of the `stored` row that it does not repeat."""
+    """Return the new row with the runs of `stored` that it does not repeat added."""
     new = {(run["id"], run["seed"]) for run in row["runs"]}
     old = [dict(run) for run in stored["runs"] if (run["id"], run["seed"]) not in new]
     if not old:
@@ -239,7 +239,7 @@ def _joined(suite: Suite, stored: Mapping[str, Any], row: dict[str, Any]) -> dic
 
 
 def _united(first: str | None, second: str | None) -> str | None:
-    """Join two texts, each a list separated by semicolons, without duplicates."""
+    """Return two lists of items, each a text with semicolons between, as one without duplicates."""
     if first == second:
         return first
     items = [item for text in (first, second) for item in str(text).split("; ")]

@@ -1,4 +1,4 @@
-"""The plan of a comparison: tasks, jobs and budgets.
+"""The plan of a comparison: its tasks, its runs (`Job`) and their budgets.
 
 Tasks are small enough for all methods: worlds are smaller and episodes shorter than the paper's, so
 that reinforcement learning and evolution run many of them in a minute, and states have few channels
@@ -15,52 +15,36 @@ from typing import Any, Literal, get_args
 from npa_envs.agents.learning.problem import Problem
 from npa_envs.measure.process_queue import part_of
 
-GROWTH = {
-    "target": "heart",
-    "particle_count": 512,
-    "state_dim": 8,
-    "eps": 0.12,
-    "eps0": 0.12,
-    "state_scale": 0.1,
-    "colour_weight": 20.0,
-}
-"""Keywords of both tasks of growth: a heart, wide neighbourhoods, small steps."""
+GROWTH_KEYWORDS = {
+    "target": "heart", "particle_count": 512, "state_dim": 8, "eps": 0.12, "eps0": 0.12,
+    "state_scale": 0.1, "colour_weight": 20.0,
+}  # fmt: skip
+"""Keywords of the tasks "morphogenesis2d" and "regeneration2d"."""
 
 PROBLEMS: Mapping[str, Mapping[str, Any]] = {
     "morphogenesis2d": {
-        "env_id": "npa/Morphogenesis2D-v0",
-        "keywords": {**GROWTH, "seed_radius": 0.4},
-        "episode_steps": 48,
-        "hidden_dim": 64,
+        "env_id": "npa/Morphogenesis2D-v0", "episode_steps": 48, "hidden_dim": 64,
+        "keywords": {**GROWTH_KEYWORDS, "seed_radius": 0.4},
     },
     "regeneration2d": {
-        "env_id": "npa/Regeneration2D-v0",
-        "keywords": {**GROWTH, "rule": "picture", "damage": "wipe", "damage_size": 0.4},
-        "episode_steps": 32,
-        "hidden_dim": 64,
+        "env_id": "npa/Regeneration2D-v0", "episode_steps": 32, "hidden_dim": 64,
+        "keywords": {**GROWTH_KEYWORDS, "rule": "picture", "damage": "wipe", "damage_size": 0.4},
     },
     "point_classification": {
-        "env_id": "npa/PointClassification-v0",
+        "env_id": "npa/PointClassification-v0", "episode_steps": 24, "hidden_dim": 128,
         "keywords": {
             "particle_count": 256, "state_dim": 16, "state_scale": 0.1, "eps": 0.3, "eps0": 0.3
         },
-        "episode_steps": 24,
-        "hidden_dim": 128,
     },
     "mixing": {
-        "env_id": "npa/Mixing-v0",
+        "env_id": "npa/Mixing-v0", "episode_steps": 48, "hidden_dim": 64,
         "keywords": {
-            "species_count": 2,
-            "particle_count": 512,
-            "state_dim": 8,
-            "state_scale": 0.1,
+            "species_count": 2, "particle_count": 512, "state_dim": 8, "state_scale": 0.1,
             "perception": "per_species",
         },
-        "episode_steps": 48,
-        "hidden_dim": 64,
     },
 }  # fmt: skip
-"""Fields of `Problem` by the names of tasks."""
+"""Fields of the task's `Problem` by the name of the task."""
 
 WIDER = {"eps": 0.2, "eps0": 0.2}
 QUICK_KEYWORDS: Mapping[str, Mapping[str, Any]] = {
@@ -68,14 +52,14 @@ QUICK_KEYWORDS: Mapping[str, Mapping[str, Any]] = {
     "regeneration2d": {**WIDER, "resolution": 32},
     "mixing": WIDER,
 }
-"""Keywords of tiny tasks, with 64 particles, to test that everything runs."""
+"""Keywords that `make_problem` changes with `quick`, by task."""
 
 LEFT_OUT = frozenset({("point_classification", "scripted")})
 """Pairs (task, method) that do not run by default: no scripted policy classifies."""
 
 
 def make_problem(name: str, *, quick: bool = False) -> Problem:
-    """Return the problem of a name in `PROBLEMS`; `quick`: with tiny worlds and rules."""
+    """Return the problem of a task in `PROBLEMS`; `quick`: 4 worlds of 64 particles, 16 steps."""
     fields = {"num_envs": 32, **PROBLEMS[name]}
     if quick:
         keywords = {**fields["keywords"], "particle_count": 64, **QUICK_KEYWORDS.get(name, {})}
@@ -85,20 +69,20 @@ def make_problem(name: str, *, quick: bool = False) -> Problem:
 
 # Every method on every task, from every seed, within every budget.
 
-NOTHING, YARDSTICK = "zero", "gradient"
-"""Methods whose mean returns have the scores 0 and 1."""
+NOTHING, REFERENCE = "zero", "gradient"
+"""Methods whose mean returns have the scores 0 and 1: doing nothing, and the reference method."""
 
-Axis = Literal["seconds", "particle-steps"]
-"""Kind of the budget: seconds of wall time, or particle-steps."""
+BudgetKind = Literal["seconds", "particle-steps"]
+"""What a run's budget limits: wall time [s], or particle-steps."""
 
-AXES: tuple[Axis, ...] = get_args(Axis)
+BUDGET_KINDS: tuple[BudgetKind, ...] = get_args(BudgetKind)
 
 
 @dataclass(frozen=True)
 class Job:
-    """One run: a method of `npa_envs.agents.learning` on a task of the plan, from a seed."""
+    """One run: a method on a task of the plan, from a seed; `axis` is the kind of its budget."""
 
-    axis: Axis
+    axis: BudgetKind
     task: str
     method: str
     seed: int
@@ -120,12 +104,12 @@ class ComparisonPlan:
     """Problems as JSON (`Problem.to_json`), by their names."""
     methods: Sequence[str]
     seeds: Sequence[int]
-    budgets: Mapping[Axis, Mapping[str, float]]
-    """Seconds or particle-steps of each run, by axis and task."""
+    budgets: Mapping[BudgetKind, Mapping[str, float]]
+    """Seconds or particle-steps of each run, by kind of budget and task."""
     options: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    """Options by method; other methods have their defaults."""
+    """Options of methods, by method; other options have the methods' defaults."""
     own: Mapping[str, str] = field(default_factory=dict)
-    """Methods by names that the user gave them: a known method, or "module:function"."""
+    """Methods that the user named: name -> a known method, or "module:function"."""
     left_out: Collection[tuple[str, str]] = ()
     """Pairs (task, method) that are not run."""
     episodes: int = 32
@@ -145,14 +129,14 @@ class ComparisonPlan:
         ]
 
     def part(self, part: str | None) -> list[Job]:
-        """Return the runs of machine K of N, for `part` "K/N"; None: all runs.
+        """Return the runs that machine K of N does, for `part` "K/N"; None: all runs.
 
         All methods on a task from a seed run on one machine, as some use rules that others learned.
         """
         return part_of(self.jobs(), part, lambda job: (job.axis, job.seed, job.task))
 
     def teacher(self, job: Job) -> Job | None:
-        """Return the "gradient" run that a "clone" run imitates; None where no run is imitated."""
+        """Return the "gradient" run whose rules a "clone" run imitates; None for other runs."""
         if self.own.get(job.method, job.method) != "clone":
             return None
         if "teacher" in self.options.get(job.method, {}):
@@ -160,7 +144,7 @@ class ComparisonPlan:
         return replace(job, method="gradient")
 
     def facts(self, job: Job) -> dict[str, Any]:
-        """Return all settings that the results of a run depend on, in types that JSON has."""
+        """Return all settings that the results of a run depend on, by name, of JSON's types."""
         return {
             "problem": dict(self.tasks[job.task]),
             "budget": self.budgets[job.axis][job.task],

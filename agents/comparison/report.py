@@ -14,8 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from npa_envs.agents.comparison.plan import AXES, NOTHING, YARDSTICK, Axis, ComparisonPlan
-from npa_envs.agents.comparison.single_run import PICTURE, SIZE, RunRecord, mean_of
+from npa_envs.agents.comparison.plan import (
+    BUDGET_KINDS,
+    NOTHING,
+    REFERENCE,
+    BudgetKind,
+    ComparisonPlan,
+)
+from npa_envs.agents.comparison.single_run import PICTURE, PICTURE_SIDE, RunRecord, mean_of
 from npa_envs.agents.learning import CurvePoint
 from npa_envs.atomic_files import write_text
 from npa_envs.measure.benchmark_records import (
@@ -30,9 +36,9 @@ from npa_envs.measure.plots import draw_band, legend_of, new_figure, png, write_
 from npa_envs.render import write_filmstrip
 
 DIVERGED = ("diverged", "left the world")
-"""Endings of diverged episodes: of worlds, and of species."""
+"""Reasons for the end of episodes that diverged: of worlds, and of species."""
 
-HEADINGS: Mapping[Axis, str] = {
+HEADINGS: Mapping[BudgetKind, str] = {
     "seconds": "Equal wall time",
     "particle-steps": "Equal particle-steps",
 }
@@ -43,7 +49,10 @@ TABLE, RESULTS, CURVES = "comparison.md", "comparison.json", "comparison.csv"
 def write_table(
     plan: ComparisonPlan, records: Sequence[RunRecord], folder: Path, command: str
 ) -> str:
-    """Write comparison.md and .json (results by method) and .csv (curves); return the Markdown."""
+    """Write the results by method as comparison.md and .json, the curves as .csv; return the .md.
+
+    The files name `command`, the command line of the comparison.
+    """
     table = report_rows(records)
     shown = markdown(table)
     facts = {"command": command, **asdict(plan), "left_out": sorted(map(list, plan.left_out))}
@@ -54,7 +63,7 @@ def write_table(
 
 
 def write_pictures(records: Sequence[RunRecord], folder: Path) -> list[str]:
-    """Write filmstrips and, with matplotlib, plots of curves; return "wrote PATH" for each."""
+    """Write filmstrips, and curves if matplotlib is installed; return "wrote PATH" for each."""
     strips = [f"wrote {path}" for path in write_strips(records, folder)]
 
     def curves() -> dict[str, bytes]:
@@ -83,7 +92,7 @@ UNKNOWN = Estimate(math.nan, math.nan)
 
 
 def estimate(values: Iterable[float]) -> Estimate:
-    """Return the mean and standard error of the finite ones among `values`, one for each seed."""
+    """Return the mean and standard error of values, one for each seed; only finite ones count."""
     finite = [value for value in values if math.isfinite(value)]
     mean = mean_of(finite)
     if len(finite) < 2:
@@ -94,47 +103,47 @@ def estimate(values: Iterable[float]) -> Estimate:
 
 @dataclass(frozen=True)
 class ReportRow:
-    """The results of a method on a task, over its seeds."""
+    """The results of a method on a task, over the runs from all seeds."""
 
-    axis: Axis
+    axis: BudgetKind
     task: str
     method: str
     done: int
     diverged: int
-    """Runs whose numbers became infinite or NaN."""
+    """Number of runs in which numbers became infinite or NaN."""
     failed: int
     counted: int
-    """Runs with a finite return, over which means are taken."""
+    """Number of runs with a finite return, over which means are taken."""
     episodes_diverged: float
     """Fraction of the held-out episodes that diverged; NaN without episodes."""
     final_return: Estimate
     final_loss: Estimate
     fraction: Estimate
-    """Fraction of the gradient's improvement over doing nothing."""
+    """Improvement over doing nothing, as a fraction of the reference method's (`fraction`)."""
     seconds: float
     particle_steps: float
 
     @property
     def runs(self) -> int:
-        """Number of runs."""
+        """Number of all runs."""
         return self.done + self.diverged + self.failed
 
 
 def report_rows(records: Iterable[RunRecord]) -> list[ReportRow]:
     """Return a row for each kind of budget, task and method, in the order of the records."""
-    groups: dict[tuple[Axis, str, str], list[RunRecord]] = {}
+    groups: dict[tuple[BudgetKind, str, str], list[RunRecord]] = {}
     for record in records:
         job = record.job
         groups.setdefault((job.axis, job.task, job.method), []).append(record)
     returns = {key: estimate(r.mean_return for r in group) for key, group in groups.items()}
     table = []
     for (axis, task, method), group in groups.items():
-        result, nothing, yardstick = (
-            returns.get((axis, task, name), UNKNOWN) for name in (method, NOTHING, YARDSTICK)
+        result, nothing, reference = (
+            returns.get((axis, task, name), UNKNOWN) for name in (method, NOTHING, REFERENCE)
         )
-        of_yardstick = fraction(result, nothing, yardstick)
-        if method == YARDSTICK and not math.isnan(of_yardstick.mean):
-            of_yardstick = Estimate(1.0, math.nan)
+        of_reference = fraction(result, nothing, reference)
+        if method == REFERENCE and not math.isnan(of_reference.mean):
+            of_reference = Estimate(1.0, math.nan)
         statuses = Counter(record.status for record in group)
         endings = sum((Counter(record.endings or {}) for record in group), Counter())
         diverged = sum(endings[word] for word in DIVERGED)
@@ -151,7 +160,7 @@ def report_rows(records: Iterable[RunRecord]) -> list[ReportRow]:
                 episodes_diverged=diverged / endings.total() if endings else math.nan,
                 final_return=result,
                 final_loss=estimate(record.mean_loss for record in group),
-                fraction=of_yardstick,
+                fraction=of_reference,
                 seconds=estimate(point.seconds for point in last_points).mean,
                 particle_steps=estimate(point.particle_steps for point in last_points).mean,
             )
@@ -159,18 +168,18 @@ def report_rows(records: Iterable[RunRecord]) -> list[ReportRow]:
     return table
 
 
-def fraction(result: Estimate, nothing: Estimate, yardstick: Estimate) -> Estimate:
-    """Return (R - R_nothing) / (R_yardstick - R_nothing) of mean returns R, with its error.
+def fraction(result: Estimate, nothing: Estimate, reference: Estimate) -> Estimate:
+    """Return (R - R_nothing) / (R_reference - R_nothing) of mean returns R, with its error.
 
-    `nothing` is of the method "zero", `yardstick` of "gradient". The fraction is NaN if the
-    yardstick is not better than nothing. The standard errors of R and R_yardstick are propagated to
-    first order; that of R_nothing, which is in both differences, is ignored.
+    `nothing` is the mean return of the method "zero", `reference` that of "gradient". The fraction
+    is NaN unless R_reference > R_nothing. The standard errors of R and R_reference are propagated
+    to first order; that of R_nothing, which is in both differences, is ignored.
     """
-    gain = yardstick.mean - nothing.mean
+    gain = reference.mean - nothing.mean
     if not gain > 0.0 or math.isnan(result.mean):
         return UNKNOWN
     mean = (result.mean - nothing.mean) / gain
-    spread = math.hypot(result.standard_error, mean * yardstick.standard_error)
+    spread = math.hypot(result.standard_error, mean * reference.standard_error)
     return Estimate(mean, spread / gain)
 
 
@@ -180,7 +189,7 @@ def fraction(result: Estimate, nothing: Estimate, yardstick: Estimate) -> Estima
 def markdown(table: Sequence[ReportRow]) -> str:
     """Return the rows in Markdown, one table for each kind of budget and task."""
     sections = []
-    for axis in AXES:
+    for axis in BUDGET_KINDS:
         axis_rows = [row for row in table if row.axis == axis]
         if axis_rows:
             sections.append(f"## {HEADINGS[axis]}")
@@ -188,7 +197,7 @@ def markdown(table: Sequence[ReportRow]) -> str:
             task_rows = [row for row in axis_rows if row.task == task]
             sections.append(f"### {task}\n\n{_table(task_rows)}")
             methods = {row.method for row in task_rows}
-            missing = [f"`{name}`" for name in (NOTHING, YARDSTICK) if name not in methods]
+            missing = [f"`{name}`" for name in (NOTHING, REFERENCE) if name not in methods]
             if missing:
                 sections.append(f"Fractions need runs of {' and '.join(missing)}.")
     return "\n\n".join(sections) + "\n"
@@ -196,7 +205,7 @@ def markdown(table: Sequence[ReportRow]) -> str:
 
 def _table(table: Sequence[ReportRow]) -> str:
     heads = (
-        "method", "runs", "return", "final loss", f"fraction of {YARDSTICK}", "seconds",
+        "method", "runs", "return", "final loss", f"fraction of {REFERENCE}", "seconds",
         "particle-steps",
     )  # fmt: skip
 
@@ -235,22 +244,22 @@ def curves_csv(records: Iterable[RunRecord]) -> str:
 
 
 ACROSS = {"wall time [s]": "seconds", "particle-steps": "particle_steps"}
-"""Fields of `CurvePoint` that are abscissae, by their labels."""
+"""Field of `CurvePoint` along a plot's horizontal axis, by the axis' label."""
 
 CURVE_POINTS = 64
-"""Points of a mean curve."""
+"""Number of points of a mean learning curve."""
 
 
 Curve = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
-"""Points of a mean learning curve: abscissae, mean returns, standard errors (0 for one seed)."""
+"""Points of a mean learning curve: times, mean returns, standard errors (0 for one seed)."""
 
 
 def mean_curve(records: Sequence[RunRecord], across: str) -> Curve | None:
     """Return the mean over runs of a method's learning curves; None if they do not overlap.
 
-    Curves are interpolated linearly where all of them overlap; `across` is the field of
-    `CurvePoint` that is the abscissa. A method that does not learn has a single point. Failed and
-    diverged runs, whose curves are short, count only if there are no others.
+    Curves are interpolated linearly along `across`, the field "seconds" or "particle_steps" of
+    `CurvePoint`, where all of them overlap. A method that does not learn has a single point. Failed
+    and diverged runs, whose curves are short, count only if there are no others.
     """
     lines = []
     for record in [record for record in records if record.status == "done"] or records:
@@ -272,7 +281,7 @@ def mean_curve(records: Sequence[RunRecord], across: str) -> Curve | None:
 
 
 def _picture(records: Sequence[RunRecord]) -> bytes:
-    axes = [axis for axis in AXES if any(record.job.axis == axis for record in records)]
+    axes = [axis for axis in BUDGET_KINDS if any(record.job.axis == axis for record in records)]
     names = {}
     for method in dict.fromkeys(record.job.method for record in records):
         states = [record.status for record in records if record.job.method == method]
@@ -309,26 +318,27 @@ def _draw(panel: Any, drawn: Curve | None, colour: str, name: str) -> None:
         draw_band(panel, across, lines, colour, name, lw=1.5)
 
 
-# Filmstrips: the last picture of a held-out episode of each run
+# Filmstrips
 
 
 def write_strips(records: Sequence[RunRecord], folder: Path) -> list[Path]:
-    """Write a filmstrip of final worlds for each kind of budget and task; return the paths.
+    """Write a filmstrip for each kind of budget and task; return the paths.
 
-    It has a column for each method and a row for each seed, from the runs' pictures in the
-    comparison's folder.
+    It has a column for each method and a row for each seed, with the runs' pictures in the
+    comparison's `folder`, each of the end of a held-out episode.
     """
-    groups: dict[tuple[Axis, str], dict[tuple[int, str], RunRecord]] = {}
+    groups: dict[tuple[BudgetKind, str], dict[tuple[int, str], RunRecord]] = {}
     for record in records:
         job = record.job
         groups.setdefault((job.axis, job.task), {})[job.seed, job.method] = record
     written = []
-    for (axis, task), runs in sorted(groups.items(), key=lambda group: AXES.index(group[0][0])):
+    kinds = sorted(groups.items(), key=lambda item: BUDGET_KINDS.index(item[0][0]))
+    for (axis, task), runs in kinds:
         methods = list(dict.fromkeys(method for _, method in runs))
         frames, captions = [], []
         for seed, method in itertools.product(sorted({seed for seed, _ in runs}), methods):
             run = runs.get((seed, method))
-            frames.append(np.full((SIZE, SIZE, 3), 255, np.uint8))
+            frames.append(np.full((PICTURE_SIDE, PICTURE_SIDE, 3), 255, np.uint8))
             result: str = "not run" if run is None else run.status
             if run is not None and run.status == "done":
                 result = f"loss {run.mean_loss:.3f}"

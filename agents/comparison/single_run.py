@@ -1,10 +1,10 @@
 """Runs of a comparison: each learns, is tested on held-out episodes, writes a record and a picture.
 
-A run has a folder, with its job and settings (`request.json`) before it, and its `RunRecord`
-(`run.json`) after it. Runs are done by processes on several cores or GPUs, `python -m
+A run has a folder: at first with its job and settings, `request.json`, at the end with its
+`RunRecord`, `run.json`. Processes do the runs, on several cores or GPUs: `python -m
 npa_envs.agents.comparison.single_run FOLDER`. A process loads the libraries that the run in FOLDER
-needs. Then it does the run of each order, a line of JSON on its standard input, and it ends with
-its input. An order is [folder, device, folder of the run whose rules are cloned, or ""].
+needs. Then it reads orders from its standard input, lines of JSON: [folder of the run to do,
+device, folder of the run whose rules it clones, or ""]. It ends when its input ends.
 """
 
 from __future__ import annotations
@@ -45,28 +45,31 @@ from npa_envs.render import write_png
 Status = Literal["done", "diverged", "failed"]
 
 RECORD, REQUEST, OUTPUT, PICTURE = "run.json", "request.json", "output.txt", "picture.png"
-"""Files of a run: record, request to the process, output of the process, and the last picture of a
-held-out episode."""
+"""Files of a run: its record, the request to its process, its process's output, and a picture of
+the end of a held-out episode."""
 
-SIZE = 192
+PICTURE_SIDE = 192
 """Pixels on each side of a picture."""
 
 FIRST_TEST_SEED = 2_000_000
-"""First seed of the held-out episodes; learning curves use smaller ones."""
+"""First seed of held-out episodes, above all seeds of learning curves."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunRecord:
-    """The result of one run, as its folder's `run.json` has it."""
+    """The result of one run, which its folder's `run.json` stores."""
 
     job: Job
     facts: Mapping[str, Any]
+    """Settings that the result depends on (`ComparisonPlan.facts`)."""
     status: Status
     """"done"; "diverged": numbers became infinite or NaN; "failed": an error of another kind."""
     error: str = ""
     curve: Sequence[CurvePoint] = ()
     returns: Sequence[float] = ()
+    """Returns of the held-out episodes."""
     final_losses: Sequence[float] = ()
+    """Losses at the ends of the held-out episodes."""
     endings: Mapping[str, int] | None = None
     """Number of held-out episodes by the reason of their end."""
     seconds: float = 0.0
@@ -85,7 +88,7 @@ class RunRecord:
         return mean_of(self.final_losses)
 
     def write(self, folder: Path) -> None:
-        """Write the record into the run's folder; numbers that are not finite become null."""
+        """Write `run.json` into the run's folder; numbers that are not finite become null."""
         write_record(folder / RECORD, asdict(self))
 
     def write_ended(self, folder: Path, begin: float) -> RunRecord:
@@ -97,7 +100,7 @@ class RunRecord:
 
     @classmethod
     def read(cls, folder: Path, facts: Mapping[str, Any]) -> RunRecord | None:
-        """Return the record in a run's folder, if any; raises NPAError if it has other `facts`."""
+        """Return the record in a run's folder, if any; raises NPAError if its `facts` differ."""
 
         def make(content: dict[str, Any]) -> RunRecord:
             fields: dict[str, Any] = {"job": Job(**content["job"])}
@@ -111,21 +114,21 @@ class RunRecord:
 
 
 def mean_of(values: Sequence[float]) -> float:
-    """Return the mean of numbers, NaN if there are none."""
+    """Return the mean of numbers; NaN if there are none."""
     return sum(values) / len(values) if values else math.nan
 
 
 def requested_run(folder: Path) -> RunRecord:
-    """Return the record of the run that a folder requests, with status "failed" for now."""
+    """Return a record without results of the run in a folder's `request.json`, as "failed"."""
     content = json.loads((folder / REQUEST).read_text("utf-8"))
     return RunRecord(**content | {"job": Job(**content["job"])}, status="failed")
 
 
 def run(folder: Path, device: str, teacher: str = "") -> None:
-    """Do the run that a folder requests; write record, rules and picture into the folder.
+    """Do the run of a folder's `request.json`; write record, rules and picture into the folder.
 
     Errors are recorded, so that other runs can continue. `teacher` is the folder of the run whose
-    rules are cloned, if any.
+    rules are cloned; "": none.
     """
     record, begin = requested_run(folder), time.perf_counter()
     curve: list[CurvePoint] = []
@@ -159,7 +162,7 @@ def _learn(
     teacher: str,
     on_point: Callable[[CurvePoint], None],
 ) -> Episodes:
-    """Learn, write rules or policy and a picture, and return the held-out episodes."""
+    """Learn, write rules or policy and a picture, and return the results of held-out episodes."""
     job, facts = record.job, record.facts
     problem, amount = Problem(**facts["problem"]), facts["budget"]
     in_seconds = job.axis == "seconds"
@@ -181,11 +184,11 @@ def _learn(
 def final_picture(
     problem: Problem, policy: Callable[[Any], Any], seed: int, *, device: str
 ) -> NDArray[np.uint8]:
-    """Return a picture of the world at the end of an episode, uint8, shape [192, 192, 3].
+    """Return a picture of the world at the end of the episode from a seed, uint8, [192, 192, 3].
 
     The policy maps observations, [1, N, P], to actions, [1, N, A].
     """
-    keywords = {**problem.keywords, "render_mode": "rgb_array", "render_size": SIZE}
+    keywords = {**problem.keywords, "render_mode": "rgb_array", "render_size": PICTURE_SIDE}
     # One more step, as an environment at the end of an episode shows the next start.
     longer = replace(problem, keywords=keywords, episode_steps=problem.episode_steps + 1)
     envs: Any = longer.make_envs(1, device=device)
@@ -202,7 +205,7 @@ def final_picture(
 
 
 def main(folder: Path) -> None:
-    """Load the libraries of the run in `folder`; then do the runs ordered on standard input."""
+    """Load the libraries that the run in `folder` needs; then do each run that is ordered."""
     orders: SimpleQueue[tuple[str, str, str]] = SimpleQueue()
 
     def listen() -> None:
@@ -234,15 +237,15 @@ def main(folder: Path) -> None:
 PROGRAM = (sys.executable, "-m", "npa_envs.agents.comparison.single_run")
 
 MEASURED = ("done", "diverged")
-"""Runs that a resumed comparison does not repeat."""
+"""Statuses of runs that a resumed comparison does not repeat."""
 
 LAST_OUTPUT = 2000
-"""Most characters of a dead process's output that are shown."""
+"""Maximum number of characters that are shown of a dead process's output."""
 
 
 @dataclass
 class RunProcess(Child):
-    """A run in progress: its job, its process, and its temporary folder, which requests it."""
+    """A run in progress, its process and temporary folder; `teacher`: folder of rules to clone."""
 
     job: Job
     teacher: str
@@ -256,7 +259,7 @@ class RunProcess(Child):
         return (self.folder / RECORD).exists() or self.process.poll() is not None
 
     def begin_work(self, device: str) -> None:
-        """Order the waiting process to do the run."""
+        """Order the waiting process to do the run on a device."""
         self.begin = time.perf_counter()
         assert self.process.stdin is not None, "opened at its start"
         # The death of a process is found and recorded later.
@@ -266,7 +269,7 @@ class RunProcess(Child):
             self.process.stdin.flush()
 
     def end(self) -> None:
-        """Terminate the process, and remove the run's folder."""
+        """Terminate the process, and remove the temporary folder."""
         self.process.terminate()
         self.process.communicate()
         shutil.rmtree(self.folder, ignore_errors=True)
@@ -284,9 +287,24 @@ def shares_process(plan: ComparisonPlan, job: Job) -> bool:
 
 
 def held_records(plan: ComparisonPlan, folder: Path) -> dict[Job, RunRecord]:
-    """Return the records of a plan's runs that a folder contains, without those that failed."""
+    """Return the records of a plan's runs in a folder, by job, except of runs that failed."""
     records = {job: RunRecord.read(folder / job.folder, plan.facts(job)) for job in plan.jobs()}
     return {job: one for job, one in records.items() if one is not None and one.status in MEASURED}
+
+
+def _check_teachers(plan: ComparisonPlan, jobs: Sequence[Job], folder: Path) -> None:
+    """Check that runs whose rules are cloned are among the jobs or in the comparison's folder."""
+    for job in jobs:
+        teacher = plan.teacher(job)
+        if teacher is None or teacher in jobs:
+            continue
+        record = RunRecord.read(folder / teacher.folder, plan.facts(teacher))
+        if record is None or record.status not in MEASURED:
+            raise NPAError(
+                f"{job.method!r} clones the rules of {teacher.method!r} from the same seed, but "
+                f"{teacher} is neither in {str(folder)!r} nor to be run: add --methods "
+                f"{teacher.method}, or name a rule by --options {job.method}.teacher=NAME"
+            )
 
 
 def run_jobs(
@@ -303,20 +321,16 @@ def run_jobs(
 
     A process does several runs with budgets of particle-steps, as long as none fails. Other runs
     have a process each; on GPUs it loads its libraries while an earlier run learns. A run's folder
-    appears when the run is over, and `written` is called with its record. No run starts after
-    `max_seconds`. An interrupt ends all processes and removes their unfinished folders.
+    appears when the run is over. An interrupt ends all processes and removes unfinished folders.
+    No run starts after `max_seconds`. `folder` is that of the comparison, `command` its command
+    line, and `written` is called with each record.
     """
+    _check_teachers(plan, jobs, folder)
+    # Remove unfinished runs of a killed comparison.
     for job in jobs:
-        teacher = plan.teacher(job)
-        if teacher is None or teacher in jobs:
-            continue
-        record = RunRecord.read(folder / teacher.folder, plan.facts(teacher))
-        if record is None or record.status not in MEASURED:
-            raise NPAError(
-                f"{job.method!r} clones the rules of {teacher.method!r} from the same seed, but "
-                f"{teacher} is neither in {str(folder)!r} nor to be run: add --methods "
-                f"{teacher.method}, or name a rule by --options {job.method}.teacher=NAME"
-            )
+        target = folder / job.folder
+        for unfinished in target.parent.glob(f".{target.name}.*"):
+            shutil.rmtree(unfinished, ignore_errors=True)
     waiting = list(jobs)
     idle: list[subprocess.Popen[bytes]] = []
 
@@ -349,11 +363,6 @@ def run_jobs(
             one.process.communicate()
         written(record)
 
-    # Remove unfinished runs of a killed comparison.
-    for job in jobs:
-        target = folder / job.folder
-        for unfinished in target.parent.glob(f".{target.name}.*"):
-            shutil.rmtree(unfinished, ignore_errors=True)
     try:
         run_children(
             start,
@@ -368,7 +377,7 @@ def run_jobs(
 
 
 def _new_process(folder: Path, threads: int) -> subprocess.Popen[bytes]:
-    """Return a process that loads the libraries of the run in `folder`, and waits for orders."""
+    """Start a process that loads the libraries of the run in `folder` and waits for orders."""
     with (folder / OUTPUT).open("wb") as output:
         return subprocess.Popen(
             [*PROGRAM, str(folder)],
@@ -380,7 +389,7 @@ def _new_process(folder: Path, threads: int) -> subprocess.Popen[bytes]:
 
 
 def _finish(one: RunProcess, folder: Path) -> RunRecord:
-    """Move the results of an ended run into its folder, and return its record."""
+    """Move the files of an ended run from its temporary folder to its own; return its record."""
     requested = requested_run(one.folder)
     record = RunRecord.read(one.folder, requested.facts)
     if record is None:

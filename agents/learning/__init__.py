@@ -4,9 +4,9 @@
 keywords, and returns rules and a learning curve. Each method is a function in its own module, which
 is imported with its libraries when it is used.
 
-To read a method, for example `ppo.py`: `problem.py` makes the worlds, `rule_set.py` has the rules
-as functions, `progress.py` the budget, the curve and checkpoints; `actor_critic.py` has the parts
-that the actor-critics `ppo.py`, `sb3.py` and `shac.py` share.
+What the methods share: `problem.py` makes the worlds, `rule_set.py` has the rules as functions,
+`progress.py` the budget, the learning curve and checkpoints, `actor_critic.py` the parts of the
+actor-critics `ppo.py`, `sb3.py` and `shac.py`.
 """
 
 from __future__ import annotations
@@ -55,12 +55,12 @@ METHODS: dict[str, str] = {
     "zero": "npa_envs.agents.learning.baselines:train_zero",
     "scripted": "npa_envs.agents.learning.baselines:train_scripted",
 }
-"""Methods: functions `f(progress, ...)` of a `Progress` that return a `RuleSet` or a policy. Their
-options are keyword-only arguments, or fields of a dataclass that is the default of an argument
-`options`. You may add methods."""
+"""Methods: functions `f(progress, ...)` of a `Progress` that return a `RuleSet` or a policy. The
+options of a method are its keyword-only arguments, or the fields of a dataclass, the default of its
+argument `options`. You may add methods."""
 
 KEPT_METHODS = ("ppo", "shac")
-"""Methods whose runs can be written to a folder, resumed, and distributed over processes."""
+"""Methods whose runs can be written to a folder, resumed, and shared by several processes."""
 
 GARDEN_METHODS: dict[str, str] = {
     "gradient": "npa_envs.agents.learning.baselines:tend_gradient",
@@ -80,11 +80,11 @@ class Trained(NamedTuple):
     """The rules, on the run's device; None if the method returns a policy."""
     log: list[CurvePoint]
     policy: Callable[[Any], Any]
-    """Maps observations, [B, N, P], to actions, [B, N, A], and a dict of agents' observations, as
-    of PettingZoo's parallel environments, to a dict of their actions."""
+    """Maps observations, [B, N, P], to actions, [B, N, A]; or a dict of agents' observations, as of
+    PettingZoo's parallel environments, to a dict of their actions."""
 
     def save(self, folder: str | Path) -> list[Path]:
-        """Write the rules' or the policy's files, if it can be saved; return their paths."""
+        """Write the rules, or a policy that has `save`, into a folder; return the files' paths."""
         save = getattr(self.policy if self.rules is None else self.rules, "save", None)
         return [] if save is None else save(folder)
 
@@ -108,8 +108,8 @@ def train(
 ) -> Trained:
     """Learn a problem by a method, within a budget.
 
-    With a default process group of torch, its processes learn together, by `KEPT_METHODS` only:
-    each has a part of the worlds, and rank 0 writes.
+    Where `torch.distributed` has a default process group, all its processes must call this, and
+    learn together, by `KEPT_METHODS` only: each has some of the worlds, and rank 0 writes.
 
     Args:
         method: A name from `methods_for(problem)`, or your own function, "package.module:function".
@@ -118,10 +118,10 @@ def train(
         seed: Seed of all random numbers, from 0 to 99: runs with different seeds learn in different
             worlds, and none in those of evaluations.
         device: Device of worlds, rules and evaluations.
-        start: Rules to begin with, `RuleSet.of(problem, "heart")`; copied. None: new ones.
+        start: Rules to begin with, such as `RuleSet.of(problem, "heart")`; copied. None: new ones.
         evaluation_seeds: Seeds of the episodes that measure the learning curve.
-        curve_points: Points of the curve after the first, at equal fractions of the budget.
-        on_point: Called with each point as soon as it is known.
+        curve_points: Number of points of the curve after the first, at equal parts of the budget.
+        on_point: Called with each point of the curve as soon as it is known.
         on_stop: Called when a signal stops a run with `out` before its budget is spent.
         out: Folder for checkpoint, rules and curve, by `KEPT_METHODS` only; SIGTERM and Ctrl-C then
             save before they stop the run. None: nothing is written.

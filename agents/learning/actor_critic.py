@@ -1,4 +1,4 @@
-"""Parts of both forms of PPO, and of SHAC: options, rules that explore, the critic, minibatches."""
+"""Parts that PPO (`ppo.py`, `sb3.py`) and SHAC share: options, noisy rules, critic, minibatches."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from npa_envs.world.randomness import Randomness, WorldRandom, normal_draws
 
 
 class Schedule(NamedTuple):
-    """Values of the `CommonOptions` whose defaults depend on `start`, the rules to begin with."""
+    """The `CommonOptions` whose defaults depend on whether a run begins with rules, `start`."""
 
     learning_rate: float
     initial_std: float
@@ -35,7 +35,7 @@ NEW_RULES = Schedule(
 START_RULES = Schedule(
     learning_rate=1e-4, initial_std=0.05, last_noise=1.0, critic_rounds=4, target_kl=0.05
 )
-"""With a `start`: much noise, large steps and an untrained critic would spoil those rules."""
+"""Defaults with a `start`: much noise, large steps and an untrained critic would spoil it."""
 
 CRITIC_RATE = 1e-3
 """Adam's learning rate for the critic."""
@@ -44,13 +44,13 @@ CRITIC_WIDTH = 64
 """Units in a hidden layer of the critic."""
 
 CriticInput = Literal["particle", "central"]
-"""Input of a value: a "particle" alone, or also the mean over its world ("central")."""
+"""What a value depends on: one "particle" only, or also the mean over its world ("central")."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CommonOptions:
     """Options of both PPOs: `ppo.py` and Stable-Baselines3's. "None: A, or B with a `start`" means
-    that None is A for new rules, and B for a run that begins with rules, `start`."""
+    that None is A for new rules, and B for a run that begins with the rules `start`."""
 
     steps: int = 16
     """Steps of all worlds in a round, T."""
@@ -62,26 +62,27 @@ class CommonOptions:
     minibatches: int = 4
     """Minibatches of a pass, which is shuffled."""
     gamma: float = 0.5
-    """Discount of a reward one step later (dimensionless)."""
+    """Discount of a reward one step later (dimensionless). It is low, as a step's reward is what
+    that step itself improves; raise it if rewards come late."""
     gae_lambda: float = 0.9
     """λ of generalised advantage estimation (dimensionless)."""
     entropy_weight: float = 0.0
-    """Weight of the entropy of an action in the objective."""
+    """Weight of an action's entropy in the objective (dimensionless)."""
     max_gradient_norm: float = 0.5
     """Gradients are clipped to this norm: separately for rules and critic in `ppo.py`, together in
     Stable-Baselines3."""
     target_kl: float | None = None
-    """The rules learn no more in a round once the KL divergence from the rules that played it is
+    """Rules stop learning from a round once their KL divergence from the rules that played it is
     larger [nats]. None: 0.2, or 0.05 with a `start`."""
     initial_std: float | None = None
-    """Standard deviation of every action column at first. None: 0.2, or 0.05 with a `start`."""
+    """Standard deviation of all columns of actions at first. None: 0.2, or 0.05 with a `start`."""
     last_noise: float | None = None
     """Factor on the standard deviations at the end of the budget (dimensionless). None: 0.25, or 1
     with a `start`."""
     noise_decay_share: float = 0.5
-    """Fraction of the budget, at its end, in which standard deviations fall by `last_noise`."""
+    """Last fraction of the budget, in which standard deviations fall by the factor `last_noise`."""
     critic_rounds: int | None = None
-    """Rounds at first in which only the critic learns. None: 0, or 4 with a `start`."""
+    """Number of first rounds, in which only the critic learns. None: 0, or 4 with a `start`."""
     critic: CriticInput = "particle"
     """Input of the critic: a particle's own perception, or also its whole world ("central")."""
 
@@ -100,22 +101,22 @@ class CommonOptions:
         check_word(self, "critic", get_args(CriticInput))
 
     def schedule(self, start: RuleSet | None) -> Schedule:
-        """Return the options that depend on `start`, with the defaults in place of None."""
+        """Return the options that depend on `start`, the rules to begin with, without None."""
         chosen = {name: getattr(self, name) for name in Schedule._fields}
         chosen = {name: value for name, value in chosen.items() if value is not None}
         return (NEW_RULES if start is None else START_RULES)._replace(**chosen)
 
     def noise_factor(self, remaining_budget: float, last_noise: float) -> float:
-        """Return the factor on the initial standard deviations of actions, for the budget left.
+        """Return the factor on the first standard deviations, for the budget's remaining fraction.
 
         It is 1 until the last `noise_decay_share` of the budget, and there falls exponentially to
-        `last_noise`, as rules learn with noise, but are evaluated without.
+        `last_noise`: rules learn with noise, but are evaluated without.
         """
         return math.pow(last_noise, max(0.0, 1.0 - remaining_budget / self.noise_decay_share))
 
 
 def set_gradients(optimiser: torch.optim.Optimizer, loss: Tensor) -> None:
-    """Compute a loss's gradients, and write them into `grad` of an optimiser's parameters."""
+    """Write the gradients of a loss into `grad` of an optimiser's parameters."""
     # Read-outs and frozen layers have no gradients.
     parameters = [p for p in optimiser.param_groups[0]["params"] if p.requires_grad]
     # Not backward(): its accumulation nodes keep the stream of their first use, which a capture
@@ -130,7 +131,7 @@ def set_gradients(optimiser: torch.optim.Optimizer, loss: Tensor) -> None:
 
 
 def gradients_of(optimiser: torch.optim.Optimizer) -> list[Tensor]:
-    """Return `grad` of each of an optimiser's parameters where it is not None."""
+    """Return the tensors `grad` of an optimiser's parameters, without None."""
     return [p.grad for p in optimiser.param_groups[0]["params"] if p.grad is not None]
 
 
@@ -138,16 +139,16 @@ HALF_LOG_TAU = 0.5 * math.log(2.0 * math.pi)
 
 
 def gaussian_log_prob(mean: Tensor, log_std: Tensor, action: Tensor) -> Tensor:
-    """Return Gaussian log-probabilities [...] of actions [..., A], summed over columns."""
+    """Return Gaussian log-probabilities [nats], [...], of actions [..., A]: sums over columns."""
     noise = (action - mean) * torch.exp(-log_std)
     return -(0.5 * noise.square() + log_std + HALF_LOG_TAU).sum(dim=-1)
 
 
 class GaussianRules(nn.Module):
-    """A policy of Gaussian actions, whose means are those of copies of the rules.
+    """A policy of Gaussian actions, whose means are the actions of copies of the rules.
 
-    Standard deviations are learned, one for each species and action column. A particle's
-    log-probability is the sum over columns. A world's is the mean over its particles, as with their
+    Standard deviations are learned, one for each species and column of actions. A particle's
+    log-probability is the sum over columns. A world's is the mean over its particles: with their
     sum a likelihood ratio would be far from 1 after the smallest update.
     """
 
@@ -159,7 +160,7 @@ class GaussianRules(nn.Module):
         widths = [rule.update_dim for rule in self.rules]
         start = torch.full((len(widths), widths[0]), math.log(initial_std))
         self.noise_factor = 1.0
-        """Factor on the first standard deviations (dimensionless)."""
+        """Factor on the first standard deviations, set by `set_noise` (dimensionless)."""
         self.log_std = nn.Parameter(start)
         """Logarithms of the standard deviations, a row for each species, shape [species, A]."""
         self.register_buffer("row_species", species_of(rules.counts), persistent=False)
@@ -173,49 +174,51 @@ class GaussianRules(nn.Module):
         self.noise_factor = state
 
     def row_log_std(self) -> Tensor:
-        """Return the logarithm of each action's standard deviation, by particle, shape [N, A]."""
+        """Return logarithms of the standard deviations of each particle's actions, shape [N, A]."""
         return self.log_std[self.row_species]
 
     @torch.no_grad()
     def set_noise(self, factor: float) -> None:
-        """Rescale the standard deviations by `factor` over `noise_factor`, and store it there."""
+        """Rescale standard deviations by `factor` / `noise_factor`; then that is `factor`."""
         self.log_std.add_(math.log(factor / self.noise_factor))
         self.noise_factor = factor
 
     def sample(
         self, observation: Tensor, generator: Randomness | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Draw unclipped actions for observations [M, N, P], with log-probabilities [M, N]."""
+        """Return random actions [B, N, A], unclipped, for observations [B, N, P], and their
+        log-probabilities [B, N]; `generator`: None for torch's own."""
         mean, log_std = self.rules.mean(observation), self.row_log_std()
         noise = normal_draws(generator, mean.shape, mean)
         action = mean + log_std.exp() * noise
         return action, gaussian_log_prob(mean, log_std, action)
 
     def log_prob(self, observation: Tensor, action: Tensor) -> Tensor:
-        """Return the log-probability of each particle's action, shape [M, N]."""
+        """Return log-probabilities [B, N] of actions [B, N, A] at observations [B, N, P]."""
         return gaussian_log_prob(self.rules.mean(observation), self.row_log_std(), action)
 
     def row_log_prob(self, species: int, rows: Tensor, action: Tensor) -> Tensor:
-        """Return log-probabilities [K] of a species' actions [K, A] at observations [K, P]."""
+        """Return log-probabilities [K] of one species' actions [K, A] at observations [K, P]."""
         mean = self.rules.mean_by_rule(list(self.rules)[species], rows)
         return gaussian_log_prob(mean, self.log_std[species], action)
 
     def entropy(self) -> Tensor:
-        """Return the mean entropy of a particle's action [nats]."""
+        """Return the entropy of a particle's action, averaged over particles [nats], shape []."""
         return (self.row_log_std() + HALF_LOG_TAU + 0.5).sum(dim=-1).mean()
 
 
 MIN_RATE = 0.01
-"""Least weight of a new batch in the running moments; the first batches are averaged plainly."""
+"""Minimum weight of a new batch in a running moment; the first 100 batches weigh the same."""
 
 INPUT_LIMIT = 8.0
 """Standardised inputs are clipped to ± this."""
 
 
 class Critic(nn.Module):
-    """Network of each particle's value, whose inputs and outputs are scaled by running moments.
+    """Network that estimates each particle's value, the discounted sum of its later rewards.
 
-    Its input is a particle's perception, and if "central" also the mean features of the world.
+    Its input is a particle's perception, and with "central" also the mean of its world's hidden
+    features. Running moments standardise inputs (`observe`) and scale outputs (`rescale`).
     """
 
     mean: Tensor
@@ -244,7 +247,7 @@ class Critic(nn.Module):
         self.register_buffer("updates", torch.zeros(2))
 
     def forward(self, observation: Tensor) -> Tensor:
-        """Return values [M, N] for observations [M, N, P], in units of the rewards."""
+        """Return values [B, N] for observations [B, N, P], in units of the rewards."""
         spread = (self.square - self.mean.square()).clamp(min=1e-6).sqrt()
         inputs = ((observation - self.mean) / spread).clamp(-INPUT_LIMIT, INPUT_LIMIT)
         features = torch.tanh(self.features(inputs))
@@ -256,7 +259,7 @@ class Critic(nn.Module):
 
     @torch.no_grad()
     def observe(self, observation: Tensor, processes: ProcessGroup = ALONE) -> None:
-        """Update the inputs' running moments by observations [..., P], averaged over processes."""
+        """Update the running moments of inputs by observations [..., P] of all processes."""
         rate = self._rate(0)
         rows = observation.flatten(0, -2)
         mean, square = rows.mean(dim=0), rows.square().mean(dim=0)
@@ -266,7 +269,7 @@ class Critic(nn.Module):
 
     @torch.no_grad()
     def rescale(self, targets: Tensor, processes: ProcessGroup = ALONE) -> None:
-        """Update the outputs' scale, the running RMS of targets, without a change of the values."""
+        """Update the running RMS of targets of all processes; the values of observations stay."""
         before = self.scale.clone()
         square = targets.square().mean()
         processes.reduce([square])
@@ -276,22 +279,22 @@ class Critic(nn.Module):
             parameter.mul_(before / self.scale)
 
     def _rate(self, moment: int) -> Tensor:
-        """Count a batch of inputs (`moment` 0) or targets (1); return its weight in their mean."""
+        """Count a batch of inputs (0) or targets (1); return its weight in the running moment."""
         self.updates[moment] += 1.0
         return (1.0 / self.updates[moment]).clamp(min=MIN_RATE)
 
 
 def seeded_critic(progress: Progress, input_dim: int, inputs: CriticInput) -> Critic:
-    """Return a new critic, drawn by the run's seed; torch's global random state is unchanged."""
+    """Return a new critic for inputs of `input_dim` columns, with weights by the run's seed."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(progress.seed)
         return Critic(input_dim, progress.problem.counts, inputs).to(progress.device)
 
 
 def share_of_worlds(progress: Progress, total: int) -> tuple[list[int], Randomness]:
-    """Return the indices of this process's worlds out of `total`, and their random source.
+    """Return the indices of this process's worlds out of `total`, and their random numbers' source.
 
-    That is a torch generator, or with several processes a stream for each world.
+    That is one torch generator, or with several processes a stream for each world.
     """
     progress.processes.check_even("num_envs", total)
     indices = progress.processes.indices(total)
@@ -307,9 +310,9 @@ class Minibatches:
 
     There are several groups of samples, which are shuffled separately: one with n in `group_sizes`
     has n samples per world and step, in the order [T, B, n]. Few samples make fewer minibatches.
-    One process shuffles all samples. Of several, each shuffles those of each world by the world's
-    own random stream, and a minibatch has equally many of each world, so that minibatches do not
-    depend on the number of processes.
+    A single process shuffles all samples together. Each of several processes shuffles the samples
+    of each world separately, by the world's random stream, and a minibatch has equally many of each
+    world: so minibatches do not depend on the number of processes.
     """
 
     def __init__(
@@ -325,21 +328,21 @@ class Minibatches:
         self._random = random
         unit = world_count if isinstance(random, WorldRandom) else 1
         self.count = min(count, steps * world_count * min(group_sizes) // unit)
-        """Minibatches of a pass."""
+        """Number of minibatches of a pass."""
         # CUDA graphs read them in place.
         self._orders = [
             torch.zeros(steps * world_count * n, dtype=torch.int64, device=random.device)
             for n in group_sizes
         ]
         self.indices: list[tuple[Tensor, ...]] = []
-        """Indices of each minibatch by group, int64: views that `shuffle` overwrites."""
+        """For each group the indices of each minibatch, int64: views that `shuffle` overwrites."""
         for order in self._orders:
             # Sizes as of `tensor_split`.
             sizes = [unit * ((len(order) // unit + k) // self.count) for k in range(self.count)]
             self.indices.append(torch.split(order, sizes[::-1]))
 
     def shuffle(self) -> None:
-        """Draw new random orders, for the next pass."""
+        """Shuffle the samples for the next pass."""
         begin_episodes(self._random)
         for order, group_size in zip(self._orders, self._group_sizes, strict=True):
             if isinstance(self._random, WorldRandom):
@@ -348,7 +351,7 @@ class Minibatches:
                 torch.randperm(len(order), generator=self._random, out=order)
 
     def _shuffled_by_world(self, random: WorldRandom, group_size: int) -> Tensor:
-        """Return the indices of a group's samples, minibatch by minibatch, shape [T B n]."""
+        """Return indices of a group's samples, shape [T B n], one minibatch after the other."""
         order = random.uniform(self._steps * group_size).argsort(dim=1, stable=True)
         world = torch.arange(self._world_count, device=order.device)[:, None]
         step, row = order // group_size, order % group_size

@@ -1,4 +1,4 @@
-"""Baseline methods that learn nothing, for particles and gardens."""
+"""Methods of `train` that train no weights: random, zero, scripted and planning policies."""
 
 from __future__ import annotations
 
@@ -31,25 +31,26 @@ from npa_envs.envs.shepherd2d import ShepherdTask
 from npa_envs.errors import NPAError, shown
 
 SCRIPTED: tuple[Callable[..., Policy], ...] = (PaintPolicy, SpreadPolicy, MendPolicy)
+"""Scripted policies of particles that `train_scripted` tries."""
 
 GAINS = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, -0.01, -0.03, -0.1, -0.3)
-"""Gains of scripted policies, as for `SpreadPolicy`; below 0 particles attract each other."""
+"""Gains, as of `SpreadPolicy`, at which `train_scripted` tries each scripted policy."""
 
 
 def train_random(progress: Progress) -> Policy | UnboundGardener:
-    """Return the policy that acts at random; no particle-steps are used."""
+    """Evaluate and return the policy that acts at random; no particle-steps are spent."""
     return _evaluate_once(progress, RandomPolicy, RandomGardener, seed=progress.seed)
 
 
 def train_zero(progress: Progress) -> Policy | UnboundGardener:
-    """Return the policy that does nothing; no particle-steps are used."""
+    """Evaluate and return the policy that does nothing; no particle-steps are spent."""
     return _evaluate_once(progress, ZeroPolicy, StillGardener)
 
 
 def _evaluate_once(
     progress: Progress, policy: Callable[..., Policy], gardener: Any, **options: int
 ) -> Policy | UnboundGardener:
-    """Make the `policy` for particles, or in gardens the `gardener`, evaluate and return it."""
+    """Evaluate and return a new `policy` of particles, or in a garden a new `gardener`."""
     check_no_start(progress)
     result: Policy | UnboundGardener
     if progress.problem.controlled == "brushes":
@@ -63,8 +64,8 @@ def _evaluate_once(
 def train_scripted(progress: Progress, *, gains: Sequence[float] = GAINS) -> Policy:
     """Return the policy of the highest mean return: `ZeroPolicy`, or one of `SCRIPTED` at a gain.
 
-    Each policy is tried for one episode in each of the problem's worlds, from seeds that
-    evaluations do not use, until the budget is spent.
+    Each policy is tried for one episode in each of the problem's `num_envs` worlds, with the same
+    seeds, which evaluations do not use. No policy is tried once the budget is spent.
     """
     check_no_start(progress)
     if not isinstance(gains, list | tuple) or not all(map(is_real, gains)):
@@ -97,7 +98,7 @@ def train_scripted(progress: Progress, *, gains: Sequence[float] = GAINS) -> Pol
 
 
 def check_no_start(progress: Progress) -> None:
-    """Raise an NPAError if the run has a `start`: rules to begin with."""
+    """Raise an NPAError if the run was given rules to begin with, `start`."""
     if progress.initial is not None:
         if progress.problem.controlled == "brushes":
             raise NPAError("start must be None in a garden, where the world's rule is not learned")
@@ -112,23 +113,23 @@ def check_no_start(progress: Progress) -> None:
 
 @dataclass(frozen=True)
 class UnboundGardener:
-    """A gardener for any garden: `made_for(env)` makes the policy that reads its worlds."""
+    """A gardener before it has a garden: `made_for(env)` makes the policy that reads its worlds."""
 
     made_for: Callable[[Any], BrushPolicy]
 
     def __call__(self, observation: Any) -> Any:
-        """Raise an NPAError: observations do not identify their worlds."""
+        """Raise an NPAError: an observation does not say which worlds it is of."""
         raise NPAError(
             "this gardener reads the worlds: call made_for(env), and then what that returns"
         )
 
 
 def tend_scripted(progress: Progress) -> Policy | UnboundGardener:
-    """Return the scripted gardener, or in `npa/Shepherd2D-v0` the scripted shepherd."""
+    """Evaluate and return the scripted gardener, in `npa/Shepherd2D-v0` the scripted shepherd."""
     shepherd = issubclass(progress.problem.task_type, ShepherdTask)
     return _evaluate_once(progress, ZeroPolicy, ScriptedShepherd if shepherd else ScriptedGardener)
 
 
 def tend_gradient(progress: Progress) -> Policy | UnboundGardener:
-    """Return the gardener that plans by the gradient through the world's physics."""
+    """Evaluate and return the gardener that plans by the gradient through the physics."""
     return _evaluate_once(progress, ZeroPolicy, GradientGardener, seed=progress.seed)

@@ -1,4 +1,4 @@
-"""Behaviour cloning: rules learn the actions of other rules, or those of a dataset."""
+"""Behaviour cloning: rules learn the actions of other rules, or of a dataset."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from npa_envs.checks import check_fraction, check_non_negative, check_positive
 from npa_envs.errors import NPAError
 
 STORED_STEPS = 64
-"""Last steps of all worlds that are learned from, or `collect_steps` if that is more."""
+"""Number of last steps of all worlds that are learned from, or `collect_steps` if larger."""
 
 VARIANCE_FLOOR = 1e-8
-"""Added to the variance of the teacher's actions, which may be 0."""
+"""Added to the variance of the teacher's actions before dividing by it, as it may be 0."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,13 +26,13 @@ class CloneOptions:
     """Options of behaviour cloning."""
 
     teacher: Source | Iterable[Source] | None = None
-    """A rule, a shipped rule's name or a file, for all species or one for each, or a set of rules.
-    Either it or a dataset is needed."""
+    """Rules to imitate: a rule, a shipped rule's name or a file, for all species or one for each,
+    or a set of rules. None: the rules imitate a dataset."""
     dataset: str | None = None
-    """Id of a Minari dataset to learn from instead; its steps count as particle-steps each time
-    that they are used."""
+    """Id of a Minari dataset to imitate instead of a teacher; each use of one of its steps counts
+    as particle-steps. None: there is a teacher."""
     student_share: float = 0.5
-    """Fraction of the worlds in which the student acts, in [0, 1]; 0: only the teacher acts."""
+    """Fraction of the worlds in which the new rules act, in [0, 1]; 0: only the teacher acts."""
     collect_steps: int = 8
     """Steps of the worlds in an iteration."""
     updates: int = 16
@@ -40,9 +40,9 @@ class CloneOptions:
     batch_worlds: int = 4
     """Worlds, with all of their particles, in an optimiser's step."""
     learning_rate: float = 3e-3
-    """Adam's, at first."""
+    """Adam's learning rate at first."""
     last_rate: float = 0.02
-    """Learning rate at the end, as a fraction of the first."""
+    """Learning rate at the end of the budget, as a fraction of the first (dimensionless)."""
 
     def __post_init__(self) -> None:
         check_non_negative(self, "student_share", at_most=1.0)
@@ -52,11 +52,11 @@ class CloneOptions:
 
 
 def train(progress: Progress, options: CloneOptions = CloneOptions()) -> RuleSet:
-    """Return rules that imitate a teacher's actions, in worlds where the teacher or they act.
+    """Return rules, the student, that imitate the actions of a teacher or of a dataset.
 
-    The loss is the squared error of actions over the variance of the teacher's, column by column.
-    In a fraction of the worlds the student acts, so that it learns the teacher's actions also in
-    states that its own errors lead to (dataset aggregation, Ross et al. 2011).
+    The loss is `unexplained_variance`. In a fraction of the worlds the student acts, so that it
+    learns the teacher's actions also in states that its own errors lead to (dataset aggregation,
+    Ross et al. 2011).
     """
     device, rules = progress.device, progress.first_rules()
     generator = torch.Generator(device).manual_seed(progress.seed)
@@ -87,7 +87,7 @@ def train(progress: Progress, options: CloneOptions = CloneOptions()) -> RuleSet
 def _from_teacher(
     progress: Progress, rules: RuleSet, options: CloneOptions
 ) -> tuple[Callable[[], int], Demonstrations]:
-    """Return a function that adds worlds to a buffer and returns how many, and the buffer."""
+    """Return a function that adds steps of worlds to a buffer and counts them, and the buffer."""
     problem, device, source = progress.problem, progress.device, options.teacher
     if source is None:
         raise NPAError("teacher must be given to clone, or a dataset: for example teacher='heart'")
@@ -134,9 +134,10 @@ def _from_dataset(progress: Progress, options: CloneOptions) -> Demonstrations:
 
 
 def unexplained_variance(rules: RuleSet, observation: Tensor, action: Tensor) -> Tensor:
-    """Return 1 - R²: the rules' squared error over the variance of the teacher's actions.
+    """Return 1 - R²: the squared error of the rules' actions over the variance of the teacher's.
 
-    It is a mean over species and columns, for observations [B, N, P] and actions [B, N, A].
+    It is a mean over species and columns, for observations [B, N, P] and the teacher's actions
+    [B, N, A].
     """
     ratios, errors = [], (rules.mean(observation) - action).square()
     for span in rules.spans:
@@ -147,19 +148,19 @@ def unexplained_variance(rules: RuleSet, observation: Tensor, action: Tensor) ->
 
 
 class Demonstrations:
-    """Ring buffer of `capacity` worlds, each with observations [N, P] and actions [N, A].
+    """Ring buffer of observations and actions of up to `capacity` worlds, [N, P] and [N, A] each.
 
-    The shapes, types and device are those of the `observation` and `action` that are given first.
+    `observation`, [B, N, P], and `action`, [B, N, A], are examples of what it stores.
     """
 
     def __init__(self, capacity: int, observation: Tensor, action: Tensor) -> None:
         self.observations = observation.new_zeros(capacity, *observation.shape[1:])
         self.actions = action.new_zeros(capacity, *action.shape[1:])
         self.count = 0
-        """Worlds added so far."""
+        """Number of worlds added so far."""
 
     def add(self, observation: Tensor, action: Tensor) -> None:
-        """Add B <= capacity worlds, [B, N, P] and [B, N, A], in place of the oldest."""
+        """Add B worlds, [B, N, P] and [B, N, A], in place of the oldest; B <= capacity."""
         capacity = len(self.observations)
         index = torch.arange(self.count, self.count + len(observation), device=observation.device)
         self.observations.index_copy_(0, index % capacity, observation)

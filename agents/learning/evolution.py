@@ -1,9 +1,9 @@
 """Evolution strategies over rules' weights: sep-CMA-ES, all candidates in one batch of worlds.
 
-The library `cma` (pycma) proposes candidates, with a diagonal covariance, as rules have thousands
-of weights (Ros and Hansen, A Simple Modification in CMA-ES Achieving Linear Time and Space
-Complexity, 2008). A candidate's fitness is the mean return of its worlds. All candidates of a
-generation have worlds of the same seeds; each generation has new ones.
+The library `cma` (pycma) proposes candidates, vectors of weights, with a diagonal covariance, as
+rules have thousands of weights (Ros and Hansen, A Simple Modification in CMA-ES Achieving Linear
+Time and Space Complexity, 2008). A candidate's fitness is the mean return of its worlds. All
+candidates of a generation have worlds of the same seeds; each generation has new seeds.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from npa_envs.rule.folded_network import without_small
 from npa_envs.rule.rule import NPARule
 
 MAX_HIDDEN = 2**27
-"""Most numbers of hidden layers in memory at a time: 512 MiB of float32."""
+"""Maximum number of hidden units' values in memory at a time: 512 MiB of float32."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,12 +36,11 @@ class EvolutionOptions:
     """Options of evolution."""
 
     population: int = 32
-    """Candidates of a generation, at least 4."""
+    """Number of candidates of a generation, at least 4."""
     worlds_per_candidate: int = 1
-    """Worlds in which each candidate is evaluated."""
+    """Number of worlds in which each candidate is evaluated."""
     sigma: float = 0.1
-    """First step size, as a fraction of the standard deviation of a layer's random weights (Xavier,
-    gain 1; dimensionless)."""
+    """First standard deviation of each weight, in units of `RuleWeights.scales`."""
 
     def __post_init__(self) -> None:
         check_positive(self, int, "population", at_least=4)
@@ -52,19 +51,19 @@ class EvolutionOptions:
 def train(progress: Progress, options: EvolutionOptions = EvolutionOptions()) -> RuleSet:
     """Evolve rules until the budget is spent, and return the mean of the last generation.
 
-    Candidates are drawn on the CPU and evaluated on the device.
+    Candidates are proposed on the CPU and evaluated on the device.
     """
     problem, device = progress.problem, progress.device
     rules = progress.first_rules()
     rule_weights = RuleWeights(rules)
     world_count = options.population * options.worlds_per_candidate
     envs = problem.make_envs(world_count, device=device, copy=False)
-    draws = np.random.default_rng(progress.seed)
-    strategy = _strategy(rule_weights, options, draws)
+    random = np.random.default_rng(progress.seed)
+    strategy = _strategy(rule_weights, options, random)
 
     def generation() -> int:
         proposed = strategy.ask()
-        seeds = draws.integers(FIRST_EVALUATION_SEED, size=options.worlds_per_candidate).tolist()
+        seeds = random.integers(FIRST_EVALUATION_SEED, size=options.worlds_per_candidate).tolist()
         weights = torch.as_tensor(np.stack(proposed), dtype=torch.float32).to(device)
         returns = fitness(envs, rules, weights, seeds, problem.episode_steps)
         strategy.tell(proposed, costs(returns.cpu().double().numpy()))
@@ -75,7 +74,7 @@ def train(progress: Progress, options: EvolutionOptions = EvolutionOptions()) ->
 
 
 class RuleWeights:
-    """Reads and writes rules' weights as one vector: W1, b1, W2, rule after rule.
+    """Reads and writes the weights of rules as one vector: W1, b1 and W2 of each rule in turn.
 
     Rules must have networks of these two layers; read-outs are left as they are.
     """
@@ -96,7 +95,7 @@ class RuleWeights:
             return nn.utils.parameters_to_vector(self._layers).double().cpu().numpy()
 
     def set_vector(self, vector: NDArray[np.float64]) -> None:
-        """Set the weights of the rules in place from a vector, shape [W]."""
+        """Set the weights of the rules, in place, to those of a vector, shape [W]."""
         first = self._layers[0]
         with torch.no_grad():
             nn.utils.vector_to_parameters(
@@ -104,7 +103,7 @@ class RuleWeights:
             )
 
     def scales(self) -> NDArray[np.float64]:
-        """Return the standard deviations of weights drawn by Xavier, gain 1, [W]; b1 as W1."""
+        """Return the standard deviation of each weight by Xavier, gain 1, [W]; of b1 as of W1."""
         sizes = []
         for rule in self._rules:
             hidden, bias, output = layers_of(rule)
@@ -121,28 +120,28 @@ def layers_of(rule: NPARule) -> tuple[Tensor, Tensor, Tensor]:
 
 def updates_of(rule: NPARule, weights: Tensor, rows: Tensor) -> Tensor:
     """Return raw updates [G, K, A] of G candidates, weights [G, W], for perceptions [G, K, P]."""
-    shapes = [tuple(part.shape) for part in layers_of(rule)]
+    shapes = [tuple(layer.shape) for layer in layers_of(rule)]
     sizes = [math.prod(shape) for shape in shapes]
     first, bias, second = (
-        part.reshape(-1, *shape)
-        for part, shape in zip(torch.split(weights, sizes, dim=1), shapes, strict=True)
+        layer.reshape(-1, *shape)
+        for layer, shape in zip(torch.split(weights, sizes, dim=1), shapes, strict=True)
     )
     size = max(1, MAX_HIDDEN // (rows.shape[1] * rule.hidden_dim))
     updates = []
     for k in range(0, len(weights), size):
-        part = slice(k, k + size)
-        hidden = torch.baddbmm(bias[part, None], rows[part], first[part].mT).relu_()
-        updates.append(torch.bmm(hidden, second[part].mT))
+        chunk = slice(k, k + size)
+        hidden = torch.baddbmm(bias[chunk, None], rows[chunk], first[chunk].mT).relu_()
+        updates.append(torch.bmm(hidden, second[chunk].mT))
     return without_small(torch.cat(updates), rule.dead_zone)
 
 
 @torch.no_grad()
 def candidates_actions(rules: RuleSet, weights: Tensor, observation: Tensor) -> Tensor:
-    """Return actions [G * M, N, A] of G candidates, with weights [G, W], in M worlds of each.
+    """Return actions [G B, N, A] of G candidates, weights [G, W], each in B worlds.
 
-    Observations, [G * M, N, P], are ordered by candidate.
+    Observations, [G B, N, P], are ordered by candidate.
     """
-    sizes = [sum(part.numel() for part in layers_of(rule)) for rule in rules]
+    sizes = [sum(layer.numel() for layer in layers_of(rule)) for rule in rules]
     weights_of = dict(zip(rules, torch.split(weights, sizes, dim=1), strict=True))
 
     def action(rule: NPARule, observation: Tensor) -> Tensor:
@@ -157,9 +156,9 @@ def candidates_actions(rules: RuleSet, weights: Tensor, observation: Tensor) -> 
 def fitness(
     envs: Any, rules: RuleSet, weights: Tensor, seeds: list[int], episode_steps: int
 ) -> Tensor:
-    """Return the mean returns [G] of candidates with weights [G, W] over worlds of the same seeds.
+    """Return the mean return of each candidate, shape [G], for weights [G, W].
 
-    `envs` has G * M worlds: M from k * M on for candidate k, one for each of the seeds.
+    `envs` has G B worlds: for each candidate in turn B worlds, with the B `seeds`.
     """
     observation, _ = envs.reset(seed=seeds * len(weights))
     returns = torch.zeros(envs.num_envs, device=weights.device)
@@ -174,15 +173,15 @@ def fitness(
 
 
 def _strategy(
-    rule_weights: RuleWeights, options: EvolutionOptions, draws: np.random.Generator
+    rule_weights: RuleWeights, options: EvolutionOptions, random: np.random.Generator
 ) -> Any:
-    """Return an evolution strategy of library `cma`, which begins at the rules' weights."""
+    """Return an evolution strategy of the library `cma` that begins at the rules' weights."""
     with importing("cma", "evolution", "pip install 'npa-envs[evolution]'"):
         import cma
 
     settings = {
         "popsize": options.population,
-        "randn": lambda *shape: draws.standard_normal(shape),
+        "randn": lambda *shape: random.standard_normal(shape),
         # The library takes no seed with `randn`.
         "seed": math.nan,
         "verbose": -9,
@@ -193,7 +192,7 @@ def _strategy(
 
 
 def costs(returns: NDArray[np.float64]) -> list[float]:
-    """Return costs to minimise: minus mean returns [G]; infinite and NaN ones cost the most."""
+    """Return costs to minimise: minus the returns [G]; infinite and NaN ones cost the most."""
     finite = np.isfinite(returns)
     worst = returns[finite].min() - 1.0 if finite.any() else 0.0
     minimised: list[float] = (-np.where(finite, returns, worst)).tolist()

@@ -1,12 +1,13 @@
 """Proximal policy optimisation (PPO) whose worlds, rollouts and updates are tensors on the device.
 
-Source: Schulman et al., arXiv 1707.06347. A round is `steps` steps of all worlds, then `epochs`
-passes over them in minibatches of particles. Read `PPOLearner.play` and `improve` first, then the
-formulas at the end of the file. Actor, critic and minibatches are in `actor_critic.py`.
+Source: Schulman et al., arXiv 1707.06347. A round is a rollout of `steps` steps of all worlds, its
+advantages (both in `PPOLearner.play`), and `epochs` passes over it in minibatches
+(`PPOLearner.improve`). The formulas are at the end of the file; actor, critic and the indices of
+minibatches are in `actor_critic.py`.
 
 The CPU reads one byte per world in each step (whether its episode ended) and one number per pass.
 On CUDA most work is captured once in CUDA graphs, as launching its short kernels one by one takes
-longer than running them.
+longer than running them. So results are written in place, into `RoundBuffers`.
 """
 
 from __future__ import annotations
@@ -53,13 +54,13 @@ from npa_envs.world.cuda_graph import GraphedCallable
 from npa_envs.wrappers.base import own_rewards
 
 MANY_PARTICLES = 2**17
-"""Particles of all worlds on a GPU by default: fewer take hardly less time."""
+"""Default number of particles of all worlds on a GPU: fewer take hardly less time."""
 
 MIN_ROUNDS = 128
-"""Least rounds in a budget of particle-steps, which limits the default number of worlds."""
+"""Minimum number of rounds in a budget of particle-steps, which limits the default of worlds."""
 
 MEMORY_FRACTION = 0.25
-"""Largest fraction of the free GPU memory to use."""
+"""Largest fraction of the free GPU memory that the default number of worlds uses."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,7 +80,8 @@ class PPOOptions(CommonOptions):
     """Reward of each particle: "particle", its own part of its world's reward; "marginal", the
     difference that its action makes to the world's. None: its world's reward."""
     masked: bool = False
-    """Ignore actions in steps that did not update their particles; not with several species."""
+    """Whether to ignore actions in steps whose update mask left out their particles; not with
+    several species."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -98,7 +100,7 @@ class PPOOptions(CommonOptions):
 
     @property
     def clip_range(self) -> float:
-        """`clip`, or its default for `ratio`."""
+        """`clip`, or the default for `ratio` if it is None (dimensionless)."""
         if self.clip is not None:
             return self.clip
         return 0.02 if self.ratio == "world" else 0.2
@@ -113,17 +115,115 @@ def train(progress: Progress, options: PPOOptions = PPOOptions()) -> RuleSet:
         remaining_budget = 1.0 - progress.spent_fraction
         learner.play()
         learner.improve(remaining_budget)
-        return learner.round_size
+        return count * options.steps * progress.problem.particle_count
 
     return progress.run(learner.actor.rules, iteration, learner)
+
+
+class Round(NamedTuple):
+    """What PPO learns from: T steps of B worlds of N particles, in the order of steps.
+
+    A minibatch has the same fields, with some of the T B worlds, or [K, ...] of K single particles.
+    """
+
+    observations: Tensor
+    """Perceptions, shape [T B, N, P]."""
+    actions: Tensor
+    """Actions before they are clipped to the action space, shape [T B, N, A]."""
+    log_probs: Tensor
+    """Log-probabilities of the actions by the rules that drew them [nats], shape [T B, N]."""
+    advantages: Tensor
+    """Standardised advantages, dimensionless, shape [T B, N], or [T B, 1] with `ratio="world"`."""
+    targets: Tensor
+    """Targets of the critic, in units of the rewards, shape [T B, N]."""
+    acted: Tensor
+    """1 where an action counts; 0 where its species had ended or it is masked; shape [T B, N]."""
+
+
+class RoundBuffers:
+    """Tensors of a round and of its updates, which each round overwrites.
+
+    CUDA graphs read and write them in place. The shape is [T, B, N] where no other is given. At
+    first the worlds have the observations `observation`, shape [B, N, P].
+    """
+
+    def __init__(
+        self, options: PPOOptions, observation: Tensor, action_dim: int, minibatch_count: int
+    ) -> None:
+        steps, (worlds, particles) = options.steps, observation.shape[:2]
+
+        def zeros(*shape: int, dtype: torch.dtype = observation.dtype) -> Tensor:
+            return observation.new_zeros(shape, dtype=dtype)
+
+        self.current_observation = observation.clone()
+        """Observations before the current step, shape [B, N, P]."""
+        self.current_action = zeros(worlds, particles, action_dim)
+        """Actions of the current step, shape [B, N, A]."""
+        self.current_log_prob = zeros(worlds, particles)
+        """Log-probabilities of the current step's actions, shape [B, N]."""
+        single = (steps, worlds, particles)
+        self.observations = zeros(steps + 1, *observation.shape)
+        """Observations before each step, and after the last one, shape [T + 1, B, N, P]."""
+        self.observations[-1].copy_(observation)
+        self.actions = zeros(*single, action_dim)
+        self.rewards, self.log_probs, self.targets = (zeros(*single) for _ in range(3))
+        """Rewards of the steps; the others are fields of `Round`, and so are `actions`, `acted`."""
+        self.acted = torch.ones_like(self.rewards)
+        self.terminated, self.ended = (zeros(*single, dtype=torch.bool) for _ in range(2))
+        """Whether a particle's episode terminated in a step; whether it terminated or truncated."""
+        self.values = zeros(steps + 1, worlds, particles)
+        """The critic's values of `observations`, shape [T + 1, B, N]."""
+        self.next_values = zeros(*single)
+        """The critic's values of the observations after each step, before any restart."""
+        self.advantages = zeros(steps, worlds, 1 if options.ratio == "world" else particles)
+        self.within_kl = zeros()
+        """1, or 0 once the rules have moved farther than `target_kl` in a round, shape []."""
+        self.rules_rate = zeros()
+        """Learning rate of the rules while `within_kl` is 1, shape []."""
+        self.kl_sums = zeros(2)
+        """Sums of a minibatch's KL estimates [nats] and of their weights, shape [2]."""
+        self.weight_sums = zeros(minibatch_count, 2)
+        """Sums of `acted` over the critic's and over the rules' samples, [minibatches, 2]."""
+
+    @property
+    def round(self) -> Round:
+        """The round as views of these tensors."""
+        others = (self.actions, self.log_probs, self.advantages, self.targets, self.acted)
+        return Round(*(values.flatten(0, 1) for values in (self.observations[:-1], *others)))
+
+
+class GraphedParts:
+    """Methods of a `PPOLearner` as CUDA graphs on CUDA, as they are on a CPU.
+
+    `graphed.draw_actions()` does what `learner.draw_actions()` does, and so on. They have neither
+    arguments nor results: they read and write the tensors of `buffers` that their docstrings name.
+    """
+
+    def __init__(self, learner: PPOLearner, device: torch.device) -> None:
+        graph = partial(GraphedCallable, device=device)
+        self.draw_actions = graph(
+            learner.draw_actions, generator=generator_to_register(learner.random)
+        )
+        self.compute_values = graph(learner.compute_values)
+        captured = not learner.processes.distributed
+        self.compute_advantages = graph(learner.compute_advantages, captured=captured)
+        # Updates share memory.
+        pool = torch.cuda.graph_pool_handle() if device.type == "cuda" else None
+        self.sum_weights = graph(learner.sum_weights, pool=pool)
+        # The learner has these graphs, so they refer to it weakly.
+        weak = weakref.proxy(learner)
+        self.compute_gradients = [
+            graph(partial(PPOLearner.compute_gradients, weak, minibatch), pool=pool)
+            for minibatch in range(learner.minibatches.count)
+        ]
+        self.descend_both = graph(learner.descend_both, pool=pool)
 
 
 class PPOLearner:
     """Rules, critic and worlds, which alternately `play` a round and `improve` from it.
 
     With several processes each has some of the worlds, which have separate random streams.
-    Gradients, moments and weights are averaged over processes. On CUDA `GraphedParts` replays the
-    methods that `play` and `improve` call through `graphed`.
+    Gradients, running moments and sums of weights are averaged over processes.
     """
 
     def __init__(self, progress: Progress, options: PPOOptions) -> None:
@@ -162,15 +262,15 @@ class PPOLearner:
         )
         observation = self._reset_worlds(0)
         self.critic.observe(observation, self.processes)
-        self.memory = Memory(
+        self.buffers = RoundBuffers(
             options, observation, problem.interface.action_dim, self.minibatches.count
         )
         self.graphed = GraphedParts(self, device)
 
     def resume(self, iteration: int, resumption: int) -> None:
-        """Resume after `iteration` rounds, for the `resumption`-th time, in new worlds."""
+        """Begin new worlds after `iteration` rounds; `resumption`: number of resumes so far."""
         self.rounds = iteration
-        self.memory.observations[-1].copy_(self._reset_worlds(resumption))
+        self.buffers.observations[-1].copy_(self._reset_worlds(resumption))
 
     def _reset_worlds(self, resumption: int) -> Tensor:
         seeds = world_seeds(self._seed, self._total, resumption)
@@ -178,113 +278,112 @@ class PPOLearner:
         observation, _ = self.envs.reset(seed=[seeds[k] for k in self._indices])
         return observation
 
-    @property
-    def round_size(self) -> int:
-        """Particle-steps of a round of all processes, T B N."""
-        return self.processes.count * self.memory.rewards.numel()
-
     @torch.no_grad()
     def play(self) -> Round:
-        """Play T steps, and return them with advantages; the next round overwrites them."""
-        memory, options = self.memory, self.options
-        memory.observations[0].copy_(memory.observations[-1])
+        """Roll out T steps and estimate advantages; return both as views of `buffers`."""
+        buffers, options = self.buffers, self.options
+        buffers.observations[0].copy_(buffers.observations[-1])
         last_observations = {}
         for step in range(options.steps):
-            memory.observation.copy_(memory.observations[step])
+            buffers.current_observation.copy_(buffers.observations[step])
             self.graphed.draw_actions()
-            memory.actions[step].copy_(memory.action)
-            memory.log_probs[step].copy_(memory.log_prob)
+            buffers.actions[step].copy_(buffers.current_action)
+            buffers.log_probs[step].copy_(buffers.current_log_prob)
             last_observation = self._step_worlds(step)
             if last_observation is not None:
                 last_observations[step] = last_observation
         self.graphed.compute_values()
+        # `observations` has the first ones of the next episodes in place of these.
         for step, observation in last_observations.items():
-            memory.next_values[step].copy_(self.critic(observation))
+            buffers.next_values[step].copy_(self.critic(observation))
         self.graphed.compute_advantages()
-        return memory.round
+        return buffers.round
 
     def _step_worlds(self, step: int) -> Tensor | None:
-        """Store a step of all worlds; return last observations [B, N, P] if any episode ended."""
-        memory, options = self.memory, self.options
-        observation, reward, terminated, truncated, infos = self.envs.step(memory.action)
+        """Apply `current_action`, and write the results of the step into the buffers.
+
+        Return the last observations of episodes, [B, N, P], where one ended; None if none did.
+        """
+        buffers, options = self.buffers, self.options
+        observation, reward, terminated, truncated, infos = self.envs.step(buffers.current_action)
         # Flags and rewards of worlds, [B, 1], are those of all of their particles.
         terminated, ended = terminated[:, None], (terminated | truncated)[:, None]
         if isinstance(self.envs, ConcatenatedSpeciesEnv):
             # A species may end before its world does.
             terminated = terminated | infos["particle_terminated"]
             ended = ended | infos["particle_terminated"]
-            memory.acted[step].copy_(infos["acted"])
+            buffers.acted[step].copy_(infos["acted"])
         elif options.masked:
             # It describes the step before a restart.
-            memory.acted[step].copy_(infos["updated"])
-        memory.observations[step + 1].copy_(observation)
-        memory.rewards[step].copy_(
+            buffers.acted[step].copy_(infos["updated"])
+        buffers.observations[step + 1].copy_(observation)
+        buffers.rewards[step].copy_(
             reward[:, None] if options.particle_rewards is None else own_rewards(infos)
         )
-        memory.terminated[step].copy_(terminated)
-        memory.ended[step].copy_(ended)
+        buffers.terminated[step].copy_(terminated)
+        buffers.ended[step].copy_(ended)
         last: Tensor | None = infos.get("final_obs")
         return last
 
     @torch.no_grad()
     def draw_actions(self) -> None:
-        """Draw `memory.action` for `memory.observation`, with its log-probability."""
+        """Draw actions: from `current_observation` to `current_action` and `current_log_prob`."""
         begin_episodes(self.random)
-        action, log_prob = self.actor.sample(self.memory.observation, self.random)
-        self.memory.action.copy_(action)
-        self.memory.log_prob.copy_(log_prob)
+        action, log_prob = self.actor.sample(self.buffers.current_observation, self.random)
+        self.buffers.current_action.copy_(action)
+        self.buffers.current_log_prob.copy_(log_prob)
 
     @torch.no_grad()
     def compute_values(self) -> None:
-        """Compute the critic's values of all observations, in chunks to save memory."""
-        memory, observations = self.memory, self.memory.observations.flatten(0, 1)
+        """Write `values`, in chunks to save memory, and `next_values` as if no episode ended."""
+        buffers, observations = self.buffers, self.buffers.observations.flatten(0, 1)
         size = -(-len(observations) // self.options.minibatches)
         values = torch.cat([self.critic(chunk) for chunk in torch.split(observations, size)])
-        memory.values.copy_(values.view_as(memory.values))
-        memory.next_values.copy_(memory.values[1:])
+        buffers.values.copy_(values.view_as(buffers.values))
+        buffers.next_values.copy_(buffers.values[1:])
 
     @torch.no_grad()
     def compute_advantages(self) -> None:
-        """Compute the round's standardised advantages, and the critic's targets."""
-        memory, values = self.memory, self.memory.values[:-1]
+        """Write standardised `advantages` and the critic's `targets`, from rewards and values."""
+        buffers, values = self.buffers, self.buffers.values[:-1]
         advantages = generalised_advantages(
-            memory.rewards,
+            buffers.rewards,
             values,
-            memory.next_values,
-            memory.terminated,
-            memory.ended,
+            buffers.next_values,
+            buffers.terminated,
+            buffers.ended,
             gamma=self.options.gamma,
             gae_lambda=self.options.gae_lambda,
         )
-        memory.targets.copy_(advantages + values)
+        buffers.targets.copy_(advantages + values)
         if self.options.ratio == "world":
-            advantages = particle_means(advantages, memory.acted)
-        memory.advantages.copy_(standardised(advantages, memory.acted, self.processes))
+            advantages = particle_means(advantages, buffers.acted)
+        buffers.advantages.copy_(standardised(advantages, buffers.acted, self.processes))
 
     def improve(self, remaining_budget: float) -> None:
-        """Train rules and critic on the last round.
+        """Train rules and critic by `epochs` passes over the last round.
 
         Learning rates, and the noise of the next round, fall with the remaining fraction of the
         budget.
         """
-        schedule, memory = self.schedule, self.memory
+        schedule, buffers = self.schedule, self.buffers
         critic, actor = (self.optimisers[name] for name in ("critic", "actor"))
         rules_learn = self.rounds >= schedule.critic_rounds
         self.rounds += 1
-        self.critic.observe(memory.observations[:-1], self.processes)
-        self.critic.rescale(memory.targets, self.processes)
+        self.critic.observe(buffers.observations[:-1], self.processes)
+        self.critic.rescale(buffers.targets, self.processes)
         critic.param_groups[0]["lr"].fill_(CRITIC_RATE * remaining_budget)
-        memory.rules_rate.fill_(schedule.learning_rate * remaining_budget)
-        memory.within_kl.fill_(1.0)
+        buffers.rules_rate.fill_(schedule.learning_rate * remaining_budget)
+        buffers.within_kl.fill_(1.0)
         for _ in range(self.options.epochs):
             self.minibatches.shuffle()
             self.graphed.sum_weights()
-            self.processes.reduce([memory.weight_sums])
+            self.processes.reduce([buffers.weight_sums])
             for minibatch in range(self.minibatches.count):
                 if rules_learn:
                     self.graphed.compute_gradients[minibatch]()
                     self.processes.reduce(
-                        [*gradients_of(critic), *gradients_of(actor), memory.kl_sums]
+                        [*gradients_of(critic), *gradients_of(actor), buffers.kl_sums]
                     )
                     self.graphed.descend_both()
                 else:
@@ -292,37 +391,37 @@ class PPOLearner:
                     self.processes.reduce(gradients_of(critic))
                     self._descend(critic)
             # The only synchronisation with the device.
-            if not bool(memory.within_kl):
+            if not bool(buffers.within_kl):
                 break
         self.actor.set_noise(self.options.noise_factor(remaining_budget, schedule.last_noise))
 
     def sum_weights(self) -> None:
-        """Sum the weights of the samples in each minibatch of a pass, for critic and rules."""
-        acted = [self.memory.round.acted]
-        for minibatch in range(self.minibatches.count):
-            (worlds,) = self._critic_rows(minibatch, acted)
-            rows = torch.cat([group for (group,) in self._rule_rows(minibatch, acted)])
-            sums = worlds.sum(), self._ratio_weights(rows).sum()
-            self.memory.weight_sums[minibatch].copy_(torch.stack(sums))
+        """Write `weight_sums`: the sums of `acted` in each minibatch of a pass."""
+        acted = self.buffers.round.acted
+        for minibatch, critic_index in enumerate(self.minibatches.indices[-1]):
+            rows = torch.cat([group for (group,) in self._rule_rows(minibatch, [acted])])
+            sums = acted[critic_index].sum(), self._ratio_weights(rows).sum()
+            self.buffers.weight_sums[minibatch].copy_(torch.stack(sums))
 
     def compute_gradients(self, minibatch: int) -> None:
-        """Set the gradients of critic and rules, and `memory.kl_sums`, for a minibatch."""
+        """Write the gradients of critic and rules for a minibatch of `round`, and its `kl_sums`."""
         self._compute_critic_gradients(minibatch)
         objective, kl_sums = self._objective(minibatch)
         set_gradients(self.optimisers["actor"], -objective)
-        self.memory.kl_sums.copy_(kl_sums)
+        self.buffers.kl_sums.copy_(kl_sums)
 
     def _compute_critic_gradients(self, minibatch: int) -> None:
-        worlds = Round(*self._critic_rows(minibatch, self.memory.round))
+        index = self.minibatches.indices[-1][minibatch]
+        worlds = Round(*(values[index] for values in self.buffers.round))
         error = (self.critic(worlds.observations) - worlds.targets) / self.critic.scale
         squares = (worlds.acted * error.square()).sum()
-        loss = 0.5 * squares / self.memory.weight_sums[minibatch, 0].clamp(min=1.0)
+        loss = 0.5 * squares / self.buffers.weight_sums[minibatch, 0].clamp(min=1.0)
         set_gradients(self.optimisers["critic"], loss)
 
     def _objective(self, minibatch: int) -> tuple[Tensor, Tensor]:
-        """Return PPO's clipped objective of a minibatch, and its `Memory.kl_sums`."""
+        """Return PPO's clipped objective of a minibatch, shape [], and its `kl_sums`, shape [2]."""
         options, actor = self.options, self.actor
-        groups = [Round(*rows) for rows in self._rule_rows(minibatch, self.memory.round)]
+        groups = [Round(*rows) for rows in self._rule_rows(minibatch, self.buffers.round)]
         if options.ratio == "world":
             (worlds,) = groups
             log_probs = [actor.log_prob(worlds.observations, worlds.actions)]
@@ -341,7 +440,7 @@ class PPOLearner:
         kl_sums = torch.stack((divergence, acted.sum()))
         if options.ratio == "world":
             log_ratio = particle_means(log_ratio, acted)
-        weights, total = self._ratio_weights(acted), self.memory.weight_sums[minibatch, 1]
+        weights, total = self._ratio_weights(acted), self.buffers.weight_sums[minibatch, 1]
         objective = clipped_objective(
             log_ratio, advantages, weights, total, clip=options.clip_range
         )
@@ -350,13 +449,13 @@ class PPOLearner:
         return objective, kl_sums
 
     def descend_both(self) -> None:
-        """Take a step of critic and rules along the gradients of a minibatch."""
+        """Step critic and rules along their gradients; rules stay once `within_kl` is 0."""
         self._descend(self.optimisers["critic"])
         # Rules that moved too far get the learning rate 0, without a synchronisation.
-        divergence, count = self.memory.kl_sums
-        self.memory.within_kl.mul_(divergence / count.clamp(min=1.0) <= self.schedule.target_kl)
+        divergence, count = self.buffers.kl_sums
+        self.buffers.within_kl.mul_(divergence / count.clamp(min=1.0) <= self.schedule.target_kl)
         optimiser = self.optimisers["actor"]
-        rate = self.memory.within_kl * self.memory.rules_rate
+        rate = self.buffers.within_kl * self.buffers.rules_rate
         optimiser.param_groups[0]["lr"].copy_(rate)
         self._descend(optimiser)
 
@@ -365,17 +464,15 @@ class PPOLearner:
         nn.utils.clip_grad_norm_(parameters, self.options.max_gradient_norm)
         optimiser.step()
 
-    def _critic_rows(self, minibatch: int, values: Sequence[Tensor]) -> list[Tensor]:
-        """Return the critic's minibatch of each tensor [T B, N, ...]: worlds at some steps."""
-        index = self.minibatches.indices[-1][minibatch]
-        return [value[index] for value in values]
-
     def _rule_rows(self, minibatch: int, values: Sequence[Tensor]) -> list[list[Tensor]]:
-        """Return a minibatch of each tensor: one of worlds, or one of each species' particles."""
+        """Return the rules' minibatch of tensors [T B, N, ...], group by group.
+
+        A group is K particles of a species, [K, ...], or with `ratio="world"` some of the worlds.
+        """
         indices = [group[minibatch] for group in self.minibatches.indices[:-1]]
         if self.options.ratio == "world":
             return [[value[index] for value in values] for index in indices]
-        rows, total = [], self.memory.acted.shape[2]
+        rows, total = [], self.buffers.acted.shape[2]
         for span, index in zip(self.actor.rules.spans, indices, strict=True):
             count = span.stop - span.start
             if count < total:
@@ -384,96 +481,8 @@ class PPOLearner:
         return rows
 
     def _ratio_weights(self, acted: Tensor) -> Tensor:
+        """Return the weight of each likelihood ratio: `acted`, or 1 for worlds where any acted."""
         return acted.amax(dim=1, keepdim=True) if self.options.ratio == "world" else acted
-
-
-class GraphedParts:
-    """Methods of a `PPOLearner` that run as CUDA graphs on CUDA, and as they are on a CPU."""
-
-    def __init__(self, learner: PPOLearner, device: torch.device) -> None:
-        graph = partial(GraphedCallable, device=device)
-        self.draw_actions = graph(
-            learner.draw_actions, generator=generator_to_register(learner.random)
-        )
-        self.compute_values = graph(learner.compute_values)
-        captured = not learner.processes.distributed
-        self.compute_advantages = graph(learner.compute_advantages, captured=captured)
-        # Updates share memory.
-        pool = torch.cuda.graph_pool_handle() if device.type == "cuda" else None
-        self.sum_weights = graph(learner.sum_weights, pool=pool)
-        # The learner has these graphs, so they refer to it weakly.
-        weak = weakref.proxy(learner)
-        self.compute_gradients = [
-            graph(partial(PPOLearner.compute_gradients, weak, minibatch), pool=pool)
-            for minibatch in range(learner.minibatches.count)
-        ]
-        self.descend_both = graph(learner.descend_both, pool=pool)
-
-
-class Round(NamedTuple):
-    """T steps of B worlds of N particles, flattened to M = T B worlds."""
-
-    observations: Tensor
-    """Perceptions, shape [M, N, P]."""
-    actions: Tensor
-    """Actions before clipping, shape [M, N, A]."""
-    log_probs: Tensor
-    """Their log-probabilities when they were drawn, shape [M, N]."""
-    advantages: Tensor
-    """Standardised advantages, shape [M, N], or [M, 1] with `ratio="world"`."""
-    targets: Tensor
-    """Targets of the critic, shape [M, N]."""
-    acted: Tensor
-    """1 where an action counts, 0 where its species had ended or it is masked, shape [M, N]."""
-
-
-class Memory:
-    """Tensors of a round and its updates, which the next round overwrites.
-
-    CUDA graphs read and write them in place. The default shape is [T, B, N]; for other fields see
-    `Round`.
-    """
-
-    def __init__(
-        self, options: PPOOptions, observation: Tensor, action_dim: int, minibatches: int
-    ) -> None:
-        steps, (worlds, particles) = options.steps, observation.shape[:2]
-
-        def zeros(*shape: int, dtype: torch.dtype = observation.dtype) -> Tensor:
-            return observation.new_zeros(shape, dtype=dtype)
-
-        self.observation = observation.clone()
-        """Observations before the current step, shape [B, N, P]."""
-        self.action, self.log_prob = zeros(worlds, particles, action_dim), zeros(worlds, particles)
-        """Actions of the current step, [B, N, A], and their log-probabilities, [B, N]."""
-        single = (steps, worlds, particles)
-        self.observations = zeros(steps + 1, *observation.shape)
-        """Observations before each step, and after the last one, shape [T + 1, B, N, P]."""
-        self.observations[-1].copy_(observation)
-        self.actions = zeros(*single, action_dim)
-        self.rewards, self.log_probs, self.targets = (zeros(*single) for _ in range(3))
-        self.acted = torch.ones_like(self.rewards)
-        self.terminated, self.ended = (zeros(*single, dtype=torch.bool) for _ in range(2))
-        """Whether a particle's episode terminated in a step; whether it terminated or truncated."""
-        self.values = zeros(steps + 1, worlds, particles)
-        """The critic's values of `observations`, shape [T + 1, B, N]."""
-        self.next_values = zeros(*single)
-        """The critic's values of the states after each step, before any restart."""
-        self.advantages = zeros(steps, worlds, 1 if options.ratio == "world" else particles)
-        self.within_kl = zeros()
-        """1, or 0 once the rules have moved farther than `target_kl` in a round, shape []."""
-        self.rules_rate = zeros()
-        """Learning rate of the rules while `within_kl` is 1, shape []."""
-        self.kl_sums = zeros(2)
-        """Sums of a minibatch's KL estimates [nats] and of their weights, shape [2]."""
-        self.weight_sums = zeros(minibatches, 2)
-        """Sums of the weights of the critic's and of the rules' samples by minibatch, [M, 2]."""
-
-    @property
-    def round(self) -> Round:
-        """The round, as views of these tensors."""
-        others = (self.actions, self.log_probs, self.advantages, self.targets, self.acted)
-        return Round(*(values.flatten(0, 1) for values in (self.observations[:-1], *others)))
 
 
 def generalised_advantages(
@@ -488,9 +497,9 @@ def generalised_advantages(
 ) -> Tensor:
     """Return generalised advantage estimates (Schulman et al., arXiv 1506.02438, equation 16).
 
-    All have shape [T, ...]. `values` are of the states before each step, `next_values` of those
-    after it, before any restart; they count as 0 where an episode terminated. `ended`: terminated
-    or truncated.
+    All tensors have one shape, [T, ...]. `values` are the critic's before each step, `next_values`
+    those after it, before any restart; they count as 0 where an episode terminated in the step.
+    `ended`: it terminated or was truncated.
     """
     errors = rewards + gamma * next_values.masked_fill(terminated, 0.0) - values
     discounts = (gamma * gae_lambda) * (~ended).to(rewards.dtype)
@@ -503,16 +512,16 @@ def generalised_advantages(
 
 
 def particle_means(values: Tensor, weights: Tensor) -> Tensor:
-    """Return weighted means [..., 1] of values [..., N]; 0 where all weights are 0."""
+    """Return weighted means [..., 1] of values [..., N] of particles; 0 where all weights are 0."""
     total = (values * weights).sum(dim=-1, keepdim=True)
     return total / weights.sum(dim=-1, keepdim=True).clamp(min=1e-8)
 
 
 def standardised(values: Tensor, weights: Tensor, processes: ProcessGroup = ALONE) -> Tensor:
-    """Return values minus their weighted mean at each step t, over one standard deviation of all.
+    """Return values minus their weighted mean at each step, over the standard deviation of all.
 
-    Each t has its own mean over worlds, as it depends on the step of the episode, which a critic
-    learns only slowly; a single world has one mean over all t. Values have shape [T, B, N] or
+    The mean of a step is over its worlds: it depends on the step of the episode, which a critic
+    learns only slowly. A single world has one mean over all steps. Values have shape [T, B, N] or
     [T, B, 1], weights [T, B, N]. Mean and deviation are over the worlds of all processes.
     """
     weights = weights if values.shape == weights.shape else weights.amax(-1, True)
@@ -530,9 +539,9 @@ def clipped_objective(
 ) -> Tensor:
     """Return the weighted mean of min(r A, clip(r) A) for likelihood ratios r and advantages A.
 
-    All have shape [M, N], or [M, 1] for one ratio per world; clip(r) is in 1 ± `clip`. `total` is
-    the sum of the weights, with several processes its mean over them. Source: Schulman et al.,
-    arXiv 1707.06347, equation 7.
+    Logarithms of the ratios, advantages and weights have one shape: [K] for K particles, or [K, 1]
+    for K worlds. clip(r) is in 1 ± `clip`. `total` is the sum of the weights, with several
+    processes its mean over them. Source: Schulman et al., arXiv 1707.06347, equation 7.
     """
     ratio = log_ratio.exp()
     clipped = ratio.clamp(1.0 - clip, 1.0 + clip)
@@ -559,7 +568,7 @@ def total_num_envs(progress: Progress, options: PPOOptions) -> int:
 
 
 def world_bytes(problem: Problem, options: PPOOptions, device: torch.device) -> int:
-    """Return roughly the memory of one world, its steps in a round and their gradients [bytes]."""
+    """Return an estimate of the memory of a world, its steps in a round and gradients [bytes]."""
     interface, count = problem.interface, problem.particle_count
     columns = interface.perception_dim + interface.action_dim
     # A step stores observations, actions and rewards; a minibatch also gradients.

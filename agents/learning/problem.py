@@ -1,6 +1,7 @@
-"""Problems to learn: an environment with its keywords, its vector environment, and seeds of runs.
+"""Problems to learn: an environment with its keywords, and seeds of the worlds of runs.
 
-Worlds of runs have seeds by `world_seeds`, those of evaluations have larger ones.
+`Problem.make_envs` makes its worlds for reinforcement learning, `DifferentiableTask` for gradients.
+The worlds of runs have the seeds `world_seeds`; the worlds of evaluations have larger ones.
 """
 
 from __future__ import annotations
@@ -9,11 +10,13 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, Self, get_args
 
 import gymnasium
 import torch
+from torch import Tensor
 
+from npa_envs.agents.learning.rule_set import ClampedRule, RuleSet, species_of
 from npa_envs.agents.learning.species_env import ConcatenatedSpeciesEnv
 from npa_envs.checks import check_device, check_positive, is_whole
 from npa_envs.envs.core.config import EnvConfig, Interface
@@ -21,28 +24,37 @@ from npa_envs.envs.core.task import Controls, EnvTask
 from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.envs.multi.shipped_tasks import task_settings
 from npa_envs.envs.multi.shipped_tasks import task_type as species_task_type
-from npa_envs.envs.multi.species_task import SpeciesConfig, SpeciesTask
+from npa_envs.envs.multi.species_task import Population, SpeciesConfig, SpeciesTask
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.registration import ALL, SPECIES_SIZES
 from npa_envs.registration import SPECIES as SPECIES_TASKS
+from npa_envs.tasks.base import ParticleTask
 from npa_envs.world.environment_steps import Physics
+from npa_envs.world.particles import Particles
+from npa_envs.world.randomness import Randomness, WorldRandom
+from npa_envs.world.rollout import rollout_particles
+from npa_envs.world.species import species_particles
 
 WORLDS_PER_SEED = 10_000
-"""Seeds of worlds that each run has: run k has those from k times this."""
+"""Number of worlds' seeds for each seed of a run: run k has the seeds from k times this on."""
 
 FIRST_EVALUATION_SEED = 1_000_000
-"""Runs learn in worlds with smaller seeds."""
+"""Smallest seed of the worlds of evaluations; runs learn in worlds with smaller seeds."""
 
-RUNS = FIRST_EVALUATION_SEED // WORLDS_PER_SEED
-"""Seeds of runs are below this."""
+RUN_SEED_COUNT = FIRST_EVALUATION_SEED // WORLDS_PER_SEED
+"""Number of seeds of runs: a run's seed is below it."""
 
 EVALUATION_SEEDS = range(FIRST_EVALUATION_SEED, FIRST_EVALUATION_SEED + 16)
 """Seeds of the worlds of evaluations."""
 
 DEFAULT_STEPS = 256
-"""Steps of an episode of an id that is registered without a limit."""
+"""Steps of an episode where an environment's registration has no limit."""
 
-SPECIES = (*SPECIES_TASKS, *(size.id for size in SPECIES_SIZES))
+KEY_RANGE = -(2**63), 2**63 - 1
+"""Range of the keys of worlds' random streams."""
+
+SPECIES_IDS = (*SPECIES_TASKS, *(size.id for size in SPECIES_SIZES))
+"""Ids of environments of several species."""
 
 ParticleRewardKind = Literal["particle", "marginal"]
 """Kinds of rewards that each particle gets separately."""
@@ -57,12 +69,12 @@ RESERVED_KEYWORDS = {
     "output": "learners are given tensors",
     "observe_target": "rules read what particles perceive, and no target",
 }
-"""Keywords of environments that problems do not take, and why."""
+"""Keywords of environments that problems do not take: what to do instead, by keyword."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Problem:
-    """An environment to learn in, with its keywords; `to_json` and `from_json` store it."""
+    """An environment to learn in, with its keywords and sizes."""
 
     env_id: str
     """Id of an environment of this library, "npa/Mixing-v0", or of your own that is registered with
@@ -109,7 +121,7 @@ class Problem:
 
     @cached_property
     def registration(self) -> RegisteredEnv:
-        """What `env_id` stands for."""
+        """Task and keywords that `env_id` stands for."""
         return registration_of(self.env_id)
 
     @property
@@ -134,12 +146,12 @@ class Problem:
 
     @property
     def interface(self) -> Interface:
-        """Meaning of the columns of observations and actions."""
+        """Columns of observations and actions."""
         return self.config.interface(self.physics)
 
     @property
     def counts(self) -> tuple[int, ...]:
-        """Numbers of particles of the species that act; one number without species."""
+        """Number of particles of each species that acts; one number without species."""
         config = self.config
         if isinstance(config, SpeciesConfig):
             return config.agent_particle_counts
@@ -151,7 +163,7 @@ class Problem:
         return sum(self.counts)
 
     def make_task(self, device: str | torch.device = "cpu") -> EnvTask[Any] | SpeciesTask:
-        """Return the environment's task, which makes start worlds and their losses, on a device."""
+        """Return the environment's task on a device: it makes start worlds and computes losses."""
         device = check_device(device)
         return self.task_type(replace(self.config, device=str(device)), device)
 
@@ -222,7 +234,7 @@ class Problem:
         return envs
 
     def to_json(self) -> str:
-        """Return the problem as JSON, on one line."""
+        """Return the problem as one line of JSON, for `from_json`."""
         return json.dumps(asdict(self), sort_keys=True)
 
     @classmethod
@@ -237,11 +249,121 @@ class Problem:
             ) from error
 
 
+class DifferentiableTask(ParticleTask[Any]):
+    """The worlds of a problem's episodes, with a loss and rollouts through which gradients flow.
+
+    It has the methods of a task that training calls: `seed`, `loss` and `rollout`; it has no
+    pictures and no metric. All species must share one loss, and no particle may leave a world.
+    """
+
+    def __init__(self, problem: Problem, device: torch.device) -> None:
+        super().__init__()
+        self.problem, self.config, self.physics = problem, problem.config, problem.physics
+        task = problem.make_task(device)
+        self.inner: Any = task
+        """The environment's task."""
+        self._species = species_of(problem.counts).to(device)
+        self._clamped: tuple[RuleSet, list[ClampedRule]] | None = None
+        if not isinstance(task, SpeciesTask):
+            return
+        if type(task).final_rewards is not SpeciesTask.final_rewards:
+            raise NPAError(
+                "a method that follows gradients must have one loss to descend, but in "
+                f"{problem.env_id} species gain rewards at each other's expense: learn by 'ppo' "
+                "with the reward of each particle"
+            )
+        if problem.keywords.get("deaths"):
+            raise NPAError(
+                "a method that follows gradients must keep all particles, got "
+                f"deaths={shown(problem.keywords['deaths'])}: "
+                "leave deaths out, or learn by 'ppo' or 'evolution'"
+            )
+
+    @property
+    def box(self) -> tuple[float, ...] | None:
+        """Sides of the periodic box [length units]; None: open space."""
+        return self.physics.periodic_box
+
+    @property
+    def start_is_short(self) -> bool:
+        """Whether start worlds are made by little work, not by long rollouts."""
+        return not isinstance(self.inner, EnvTask) or self.inner.start_is_short
+
+    def seed(
+        self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
+    ) -> Particles:
+        """Return `world_count` worlds at the start of an episode, with their goals, if any."""
+        if isinstance(generator, WorldRandom):
+            keys = generator.integers(KEY_RANGE[1])
+        else:
+            keys = torch.randint(*KEY_RANGE, (world_count,), generator=generator, device=device)
+        x, s, *rest = self.inner.start(WorldRandom.from_keys(keys))
+        return Particles(x, s, goal=rest[1] if rest else None)
+
+    def with_goal(self, goal: Tensor | None) -> Self:
+        """Return a copy whose losses are for these goals of worlds, shape [B]; None: the task."""
+        return self if goal is None else self._with(inner=self.inner.with_goal(goal))
+
+    def compare(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the loss and its terms by name, averaged over worlds and species, shape []."""
+        losses = {name: loss.mean() for name, loss in self._losses(worlds).items()}
+        return torch.stack(list(losses.values())).sum(), losses
+
+    def penalties(self, *_: Any) -> dict[str, tuple[float, Tensor]]:
+        """Return no penalties: environments have none."""
+        return {}
+
+    def world_losses(self, worlds: Particles) -> Tensor:
+        """Return the loss of each world, averaged over its species, shape [B]."""
+        losses = self.with_goal(worlds.goal)._losses(worlds)
+        total = torch.stack(list(losses.values())).sum(dim=0)
+        return total.flatten(1).mean(dim=1) if total.dim() > 1 else total
+
+    def rollout(self, rules: Any, worlds: Particles, steps: int, /, **options: Any) -> Particles:
+        """Return worlds after steps of a `RuleSet`; `options` are those of `npa_envs.rollout`."""
+        physics, config = self.physics, self.config
+        if self._clamped is None or self._clamped[0] is not rules:
+            # Made once, as captured rollouts identify rules by `id`.
+            limit = physics.limits.state_scale
+            self._clamped = rules, [ClampedRule(rule, limit) for rule in rules]
+        rule: Any = self._clamped[1]
+        options |= {
+            "dt": physics.dt,
+            "position_noise": physics.position_noise,
+            "box": physics.box,
+            "boundary": physics.boundary,
+        }
+        if isinstance(config, SpeciesConfig):
+            options |= {"counts": config.counts, "perception": config.perception}
+            run: Any = species_particles
+        else:
+            run, (rule,) = rollout_particles, rule
+        after: Particles = run(rule, worlds, steps, **options)
+        return after
+
+    def _losses(self, worlds: Particles) -> Mapping[str, Tensor]:
+        """Return the terms of worlds' losses by name, shape [B], or [B, S] of S species."""
+        x, s, *_ = worlds
+        losses: Mapping[str, Tensor]
+        if isinstance(self.inner, SpeciesTask):
+            losses = self.inner.losses(Population(x, s, self.problem.counts, self._species))
+        else:
+            losses = self.inner.losses(x, s)
+        needed = torch.is_grad_enabled() and (x.requires_grad or s.requires_grad)
+        if needed and not any(loss.requires_grad for loss in losses.values()):
+            raise NPAError(
+                f"the losses of {type(self.inner).__name__} must be differentiable for "
+                "a method that follows gradients, but no gradient leads from them to positions or "
+                "states: compute them by torch's operations, or learn by 'ppo' or 'evolution'"
+            )
+        return losses
+
+
 # Ids of environments, and seeds.
 
 
 class RegisteredEnv(NamedTuple):
-    """What an environment id stands for: a class of tasks and its settings."""
+    """What an environment id stands for: the class of its task, and settings."""
 
     task_type: type[EnvTask[Any]] | type[SpeciesTask]
     keywords: dict[str, Any]
@@ -253,8 +375,8 @@ class RegisteredEnv(NamedTuple):
 
 
 def registration_of(env_id: Any) -> RegisteredEnv:
-    """Return what an environment id stands for; raises NPAError if it has no batched form."""
-    if isinstance(env_id, str) and env_id in SPECIES:
+    """Return what an environment id stands for; NPAError if it has no form of many worlds."""
+    if isinstance(env_id, str) and env_id in SPECIES_IDS:
         name, keywords = task_settings(env_id)
         steps = keywords.pop("max_cycles", DEFAULT_STEPS)
         return RegisteredEnv(species_task_type(name), keywords, steps, name)
@@ -266,25 +388,26 @@ def registration_of(env_id: Any) -> RegisteredEnv:
         known = [environment.id for environment in ALL]
         raise NPAError(
             f"env_id must be of an environment of many worlds, got {shown(env_id)}: "
-            f"{suggest(env_id, [*known, *SPECIES])}"
+            f"{suggest(env_id, [*known, *SPECIES_IDS])}"
         )
     steps = DEFAULT_STEPS if spec.max_episode_steps is None else spec.max_episode_steps
     return RegisteredEnv(entry.task_type, dict(spec.kwargs), steps)
 
 
 def check_run_seed(seed: Any) -> None:
-    """Check that the seed of a run is a whole number below `RUNS`."""
-    if not is_whole(seed) or not 0 <= seed < RUNS:
+    """Check that the seed of a run is a whole number from 0 to below `RUN_SEED_COUNT`."""
+    if not is_whole(seed) or not 0 <= seed < RUN_SEED_COUNT:
         raise NPAError(
-            f"seed must be a whole number from 0 to {RUNS - 1}, as the worlds of later ones are "
-            f"those of evaluations, got {shown(seed)}: give seed=0"
+            f"seed must be a whole number from 0 to {RUN_SEED_COUNT - 1}, as the worlds of "
+            f"later ones are those of evaluations, got {shown(seed)}: give seed=0"
         )
 
 
 def world_seeds(seed: int, count: int, resumption: int = 0) -> list[int]:
-    """Return seeds of `count` worlds, which no run with another seed has.
+    """Return the seeds of `count` worlds of the run with `seed`; no other run has these.
 
-    Each `resumption` of the run has new ones; they repeat after `WORLDS_PER_SEED` worlds.
+    resumption: How often the run was resumed. Each time has new seeds, until `WORLDS_PER_SEED` are
+    used; then they repeat.
     """
     check_run_seed(seed)
     if count > WORLDS_PER_SEED:

@@ -1,4 +1,4 @@
-"""Budget, learning curve and checkpoints of a run."""
+"""Budget, learning curve and checkpoints of a run, for all methods."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ from npa_envs.world.randomness import Randomness, WorldRandom
 
 @dataclass(frozen=True, kw_only=True)
 class Budget:
-    """Limit of a run: seconds, particle-steps, or whichever of both is reached first."""
+    """Limit of a run: seconds, particle-steps, or the one of both that is reached first."""
 
     seconds: float | None = None
     """Wall-clock time of learning [s]. Set-up and evaluations do not count, and may take longer:
     there are at most `curve_points` + 2 evaluations, by default 22 of 16 episodes."""
     particle_steps: int | None = None
-    """Steps times particles that took them, of environments and rollouts together."""
+    """Steps of all particles, in environments and rollouts, by which a method learns."""
 
     def __post_init__(self) -> None:
         if self.seconds is None and self.particle_steps is None:
@@ -52,39 +52,41 @@ class CurvePoint:
     """One evaluation: a point of a learning curve."""
 
     seconds: float
-    """Learning time before it [s]."""
+    """Learning time before the evaluation [s]."""
     particle_steps: int
-    """Particle-steps before it."""
+    """Particle-steps before the evaluation."""
     mean_return: float
     """Mean return of the evaluation's episodes."""
     standard_error: float
-    """Its standard error; infinite for a single episode."""
+    """Standard error of the mean return; infinite for a single episode."""
     final_loss: float
     """Mean loss at the episodes' ends, before the next ones start."""
 
 
 class Learner(Protocol):
-    """A learner whose run can be stopped and resumed, by the state that checkpoints contain."""
+    """What a method must have so that its runs can be saved in checkpoints and resumed."""
 
     random: Randomness
+    """Source of its random numbers."""
 
     @property
     def modules(self) -> Mapping[str, nn.Module]:
-        """Modules that are trained, by name."""
+        """Modules that it trains, by name."""
 
     @property
     def optimisers(self) -> Mapping[str, torch.optim.Optimizer]:
-        """Optimisers of the `modules`, Adam or AdamW, by name."""
+        """Optimisers of these modules, Adam or AdamW, by name."""
 
     def resume(self, iteration: int, resumption: int) -> None:
-        """Resume after `iteration` iterations, for the `resumption`-th time, in new worlds."""
+        """Begin new worlds after `iteration` iterations; `resumption`: number of resumes so far."""
 
 
 class Progress:
-    """Counts what a learner spends, evaluates its rules at regular intervals, and saves them.
+    """Counts what a method spends, evaluates its rules at equal parts of the budget, saves them.
 
-    A learner makes its worlds, compiles what it needs, and then calls `run`, or itself `start`, and
-    until the budget is `over`, `advance` and `look` after each iteration.
+    A method makes its worlds, compiles what it needs, and calls `run`, which repeats an iteration
+    until the budget is spent. A method whose loop a library runs calls the parts of `run`: `start`,
+    and until the budget is `over`, `advance` and `look` after each iteration.
 
     Set-up before `start`, evaluations and checkpoints do not count as time. On CUDA only these
     synchronise, but `advance` keeps the CPU at most one iteration ahead of the device.
@@ -99,7 +101,7 @@ class Progress:
     Args:
         initial: Rules to begin with, which are copied; None: new ones.
         run: Settings of the run, of JSON's types, which must be equal when it is resumed.
-        others: As of `npa_envs.agents.learning.train`.
+        others: As of `npa_envs.agents.learning.train`, whose `start` is `initial`.
     """
 
     def __init__(
@@ -133,7 +135,7 @@ class Progress:
                 )
             self.initial = RuleSet.of(problem, initial).to(self.device)
         self.particle_steps = 0
-        """Particle-steps spent so far."""
+        """Number of particle-steps spent so far."""
         self.log: list[CurvePoint] = []
         """Evaluations so far."""
         self.processes = ProcessGroup.current()
@@ -156,7 +158,7 @@ class Progress:
             folder.prepare(0, pictures=False)
 
     def first_rules(self, *, zero_output: bool = False) -> RuleSet:
-        """Return the rules that a learner begins with and trains in place, on the device.
+        """Return the rules that a method begins with and trains in place, on the device.
 
         zero_output: New rules do nothing, as their output layers are zero: random ones destroy the
         picture in `npa/Regeneration2D-v0`.
@@ -174,8 +176,9 @@ class Progress:
         """Learn until the budget is spent, and return the rules.
 
         Args:
-            iteration: Trains the rules a little, and returns the particle-steps that it took.
-            learner: The learner that checkpoints save; needed with `out`.
+            rules: The rules that `iteration` trains in place.
+            iteration: One iteration of the method; it returns the particle-steps that it took.
+            learner: The learner whose state checkpoints contain; needed with `out`.
 
         Raises:
             NPAError: A file of a run that is kept cannot be written or used, or another run writes
@@ -210,10 +213,7 @@ class Progress:
         return rules
 
     def start(self, policy: RuleSet | Callable[[Any], Any]) -> None:
-        """Evaluate the rules or the policy before any learning, and start the clock.
-
-        A resumed run has this evaluation already.
-        """
+        """Evaluate the rules or the policy before any learning, unless resumed; start the clock."""
         if self._begin is not None:
             raise NPAError("progress must start once, got a second start: make one for each run")
         if not self.log:
@@ -223,7 +223,7 @@ class Progress:
 
     @property
     def spent_fraction(self) -> float:
-        """Fraction of the budget that is spent; the last iteration may take it above 1."""
+        """Fraction of the budget that is spent, which the last iteration may take above 1."""
         seconds, particle_steps = self.budget.seconds, self.budget.particle_steps
         by_time = 0.0 if seconds is None else self._agreed_seconds / seconds
         return max(by_time, 0.0 if particle_steps is None else self.particle_steps / particle_steps)
@@ -249,8 +249,8 @@ class Progress:
     def look(self, policy: RuleSet | Callable[[Any], Any], force: bool = False) -> bool:
         """Evaluate if the curve's next point is due, or with `force`; return whether it was done.
 
-        It is not, if no particle-steps have been counted since the last one. Raises a DivergedError
-        if a weight of the rules is not finite, or an action.
+        Nothing is done if no particle-steps were counted since the last evaluation. Raises a
+        DivergedError if a weight of the rules, or an action, is not finite.
         """
         self._check_started("look")
         due = self.spent_fraction >= (self._points_due + 1) / self._curve_points
@@ -263,7 +263,7 @@ class Progress:
 
     @contextlib.contextmanager
     def _stopped_clock(self) -> Iterator[None]:
-        """Stop the clock while a block runs; all processes enter it."""
+        """Stop the clock within a block, which all processes must enter."""
         self._synchronise()
         self._agree_on_time()
         self._seconds, self._begin = self._agreed_seconds, None
@@ -365,13 +365,13 @@ class Progress:
 
 
 def annealed(rate: float, last_rate: float, fraction: float) -> float:
-    """Return a rate that falls along half a cosine, to `rate * last_rate` at fraction 1."""
+    """Return a rate along half a cosine: `rate` at fraction 0, `rate * last_rate` from 1 on."""
     wave = 0.5 * (1.0 + math.cos(math.pi * min(fraction, 1.0)))
     return rate * (last_rate + (1.0 - last_rate) * wave)
 
 
 def check_finite(rules: RuleSet, particle_steps: int) -> None:
-    """Raise a DivergedError if a weight of rules is not finite; waits for the device."""
+    """Raise a DivergedError if a weight of the rules is not finite; waits for the device."""
     for number, rule in enumerate(rules):
         for name, weight in rule.named_parameters():
             bad = int((~torch.isfinite(weight)).sum())
@@ -386,7 +386,7 @@ def check_finite(rules: RuleSet, particle_steps: int) -> None:
 def learner_state(learner: Learner) -> dict[str, Any]:
     """Return a learner's modules, optimisers and random source as checkpoints contain them."""
     random = learner.random
-    # The counter of draws is the same in all worlds.
+    # The counter of random numbers is the same in all worlds.
     drawn = random.episodes[:1] if isinstance(random, WorldRandom) else random.get_state()
     optimisers = learner.optimisers.items()
     return {

@@ -1,11 +1,11 @@
-"""Sets of rules, one for each species of a problem."""
+"""Sets of rules, one for each species of a problem; rules with clamped state steps."""
 
 from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -16,6 +16,7 @@ from npa_envs.checks import checked_count
 from npa_envs.envs.core.config import Interface
 from npa_envs.errors import NPAError, shown
 from npa_envs.rule.files import load_rule, save_rule
+from npa_envs.rule.folded_network import FoldedRule
 from npa_envs.rule.rule import NPARule
 
 if TYPE_CHECKING:
@@ -32,8 +33,8 @@ class RuleSet(nn.Module):
 
     Args:
         rules: One for each species; not copied.
-        counts: Particles of each species.
-        interface: `problem.interface`.
+        counts: Number of particles of each species.
+        interface: Columns of observations and actions, `problem.interface`.
     """
 
     def __init__(
@@ -47,14 +48,14 @@ class RuleSet(nn.Module):
             )
         self.rules = nn.ModuleList(rules)
         self.spans = spans_of(counts)
-        """Slice of each species' particles."""
+        """Slice of the particles of each species, among all N."""
         self.counts = tuple(counts)
-        """Particles of each species."""
+        """Number of particles of each species."""
         self.interface = interface
 
     @classmethod
     def new(cls, problem: Problem, seed: int) -> RuleSet:
-        """Return untrained rules, on the CPU; torch's random state does not change."""
+        """Return untrained rules for a problem, on the CPU; torch's random state stays."""
         seed, interface, config = checked_count("seed", seed), problem.interface, problem.config
         with torch.random.fork_rng(devices=()):
             torch.manual_seed(seed)
@@ -74,12 +75,10 @@ class RuleSet(nn.Module):
 
     @classmethod
     def of(cls, problem: Problem, source: Source | Iterable[Source]) -> RuleSet:
-        """Return copies of existing rules for a problem that they fit, on the CPU.
+        """Return copies of existing rules, on the CPU, checked to fit a problem.
 
-        Args:
-            problem: The problem that they are for.
-            source: A rule, or what `npa_envs.load_rule` takes, for all species or one for each; or
-                a folder that `save` wrote.
+        `source` is a rule, or what `npa_envs.load_rule` takes, for all species or one for each; or
+        a folder that `save` wrote.
         """
         if isinstance(source, str | Path) and (Path(source) / _file_name(0)).is_file():
             return cls.load(source, problem)
@@ -99,11 +98,7 @@ class RuleSet(nn.Module):
         return cls.of(problem, [Path(folder) / _file_name(k) for k in range(len(problem.counts))])
 
     def save(self, folder: str | Path) -> list[Path]:
-        """Write `rule-0.safetensors` and so on into a folder, and return their paths.
-
-        Raises:
-            NPAError: A weight is not finite, or a file cannot be written.
-        """
+        """Write each rule, as `rule-0.safetensors` and so on, into a folder; return the paths."""
         paths = [Path(folder) / _file_name(k) for k in range(len(self.rules))]
         try:
             with made_folder(Path(folder)):
@@ -117,26 +112,26 @@ class RuleSet(nn.Module):
         return paths
 
     def __iter__(self) -> Iterator[NPARule]:
-        """Return the rules one by one."""
+        """Return an iterator over the rules, by species."""
         return iter(cast(list[NPARule], list(self.rules)))
 
     def mean(self, observation: Tensor) -> Tensor:
         """Return actions [B, N, A] for observations: a_x = δ / (1 + |δ|), a_s = Δs / state_scale.
 
-        They are differentiable. Unlike those of `policy`, state steps are not clipped to the action
-        space, so that gradients do not vanish.
+        They are differentiable. Unlike in `policy`, a_s is not clipped to the action space, so that
+        gradients do not vanish.
         """
         return self.actions(observation, self.mean_by_rule)
 
     def mean_by_rule(self, rule: NPARule, rows: Tensor) -> Tensor:
-        """Return actions [K, A], as `mean`, of one rule for K rows of observations [K, P]."""
+        """Return what `mean` does, of one rule for K rows of observations, [K, P]: [K, A]."""
         delta, state_step = bounded_update(rule, rows)
         return torch.cat((delta, state_step / self.interface.state_scale), dim=-1)
 
     def actions(
         self, observation: Tensor, action_by_rule: Callable[[NPARule, Tensor], Tensor]
     ) -> Tensor:
-        """Return actions [B, N, A]; `action_by_rule` maps a rule and [K, P] to actions [K, A]."""
+        """Return actions [B, N, A]; `action_by_rule` gives those of K rows [K, P] of one rule."""
         actions = []
         for rule, span in zip(self, self.spans, strict=True):
             rows = observation[:, span]
@@ -145,19 +140,19 @@ class RuleSet(nn.Module):
         return actions[0] if len(actions) == 1 else torch.cat(actions, dim=1)
 
     def policy(self) -> RuleSetPolicy:
-        """Return the rules as a policy; it shares their weights."""
+        """Return the rules, not copied, as a policy."""
         return RuleSetPolicy(self)
 
 
 class RuleSetPolicy(Policy):
-    """A set of rules as a policy, which computes on the rules' device."""
+    """A set of rules as a policy; it computes on the rules' device."""
 
     def __init__(self, rules: RuleSet) -> None:
         super().__init__(rules.interface)
         self.rules = rules
 
     def act(self, observation: Tensor) -> Tensor:
-        """Return the actions [B, N, A] of particles by their species' rules."""
+        """Return the actions of all particles by their species' rules, shape [B, N, A]."""
 
         def action(rule: NPARule, rows: Tensor) -> Tensor:
             return self.interface.action(*bounded_update(rule, rows))
@@ -177,6 +172,66 @@ class RuleSetPolicy(Policy):
                     "was made for"
                 )
         return {agent: known[agent] for agent in counts}
+
+
+class _ClampInward(torch.autograd.Function):
+    """Clamp values to ± `limit`; beyond it, only gradients whose descent leads back inside pass."""
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, limit: float) -> Tensor:
+        ctx.save_for_backward(values)
+        ctx.limit = limit
+        return values.clamp(-limit, limit)
+
+    @staticmethod
+    def backward(ctx: Any, bar: Tensor) -> tuple[Tensor, None]:
+        (values,) = ctx.saved_tensors
+        # Descent moves values against their gradient.
+        leads_out = torch.where(values > 0.0, bar < 0.0, bar > 0.0)
+        return bar.masked_fill((values.abs() > ctx.limit) & leads_out, 0.0), None
+
+
+class ClampedWeights(FoldedRule):
+    """The network of a `ClampedRule` as steps run it: two matrix products, then the clamp."""
+
+    rule: ClampedRule
+
+    def __call__(self, rows: Tensor) -> Tensor:
+        """Map K perceptions, [z | 1 | 0], to K updates, [δ | clamped Δs | 0], row by row."""
+        return self.rule.clamped(super().__call__(rows))
+
+
+class ClampedRule(NPARule):
+    """A rule that shares another rule's parameters and clamps its state steps to ± `limit`.
+
+    In a rollout it acts as the other rule does in an environment with `state_scale` = `limit`
+    (dimensionless).
+    """
+
+    def __init__(self, rule: NPARule, limit: float) -> None:
+        self.share(rule)
+        self.limit = limit
+        self.rule_is_plain = rule.is_plain()
+
+    def forward(self, perception: Tensor) -> Tensor:
+        """Map perceptions [..., P] to raw updates [..., A] with clamped state steps."""
+        return self.clamped(super().forward(perception))
+
+    def clamped(self, update: Tensor) -> Tensor:
+        """Return raw updates [δ | Δs], shape [..., A], with the state steps Δs clamped."""
+        first = self.update_dim - self.state_dim
+        state_step = _ClampInward.apply(update[..., first:], self.limit)  # type: ignore[no-untyped-call]
+        return torch.cat((update[..., :first], state_step), dim=-1)
+
+    def is_plain(self) -> bool:
+        """Return whether the network that is clamped is two layers, so that `folded` has it."""
+        return self.rule_is_plain
+
+    def folded(self) -> FoldedRule:
+        """Return the network as `ClampedWeights`."""
+        clamped = ClampedWeights(*super().folded())
+        clamped.rule = self
+        return clamped
 
 
 def species_of(counts: Sequence[int]) -> Tensor:

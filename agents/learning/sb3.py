@@ -1,8 +1,8 @@
 """Learners of Stable-Baselines3: PPO over whole worlds; PPO and SAC in gardens.
 
-PPO over worlds has one likelihood per world, the mean over its particles. It is an independent
-baseline for `ppo.py`: rollouts, advantages and updates are Stable-Baselines3's; only the policy,
-whose actor is a set of rules, is this library's.
+PPO over worlds has one likelihood for each world: its log-probability is the mean over particles.
+It checks `ppo.py` independently: rollouts, advantages and updates are Stable-Baselines3's; only the
+policy, whose actor is a set of rules, is this library's.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class WorldOptions(CommonOptions):
 
 
 def train(progress: Progress, options: WorldOptions = WorldOptions()) -> RuleSet:
-    """Return the rules that Stable-Baselines3's PPO finds within a budget.
+    """Return the rules that Stable-Baselines3's PPO learns within the budget.
 
     Stable-Baselines3 seeds the global random states of torch and NumPy. Observations are copied to
     the CPU.
@@ -100,19 +100,16 @@ def train(progress: Progress, options: WorldOptions = WorldOptions()) -> RuleSet
 
 
 def world_kl(particle_kl: float) -> float:
-    """Return the `target_kl` of Stable-Baselines3 for a divergence of particles' actions [nats].
+    """Return Stable-Baselines3's `target_kl` for a `target_kl` of particles' actions [nats].
 
     The mean log-ratio of many particles is close to minus their divergence k, so that
-    Stable-Baselines3's estimate, r - 1 - log r, is k² / 2.
+    Stable-Baselines3's estimate for the ratio r, r - 1 - log r, is k² / 2.
     """
     return 0.5 * particle_kl**2 / KL_FACTOR
 
 
 class ProgressCallback(BaseCallback):
-    """Reports to `Progress` while Stable-Baselines3 learns; stops it at the end of the budget.
-
-    It does both after each step of all worlds.
-    """
+    """Calls `Progress` after each step of all worlds, and stops learning at the budget's end."""
 
     def __init__(self, progress: Progress) -> None:
         super().__init__()
@@ -121,7 +118,7 @@ class ProgressCallback(BaseCallback):
         """Particle-steps of a step of all worlds."""
 
     def learn(self, model: Any, learned: LearnedT) -> LearnedT:
-        """Let a model learn until the budget is spent; evaluate and return its rules or policy."""
+        """Let a model learn until the budget is spent; return its rules or policy, `learned`."""
         self.learned: Any = learned
         # Stable-Baselines3 would use the seeds seed, seed + 1, and so on.
         model.env.seed(world_seeds(self.progress.seed, self.progress.problem.num_envs)[0])
@@ -141,7 +138,7 @@ class ProgressCallback(BaseCallback):
 
 
 class RoundCallback(ProgressCallback):
-    """Reports once a round; anneals the rules' noise; at first lets only the critic learn."""
+    """Calls `Progress` once a round; sets the rules' noise; at first lets only the critic learn."""
 
     def __init__(self, progress: Progress, options: WorldOptions, schedule: Schedule) -> None:
         super().__init__(progress)
@@ -172,7 +169,7 @@ class RoundCallback(ProgressCallback):
 
 
 class WorldRulePolicy(ActorCriticPolicy):
-    """Policy of Stable-Baselines3 for `WorldVecEnv`: particles act by their species' rule.
+    """A policy for Stable-Baselines3 and `WorldVecEnv`: particles act by their species' rule.
 
     Log-probability and value of a world are means over its particles. Rules are copied.
     """
@@ -200,7 +197,7 @@ class WorldRulePolicy(ActorCriticPolicy):
         )
 
     def forward(self, obs: Tensor, deterministic: bool = False) -> tuple[Tensor, Tensor, Tensor]:
-        """Return actions, values [M, 1] and log-probabilities [M] for worlds [M, N, P]."""
+        """Return actions [B, N, A], values [B, 1], log-probabilities [B] for worlds [B, N, P]."""
         self.critic.observe(obs)
         if deterministic:
             action = self.actor.rules.mean(obs)
@@ -210,12 +207,12 @@ class WorldRulePolicy(ActorCriticPolicy):
         return action, self.predict_values(obs), log_prob.mean(dim=1)
 
     def evaluate_actions(self, obs: Any, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return values [M, 1], log-probabilities [M] and entropies [M] of worlds' actions."""
+        """Return values [B, 1], log-probabilities [B] and entropies [B] of worlds' actions."""
         log_prob = self.actor.log_prob(obs, actions.view(*obs.shape[:2], -1))
         return self.predict_values(obs), log_prob.mean(dim=1), self.actor.entropy().expand(len(obs))
 
     def predict_values(self, obs: Any) -> Tensor:
-        """Return the values of worlds, shape [M, 1]."""
+        """Return the values of worlds, shape [B, 1]."""
         values: Tensor = self.critic(obs)
         return values.mean(dim=1, keepdim=True)
 
@@ -236,7 +233,7 @@ ALGORITHMS: dict[str, type[SAC] | type[PPO]] = {"sac": SAC, "ppo": PPO}
 
 @dataclass(frozen=True, kw_only=True)
 class GardenOptions:
-    """Options of SAC and PPO in gardens; others have the defaults of Stable-Baselines3."""
+    """Options of both SAC and PPO in gardens; all else is Stable-Baselines3's default."""
 
     gamma: float = 0.9
     """Discount of a reward one step later (dimensionless)."""
@@ -254,7 +251,7 @@ class SACOptions(GardenOptions):
     """Options of SAC in gardens."""
 
     learning_starts: int = 1000
-    """Steps of worlds before the first gradient step."""
+    """Number of steps of single worlds before the first gradient step."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -264,11 +261,11 @@ class GardenPPOOptions(GardenOptions):
     steps: int = 32
     """Steps of each world in a round."""
     batch_size: int = 64
-    """Steps of worlds in a minibatch, at least 2."""
+    """Number of steps of single worlds in a minibatch, at least 2."""
 
 
 def train_garden_sac(progress: Progress, options: SACOptions = SACOptions()) -> GardenPolicy:
-    """Return the policy that SAC (Haarnoja et al., arXiv 1801.01290) finds within a budget."""
+    """Return the policy that SAC (Haarnoja et al., arXiv 1801.01290) learns within the budget."""
     # A gradient step for about eight steps of worlds.
     steps, starts = max(1, progress.problem.num_envs // 8), options.learning_starts
     return _garden_policy(SAC, progress, options, learning_starts=starts, gradient_steps=steps)
@@ -277,7 +274,7 @@ def train_garden_sac(progress: Progress, options: SACOptions = SACOptions()) -> 
 def train_garden_ppo(
     progress: Progress, options: GardenPPOOptions = GardenPPOOptions()
 ) -> GardenPolicy:
-    """Return the policy that PPO (Schulman et al., arXiv 1707.06347) finds within a budget."""
+    """Return the policy that PPO (Schulman et al., arXiv 1707.06347) learns within the budget."""
     size = options.batch_size
     if min(options.steps * progress.problem.num_envs, size) < 2:
         raise NPAError(
@@ -309,7 +306,7 @@ def _garden_policy(
 
 
 class GardenPolicy:
-    """A model of Stable-Baselines3 as the policy of a garden, without noise; it shares weights."""
+    """A model of Stable-Baselines3, not copied, as the policy of a garden, without noise."""
 
     def __init__(self, model: Any) -> None:
         self.model = model
@@ -317,7 +314,7 @@ class GardenPolicy:
         self._shapes = _shapes(space.spaces if isinstance(space, Dict) else space)
 
     def __call__(self, observation: Any) -> NDArray[np.float32]:
-        """Return actions [B, J, W] of J brushes with W columns for observations [B, ...]."""
+        """Return actions [B, J, W] of J brushes, W columns each, for observations [B, ...]."""
         shapes = {name: shape[1:] for name, shape in _shapes(observation).items()}
         if shapes != self._shapes:
             raise NPAError(
@@ -339,7 +336,7 @@ class GardenPolicy:
 
     @classmethod
     def load(cls, path: str | Path) -> GardenPolicy:
-        """Return what `save` wrote; Stable-Baselines3 unpickles it, so trust who made the file."""
+        """Return the policy in a file of `save`, which is unpickled: trust who made the file."""
         name = Path(path).stem
         if name not in ALGORITHMS or not Path(path).is_file():
             raise NPAError(
@@ -357,6 +354,6 @@ class GardenPolicy:
 
 
 def _shapes(values: Any) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of a dict of arrays or spaces by name; a single one is "observation"."""
+    """Return the shapes in a dict of arrays or spaces, by name; of one array as "observation"."""
     named = values if isinstance(values, dict) else {"observation": values}
     return {name: tuple(value.shape) for name, value in named.items()}

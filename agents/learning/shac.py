@@ -1,8 +1,8 @@
 """Short-horizon actor-critic: gradients through a few steps, a critic for the rest.
 
-Source: Xu et al., arXiv 2204.07137. An episode is cut into windows, and worlds go on from one to
-the next. Rules ascend the rewards of a window, differentiated through its steps, plus the critic's
-value of the worlds at its end.
+Source: Xu et al., arXiv 2204.07137. An episode is cut into windows of a few steps, and each window
+continues the worlds of the last one. Rules ascend the rewards of a window, differentiated through
+its steps, plus the critic's value of the worlds at its end. Read `SHACLearner.learn` first.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from npa_envs.agents.learning.actor_critic import (
     set_gradients,
     share_of_worlds,
 )
-from npa_envs.agents.learning.gradient import EnvironmentTask
+from npa_envs.agents.learning.problem import DifferentiableTask
 from npa_envs.agents.learning.progress import Progress, annealed
 from npa_envs.agents.learning.rule_set import RuleSet
 from npa_envs.checks import check_fraction, check_non_negative, check_positive, check_word
@@ -39,28 +39,28 @@ class SHACOptions:
     """Options of the short-horizon actor-critic."""
 
     steps: int = 16
-    """Most steps of a window, h; windows of an episode have equal lengths."""
+    """Maximum number of steps of a window; the windows of an episode have equal lengths h."""
     num_envs: int = 8
     """Worlds B of all processes."""
     gamma: float = 0.97
     """Discount of a reward one step later (dimensionless)."""
     value_weight: float = 0.25
-    """Weight of the critic's value in the rules' objective (dimensionless); 1 in the source."""
+    """Weight of the critic's value in the rules' objective (dimensionless); the source has 1."""
     td_lambda: float = 0.95
     """λ of the critic's TD(λ) targets (dimensionless)."""
     learning_rate: float = 4e-3
-    """AdamW's for the rules, at first; gradients are normalised parameter by parameter."""
+    """AdamW's learning rate of the rules at first; each parameter's gradient has the norm 1."""
     last_rate: float = 0.05
-    """Learning rate at the end, as a fraction of the first (dimensionless)."""
+    """Learning rate at the end of the budget, as a fraction of the first (dimensionless)."""
     critic_epochs: int = 4
     """Passes of the critic over a window."""
     minibatches: int = 4
     """Minibatches of a pass, which is shuffled."""
     critic: CriticInput = "central"
-    """Input of the critic: each particle, or also its whole world ("central"). A world's value is
-    the mean over its particles."""
+    """Input of the critic: one "particle" only, or also the mean over its world ("central"). A
+    world's value is the mean over its particles."""
     target_rate: float = 0.2
-    """Rate at which the target critic follows the critic after each window (dimensionless)."""
+    """Fraction of its distance from the critic that the target critic moves after each window."""
 
     def __post_init__(self) -> None:
         check_positive(self, int, "steps", "num_envs", "critic_epochs", "minibatches")
@@ -71,10 +71,10 @@ class SHACOptions:
 
 
 def train(progress: Progress, options: SHACOptions = SHACOptions()) -> RuleSet:
-    """Return the rules that a short-horizon actor-critic finds within a budget.
+    """Return the rules that a short-horizon actor-critic learns within the budget.
 
-    Rewards are decreases of the environment's loss, as with `reward="dense"`. The critic values
-    worlds as if episodes had no end. State steps are clamped as in `gradient.train`.
+    Rewards are decreases of the environment's loss, as with `reward="dense"`. The critic's values
+    ignore that episodes end. State steps are clamped as by `ClampedRule`.
     """
     learner = SHACLearner(progress, options)
 
@@ -86,12 +86,13 @@ def train(progress: Progress, options: SHACOptions = SHACOptions()) -> RuleSet:
 
 
 class StepWindow(NamedTuple):
-    """Features and losses of B worlds over h steps, differentiable."""
+    """Features and losses of B worlds before and after each of h steps, differentiable."""
 
     features: Tensor
-    """The critic's inputs before and after each step, shape [h + 1, B, N, F]."""
+    """Inputs of the critic: positions about the centroid, states and the world's loss, in F = D + C
+    + 1 columns, shape [h + 1, B, N, F]."""
     losses: Tensor
-    """The worlds' losses before and after each step, shape [h + 1, B]."""
+    """Losses of the worlds, shape [h + 1, B]."""
 
     @property
     def rewards(self) -> Tensor:
@@ -100,10 +101,10 @@ class StepWindow(NamedTuple):
 
 
 class SHACLearner:
-    """Rules, critic and worlds, which `learn` runs and trains window by window.
+    """Rules, critic and worlds; each call of `learn` runs a window and trains on it.
 
     With several processes each has some of the worlds, which have separate random streams.
-    Gradients and moments are averaged over processes.
+    Gradients and running moments are averaged over processes.
     """
 
     def __init__(self, progress: Progress, options: SHACOptions) -> None:
@@ -114,7 +115,7 @@ class SHACLearner:
         count = -(-problem.episode_steps // options.steps)
         self.window = -(-problem.episode_steps // count)
         """Steps of a window, h."""
-        self.task = EnvironmentTask(problem, device)
+        self.task = DifferentiableTask(problem, device)
         width = problem.physics.space_dim + problem.physics.state_dim + 1
         self.critic = seeded_critic(progress, width, options.critic)
         self.target = copy.deepcopy(self.critic).requires_grad_(False)
@@ -131,7 +132,7 @@ class SHACLearner:
         self.resume(0, 0)
 
     def resume(self, iteration: int, resumption: int) -> None:
-        """Resume after `iteration` windows, for the `resumption`-th time, in new worlds."""
+        """Begin new worlds, drawn by `random`; the arguments are not used."""
         begin_episodes(self.random)
         self.worlds = self._new_worlds(list(range(len(self._indices))))
         self.windows_left = [1 + k % self.window_count for k in self._indices]
@@ -139,7 +140,7 @@ class SHACLearner:
         parts of an episode."""
 
     def learn(self, rate: float) -> None:
-        """Run the worlds for a window, and train rules and critic on it."""
+        """Run a window; train the rules on it, at the learning rate `rate`, and the critic."""
         window, optimiser = self.play(), self.optimisers["rules"]
         set_gradients(optimiser, -self.objective(window))
         means = gradients_of(optimiser)
@@ -150,7 +151,7 @@ class SHACLearner:
         self.learn_values(StepWindow(*(values.detach() for values in window)))
 
     def play(self) -> StepWindow:
-        """Run the rules for a window, differentiably; then restart worlds whose episode is over."""
+        """Run the worlds for a window and return it; restart worlds whose episode is over."""
         task, steps = self.task, self.window
         begin, limits = self.worlds, task.physics.limits
         begin_episodes(self.random)
@@ -193,7 +194,7 @@ class SHACLearner:
         return self.task.seed(len(worlds), generator=random, device=self.device)
 
     def objective(self, window: StepWindow) -> Tensor:
-        """Return the rules' objective: mean discounted rewards of a window plus its end's value."""
+        """Return what the rules ascend, shape []: discounted rewards plus the value at the end."""
         gamma, steps = self.options.gamma, self.window
         discounts = gamma ** torch.arange(steps, device=self.device, dtype=torch.float32)
         returns = (discounts[:, None] * window.rewards).sum(dim=0)
@@ -201,7 +202,7 @@ class SHACLearner:
         return (returns + self.options.value_weight * gamma**steps * value).mean()
 
     def learn_values(self, window: StepWindow) -> None:
-        """Train the critic on a window's TD(λ) targets, and move the target critic towards it."""
+        """Train the critic on TD(λ) targets of a window; move the target critic towards it."""
         options = self.options
         features = window.features[:-1].flatten(0, 1)
         with torch.no_grad():
@@ -231,7 +232,7 @@ class SHACLearner:
 
 
 def world_values(critic: Critic, features: Tensor) -> Tensor:
-    """Return values [M] of worlds with features [M, N, F]: means over particles."""
+    """Return the values [B] of worlds with features [B, N, F]: means over particles."""
     each: Tensor = critic(features)
     return each.mean(dim=-1)
 
@@ -239,11 +240,11 @@ def world_values(critic: Critic, features: Tensor) -> Tensor:
 def td_lambda_targets(
     rewards: Tensor, next_values: Tensor, *, gamma: float, td_lambda: float
 ) -> Tensor:
-    """Return TD(λ) targets before each step of a window, shape [h, ...].
+    """Return TD(λ) targets of the values before each step of a window, shape [h, ...].
 
-    They are discounted sums of later rewards, in which the critic's values after each step,
-    `next_values`, have the weight 1 - λ, and 1 after the last step. Source: arXiv 2204.07137,
-    equation 7.
+    `rewards` are those of the steps, `next_values` the critic's values after each step. The target
+    of step t is r_t + γ ((1 - λ) v_t + λ target of step t + 1), that of the last step r + γ v.
+    Source: arXiv 2204.07137, equation 7.
     """
     targets = torch.empty_like(rewards)
     later = next_values[-1]

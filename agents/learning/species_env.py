@@ -1,4 +1,4 @@
-"""Worlds of several species as learners need them: all particles in one array."""
+"""Worlds of several species as learners need them: all particles' rows in one tensor."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from npa_envs.envs.multi.vector import MultiSpeciesVectorEnv
 from npa_envs.world.cuda_graph import to_device_async
 
 LEFT_WORLD = "left the world"
-"""Reason for the end of a species that diverged."""
+"""Reason why the episode of a species ended that diverged."""
 
 
 class ConcatenatedSpeciesEnv(MultiSpeciesVectorEnv):
     """Worlds of several species as one agent, with observations [B, N, P] and actions [B, N, A].
 
-    It has those attributes of `NPAVectorEnv` that learners need. Reward and loss of a world are
-    means over its species; a species that ended keeps its last loss. A world terminates once all
-    of its species have; its reason is that of the first one, or "left the world" if any did.
-    Infos of a step have for each particle, [B, N], the `particle_reward` of its species, whether it
-    was alive, `acted`, and whether it terminated in this step, `particle_terminated`.
+    It has the attributes of `NPAVectorEnv` that learners need. Reward and loss of a world are means
+    over its species; a species that ended keeps its last loss. A world terminates once all of its
+    species have; its reason is that of the first one, or "left the world" if any diverged. Infos of
+    a step have for each particle, [B, N]: `particle_reward`, the reward of its species; `acted`,
+    whether its species had not ended before; `particle_terminated`, whether it terminates now.
     """
 
     def __init__(self, task: str, **config: Any) -> None:
@@ -66,7 +66,7 @@ class ConcatenatedSpeciesEnv(MultiSpeciesVectorEnv):
     def step(  # type: ignore[override]
         self, actions: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
-        """Apply actions, [B, N, A], in [-1, 1], and observe; an error changes no world."""
+        """Apply actions in [-1, 1], [B, N, A]; return observations, rewards, flags and infos."""
         by_species = {agent: actions[:, span] for agent, span in self.spans.items()}
         observations, *results, infos = super().step(by_species)
         rewards, terminated, truncated = (
@@ -95,7 +95,7 @@ class ConcatenatedSpeciesEnv(MultiSpeciesVectorEnv):
         return observation, reward, over & ~cut, over & cut, info
 
     def _update_reasons(self, infos: Mapping[str, Mapping[str, Any]]) -> None:
-        """Store each world's reason: its first species' that ended, or "left the world" of any."""
+        """Store why each world ends: the first reason of a species, or "left the world" of any."""
         for agent in self.agents:
             reasons = infos[agent].get("reason")
             if reasons is not None:

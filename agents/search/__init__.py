@@ -3,7 +3,7 @@
 An archive of cells keeps an elite in each: the best rule whose worlds fall into the cell.
 """
 
-from npa_envs.agents.search.candidates import Found, SearchWorld
+from npa_envs.agents.search.candidate_evaluation import Found, SearchWorld
 from npa_envs.agents.search.quality_diversity import Elite, Growth, Search, tried_again
 
 __all__ = ["Elite", "Found", "Growth", "Search", "SearchWorld", "tried_again"]

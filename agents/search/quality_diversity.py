@@ -1,4 +1,4 @@
-"""A search that can be stopped and resumed: methods, archive, record, and elites.
+"""The search: methods that propose candidates, the archive of the best, the record of all.
 
 The archive is the grid of MAP-Elites (Mouret and Clune, arXiv 1504.04909): each cell keeps the best
 candidate with descriptors in it. Methods differ in the candidates that they propose next.
@@ -16,7 +16,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from npa_envs.agents.search.candidates import Axis, Candidates, Found, Numbers, SearchWorld
+from npa_envs.agents.search.candidate_evaluation import (
+    Axis,
+    Candidates,
+    Found,
+    Numbers,
+    SearchWorld,
+)
 from npa_envs.checks import is_whole
 from npa_envs.errors import NPAError, importing, shown, suggest
 from npa_envs.measure.benchmark_records import installed_version, read_record, write_record
@@ -28,13 +34,13 @@ LIBRARIES = ("numpy", "ribs", "cma")
 """Libraries whose versions affect the proposed candidates."""
 
 MIN_STD, MAX_STD = 0.05, 0.8
-"""Range of a random candidate's standard deviation of weights, in Xavier's."""
+"""Range of the standard deviation of a random candidate's weights, in units of Xavier's."""
 
 MUTATION = 0.1
-"""Standard deviation of mutations, in Xavier's standard deviations of the weights."""
+"""Standard deviation of mutations, in units of Xavier's standard deviation of each weight."""
 
 FIRST_STEP = 0.2
-"""First standard deviation of CMA-ES, in Xavier's standard deviations of the weights."""
+"""First standard deviation of CMA-ES, in units of Xavier's standard deviation of each weight."""
 
 
 def import_ribs() -> Any:
@@ -50,7 +56,8 @@ def import_ribs() -> Any:
 def make_archive(weight_count: int, axes: tuple[Axis, ...], seed: int = 0) -> Any:
     """Return an empty `ribs.archives.GridArchive` of candidates with `weight_count` weights.
 
-    Only qualities above 0 are kept: other worlds are dead or diverged. Elites are drawn by `seed`.
+    It keeps only qualities above 0: other worlds stopped changing or diverged. `seed` is that of
+    its random choices.
     """
     return import_ribs().archives.GridArchive(
         solution_dim=weight_count,
@@ -64,33 +71,33 @@ def make_archive(weight_count: int, axes: tuple[Axis, ...], seed: int = 0) -> An
 
 
 class RandomEmitter:
-    """Proposes `random_weights` as an emitter of pyribs; ignores the archive."""
+    """An emitter of pyribs that proposes `random_weights`, whatever the archive contains."""
 
     def __init__(self, archive: Any, batch_size: int, seed: int) -> None:
         self.solution_dim: int = archive.solution_dim
         self._batch_size = batch_size
-        self._draws = np.random.default_rng(seed)
+        self._random = np.random.default_rng(seed)
 
     def ask(self) -> Numbers:
         """Return the weights of new candidates, shape [G, W]."""
-        return random_weights(self._draws, self._batch_size, self.solution_dim)
+        return random_weights(self._random, self._batch_size, self.solution_dim)
 
     def tell(self, *_: Any, **results: Any) -> None:
         """Ignore the results."""
 
 
-def random_weights(draws: np.random.Generator, count: int, weight_count: int) -> Numbers:
-    """Return Gaussian weights [count, W]; each row's deviation is drawn log-uniformly."""
-    deviations = np.exp(draws.uniform(np.log(MIN_STD), np.log(MAX_STD), (count, 1)))
-    return deviations * draws.standard_normal((count, weight_count))
+def random_weights(random: np.random.Generator, count: int, weight_count: int) -> Numbers:
+    """Return Gaussian weights [count, W]; each candidate's deviation is drawn log-uniformly."""
+    deviations = np.exp(random.uniform(np.log(MIN_STD), np.log(MAX_STD), (count, 1)))
+    return deviations * random.standard_normal((count, weight_count))
 
 
 def _map_elites(archive: Any, batch_size: int, seed: int) -> Any:
-    draws = np.random.default_rng(seed)
+    random = np.random.default_rng(seed)
     return import_ribs().emitters.GaussianEmitter(
         archive,
         sigma=MUTATION,
-        initial_solutions=random_weights(draws, batch_size, archive.solution_dim),
+        initial_solutions=random_weights(random, batch_size, archive.solution_dim),
         batch_size=batch_size,
         seed=seed,
     )
@@ -116,14 +123,14 @@ def _evolution(ranker: str, restart_rule: str, archive: Any, batch_size: int, se
     )
 
 
-METHODS: Mapping[str, Callable[[Any, int, int], Any]] = {
+EMITTERS: Mapping[str, Callable[[Any, int, int], Any]] = {
     "map-elites": _map_elites,
     "cma-me": partial(_evolution, "2imp", "no_improvement"),
     "cma-es": partial(_evolution, "obj", "basic"),
     "random": RandomEmitter,
 }
-"""Functions that make an emitter of pyribs, whose `ask` returns candidates [G, W], from an archive,
-a batch size and a seed.
+"""Methods of a search: functions of an archive, a batch size and a seed that return an emitter of
+pyribs, whose `ask` proposes candidates, [G, W].
 
 `map-elites` mutates random elites. `cma-me` (arXiv 1912.02400) is CMA-ES that ranks new cells
 before better elites. `cma-es` ranks by quality only. Both adapt a diagonal covariance. `random`
@@ -134,7 +141,7 @@ draws independent candidates.
 def qualities_and_measures(
     found: Sequence[Found | None], axes: Sequence[Axis]
 ) -> tuple[Numbers, Numbers]:
-    """Return qualities [G] and M descriptors [G, M] of candidates, 0 where a result is None."""
+    """Return the qualities [G] and descriptors [G, axes] of candidates, 0 where one is None."""
     nothing = Found(0.0, (0.0,) * len(axes))
     qualities, measures = zip(*(one or nothing for one in found), strict=True)
     return np.array(qualities), np.array(measures)
@@ -144,23 +151,23 @@ def qualities_and_measures(
 
 
 class Growth(NamedTuple):
-    """Statistics of an archive after some evaluations."""
+    """Statistics of an archive after a number of evaluations."""
 
     evaluations: int
     """Candidates tried so far."""
     qd_score: float
     """Sum of the elites' qualities."""
     coverage: float
-    """Fraction of the cells with an elite."""
+    """Fraction of the cells that have an elite."""
     best: float
-    """Quality of the best elite, 0 without elites."""
+    """Quality of the best elite; 0 without elites."""
 
 
 class Elite(NamedTuple):
     """The best candidate in a cell of the archive."""
 
     cell: tuple[int, ...]
-    """Index on each axis."""
+    """Index of the cell on each axis."""
     found: Found
     """Its quality and descriptors."""
     solution: Numbers
@@ -168,28 +175,28 @@ class Elite(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Indices of its cell as the name of its files, such as "3-4-1"."""
+        """Name of its rule's file, the indices of its cell, such as "3-4-1"."""
         return "-".join(map(str, self.cell))
 
 
 Batch = dict[str, Any]
-"""Candidates that were tried together, as in the record: "fingerprint", the CRC-32 of their
-weights, and "found", quality and descriptors of each, or None where nothing is alive."""
+"""A batch of candidates in the record: "fingerprint", the CRC-32 of their weights, and "found", a
+list of quality and descriptors of each, or None where its worlds stopped changing or diverged."""
 
 
 class Search:
     """A quality-diversity search for rules, with a record from which it can be resumed.
 
-    The same settings give the same elites. The record has the results of all candidates, but not
-    their weights: a resumed search proposes the same candidates again without evaluating them.
+    The same settings give the same elites. The record has the results of all candidates, not their
+    weights: a resumed search proposes the same candidates again, and takes their results from it.
 
     Args:
         world: Sizes of rules and worlds.
-        method: A name of `METHODS`.
+        method: A name of `EMITTERS`.
         seed: Seed of the proposals, at least 0. All candidates have the same worlds.
-        batch_size: Candidates in a batch, at least 2.
+        batch_size: Candidates that are proposed at a time, at least 2.
         device: Device of the worlds.
-        path: File of the record, which is written after each batch; None: no record.
+        path: File of the record, written after each batch and read at first; None: no record.
     """
 
     def __init__(
@@ -202,8 +209,8 @@ class Search:
         device: torch.device,
         path: Path | None = None,
     ) -> None:
-        if method not in METHODS:
-            raise NPAError(f"unknown method {shown(method)}: {suggest(method, METHODS)}")
+        if method not in EMITTERS:
+            raise NPAError(f"unknown method {shown(method)}: {suggest(method, EMITTERS)}")
         for name, value, least in (("seed", seed, 0), ("batch_size", batch_size, 2)):
             if not is_whole(value) or value < least:
                 raise NPAError(
@@ -222,23 +229,23 @@ class Search:
             "versions": {name: installed_version(name) for name in LIBRARIES},
         }
         self.growth: list[Growth] = []
-        """The archive after each batch."""
+        """Statistics of the archive after each batch."""
         self._path = path
         self._batches: list[Batch] = []
         self.archive = make_archive(self.candidates.weight_count, self.axes, seed)
         """The elites, a `ribs.archives.GridArchive`."""
-        emitter = METHODS[method](self.archive, batch_size, seed)
+        emitter = EMITTERS[method](self.archive, batch_size, seed)
         self._proposals = import_ribs().schedulers.Scheduler(self.archive, [emitter])
         self._replay()
 
     @property
     def evaluations(self) -> int:
-        """Number of candidates that have been evaluated."""
+        """Number of candidates evaluated so far."""
         return sum(len(batch["found"]) for batch in self._batches)
 
     @property
     def particle_steps(self) -> int:
-        """Particle-steps of all candidates, B N T each."""
+        """Particle-steps spent so far: B N T for each candidate."""
         return self.evaluations * self.world.particle_steps
 
     def run(
@@ -251,7 +258,7 @@ class Search:
         """Propose and evaluate batches of candidates while the search is within its budget.
 
         Args:
-            budget: Particle-steps of the whole search, with those before a resume.
+            budget: Particle-steps of the whole search, including those before it was resumed.
             enough: Called after each batch; True stops the search.
             progress: Called with the particle-steps of each batch.
         """
@@ -284,7 +291,7 @@ class Search:
         self.growth.append(growth_of(self.archive, self.evaluations))
 
     def _replay(self) -> None:
-        """Propose the candidates of the record, if there is one, again; take its results."""
+        """Propose the candidates of the record again, and take their results, if there is one."""
 
         def batches_of(content: Mapping[str, Any]) -> list[Batch]:
             return [
@@ -318,7 +325,7 @@ def growth_of(archive: Any, evaluations: int) -> Growth:
 
 
 def tried_again(search: Search, seeds: Sequence[int]) -> Growth:
-    """Evaluate a search's elites again in worlds of other seeds; return their statistics."""
+    """Evaluate a search's elites again in worlds of other seeds; return their archive's growth."""
     candidates = Candidates(search.world, device=search.candidates.device, seeds=seeds)
     archive = make_archive(candidates.weight_count, search.axes)
     elites = search.elites()

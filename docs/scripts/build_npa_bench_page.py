@@ -17,8 +17,8 @@ import numpy as np
 from npa_bench_rows import BenchRow, read_rows, score, scores_in
 from page_parts import table, write_or_check
 
-from npa_envs.agents.comparison.npa_bench import METHODS, SUITES, Suite, task_name
-from npa_envs.agents.comparison.plan import NOTHING, YARDSTICK
+from npa_envs.agents.comparison.npa_bench import METHOD_DESCRIPTIONS, SUITES, Suite, task_name
+from npa_envs.agents.comparison.plan import NOTHING, REFERENCE
 from npa_envs.measure.benchmark_records import NONE
 from npa_envs.measure.plots import draw_band, legend_of, new_figure, png
 
@@ -54,7 +54,7 @@ def problems(suite: Suite) -> str:
 
 def ranked(rows: dict[str, BenchRow]) -> list[str]:
     """Return the methods: the library's own in their order, then all others by name."""
-    own = list(METHODS)
+    own = list(METHOD_DESCRIPTIONS)
     return sorted(rows, key=lambda name: (own.index(name) if name in own else len(own), name))
 
 
@@ -66,9 +66,9 @@ def measured(suite: Suite, rows: dict[str, BenchRow]) -> list[str]:
 
 def scored(suite: Suite, rows: dict[str, BenchRow], group: str) -> str:
     """Return the scores of all methods on a group of problems, Markdown."""
-    if not {NOTHING, YARDSTICK} <= rows.keys():
-        return f"Scores need the rows `{NOTHING}` and `{YARDSTICK}`."
-    ids = [env_id for env_id in suite.groups[group] if len(rows[YARDSTICK].returns(env_id))]
+    if not {NOTHING, REFERENCE} <= rows.keys():
+        return f"Scores need the rows `{NOTHING}` and `{REFERENCE}`."
+    ids = [env_id for env_id in suite.groups[group] if len(rows[REFERENCE].returns(env_id))]
     lines = []
     for method in ranked(rows):
         found = scores_in(rows, method, ids)

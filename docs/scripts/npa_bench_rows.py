@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.stats import bootstrap, trim_mean
 
 from npa_envs.agents.comparison.npa_bench import MIN_SEEDS, SCHEMA, SUITES, Suite
-from npa_envs.agents.comparison.plan import NOTHING, YARDSTICK
+from npa_envs.agents.comparison.plan import NOTHING, REFERENCE
 from npa_envs.agents.comparison.single_run import mean_of
 from npa_envs.atomic_files import read_json
 from npa_envs.errors import NPAError, shown
@@ -148,15 +148,15 @@ def normalised(rows: Mapping[str, BenchRow], method: str, env_id: str) -> NDArra
     R_zero and R_gradient are means over their runs. A run that diverged has the score 0.
     """
     ends = []
-    for name in (NOTHING, YARDSTICK):
+    for name in (NOTHING, REFERENCE):
         values = rows[name].returns(env_id) if name in rows else np.array([])
         if not np.isfinite(values).any():
             raise NPAError(f"scores of {env_id} need runs of {name!r}: run them")
         ends.append(float(np.nanmean(values)))
-    nothing, yardstick = ends
-    if not yardstick > nothing:
-        raise NPAError(f"scores of {env_id} need {YARDSTICK} to be better than {NOTHING}")
-    scores = (rows[method].returns(env_id) - nothing) / (yardstick - nothing)
+    nothing, reference = ends
+    if not reference > nothing:
+        raise NPAError(f"scores of {env_id} need {REFERENCE} to be better than {NOTHING}")
+    scores = (rows[method].returns(env_id) - nothing) / (reference - nothing)
     return np.nan_to_num(scores, nan=0.0)
 
 

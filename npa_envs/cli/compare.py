@@ -19,7 +19,7 @@ from npa_envs.cli import common
 from npa_envs.errors import NPAError, suggest
 
 if TYPE_CHECKING:
-    from npa_envs.agents.comparison.plan import Axis, ComparisonPlan
+    from npa_envs.agents.comparison.plan import BudgetKind, ComparisonPlan
     from npa_envs.agents.comparison.single_run import RunRecord
 
 
@@ -126,13 +126,13 @@ def make_plan(options: CompareOptions) -> ComparisonPlan:
     from npa_envs.agents.comparison import npa_bench
     from npa_envs.agents.comparison.plan import LEFT_OUT, PROBLEMS, ComparisonPlan, make_problem
     from npa_envs.agents.learning import METHODS
-    from npa_envs.agents.learning.problem import RUNS
+    from npa_envs.agents.learning.problem import RUN_SEED_COUNT
 
     common.check_numbers(options, seed_count=1, episodes=1, jobs=1, threads=1)
-    if options.seed_count is not None and options.seed_count > RUNS:
+    if options.seed_count is not None and options.seed_count > RUN_SEED_COUNT:
         raise NPAError(
-            f"seed_count must be at most {RUNS}, got {options.seed_count}: later runs would learn "
-            "in the worlds of evaluations"
+            f"seed_count must be at most {RUN_SEED_COUNT}, got {options.seed_count}: later "
+            "runs would learn in the worlds of evaluations"
         )
     quick = options.quick
     suite = None if options.suite is None else npa_bench.SUITES[options.suite]
@@ -157,7 +157,7 @@ def make_plan(options: CompareOptions) -> ComparisonPlan:
     if not (suite or options.methods):
         methods = [name for name in methods if name != "clone"]  # It needs a teacher.
     changed_options = _method_options(options.options, methods, own)
-    budgets: dict[Axis, dict[str, float]]
+    budgets: dict[BudgetKind, dict[str, float]]
     if suite:
         for name in changed_options.keys() - own.keys():
             raise NPAError(
@@ -167,7 +167,7 @@ def make_plan(options: CompareOptions) -> ComparisonPlan:
         problems = {name: suite.problem_of(name) for name in tasks}
         part = npa_bench.QUICK_FRACTION if quick else 1.0
         steps = {name: part * suite.budgets[suite.tasks[name]] for name in tasks}
-        budgets = {npa_bench.AXIS: steps}
+        budgets = {npa_bench.BUDGET_KIND: steps}
         left_out = [
             (task, method)
             for task, method in itertools.product(tasks, methods)
@@ -187,11 +187,11 @@ def make_plan(options: CompareOptions) -> ComparisonPlan:
     )  # fmt: skip
 
 
-def _budgets(options: CompareOptions) -> dict[Axis, float]:
+def _budgets(options: CompareOptions) -> dict[BudgetKind, float]:
     seconds, steps = options.learning_seconds, options.particle_steps
     if options.quick and steps is None and seconds is None:
         steps = 200_000
-    limits: dict[Axis, float | None] = {"seconds": seconds, "particle-steps": steps}
+    limits: dict[BudgetKind, float | None] = {"seconds": seconds, "particle-steps": steps}
     budgets = {axis: limit for axis, limit in limits.items() if limit is not None}
     if not budgets:
         raise NPAError(

@@ -20,7 +20,7 @@ from npa_envs.agents.comparison.plan import ComparisonPlan
 from npa_envs.agents.learning import Budget, Problem, Progress, RuleSet, train
 from npa_envs.agents.learning.problem import world_seeds
 from npa_envs.agents.search import SearchWorld
-from npa_envs.agents.search.candidates import SNAPSHOTS
+from npa_envs.agents.search.candidate_evaluation import SNAPSHOTS
 from npa_envs.cli.compare import CompareOptions, make_plan
 from npa_envs.envs import multispecies_v0
 

@@ -28,7 +28,7 @@ from npa_envs.agents.comparison.report import (
     report_rows,
 )
 from npa_envs.agents.comparison.single_run import (
-    SIZE,
+    PICTURE_SIDE,
     RunRecord,
     final_picture,
     held_records,
@@ -435,8 +435,8 @@ def test_a_table_has_the_right_numbers_the_best_first_and_leaves_no_method_out()
     assert ppo.episodes_diverged == pytest.approx(2 / 6)
     # No fraction of an improvement that there is not.
     nothing = Estimate(0.5, 0.0)
-    for yardstick in (Estimate(0.5, 0.1), Estimate(math.nan, 0.1)):
-        assert math.isnan(fraction(Estimate(1.5, 0.1), nothing, yardstick).mean)
+    for reference in (Estimate(0.5, 0.1), Estimate(math.nan, 0.1)):
+        assert math.isnan(fraction(Estimate(1.5, 0.1), nothing, reference).mean)
 
 
 def test_curves_have_a_line_for_each_point_of_each_run():
@@ -477,7 +477,7 @@ def test_a_curve_is_the_mean_of_seeds_where_all_of_them_are():
 @pytest.mark.parametrize("name", ["morphogenesis2d", "mixing"])
 def test_a_picture_shows_the_end_of_the_episode_and_not_the_next_start(name, device):
     problem = make_problem(name, quick=True)
-    keywords = {**problem.keywords, "render_mode": "rgb_array", "render_size": SIZE}
+    keywords = {**problem.keywords, "render_mode": "rgb_array", "render_size": PICTURE_SIDE}
     longer = dataclasses.replace(problem, keywords=keywords, episode_steps=99)
     envs = longer.make_envs(1, device=device)
     first, second, third = (RandomPolicy(envs) for _ in range(3))
@@ -485,7 +485,7 @@ def test_a_picture_shows_the_end_of_the_episode_and_not_the_next_start(name, dev
     for _ in range(problem.episode_steps):
         observation, *_ = envs.step(first(observation))
     (last,) = envs.render()
-    assert last.shape == (SIZE, SIZE, 3)
+    assert last.shape == (PICTURE_SIDE, PICTURE_SIDE, 3)
     assert np.array_equal(last, final_picture(problem, second, 3, device=str(device)))
     assert not np.array_equal(last, final_picture(problem, third, 4, device=str(device)))
 

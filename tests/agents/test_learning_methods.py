@@ -21,8 +21,8 @@ from npa_envs.agents import (
 from npa_envs.agents.learning import EVALUATION_SEEDS, Budget, Problem, RuleSet, train
 from npa_envs.agents.learning.clone import Demonstrations, unexplained_variance
 from npa_envs.agents.learning.evolution import RuleWeights, candidates_actions, costs, fitness
-from npa_envs.agents.learning.gradient import ClampedRule, EnvironmentTask
-from npa_envs.agents.learning.problem import FIRST_EVALUATION_SEED, world_seeds
+from npa_envs.agents.learning.problem import FIRST_EVALUATION_SEED, DifferentiableTask, world_seeds
+from npa_envs.agents.learning.rule_set import ClampedRule
 from npa_envs.agents.learning.shac import SHACLearner, SHACOptions, td_lambda_targets, world_values
 from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.envs.morphogenesis2d import PictureEnvTask
@@ -76,7 +76,7 @@ def test_what_is_differentiated_is_the_environments_own_episode(problem):
     rules, envs = wild_rules(problem), problem.make_envs(1)
     observation, infos = envs.reset(seed=5)
     largest = 0.0
-    task, random = EnvironmentTask(problem, torch.device("cpu")), npa_envs.WorldRandom(5)
+    task, random = DifferentiableTask(problem, torch.device("cpu")), npa_envs.WorldRandom(5)
     x, s, *rest = problem.make_task().start(random)
     if rest and rest[1] is not None:
         task = task.with_goal(rest[1])
@@ -102,7 +102,7 @@ def test_what_is_differentiated_is_the_environments_own_episode(problem):
 @pytest.mark.parametrize("cuda_graph", ["auto", True])
 def test_repeated_rollouts_stay_clamped_where_they_are_captured(cuda_graph, device):
     problem = heart(state_scale=0.1)
-    rules, task = wild_rules(problem).to(device), EnvironmentTask(problem, device)
+    rules, task = wild_rules(problem).to(device), DifferentiableTask(problem, device)
     worlds = task.seed(2, generator=torch.Generator(device).manual_seed(0), device=device)
     found = []
     for _ in range(4):

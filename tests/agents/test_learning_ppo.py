@@ -285,12 +285,12 @@ def test_captured_rounds_are_those_of_kernels_one_by_one(
 
 
 @pytest.mark.parametrize("problem", [HEART, MIXING], ids=["one", "two species"])
-def test_a_learner_and_its_memory_are_freed_at_once(problem):
+def test_a_learner_and_its_buffers_are_freed_at_once(problem):
     given = learner(problem, steps=4)
     given.play()
     given.improve(1.0)
     worlds = given.envs.worlds if problem is HEART else given.envs
-    parts = (given, given.memory, given.envs, worlds, *given.actor.parameters())
+    parts = (given, given.buffers, given.envs, worlds, *given.actor.parameters())
     references = [weakref.ref(part) for part in parts]
     with no_garbage_collection():
         del given, worlds, parts

@@ -36,12 +36,12 @@ def learner_of(form):
     for module in learner.modules.values():
         module.double()
     if method is ppo:
-        for name, value in vars(learner.memory).items():
+        for name, value in vars(learner.buffers).items():
             if value.is_floating_point():
-                setattr(learner.memory, name, value.double())
+                setattr(learner.buffers, name, value.double())
         # As at the beginning.
         learner.critic.updates.zero_()
-        learner.critic.observe(learner.memory.observations[-1], learner.processes)
+        learner.critic.observe(learner.buffers.observations[-1], learner.processes)
         return learner
     new_worlds = learner._new_worlds
     learner._new_worlds = lambda worlds: new_worlds(worlds).map(

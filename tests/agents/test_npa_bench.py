@@ -79,7 +79,7 @@ def test_a_suite_is_every_method_on_all_that_it_can_learn_within_the_frozen_budg
 
 def test_the_small_suite_is_all_small_worlds_that_rules_act_in():
     small = {row.id for row in (*SIZES, *SPECIES_SIZES) if "Small" in row.id}
-    # The yardstick is a gradient, and where one side pays for the other there is none.
+    # The reference method is a gradient, and where one side pays for the other there is none.
     small.remove("npa/InvasionSmall-v0")
     assert set(SMALL_SUITE.budgets) == small
 

@@ -10,14 +10,14 @@ from support.refusals import refused
 
 from npa_envs import load_rule, rollout
 from npa_envs.agents.search import Search, SearchWorld, tried_again
-from npa_envs.agents.search.candidates import (
+from npa_envs.agents.search.candidate_evaluation import (
     SEED_RADIUS,
     UPDATE_PROB,
     Candidates,
     correlation,
     quality_of,
 )
-from npa_envs.agents.search.quality_diversity import METHODS, RESULTS, import_ribs
+from npa_envs.agents.search.quality_diversity import EMITTERS, RESULTS, import_ribs
 from npa_envs.cli import main
 from npa_envs.errors import MissingDependencyError
 from npa_envs.rule.files import rule_metadata, save_rule
@@ -119,7 +119,7 @@ def test_a_missing_library_is_named_with_its_extra(monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", EMITTERS)
 def test_a_stopped_search_goes_on_as_if_it_had_not_been(method, tmp_path):
     # Many weights, whose steps cma adapts otherwise by default.
     options = {"method": method, "seed": 3, "world": {"hidden_dim": 16}}

@@ -1,4 +1,4 @@
-"""Evaluation of candidate rules: their quality, how alive worlds are, and descriptors."""
+"""Evaluation of candidate rules that a search proposes: rollouts, quality and descriptors."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ from npa_envs.world.particles import Particles, combined
 from npa_envs.world.rollout import rollout_particles
 
 SNAPSHOTS = 16
-"""Times at which a world is measured, evenly spread; the later half counts."""
+"""Number of times at which a rollout is stored, evenly spread; the second half is evaluated."""
 
 UPDATE_PROB = 0.5
 """Probability of a particle's update in a step (dimensionless)."""
 
 SEED_RADIUS = 0.2
-"""Radius of the disk that particles start in [length units]."""
+"""Radius of the disk in which particles start [length units]."""
 
 MIN_VARIANCE = 1e-12
-"""Variance of colours that counts as a single colour."""
+"""Colours with a variance of at most this count as a single colour (dimensionless)."""
 
 Numbers = NDArray[np.float64]
 
 
 class Axis(NamedTuple):
-    """A descriptor of worlds: name, range, and number of cells along it in the archive."""
+    """A descriptor of worlds: its name and range, and the archive's number of cells along it."""
 
     name: str
     lowest: float
@@ -46,14 +46,14 @@ class Axis(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class SearchWorld:
-    """Sizes of the candidate rules and of the worlds that they are tried in."""
+    """Sizes of the candidate rules and of the worlds in which they are evaluated."""
 
     particle_count: int = 128
     """Particles N."""
     steps: int = 128
-    """Steps from the seed, a multiple of 16; the second half of them is evaluated."""
+    """Steps of a rollout T, a multiple of 16; the second half of them is evaluated."""
     world_count: int = 1
-    """Worlds of each candidate, B, over which metrics are averaged."""
+    """Worlds of each candidate, B, over which quality and descriptors are averaged."""
     state_dim: int = 4
     """State channels C, at least 3; the last three are the colour (less 0.5)."""
     hidden_dim: int = 8
@@ -78,18 +78,18 @@ class SearchWorld:
         return self.world_count * self.particle_count * self.steps
 
     def make_rule(self) -> NPARule:
-        """Return a rule of these sizes with arbitrary weights, on the CPU."""
+        """Return a rule of these sizes with random weights, on the CPU."""
         with torch.random.fork_rng(devices=()):
             return NPARule(2, self.state_dim, self.hidden_dim, eps0=self.eps).requires_grad_(False)
 
     def axes(self) -> tuple[Axis, ...]:
-        """Return the descriptors by which the archive distinguishes worlds.
+        """Return the descriptors by which the archive distinguishes worlds, all dimensionless.
 
-        `speed` is the mean path length of a step [ε], at most α times the probability of an update.
-        `crowding` is log(ρ / ρ₁) / log N for the mean density ρ at particles and the density ρ₁ of
-        a single particle: 0 if each is alone, 1 if all coincide. `mixing` is 1 − r for the
-        correlation r between particles' colours and those around them: 0 if neighbours look alike,
-        1 if their colours are independent. Both are dimensionless.
+        `speed` is the mean path length of a step over ε, at most α times the probability of an
+        update. `crowding` is log(ρ / ρ₁) / log N for the mean density ρ at particles and the
+        density ρ₁ of a single particle: 0 if none has neighbours, 1 if all coincide. `mixing` is
+        1 − r for the correlation r between the colours of particles and the smoothed colours around
+        them: 0 if neighbours look alike, 1 if their colours are independent.
         """
         fastest = self.make_rule().alpha * UPDATE_PROB
         return (
@@ -103,25 +103,25 @@ class Found(NamedTuple):
     """Quality and descriptors of a candidate."""
 
     quality: float
-    """`bounded` times `alive`, in (0, 1]."""
+    """Value of `quality_of`, in (0, 1]."""
     measures: tuple[float, ...]
-    """Its descriptors, in the order of `SearchWorld.axes`."""
+    """Values of the descriptors, in the order of `SearchWorld.axes`."""
 
 
 class Trials(NamedTuple):
-    """Results of G candidates that were tried."""
+    """Results of G candidates that were run."""
 
     found: list[Found | None]
-    """One for each candidate; None where its worlds diverged or stopped changing."""
+    """Result of each candidate; None where its worlds diverged or stopped changing."""
     worlds: Particles
-    """The B worlds of each candidate at the end: positions [G, B, N, D] and so on."""
+    """The B worlds of each candidate at the end, positions [G, B, N, D] and so on."""
 
 
 class RuleStack(NPARule):
-    """G rules of one architecture in one batch of worlds, where each updates its own worlds.
+    """G rules of one architecture as one rule of a batch of worlds: each updates some of them.
 
-    Each rule must have the same number of worlds with the same update masks, so that each gets the
-    same number of perceptions. Weights [G, W] are in the order of `RuleWeights`.
+    The rules must have equally many worlds, with the same update masks, so that each gets the same
+    number of perceptions. Weights have shape [G, W], in the order of `RuleWeights`.
     """
 
     def __init__(self, rule: NPARule, weights: Tensor) -> None:
@@ -131,7 +131,7 @@ class RuleStack(NPARule):
         self.to(weights.device)
 
     def forward(self, perception: Tensor) -> Tensor:
-        """Map perceptions [G K, P], K for each rule, to raw updates [G K, A]."""
+        """Map perceptions [G K, P], K for each rule in turn, to raw updates [G K, A]."""
         count = len(self.weights)
         if len(perception) % count:
             # If no particle is updated there is one row, which is not used.
@@ -141,10 +141,10 @@ class RuleStack(NPARule):
 
 
 class Candidates:
-    """Evaluates candidates, all from the same seeds and with the same update masks.
+    """Evaluates candidates, each in B worlds with the same seeds, by default 0 to B - 1.
 
     On a CPU candidates share a batch of worlds. On CUDA, where the number of perceptions is not
-    known, they run one after the other. The seeds of the B worlds are 0 to B - 1 by default.
+    known, they run one after the other.
     """
 
     def __init__(
@@ -155,7 +155,7 @@ class Candidates:
         self._seeds = tuple(range(world.world_count) if seeds is None else seeds)
         self._rule = world.make_rule()
         self.scales = RuleWeights([self._rule]).scales()
-        """Standard deviation of each weight by Xavier, shape [W]: the units of solutions."""
+        """Standard deviation of each weight by Xavier, shape [W]: the unit of `solutions`."""
         alone = torch.zeros(1, 1, 2), torch.zeros(1, 1, 1)
         self._alone = float(perception_fields(*alone, eps=world.eps).rho)
 
@@ -165,14 +165,14 @@ class Candidates:
         return len(self.scales)
 
     def rule_of(self, solution: Numbers) -> NPARule:
-        """Return the rule with the weights `solution` [W], in units of `scales`, on the CPU."""
+        """Return the rule with the weights `solution`, [W] in units of `scales`, on the CPU."""
         rule = self.world.make_rule()
         RuleWeights([rule]).set_vector(solution * self.scales)
         return rule
 
     @torch.no_grad()
     def try_all(self, solutions: Numbers) -> Trials:
-        """Run G candidates, whose weights are `solutions` [G, W] in units of `scales`."""
+        """Run and evaluate G candidates, with weights `solutions`, [G, W] in units of `scales`."""
         weights = torch.as_tensor(solutions * self.scales, dtype=torch.float32).to(self.device)
         batch_size = len(weights) if self.device.type == "cpu" else 1
         batches = [self._try(batch) for batch in torch.split(weights, batch_size)]
@@ -211,7 +211,7 @@ class Candidates:
         return Trials(found, later.map(lambda values: values[-1]))
 
     def crowding_and_mixing(self, worlds: Particles) -> tuple[float, float]:
-        """Return the descriptors `crowding` and `mixing` of `axes`, averaged over worlds."""
+        """Return the descriptors `crowding` and `mixing` of `SearchWorld.axes`, averaged."""
         colours = _colours(worlds)
         fields = perception_fields(worlds.x, colours, eps=self.world.eps)
         excess = math.log(float(fields.rho.mean()) / self._alone)
@@ -225,11 +225,11 @@ def _colours(worlds: Particles) -> Tensor:
 
 
 def quality_of(worlds: Particles) -> Tensor:
-    """Return the quality bounded * alive, in [0, 1], of worlds [T, B, N, ·] at T times, shape [].
+    """Return the quality of B worlds at T times, [T, B, N, ...]: a number in [0, 1], shape [].
 
-    bounded = 1 / (1 + mean |s − clip(s, −1, 1)| + mean |x − clip(x, −1, 1)|), with the terms that
-    training penalises. alive = twice the standard deviation over the T times of a particle's colour
-    channels, averaged: 1 if each flickers between 0 and 1.
+    It is alive / (1 + mean |s − clip(s, −1, 1)| + mean |x − clip(x, −1, 1)|). `alive` is twice the
+    standard deviation of a particle's colour channels over the T times, averaged over particles
+    and channels: 1 if each flickers between 0 and 1.
     """
     excess = [(values - values.clamp(-1.0, 1.0)).abs().mean() for values in worlds.tensors()]
     alive = 2.0 * _colours(worlds).std(dim=0, correction=0).mean()
@@ -237,7 +237,7 @@ def quality_of(worlds: Particles) -> Tensor:
 
 
 def correlation(first: Tensor, second: Tensor) -> Tensor:
-    """Return the correlation of two fields [B, N, ...] over particles and channels, shape [B].
+    """Return the correlation of two fields [B, N, C] over particles and channels, shape [B].
 
     The mean of each channel is subtracted. The correlation is 1 if the first field is constant.
     """

@@ -1,4 +1,4 @@
-"""The atlas of a search: elites as rule files, and an HTML page of their pictures."""
+"""Output of a search: the elites' rules as files, and the atlas, a page of their pictures."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from npa_envs.agents.search.candidates import SEED_RADIUS, UPDATE_PROB, Axis
+from npa_envs.agents.search.candidate_evaluation import SEED_RADIUS, UPDATE_PROB, Axis
 from npa_envs.agents.search.quality_diversity import Elite, Search
 from npa_envs.atomic_files import made_folder
 from npa_envs.measure.plots import new_figure, png
@@ -22,18 +22,18 @@ from npa_envs.rule.files import save_rule
 ELITES, PAGE = "elites", "atlas.html"
 """Folder of the elites' rules and the page, in the folder of a search."""
 
-SIDE = 64
+PICTURE_SIDE = 64
 """Pixels on each side of an elite's picture."""
 
 HALF_WIDTH = 0.6
-"""Half the side of a picture, whose centre is the centroid [length units]."""
+"""Half the side of a picture, whose centre is the particles' centroid [length units]."""
 
 Pictures = Mapping[tuple[int, ...], NDArray[np.uint8]]
-"""Pictures by cell, uint8, [R, R, 3] each."""
+"""Pictures of elites by cell, uint8, [R, R, 3] each."""
 
 
 def write_elites(search: Search, folder: Path) -> Pictures:
-    """Write each elite's rule as `elites/CELL.safetensors`; return pictures of their worlds."""
+    """Write each elite's rule as `elites/CELL.safetensors`; return a picture of a world of each."""
     pictures: dict[tuple[int, ...], NDArray[np.uint8]] = {}
     count = search.world.particle_count
     for elite in search.elites():
@@ -49,7 +49,7 @@ def write_elites(search: Search, folder: Path) -> Pictures:
         (pictures[elite.cell],) = draw_worlds(
             x,
             s,
-            resolution=SIDE,
+            resolution=PICTURE_SIDE,
             pixel_size=math.sqrt(math.pi / count) * SEED_RADIUS,
             centre=x.mean(dim=1),
             half_width=HALF_WIDTH,
@@ -58,7 +58,7 @@ def write_elites(search: Search, folder: Path) -> Pictures:
 
 
 def atlas_html(search: Search, pictures: Pictures) -> str:
-    """Return the atlas as one HTML page: a table for each cell of the last axis.
+    """Return the atlas as one HTML page: a table of pictures for each cell of the last axis.
 
     The first axis goes from left to right, the second one upwards.
     """
@@ -94,8 +94,8 @@ _HEAD = f"""<!doctype html>
 body {{ font: 14px sans-serif; margin: 1em; }}
 table {{ border-collapse: collapse; }}
 th {{ font-weight: normal; font-size: 11px; padding: 2px 6px; }}
-td {{ width: {SIDE}px; height: {SIDE}px; border: 1px solid #ddd; padding: 0; }}
-img {{ display: block; width: {SIDE}px; height: {SIDE}px; }}
+td {{ width: {PICTURE_SIDE}px; height: {PICTURE_SIDE}px; border: 1px solid #ddd; padding: 0; }}
+img {{ display: block; width: {PICTURE_SIDE}px; height: {PICTURE_SIDE}px; }}
 </style>"""
 
 
@@ -119,7 +119,7 @@ def _span(axis: Axis, cell: int) -> str:
 
 
 def atlas_png(axes: Sequence[Axis], pictures: Pictures) -> bytes:
-    """Return the atlas as a PNG file: a panel for each cell of the last axis, two in a row."""
+    """Return the atlas as a PNG file: a panel for each cell of the last axis, in rows of two."""
     across, up, last = axes
     width, height = ((axis.highest - axis.lowest) / axis.cells for axis in (across, up))
     rows = -(-last.cells // 2)
