@@ -155,12 +155,21 @@ def save_rule(
         )
     header = {"format": FORMAT_NAME, "version": FORMAT_VERSION}
     header |= {name: json.dumps(value) for name, value in rule.hyper_parameters().items()}
-    if not isinstance(metadata, Mapping | None):
+    header |= _checked_metadata({} if metadata is None else metadata)
+    weights = {k: v.detach().cpu().contiguous() for k, v in rule.state_dict().items()}
+    check_weights(weights)
+    header["checksum"] = _checksum(header, weights)
+    write_bytes(path, _with_sorted_metadata(serialise(weights, metadata=header)))
+
+
+def _checked_metadata(metadata: Mapping[str, str]) -> Mapping[str, str]:
+    """Return the metadata of a rule's file; raise NPAError unless a header can hold it."""
+    if not isinstance(metadata, Mapping):
         raise NPAError(
             f"metadata must map text to text, got {type(metadata).__name__}: for example "
             "metadata={'trained by': 'me'}"
         )
-    for name, text in (metadata or {}).items():
+    for name, text in metadata.items():
         came = f"got {shown(name)}: {shown(text)}"
         if not isinstance(name, str) or not isinstance(text, str):
             raise NPAError(f"metadata must map text to text, {came}: use str()")
@@ -172,11 +181,7 @@ def save_rule(
             raise NPAError(
                 f"metadata must not use the name {shown(name)}: the format holds it itself"
             )
-        header[name] = text
-    weights = {k: v.detach().cpu().contiguous() for k, v in rule.state_dict().items()}
-    check_weights(weights)
-    header["checksum"] = _checksum(header, weights)
-    write_bytes(path, _with_sorted_metadata(serialise(weights, metadata=header)))
+    return metadata
 
 
 def _fits_a_file(rule: NPARule) -> bool:

@@ -184,17 +184,24 @@ def _equivariant_parts(
 
 
 def read_demo_json(data: bytes, name: str | None) -> RuleParts:
-    """Return the `RuleParts` of the rule `name` in a JSON file of the authors' web demo."""
+    """Return the `RuleParts` of the rule `name` in a JSON file of the authors' web demo.
+
+    None takes the only rule of the file.
+    """
     entry, index = _demo_rule(parse_json(data), name)
-    if "W_hidden" in entry:
-        tensors = {
-            known: _decode(entry, known, 1 if known.endswith("bias") else 2, index)
-            for known in _EQUIVARIANT_NAMES.values()
-        }
-        # Each number is repeated.
-        repeated = ("W_hidden", "W_out")
-        tensors |= {known: tensors[known][:, ::_TEXEL] for known in repeated}
-        return _equivariant_parts(tensors, entry, padded=True)
+    if "W_hidden" not in entry:
+        return _plain_demo_parts(entry, index)
+    tensors = {
+        known: _decode(entry, known, 1 if known.endswith("bias") else 2, index)
+        for known in _EQUIVARIANT_NAMES.values()
+    }
+    # Each number is repeated.
+    tensors |= {known: tensors[known][:, ::_TEXEL] for known in ("W_hidden", "W_out")}
+    return _equivariant_parts(tensors, entry, padded=True)
+
+
+def _plain_demo_parts(entry: Mapping[str, Any], index: int | None) -> RuleParts:
+    """Return `RuleParts` of a rule of two plain layers; `index`: the rule's in a stack."""
     first = _decode(entry, "w1.weight", 2, index)
     bias = _decode(entry, "w1.bias", 1, index)
     second = _decode(entry, "w2.weight.T", 2, index)

@@ -48,7 +48,6 @@ LIFE = 0
 FIRST_FATES = (5.0, -8.0)
 """Initial log odds of division and of death against neither."""
 
-
 STEP_PARTS = frozenset(
     [
         "__call__",
@@ -175,21 +174,25 @@ class NPARule(nn.Module):
         self.encoder = checked_flag("encoder", encoder)
         self.divides = checked_flag("divides", divides)
         self._check_combinations()
+        self._make_layers()
+        self.codes = Codes(code_names, code_dim, encoder=encoder) if code_dim else None
+        """The known codes, or None without `code_dim`."""
 
-        self.hidden = nn.Linear(self.input_dim, hidden_dim)
-        self.output = nn.Linear(hidden_dim, self.output_dim, bias=False)
+    def _make_layers(self) -> None:
+        self.hidden = nn.Linear(self.input_dim, self.hidden_dim)
+        self.output = nn.Linear(self.hidden_dim, self.output_dim, bias=False)
         self.readout: nn.Sequential | None = None
-        if readout_dim:
+        if self.readout_dim:
             self.readout = nn.Sequential(
-                nn.Linear(state_dim, readout_hidden_dim),
+                nn.Linear(self.state_dim, self.readout_hidden_dim),
                 nn.ReLU(),
-                nn.Linear(readout_hidden_dim, readout_dim),
+                nn.Linear(self.readout_hidden_dim, self.readout_dim),
             )
         for module in self.modules():
             if isinstance(module, nn.Linear):
                 nn.init.xavier_uniform_(module.weight, gain=INIT_GAIN)
         if self.divides:
-            self.fate = nn.Linear(state_dim, 2)
+            self.fate = nn.Linear(self.state_dim, 2)
             with torch.no_grad():
                 self.fate.weight.zero_()
                 self.fate.bias.copy_(torch.tensor(FIRST_FATES))
@@ -199,8 +202,6 @@ class NPARule(nn.Module):
             self.mixing = nn.Parameter(nn.init.xavier_uniform_(mixing))
             steering = torch.empty(1, 0 if self.static else vectors.gate_count)
             self.steering = nn.Parameter(nn.init.xavier_uniform_(steering)[0])
-        self.codes = Codes(code_names, code_dim, encoder=encoder) if code_dim else None
-        """The known codes, or None without `code_dim`."""
 
     def _check_sizes(self) -> None:
         if not is_whole(self.space_dim) or self.space_dim not in (2, 3):
@@ -213,10 +214,6 @@ class NPARule(nn.Module):
                 "a read-out needs readout_hidden_dim of at least 1, got "
                 f"{self.readout_hidden_dim} with readout_dim={self.readout_dim}"
             )
-
-    def share(self, rule: NPARule) -> None:
-        """Take another rule's parameters and settings, not copied; in place of `__init__`."""
-        vars(self).update(vars(rule))
 
     def _check_combinations(self) -> None:
         zone, species_count, code_dim = self.dead_zone, self.species_count, self.code_dim
@@ -261,6 +258,10 @@ class NPARule(nn.Module):
                 f"static={self.static}, species_count={species_count} and code_dim={code_dim}: "
                 "leave these out"
             )
+
+    def share(self, rule: NPARule) -> None:
+        """Take another rule's parameters and settings, not copied; in place of `__init__`."""
+        vars(self).update(vars(rule))
 
     @property
     def terms(self) -> Terms:

@@ -15,10 +15,9 @@ from torch import Tensor
 
 from npa_envs.checks import check_fraction, check_non_negative, check_positive
 from npa_envs.errors import NPAError, shown
-from npa_envs.ops import Cameras, world_mean
+from npa_envs.ops import world_mean
 from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
 from npa_envs.tasks.damage import CHANCE, far_points, random_particle, tear_off
-from npa_envs.tasks.gaussian_outputs import Gaussians
 from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.tasks.train_config import Common
 from npa_envs.world.brushes import clump, cut, wipe_state
@@ -107,7 +106,7 @@ class ParticleTask(Generic[ConfigT]):
     """Whether worlds are compared with `target_picture` pixel by pixel, so a PSNR makes sense."""
 
     has_views: bool = False
-    """Whether the task has `views`, `view_psnr` and `gaussians`: pictures from several cameras."""
+    """Whether the task is a `Morphogenesis3D`, whose worlds are drawn from any camera."""
 
     has_texture_metric: bool = False
     """Whether `npa_envs.measure.texture_metric` compares pictures of the task."""
@@ -124,6 +123,7 @@ class ParticleTask(Generic[ConfigT]):
     _resized_with: tuple[str, ...] = ()
     """Attributes that `resized` passes to the constructor."""
 
+    _mean_of_processes: Callable[[Tensor], Tensor] | None = None
     _goal: Tensor | None = None
     _target_picture: Tensor | None = None
     _pixel_size: float | None = None
@@ -247,12 +247,18 @@ class ParticleTask(Generic[ConfigT]):
         return self._goal
 
     def process_mean(self, value: Tensor) -> Tensor:
-        """Return the mean of a tensor over all training processes: by default there is one."""
-        return value
+        """Return the mean of a tensor over all training processes, or the tensor if there is one.
+
+        Each process calls it with its own tensor of the same shape.
+        """
+        return value if self._mean_of_processes is None else self._mean_of_processes(value)
 
     def with_process_mean(self, mean: Callable[[Tensor], Tensor]) -> Self:
-        """Return a copy for one of several training processes; `mean` is its `process_mean`."""
-        return self._with(process_mean=mean)
+        """Return a copy of the task for one of several training processes.
+
+        `mean` returns the mean of a tensor over all of them.
+        """
+        return self._with(_mean_of_processes=mean)
 
     def with_target_code(self, s: Tensor) -> Tensor:
         """Return states [B, N, C] whose first channels hold the code of the world's target again.
@@ -315,18 +321,6 @@ class ParticleTask(Generic[ConfigT]):
     def colours(self, s: Tensor) -> Tensor:
         """Return each particle's colour as pictures show it, shape [B, N, 3]."""
         return s[..., -3:] + COLOUR_OFFSET
-
-    def views(self, x: Tensor, s: Tensor, cameras: Cameras) -> Tensor:
-        """Return pictures by V cameras: colours times alpha, and alpha, shape [B, V, H, W, 4]."""
-        raise NotImplementedError
-
-    def view_psnr(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return each world's mean PSNR over the held-out views [dB], shape [B]."""
-        raise NotImplementedError
-
-    def gaussians(self, s: Tensor) -> Gaussians:
-        """Return the 3D Gaussian that draws each particle, from states s."""
-        raise NotImplementedError
 
     def _with(self, **fields: object) -> Self:
         """Return a shallow copy with some attributes replaced."""

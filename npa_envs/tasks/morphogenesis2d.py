@@ -24,6 +24,7 @@ from npa_envs.ops.pictures.splat import picture_losses
 from npa_envs.rule.picture_codes import replace_code
 from npa_envs.rule.rule import COLOUR_OFFSET, LIFE, NPARule
 from npa_envs.tasks.base import GrowthConfig, GrowthTask
+from npa_envs.tasks.losses.image_distances import mean_by_world
 from npa_envs.tasks.targets.images import MAX_POINT_COUNT
 from npa_envs.tasks.targets.picture_points import PointTarget, load_target
 from npa_envs.tasks.train_config import Common, TrainConfig, fast_run, presets_of, tiny_run
@@ -282,7 +283,7 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         with_gradient = torch.is_grad_enabled() and (x.requires_grad or s.requires_grad)
         if with_gradient or self.config.division or self.goal_count > 0:
             density, colour = self.splat_errors(x, s)
-            return _pixel_mean(density), _pixel_mean(colour)
+            return mean_by_world(density), mean_by_world(colour)
         return self._picture_losses(turned(x, self.best_turn(x, s)) if self._tries_angles else x, s)
 
     def metric(self, x: Tensor, s: Tensor) -> Tensor:
@@ -340,7 +341,7 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
             # The picture is linear in the colours: its gradient sums over a particle's splat.
             (pulled,) = torch.autograd.grad(picture[..., 0], blank, owned)
         pixel_count = self.config.resolution**2
-        unowned = _pixel_mean(UNOWNED * owned)
+        unowned = mean_by_world(UNOWNED * owned)
         return pulled[..., 0] * (x.shape[1] / pixel_count) + unowned[:, None]
 
     @torch.no_grad()
@@ -419,10 +420,6 @@ def turned(x: Tensor, turn: Tensor) -> Tensor:
     u, v = x.unbind(dim=-1)
     # Written out: the order of torch's own batched products may depend on the batch.
     return torch.stack((a * u + b * v, c * u + d * v), dim=-1)
-
-
-def _pixel_mean(errors: Tensor) -> Tensor:
-    return world_mean(errors.flatten(1)[..., None])[:, 0]
 
 
 Morphogenesis2DTrainConfig = TrainConfig[Morphogenesis2DConfig]

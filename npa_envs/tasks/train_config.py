@@ -193,11 +193,27 @@ class TrainConfig(Generic[TaskConfigT]):
         check_seed(self, "seed")
         check_flag(self, "cuda_graph", "tensorboard")
         parse_device(self.device)
-        check = partial(check_field, self)
         choices = {"optimiser": OptimiserName, "schedule": Schedule, "memory": Memory}
         choices |= {"moment_inverse": MomentInverse, "dtype": Literal["float32", "float64"]}
         for name, literal in choices.items():
             check_word(self, name, get_args(literal))
+        self._check_schedule()
+        self._check_pool()
+        factors, check = self.vary_eps, partial(check_field, self)
+        fits = _is_pair(factors, is_real) and 0.0 < factors[0] <= factors[1]
+        hint = "for example vary_eps=(0.5, 2.0)"
+        check("vary_eps", fits, "be two factors (lo, hi) with 0 < lo <= hi", hint)
+        is_path = isinstance(self.out, Path)
+        check("out", is_path, "be a pathlib.Path", f"Path({shown(self.out)})")
+        for name in ("stillness_weight", "damage_and_keep_share"):
+            if getattr(self, name) > 0 and not self.ages:
+                raise NPAError(
+                    f"{name} needs max_age_range, got {getattr(self, name)} without: "
+                    "set max_age_range, for example to (256, 32768)"
+                )
+
+    def _check_schedule(self) -> None:
+        check, milestones = partial(check_field, self), self.milestones
         fits = 1.0 <= self.stillness_power <= MAX_POWER
         rule = f"be at least 1 and at most {MAX_POWER:g}"
         check("stillness_power", fits, rule, "1 for arithmetic means")
@@ -208,34 +224,24 @@ class TrainConfig(Generic[TaskConfigT]):
         fits = _is_pair(self.steps, is_whole) and 1 <= self.steps[0] < self.steps[1]
         rule = "be two whole numbers (lo, hi) with 1 <= lo < hi"
         check("steps", fits, rule, "hi is exclusive, so exactly 32 steps are steps=(32, 33)")
-        milestones, ages = self.milestones, self.max_age_range
         fits = isinstance(milestones, tuple) and all(map(is_whole, milestones))
         fits = fits and list(milestones) == sorted({m for m in milestones if m >= 1})
         rule = "be positive and increasing whole numbers in a tuple"
         check("milestones", fits, rule, "for example milestones=(2000, 4000)")
-        rule = f"be at most pool_size={self.pool_size} (batches are drawn without replacement)"
+
+    def _check_pool(self) -> None:
+        check, ages = partial(check_field, self), self.max_age_range
         fits, hint = self.world_count <= self.pool_size, f"set pool_size={self.world_count} or more"
+        rule = f"be at most pool_size={self.pool_size} (batches are drawn without replacement)"
         check("world_count", fits, rule, hint)
         fits = _is_pair(ages, is_whole) and (1 <= ages[0] <= ages[1] or ages == (0, 0))
         rule = "be two whole numbers (lo, hi) with 1 <= lo <= hi, or (0, 0)"
         check("max_age_range", fits, rule, "for example max_age_range=(64, 16384)")
-        fits = not self.ages or self.pool_size % self.world_count == 0
-        rule = "be a multiple of world_count where max_age_range is set"
         sections = self.pool_size // self.world_count * self.world_count
+        fits = not self.ages or self.pool_size == sections
+        rule = "be a multiple of world_count where max_age_range is set"
         hint = f"with world_count={self.world_count} set pool_size={sections}"
         check("pool_size", fits, rule, hint)
-        factors = self.vary_eps
-        fits = _is_pair(factors, is_real) and 0.0 < factors[0] <= factors[1]
-        rule = "be two factors (lo, hi) with 0 < lo <= hi"
-        check("vary_eps", fits, rule, "for example vary_eps=(0.5, 2.0)")
-        is_path = isinstance(self.out, Path)
-        check("out", is_path, "be a pathlib.Path", f"Path({shown(self.out)})")
-        for name in ("stillness_weight", "damage_and_keep_share"):
-            if getattr(self, name) > 0 and not self.ages:
-                raise NPAError(
-                    f"{name} needs max_age_range, got {getattr(self, name)} without: "
-                    "set max_age_range, for example to (256, 32768)"
-                )
 
     @property
     def ages(self) -> bool:

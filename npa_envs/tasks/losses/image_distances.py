@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
+from npa_envs.ops import world_mean
 
 WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 """Exponents of the sizes, from fine to coarse (Wang et al. 2003)."""
@@ -21,6 +22,11 @@ STABILISERS = (0.01**2, 0.03**2)
 
 FLOOR = 1e-4
 """Least similarity of a size; below it the gradient is 0."""
+
+
+def mean_by_world(values: Tensor) -> Tensor:
+    """Return the mean of each world's numbers [B, ...], shape [B]: by `world_mean`."""
+    return world_mean(values.flatten(1)[..., None])[:, 0]
 
 
 class MultiScaleSimilarity:

@@ -172,12 +172,20 @@ def cut_out_background(image: Image.Image, *, label: str) -> Image.Image:
 
 
 def resample(image: Image.Image, point_count: int, *, label: str = "picture") -> Image.Image:
-    """Scale a picture so that the number of its opaque pixels is nearest to `point_count`.
+    """Return an RGBA picture, scaled so that about `point_count` of its pixels are opaque.
 
-    The sampling pitch is continuous, found by bisection, on a square grid that contains the whole
-    picture; other shapes than squares are padded. Colours are averaged with alpha as weight.
+    It is square and contains the whole picture. Colours are averaged with alpha as weight. `label`
+    names the picture in errors.
     """
-    image = image.crop(image.getchannel("A").getbbox())
+    padded, span, pitch = _padded(image.crop(image.getchannel("A").getbbox()), point_count)
+    return _sample(padded, span, _best_pitch(padded, span, pitch, point_count, label))
+
+
+def _padded(image: Image.Image, point_count: int) -> tuple[Image.Image, int, float]:
+    """Return a picture in the middle of a transparent square, its longer side, and a first pitch.
+
+    The pitch is the number of pixels along each side that one pixel of the result is made of.
+    """
     area = _opaque_count(image)
     pitch = math.sqrt(area / point_count)
     # A picture far larger than the grid is reduced first, for speed, unless that loses fine parts.
@@ -194,6 +202,13 @@ def resample(image: Image.Image, point_count: int, *, label: str = "picture") ->
         span, margin = max(image.size), _margin(image, pitch)
     padded = Image.new("RGBA", (span + 2 * margin, span + 2 * margin), (0, 0, 0, 0))
     padded.paste(image, (margin + (span - image.width) // 2, margin + (span - image.height) // 2))
+    return padded, span, pitch
+
+
+def _best_pitch(
+    padded: Image.Image, span: int, pitch: float, point_count: int, label: str
+) -> float:
+    """Return the pitch, found by bisection, that leaves about `point_count` opaque pixels."""
     alpha = padded.getchannel("A")
 
     def count(candidate: float) -> int:
@@ -223,7 +238,7 @@ def resample(image: Image.Image, point_count: int, *, label: str = "picture") ->
             f"target {shown(label)} is too thin to be resampled to {point_count} points, no opaque "
             "pixel would be left: thicken it or raise target_point_count"
         )
-    return _sample(padded, span, best)
+    return best
 
 
 def _margin(image: Image.Image, pitch: float) -> int:
@@ -232,6 +247,7 @@ def _margin(image: Image.Image, pitch: float) -> int:
 
 
 def _sample(padded: Image.Image, span: int, pitch: float) -> Image.Image:
+    """Return the middle `span` pixels of a picture and a border, scaled down by `pitch`."""
     side = math.ceil(span / pitch) + 2
     low = 0.5 * (padded.width - side * pitch)
     high = low + side * pitch

@@ -85,6 +85,7 @@ def load_mesh(source: str | Path) -> Mesh:
 
 
 def _read_mesh(path: Path) -> Mesh:
+    """Return the mesh in a file, as large as there; grey where the file has no colours."""
     try:
         import trimesh
     except ImportError as error:
@@ -105,6 +106,14 @@ def _read_mesh(path: Path) -> Mesh:
             f"target {shown(str(path))} cannot be read as a mesh ({type(error).__name__}: "
             f"{shown(error)}): save it again, for example as .ply or .glb"
         ) from error
+    _check_triangles(vertices, faces, path)
+    if colours.shape != vertices.shape or not np.isfinite(colours).all():
+        colours = np.full(vertices.shape, 0.6)
+    return Mesh(vertices, faces, colours)
+
+
+def _check_triangles(vertices: FloatArray, faces: NDArray[np.int64], path: Path) -> None:
+    """Raise NPAError unless a file's triangles exist, are finite, of a usual size, and no lines."""
     in_space = vertices.shape[1:] == (3,) and faces.shape[1:] == (3,)
     if not in_space or faces.size == 0 or vertices.size == 0 or not np.isfinite(vertices).all():
         raise NPAError(
@@ -129,9 +138,6 @@ def _read_mesh(path: Path) -> Mesh:
             f"target {shown(str(path))} must have a surface, but the corners of every triangle "
             "lie on a line: give triangles with an area"
         )
-    if colours.shape != vertices.shape or not np.isfinite(colours).all():
-        colours = np.full(vertices.shape, 0.6)
-    return Mesh(vertices, faces, colours)
 
 
 # Pictures of meshes.
