@@ -426,89 +426,48 @@ Morphogenesis2DTrainConfig = TrainConfig[Morphogenesis2DConfig]
 """A training run of 2D morphogenesis."""
 
 _TOGETHER: Mapping[str, Any] = {
-    "escape_weight": 10.0,
-    "bound_weight": 10.0,
-    "drift_weight": 1.0,
-    "clump_radius": 0.2,
+    "escape_weight": 10.0, "bound_weight": 10.0, "drift_weight": 1.0, "clump_radius": 0.2,
     "cut_gap": 0.1,
-}
+}  # fmt: skip
 """Settings for long stability and for healing clumps and cuts (docs/stability.md)."""
 
 HALF_SEEDS: Mapping[str, Any] = {
-    "optimiser": "adamw",
-    "seed_interval": 1,
-    "max_age_range": (0, 0),
-    "damage_share": 1.0,
+    "optimiser": "adamw", "seed_interval": 1, "max_age_range": (0, 0), "damage_share": 1.0,
     "stillness_weight": 0.0,
-}
+}  # fmt: skip
 """AdamW, with an initial world in every batch and no stillness loss: for several species
 (docs/species.md)."""
 
 MORPHOGENESIS2D_PRESETS = presets_of(
-    "morphogenesis2d",
-    paper=TrainConfig(task=Morphogenesis2DConfig()),
+    "morphogenesis2d", paper=TrainConfig(task=Morphogenesis2DConfig()),
     # Found by experiment on pictures that nobody tuned for: docs/recipes.md.
     best=TrainConfig(
         task=Morphogenesis2DConfig(
-            escape_share=2e-4,
-            damage_radius=0.2,
-            cut_share=0.5,
-            **_TOGETHER,
+            escape_share=2e-4, damage_radius=0.2, cut_share=0.5, **_TOGETHER,
         ),
-        repeats=1,
-        iterations=8000,
-        pool_size=64,
-        steps=(48, 80),
-        optimiser="muon",
-        learning_rate=3e-3,
-        weight_decay=0.1,
-        schedule="cosine",
-        max_age_range=(16, 16_384),
-        damage_and_keep_share=0.7,
-        damage_share=0.125,
-        stillness_min_age=1024,
-        stillness_weight=2.0,
-        stillness_power=4.0,
-        dead_zone=1e-3,
-        initial_rule="heart-first",
+        repeats=1, iterations=8000, pool_size=64, steps=(48, 80), optimiser="muon",
+        learning_rate=3e-3, weight_decay=0.1, schedule="cosine", max_age_range=(16, 16_384),
+        damage_and_keep_share=0.7, damage_share=0.125, stillness_min_age=1024, stillness_weight=2.0,
+        stillness_power=4.0, dead_zone=1e-3, initial_rule="heart-first",
     ),
     # A few particles that see far; of two worlds one is young, one grown and at rest:
     # docs/recipes.md.
     fast=fast_run(
         task=Morphogenesis2DConfig(
-            target_point_count=512,
-            particle_count=512,
-            eps=0.2,
-            seed_radius=0.4,
-            resolution=64,
-            escape_share=1e-3,
-            **_TOGETHER,
+            target_point_count=512, particle_count=512, eps=0.2, seed_radius=0.4, resolution=64,
+            escape_share=1e-3, **_TOGETHER,
         ),
-        iterations=2400,
-        pool_size=32,
-        steps=(16, 32),
-        optimiser="muon",
-        learning_rate=5e-3,
-        schedule="cosine",
-        max_age_range=(24, 256),
-        damage_share=0.5,
-        stillness_min_age=64,
-        stillness_weight=2.0,
-        picture_interval=200,
+        iterations=2400, pool_size=32, steps=(16, 32), optimiser="muon", learning_rate=5e-3,
+        schedule="cosine", max_age_range=(24, 256), damage_share=0.5, stillness_min_age=64,
+        stillness_weight=2.0, picture_interval=200,
     ),
     tiny=tiny_run(
         task=Morphogenesis2DConfig(
-            target="ring",
-            target_point_count=128,
-            particle_count=128,
-            hidden_dim=32,
-            eps=0.3,
+            target="ring", target_point_count=128, particle_count=128, hidden_dim=32, eps=0.3,
             resolution=32,
         ),
-        iterations=40,
-        steps=(8, 16),
-        milestones=(30,),
+        iterations=40, steps=(8, 16), milestones=(30,),
     ),
-)
+)  # fmt: skip
 """2D morphogenesis: `paper` (arXiv 2601.16096), `best` (any picture, one run of minutes on a GPU),
 `fast` (minutes on one core), `tiny` (tests)."""

@@ -256,17 +256,10 @@ PICTURE_MARGIN = 0.0625
 """Margin around [0, 1]² in pictures [length units]."""
 
 PALETTE = (
-    (0.90, 0.10, 0.29),
-    (0.24, 0.71, 0.29),
-    (1.00, 0.85, 0.10),
-    (0.26, 0.39, 0.85),
-    (0.96, 0.51, 0.19),
-    (0.57, 0.12, 0.71),
-    (0.27, 0.80, 0.85),
-    (0.94, 0.20, 0.90),
-    (0.50, 0.35, 0.14),
-    (0.05, 0.05, 0.05),
-)
+    (0.90, 0.10, 0.29), (0.24, 0.71, 0.29), (1.00, 0.85, 0.10), (0.26, 0.39, 0.85),
+    (0.96, 0.51, 0.19), (0.57, 0.12, 0.71), (0.27, 0.80, 0.85), (0.94, 0.20, 0.90),
+    (0.50, 0.35, 0.14), (0.05, 0.05, 0.05),
+)  # fmt: skip
 """Red, green and blue of class 0, 1, ..., repeated for more classes."""
 
 UNDECIDED = (0.6, 0.6, 0.6)
@@ -314,52 +307,24 @@ def channel_mean(values: Tensor) -> Tensor:
 POINT_CLASSIFICATION_PRESETS = presets_of(
     "point_classification",
     paper=TrainConfig(
-        task=PointClassificationConfig(),
-        iterations=50_000,
-        repeats=1,
-        world_count=64,
-        pool_size=1024,
-        steps=(12, 24),
-        learning_rate=1e-3,
-        weight_decay=0.1,
-        milestones=(20_000, 40_000),
-        seed_interval=1,
-        fresh_share=0.5,
+        task=PointClassificationConfig(), iterations=50_000, repeats=1, world_count=64,
+        pool_size=1024, steps=(12, 24), learning_rate=1e-3, weight_decay=0.1,
+        milestones=(20_000, 40_000), seed_interval=1, fresh_share=0.5,
     ),
     # Of clouds never seen 91 % are classified rightly, after some four minutes on one core.
     fast=fast_run(
         task=PointClassificationConfig(
-            stretch=0.1,
-            mutated_share=0.25,
-            particle_count=128,
-            hidden_dim=128,
-            readout_hidden_dim=64,
-            eps=0.2,
-            resolution=64,
+            stretch=0.1, mutated_share=0.25, particle_count=128, hidden_dim=128,
+            readout_hidden_dim=64, eps=0.2, resolution=64,
         ),
-        iterations=1500,
-        world_count=32,
-        pool_size=256,
-        steps=(12, 20),
-        milestones=(1100, 1400),
-        seed_interval=1,
-        fresh_share=0.5,
-        picture_interval=500,
-        checkpoint_interval=300,
+        iterations=1500, world_count=32, pool_size=256, steps=(12, 20), milestones=(1100, 1400),
+        seed_interval=1, fresh_share=0.5, picture_interval=500, checkpoint_interval=300,
     ),
     tiny=tiny_run(
         task=PointClassificationConfig(
-            particle_count=64,
-            hidden_dim=32,
-            readout_hidden_dim=32,
-            eps=0.25,
-            resolution=32,
+            particle_count=64, hidden_dim=32, readout_hidden_dim=32, eps=0.25, resolution=32,
         ),
-        world_count=8,
-        pool_size=32,
-        steps=(6, 10),
-        seed_interval=1,
-        fresh_share=0.5,
+        world_count=8, pool_size=32, steps=(6, 10), seed_interval=1, fresh_share=0.5,
     ),
-)
+)  # fmt: skip
 """Classification of point clouds: `paper` (arXiv 2601.16096), `fast` (on one core), `tiny`."""

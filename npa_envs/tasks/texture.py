@@ -124,7 +124,7 @@ JOINT_POWER = 0.5
 JITTER = 0.35
 """Largest displacement of a drawing's points from their lattice, as a fraction of its spacing."""
 
-DRAWINGS = 16
+DRAWING_COUNT = 16
 """Number of drawings that `Texture.drawable` averages."""
 
 
@@ -217,7 +217,7 @@ class Texture(ParticleTask[TextureConfig]):
     @cached_property
     def drawable(self) -> Tensor:
         """The target as sharp as splats can draw it: a mean of `drawing`s, shape [R, R, 4]."""
-        drawn = [self.drawing(number, shifted=False) for number in range(DRAWINGS)]
+        drawn = [self.drawing(number, shifted=False) for number in range(DRAWING_COUNT)]
         return torch.cat(drawn).mean(0)
 
     def texture_losses(self, x: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
@@ -327,55 +327,34 @@ def density_image(density: Tensor) -> Tensor:
 # Found by experiment: docs/textures.md. What is learned with 2048 particles holds for more.
 _BEST = TrainConfig(
     task=TextureConfig(
-        target="hearts",
-        particle_count=2048,
-        see_across=True,
-        loss="patch_ot+joint_swd",
+        target="hearts", particle_count=2048, see_across=True, loss="patch_ot+joint_swd",
         motion_weight=0.02,
     ),
-    iterations=8000,
-    repeats=1,
-    world_count=4,
-    pool_size=64,
-    steps=(24, 32),
-    optimiser="muon",
-    learning_rate=3e-3,
-    weight_decay=0.1,
-    schedule="cosine",
-    max_age_range=(64, 8192),
+    iterations=8000, repeats=1, world_count=4, pool_size=64, steps=(24, 32), optimiser="muon",
+    learning_rate=3e-3, weight_decay=0.1, schedule="cosine", max_age_range=(64, 8192),
     damage_share=0.5,
-)
+)  # fmt: skip
 
 TEXTURE_PRESETS = presets_of(
     "texture",
     paper=TrainConfig(
-        task=TextureConfig(loss="vgg_ot"),
-        iterations=12_000,
-        repeats=1,
-        steps=(16, 32),
-        learning_rate=1e-4,
-        weight_decay=0.1,
-        milestones=(3_000, 6_000, 9_000),
+        task=TextureConfig(loss="vgg_ot"), iterations=12_000, repeats=1, steps=(16, 32),
+        learning_rate=1e-4, weight_decay=0.1, milestones=(3_000, 6_000, 9_000),
     ),
     best=_BEST,
     # Three minutes on two cores.
     fast=replace(
         _BEST,
         task=replace(_BEST.task, target="dots", particle_count=1024, hidden_dim=64, resolution=64),
-        iterations=600,
-        world_count=2,
-        pool_size=32,
-        picture_interval=100,
-        checkpoint_interval=200,
+        iterations=600, world_count=2, pool_size=32, picture_interval=100, checkpoint_interval=200,
         tensorboard=False,
     ),
     tiny=tiny_run(
         task=TextureConfig(
             target="dots", particle_count=256, hidden_dim=32, eps=0.3, resolution=24
         ),
-        steps=(8, 16),
-        seed_interval=4,
+        steps=(8, 16), seed_interval=4,
     ),
-)
+)  # fmt: skip
 """Textures: `paper` (arXiv 2601.16096, needs VGG16's weights), `best` (any texture, one run of
 minutes on a GPU), `fast` (`best` in small, on a CPU), `tiny`."""

@@ -314,22 +314,16 @@ def _is_pair(value: object, kind: Callable[[object], bool]) -> bool:
     return isinstance(value, tuple) and len(value) == 2 and all(map(kind, value))
 
 
-SMALL: Mapping[str, Any] = {"repeats": 1, "world_count": 2, "tensorboard": False}
+SMALL_RUN: Mapping[str, Any] = {"repeats": 1, "world_count": 2, "tensorboard": False}
 
-fast_run = partial(TrainConfig, **SMALL, learning_rate=2e-3, checkpoint_interval=200)
+fast_run = partial(TrainConfig, **SMALL_RUN, learning_rate=2e-3, checkpoint_interval=200)
 """Makes the settings of a run of a few minutes on one core, from its task and other fields."""
 
 tiny_run = partial(
     TrainConfig,
-    **SMALL,
-    iterations=60,
-    pool_size=8,
-    learning_rate=5e-3,
-    milestones=(45,),
-    log_interval=1,
-    picture_interval=20,
-    checkpoint_interval=20,
-)
+    **SMALL_RUN, iterations=60, pool_size=8, learning_rate=5e-3, milestones=(45,), log_interval=1,
+    picture_interval=20, checkpoint_interval=20,
+)  # fmt: skip
 """Makes the settings of a run of a few seconds, for tests, from its task and other fields."""
 
 

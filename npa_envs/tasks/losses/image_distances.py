@@ -8,19 +8,19 @@ from torch import Tensor
 from npa_envs.errors import NPAError
 from npa_envs.ops import world_mean
 
-WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
+SIZE_EXPONENTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 """Exponents of the sizes, from fine to coarse (Wang et al. 2003)."""
 
-WINDOW = 11
+WINDOW_SIDE = 11
 """Largest side of the window [pixels]."""
 
-SPREAD = 1.5
+WINDOW_SPREAD = 1.5
 """Standard deviation of a window of 11 pixels [pixels]; proportional for smaller windows."""
 
 STABILISERS = (0.01**2, 0.03**2)
 """SSIM's constants C1 and C2 for pictures in [0, 1]."""
 
-FLOOR = 1e-4
+MIN_SIMILARITY = 1e-4
 """Least similarity of a size; below it the gradient is 0."""
 
 
@@ -38,14 +38,14 @@ class MultiScaleSimilarity:
     """
 
     def __init__(self, resolution: int, *, device: str | torch.device = "cpu") -> None:
-        least = 2 ** len(WEIGHTS[1:])
+        least = 2 ** len(SIZE_EXPONENTS[1:])
         if resolution < least:
             raise NPAError(
                 f"resolution must be at least {least} pixels for MS-SSIM, got {resolution}: raise "
                 "it, or set ssim_weight to 0"
             )
         sizes = [resolution]
-        for _ in WEIGHTS[1:]:
+        for _ in SIZE_EXPONENTS[1:]:
             sizes.append((sizes[-1] + 1) // 2)
         self._windows = [_window(size).float().to(device) for size in sizes]
         self._halvings = [_halving(size).to(device) for size in sizes[:-1]]
@@ -53,11 +53,11 @@ class MultiScaleSimilarity:
     def __call__(self, pictures: Tensor, target: Tensor) -> Tensor:
         """Return the similarity of pictures [..., R, R] of one channel, at most 1, shape [...]."""
         total = pictures.new_zeros(pictures.shape[:-2])
-        last = len(WEIGHTS) - 1
-        for size, (weight, window) in enumerate(zip(WEIGHTS, self._windows, strict=True)):
+        last = len(SIZE_EXPONENTS) - 1
+        for size, (weight, window) in enumerate(zip(SIZE_EXPONENTS, self._windows, strict=True)):
             whole, contrast = _similarity(pictures, target, window.to(pictures))
             factor = whole if size == last else contrast
-            total = total + weight * factor.clamp_min(FLOOR).log()
+            total = total + weight * factor.clamp_min(MIN_SIMILARITY).log()
             if size < last:
                 halving = self._halvings[size].to(pictures)
                 pictures = _from_both_sides(pictures, halving)
@@ -86,9 +86,9 @@ def _from_both_sides(pictures: Tensor, matrix: Tensor) -> Tensor:
 
 def _window(size: int) -> Tensor:
     """Return the weights of pixels in the window at each position along a side, in columns."""
-    width = min(WINDOW, size - 1 + size % 2)
+    width = min(WINDOW_SIDE, size - 1 + size % 2)
     offset = torch.arange(width, dtype=torch.float64) - width // 2
-    weights = torch.exp(-0.5 * (offset * (WINDOW / (SPREAD * width))) ** 2)
+    weights = torch.exp(-0.5 * (offset * (WINDOW_SIDE / (WINDOW_SPREAD * width))) ** 2)
     matrix = torch.zeros(size, size - width + 1, dtype=torch.float64)
     for first in range(matrix.shape[1]):
         matrix[first : first + width, first] = weights / weights.sum()

@@ -28,10 +28,8 @@ class LossOptions:
 
     tiles: bool = True
     """Whether the target's opposite edges fit together, so that patches may cross them."""
-
     seed: int = 0
     """Seed of the loss's directions, filters and positions."""
-
     vgg_weights: str = ""
     """File of VGG16's weights, for `vgg_ot`; empty: torch's usual folder of downloads."""
 
@@ -52,10 +50,8 @@ class LossEntry:
 
     summary: str
     """One line for lists."""
-
     make: Callable[[Tensor, LossOptions], TextureLoss]
     """Returns the loss against a target, shape [K, R, R]."""
-
     joint: bool = False
     """Whether it compares colours and density together, K = 4, with `Texture.drawable`."""
 
@@ -106,13 +102,13 @@ def _summed(losses: list[TextureLoss], images: Tensor) -> Tensor:
 
 # What the losses share: images at several sizes, their patches, quantiles.
 
-LEVELS = 4
+MAX_LEVELS = 4
 """Largest number of image sizes, each half of the one before."""
 
-MIN_SIDE = 12
+MIN_IMAGE_SIDE = 12
 """Least side of the smallest image size [pixels]."""
 
-POSITIONS = 64
+MAX_POSITIONS = 64
 """Largest number of positions along each side that are compared; larger images are subsampled."""
 
 ALIGNMENT = 64
@@ -126,9 +122,9 @@ class TextureDistance:
     """Whether `compare` returns the same for an image, bit for bit, in every batch."""
 
     def __init__(self, target: Tensor) -> None:
-        if target.shape[-1] < MIN_SIDE:
+        if target.shape[-1] < MIN_IMAGE_SIDE:
             raise NPAError(
-                f"resolution must be at least {MIN_SIDE} pixels, got {target.shape[-1]}: for "
+                f"resolution must be at least {MIN_IMAGE_SIDE} pixels, got {target.shape[-1]}: for "
                 "example 64"
             )
         self._shape = tuple(target.shape)
@@ -156,7 +152,7 @@ class TextureDistance:
 def level_count(resolution: int) -> int:
     """Return at how many sizes images of a resolution [pixels] are compared."""
     count = 1
-    while count < LEVELS and resolution % 2 == 0 and resolution // 2 >= MIN_SIDE:
+    while count < MAX_LEVELS and resolution % 2 == 0 and resolution // 2 >= MIN_IMAGE_SIDE:
         resolution //= 2
         count += 1
     return count
@@ -175,7 +171,7 @@ def pyramid(images: Tensor, count: int) -> list[Tensor]:
 
 def stride_of(level: Tensor, thinned: bool) -> int:
     """Return the distance [pixels] between an image's compared positions; 1 unless `thinned`."""
-    return max(1, level.shape[-1] // POSITIONS) if thinned else 1
+    return max(1, level.shape[-1] // MAX_POSITIONS) if thinned else 1
 
 
 def patches(images: Tensor, size: int, *, stride: int, wrap: bool) -> Tensor:
@@ -222,16 +218,16 @@ def quantiles(values: Tensor, count: int) -> Tensor:
 # Sliced Wasserstein distances. A texture is described, at each image size, by many features at each
 # position. The distributions of a feature over the positions are compared by sorting its values.
 
-PATCH = 5
+PATCH_SIDE = 5
 """Side of a patch [pixels]."""
 
 FILTERS = 24
 """Random filters of the first layer; each gives two features, its positive and negative part."""
 
-SECOND_PATCH = 3
+SECOND_PATCH_SIDE = 3
 """Side of a filter of the second layer [pixels]."""
 
-FLOOR = 0.01
+VARIANCE_FLOOR = 0.01
 """Added to the target's variance, so that a uniform target works too."""
 
 
@@ -243,7 +239,7 @@ class SlicedWasserstein(TextureDistance):
 
     `describe` is the class of a descriptor: it maps images to F features at M positions, [B, M, F]
     for each size. With `wrap` opposite edges are connected, else positions near them are left out.
-    With `thinned` there are at most `POSITIONS` along each side.
+    With `thinned` there are at most `MAX_POSITIONS` along each side.
     """
 
     same_in_every_batch = True
@@ -262,7 +258,7 @@ class SlicedWasserstein(TextureDistance):
                 quantiles(features[0].T, compared.shape[1]).to(target)
                 for features, compared in zip(described, thinned, strict=True)
             ]
-            self._scales = [1.0 / (each[0].var(0).mean() + FLOOR) for each in described]
+            self._scales = [1.0 / (each[0].var(0).mean() + VARIANCE_FLOOR) for each in described]
 
     def compare(self, images: Tensor) -> Tensor:
         """Return the distance of images [B, K, R, R] from the target, [B]."""
@@ -281,20 +277,23 @@ class PatchDescriptor:
 
     def __init__(self, like: Tensor, *, seed: int) -> None:
         generator = torch.Generator().manual_seed(seed)
-        size = like.shape[0] * PATCH * PATCH
+        size = like.shape[0] * PATCH_SIDE * PATCH_SIDE
         self.directions = [
             orthogonal(size, size, generator).to(like) for _ in range(level_count(like.shape[-1]))
         ]
         """Directions for each image size, columns of [K PATCH², K PATCH²]."""
 
     def __call__(self, images: Tensor, *, wrap: bool, thinned: bool) -> list[Tensor]:
-        """Return for each size of images, [B, K, R, R], M projected patches, [B, M, K PATCH²].
+        """Return M projected patches of images [B, K, R, R], [B, M, K PATCH_SIDE²], for each size.
 
-        `wrap`: also across opposite edges; `thinned`: at most `POSITIONS` patches along each side.
+        With `wrap` some lie across opposite edges. With `thinned` at most `MAX_POSITIONS` patches
+        are taken along each side.
         """
         sizes = pyramid(images, len(self.directions))
         return [
-            products(patches(level, PATCH, stride=stride_of(level, thinned), wrap=wrap), direction)
+            products(
+                patches(level, PATCH_SIDE, stride=stride_of(level, thinned), wrap=wrap), direction
+            )
             for level, direction in zip(sizes, self.directions, strict=True)
         ]
 
@@ -308,16 +307,16 @@ class FilterDescriptor:
 
     def __init__(self, like: Tensor, *, seed: int) -> None:
         generator = torch.Generator().manual_seed(seed)
-        channels, area = like.shape[0], PATCH * PATCH
+        channels, area = like.shape[0], PATCH_SIDE * PATCH_SIDE
         self.levels: list[tuple[Tensor, Tensor]] = []
         """Filters of both layers, in columns, for each size of the image."""
         for _ in range(level_count(like.shape[-1])):
             first = torch.randn(channels * area, FILTERS, generator=generator, dtype=torch.float64)
             first -= first.mean(0)
             first /= first.norm(dim=0)
-            means = torch.eye(channels, dtype=torch.float64).repeat_interleave(area, 0) / PATCH
+            means = torch.eye(channels, dtype=torch.float64).repeat_interleave(area, 0) / PATCH_SIDE
             first[:, :channels] = means
-            second = orthogonal(2 * FILTERS * SECOND_PATCH**2, 2 * FILTERS, generator)
+            second = orthogonal(2 * FILTERS * SECOND_PATCH_SIDE**2, 2 * FILTERS, generator)
             self.levels.append((first.to(like), second.to(like)))
 
     def __call__(self, images: Tensor, *, wrap: bool, thinned: bool) -> list[Tensor]:
@@ -326,13 +325,13 @@ class FilterDescriptor:
         for level, (first, second) in zip(
             pyramid(images, len(self.levels)), self.levels, strict=True
         ):
-            signed = products(patches(level, PATCH, stride=1, wrap=wrap), first)
+            signed = products(patches(level, PATCH_SIDE, stride=1, wrap=wrap), first)
             features = torch.cat((signed, -signed), dim=2).relu()
-            side = level.shape[-1] - (0 if wrap else PATCH - 1)
+            side = level.shape[-1] - (0 if wrap else PATCH_SIDE - 1)
             field = features.transpose(1, 2).reshape(len(images), -1, side, side)
             stride = stride_of(level, thinned)
             result.append(field[:, :, ::stride, ::stride].flatten(2).transpose(1, 2))
-            around = patches(field, SECOND_PATCH, stride=stride, wrap=wrap)
+            around = patches(field, SECOND_PATCH_SIDE, stride=stride, wrap=wrap)
             result.append(products(around, second))
         return result
 
@@ -368,7 +367,7 @@ class PatchTransport(TextureDistance):
             rows = patches(level, MATCHED_PATCH, stride=stride, wrap=options.tiles)[0].contiguous()
             spread = (rows.double() - rows.double().mean(0)).square().mean()
             self._expected.append(rows)
-            self._scales.append(1.0 / (spread + FLOOR))
+            self._scales.append(1.0 / (spread + VARIANCE_FLOOR))
 
     def compare(self, images: Tensor) -> Tensor:
         """Return the distance of images [B, K, R, R] from the target, [B]."""
@@ -455,8 +454,8 @@ class VGGTransport(TextureDistance):
         for numbers, width in VGG_LAYERS.items():
             group = []
             for number in numbers:
-                weight = _checked(file, f"features.{number}.weight", (width, channels, 3, 3))
-                bias = _checked(file, f"features.{number}.bias", (width,))
+                weight = _weight(file, f"features.{number}.weight", (width, channels, 3, 3))
+                bias = _weight(file, f"features.{number}.bias", (width,))
                 group.append((weight.to(target), bias.to(target)))
                 channels = width
             self._groups.append(group)
@@ -554,7 +553,7 @@ def load_vgg_weights(path: str | Path = "") -> dict[str, Any]:
     return content
 
 
-def _checked(weights: Mapping[str, Any], name: str, shape: tuple[int, ...]) -> Tensor:
+def _weight(weights: Mapping[str, Any], name: str, shape: tuple[int, ...]) -> Tensor:
     tensor = weights.get(name)
     if not isinstance(tensor, Tensor) or tuple(tensor.shape) != shape:
         got = tuple(tensor.shape) if isinstance(tensor, Tensor) else "nothing"

@@ -22,29 +22,29 @@ from npa_envs.world.randomness import Randomness, normal_draws, uniform_draws
 
 Split = Literal["train", "test"]
 
-LEVELS = 2048
+COORDINATE_COUNT = 2048
 """Coordinates are integers below this while points are chosen, so that squared distances are exact
 in float32 and every device chooses the same points."""
 
 INK = 0.5
 """A position has ink where the picture has at least this fraction of its darkest pixel."""
 
-CANDIDATES = (2, 3)
+CANDIDATE_FACTORS = (2, 3)
 """Least and largest number of candidates for each chosen point."""
 
-FINEST = 1024
+FINEST_GRID = 1024
 """Finest grid of candidates: cells along each side."""
 
-CHUNK = {"cpu": 256, "cuda": 1024}
+BATCH_SIZES = {"cpu": 256, "cuda": 1024}
 """Pictures that are sampled in one batch, by device; a CPU's fit into its caches."""
 
-CHUNK_CELLS = 1 << 24
+CELLS_PER_BATCH = 1 << 24
 """Largest number of grid cells in one batch."""
 
 MAX_IDX = 600_000_000
 """Largest IDX file [bytes of data]; the largest of EMNIST has 547 million."""
 
-CACHED = 4
+CACHED_DATA_SETS = 4
 """Number of data sets in the cache."""
 
 
@@ -54,15 +54,13 @@ class PointClouds:
 
     x: Tensor
     """Positions in [0, 1]² [length units], shape [M, N, 2]; y is up."""
-
     label: Tensor
     """Classes, int64, shape [M]."""
-
     coverage: float
     """Fraction of the unit square that has ink, averaged over the clouds."""
 
 
-@functools.lru_cache(CACHED)
+@functools.lru_cache(CACHED_DATA_SETS)
 def load_clouds(
     data: str,
     split: Split,
@@ -99,24 +97,24 @@ def sample_ink(
         raise NPAError(
             f"every picture must have ink, got an empty one at {int(np.argmin(darkest))}: remove it"
         )
-    least, most = (factor * particle_count for factor in CANDIDATES)
+    least, most = (factor * particle_count for factor in CANDIDATE_FACTORS)
     relative = torch.from_numpy(ink / darkest[:, None, None])
     x = torch.empty(len(ink), particle_count, 2, device=device)
     areas = torch.empty(len(ink))
     random = torch.Generator().manual_seed(sample_seed)
-    chunk = CHUNK[torch.device(device).type]
+    chunk = BATCH_SIZES[torch.device(device).type]
     waiting = torch.arange(len(ink))
     side = 1 << math.ceil(math.log2(2.0 * math.sqrt(least)))
     while len(waiting) > 0:
         cells, points = _grid_points(side, relative.shape[1:], random)
         finer = []
-        for part in torch.split(waiting, max(1, min(chunk, CHUNK_CELLS // side**2))):
+        for part in torch.split(waiting, max(1, min(chunk, CELLS_PER_BATCH // side**2))):
             enlarged = torch.nn.functional.interpolate(
                 relative[part][:, None], size=(side, side), mode="bilinear", align_corners=False
             )
             has_ink = enlarged.flatten(1)[:, cells] >= INK
             counts = has_ink.sum(1)
-            enough = (counts >= least) | (side >= FINEST)
+            enough = (counts >= least) | (side >= FINEST_GRID)
             finer.append(part[~enough])
             part, has_ink, counts = part[enough], has_ink[enough], counts[enough]
             if len(part) == 0:
@@ -127,7 +125,7 @@ def sample_ink(
             )
         waiting = torch.cat(finer)
         side *= 2
-    return (x + 0.5) / LEVELS, float(areas.mean())
+    return (x + 0.5) / COORDINATE_COUNT, float(areas.mean())
 
 
 def _grid_points(
@@ -139,9 +137,9 @@ def _grid_points(
     order = torch.randperm(side * side, generator=random)
     corner = torch.stack((order % side, side - 1 - order // side), dim=1)
     within = torch.rand(len(order), 2, generator=random)
-    points = (corner + within) * (LEVELS / side)
+    points = (corner + within) * (COORDINATE_COUNT / side)
     points *= torch.tensor((width / longer, height / longer))
-    return order, points.floor().clamp(max=LEVELS - 1)
+    return order, points.floor().clamp(max=COORDINATE_COUNT - 1)
 
 
 def _first(has_ink: Tensor, most: int) -> Tensor:

@@ -32,7 +32,7 @@ MAX_AREA = 2**26
 FORMATS = ("PNG", "JPEG", "BMP", "GIF", "PPM", "TIFF", "WEBP")
 """Pillow's names of the allowed formats. Others may start other programs, as EPS does."""
 
-MAX_GRID = 6144
+MAX_GRID_SIDE = 6144
 """Largest side of the grid that a picture is resampled to [pixels]."""
 
 MAX_POINT_COUNT = 2**24
@@ -216,12 +216,12 @@ def _best_pitch(
         return int((np.asarray(sampled) >= OPAQUE).sum())
 
     fine, coarse = pitch / 1.5, min(pitch * 1.5, span)
-    while span / fine <= MAX_GRID and count(fine) < point_count:
+    while span / fine <= MAX_GRID_SIDE and count(fine) < point_count:
         fine /= 1.5
-    if span / fine > MAX_GRID:
+    if span / fine > MAX_GRID_SIDE:
         raise NPAError(
             f"target {shown(label)} must give {point_count} points on a grid of at most "
-            f"{MAX_GRID} x {MAX_GRID} pixels, but its opaque pixels are few and far "
+            f"{MAX_GRID_SIDE} x {MAX_GRID_SIDE} pixels, but its opaque pixels are few and far "
             "apart: fill more of the picture, or lower target_point_count"
         )
     best, best_miss = pitch, abs(count(pitch) - point_count)

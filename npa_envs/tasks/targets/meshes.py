@@ -21,7 +21,7 @@ RADIUS = 0.85
 """Largest distance from the origin to which every mesh is scaled [length units]."""
 
 _MAX_FILE = 256 * 2**20
-_SIZES = 1e-30, 1e30
+_SIZE_RANGE = 1e-30, 1e30
 _MIN_AREA = 1e-12
 
 MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
@@ -34,10 +34,8 @@ class Mesh:
 
     vertices: FloatArray
     """Vertices [length units], shape [K, 3]."""
-
     faces: NDArray[np.int64]
     """Vertex indices of each triangle, counterclockwise from outside, shape [F, 3]."""
-
     colours: FloatArray
     """Red, green and blue of each vertex, in [0, 1], shape [K, 3]."""
 
@@ -127,10 +125,10 @@ def _check_triangles(vertices: FloatArray, faces: NDArray[np.int64], path: Path)
         )
     used = vertices[np.unique(faces)]
     size = float((used.max(axis=0) / 2 - used.min(axis=0) / 2).max()) * 2
-    if not _SIZES[0] <= size <= _SIZES[1] or np.abs(used).max() > _SIZES[1]:
+    if not _SIZE_RANGE[0] <= size <= _SIZE_RANGE[1] or np.abs(used).max() > _SIZE_RANGE[1]:
         raise NPAError(
-            f"target {shown(str(path))} must lie within {_SIZES[1]:g} of the origin and be of a "
-            f"size of at least {_SIZES[0]:g}, got a size of {size:.3g}: scale it"
+            f"target {shown(str(path))} must lie within {_SIZE_RANGE[1]:g} of the origin and be of "
+            f"a size of at least {_SIZE_RANGE[0]:g}, got a size of {size:.3g}: scale it"
         )
     a, b, c = ((vertices[faces[:, k]] - used.min(axis=0)) / size for k in range(3))
     if np.linalg.norm(np.cross(b - a, c - a), axis=1).max() < _MIN_AREA:

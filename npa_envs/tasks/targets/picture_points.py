@@ -34,13 +34,10 @@ class PointTarget:
 
     name: str
     """The built-in name, the emoji, or the picture file's name without its suffix."""
-
     points: Tensor
     """Pixel centres [length units], shape [M, 2], float32, y upwards, their mean at the origin."""
-
     colours: Tensor
     """Red, green and blue of each point in [0, 1] (dimensionless), shape [M, 3], float32."""
-
     pixel_size: float
     """Distance h between neighbouring points [length units]."""
 
@@ -54,7 +51,7 @@ class PointTarget:
         return replace(self, points=self.points.to(device), colours=self.colours.to(device))
 
 
-SIDE = 1.8
+TARGET_SIDE = 1.8
 """Side of the smallest square around the origin that contains a target [length units]; pictures
 show [-1, 1]²."""
 
@@ -112,7 +109,7 @@ def target_from_image(image: Image.Image, *, name: str, point_count: int = 4096)
     grid = np.stack([columns, -rows], axis=1).astype(np.float64)
     grid -= grid.mean(axis=0)
     # Half a pixel more on either side: a point represents a square of one pixel.
-    pixel_size = SIDE / (2 * float(np.abs(grid).max()) + 1)
+    pixel_size = TARGET_SIDE / (2 * float(np.abs(grid).max()) + 1)
     colours = pixels[rows, columns, :3].astype(np.float32) / 255
     return PointTarget(
         name=name,
@@ -135,7 +132,7 @@ FONTS = (
 """Files of colour-emoji fonts, of Linux, macOS, Windows and others."""
 
 # Bitmap fonts open only at the sizes that they hold: 109 is Noto's, 160, 96 ... are Apple's.
-_SIZES = (109, 160, 136, 128, 96, 72, 64, 48, 32)
+_FONT_SIZES = (109, 160, 136, 128, 96, 72, 64, 48, 32)
 _INK = (255, 0, 254)
 _KEYCAP, _PICTURE_STYLE = "\u20e3", "\ufe0f"
 
@@ -153,7 +150,7 @@ def find_emoji_fonts() -> list[ImageFont.FreeTypeFont]:
     """Return the colour-emoji fonts that Pillow finds in the system's folders of fonts."""
     fonts = []
     for name in FONTS:
-        for size in _SIZES:
+        for size in _FONT_SIZES:
             with contextlib.suppress(OSError):
                 fonts.append(ImageFont.truetype(name, size))
                 break

@@ -45,11 +45,9 @@ class TextureTarget:
 
     name: str
     """The built-in name, or the picture file's name without its suffix."""
-
     picture: Tensor
     """Red, green and blue, each times the density, and the density, dimensionless, shape
     [R, R, 4], float32, as pictures of worlds: the first row is the bottom."""
-
     tiles: bool
     """Whether opposite edges fit together."""
 

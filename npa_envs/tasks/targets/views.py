@@ -22,7 +22,7 @@ from npa_envs.tasks.targets.meshes import RADIUS, Mesh, draw_mesh, load_mesh
 DISTANCE = 3.2
 """Distance of cameras from the origin [length units]."""
 
-MAX_VIEWS = 2**27
+MAX_PIXELS = 2**27
 """Largest number of pixels of all views of a target; a pixel takes 16 bytes."""
 
 ANGLE = 40.0
@@ -35,7 +35,6 @@ class Views:
 
     cameras: Cameras
     """V cameras."""
-
     pictures: Tensor
     """Red, green and blue, each times alpha, and alpha, dimensionless, shape [V, H, W, 4]; the
     first row is the upper one."""
@@ -51,10 +50,8 @@ class ViewTarget:
 
     name: str
     """The built-in name, or the file's or folder's name."""
-
     training: Views
     """The views that the loss compares."""
-
     held_out: Views
     """The views that metrics compare."""
 
@@ -85,9 +82,9 @@ def load_views(
     for name, value in {"resolution": resolution, **counts}.items():
         check_count(name, value)
     pixels = (training_count + held_out_count) * resolution**2
-    if pixels > MAX_VIEWS:
+    if pixels > MAX_PIXELS:
         raise NPAError(
-            f"all views together must have at most {MAX_VIEWS} pixels, got {shown(pixels)} of "
+            f"all views together must have at most {MAX_PIXELS} pixels, got {shown(pixels)} of "
             f"resolution={shown(resolution)}: lower it, or take fewer views"
         )
     folder = home_path(source)
@@ -153,8 +150,8 @@ def nearest_camera(cameras: Cameras, elevation: float) -> int:
 
 # Folders of pictures and cameras in the format of NeRF-synthetic (Mildenhall et al. 2020).
 
-TRAINING = "transforms_train.json"
-HELD_OUT = ("transforms_test.json", "transforms_val.json")
+TRAINING_FILE = "transforms_train.json"
+HELD_OUT_FILES = ("transforms_test.json", "transforms_val.json")
 
 OPAQUE_ALPHA = 0.5
 """Alpha above which a pixel belongs to the scene."""
@@ -167,14 +164,14 @@ def read_nerf(
     folder: Path, resolution: int, training_count: int, held_out_count: int
 ) -> ViewTarget:
     """Return the target in a NeRF-synthetic folder, as `load_views` describes."""
-    held_out = next((folder / name for name in HELD_OUT if (folder / name).is_file()), None)
-    if held_out is None or not (folder / TRAINING).is_file():
+    held_out = next((folder / name for name in HELD_OUT_FILES if (folder / name).is_file()), None)
+    if held_out is None or not (folder / TRAINING_FILE).is_file():
         raise NPAError(
-            f"a folder of views must hold {TRAINING}, and {' or '.join(HELD_OUT)}, "
+            f"a folder of views must hold {TRAINING_FILE}, and {' or '.join(HELD_OUT_FILES)}, "
             f"{shown(str(folder))} does not: views to measure by must be others than those trained "
             "with"
         )
-    training = _read_views(folder / TRAINING, resolution, training_count)
+    training = _read_views(folder / TRAINING_FILE, resolution, training_count)
     measured = _read_views(held_out, resolution, held_out_count)
     radius = max(scene_radius(training), scene_radius(measured))
     if radius == 0.0:
