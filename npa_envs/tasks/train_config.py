@@ -1,4 +1,4 @@
-"""Configurations of training runs: of one rule, of several rules in one world; small runs."""
+"""Configurations of training runs: `TrainConfig`, of several rules in one world, of small runs."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ OptimiserName = Literal["adamw", "muon"]
 """Names of optimisers."""
 
 RISE = 0.01
-"""Fraction of a repeat in which the learning rate of the schedule "cosine" rises."""
+"""Fraction of a repeat in which the schedule "cosine" raises the learning rate from 0."""
 
 LOWEST = 0.01
 """Final learning rate of the schedule "cosine", as a fraction of the largest."""
@@ -57,8 +57,10 @@ MAX_POWER = 8.0
 class TrainConfig(Generic[TaskConfigT]):
     """A training run: the schedule, the pool, the optimiser, the machine, what is written.
 
-    The defaults are the paper's for 2D morphogenesis (arXiv 2601.16096). Fields of the task lie
-    in `task`; `npa_envs.training.override` and configuration files accept both by name.
+    The pool stores worlds between batches. In each iteration a batch of them is rolled out further,
+    the rule learns from the loss at the end, and the worlds go back into the pool. The defaults are
+    the paper's for 2D morphogenesis (arXiv 2601.16096). `npa_envs.training.override` and
+    configuration files take names of these fields and of those of `task`.
     """
 
     task: TaskConfigT
@@ -85,13 +87,14 @@ class TrainConfig(Generic[TaskConfigT]):
     """Optimiser steps in one repeat."""
 
     repeats: Common[int] = 3
-    """How often the schedule runs. Rule and pool continue; the optimiser is reset."""
+    """How often the schedule of `iterations` runs: rule and pool continue, the optimiser is
+    reset."""
 
     world_count: Common[int] = 8
-    """Worlds in a batch, B."""
+    """Number of worlds in a batch, B."""
 
     pool_size: Common[int] = 512
-    """Worlds that are stored between batches."""
+    """Number of worlds that are stored between batches."""
 
     steps: Common[tuple[int, int]] = (32, 96)
     """Range [lo, hi) that the number of steps of a rollout is drawn from, uniformly."""
@@ -114,11 +117,11 @@ class TrainConfig(Generic[TaskConfigT]):
     """The optimiser's weight decay."""
 
     seed_interval: int = 16
-    """Every this many batches, the batch begins with initial worlds; 1: every batch."""
+    """One batch in this many contains initial worlds; 1: every batch."""
 
     fresh_share: float = 0.0
-    """Fraction of initial worlds in a batch with some (`seed_interval`); at least one world. No
-    effect with `max_age_range`."""
+    """Fraction of initial worlds in such a batch (`seed_interval`); at least one world. No effect
+    with `max_age_range`."""
 
     max_age_range: tuple[int, int] = (0, 0)
     """Range of the lifetimes [steps] after which a world of the pool is replaced by an initial one,
@@ -148,7 +151,7 @@ class TrainConfig(Generic[TaskConfigT]):
     damage_share: float = 1.0
     """Fraction in [0, 1] of the pool whose worlds are damaged in every batch, so that a rule learns
     to heal: the first indices, which with `max_age_range` have the shortest lifetimes. All others
-    are damaged by `damage_and_keep_share` alone."""
+    are damaged by `damage_and_keep_share` only."""
 
     seed: Common[int] = 0
     """Seed of every random number of the run, in [0, 2**63)."""
@@ -255,7 +258,7 @@ class TrainConfig(Generic[TaskConfigT]):
 
     @property
     def fresh_count(self) -> int:
-        """Number of initial worlds in each batch that gets some: every `seed_interval`-th."""
+        """Number of initial worlds in a batch that contains some, by `fresh_share`."""
         return max(1, round(self.fresh_share * self.world_count))
 
     @property
@@ -271,9 +274,9 @@ class TrainConfig(Generic[TaskConfigT]):
     def learning_rate_at(self, iteration: int, fraction: float = 0.0) -> float:
         """Return the learning rate of an iteration, counted from 0 over all repeats.
 
-        A resumed run needs no scheduler state. Each repeat restarts it: steps at the milestones, or
-        a short linear rise and a cosine (Loshchilov and Hutter, arXiv 1608.03983). `fraction` is
-        the least progress along the cosine, from 0 to 1, also in earlier iterations.
+        It falls in steps at the milestones, or after a short linear rise along a cosine (Loshchilov
+        and Hutter, arXiv 1608.03983), and starts again in each repeat. The cosine is followed at
+        least to `fraction`, from 0 to 1, even if the iteration has not come so far.
         """
         within = iteration % self.iterations
         if self.schedule == "milestones":
@@ -287,13 +290,13 @@ class TrainConfig(Generic[TaskConfigT]):
 
 @dataclass(frozen=True, kw_only=True)
 class JointTrainConfig(TrainConfig[TaskConfigT]):
-    """A training run of several rules in one world; `initial_rule`, of one rule, must be empty."""
+    """A training run of several rules in one world; `initial_rule` must be empty."""
 
     initial_rules: Common[tuple[str, ...]] = ()
-    """Rules to start from, names of shipped rules or files, one for each species."""
+    """Rules to start from, one for each species: names or files; (): random weights."""
 
     frozen: Common[tuple[int, ...]] = ()
-    """Indices of the species, from 0, whose initial rules do not learn."""
+    """Indices of the species, from 0, whose initial rules stay as they are."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -311,24 +314,25 @@ class JointTrainConfig(TrainConfig[TaskConfigT]):
 
 
 def _is_pair(value: object, kind: Callable[[object], bool]) -> bool:
+    """Return whether a value is a tuple of two numbers for which `kind` is true."""
     return isinstance(value, tuple) and len(value) == 2 and all(map(kind, value))
 
 
 SMALL_RUN: Mapping[str, Any] = {"repeats": 1, "world_count": 2, "tensorboard": False}
 
 fast_run = partial(TrainConfig, **SMALL_RUN, learning_rate=2e-3, checkpoint_interval=200)
-"""Makes the settings of a run of a few minutes on one core, from its task and other fields."""
+"""A function that returns a `TrainConfig` of minutes on one core, from `task` and other fields."""
 
 tiny_run = partial(
     TrainConfig,
     **SMALL_RUN, iterations=60, pool_size=8, learning_rate=5e-3, milestones=(45,), log_interval=1,
     picture_interval=20, checkpoint_interval=20,
 )  # fmt: skip
-"""Makes the settings of a run of a few seconds, for tests, from its task and other fields."""
+"""A function that returns a `TrainConfig` of seconds, for tests, from `task` and other fields."""
 
 
 def presets_of(
     task_name: str, **runs: TrainConfig[TaskConfigT]
 ) -> Mapping[str, TrainConfig[TaskConfigT]]:
-    """Return the presets of a task, each of which writes to runs/<task_name>."""
+    """Return the `runs` by name, with runs/<task_name> as the folder that each writes to."""
     return {name: replace(run, out=Path("runs") / task_name) for name, run in runs.items()}

@@ -18,7 +18,7 @@ from npa_envs.tasks.targets.images import no_foreign_programs
 FloatArray = NDArray[np.float64]
 
 RADIUS = 0.85
-"""Largest distance from the origin to which every mesh is scaled [length units]."""
+"""Radius of the ball around the origin into which every mesh is scaled [length units]."""
 
 _MAX_FILE = 256 * 2**20
 _SIZE_RANGE = 1e-30, 1e30
@@ -40,14 +40,14 @@ class Mesh:
     """Red, green and blue of each vertex, in [0, 1], shape [K, 3]."""
 
     def fitted(self, radius: float = RADIUS) -> Mesh:
-        """Return the mesh with its bounding box centred, scaled into a ball of `radius`."""
+        """Return the mesh with its bounding box centred at 0, scaled into a ball of `radius`."""
         used = self.vertices[np.unique(self.faces)]
         middle = 0.5 * (used.min(axis=0) + used.max(axis=0))
         farthest = np.linalg.norm(used - middle, axis=1).max()
         return Mesh((self.vertices - middle) * (radius / farthest), self.faces, self.colours)
 
     def normals(self) -> FloatArray:
-        """Return unit normals at the vertices, weighted by the triangles' areas, shape [K, 3]."""
+        """Return unit normals at vertices, means over triangles weighted by area, shape [K, 3]."""
         a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
         flat = np.cross(b - a, c - a)
         sums = np.zeros_like(self.vertices)
@@ -68,7 +68,7 @@ def builtin_meshes() -> tuple[str, ...]:
 
 
 def load_mesh(source: str | Path) -> Mesh:
-    """Return a built-in mesh or the mesh in a file, scaled into a ball of radius 0.85."""
+    """Return a built-in mesh, by name, or the mesh in a file, scaled into a ball of radius 0.85."""
     if isinstance(source, str) and source in MESHES:
         with np.load(MESHES[source]) as file:
             return Mesh(file["vertices"], file["faces"].astype(np.int64), file["colours"]).fitted()
@@ -141,21 +141,21 @@ def _check_triangles(vertices: FloatArray, faces: NDArray[np.int64], path: Path)
 # Pictures of meshes.
 
 LIGHT = (0.35, 0.80, 0.50)
-"""Direction towards the light, fixed in the world."""
+"""Direction towards the light, fixed in the world; it need not have length 1."""
 
 AMBIENT = 0.6
-"""Brightness of a surface that faces away from the light, as a fraction."""
+"""Brightness of a surface that faces away from the light, where 1 is one that faces it."""
 
 SAMPLES = 2
-"""Samples along each side of a pixel."""
+"""Number of samples along each side of a pixel."""
 
 BATCH_LIMIT = 2**22
-"""Largest number of samples, of vertices, and of triangles' vertices of views that are drawn in one
-batch; a single view may have more."""
+"""Maximum number of samples, and of vertices, of the views that are drawn in one batch; a single
+view may have more."""
 
 
 def draw_mesh(mesh: Mesh, cameras: Cameras) -> NDArray[np.float32]:
-    """Return pictures of a mesh [V, H, W, 4]: colours times alpha, and alpha, in [0, 1].
+    """Return pictures of a mesh by V cameras, [V, H, W, 4]: colours times alpha, alpha, in [0, 1].
 
     Surfaces are matt and lit from a direction that is fixed in the world. Both sides of a triangle
     are visible. Triangles with a vertex nearer than `cameras.near` are left out. The first row is

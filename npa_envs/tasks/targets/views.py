@@ -23,10 +23,10 @@ DISTANCE = 3.2
 """Distance of cameras from the origin [length units]."""
 
 MAX_PIXELS = 2**27
-"""Largest number of pixels of all views of a target; a pixel takes 16 bytes."""
+"""Maximum number of pixels of all views of a target; a pixel takes 16 bytes."""
 
 ANGLE = 40.0
-"""Cameras' angle of view [degrees]: the unit ball fits into the picture."""
+"""Angle of view of cameras [degrees]: the unit ball fits into the picture."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,19 +34,19 @@ class Views:
     """Pictures and the cameras that took them."""
 
     cameras: Cameras
-    """V cameras."""
+    """Poses and lenses of V cameras."""
     pictures: Tensor
     """Red, green and blue, each times alpha, and alpha, dimensionless, shape [V, H, W, 4]; the
     first row is the upper one."""
 
     def to(self, device: str | torch.device) -> Views:
-        """Return the views on another device."""
+        """Return a copy on another device."""
         return Views(self.cameras.to(torch.device(device)), self.pictures.to(device))
 
 
 @dataclass(frozen=True, eq=False)
 class ViewTarget:
-    """A 3D target as pictures from all sides."""
+    """A 3D target: pictures of it from all sides."""
 
     name: str
     """The built-in name, or the file's or folder's name."""
@@ -56,7 +56,7 @@ class ViewTarget:
     """The views that metrics compare."""
 
     def to(self, device: str | torch.device) -> ViewTarget:
-        """Return the target on another device."""
+        """Return a copy on another device."""
         return ViewTarget(self.name, self.training.to(device), self.held_out.to(device))
 
 
@@ -106,7 +106,10 @@ def views_of_mesh(
 
 
 def surrounding_cameras(count: int, resolution: int, *, turn: float = 0.0) -> Cameras:
-    """Return cameras on a Fibonacci spiral, rotated by `turn` (of 1), pointing at the origin."""
+    """Return cameras on a Fibonacci spiral around the origin, at which they point.
+
+    The spiral is rotated by `turn` turns around the y axis.
+    """
     k = torch.arange(count, dtype=torch.float64)
     height = (2.0 * k + 1.0) / count - 1.0
     angle = math.tau * (k * (0.5 * (math.sqrt(5.0) - 1.0)) + turn)
@@ -123,12 +126,12 @@ def surrounding_cameras(count: int, resolution: int, *, turn: float = 0.0) -> Ca
 
 
 def composited(views: Tensor, background: Tensor) -> Tensor:
-    """Return views [..., 4] composited over a background [..., 3], shape [..., 3]."""
+    """Return the colours [..., 3] of views [..., 4] in front of a background [..., 3]."""
     return views[..., :3] + (1.0 - views[..., 3:]) * background
 
 
 def some_views(views: Views, index: Tensor) -> Views:
-    """Return the pictures and cameras with these indices."""
+    """Return the views with these indices, int64, shape [any]."""
     cameras = views.cameras
     intrinsics = cameras.intrinsics
     chosen = replace(
