@@ -21,6 +21,7 @@ from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Task
 from npa_envs.tasks.damage import random_particle
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
+from npa_envs.tasks.morphogenesis3d import Morphogenesis3D
 from npa_envs.tasks.point_classification import PointClassification, majority
 from npa_envs.world.brushes import cut, wipe_state
 from npa_envs.world.particles import Particles, combined
@@ -115,7 +116,7 @@ def measure(task: Task, x: Tensor, s: Tensor, step: int) -> EvaluationRow:
     """Return the measurements of worlds that are `step` steps after their seed."""
     loss, ratio = task.metric(x, s), None
     if task.has_views:
-        ratio = task.view_psnr(x, s)
+        ratio = cast(Morphogenesis3D, task).view_psnr(x, s)
     elif task.aligned:
         ratio = psnr(task.picture(x, s), task.target_picture.to(x.device))
     return EvaluationRow(

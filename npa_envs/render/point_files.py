@@ -11,7 +11,7 @@ from torch import Tensor
 
 from npa_envs.atomic_files import write_bytes
 from npa_envs.errors import NPAError
-from npa_envs.tasks.gaussian_outputs import FLAT, Gaussians
+from npa_envs.tasks.gaussian_outputs import HARMONIC_0, Gaussians
 
 MIN_OPACITY = 1e-6
 """Opacities are clipped to this distance from 0 and 1, so that logits are finite."""
@@ -93,7 +93,7 @@ def _numpy(values: Tensor) -> NDArray[np.float32]:
 
 def _colours(gaussians: Gaussians) -> NDArray[np.float32]:
     """Return red, green and blue in [0, 1], averaged over viewing directions, [N, 3]."""
-    return (FLAT * _numpy(gaussians.colours)[:, 0] + 0.5).clip(0.0, 1.0)
+    return (HARMONIC_0 * _numpy(gaussians.colours)[:, 0] + 0.5).clip(0.0, 1.0)
 
 
 def _rotations(gaussians: Gaussians) -> NDArray[np.float32]:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import torch
@@ -23,6 +24,7 @@ from npa_envs.render.point_files import write_gaussians, write_points, write_spl
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Task
 from npa_envs.tasks.damage import DamageEvent, damage_worlds
+from npa_envs.tasks.morphogenesis3d import Morphogenesis3D
 from npa_envs.world.particles import Particles
 from npa_envs.world.rollout import rollout_particles
 
@@ -142,12 +144,12 @@ def write_3d_world(
     paths = [folder / name for name in names]
     x, s, *_ = worlds
     frames = turntable_frames(
-        lambda cameras: drawn_by.views(x, s, cameras),
+        lambda cameras: cast(Morphogenesis3D, drawn_by).views(x, s, cameras),
         resolution=resolution,
         background=background,
         device=x.device,
     )
-    gaussians = task.gaussians(s)
+    gaussians = cast(Morphogenesis3D, task).gaussians(s)
     write_gif(paths[0], frames, fps=20.0)
     write_points(paths[1], x, gaussians)
     write_gaussians(paths[2], x, gaussians)

@@ -61,7 +61,7 @@ def shipped_rules(task: str | None = None) -> dict[str, Path]:
 
 
 def preset_rules() -> dict[str, Path]:
-    """Return the initial rules of presets and environments: name -> file, sorted by name.
+    """Return the rules that presets and environments start from: name -> file, sorted by name.
 
     They do not change when a shipped rule of the same picture is trained again.
     """
@@ -155,12 +155,21 @@ def save_rule(
         )
     header = {"format": FORMAT_NAME, "version": FORMAT_VERSION}
     header |= {name: json.dumps(value) for name, value in rule.hyper_parameters().items()}
-    if not isinstance(metadata, Mapping | None):
+    header |= _checked_metadata({} if metadata is None else metadata)
+    weights = {k: v.detach().cpu().contiguous() for k, v in rule.state_dict().items()}
+    check_weights(weights)
+    header["checksum"] = _checksum(header, weights)
+    write_bytes(path, _with_sorted_metadata(serialise(weights, metadata=header)))
+
+
+def _checked_metadata(metadata: Mapping[str, str]) -> Mapping[str, str]:
+    """Return the metadata of a rule's file; raise NPAError unless a header can hold it."""
+    if not isinstance(metadata, Mapping):
         raise NPAError(
             f"metadata must map text to text, got {type(metadata).__name__}: for example "
             "metadata={'trained by': 'me'}"
         )
-    for name, text in (metadata or {}).items():
+    for name, text in metadata.items():
         came = f"got {shown(name)}: {shown(text)}"
         if not isinstance(name, str) or not isinstance(text, str):
             raise NPAError(f"metadata must map text to text, {came}: use str()")
@@ -172,15 +181,11 @@ def save_rule(
             raise NPAError(
                 f"metadata must not use the name {shown(name)}: the format holds it itself"
             )
-        header[name] = text
-    weights = {k: v.detach().cpu().contiguous() for k, v in rule.state_dict().items()}
-    check_weights(weights)
-    header["checksum"] = _checksum(header, weights)
-    write_bytes(path, _with_sorted_metadata(serialise(weights, metadata=header)))
+    return metadata
 
 
 def _fits_a_file(rule: NPARule) -> bool:
-    """Return whether a file can hold the rule: it has no hooks and no layers of other types."""
+    """Return whether a rule has the layers of `NPARule` only and no hooks, so a file holds all."""
     loaded = _without_weights(rule.hyper_parameters())
     same_shapes = _shapes(rule.state_dict()) == _shapes(loaded.state_dict())
     if type(rule).forward is not NPARule.forward or is_altered(rule) or not same_shapes:
@@ -193,7 +198,7 @@ def _fits_a_file(rule: NPARule) -> bool:
 
 
 def _with_sorted_metadata(file: bytes) -> bytes:
-    """Return a safetensors file with sorted metadata, so that equal rules make equal files."""
+    """Return the bytes of a safetensors file with its metadata sorted, the same for equal rules."""
     size = int.from_bytes(file[:8], "little")
     header = json.loads(file[8 : 8 + size])
     header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
@@ -220,12 +225,15 @@ def rule_digest(rule: NPARule) -> str:
 
 
 def rule_file(source: str | Path) -> Path:
-    """Return the file from which `load_rule(source)` loads a rule."""
+    """Return the path of the file that `load_rule(source)` reads."""
     return _locate(source)[0]
 
 
 def rule_name(source: str) -> str:
-    """Return the name of a rule's file; for rule.safetensors, that of its folder."""
+    """Return a short name of a rule: what follows "#", or else its file's name without suffix.
+
+    Of a run's rule.safetensors it is the folder's name.
+    """
     if "#" in source:
         return source.rpartition("#")[2]
     path = rule_file(source)
@@ -233,7 +241,7 @@ def rule_name(source: str) -> str:
 
 
 def _locate(source: str | Path) -> tuple[Path, str | None]:
-    """Return the file of a rule, and the rule's name in it, after '#', or None."""
+    """Return the file that `source` names, and the rule's name in it: what follows "#", or None."""
     if not isinstance(source, str | os.PathLike):
         raise NPAError(
             f"source must be a rule's name or the path of its file, got {shown(source)}: "
@@ -267,7 +275,10 @@ def _locate(source: str | Path) -> tuple[Path, str | None]:
 
 
 def _read_ours(path: Path, *, with_weights: bool) -> tuple[dict[str, str], dict[str, Tensor]]:
-    """Return the metadata of a file that `save_rule` wrote, and, `with_weights`, its weights."""
+    """Return the metadata of a file that `save_rule` wrote, and its weights by name.
+
+    Without `with_weights` there are none.
+    """
     open_regular(path, limit=_MAX_FILE).close()
     try:
         with safe_open(path, framework="pt") as file:
@@ -302,6 +313,7 @@ def _checksum(header: Mapping[str, str], weights: Mapping[str, Tensor]) -> str:
 
 
 def _parse(header: Mapping[str, str], name: str, cls: type) -> Any:
+    """Return the hyper-parameter `name` in a file's metadata, of type `cls`."""
     if name not in header:
         raise NPAError(f"the metadata lacks {name!r}: save the rule again with npa_envs.save_rule")
     try:
@@ -320,7 +332,7 @@ def _parse(header: Mapping[str, str], name: str, cls: type) -> Any:
 
 
 def _without_weights(hyper_parameters: Mapping[str, Any]) -> NPARule:
-    """Return a rule on torch's meta device: its weights have shapes and no memory."""
+    """Return a rule on torch's meta device, where weights have a shape and no values."""
     try:
         with torch.device("meta"):
             return NPARule(**hyper_parameters)
@@ -329,7 +341,7 @@ def _without_weights(hyper_parameters: Mapping[str, Any]) -> NPARule:
 
 
 def rule_like(hyper_parameters: Mapping[str, Any]) -> NPARule:
-    """Return a rule on the CPU whose weights have arbitrary values and are to be loaded."""
+    """Return a rule on the CPU with uninitialised weights, for a state dict to be loaded into."""
     return _without_weights(hyper_parameters).to_empty(device="cpu")
 
 
@@ -338,7 +350,7 @@ def _shapes(weights: Mapping[str, Tensor]) -> dict[str, tuple[int, ...]]:
 
 
 def _assemble(parts: RuleParts) -> NPARule:
-    """Return the rule with these hyper-parameters and weights; no random weights are drawn."""
+    """Return the rule with these hyper-parameters and weights; torch's random state is kept."""
     rule = _without_weights(parts.hyper_parameters)
     expected, got = _shapes(rule.state_dict()), _shapes(parts.weights)
     if got != expected:

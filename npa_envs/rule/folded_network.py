@@ -1,4 +1,7 @@
-"""A rule's network as steps run it: fused weights that map rows of perception to updates."""
+"""A rule's network as steps run it, "folded": biases and padding are parts of the weight matrices.
+
+A row is the input of the network for one particle: its perception vector z, then 1, then zeros.
+"""
 
 from __future__ import annotations
 
@@ -12,14 +15,14 @@ from npa_envs.ops.equivariance import VectorSizes, read_rows, steer_rows
 from npa_envs.ops.network import ArrangedWeights, arrange_weights, run_network
 
 FOLD = 4
-"""Rows of perception and of updates are padded to a multiple of this: 16 bytes of float32."""
+"""The lengths of rows and of updates are rounded up to a multiple of this, 16 bytes of float32."""
 
 OUTPUT_BLOCKS = 4
-"""Number of blocks in which the sum over hidden units is computed."""
+"""Number of partial sums that the sum over hidden units is computed from, to limit rounding."""
 
 
 def _blocked_product(hidden: Tensor, weight: Tensor) -> Tensor:
-    """Return hidden @ weight.T; the sum over hidden units is computed in blocks."""
+    """Return hidden @ weight.T, as a sum of the products of `OUTPUT_BLOCKS` blocks of units."""
     blocks = OUTPUT_BLOCKS if hidden.shape[1] % OUTPUT_BLOCKS == 0 else 1
     left = hidden.view(hidden.shape[0], blocks, -1).transpose(0, 1)
     right = weight.view(weight.shape[0], blocks, -1).permute(1, 2, 0)
@@ -57,8 +60,8 @@ def without_small(update: Tensor, dead_zone: float) -> Tensor:
 class FoldedRule(NamedTuple):
     """A rule's network as two matrix products: the bias is a column of the first matrix.
 
-    A row of input is a particle's perception vector z, then 1, then zeros. That saves the passes
-    over all rows that a bias and its gradient cost, and aligns the rows.
+    It is multiplied by the 1 that follows the perception vector in a row. That saves the passes
+    over all rows that a bias and its gradient cost.
     """
 
     hidden_weight: Tensor
@@ -66,24 +69,24 @@ class FoldedRule(NamedTuple):
     output_weight: Tensor
     """W2, then rows of zeros, shape [A', H]."""
     arranged: ArrangedWeights | None = None
-    """Both in the order of the fused kernels, if there are such for the device and sizes."""
+    """Both as the kernel of the whole network reads them; None: it does not run these sizes."""
     joined: Tensor | None = None
-    """Both flattened into one tensor for these kernels, so that gradients are added at once."""
+    """Both flattened into one tensor for that kernel, so that their gradients are one as well."""
     dead_zone: float = 0.0
-    """Outputs y with |y| <= this are set to 0."""
+    """Outputs y with |y| <= `dead_zone` are set to 0 (dimensionless)."""
 
     @property
     def row_width(self) -> int:
-        """Length of a row of input: that of z plus 1, rounded up to a multiple of `FOLD`."""
+        """Length of a row: P + 1, rounded up to a multiple of `FOLD`."""
         return self.hidden_weight.shape[1]
 
     @property
     def update_width(self) -> int:
-        """Length A' of an output: that of an update, A, rounded up to a multiple of `FOLD`."""
+        """Length A' of an output: A of an update, rounded up to a multiple of `FOLD`."""
         return self.output_weight.shape[0]
 
     def __call__(self, rows: Tensor) -> Tensor:
-        """Map K rows of input, [K, row_width], to K updates, each followed by zeros, [K, A']."""
+        """Return the updates of K rows [K, row_width], each followed by zeros, shape [K, A']."""
         update: Tensor
         if self.arranged is not None and self.joined is not None:
             update = run_network(rows, self.joined, self.output_weight.shape, self.arranged)
@@ -96,24 +99,28 @@ class FoldedRule(NamedTuple):
 
 
 class FoldedInvariants(NamedTuple):
-    """An equivariant rule's network: it mixes vectors, and its two matrix products gate these."""
+    """An equivariant rule's network: a displacement is a weighted sum of mixed vectors.
+
+    Mixed vectors are linear combinations of the perceived ones. Their weights in the sum are gates:
+    outputs of two matrix products.
+    """
 
     products: FoldedRule
-    """The matrix products; inputs are scalars and products of mixed vectors, outputs are gates,
-    scaled by the size of their steering weights, and Δs."""
+    """The matrix products, from scalars and products of mixed vectors to gates and Δs; its second
+    matrix contains the sizes of `NPARule.steering`, the gates' factors."""
     mixing: Tensor
-    """Weights that mix vectors."""
+    """Coefficients of the linear combinations, shape [perceived, mixed]."""
     signs: Tensor
-    """Signs of the steering weights: along or against the vector."""
+    """Signs of the gates' factors, 1 or -1: a gate moves along or against its vector."""
     form: VectorSizes
-    """Positions of vectors in a row."""
+    """Numbers of scalars and vectors."""
     row_width: int
-    """Length of a row of input."""
+    """Length of a row: P + 1, rounded up to a multiple of `FOLD`."""
     update_width: int
-    """Length A' of an output."""
+    """Length A' of an output: A of an update, rounded up to a multiple of `FOLD`."""
 
     def __call__(self, rows: Tensor) -> Tensor:
-        """Map K rows of input, [K, row_width], to K updates, each followed by zeros, [K, A']."""
+        """Return the updates of K rows [K, row_width], each followed by zeros, shape [K, A']."""
         mixed, inputs = read_rows(rows, self.mixing, self.form, self.products.row_width)
         output = self.products(inputs)
         if len(self.signs) == 0:
@@ -122,13 +129,13 @@ class FoldedInvariants(NamedTuple):
 
 
 Network = FoldedRule | FoldedInvariants
-"""Maps rows of perception to updates."""
+"""Maps rows [K, row_width] to updates [K, A']."""
 
 
 def fold_weights(
     hidden_weight: Tensor, output_weight: Tensor, dead_zone: float = 0.0
 ) -> FoldedRule:
-    """Return a `FoldedRule` of padded matrices, also as kernels read them; differentiable."""
+    """Return the `FoldedRule` of two padded matrices, differentiable in these."""
     arranged = arrange_weights(hidden_weight, output_weight)
     if arranged is None:
         return FoldedRule(hidden_weight, output_weight, dead_zone=dead_zone)

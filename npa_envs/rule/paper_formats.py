@@ -79,7 +79,7 @@ _IGNORED = {"N0"}
 
 @dataclass(frozen=True)
 class RuleParts:
-    """What a file holds of an `NPARule`: its arguments, and its state dict."""
+    """An `NPARule` as read from a file: the arguments of its constructor, and its state dict."""
 
     hyper_parameters: dict[str, Any]
     weights: dict[str, Tensor]
@@ -105,7 +105,7 @@ def check_weights(weights: Mapping[str, Tensor]) -> None:
 
 
 def read_state_dict(data: bytes) -> RuleParts:
-    """Return the `RuleParts` in the authors' state dict, whose shapes determine D and C."""
+    """Return the rule in a file of the authors' state dict; shapes of its tensors give D and C."""
     state = _unpickle(data)
     known, rule_type, more = _WEIGHT_NAMES, "", f" and, with a read-out, {sorted(_DECODER_NAMES)}"
     if state.keys() & _EQUIVARIANT_NAMES:
@@ -137,7 +137,7 @@ def read_state_dict(data: bytes) -> RuleParts:
 def _parts(
     weights: dict[str, Tensor], scalars: Mapping[Any, Any], **hyper_parameters: Any
 ) -> RuleParts:
-    """Return `RuleParts`, with `eps0` and `alpha`, which all formats have, from `scalars`."""
+    """Return `RuleParts` in 2D if not said otherwise, with `eps0` and `alpha` of `scalars`."""
     common = {name: _scalar(name, scalars.get(name)) for name in ("eps0", "alpha")}
     sizes = {"space_dim": _DEMO_SPACE_DIM, "hidden_dim": len(weights["hidden.weight"])}
     return RuleParts(sizes | common | hyper_parameters, weights)
@@ -146,9 +146,9 @@ def _parts(
 def _equivariant_parts(
     tensors: Mapping[str, Tensor], scalars: Mapping[Any, Any], *, padded: bool = False
 ) -> RuleParts:
-    """Return `RuleParts` of a 2D equivariant rule from values with the names of `models.json`.
+    """Return `RuleParts` of a 2D equivariant rule from tensors with the names of `models.json`.
 
-    Tensors may be `padded` with zeros.
+    `scalars` has `eps0` and `alpha`. `padded` tensors end in zeros, which are cut off.
     """
     mixing = tensors["W_hidden"]
     state_dim, mixed = mixing.shape[0] - 1, mixing.shape[1]
@@ -184,17 +184,21 @@ def _equivariant_parts(
 
 
 def read_demo_json(data: bytes, name: str | None) -> RuleParts:
-    """Return the `RuleParts` of the rule `name` in a JSON file of the authors' web demo."""
+    """Return the rule `name` in a JSON file of the authors' web demo; None: its only rule."""
     entry, index = _demo_rule(parse_json(data), name)
-    if "W_hidden" in entry:
-        tensors = {
-            known: _decode(entry, known, 1 if known.endswith("bias") else 2, index)
-            for known in _EQUIVARIANT_NAMES.values()
-        }
-        # Each number is repeated.
-        repeated = ("W_hidden", "W_out")
-        tensors |= {known: tensors[known][:, ::_TEXEL] for known in repeated}
-        return _equivariant_parts(tensors, entry, padded=True)
+    if "W_hidden" not in entry:
+        return _plain_demo_parts(entry, index)
+    tensors = {
+        known: _decode(entry, known, 1 if known.endswith("bias") else 2, index)
+        for known in _EQUIVARIANT_NAMES.values()
+    }
+    # Each number is repeated.
+    tensors |= {known: tensors[known][:, ::_TEXEL] for known in ("W_hidden", "W_out")}
+    return _equivariant_parts(tensors, entry, padded=True)
+
+
+def _plain_demo_parts(entry: Mapping[str, Any], index: int | None) -> RuleParts:
+    """Return `RuleParts` of a rule that is not equivariant; `index` is its place in a stack."""
     first = _decode(entry, "w1.weight", 2, index)
     bias = _decode(entry, "w1.bias", 1, index)
     second = _decode(entry, "w2.weight.T", 2, index)
@@ -251,9 +255,10 @@ def save_demo_json(
     *,
     particle_counts: Mapping[str, int] | None = None,
 ) -> None:
-    """Write rules as a collection of the authors' web demo, in float32.
+    """Write rules, by name, to one JSON file that the authors' web demo reads, in float32.
 
-    `load_rule("models.json#name")` reads each of them.
+    `particle_counts` are those of the demo's worlds, by default `DEMO_PARTICLE_COUNT` each.
+    `load_rule("models.json#name")` reads each rule.
     """
     path = checked_path(path)
     if path.suffix != ".json":
@@ -359,7 +364,10 @@ def _matrix(name: str, value: Any) -> Tensor:
 def _infer_dimensions(
     perception_dim: int, update_dim: int, channels: int | None
 ) -> tuple[int, int, bool]:
-    """Return (D, C, static) such that P = C(2+D)+D and A = C+D, or C if static."""
+    """Return (D, C, static) such that P = C(2+D)+D and A = C+D, or C if static.
+
+    `channels` is C as the read-out's shape says; None: the rule has no read-out.
+    """
     fitting = []
     for space_dim in (2, 3):
         state_dim, rest = divmod(perception_dim - space_dim, 2 + space_dim)
@@ -377,7 +385,7 @@ def _infer_dimensions(
 
 
 def _scalar(name: str, value: Any) -> float:
-    """Return the shortest decimal number that rounds to `value` in float32."""
+    """Return the shortest decimal number that rounds to the float32 `value`, such as 0.1."""
     if isinstance(value, Tensor):
         _check_not_expanded(name, value)
     number = checked_finite(name, value)
@@ -393,7 +401,10 @@ def _as_float32(number: float) -> float:
 
 
 def _decode(entry: Mapping[str, Any], name: str, rank: int, index: int | None) -> Tensor:
-    """Return the tensor `name` of a rule, of `rank` dimensions; `index`: the rule's in a stack."""
+    """Return the tensor `name`, of `rank` dimensions, of a rule in the authors' JSON.
+
+    `index` is the rule's place in a stack; None: the rule stands by itself.
+    """
     stacked = index is not None
     rank += stacked
     packed = entry.get(name)

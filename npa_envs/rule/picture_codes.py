@@ -32,7 +32,7 @@ class Codes(nn.Module):
     """
 
     table: Tensor
-    """The codes, shape [pictures, code_dim]: parameters, or the encoder's last outputs."""
+    """A code for each name, shape [names, code_dim]: parameters, or the encoder's last outputs."""
 
     def __init__(self, names: Sequence[str], dim: int, *, encoder: bool = False) -> None:
         super().__init__()
@@ -67,7 +67,7 @@ class Codes(nn.Module):
         return torch.stack(parts).sum(dim=0)
 
     def encode(self, pictures: Tensor) -> Tensor:
-        """Return the codes of pictures [B, R, R, 4], shape [B, code_dim]; differentiable."""
+        """Return the encoder's codes of pictures [B, R, R, 4], [B, code_dim]; differentiable."""
         if self.encoder is None:
             raise NPAError("this rule has no encoder: train one with encoder=True (--encoder)")
         if pictures.ndim != 4 or pictures.shape[3] != 4 or pictures.shape[1] != pictures.shape[2]:
@@ -86,7 +86,7 @@ def replace_code(states: Tensor, code: Tensor) -> Tensor:
 
 
 def checked_names(names: Any) -> tuple[str, ...]:
-    """Return names of codes as a tuple; raise NPAError unless they are different strings."""
+    """Return `names` as a tuple; raise NPAError unless they are a list of different strings."""
     is_list = isinstance(names, Collection) and not isinstance(names, str)
     if not is_list or not all(isinstance(name, str) for name in names):
         raise NPAError(

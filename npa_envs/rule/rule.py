@@ -37,40 +37,22 @@ COLOUR_OFFSET = 0.5
 """Added to a particle's last three outputs to get its colour, dimensionless."""
 
 INIT_GAIN = 0.1
-"""Gain of the Xavier-uniform initialisation: a fresh rule hardly moves its particles."""
+"""Gain of the Xavier-uniform initialisation: an untrained rule hardly moves its particles."""
 
 MAX_DIM = 65536
 """Largest dimension of a rule."""
 
 LIFE = 0
-"""State channel that is 1 for living and 0 for dead particles, in rules that divide."""
+"""Index of the state that is 1 for living and 0 for dead particles, in rules that divide."""
 
 FIRST_FATES = (5.0, -8.0)
-"""Initial log odds of division and of death against neither."""
+"""Initial log odds of division, and of death, against the event that neither happens."""
 
-
-STEP_PARTS = frozenset(
-    [
-        "__call__",
-        "__getattr__",
-        "__getattribute__",
-        "_call_impl",
-        "_folded",
-        "_folded_invariants",
-        "_with_code_zeros",
-        "division_probabilities",
-        "folded",
-        "forward",
-        "input_dim",
-        "network",
-        "network_weights",
-        "output_dim",
-        "perception_dim",
-        "update_dim",
-        "update_weight",
-        "vector_form",
-    ]
-)
+STEP_PARTS = frozenset([
+    "__call__", "__getattr__", "__getattribute__", "_call_impl", "_folded", "_folded_invariants",
+    "_with_code_zeros", "division_probabilities", "folded", "forward", "input_dim", "network",
+    "network_weights", "output_dim", "perception_dim", "update_dim", "update_weight", "vector_form",
+])  # fmt: skip
 """Attributes that a step uses: a subclass that overrides one of them is not plain."""
 
 
@@ -82,9 +64,10 @@ class NPARule(nn.Module):
 
     An equivariant rule commutes with rotations: rotated worlds stay rotated. It mixes the gradients
     that it perceives, u = mixing^T v, and its network reads the states and the scalar products of
-    pairs of mixed vectors. In place of δ it outputs gates g, and δ = Σ relu(g_a) steering_a u_a, as
-    rules of the authors' web demo do. Without `chiral` it commutes with reflections too. With it, a
-    rule of 2D worlds also reads u_a × u_b, and has gates for the vectors rotated by 90 degrees.
+    pairs of mixed vectors u_a. In place of δ it outputs a number g_a for each of them, its gate,
+    and δ = Σ relu(g_a) steering_a u_a, as rules of the authors' web demo do. Without `chiral` it
+    commutes with reflections too. With it, a rule of 2D worlds also reads u_a × u_b, and has gates
+    for the vectors rotated by 90 degrees.
 
     Args:
         space_dim: Space dimension D, 2 or 3.
@@ -115,7 +98,7 @@ class NPARule(nn.Module):
     Equivariance:
         equivariant: The rule is rotation-equivariant.
         chiral: An equivariant rule of 2D worlds distinguishes left from right.
-        mixed_vectors: Mixed vectors of an equivariant rule, at least 1.
+        mixed_vectors: Number of mixed vectors of an equivariant rule, at least 1.
 
     Codes:
         code_dim: Length of a code, which names what to grow: the first `code_dim` state channels,
@@ -175,21 +158,25 @@ class NPARule(nn.Module):
         self.encoder = checked_flag("encoder", encoder)
         self.divides = checked_flag("divides", divides)
         self._check_combinations()
+        self._make_layers()
+        self.codes = Codes(code_names, code_dim, encoder=encoder) if code_dim else None
+        """The known codes, or None without `code_dim`."""
 
-        self.hidden = nn.Linear(self.input_dim, hidden_dim)
-        self.output = nn.Linear(hidden_dim, self.output_dim, bias=False)
+    def _make_layers(self) -> None:
+        self.hidden = nn.Linear(self.input_dim, self.hidden_dim)
+        self.output = nn.Linear(self.hidden_dim, self.output_dim, bias=False)
         self.readout: nn.Sequential | None = None
-        if readout_dim:
+        if self.readout_dim:
             self.readout = nn.Sequential(
-                nn.Linear(state_dim, readout_hidden_dim),
+                nn.Linear(self.state_dim, self.readout_hidden_dim),
                 nn.ReLU(),
-                nn.Linear(readout_hidden_dim, readout_dim),
+                nn.Linear(self.readout_hidden_dim, self.readout_dim),
             )
         for module in self.modules():
             if isinstance(module, nn.Linear):
                 nn.init.xavier_uniform_(module.weight, gain=INIT_GAIN)
         if self.divides:
-            self.fate = nn.Linear(state_dim, 2)
+            self.fate = nn.Linear(self.state_dim, 2)
             with torch.no_grad():
                 self.fate.weight.zero_()
                 self.fate.bias.copy_(torch.tensor(FIRST_FATES))
@@ -199,8 +186,6 @@ class NPARule(nn.Module):
             self.mixing = nn.Parameter(nn.init.xavier_uniform_(mixing))
             steering = torch.empty(1, 0 if self.static else vectors.gate_count)
             self.steering = nn.Parameter(nn.init.xavier_uniform_(steering)[0])
-        self.codes = Codes(code_names, code_dim, encoder=encoder) if code_dim else None
-        """The known codes, or None without `code_dim`."""
 
     def _check_sizes(self) -> None:
         if not is_whole(self.space_dim) or self.space_dim not in (2, 3):
@@ -213,10 +198,6 @@ class NPARule(nn.Module):
                 "a read-out needs readout_hidden_dim of at least 1, got "
                 f"{self.readout_hidden_dim} with readout_dim={self.readout_dim}"
             )
-
-    def share(self, rule: NPARule) -> None:
-        """Take another rule's parameters and settings, not copied; in place of `__init__`."""
-        vars(self).update(vars(rule))
 
     def _check_combinations(self) -> None:
         zone, species_count, code_dim = self.dead_zone, self.species_count, self.code_dim
@@ -262,15 +243,19 @@ class NPARule(nn.Module):
                 "leave these out"
             )
 
+    def share(self, rule: NPARule) -> None:
+        """Take another rule's settings and parameters, not copied; in place of `__init__`."""
+        vars(self).update(vars(rule))
+
     @property
     def terms(self) -> Terms:
-        """Which gradients the rule perceives, and how the state gradient is corrected."""
+        """Which gradients the rule perceives, and how the moment matrix corrects one of them."""
         inverse = self.moment_inverse if self.moment_correction else None
         return Terms(self.state_gradient, inverse, self.density_gradient)
 
     @property
     def vector_form(self) -> VectorSizes:
-        """How many scalars and vectors an equivariant rule perceives, and how many it mixes."""
+        """Numbers of an equivariant rule's perceived scalars and vectors, and of mixed vectors."""
         vectors = self.state_dim * self.state_gradient + self.density_gradient
         return VectorSizes(
             self.space_dim, 2 * self.state_dim, vectors, self.mixed_vectors, self.chiral
@@ -278,12 +263,12 @@ class NPARule(nn.Module):
 
     @property
     def input_dim(self) -> int:
-        """Inputs of the hidden layer: P; for an equivariant rule its scalars and products."""
+        """Number of the hidden layer's inputs: P, or an equivariant rule's scalars and products."""
         return self.vector_form.input_dim if self.equivariant else self.perception_dim
 
     @property
     def output_dim(self) -> int:
-        """Outputs of the second layer: A - code_dim; for an equivariant rule its gates and Δs."""
+        """Number of the second layer's outputs: A - code_dim; equivariant rules: gates and Δs."""
         if not self.equivariant or self.static:
             return self.update_dim - self.code_dim
         return self.vector_form.gate_count + self.state_dim
@@ -329,7 +314,7 @@ class NPARule(nn.Module):
         return self._with_code_zeros(self.output.weight, dim=0)
 
     def _with_code_zeros(self, outputs: Tensor, *, dim: int) -> Tensor:
-        """Insert zeros for the code, which no update changes, after δ in dimension `dim`."""
+        """Return updates with zeros inserted for the code, after δ in dimension `dim`."""
         if self.code_dim == 0:
             return outputs
         moves, states = outputs.tensor_split([self.update_dim - self.state_dim], dim=dim)
@@ -338,9 +323,9 @@ class NPARule(nn.Module):
         return torch.cat((moves, states.new_zeros(shape), states), dim=dim)
 
     def is_plain(self) -> bool:
-        """Return whether the rule computes only its two layers, so that `folded` may replace it.
+        """Return whether the rule computes nothing but its two layers, as `folded` does.
 
-        It does not if it is equivariant, if there are hooks, or if the subclass or the object
+        It does more if it is equivariant, if there are hooks, or if the subclass or the object
         overrides an attribute of `STEP_PARTS`, a layer, or a layer's `forward`.
         """
         return not self.equivariant and self.has_network()
@@ -368,13 +353,16 @@ class NPARule(nn.Module):
         )
 
     def network(self) -> Network | None:
-        """Return the network in the form that kernels run; None: only the module can run it."""
+        """Return the network as matrix products on rows, for steps.
+
+        None: a subclass, hook or layer changes the network, so a step calls `forward`.
+        """
         if self.is_plain():
             return self.folded()
         return self._folded_invariants() if self.has_network() else None
 
     def _folded_invariants(self) -> FoldedInvariants:
-        """Return the network of an equivariant rule; differentiable in the parameters."""
+        """Return an equivariant rule's network on rows; differentiable in the parameters."""
         width = self.perception_dim + 1
         weight, signs = signed_gates(self.output.weight, self.steering)
         return FoldedInvariants(
@@ -396,7 +384,7 @@ class NPARule(nn.Module):
         return weights + ([self.fate.weight, self.fate.bias] if self.divides else [])
 
     def folded(self) -> FoldedRule:
-        """Return the network of a plain rule; differentiable in the parameters."""
+        """Return a plain rule's network on rows; differentiable in the parameters."""
         return self._folded(self.update_weight)
 
     def _folded(self, update_weight: Tensor) -> FoldedRule:
@@ -485,10 +473,10 @@ def _has_backward_hooks(module: nn.Module) -> bool:
 
 @torch.no_grad()
 def with_codes(rule: NPARule, untrained: NPARule) -> NPARule:
-    """Copy the weights of a rule without codes into an untrained rule with codes, and return it.
+    """Copy the weights of a rule without codes into an untrained rule with codes, and return that.
 
     The columns of the code and additional hidden units keep their untrained weights. Where the
-    shapes do not fit, `rule` is returned.
+    shapes do not fit, nothing is copied and `rule` is returned.
     """
     count, space_dim, code_dim = untrained.state_dim, untrained.space_dim, untrained.code_dim
     shared = torch.ones(untrained.perception_dim, dtype=torch.bool)
@@ -513,20 +501,20 @@ def with_codes(rule: NPARule, untrained: NPARule) -> NPARule:
 
 
 def with_division(rule: NPARule) -> NPARule:
-    """Return a copy of a rule whose particles also divide, with untrained weights for that."""
+    """Return a copy of a rule whose particles also divide and die, by an untrained layer."""
     copied = NPARule(**rule.hyper_parameters() | {"divides": True}).to(rule.hidden.weight)
     copied.load_state_dict(copied.state_dict() | rule.state_dict())
     return copied
 
 
 def fate_parameters(rules: nn.Module) -> list[nn.Parameter]:
-    """Return the weights that decide division and death, of all rules in a module."""
+    """Return the parameters of all layers `fate`, which decide division and death, in a module."""
     every = (module for module in rules.modules() if isinstance(module, NPARule))
     return [parameter for rule in every if rule.divides for parameter in rule.fate.parameters()]
 
 
 def check_rule(rule: Any) -> None:
-    """Check that an object is a rule, or one that `torch.compile` has wrapped."""
+    """Raise NPAError unless an object is a rule, or one that `torch.compile` has wrapped."""
     if not isinstance(rule, NPARule) and not isinstance(getattr(rule, "_orig_mod", None), NPARule):
         raise NPAError(
             f"rule must be an NPARule, got {type(rule).__name__}: load it with npa_envs.load_rule"

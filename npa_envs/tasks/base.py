@@ -1,7 +1,7 @@
-"""Base classes of tasks.
+"""Base classes of tasks and of their configurations.
 
-The trainer calls the methods of `ParticleTask`, which has defaults for most of them. `GrowthTask`
-adds those of tasks in which a ball of particles with zero states grows into a target.
+The trainer calls the methods of `ParticleTask`. `GrowthTask` is for tasks in which a ball of
+particles with zero states grows into a target.
 """
 
 from __future__ import annotations
@@ -15,10 +15,9 @@ from torch import Tensor
 
 from npa_envs.checks import check_fraction, check_non_negative, check_positive
 from npa_envs.errors import NPAError, shown
-from npa_envs.ops import Cameras, world_mean
+from npa_envs.ops import world_mean
 from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
-from npa_envs.tasks.damage import CHANCE, far_points, random_particle, tear_off
-from npa_envs.tasks.gaussian_outputs import Gaussians
+from npa_envs.tasks.damage import DAMAGE_CHANCE, far_points, random_particle, tear_off
 from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.tasks.train_config import Common
 from npa_envs.world.brushes import clump, cut, wipe_state
@@ -31,7 +30,6 @@ class Frame(NamedTuple):
 
     centre: tuple[float, ...]
     """Its centre [length units]."""
-
     half_width: float
     """Half of its side [length units]."""
 
@@ -59,7 +57,8 @@ class TaskConfig:
     """Pixels on each side of a world's picture, R."""
 
     overflow_weight: float = 100.0
-    """Weight of mean |s − clip(s, −1, 1)| (dimensionless)."""
+    """Weight of the penalty of states outside of [-1, 1], mean |s − clip(s, −1, 1)|
+    (dimensionless)."""
 
     def __post_init__(self) -> None:
         check_positive(self, int, "particle_count", "state_dim", "hidden_dim")
@@ -70,7 +69,7 @@ class TaskConfig:
 
     @property
     def goal_text(self) -> str:
-        """What rules are trained for, in a few words: the target, or else the task's name."""
+        """The name of the target, or of the task if it has none, for reports."""
         return str(getattr(self, "target", type(self).__name__.removesuffix("Config")))
 
     def with_particle_count(self, particle_count: int) -> Self:
@@ -82,48 +81,48 @@ ConfigT = TypeVar("ConfigT", bound=TaskConfig)
 
 
 class ParticleTask(Generic[ConfigT]):
-    """A task: its worlds, untrained rule, loss, metric and pictures.
+    """A task: its initial worlds, untrained rule, loss, metric and pictures.
 
-    A subclass defines where particles start (`places`), the loss (`compare`), a metric and a
-    picture; all else has defaults. `seed` returns initial worlds. In all methods x are positions
-    [length units], shape [B, N, D], and s states (dimensionless), shape [B, N, C].
+    A subclass defines `rule_shape`, `places`, `compare`, `metric` and `picture`; all else has
+    defaults. In all methods x are positions [length units], shape [B, N, D], and s states
+    (dimensionless), shape [B, N, C].
 
     No method may synchronise with the device (no `.item()`, no branch on a tensor's value): the
-    trainer captures `seed`, `damage` and `loss` in CUDA graphs and never reads a number back
-    between two log lines. So these must launch the same work in every iteration, and draw from
-    their generator alone.
+    trainer captures `seed`, `damage` and `loss` in CUDA graphs. So these must launch the same work
+    in every iteration, and take random numbers from their generator only.
     """
 
     config: ConfigT
-    """World, rule and loss."""
+    """Sizes of worlds, of the rule and of pictures, and weights of the loss."""
 
     space_dim: int = 2
     """Space dimension D."""
 
     metric_name: str = "loss"
-    """Name of `metric` in tables."""
+    """Name of what `metric` measures, for tables."""
 
     aligned: bool = False
     """Whether worlds are compared with `target_picture` pixel by pixel, so a PSNR makes sense."""
 
     has_views: bool = False
-    """Whether the task has `views`, `view_psnr` and `gaussians`: pictures from several cameras."""
+    """Whether the task is a `Morphogenesis3D`, whose worlds are drawn from any camera."""
 
     has_texture_metric: bool = False
-    """Whether `npa_envs.measure.texture_metric` compares pictures of the task."""
+    """Whether the task is a `Texture`: `npa_envs.measure.texture_metric` compares its pictures."""
 
     classifies: bool = False
-    """Whether static particles output class scores of their point cloud."""
+    """Whether the task is a `PointClassification`, whose particles do not move."""
 
     goal_count: int = 0
-    """Number of different goals of worlds; 0: worlds have no goals."""
+    """Number of targets or classes that a world's goal chooses from; 0: worlds have no goals."""
 
     species_counts: tuple[int, ...] = ()
-    """Particles of each species, where each has its own rule (`make_rules`); (): one rule."""
+    """Number of particles of each species, where each has its own rule; (): one rule for all."""
 
     _resized_with: tuple[str, ...] = ()
-    """Attributes that `resized` passes to the constructor."""
+    """Names of the attributes that `resized` passes to the constructor as keywords."""
 
+    _mean_of_processes: Callable[[Tensor], Tensor] | None = None
     _goal: Tensor | None = None
     _target_picture: Tensor | None = None
     _pixel_size: float | None = None
@@ -145,26 +144,27 @@ class ParticleTask(Generic[ConfigT]):
 
     @property
     def rollout_options(self) -> dict[str, Any]:
-        """Options of `npa_envs.rollout` for worlds of the task."""
+        """Keyword arguments of `npa_envs.rollout` for worlds of the task."""
         return {"eps": self.eps, "box": self.box, "update_prob": self.update_prob}
 
     @property
     def frame(self) -> Frame:
-        """The region that viewers show: the box, or a square or cube around the origin."""
+        """The region that viewers show: the box, or in open space a square or cube around 0."""
         open_space = 1.1 if self.space_dim == 2 else 0.95
         half_width = open_space if self.box is None else 0.5 * min(self.box)
         return Frame((0.0,) * self.space_dim, half_width)
 
     @property
     def pixel_size(self) -> float:
-        """Usual distance between particles [length units]."""
+        """Distance between neighbouring particles of a grown world, about [length units]."""
         return self._pixel_size or (0.1 / self.config.particle_count) ** (1.0 / 3.0)
 
     @property
     def target_picture(self) -> Tensor:
         """The picture to match, dimensionless, shape [R, R, 4]; AttributeError if there is none.
 
-        Channels are red, green and blue, each summed over splats, and the density.
+        Channels are red, green and blue, each summed over the particles' splats (the Gaussian spots
+        that draw them), and the density, the sum of the splats.
         """
         if self._target_picture is None:
             raise AttributeError(f"{type(self).__name__} has no picture to match")
@@ -176,51 +176,51 @@ class ParticleTask(Generic[ConfigT]):
         raise NotImplementedError
 
     def make_rule(self, generator: torch.Generator) -> NPARule:
-        """Return an untrained rule on the CPU; its weights are drawn from `generator`."""
+        """Return an untrained rule on the CPU, with random weights from `generator`."""
         config = self.config
         sizes = {"state_dim": config.state_dim, "hidden_dim": config.hidden_dim}
         return untrained_rule(generator, **(sizes | {"eps0": config.eps} | self.rule_shape))
 
     def make_rules(self, generator: torch.Generator) -> list[NPARule]:
-        """Return an untrained rule for each species, on the CPU."""
+        """Return an untrained rule for each species, or one for all, on the CPU."""
         return [self.make_rule(generator)]
 
     def places(self, world_count: int, generator: Randomness, device: torch.device) -> Tensor:
-        """Return the positions of particles in initial worlds [length units], shape [B, N, D]."""
+        """Return the positions in B = `world_count` initial worlds [length units], [B, N, D]."""
         raise NotImplementedError
 
     def seed(
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
     ) -> Particles:
-        """Return initial worlds, with all states zero and without goals."""
+        """Return initial worlds: positions by `places`, states 0, no goals."""
         x = self.places(world_count, generator, torch.device(device))
         return Particles(x, x.new_zeros(*x.shape[:2], self.config.state_dim))
 
     def damage(self, worlds: Particles, generator: Randomness) -> Particles:
-        """Return worlds of the training pool after random damage; their goals may change."""
+        """Return worlds after the random damage of training; goals may change. By default none."""
         return worlds
 
     def begin(self, iteration: int) -> None:
-        """Set what the loss uses in an iteration only, such as camera views.
+        """Prepare `loss` for an iteration: choose what differs between them, such as views.
 
-        It depends on the iteration alone, so that a resumed run equals an uninterrupted one. It is
-        written to the same tensors in each iteration, because CUDA graphs read these.
+        The choice depends on the iteration's number only, so that a resumed run equals an
+        uninterrupted one. It is written to the same tensors each time: CUDA graphs read these.
         """
 
     def for_rule(self, rule: NPARule) -> Self:
-        """Return the task whose loss and pictures use a rule's codes or read-out, or itself.
+        """Return a copy of the task whose loss and pictures use a rule's codes or read-out.
 
-        They read the rule's parameters at each call and are differentiable in them. The original
-        task is not changed.
+        They read the rule's parameters at each call and are differentiable in them. A task that
+        uses neither returns itself.
         """
         return self
 
     def with_goal(self, goal: Tensor | None) -> Self:
         """Return a copy of the task whose loss and metric compare worlds with these goals.
 
-        A goal is the index of a world's target or class: int64, shape [B], read at each call. It is
-        the task itself for None, or without goals. On CUDA the range is not checked: that would
-        synchronise.
+        `goal` has the index of each world's target or class: int64, shape [B]. Values are read at
+        each call, and on CUDA their range is not checked. The task returns itself for None, or if
+        `goal_count` is 0.
         """
         count = self.goal_count
         if goal is None or count == 0:
@@ -247,27 +247,33 @@ class ParticleTask(Generic[ConfigT]):
         return self._goal
 
     def process_mean(self, value: Tensor) -> Tensor:
-        """Return the mean of a tensor over all training processes: by default there is one."""
-        return value
+        """Return the mean of a tensor over all training processes, or the tensor if there is one.
+
+        Each process calls it with its own tensor of the same shape.
+        """
+        return value if self._mean_of_processes is None else self._mean_of_processes(value)
 
     def with_process_mean(self, mean: Callable[[Tensor], Tensor]) -> Self:
-        """Return a copy for one of several training processes; `mean` is its `process_mean`."""
-        return self._with(process_mean=mean)
+        """Return a copy of the task for one of several training processes.
+
+        `mean` returns the mean of a tensor over all of them.
+        """
+        return self._with(_mean_of_processes=mean)
 
     def with_target_code(self, s: Tensor) -> Tensor:
-        """Return states [B, N, C] whose first channels hold the code of the world's target again.
+        """Return states [B, N, C] with the code of the world's target in their first channels.
 
-        Damage may have erased it. They are differentiable in codes that are learned; states of
-        tasks without codes are unchanged.
+        Damage may have erased it there. The result is differentiable in codes that are learned.
+        Tasks without codes return `s`.
         """
         return s
 
     def held_out(self) -> Self:
-        """Return the task with test data, where data are split; else the task itself."""
+        """Return the task with test data in place of training data; without data, itself."""
         return self
 
     def resized(self, particle_count: int) -> Self:
-        """Return the task with another number of particles; for a rule call `for_rule` again."""
+        """Return a new task with another number of particles; call `for_rule` on it again."""
         make: Any = type(self)
         options = {name: getattr(self, name) for name in self._resized_with}
         config = self.config.with_particle_count(particle_count)
@@ -275,16 +281,25 @@ class ParticleTask(Generic[ConfigT]):
         return task
 
     def compare(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the batch's weighted distance from the target, [], and its unweighted terms."""
+        """Return the batch's weighted distance from the target, [], and its terms by name, [].
+
+        Terms have no weights.
+        """
         raise NotImplementedError
 
     def penalties(self, worlds: Particles) -> dict[str, tuple[float, Tensor]]:
-        """Return what the loss adds to `compare`, name -> (weight, term []); here, "overflow"."""
+        """Return the other terms of the loss: name -> (weight, term of shape []).
+
+        By default it is "overflow", of states outside of [-1, 1].
+        """
         outside = (worlds.s - worlds.s.clamp(-1.0, 1.0)).abs().mean()
         return {"overflow": (self.config.overflow_weight, outside)}
 
     def loss(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the training loss of worlds that have path lengths, [], and unweighted terms."""
+        """Return the training loss, `compare` plus `penalties`, [], and unweighted terms by name.
+
+        The worlds are the end of a rollout: they have `path_length`.
+        """
         path, expected = worlds.path_length, tuple(worlds.x.shape[:2])
         if path is None or path.shape != expected:
             got = "none" if path is None else str(tuple(path.shape))
@@ -296,7 +311,7 @@ class ParticleTask(Generic[ConfigT]):
         return total, terms
 
     def picture(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return each world's picture, as `target_picture` but of shape [B, R, R, 4]."""
+        """Return each world's picture, shape [B, R, R, 4]; channels are as in `target_picture`."""
         raise NotImplementedError
 
     def metric(self, x: Tensor, s: Tensor) -> Tensor:
@@ -305,31 +320,19 @@ class ParticleTask(Generic[ConfigT]):
 
     @property
     def trial_name(self) -> str:
-        """Name of `trial_metric`."""
+        """Name of what `trial_metric` measures, for tables."""
         return self.metric_name
 
     def trial_metric(self, worlds: Particles) -> Tensor:
-        """Return the metric that robustness trials measure, shape [B]; by default `metric`."""
+        """Return the metric of each world in `npa-envs robustness`, [B]; by default `metric`."""
         return self.metric(worlds.x, worlds.s)
 
     def colours(self, s: Tensor) -> Tensor:
         """Return each particle's colour as pictures show it, shape [B, N, 3]."""
         return s[..., -3:] + COLOUR_OFFSET
 
-    def views(self, x: Tensor, s: Tensor, cameras: Cameras) -> Tensor:
-        """Return pictures by V cameras: colours times alpha, and alpha, shape [B, V, H, W, 4]."""
-        raise NotImplementedError
-
-    def view_psnr(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return each world's mean PSNR over the held-out views [dB], shape [B]."""
-        raise NotImplementedError
-
-    def gaussians(self, s: Tensor) -> Gaussians:
-        """Return the 3D Gaussian that draws each particle, from states s."""
-        raise NotImplementedError
-
     def _with(self, **fields: object) -> Self:
-        """Return a shallow copy with some attributes replaced."""
+        """Return a shallow copy whose attributes `fields` have new values."""
         # Not by copy.copy, which would leave out what `__getstate__` keeps from pickles.
         bound = object.__new__(type(self))
         vars(bound).update(vars(self) | fields)
@@ -345,7 +348,10 @@ PictureTask = Task
 
 @dataclass(frozen=True, kw_only=True)
 class GrowthConfig(TaskConfig):
-    """Configuration of growth from a ball: target, damage in training, penalties of the loss."""
+    """Settings of growth from a ball: target, damage in training, penalties of the loss.
+
+    Damage befalls worlds of the training pool, from which batches continue.
+    """
 
     damage_radius: float = 0.0
     """Radius of the ball whose state is wiped in worlds from the pool [length units]; 0: none."""
@@ -357,15 +363,15 @@ class GrowthConfig(TaskConfig):
     cut_gap: float = 0.0
     """Width of the slit through `cut_share` of the worlds from the pool [length units]; 0: none."""
 
-    cut_share: float = CHANCE
-    """Probability of a world from the pool to be cut (dimensionless)."""
+    cut_share: float = DAMAGE_CHANCE
+    """Probability that a world from the pool is cut (dimensionless)."""
 
     flake_radius: float = 0.0
     """Radius up to which a ball of particles is torn off and thrown out, in a quarter of the worlds
     from the pool [length units]; 0: none."""
 
     escape_share: float = 0.0
-    """Probability of each particle to be thrown out of worlds from the pool (dimensionless)."""
+    """Probability that a particle is thrown out of a world from the pool (dimensionless)."""
 
     target: str
     """What to grow."""
@@ -380,7 +386,7 @@ class GrowthConfig(TaskConfig):
     """Weight of the path length Σ|Δx| of a rollout (per length unit)."""
 
     bound_weight: float = 100.0
-    """Weight of mean |x − clip(x, −1, 1)| (per length unit)."""
+    """Weight of the penalty of positions outside, mean |x − clip(x, −1, 1)| (per length unit)."""
 
     escape_weight: float = 0.0
     """Weight of the mean path length of particles outside of [−1, 1] (per length unit)."""
@@ -421,7 +427,7 @@ class GrowthTask(ParticleTask[GrowthConfigT]):
         x, s, *_ = worlds
 
         def chosen_worlds(probability: float) -> Tensor:
-            """Return a random 0 or 1 for each of the B worlds, 1 with this probability, [B]."""
+            """Return a random 0 or 1 for each world, shape [B], 1 with this probability."""
             return (uniform_draws(generator, (len(x), 1), x)[:, 0] < probability).to(x.dtype)
 
         if config.damage_radius > 0.0:
@@ -429,7 +435,7 @@ class GrowthTask(ParticleTask[GrowthConfigT]):
             s = wipe_state(x, s, centre=centre, radius=config.damage_radius)
         if config.clump_radius > 0.0:
             centre = random_particle(x, generator)
-            radius = config.clump_radius * chosen_worlds(CHANCE)
+            radius = config.clump_radius * chosen_worlds(DAMAGE_CHANCE)
             x, s = clump(x, s, centre=centre, radius=radius, factor=1.0)
         if config.cut_gap > 0.0:
             # Directions need not be uniform; a zero vector cuts nothing.
@@ -445,7 +451,11 @@ class GrowthTask(ParticleTask[GrowthConfigT]):
         return worlds._replace(x=x, s=s)
 
     def penalties(self, worlds: Particles) -> dict[str, tuple[float, Tensor]]:
-        """Return penalties of motion, and of states, positions and motion outside of [-1, 1]."""
+        """Return the penalties "motion", "overflow" and "bound" and, if weighted, "stray".
+
+        They are of path lengths, of states and positions outside of [-1, 1], and of path lengths
+        there.
+        """
         config, bounded = self.config, self.bounded(worlds.x)
         terms = {"motion": (config.motion_weight, distances_moved(worlds).mean())}
         terms |= super().penalties(worlds)
@@ -460,29 +470,29 @@ class GrowthTask(ParticleTask[GrowthConfigT]):
         return terms
 
     def bounded(self, x: Tensor) -> Tensor:
-        """Return the coordinates that the loss keeps in [-1, 1]: by default x itself."""
+        """Return the numbers that `penalties` keep in [-1, 1], shape [B, N, any]: by default x."""
         return x
 
 
 def distances_moved(worlds: Particles) -> Tensor:
-    """Return the particles' path lengths [length units], shape [B, N]; worlds must have them."""
+    """Return the path lengths of particles since the rollout's start [length units], [B, N]."""
     assert worlds.path_length is not None, "worlds are the end of a rollout"
     return worlds.path_length
 
 
 def contributions_to_loss(loss: Tensor, effects: Tensor) -> Tensor:
-    """Return each particle's contribution to its world's loss, times N; shape [B, N].
+    """Return N times each particle's contribution to its world's `loss` [B]; shape [B, N].
 
-    It is loss + N (effect - mean effect of the world), so that its mean over particles is the loss
-    [B], up to rounding. `effects` [B, N] are the derivatives of the loss by a factor on each
-    particle's splat or opacity.
+    It is loss + N (effect - mean effect of the world), so its mean over particles is the loss, up
+    to rounding. An effect is the derivative of the loss with respect to a factor on the particle's
+    splat or opacity; `effects` has shape [B, N].
     """
     excess = effects - world_mean(effects[..., None])
     return loss[:, None] + effects.shape[1] * excess
 
 
 def untrained_rule(generator: torch.Generator, **hyper_parameters: Any) -> NPARule:
-    """Return a rule on the CPU whose weights are drawn from `generator` alone."""
+    """Return a rule on the CPU with random weights from `generator`; torch's own state is kept."""
     with torch.random.fork_rng(devices=()):
         torch.manual_seed(int(torch.randint(2**31, (), generator=generator)))
         return NPARule(**hyper_parameters)

@@ -1,4 +1,4 @@
-"""2D morphogenesis of several species that share one world."""
+"""The task of 2D morphogenesis of several species, each by its own rule, in one world."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class CoMorphogenesis2DConfig:
     """The configuration of each species' task. All have the same eps, update_prob and state_dim."""
 
     distance: float = 0.0
-    """Distance between the centres of neighbouring species' start disks, on x [length units]."""
+    """Distance between the centres of successive species' start disks, along x [length units]."""
 
     def __post_init__(self) -> None:
         species = self.species if isinstance(self.species, tuple | list) else ()
@@ -96,7 +96,7 @@ class CoMorphogenesis2D(ParticleTask[Any]):
         return [task.make_rule(generator) for task in self.tasks]
 
     def make_rule(self, generator: torch.Generator) -> NPARule:
-        """Raise NPAError: each species has its own rule (`make_rules`)."""
+        """Raise NPAError: each species has its own rule, made by `make_rules`."""
         raise NPAError(
             f"{len(self.tasks)} species need as many rules, not one: "
             "train them with npa_envs.training.train_together"
@@ -114,7 +114,7 @@ class CoMorphogenesis2D(ParticleTask[Any]):
         )
 
     def damage(self, worlds: Particles, generator: Randomness) -> Particles:
-        """Return worlds after random damage of each species."""
+        """Return worlds after the random damage of each species' task."""
         species = zip(self.tasks, worlds.split(self.config.counts), strict=True)
         return together([task.damage(each, generator) for task, each in species])
 
@@ -142,7 +142,7 @@ class CoMorphogenesis2D(ParticleTask[Any]):
         """The picture of all targets, each around its species' start disk; shape [R, R, 4]."""
         targets = []
         for task, centre in zip(self.tasks, self.config.centres, strict=True):
-            # States of pictures are colours alone.
+            # States are colours only.
             target = Particles(task.target.points[None], task.target.colours[None] - COLOUR_OFFSET)
             targets.append(_shifted(target, centre))
         x, s, *_ = together(targets)
@@ -160,24 +160,18 @@ def together(species: Sequence[Particles]) -> Particles:
     return combined(lambda fields: torch.cat(fields, 1), species)
 
 
-DISTANCE = 0.8
+PRESET_DISTANCE = 0.8
 """`distance` of every preset [length units]: the pictures overlap."""
 
 
 _RUNS: Mapping[str, Mapping[str, Any]] = {
     "best": {
-        "optimiser": "adamw",
-        "learning_rate": 2e-3,
-        "weight_decay": 0.0,
-        "max_age_range": (64, 16_384),
-        "damage_and_keep_share": 0.0,
-        "damage_share": 0.25,
-        "stillness_min_age": 512,
-        "stillness_power": 1.0,
-        "dead_zone": 0.0,
+        "optimiser": "adamw", "learning_rate": 2e-3, "weight_decay": 0.0,
+        "max_age_range": (64, 16_384), "damage_and_keep_share": 0.0, "damage_share": 0.25,
+        "stillness_min_age": 512, "stillness_power": 1.0, "dead_zone": 0.0,
     },
     "fast": {**HALF_SEEDS, "learning_rate": 4e-3},
-}
+}  # fmt: skip
 """Settings of the runs that docs/species.md measured, by AdamW."""
 
 _SPECIES: Mapping[str, Mapping[str, Any]] = {
@@ -192,7 +186,7 @@ def _joint_preset(name: str) -> JointTrainConfig[CoMorphogenesis2DConfig]:
     alone = MORPHOGENESIS2D_PRESETS[name]
     first = replace(alone.task, **_SPECIES.get(name, {}))
     species = (first, replace(first, target="heart"))
-    task = CoMorphogenesis2DConfig(species=species, distance=DISTANCE)
+    task = CoMorphogenesis2DConfig(species=species, distance=PRESET_DISTANCE)
     # A preset names no initial rules of species.
     run = {**vars(alone), "task": task, "initial_rule": "", **_RUNS.get(name, {})}
     return JointTrainConfig(**{**run, "out": Path("runs/co_morphogenesis2d")})

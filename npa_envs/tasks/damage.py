@@ -1,4 +1,4 @@
-"""Damage that a rule should heal: of worlds in rollouts, and escaping particles in training.
+"""Damage that a rule should heal: wiped, cut, clumped and noisy worlds, and escaped particles.
 
 No function reads a value back from the device, so all may be captured in a CUDA graph.
 """
@@ -20,15 +20,16 @@ from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness, check_generator, normal_draws, uniform_draws
 
 DAMAGE_SIZES = {"wipe": 0.2, "cut": 0.1, "clump": 0.2, "noise": 0.05}
-"""Kinds of damage with their usual size: radius, gap, radius, standard deviation [length units].
-`npa/Regeneration2D-v0` wipes more by default: 0.3."""
+"""Kinds of damage -> default size [length units]: states in a ball are set to 0 (radius), a slit is
+cut through the middle (width), particles in a ball are pulled together (radius), all are displaced
+(standard deviation). `npa/Regeneration2D-v0` wipes more by default: 0.3."""
 
 CLUMP_FACTOR = 0.9
-"""Fraction of its distance from the centre by which clumping moves a particle inwards."""
+"""Fraction of its distance from the ball's centre by which "clump" moves a particle inwards."""
 
 
 def check_damage(kind: object, where: str = "") -> None:
-    """Raise NPAError unless `kind` is in `DAMAGE_SIZES`; `where` is added to its message."""
+    """Raise NPAError unless `kind` is in `DAMAGE_SIZES`; its message says `where` it stood."""
     if not isinstance(kind, str) or kind not in DAMAGE_SIZES:
         raise NPAError(f"unknown damage {shown(kind)}{where}: {suggest(kind, DAMAGE_SIZES)}")
 
@@ -39,12 +40,10 @@ class DamageEvent:
 
     step: int
     """Steps since the initial world."""
-
     kind: str
     """One of `DAMAGE_SIZES`."""
-
     size: float | None = None
-    """Radius, gap or standard deviation [length units]; None is the usual one."""
+    """Radius, width or standard deviation [length units]; None: that of `DAMAGE_SIZES`."""
 
     def __post_init__(self) -> None:
         check_damage(self.kind)
@@ -87,11 +86,11 @@ def damage_worlds(
     box: Sides = None,
     generator: Randomness | None = None,
 ) -> Particles:
-    """Return worlds damaged at a random position, or cut through the middle at a random angle.
+    """Return worlds damaged around a random particle, or cut through the middle at a random angle.
 
-    `size` is the radius, gap or standard deviation [length units], by default that of
-    `DAMAGE_SIZES`. Damage continues across the edges of a periodic `box` [length units]; positions
-    may leave it, and the next step wraps them. `generator` is on the worlds' device.
+    `kind` is one of `DAMAGE_SIZES`, which has the default of `size` and says what it means. Damage
+    continues across the edges of a periodic `box` [length units]; positions may leave it, and the
+    next step wraps them. `generator` is on the worlds' device.
     """
     x, s, *_ = worlds
     check_damage(kind)
@@ -123,29 +122,32 @@ def random_particle(x: Tensor, generator: Randomness | None = None) -> Tensor:
 # it drift for ever, too slowly to notice in a picture. Training displaces some particles far out of
 # their worlds and penalises their paths, so that the rule learns to let them rest.
 
-CHANCE = 0.25
-"""Probability of a world to be clumped, to be cut, to lose a flake (dimensionless)."""
+DAMAGE_CHANCE = 0.25
+"""Probability of each of clumping, cutting and tearing off for a world (dimensionless)."""
 
 NEAREST, FARTHEST = 2.0, 4.0
 """Range of distances from the origin to which particles are displaced [length units]."""
 
 
 def tear_off(x: Tensor, *, radius: float, generator: Randomness) -> Tensor:
-    """Return positions [B, N, D]; a quarter of the worlds lose a flake.
+    """Return positions [B, N, D] of which a quarter of the worlds, at random, has lost a flake.
 
     A flake is a ball around a random particle, of a random radius up to `radius` [length units]. It
-    is thrown out of the world in one piece. Its particles perceive each other, and may drift on
-    where a lone particle has learned to rest.
+    is moved out of the world in one piece, to `far_points`. Its particles perceive each other, and
+    may drift on where a lone particle has learned to rest.
     """
     centre = random_particle(x, generator)
     draws = uniform_draws(generator, (len(x), 2), x)
-    flake_radius = torch.where(draws[:, :1] < CHANCE, radius * draws[:, 1:], -1.0)
+    flake_radius = torch.where(draws[:, :1] < DAMAGE_CHANCE, radius * draws[:, 1:], -1.0)
     torn = (x - centre[:, None]).norm(dim=-1) <= flake_radius
     return torch.where(torn[..., None], x + (far_points(x, 1, generator) - centre[:, None]), x)
 
 
 def far_points(x: Tensor, count: int, generator: Randomness) -> Tensor:
-    """Return points at random distances, `NEAREST` to `FARTHEST`, from 0; [B, count, D]."""
+    """Return points at random distances, `NEAREST` to `FARTHEST`, from the origin, [B, count, D].
+
+    B is the number of worlds of positions `x`, which also give D, device and dtype.
+    """
     ball = uniform_ball(
         len(x), count, x.shape[2], 1.0, generator=generator, device=x.device, dtype=x.dtype
     )

@@ -1,4 +1,4 @@
-"""Many pictures grown by one rule: each world has its own target, named by a code."""
+"""The task of many pictures by one rule: each world has its own target, which a code names."""
 
 from __future__ import annotations
 
@@ -25,7 +25,10 @@ PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
 
 
 def named_targets(targets: Sequence[str]) -> dict[str, str]:
-    """Return the sources of all targets, for `load_target`, by name; folders give their files."""
+    """Return the targets by name: built-in names, emoji, and paths of picture files.
+
+    A folder in `targets` stands for its picture files.
+    """
     named: dict[str, str] = {}
     for target in targets:
         for source in _pictures_of(target):
@@ -57,8 +60,8 @@ class ManyPictures(Morphogenesis2D):
     """Morphogenesis of several targets by one rule; each world has one of the targets.
 
     A world's goal is the index of its target in `names`. The target's code, a learned vector, is in
-    the first state channels of its particles. Particles are drawn equally large for all
-    targets, and pictures are scaled so that each target's density is about 1.
+    the first state channels of its particles. Particles are drawn equally large for all targets,
+    and pictures are then multiplied by a number that makes each target's density about 1.
     """
 
     _codes: Codes | None = None
@@ -102,9 +105,9 @@ class ManyPictures(Morphogenesis2D):
         }
 
     def for_rule(self, rule: NPARule) -> Self:
-        """Return the task whose worlds have the codes of a rule.
+        """Return a copy of the task whose worlds have the codes of a rule.
 
-        With an encoder they are computed now and at each call of `with_target_code`.
+        If the rule has an encoder, it computes them now and at each call of `with_target_code`.
         """
         if rule.codes is not None:
             with torch.no_grad():
@@ -114,7 +117,7 @@ class ManyPictures(Morphogenesis2D):
     def seed(
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
     ) -> Particles:
-        """Return initial worlds with random goals; particles have the targets' codes."""
+        """Return initial worlds with random goals; states begin with the code of the target."""
         x, s, *_ = super().seed(world_count, generator=generator, device=device)
         goal = drawn_indices(len(self.names), world_count, generator, torch.device(device))
         blank = s.new_zeros(*s.shape[:2], self.config.code_dim)
@@ -124,7 +127,7 @@ class ManyPictures(Morphogenesis2D):
         return Particles(x, s, goal=goal)
 
     def damage(self, worlds: Particles, generator: Randomness) -> Particles:
-        """Return worlds after random damage; some get another goal."""
+        """Return worlds after random damage; a fraction `switch_share` gets another goal."""
         worlds = super().damage(worlds, generator)
         x, goal = worlds.x, worlds.goal
         if goal is None or self.config.switch_share == 0.0:
@@ -140,7 +143,10 @@ class ManyPictures(Morphogenesis2D):
         return replace_code(s, self._read_codes(self._codes).index_select(0, self.goal)[:, None])
 
     def _read_codes(self, codes: Codes) -> Tensor:
-        """Return the codes of T targets, shape [T, K]; an encoder also updates `codes.table`."""
+        """Return the codes of all T targets, shape [T, K].
+
+        If an encoder computes them, they are also copied to `codes.table`.
+        """
         if codes.encoder is None:
             return codes.table
         read = codes.encode(self._target_pictures)
@@ -150,13 +156,13 @@ class ManyPictures(Morphogenesis2D):
 
     @property
     def target_picture(self) -> Tensor:
-        """Each world's target as a `picture`: red, green, blue (summed), density, [B, R, R, 4]."""
+        """Each world's target, shape [B, R, R, 4]; channels are as in `picture`."""
         return self._target_pictures.index_select(0, self.goal)
 
     def picture(self, x: Tensor, s: Tensor, *, centred: bool = True) -> Tensor:
         """Return each world's picture: red, green, blue (sums over splats), density, [B, R, R, 4].
 
-        Without goals, densities are scaled for a target of the mean size.
+        It is multiplied by the number of the world's target, or by 1 if the task has no goals yet.
         """
         picture = super().picture(x, s, centred=centred)
         if self._goal is None:

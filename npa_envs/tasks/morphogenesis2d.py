@@ -1,4 +1,4 @@
-"""2D morphogenesis: a disk of blank particles grows into a picture, and heals."""
+"""The task of 2D morphogenesis: a disk of particles with zero states grows into a picture."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ from npa_envs.ops.pictures.splat import picture_losses
 from npa_envs.rule.picture_codes import replace_code
 from npa_envs.rule.rule import COLOUR_OFFSET, LIFE, NPARule
 from npa_envs.tasks.base import GrowthConfig, GrowthTask
+from npa_envs.tasks.losses.image_distances import mean_by_world
 from npa_envs.tasks.targets.images import MAX_POINT_COUNT
 from npa_envs.tasks.targets.picture_points import PointTarget, load_target
 from npa_envs.tasks.train_config import Common, TrainConfig, fast_run, presets_of, tiny_run
@@ -32,15 +33,15 @@ from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import Randomness, uniform_draws
 
 MAX_CODE = 1024
-"""Largest length of a code."""
+"""Maximum of `Morphogenesis2DConfig.code_dim`."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Morphogenesis2DConfig(GrowthConfig):
-    """2D morphogenesis: a disk of blank particles grows into a picture (arXiv 2601.16096).
+    """2D morphogenesis: a disk of particles with zero states grows into a picture.
 
-    The defaults are the paper's. Lengths are in length units: the target's picture spans
-    [-1, 1] x [-1, 1].
+    The defaults are the paper's (arXiv 2601.16096). Lengths are in length units: the target's
+    picture spans [-1, 1] x [-1, 1].
     """
 
     target: Common[str] = "gecko"
@@ -50,18 +51,18 @@ class Morphogenesis2DConfig(GrowthConfig):
     """Several things to grow by one rule, in place of `target`: as that, or folders of pictures."""
 
     code_dim: int = 8
-    """Length K of the code that names one of `targets` to the particles: K more state channels, in
-    front of the others."""
+    """With `targets`: length of the code that tells particles which of them to grow, in as many
+    more state channels in front of the others."""
 
     encoder: bool = False
     """A network that is trained with the rule computes codes from pictures, so that new pictures
-    have one too. Without it, each target's code is a parameter."""
+    have one too. If False, each target's code is a parameter."""
 
     switch_share: float = 0.1
-    """Probability that a damaged world from the pool also gets another one of `targets`."""
+    """With `targets`: probability that a damaged world from the pool gets another one of them."""
 
     target_point_count: int = 4096
-    """Opaque pixels that the target is resampled to, about; usually the number of particles."""
+    """Number of opaque pixels to which the target is scaled, about; usually `particle_count`."""
 
     keep_background: bool = False
     """Grow the picture's whole rectangle, white where it is transparent: for photographs."""
@@ -74,10 +75,11 @@ class Morphogenesis2DConfig(GrowthConfig):
     """Pixels on each side of the picture that the loss compares, R."""
 
     sigma: float = 1.0
-    """Standard deviation of a particle's splat, in pixels of the target (dimensionless)."""
+    """Standard deviation of a particle's splat, the Gaussian spot that draws it, in pixels of the
+    target (dimensionless)."""
 
     splat_weight: float = 2.0
-    """Weight of the splat loss (dimensionless)."""
+    """Weight of the splat loss, the difference of pictures (dimensionless)."""
 
     colour_weight: float = 5.0
     """Weight of the splat loss's colour term relative to the density term (dimensionless)."""
@@ -90,8 +92,8 @@ class Morphogenesis2DConfig(GrowthConfig):
     angle, or, where `angles` is 0, without rotation."""
 
     chiral: bool = True
-    """An equivariant rule distinguishes left from right. Without it, mirrored worlds are compared
-    too, where angles are tried."""
+    """An equivariant rule distinguishes left from right. If False, mirrored worlds are compared
+    with the target as well, where angles are tried."""
 
     seed_axis: float = 0.5
     """Initial worlds of an equivariant rule have an axis: the first state rises linearly across the
@@ -143,26 +145,27 @@ class Morphogenesis2DConfig(GrowthConfig):
 
 
 FINER_COUNT = 4
-"""Angles around the best one that each refinement tries, evenly spaced."""
+"""Number of angles around the best one that each refinement of `best_turn` tries."""
 
 FINER_STEP = 0.4
-"""Their spacing, as a fraction of the spacing before."""
+"""Spacing of these angles, as a fraction of that of the angles before."""
 
 FINER_TIMES = 4
-"""Number of refinements."""
+"""Number of refinements of `best_turn`."""
 
 SURVIVING = 0.5
-"""Probability of a particle to survive damage, in worlds whose particles divide (dimensionless)."""
+"""Probability that a particle survives damage, in worlds whose particles divide."""
 
 FAR_AWAY = 1e3
 """Coordinate to which dead particles are moved, out of every picture [length units]."""
 
 UNOWNED = 0.05
-"""Density per pixel whose part of the error is divided evenly among all particles."""
+"""Density added to each pixel in `particle_contributions`: its part of the pixel's error is divided
+evenly among all particles."""
 
 
 class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
-    """The task of arXiv 2601.16096, section 4.1, with its loss."""
+    """The task of growing a picture of arXiv 2601.16096, section 4.1, with its loss."""
 
     metric_name = "splat loss"
     _code: Tensor | None = None
@@ -191,9 +194,10 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         self._target_picture = self._splat(points[None], colours[None])[0]
 
     def for_rule(self, rule: NPARule) -> Self:
-        """Return the task whose worlds have the rule's code of the target in the first channels.
+        """Return a copy of the task whose states begin with the rule's code of the target.
 
-        It is the stored code of the target's name, or else the encoder's code of its picture.
+        It is the stored code of the target's name, or else the encoder's code of its picture. For a
+        rule without codes it is the task itself.
         """
         codes = rule.codes
         if codes is None:
@@ -207,9 +211,10 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
     def seed(
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
     ) -> Particles:
-        """Return initial worlds; with `division` one particle lives, at the origin.
+        """Return initial worlds: a disk of particles with zero states.
 
-        With `equivariant` the first states rise along an axis (`seed_axis`, `seed_across`).
+        With `division` one particle lives, at the origin. With `equivariant` the first two states
+        rise along an axis (`seed_axis`, `seed_across`).
         """
         x, s, *_ = super().seed(world_count, generator=generator, device=device)
         config = self.config
@@ -231,11 +236,11 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         return Particles(x, s)
 
     def with_target_code(self, s: Tensor) -> Tensor:
-        """Return states whose first channels hold the target's code, if the task has one."""
+        """Return states with the target's code in their first channels; without codes, `s`."""
         return s if self._code is None else replace_code(s, self._code)
 
     def damage(self, worlds: Particles, generator: Randomness) -> Particles:
-        """Return worlds after random damage; with `division` some particles die, never all."""
+        """Return worlds after random damage; with `division` half of the particles die, not all."""
         if not (self.config.division and self.config.damage_radius > 0.0):
             return super().damage(worlds, generator)
         # Survivors are grown particles, among which newly divided ones must find their role.
@@ -247,10 +252,10 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         return others.damage(worlds._replace(s=survivors), generator)
 
     def picture(self, x: Tensor, s: Tensor, *, centred: bool = True) -> Tensor:
-        """Return each world's picture: sums of colours over splats, density; [B, R, R, 4].
+        """Return each world's picture: red, green, blue (sums over splats), density, [B, R, R, 4].
 
-        `centred`: each world's mean is moved to the target's, and worlds of an equivariant rule are
-        rotated, as the loss does.
+        If `centred`, each world's mean is moved to the target's, and worlds of an equivariant rule
+        are rotated by `best_turn`, as for the loss.
         """
         colour = s[..., -3:] + COLOUR_OFFSET
         if centred:
@@ -268,9 +273,9 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
     def splat_errors(self, x: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return each pixel's density error and colour error, dimensionless, shape [B, R, R] each.
 
-        Both are |d| + d² of the difference d between the centred picture and the target's; the
-        colour error is averaged over the colours and weighted by exp(−density error), without
-        gradient. They are the same, bit for bit, in every batch.
+        Both are |d| + d² of the difference d between the centred picture and the target's. The
+        colour error is averaged over red, green and blue, and multiplied by exp(−density error), a
+        factor without gradient. They are the same, bit for bit, in every batch.
         """
         size = (self.picture(x, s) - self.target_picture.to(x)).abs()
         # Added one by one: the order of torch's own sums is not promised.
@@ -278,20 +283,20 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         return density, (red + green + blue) / 3.0 * torch.exp(-density.detach())
 
     def splat_losses(self, x: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return each world's means of the two `splat_errors` over pixels, [B] each."""
+        """Return each world's density loss and colour loss, means of `splat_errors`, [B] each."""
         with_gradient = torch.is_grad_enabled() and (x.requires_grad or s.requires_grad)
         if with_gradient or self.config.division or self.goal_count > 0:
             density, colour = self.splat_errors(x, s)
-            return _pixel_mean(density), _pixel_mean(colour)
+            return mean_by_world(density), mean_by_world(colour)
         return self._picture_losses(turned(x, self.best_turn(x, s)) if self._tries_angles else x, s)
 
     def metric(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return each world's splat loss: density + colour_weight x colour, shape [B]."""
+        """Return each world's splat loss: density loss + colour_weight × colour loss, shape [B]."""
         density, colour = self.splat_losses(x, s)
         return density + self.config.colour_weight * colour
 
     def compare(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the batch's weighted splat loss, and its terms, each of shape []."""
+        """Return the batch's weighted splat loss, [], and its terms "density" and "colour", []."""
         density, colour = (term.mean() for term in self.splat_losses(worlds.x, worlds.s))
         total = self.config.splat_weight * (density + self.config.colour_weight * colour)
         return total, {"density": density, "colour": colour}
@@ -306,17 +311,17 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         return super().rule_shape | known
 
     def bounded(self, x: Tensor) -> Tensor:
-        """Return the coordinates that the loss keeps in [-1, 1]: by default x itself.
+        """Return what `penalties` keep in [-1, 1]: positions, or distances from 0 [B, N, 1].
 
-        For worlds that are compared at their best angle they are the distances from the origin,
-        over the radius of the circle that contains the target at every angle.
+        The latter are of worlds that are compared at their best angle. Their unit is the radius of
+        the circle that contains the target at every angle.
         """
         if not self._tries_angles:
             return x
         return x.square().sum(dim=-1, keepdim=True).add(1e-12).sqrt() / self._radius
 
     def penalties(self, worlds: Particles) -> dict[str, tuple[float, Tensor]]:
-        """Return the penalties of `GrowthTask`, and of centroids' distances from the origin."""
+        """Return the penalties of `GrowthTask` and, if weighted, "drift" from the origin."""
         terms = super().penalties(worlds)
         if self.config.drift_weight > 0.0:
             drift = world_mean(worlds.x).square().sum(dim=-1).add(1e-12).sqrt().mean()
@@ -324,9 +329,9 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         return terms
 
     def particle_contributions(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return each particle's contribution to its world's splat loss, times N; [B, N].
+        """Return N times each particle's contribution to its world's splat loss, shape [B, N].
 
-        A pixel's error is divided among the particles that cover it, by their weights there; the
+        A pixel's error is divided among the particles that cover it, by their splats there; the
         error of uncovered pixels is divided evenly among all. The mean over the particles is
         `metric`, up to rounding.
         """
@@ -340,15 +345,15 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
             # The picture is linear in the colours: its gradient sums over a particle's splat.
             (pulled,) = torch.autograd.grad(picture[..., 0], blank, owned)
         pixel_count = self.config.resolution**2
-        unowned = _pixel_mean(UNOWNED * owned)
+        unowned = mean_by_world(UNOWNED * owned)
         return pulled[..., 0] * (x.shape[1] / pixel_count) + unowned[:, None]
 
     @torch.no_grad()
     def best_turn(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return the rotation of each world around its mean that brings it closest to the target.
+        """Return matrices [B, 2, 2] of the rotations that bring worlds closest to the target.
 
-        Evenly spaced angles are tried, then finer ones near the best; of a rule that is not chiral
-        also mirrored worlds. Matrices, [B, 2, 2]; the identity where `angles` is 0.
+        Evenly spaced angles are tried, then finer ones near the best. Worlds of a rule that is not
+        chiral are mirrored as well. If `angles` is 0, matrices are the identity.
         """
         config = self.config
         if config.angles == 0:
@@ -375,7 +380,7 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         return turns(angle, hand)[:, 0]
 
     def _picture_losses(self, x: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return each world's density loss and colour loss at its present angle, shape [B] each."""
+        """Return each world's density loss and colour loss without rotation, shape [B] each."""
         return picture_losses(
             x,
             s,
@@ -392,12 +397,13 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         return self.config.equivariant and self.config.angles > 0
 
     def _aligned(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return positions moved to the target's mean, and rotated if angles are tried."""
+        """Return positions moved to the target's mean, and rotated by `best_turn` for the loss."""
         if self._tries_angles:
             x = turned(x, self.best_turn(x, s))
         return x - world_mean(x)[:, None] + self._target_mean.to(x)
 
     def _splat(self, x: Tensor, colour: Tensor) -> Tensor:
+        """Return the pictures [B, R, R, 4] of particles in colours [B, N, 3]."""
         return splat(
             x,
             colour,
@@ -408,7 +414,10 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
 
 
 def turns(angle: Tensor, hand: Tensor) -> Tensor:
-    """Return matrices of rotations by angles [rad], after a mirroring where `hand` is -1."""
+    """Return matrices [..., 2, 2] of rotations by angles [...] in radians.
+
+    Where `hand` [...] is -1 and not 1, the matrix mirrors first.
+    """
     cos, sin = angle.cos(), angle.sin()
     return torch.stack((cos, -sin * hand, sin, cos * hand), dim=-1).view(*angle.shape, 2, 2)
 
@@ -421,97 +430,52 @@ def turned(x: Tensor, turn: Tensor) -> Tensor:
     return torch.stack((a * u + b * v, c * u + d * v), dim=-1)
 
 
-def _pixel_mean(errors: Tensor) -> Tensor:
-    return world_mean(errors.flatten(1)[..., None])[:, 0]
-
-
 Morphogenesis2DTrainConfig = TrainConfig[Morphogenesis2DConfig]
 """A training run of 2D morphogenesis."""
 
 _TOGETHER: Mapping[str, Any] = {
-    "escape_weight": 10.0,
-    "bound_weight": 10.0,
-    "drift_weight": 1.0,
-    "clump_radius": 0.2,
+    "escape_weight": 10.0, "bound_weight": 10.0, "drift_weight": 1.0, "clump_radius": 0.2,
     "cut_gap": 0.1,
-}
-"""Settings for long stability and for healing clumps and cuts (docs/stability.md)."""
+}  # fmt: skip
+"""Settings of the task for long stability and for healing clumps and cuts (docs/stability.md)."""
 
 HALF_SEEDS: Mapping[str, Any] = {
-    "optimiser": "adamw",
-    "seed_interval": 1,
-    "max_age_range": (0, 0),
-    "damage_share": 1.0,
+    "optimiser": "adamw", "seed_interval": 1, "max_age_range": (0, 0), "damage_share": 1.0,
     "stillness_weight": 0.0,
-}
-"""AdamW, with an initial world in every batch and no stillness loss: for several species
-(docs/species.md)."""
+}  # fmt: skip
+"""Settings of a run of several species: AdamW, an initial world in every batch, which are half of
+batches of two worlds, and no stillness loss (docs/species.md)."""
 
 MORPHOGENESIS2D_PRESETS = presets_of(
-    "morphogenesis2d",
-    paper=TrainConfig(task=Morphogenesis2DConfig()),
+    "morphogenesis2d", paper=TrainConfig(task=Morphogenesis2DConfig()),
     # Found by experiment on pictures that nobody tuned for: docs/recipes.md.
     best=TrainConfig(
         task=Morphogenesis2DConfig(
-            escape_share=2e-4,
-            damage_radius=0.2,
-            cut_share=0.5,
-            **_TOGETHER,
+            escape_share=2e-4, damage_radius=0.2, cut_share=0.5, **_TOGETHER,
         ),
-        repeats=1,
-        iterations=8000,
-        pool_size=64,
-        steps=(48, 80),
-        optimiser="muon",
-        learning_rate=3e-3,
-        weight_decay=0.1,
-        schedule="cosine",
-        max_age_range=(16, 16_384),
-        damage_and_keep_share=0.7,
-        damage_share=0.125,
-        stillness_min_age=1024,
-        stillness_weight=2.0,
-        stillness_power=4.0,
-        dead_zone=1e-3,
-        initial_rule="heart-first",
+        repeats=1, iterations=8000, pool_size=64, steps=(48, 80), optimiser="muon",
+        learning_rate=3e-3, weight_decay=0.1, schedule="cosine", max_age_range=(16, 16_384),
+        damage_and_keep_share=0.7, damage_share=0.125, stillness_min_age=1024, stillness_weight=2.0,
+        stillness_power=4.0, dead_zone=1e-3, initial_rule="heart-first",
     ),
     # A few particles that see far; of two worlds one is young, one grown and at rest:
     # docs/recipes.md.
     fast=fast_run(
         task=Morphogenesis2DConfig(
-            target_point_count=512,
-            particle_count=512,
-            eps=0.2,
-            seed_radius=0.4,
-            resolution=64,
-            escape_share=1e-3,
-            **_TOGETHER,
+            target_point_count=512, particle_count=512, eps=0.2, seed_radius=0.4, resolution=64,
+            escape_share=1e-3, **_TOGETHER,
         ),
-        iterations=2400,
-        pool_size=32,
-        steps=(16, 32),
-        optimiser="muon",
-        learning_rate=5e-3,
-        schedule="cosine",
-        max_age_range=(24, 256),
-        damage_share=0.5,
-        stillness_min_age=64,
-        stillness_weight=2.0,
-        picture_interval=200,
+        iterations=2400, pool_size=32, steps=(16, 32), optimiser="muon", learning_rate=5e-3,
+        schedule="cosine", max_age_range=(24, 256), damage_share=0.5, stillness_min_age=64,
+        stillness_weight=2.0, picture_interval=200,
     ),
     tiny=tiny_run(
         task=Morphogenesis2DConfig(
-            target="ring",
-            target_point_count=128,
-            particle_count=128,
-            hidden_dim=32,
-            eps=0.3,
+            target="ring", target_point_count=128, particle_count=128, hidden_dim=32, eps=0.3,
             resolution=32,
         ),
-        iterations=40,
-        steps=(8, 16),
-        milestones=(30,),
+        iterations=40, steps=(8, 16), milestones=(30,),
     ),
-)
+)  # fmt: skip
 """2D morphogenesis: `paper` (arXiv 2601.16096), `best` (any picture, one run of minutes on a GPU),
 `fast` (minutes on one core), `tiny` (tests)."""

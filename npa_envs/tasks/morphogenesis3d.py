@@ -1,4 +1,4 @@
-"""3D morphogenesis: a ball of blank particles grows into an object, compared in views."""
+"""The task of 3D morphogenesis: a ball of particles with zero states grows into an object."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from npa_envs.checks import (
     check_text,
 )
 from npa_envs.errors import NPAError
-from npa_envs.ops import Cameras, render_gaussians, world_mean
+from npa_envs.ops import Cameras, render_gaussians
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import GrowthConfig, GrowthTask, contributions_to_loss
 from npa_envs.tasks.gaussian_outputs import OUTPUTS, Gaussians, appearance
-from npa_envs.tasks.losses.image_distances import MultiScaleSimilarity
+from npa_envs.tasks.losses.image_distances import MultiScaleSimilarity, mean_by_world
 from npa_envs.tasks.targets.views import (
     Views,
     ViewTarget,
@@ -40,9 +40,10 @@ from npa_envs.world.particles import Particles
 
 @dataclass(frozen=True, kw_only=True)
 class Morphogenesis3DConfig(GrowthConfig):
-    """3D morphogenesis: a ball of blank particles grows into an object, compared in views.
+    """3D morphogenesis: a ball of particles with zero states grows into an object.
 
-    The defaults are the paper's (arXiv 2601.16096) where it is known. Lengths are in length units:
+    Pictures of worlds by several cameras, the views, are compared with those of the target. The
+    defaults are the paper's (arXiv 2601.16096) where these are known. Lengths are in length units:
     the target lies within 0.85 of the origin.
     """
 
@@ -68,16 +69,16 @@ class Morphogenesis3DConfig(GrowthConfig):
     """Pixels on each side of a view, R."""
 
     training_views: int = 48
-    """Largest number of views of the target to train with."""
+    """Maximum number of views of the target to train with."""
 
     held_out_views: int = 12
-    """Largest number of other views of the target, which only metrics use."""
+    """Maximum number of other views of the target, which only metrics use."""
 
     views_per_iteration: int = 4
-    """Training views that the loss compares, drawn again in each iteration."""
+    """Number of training views that the loss compares, others in each iteration."""
 
     view_seed: int = 0
-    """Seed of the views and backgrounds of the iterations."""
+    """Seed of the random choice of views and backgrounds for the iterations."""
 
     sigma: float = 0.02
     """Standard deviation of a round particle [length units]."""
@@ -92,10 +93,10 @@ class Morphogenesis3DConfig(GrowthConfig):
     """Standard deviation of the targets' blur at the first iteration [pixels]; 0: none."""
 
     blur_iterations: int = 1000
-    """Iterations over which the blur falls linearly to 0; in the paper a twentieth of all."""
+    """Iterations in which the blur falls linearly to 0; in the paper a twentieth of the run."""
 
     view_weight: float = 2.0
-    """Weight of the loss of the views (dimensionless)."""
+    """Weight of the difference of views (dimensionless)."""
 
     ssim_weight: float = 0.2
     """Weight of 1 − MS-SSIM, relative to the mean absolute difference of views (dimensionless)."""
@@ -123,17 +124,18 @@ class Morphogenesis3DConfig(GrowthConfig):
 
 
 SHOWN_FROM = 20.0
-"""Pictures show the held-out view nearest to the front at this elevation [degrees]."""
+"""Elevation [degrees] of a camera in front: pictures show the held-out view nearest to it."""
 
 GREY = 0.5
-"""Background of the views that `metric` compares."""
+"""Brightness of the background of views that `metric` compares, in [0, 1]."""
 
 
 class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
-    """The task of arXiv 2601.16096 with its loss.
+    """The task of growing a 3D object of arXiv 2601.16096, with its loss.
 
-    Particles are round, and the last three channels of their states are the colour. In the task
-    that `for_rule` returns, outputs of the rule's read-out network say how they look.
+    Each particle is drawn as a 3D Gaussian. It is round, and the last three channels of its state
+    are its colour. In the task that `for_rule` returns, the rule's read-out network computes shape
+    and colour from the state.
     """
 
     space_dim = 3
@@ -172,17 +174,17 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
         self._target_picture = self._shown.pictures[0].flip(0)
         view_count = min(config.views_per_iteration, len(target.training.pictures))
         self.view_index = torch.zeros(view_count, dtype=torch.int64, device=device)
-        """Indices of the training views that the loss compares, shape [V]."""
+        """Indices of the training views that the loss compares in this iteration, shape [V]."""
         self.backgrounds = torch.zeros(view_count, 3, device=device)
-        """Their background colours, in [0, 1], shape [V, 3]."""
+        """Background colours of these views, in [0, 1], shape [V, 3]."""
         self.blur_sigma = torch.zeros((), device=device)
-        """Standard deviation of their blur [pixels], shape []."""
+        """Standard deviation of the blur of the target's views [pixels], shape []."""
         self.begin(0)
         with_similarity = config.ssim_weight > 0.0
         self._similarity = MultiScaleSimilarity(side, device=device) if with_similarity else None
 
     def for_rule(self, rule: NPARule) -> Self:
-        """Return a copy of the task that renders particles with outputs of a rule's read-out."""
+        """Return a copy of the task that draws particles by a rule's read-out, if it has one."""
         if rule.readout_dim not in (0, OUTPUTS):
             raise NPAError(
                 f"the rule must have a read-out of {OUTPUTS} outputs, or none, got readout_dim="
@@ -197,7 +199,7 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
         return super().rule_shape | readout
 
     def begin(self, iteration: int) -> None:
-        """Choose the views, backgrounds and blur of the next calls of `loss`."""
+        """Set the views, backgrounds and blur of an iteration, which `loss` uses from now on."""
         config = self.config
         random = np.random.default_rng((config.view_seed, iteration))
         total, count = len(self.target.training.pictures), len(self.view_index)
@@ -216,11 +218,14 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
         return appearance(outputs, config.sigma, config.anisotropy, config.opacity)
 
     def views(self, x: Tensor, s: Tensor, cameras: Cameras) -> Tensor:
-        """Return pictures by V cameras: colours times alpha, and alpha, shape [B, V, H, W, 4]."""
+        """Return pictures of worlds by V cameras, shape [B, V, H, W, 4].
+
+        Channels are red, green and blue, each times alpha, and alpha. The first row is the top.
+        """
         return self._draw(x, self.gaussians(s), cameras)
 
     def picture(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return a held-out view of each world, shape [B, R, R, 4]; the first row is the bottom."""
+        """Return one of the `views` of each world, [B, R, R, 4], with the bottom row first."""
         return self.views(x, s, self._shown.cameras)[:, 0].flip(1)
 
     def metric(self, x: Tensor, s: Tensor) -> Tensor:
@@ -235,7 +240,10 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
         return (-10.0 * error.square().mean(dim=(2, 3, 4)).log10()).mean(dim=1)
 
     def particle_contributions(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return `contributions_to_loss` times N, by a factor on a particle's opacity; [B, N]."""
+        """Return N times each particle's contribution to its world's `metric`, shape [B, N].
+
+        It is by `contributions_to_loss`, of factors on particles' opacities.
+        """
         with torch.enable_grad():
             gaussians = self.gaussians(s.detach())
             opacities = gaussians.opacities.detach().requires_grad_()
@@ -244,7 +252,9 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
         return contributions_to_loss(loss.detach(), opacities.detach() * slope)
 
     def compare(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the batch's weighted loss of the iteration's views, and terms by name, [] each."""
+        """Return the batch's weighted loss, [], and its terms by name, []: those of `_compare` on
+        the iteration's views, and "isotropy", how far particles are from round.
+        """
         config, x = self.config, worlds.x
         gaussians = self.gaussians(worlds.s)
         target = some_views(self.target.training, self.view_index)
@@ -257,6 +267,7 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
         return total + config.isotropy_weight * terms["isotropy"], terms
 
     def _metric(self, x: Tensor, gaussians: Gaussians) -> Tensor:
+        """Return each world's `metric`, shape [B], for particles with these looks."""
         grey = x.new_full((3,), GREY)
         return self._weighted(self._compare(x, gaussians, self.target.held_out, grey))
 
@@ -267,29 +278,34 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
     def _compare(
         self, x: Tensor, gaussians: Gaussians, target: Views, background: Tensor
     ) -> dict[str, Tensor]:
-        """Return each world's mean |difference| of colours and alpha, and 1 − MS-SSIM, [B] each."""
+        """Return each world's distances from the target's views, shape [B] each.
+
+        "views" is the mean |difference| of colours and alpha. "structure" is 1 − MS-SSIM, which is
+        there if its weight is not 0.
+        """
         drawn, pictures = (
             torch.cat((composited(views, background), views[..., 3:]), dim=-1)
             for views in (self._draw(x, gaussians, target.cameras), target.pictures.to(x))
         )
         size = (drawn - pictures).abs()
-        terms = {"views": world_mean(size.flatten(1)[..., None])[:, 0]}
+        terms = {"views": mean_by_world(size)}
         if self._similarity is not None:
             similarity = self._similarity(drawn.movedim(-1, 2), pictures.movedim(-1, 1))
             terms["structure"] = 1.0 - similarity.mean(dim=(1, 2))
         return terms
 
     def _weighted(self, terms: dict[str, Tensor]) -> Tensor:
+        """Return the weighted sum of the terms of `_compare`."""
         if "structure" not in terms:
             return terms["views"]
         return terms["views"] + self.config.ssim_weight * terms["structure"]
 
 
 def blurred(pictures: Tensor, sigma: Tensor) -> Tensor:
-    """Return pictures [V, H, W, K] blurred by a Gaussian; outside of their edges they are 0.
+    """Return pictures [V, H, W, K] blurred by a Gaussian, as if they were 0 outside of their edges.
 
-    `sigma` is the standard deviation [pixels], shape [], which stays on the device. With 0 pictures
-    are unchanged, bit for bit.
+    `sigma` is its standard deviation [pixels], a tensor of shape [] that is not read back from the
+    device. A `sigma` of 0 leaves pictures unchanged, bit for bit.
     """
     rows, columns = (_blur_matrix(size, sigma, pictures) for size in pictures.shape[1:3])
     across = torch.einsum("xw,vhwk->vhxk", columns, pictures)
@@ -297,7 +313,7 @@ def blurred(pictures: Tensor, sigma: Tensor) -> Tensor:
 
 
 def _blur_matrix(size: int, sigma: Tensor, like: Tensor) -> Tensor:
-    """Return the matrix that blurs the pixels along one side, [size, size]."""
+    """Return the matrix [size, size] that blurs a row of `size` pixels, in dtype of `like`."""
     far = torch.arange(-size, size + 1, device=like.device, dtype=like.dtype)
     pixel = far[size : 2 * size]
     variance = sigma.to(like).square().clamp_min(1e-6)
@@ -306,112 +322,51 @@ def _blur_matrix(size: int, sigma: Tensor, like: Tensor) -> Tensor:
 
 
 _STRETCHED: Mapping[str, Any] = {
-    "anisotropy": 1.0,
-    "isotropy_weight": 0.02,
-    "escape_weight": 10.0,
-    "clump_radius": 0.2,
+    "anisotropy": 1.0, "isotropy_weight": 0.02, "escape_weight": 10.0, "clump_radius": 0.2,
     "cut_gap": 0.1,
-}
-"""Settings for stretched particles, stable worlds, and healing of clumps and cuts."""
+}  # fmt: skip
+"""Settings of the task for stretched particles, stable worlds, and healing of clumps and cuts."""
 
 MORPHOGENESIS3D_PRESETS = presets_of(
     "morphogenesis3d",
     paper=TrainConfig(
-        task=Morphogenesis3DConfig(),
-        iterations=20_000,
-        repeats=1,
-        world_count=4,
-        pool_size=16,
-        steps=(16, 32),
-        learning_rate=1e-3,
-        milestones=(2_000, 10_000),
-        seed_interval=1,
+        task=Morphogenesis3DConfig(), iterations=20_000, repeats=1, world_count=4, pool_size=16,
+        steps=(16, 32), learning_rate=1e-3, milestones=(2_000, 10_000), seed_interval=1,
     ),
     # Half as many particles, which see as many neighbours; half of a batch are initial worlds:
     # docs/morphogenesis3d.md.
     best=TrainConfig(
         task=Morphogenesis3DConfig(
-            particle_count=8192,
-            state_dim=24,
-            eps=0.126,
-            seed_radius=0.7,
-            views_per_iteration=8,
-            sigma=0.014,
-            opacity=0.6,
-            blur_sigma=0.0,
-            damage_radius=0.15,
-            escape_share=5e-5,
+            particle_count=8192, state_dim=24, eps=0.126, seed_radius=0.7, views_per_iteration=8,
+            sigma=0.014, opacity=0.6, blur_sigma=0.0, damage_radius=0.15, escape_share=5e-5,
             **_STRETCHED,
         ),
-        iterations=9000,
-        repeats=1,
-        world_count=4,
-        pool_size=32,
-        steps=(30, 34),
-        optimiser="muon",
-        learning_rate=5e-3,
-        weight_decay=0.1,
-        schedule="cosine",
-        seed_interval=1,
-        fresh_share=0.5,
-        damage_share=0.25,
-        initial_rule="rocket-8192",
+        iterations=9000, repeats=1, world_count=4, pool_size=32, steps=(30, 34), optimiser="muon",
+        learning_rate=5e-3, weight_decay=0.1, schedule="cosine", seed_interval=1, fresh_share=0.5,
+        damage_share=0.25, initial_rule="rocket-8192",
     ),
     # Of two worlds one is young, one grown and at rest, so that what has grown stays:
     # docs/morphogenesis3d.md.
     fast=fast_run(
         task=Morphogenesis3DConfig(
-            particle_count=768,
-            hidden_dim=64,
-            readout_hidden_dim=32,
-            eps=0.3,
-            alpha=0.3,
-            seed_radius=0.6,
-            resolution=40,
-            training_views=32,
-            held_out_views=8,
-            views_per_iteration=3,
-            sigma=0.06,
-            opacity=0.5,
-            blur_sigma=4.0,
-            blur_iterations=100,
-            escape_share=1e-3,
-            **_STRETCHED,
+            particle_count=768, hidden_dim=64, readout_hidden_dim=32, eps=0.3, alpha=0.3,
+            seed_radius=0.6, resolution=40, training_views=32, held_out_views=8,
+            views_per_iteration=3, sigma=0.06, opacity=0.5, blur_sigma=4.0, blur_iterations=100,
+            escape_share=1e-3, **_STRETCHED,
         ),
-        iterations=2000,
-        pool_size=32,
-        steps=(10, 20),
-        optimiser="muon",
-        learning_rate=5e-3,
-        schedule="cosine",
-        max_age_range=(16, 256),
-        damage_share=0.5,
-        stillness_min_age=48,
-        stillness_weight=0.5,
-        picture_interval=100,
+        iterations=2000, pool_size=32, steps=(10, 20), optimiser="muon", learning_rate=5e-3,
+        schedule="cosine", max_age_range=(16, 256), damage_share=0.5, stillness_min_age=48,
+        stillness_weight=0.5, picture_interval=100,
     ),
     tiny=tiny_run(
         task=Morphogenesis3DConfig(
-            target="doughnut",
-            particle_count=200,
-            hidden_dim=32,
-            readout_hidden_dim=16,
-            eps=0.4,
-            seed_radius=0.6,
-            resolution=32,
-            training_views=8,
-            held_out_views=4,
-            views_per_iteration=2,
-            sigma=0.08,
-            opacity=0.6,
-            blur_sigma=3.0,
-            blur_iterations=5,
+            target="doughnut", particle_count=200, hidden_dim=32, readout_hidden_dim=16, eps=0.4,
+            seed_radius=0.6, resolution=32, training_views=8, held_out_views=4,
+            views_per_iteration=2, sigma=0.08, opacity=0.6, blur_sigma=3.0, blur_iterations=5,
             ssim_weight=0.0,
         ),
-        pool_size=4,
-        steps=(6, 10),
-        seed_interval=1,
+        pool_size=4, steps=(6, 10), seed_interval=1,
     ),
-)
+)  # fmt: skip
 """`paper` (arXiv 2601.16096), `best` (any mesh, one run of minutes on a GPU), `fast` (on one core),
 `tiny` (tests)."""

@@ -1,4 +1,4 @@
-"""Self-classifying point clouds: static particles agree on the class of their cloud."""
+"""The classification task: particles that do not move agree on the class of their point cloud."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ from torch import Tensor
 
 from npa_envs.checks import check_non_negative, check_positive, check_seed, check_text
 from npa_envs.errors import NPAError
-from npa_envs.ops import splat, world_mean
+from npa_envs.ops import splat
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Frame, ParticleTask, TaskConfig
+from npa_envs.tasks.losses.image_distances import mean_by_world
 from npa_envs.tasks.seeds import drawn_indices, drawn_worlds
 from npa_envs.tasks.targets.digit_clouds import PointClouds, Split, augmented, load_clouds
 from npa_envs.tasks.train_config import Common, TrainConfig, fast_run, presets_of, tiny_run
@@ -24,7 +25,7 @@ from npa_envs.world.randomness import Randomness
 
 @dataclass(frozen=True, kw_only=True)
 class PointClassificationConfig(TaskConfig):
-    """Static particles agree on the class of their point cloud (arXiv 2601.16096).
+    """Particles that do not move agree on the class of their point cloud (arXiv 2601.16096).
 
     The defaults are the paper's, but for the data, which are small. Lengths are in length units;
     a cloud fills about [0, 1]².
@@ -40,20 +41,20 @@ class PointClassificationConfig(TaskConfig):
     """Number of classes."""
 
     sample_seed: int = 0
-    """Seed of the candidates for farthest-point sampling of the pictures."""
+    """Seed of the points that are chosen from the pictures."""
 
     rotation: float = 0.0
-    """Largest random rotation of initial clouds, in either direction [degrees]."""
+    """Largest random rotation of clouds to train with, in either direction [degrees]."""
 
     stretch: float = 0.0
-    """Largest random stretch and shear of initial clouds (dimensionless)."""
+    """Largest random stretch and shear of clouds to train with (dimensionless)."""
 
     jitter: float = 0.0
-    """Standard deviation of the noise on initial clouds' coordinates [length units]."""
+    """Standard deviation of the noise on coordinates of clouds to train with [length units]."""
 
     mutated_share: float = 0.0
     """Probability that a damaged world from the pool gets the positions and class of another cloud
-    and keeps its states."""
+    and keeps its states (dimensionless)."""
 
     particle_count: Common[int] = 512
     """Particles in a world, N: points of a cloud."""
@@ -88,11 +89,11 @@ SIGMA = 0.7
 
 
 class PointClassification(ParticleTask[PointClassificationConfig]):
-    """The classification task of arXiv 2601.16096.
+    """The classification task of arXiv 2601.16096: each particle outputs a score for each class.
 
-    The goal of a world is its cloud's class. Class scores are the outputs of the rule's read-out;
-    without a read-out, they are the last channels of the states. Clouds of the split "test" are not
-    augmented.
+    Scores are the outputs of the rule's read-out; without a read-out, the last channels of the
+    states. The goal of a world is its cloud's class. Clouds of the split "train" are randomly
+    rotated, stretched and jittered, those of "test" are not.
     """
 
     metric_name = "mean squared error to the class"
@@ -144,7 +145,7 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
 
     @property
     def pixel_size(self) -> float:
-        """Usual distance between particles [length units]."""
+        """Distance between neighbouring particles, about [length units]."""
         return math.sqrt(self.clouds.coverage / self.config.particle_count)
 
     @property
@@ -155,11 +156,11 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         return {"alpha": 1.0, "static": True, **sizes}
 
     def for_rule(self, rule: NPARule) -> Self:
-        """Return the task whose losses and pictures use the rule's read-out."""
+        """Return a copy of the task whose losses and pictures use the rule's read-out."""
         return self._with(_rule=rule)
 
     def held_out(self) -> Self:
-        """Return the task with the clouds of "test"."""
+        """Return a copy of the task with the clouds of "test"."""
         task = self._with(split="test")
         vars(task).pop("clouds", None)
         return task
@@ -167,7 +168,7 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
     def seed(
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
     ) -> Particles:
-        """Return random clouds, those of "train" augmented, with blank states; goals: classes."""
+        """Return worlds of random clouds, with zero states and the clouds' classes as goals."""
         config, clouds = self.config, self.clouds
         chosen = drawn_indices(len(clouds.label), world_count, generator, torch.device(device))
         chosen = chosen.to(clouds.label.device)
@@ -177,7 +178,7 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         return Particles(x, x.new_zeros(*x.shape[:2], config.state_dim), goal=goal)
 
     def damage(self, worlds: Particles, generator: Randomness) -> Particles:
-        """Return worlds, of which some get the positions and class of another cloud."""
+        """Return worlds; a fraction `mutated_share` gets positions and class of another cloud."""
         x, probability = worlds.x, self.config.mutated_share
         if worlds.goal is None or probability == 0.0:
             return worlds
@@ -207,14 +208,14 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         return (self.outputs(s).argmax(dim=-1) != self.goal[:, None]).to(s.dtype)
 
     def cross_entropies(self, s: Tensor, sharpness: float) -> Tensor:
-        """Return each particle's cross-entropy of softmax(sharpness × scores), [B, N]."""
+        """Return each particle's cross-entropy of class and softmax(sharpness × scores), [B, N]."""
         log_probabilities = torch.log_softmax(sharpness * self.outputs(s), dim=-1)
         label = self.goal[:, None, None].expand(*s.shape[:2], 1)
         return -log_probabilities.gather(-1, label).squeeze(-1)
 
     def metric(self, x: Tensor, s: Tensor) -> Tensor:
         """Return each world's mean of (class scores - one-hot of its class)², shape [B]."""
-        return world_mean(self.errors(s)[..., None])[:, 0]
+        return mean_by_world(self.errors(s))
 
     def trial_metric(self, worlds: Particles) -> Tensor:
         """Return the fraction of each world's particles with a wrong class, shape [B]."""
@@ -229,13 +230,19 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         return channel_mean((s - s.clamp(-1.0, 1.0)).abs())
 
     def compare(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the batch's mean squared error, and by name "error" and "accuracy", [] each."""
+        """Return the batch's mean squared error, and terms "error" (the same) and "accuracy", [].
+
+        Accuracy is the fraction of particles that score the right class highest.
+        """
         error = self.errors(worlds.s).mean()
         accuracy = 1.0 - self.mistakes(worlds.s.detach()).mean()
         return error, {"error": error, "accuracy": accuracy}
 
     def picture(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return pictures coloured by class: sums of colours over splats, density, [B, R, R, 4]."""
+        """Return pictures of particles in colours of their best class, shape [B, R, R, 4].
+
+        Channels are as in `target_picture`.
+        """
         return splat(
             x,
             self.colours(s),
@@ -252,20 +259,13 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
 
 
 PICTURE_MARGIN = 0.0625
-"""Margin around [0, 1]² in pictures [length units]."""
+"""Width of the margin around [0, 1]² in pictures [length units]."""
 
 PALETTE = (
-    (0.90, 0.10, 0.29),
-    (0.24, 0.71, 0.29),
-    (1.00, 0.85, 0.10),
-    (0.26, 0.39, 0.85),
-    (0.96, 0.51, 0.19),
-    (0.57, 0.12, 0.71),
-    (0.27, 0.80, 0.85),
-    (0.94, 0.20, 0.90),
-    (0.50, 0.35, 0.14),
-    (0.05, 0.05, 0.05),
-)
+    (0.90, 0.10, 0.29), (0.24, 0.71, 0.29), (1.00, 0.85, 0.10), (0.26, 0.39, 0.85),
+    (0.96, 0.51, 0.19), (0.57, 0.12, 0.71), (0.27, 0.80, 0.85), (0.94, 0.20, 0.90),
+    (0.50, 0.35, 0.14), (0.05, 0.05, 0.05),
+)  # fmt: skip
 """Red, green and blue of class 0, 1, ..., repeated for more classes."""
 
 UNDECIDED = (0.6, 0.6, 0.6)
@@ -273,9 +273,10 @@ UNDECIDED = (0.6, 0.6, 0.6)
 
 
 def majority(outputs: Tensor) -> Tensor:
-    """Return the class to which most particles give their highest of K scores, int64, [B].
+    """Return the class that the largest number of particles score highest, int64, shape [B].
 
-    Of classes with as many particles it is the one with the largest sum of scores.
+    `outputs` are the scores [B, N, K]. If classes have equally many particles, it is that with the
+    largest sum of scores.
     """
     particle_count, class_count = outputs.shape[1:]
     classes = torch.arange(class_count, device=outputs.device)
@@ -302,7 +303,7 @@ def class_colours(outputs: Tensor) -> Tensor:
 
 
 def channel_mean(values: Tensor) -> Tensor:
-    """Return the mean over the last dimension, bit for bit the same in every batch."""
+    """Return the mean over the last dimension, whose bits do not depend on the batch."""
     # One by one: the rounding of torch's mean may depend on the batch.
     total, *rest = values.unbind(-1)
     for term in rest:
@@ -313,52 +314,24 @@ def channel_mean(values: Tensor) -> Tensor:
 POINT_CLASSIFICATION_PRESETS = presets_of(
     "point_classification",
     paper=TrainConfig(
-        task=PointClassificationConfig(),
-        iterations=50_000,
-        repeats=1,
-        world_count=64,
-        pool_size=1024,
-        steps=(12, 24),
-        learning_rate=1e-3,
-        weight_decay=0.1,
-        milestones=(20_000, 40_000),
-        seed_interval=1,
-        fresh_share=0.5,
+        task=PointClassificationConfig(), iterations=50_000, repeats=1, world_count=64,
+        pool_size=1024, steps=(12, 24), learning_rate=1e-3, weight_decay=0.1,
+        milestones=(20_000, 40_000), seed_interval=1, fresh_share=0.5,
     ),
     # Of clouds never seen 91 % are classified rightly, after some four minutes on one core.
     fast=fast_run(
         task=PointClassificationConfig(
-            stretch=0.1,
-            mutated_share=0.25,
-            particle_count=128,
-            hidden_dim=128,
-            readout_hidden_dim=64,
-            eps=0.2,
-            resolution=64,
+            stretch=0.1, mutated_share=0.25, particle_count=128, hidden_dim=128,
+            readout_hidden_dim=64, eps=0.2, resolution=64,
         ),
-        iterations=1500,
-        world_count=32,
-        pool_size=256,
-        steps=(12, 20),
-        milestones=(1100, 1400),
-        seed_interval=1,
-        fresh_share=0.5,
-        picture_interval=500,
-        checkpoint_interval=300,
+        iterations=1500, world_count=32, pool_size=256, steps=(12, 20), milestones=(1100, 1400),
+        seed_interval=1, fresh_share=0.5, picture_interval=500, checkpoint_interval=300,
     ),
     tiny=tiny_run(
         task=PointClassificationConfig(
-            particle_count=64,
-            hidden_dim=32,
-            readout_hidden_dim=32,
-            eps=0.25,
-            resolution=32,
+            particle_count=64, hidden_dim=32, readout_hidden_dim=32, eps=0.25, resolution=32,
         ),
-        world_count=8,
-        pool_size=32,
-        steps=(6, 10),
-        seed_interval=1,
-        fresh_share=0.5,
+        world_count=8, pool_size=32, steps=(6, 10), seed_interval=1, fresh_share=0.5,
     ),
-)
+)  # fmt: skip
 """Classification of point clouds: `paper` (arXiv 2601.16096), `fast` (on one core), `tiny`."""

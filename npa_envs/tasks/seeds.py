@@ -1,4 +1,4 @@
-"""Start positions of particles: uniform in a ball or a box; draws by world."""
+"""Random start positions, uniform in a ball or a box, and random choices for each world."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def uniform_ball(
     radius = checked_finite("radius", radius, " [length units]")
     if radius < 0.0:
         raise NPAError(f"radius must not be negative [length units], got {radius:g}")
-    shape, like = _checked(world_count, particle_count, space_dim, generator, device, dtype)
+    shape, like = _checked_shape(world_count, particle_count, space_dim, generator, device, dtype)
     direction = normal_draws(generator, shape, like)
     if isinstance(generator, WorldRandom):
         # Added one by one and without a root of the distance: the same bits on every device.
@@ -64,7 +64,7 @@ def uniform_box(
             f"box must hold a side for each dimension, got {shown(box)}: give (2.0, 2.0)"
         )
     sides = [checked_finite("a side of box", side, " [length units]") for side in values]
-    shape, like = _checked(world_count, particle_count, len(sides), generator, device, dtype)
+    shape, like = _checked_shape(world_count, particle_count, len(sides), generator, device, dtype)
     fraction = uniform_draws(generator, shape, like)
     return torch.stack([side * (fraction[..., d] - 0.5) for d, side in enumerate(sides)], dim=-1)
 
@@ -79,12 +79,12 @@ def drawn_indices(
 
 
 def drawn_worlds(x: Tensor, generator: Randomness, probability: float) -> Tensor:
-    """Return a random bool for each world, True with `probability`, shape [B]."""
+    """Return a random bool for each world of positions x, True with `probability`, shape [B]."""
     single = x.new_empty(0, dtype=torch.float32)
     return uniform_draws(generator, (len(x), 1), single)[:, 0] < probability
 
 
-def _checked(
+def _checked_shape(
     world_count: int,
     particle_count: int,
     space_dim: int,
@@ -92,7 +92,10 @@ def _checked(
     device: str | torch.device,
     dtype: torch.dtype,
 ) -> tuple[tuple[int, int, int], Tensor]:
-    """Return the shape of points, [B, N, D], and an empty tensor of their device and dtype."""
+    """Return the shape [B, N, D] of points, and an empty tensor of their device and dtype.
+
+    It raises NPAError if an argument is wrong.
+    """
     device = check_device(device)
     world_count = checked_count("world_count", world_count)
     particle_count = checked_count("particle_count", particle_count)

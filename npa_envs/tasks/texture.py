@@ -1,4 +1,4 @@
-"""Textures: particles all over a periodic box arrange and colour themselves like a target."""
+"""The texture task: particles in a periodic box arrange and colour themselves like a target."""
 
 from __future__ import annotations
 
@@ -79,7 +79,8 @@ class TextureConfig(TaskConfig):
     """Radius of the disk whose state is wiped in worlds from the pool [length units]; 0: none."""
 
     sigma: float = 0.7
-    """Standard deviation of a particle's splat, in distances between particles (dimensionless)."""
+    """Standard deviation of a particle's splat, the Gaussian spot that draws it, in distances
+    between particles (dimensionless)."""
 
     colour_weight: float = 1.0
     """Weight of the texture loss of the colour image (dimensionless)."""
@@ -116,20 +117,20 @@ DENSITY_FLOOR = 1e-6
 """Added to densities, so that their power has a finite slope at 0."""
 
 DENSITY_POWER = 0.1
-"""Power of densities that are compared: it separates empty from covered."""
+"""Power to which compared densities are raised: it separates empty from covered."""
 
 JOINT_POWER = 0.5
-"""Power of densities where colours and density are compared together."""
+"""Power to which densities are raised where they are compared together with colours."""
 
 JITTER = 0.35
-"""Largest displacement of a drawing's points from their lattice, as a fraction of its spacing."""
+"""Largest displacement of points from their lattice in `Texture.drawing`, in lattice spacings."""
 
-DRAWINGS = 16
-"""Number of drawings that `Texture.drawable` averages."""
+DRAWING_COUNT = 16
+"""Number of pictures by `Texture.drawing` that `Texture.drawable` averages."""
 
 
 class Texture(ParticleTask[TextureConfig]):
-    """The texture task of arXiv 2601.16096, with its loss."""
+    """The texture task of arXiv 2601.16096, by any of `TEXTURE_LOSSES`."""
 
     has_texture_metric = True
     _resized_with = ("target",)
@@ -163,7 +164,7 @@ class Texture(ParticleTask[TextureConfig]):
         self.metric_name = config.loss
         weights = config.colour_weight, config.density_weight
         self.weights = (1.0, 1.0) if is_joint(config.loss) else weights
-        """Weights of `texture_losses`; 1 for a joint loss, which contains them."""
+        """Weights of the two `texture_losses`; 1 for a joint loss, which contains the weights."""
         # All particles together have the target's mean density.
         self._pixel_size = config.box_size * (target.coverage / config.particle_count) ** 0.5
 
@@ -183,7 +184,7 @@ class Texture(ParticleTask[TextureConfig]):
         return uniform_box(world_count, count, self.box, generator=generator, device=device)
 
     def damage(self, worlds: Particles, generator: Randomness) -> Particles:
-        """Return worlds whose states in a disk around one random particle are set to zero."""
+        """Return worlds whose states are set to 0 in a disk around one random particle of each."""
         if self.config.damage_radius == 0.0:
             return worlds
         x, s, *_ = worlds
@@ -191,13 +192,14 @@ class Texture(ParticleTask[TextureConfig]):
         return worlds._replace(s=wipe_state(x, s, centre=centre, radius=radius, box=self.box))
 
     def picture(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return each world's picture: sums of colours over splats, density; [B, R, R, 4]."""
+        """Return each world's picture: red, green, blue (sums of splats), density, [B, R, R, 4]."""
         return self.splat(x, s[..., -3:] + COLOUR_OFFSET)
 
     def drawing(self, number: int, *, shifted: bool = True) -> Tensor:
-        """Return a picture of the target by splats on a jittered lattice, shape [1, R, R, 4].
+        """Return the target drawn by splats on a jittered lattice, as particles could draw it.
 
-        `number` seeds the jitter. `shifted` also translates it at random across the periodic box.
+        The picture has shape [1, R, R, 4]. `number` is the seed of the jitter. If `shifted`, it is
+        also translated at random across the periodic box.
         """
         side, resolution = self.config.box_size, self.config.resolution
         generator = torch.Generator().manual_seed(number)
@@ -216,16 +218,16 @@ class Texture(ParticleTask[TextureConfig]):
 
     @cached_property
     def drawable(self) -> Tensor:
-        """The target as sharp as splats can draw it: a mean of `drawing`s, shape [R, R, 4]."""
-        drawn = [self.drawing(number, shifted=False) for number in range(DRAWINGS)]
+        """The target as sharp as splats can draw it, shape [R, R, 4]: a mean over `drawing`s."""
+        drawn = [self.drawing(number, shifted=False) for number in range(DRAWING_COUNT)]
         return torch.cat(drawn).mean(0)
 
     def texture_losses(self, x: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return each world's loss of the colour image and of the density image, shape [B] each.
 
-        The second is 0 for a joint loss, which compares the density together with the colours.
-        Worlds are translated so that their first particle is in the middle: losses that sample
-        some positions then sample others in each world and step.
+        If the loss is joint, it compares both at once, and the second is 0. Worlds are translated
+        so that their first particle is in the middle: losses that sample some positions then sample
+        others in each world and step.
         """
         return self.compare_pictures(self.picture(x - x[:, :1].detach(), s))
 
@@ -234,7 +236,10 @@ class Texture(ParticleTask[TextureConfig]):
         return self.weighted(*self.texture_losses(x, s))
 
     def particle_contributions(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return `contributions_to_loss` times N, by a factor on a particle's splat; [B, N]."""
+        """Return N times each particle's contribution to its world's `metric`, shape [B, N].
+
+        It is by `contributions_to_loss`, of factors on particles' splats.
+        """
         x, s = x.detach(), s.detach()
         x = x - x[:, :1]
         blank = s.new_zeros(*s.shape[:2], 3).requires_grad_()
@@ -252,18 +257,18 @@ class Texture(ParticleTask[TextureConfig]):
         return contributions_to_loss(loss.detach(), red + green + blue + density[..., 0])
 
     def compare(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the batch's weighted texture loss, and its terms by name, [] each."""
+        """Return the batch's weighted texture loss, [], and its terms "colour", "density", []."""
         losses = self.texture_losses(worlds.x, worlds.s)
         colour, density = (term.mean() for term in losses)
         return self.weighted(colour, density), {"colour": colour, "density": density}
 
     def penalties(self, worlds: Particles) -> dict[str, tuple[float, Tensor]]:
-        """Return penalties of motion and of states outside of [-1, 1]."""
+        """Return the penalties of path lengths, "motion", and of states, "overflow"."""
         motion = self.config.motion_weight, distances_moved(worlds).mean()
         return {"motion": motion, **super().penalties(worlds)}
 
     def splat(self, x: Tensor, colour: Tensor) -> Tensor:
-        """Return the picture of particles at x, [B, N, 2], in colours [B, N, 3]: [B, R, R, 4]."""
+        """Return the pictures [B, R, R, 4] of particles at x [B, N, 2] in colours [B, N, 3]."""
         half = 0.5 * self.config.box_size
         return periodic_splat(
             x,
@@ -276,7 +281,7 @@ class Texture(ParticleTask[TextureConfig]):
         )
 
     def compare_pictures(self, picture: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the losses of pictures' [B, R, R, 4] colours and densities, [B] each."""
+        """Return the losses of pictures' [B, R, R, 4] colours and of their densities, [B] each."""
         compare_colours, compare_densities = self._losses
         channels = picture.movedim(-1, 1)
         if compare_densities is None:
@@ -287,14 +292,17 @@ class Texture(ParticleTask[TextureConfig]):
         return compare_colours(colour_image(channels)), compare_densities(density)
 
     def joint_image(self, channels: Tensor) -> Tensor:
-        """Return colours and density^0.5, times the roots of their weights, [..., 4, R, R]."""
+        """Return what joint losses compare: colours and density^0.5, times the weights' roots.
+
+        The shape is [..., 4, R, R], that of the `channels` of a picture.
+        """
         density = (channels[..., 3:, :, :] + DENSITY_FLOOR) ** JOINT_POWER
         colour_scale = self.config.colour_weight**0.5
         density_scale = self.config.density_weight**0.5
         return torch.cat((colour_scale * colour_image(channels), density_scale * density), dim=-3)
 
     def weighted(self, colour: Tensor, density: Tensor) -> Tensor:
-        """Return the sum of both losses, each times its weight."""
+        """Return the sum of both `texture_losses`, each times its weight."""
         colour_weight, density_weight = self.weights
         return colour_weight * colour + density_weight * density
 
@@ -314,7 +322,10 @@ class Texture(ParticleTask[TextureConfig]):
 
 
 def colour_image(channels: Tensor) -> Tensor:
-    """Return the colours that losses compare, [..., 3, R, R]: means where splats overlap."""
+    """Return the colours that losses compare, [..., 3, R, R], from a picture's `channels`.
+
+    Where splats overlap, they are means over these.
+    """
     sums, density = channels[..., :3, :, :], channels[..., 3:, :, :]
     return sums / density.clamp_min(1.0)
 
@@ -327,55 +338,34 @@ def density_image(density: Tensor) -> Tensor:
 # Found by experiment: docs/textures.md. What is learned with 2048 particles holds for more.
 _BEST = TrainConfig(
     task=TextureConfig(
-        target="hearts",
-        particle_count=2048,
-        see_across=True,
-        loss="patch_ot+joint_swd",
+        target="hearts", particle_count=2048, see_across=True, loss="patch_ot+joint_swd",
         motion_weight=0.02,
     ),
-    iterations=8000,
-    repeats=1,
-    world_count=4,
-    pool_size=64,
-    steps=(24, 32),
-    optimiser="muon",
-    learning_rate=3e-3,
-    weight_decay=0.1,
-    schedule="cosine",
-    max_age_range=(64, 8192),
+    iterations=8000, repeats=1, world_count=4, pool_size=64, steps=(24, 32), optimiser="muon",
+    learning_rate=3e-3, weight_decay=0.1, schedule="cosine", max_age_range=(64, 8192),
     damage_share=0.5,
-)
+)  # fmt: skip
 
 TEXTURE_PRESETS = presets_of(
     "texture",
     paper=TrainConfig(
-        task=TextureConfig(loss="vgg_ot"),
-        iterations=12_000,
-        repeats=1,
-        steps=(16, 32),
-        learning_rate=1e-4,
-        weight_decay=0.1,
-        milestones=(3_000, 6_000, 9_000),
+        task=TextureConfig(loss="vgg_ot"), iterations=12_000, repeats=1, steps=(16, 32),
+        learning_rate=1e-4, weight_decay=0.1, milestones=(3_000, 6_000, 9_000),
     ),
     best=_BEST,
     # Three minutes on two cores.
     fast=replace(
         _BEST,
         task=replace(_BEST.task, target="dots", particle_count=1024, hidden_dim=64, resolution=64),
-        iterations=600,
-        world_count=2,
-        pool_size=32,
-        picture_interval=100,
-        checkpoint_interval=200,
+        iterations=600, world_count=2, pool_size=32, picture_interval=100, checkpoint_interval=200,
         tensorboard=False,
     ),
     tiny=tiny_run(
         task=TextureConfig(
             target="dots", particle_count=256, hidden_dim=32, eps=0.3, resolution=24
         ),
-        steps=(8, 16),
-        seed_interval=4,
+        steps=(8, 16), seed_interval=4,
     ),
-)
+)  # fmt: skip
 """Textures: `paper` (arXiv 2601.16096, needs VGG16's weights), `best` (any texture, one run of
 minutes on a GPU), `fast` (`best` in small, on a CPU), `tiny`."""

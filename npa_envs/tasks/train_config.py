@@ -1,4 +1,4 @@
-"""Configurations of training runs: of one rule, of several rules in one world; small runs."""
+"""Configurations of training runs: `TrainConfig`, of several rules in one world, of small runs."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ OptimiserName = Literal["adamw", "muon"]
 """Names of optimisers."""
 
 RISE = 0.01
-"""Fraction of a repeat in which the learning rate of the schedule "cosine" rises."""
+"""Fraction of a repeat in which the schedule "cosine" raises the learning rate from 0."""
 
 LOWEST = 0.01
 """Final learning rate of the schedule "cosine", as a fraction of the largest."""
@@ -57,8 +57,10 @@ MAX_POWER = 8.0
 class TrainConfig(Generic[TaskConfigT]):
     """A training run: the schedule, the pool, the optimiser, the machine, what is written.
 
-    The defaults are the paper's for 2D morphogenesis (arXiv 2601.16096). Fields of the task lie
-    in `task`; `npa_envs.training.override` and configuration files accept both by name.
+    The pool stores worlds between batches. In each iteration a batch of them is rolled out further,
+    the rule learns from the loss at the end, and the worlds go back into the pool. The defaults are
+    the paper's for 2D morphogenesis (arXiv 2601.16096). `npa_envs.training.override` and
+    configuration files take names of these fields and of those of `task`.
     """
 
     task: TaskConfigT
@@ -85,13 +87,14 @@ class TrainConfig(Generic[TaskConfigT]):
     """Optimiser steps in one repeat."""
 
     repeats: Common[int] = 3
-    """How often the schedule runs. Rule and pool continue; the optimiser is reset."""
+    """How often the schedule of `iterations` runs: rule and pool continue, the optimiser is
+    reset."""
 
     world_count: Common[int] = 8
-    """Worlds in a batch, B."""
+    """Number of worlds in a batch, B."""
 
     pool_size: Common[int] = 512
-    """Worlds that are stored between batches."""
+    """Number of worlds that are stored between batches."""
 
     steps: Common[tuple[int, int]] = (32, 96)
     """Range [lo, hi) that the number of steps of a rollout is drawn from, uniformly."""
@@ -114,11 +117,11 @@ class TrainConfig(Generic[TaskConfigT]):
     """The optimiser's weight decay."""
 
     seed_interval: int = 16
-    """Every this many batches, the batch begins with initial worlds; 1: every batch."""
+    """One batch in this many contains initial worlds; 1: every batch."""
 
     fresh_share: float = 0.0
-    """Fraction of initial worlds in a batch with some (`seed_interval`); at least one world. No
-    effect with `max_age_range`."""
+    """Fraction of initial worlds in such a batch (`seed_interval`); at least one world. No effect
+    with `max_age_range`."""
 
     max_age_range: tuple[int, int] = (0, 0)
     """Range of the lifetimes [steps] after which a world of the pool is replaced by an initial one,
@@ -148,7 +151,7 @@ class TrainConfig(Generic[TaskConfigT]):
     damage_share: float = 1.0
     """Fraction in [0, 1] of the pool whose worlds are damaged in every batch, so that a rule learns
     to heal: the first indices, which with `max_age_range` have the shortest lifetimes. All others
-    are damaged by `damage_and_keep_share` alone."""
+    are damaged by `damage_and_keep_share` only."""
 
     seed: Common[int] = 0
     """Seed of every random number of the run, in [0, 2**63)."""
@@ -193,11 +196,27 @@ class TrainConfig(Generic[TaskConfigT]):
         check_seed(self, "seed")
         check_flag(self, "cuda_graph", "tensorboard")
         parse_device(self.device)
-        check = partial(check_field, self)
         choices = {"optimiser": OptimiserName, "schedule": Schedule, "memory": Memory}
         choices |= {"moment_inverse": MomentInverse, "dtype": Literal["float32", "float64"]}
         for name, literal in choices.items():
             check_word(self, name, get_args(literal))
+        self._check_schedule()
+        self._check_pool()
+        factors, check = self.vary_eps, partial(check_field, self)
+        fits = _is_pair(factors, is_real) and 0.0 < factors[0] <= factors[1]
+        hint = "for example vary_eps=(0.5, 2.0)"
+        check("vary_eps", fits, "be two factors (lo, hi) with 0 < lo <= hi", hint)
+        is_path = isinstance(self.out, Path)
+        check("out", is_path, "be a pathlib.Path", f"Path({shown(self.out)})")
+        for name in ("stillness_weight", "damage_and_keep_share"):
+            if getattr(self, name) > 0 and not self.ages:
+                raise NPAError(
+                    f"{name} needs max_age_range, got {getattr(self, name)} without: "
+                    "set max_age_range, for example to (256, 32768)"
+                )
+
+    def _check_schedule(self) -> None:
+        check, milestones = partial(check_field, self), self.milestones
         fits = 1.0 <= self.stillness_power <= MAX_POWER
         rule = f"be at least 1 and at most {MAX_POWER:g}"
         check("stillness_power", fits, rule, "1 for arithmetic means")
@@ -208,34 +227,24 @@ class TrainConfig(Generic[TaskConfigT]):
         fits = _is_pair(self.steps, is_whole) and 1 <= self.steps[0] < self.steps[1]
         rule = "be two whole numbers (lo, hi) with 1 <= lo < hi"
         check("steps", fits, rule, "hi is exclusive, so exactly 32 steps are steps=(32, 33)")
-        milestones, ages = self.milestones, self.max_age_range
         fits = isinstance(milestones, tuple) and all(map(is_whole, milestones))
         fits = fits and list(milestones) == sorted({m for m in milestones if m >= 1})
         rule = "be positive and increasing whole numbers in a tuple"
         check("milestones", fits, rule, "for example milestones=(2000, 4000)")
-        rule = f"be at most pool_size={self.pool_size} (batches are drawn without replacement)"
+
+    def _check_pool(self) -> None:
+        check, ages = partial(check_field, self), self.max_age_range
         fits, hint = self.world_count <= self.pool_size, f"set pool_size={self.world_count} or more"
+        rule = f"be at most pool_size={self.pool_size} (batches are drawn without replacement)"
         check("world_count", fits, rule, hint)
         fits = _is_pair(ages, is_whole) and (1 <= ages[0] <= ages[1] or ages == (0, 0))
         rule = "be two whole numbers (lo, hi) with 1 <= lo <= hi, or (0, 0)"
         check("max_age_range", fits, rule, "for example max_age_range=(64, 16384)")
-        fits = not self.ages or self.pool_size % self.world_count == 0
-        rule = "be a multiple of world_count where max_age_range is set"
         sections = self.pool_size // self.world_count * self.world_count
+        fits = not self.ages or self.pool_size == sections
+        rule = "be a multiple of world_count where max_age_range is set"
         hint = f"with world_count={self.world_count} set pool_size={sections}"
         check("pool_size", fits, rule, hint)
-        factors = self.vary_eps
-        fits = _is_pair(factors, is_real) and 0.0 < factors[0] <= factors[1]
-        rule = "be two factors (lo, hi) with 0 < lo <= hi"
-        check("vary_eps", fits, rule, "for example vary_eps=(0.5, 2.0)")
-        is_path = isinstance(self.out, Path)
-        check("out", is_path, "be a pathlib.Path", f"Path({shown(self.out)})")
-        for name in ("stillness_weight", "damage_and_keep_share"):
-            if getattr(self, name) > 0 and not self.ages:
-                raise NPAError(
-                    f"{name} needs max_age_range, got {getattr(self, name)} without: "
-                    "set max_age_range, for example to (256, 32768)"
-                )
 
     @property
     def ages(self) -> bool:
@@ -249,7 +258,7 @@ class TrainConfig(Generic[TaskConfigT]):
 
     @property
     def fresh_count(self) -> int:
-        """Number of initial worlds in each batch that gets some: every `seed_interval`-th."""
+        """Number of initial worlds in a batch that contains some, by `fresh_share`."""
         return max(1, round(self.fresh_share * self.world_count))
 
     @property
@@ -265,9 +274,9 @@ class TrainConfig(Generic[TaskConfigT]):
     def learning_rate_at(self, iteration: int, fraction: float = 0.0) -> float:
         """Return the learning rate of an iteration, counted from 0 over all repeats.
 
-        A resumed run needs no scheduler state. Each repeat restarts it: steps at the milestones, or
-        a short linear rise and a cosine (Loshchilov and Hutter, arXiv 1608.03983). `fraction` is
-        the least progress along the cosine, from 0 to 1, also in earlier iterations.
+        It falls in steps at the milestones, or after a short linear rise along a cosine (Loshchilov
+        and Hutter, arXiv 1608.03983), and starts again in each repeat. The cosine is followed at
+        least to `fraction`, from 0 to 1, even if the iteration has not come so far.
         """
         within = iteration % self.iterations
         if self.schedule == "milestones":
@@ -281,13 +290,13 @@ class TrainConfig(Generic[TaskConfigT]):
 
 @dataclass(frozen=True, kw_only=True)
 class JointTrainConfig(TrainConfig[TaskConfigT]):
-    """A training run of several rules in one world; `initial_rule`, of one rule, must be empty."""
+    """A training run of several rules in one world; `initial_rule` must be empty."""
 
     initial_rules: Common[tuple[str, ...]] = ()
-    """Rules to start from, names of shipped rules or files, one for each species."""
+    """Rules to start from, one for each species: names or files; (): random weights."""
 
     frozen: Common[tuple[int, ...]] = ()
-    """Indices of the species, from 0, whose initial rules do not learn."""
+    """Indices of the species, from 0, whose initial rules stay as they are."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -305,30 +314,25 @@ class JointTrainConfig(TrainConfig[TaskConfigT]):
 
 
 def _is_pair(value: object, kind: Callable[[object], bool]) -> bool:
+    """Return whether a value is a tuple of two numbers for which `kind` is true."""
     return isinstance(value, tuple) and len(value) == 2 and all(map(kind, value))
 
 
-SMALL: Mapping[str, Any] = {"repeats": 1, "world_count": 2, "tensorboard": False}
+SMALL_RUN: Mapping[str, Any] = {"repeats": 1, "world_count": 2, "tensorboard": False}
 
-fast_run = partial(TrainConfig, **SMALL, learning_rate=2e-3, checkpoint_interval=200)
-"""Makes the settings of a run of a few minutes on one core, from its task and other fields."""
+fast_run = partial(TrainConfig, **SMALL_RUN, learning_rate=2e-3, checkpoint_interval=200)
+"""A function that returns a `TrainConfig` of minutes on one core, from `task` and other fields."""
 
 tiny_run = partial(
     TrainConfig,
-    **SMALL,
-    iterations=60,
-    pool_size=8,
-    learning_rate=5e-3,
-    milestones=(45,),
-    log_interval=1,
-    picture_interval=20,
-    checkpoint_interval=20,
-)
-"""Makes the settings of a run of a few seconds, for tests, from its task and other fields."""
+    **SMALL_RUN, iterations=60, pool_size=8, learning_rate=5e-3, milestones=(45,), log_interval=1,
+    picture_interval=20, checkpoint_interval=20,
+)  # fmt: skip
+"""A function that returns a `TrainConfig` of seconds, for tests, from `task` and other fields."""
 
 
 def presets_of(
     task_name: str, **runs: TrainConfig[TaskConfigT]
 ) -> Mapping[str, TrainConfig[TaskConfigT]]:
-    """Return the presets of a task, each of which writes to runs/<task_name>."""
+    """Return the `runs` by name, with runs/<task_name> as the folder that each writes to."""
     return {name: replace(run, out=Path("runs") / task_name) for name, run in runs.items()}

@@ -12,7 +12,7 @@ from npa_envs.errors import NPAError
 from npa_envs.render.world_film import film_world
 from npa_envs.tasks import damage
 from npa_envs.tasks.base import GrowthConfig, GrowthTask
-from npa_envs.tasks.damage import CHANCE, FARTHEST, NEAREST, damage_worlds, parse_damage
+from npa_envs.tasks.damage import DAMAGE_CHANCE, FARTHEST, NEAREST, damage_worlds, parse_damage
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.tasks.texture import Texture, TextureConfig
@@ -74,7 +74,7 @@ def test_a_ball_of_states_is_wiped_in_every_world(space_dim):
 @pytest.mark.parametrize(
     ("fields", "fraction"),
     [
-        *(({name: 0.5}, CHANCE) for name in ("clump_radius", "cut_gap", "flake_radius")),
+        *(({name: 0.5}, DAMAGE_CHANCE) for name in ("clump_radius", "cut_gap", "flake_radius")),
         ({"cut_gap": 0.5, "cut_share": 0.7}, 0.7),
     ],
 )

@@ -128,7 +128,7 @@ def test_a_cloud_does_not_depend_on_the_others_nor_on_the_device(device, monkeyp
     x, _ = sample_ink(images, 100, sample_seed=5)
     for k in (0, 1, 11):
         assert torch.equal(sample_ink(images[k : k + 1], 100, sample_seed=5)[0][0], x[k])
-    monkeypatch.setattr("npa_envs.tasks.targets.digit_clouds.CHUNK", {"cpu": 5, "cuda": 5})
+    monkeypatch.setattr("npa_envs.tasks.targets.digit_clouds.BATCH_SIZES", {"cpu": 5, "cuda": 5})
     assert torch.equal(sample_ink(images, 100, sample_seed=5, device=device)[0].cpu(), x)
     assert not torch.equal(sample_ink(images, 100, sample_seed=6)[0], x)
 

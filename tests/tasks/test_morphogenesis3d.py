@@ -12,7 +12,7 @@ from npa_envs.errors import NPAError
 from npa_envs.measure.quality import measure
 from npa_envs.render import turntable_frames, write_gaussians, write_points, write_splat
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.gaussian_outputs import FLAT, OUTPUTS, appearance
+from npa_envs.tasks.gaussian_outputs import HARMONIC_0, OUTPUTS, appearance
 from npa_envs.tasks.morphogenesis3d import Morphogenesis3D, Morphogenesis3DConfig
 from npa_envs.tasks.targets.meshes import AMBIENT, LIGHT, load_mesh
 from npa_envs.tasks.targets.views import ANGLE, DISTANCE, composited, load_views, some_views
@@ -56,7 +56,7 @@ def test_outputs_stretch_within_the_bound_and_colour_as_the_rule_says(task):
     look = task.for_rule(rule).gaussians(20.0 * s)
     assert 0.09 < float(look.stretch.detach().abs().max()) <= 0.1 + 1e-7
     torch.testing.assert_close(look.scales, 0.1 * look.stretch.exp())
-    torch.testing.assert_close(FLAT * look.colours[..., 0, :] + 0.5, rule.colour(20.0 * s))
+    torch.testing.assert_close(HARMONIC_0 * look.colours[..., 0, :] + 0.5, rule.colour(20.0 * s))
     opacities = look.opacities.detach()
     assert 0.0 < float(opacities.min()) < 0.4 < 0.6 < float(opacities.max()) < 1.0
     assert float(look.colours[..., 1:, :].detach().abs().max()) > 0.5
@@ -74,7 +74,7 @@ def test_states_are_colours_where_there_is_no_read_out(task):
     broad = task.for_rule(NPARule(3, 20, 8))
     assert torch.equal(broad.picture(x, wide), task.picture(x, s))
     look = task.gaussians(s)
-    torch.testing.assert_close(FLAT * look.colours[..., 0, :], s[..., -3:])
+    torch.testing.assert_close(HARMONIC_0 * look.colours[..., 0, :], s[..., -3:])
     assert not torch.equal(task.for_rule(lively_rule(task)).picture(x, s), task.picture(x, s))
 
 

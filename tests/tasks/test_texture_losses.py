@@ -9,9 +9,9 @@ import torch
 from npa_envs.errors import NPAError
 from npa_envs.tasks.losses.texture import (
     FILTERS,
-    FLOOR,
     MATCHED_PATCH,
     TEXTURE_LOSSES,
+    VARIANCE_FLOOR,
     WEIGHTS_FILE,
     FilterDescriptor,
     LossOptions,
@@ -117,7 +117,7 @@ def plain_distance(tables, expected_tables):
     total = 0.0
     for actual, expected in zip(tables, expected_tables, strict=True):
         difference = np.sort(actual, axis=0) - np.sort(expected, axis=0)
-        scale = expected.var(axis=0, ddof=1).mean() + FLOOR
+        scale = expected.var(axis=0, ddof=1).mean() + VARIANCE_FLOOR
         total += (difference**2).mean() / scale
     return total
 
@@ -170,7 +170,7 @@ def test_patch_transport_equals_plain_arithmetic():
     for actual, expected in zip(pyramid(image[None], 2), pyramid(target[None], 2), strict=True):
         ours, theirs = (rolled_patches(p[0].numpy(), MATCHED_PATCH) for p in (actual, expected))
         costs = ((ours[:, None] - theirs[None]) ** 2).mean(axis=2)
-        spread = theirs.var(axis=0).mean() + FLOOR
+        spread = theirs.var(axis=0).mean() + VARIANCE_FLOOR
         total += max(costs.min(axis=1).mean(), costs.min(axis=0).mean()) / spread
     loss = make_texture_loss("patch_ot", target)
     assert float(loss(image[None])) == pytest.approx(total / 2, rel=1e-10)

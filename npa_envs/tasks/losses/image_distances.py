@@ -1,4 +1,4 @@
-"""Distances between pictures of particles and of a target: MS-SSIM."""
+"""MS-SSIM, the similarity of pictures of worlds and of a target, and means by world."""
 
 from __future__ import annotations
 
@@ -6,52 +6,58 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
+from npa_envs.ops import world_mean
 
-WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
-"""Exponents of the sizes, from fine to coarse (Wang et al. 2003)."""
+SIZE_EXPONENTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
+"""Exponents of the five picture sizes' similarities, from fine to coarse (Wang et al. 2003)."""
 
-WINDOW = 11
-"""Largest side of the window [pixels]."""
+WINDOW_SIDE = 11
+"""Side of the window in which statistics are taken [pixels]; smaller in smaller pictures."""
 
-SPREAD = 1.5
-"""Standard deviation of a window of 11 pixels [pixels]; proportional for smaller windows."""
+WINDOW_SPREAD = 1.5
+"""Standard deviation of the Gaussian window [pixels]; in proportion smaller in smaller windows."""
 
 STABILISERS = (0.01**2, 0.03**2)
-"""SSIM's constants C1 and C2 for pictures in [0, 1]."""
+"""Constants C1 and C2 of SSIM for pictures in [0, 1]: they keep quotients finite."""
 
-FLOOR = 1e-4
-"""Least similarity of a size; below it the gradient is 0."""
+MIN_SIMILARITY = 1e-4
+"""Least value of a size's similarity, to which smaller ones are raised, without gradient."""
+
+
+def mean_by_world(values: Tensor) -> Tensor:
+    """Return the mean of each world's numbers [B, ...], shape [B], bit for bit in any batch."""
+    return world_mean(values.flatten(1)[..., None])[:, 0]
 
 
 class MultiScaleSimilarity:
-    """MS-SSIM of pictures in [0, 1].
+    """MS-SSIM of pictures of R x R pixels in [0, 1]: a product of similarities at five sizes.
 
     Windowed means and smaller sizes are computed by matrix products, which are fast for tens of
-    pictures. Logarithms of similarities are added up: the derivative of torch's product
-    synchronises, and is not finite where a similarity is 0.
+    pictures. The product is computed by logarithms: the derivative of torch's product synchronises,
+    and is not finite where a similarity is 0.
     """
 
     def __init__(self, resolution: int, *, device: str | torch.device = "cpu") -> None:
-        least = 2 ** len(WEIGHTS[1:])
+        least = 2 ** len(SIZE_EXPONENTS[1:])
         if resolution < least:
             raise NPAError(
                 f"resolution must be at least {least} pixels for MS-SSIM, got {resolution}: raise "
                 "it, or set ssim_weight to 0"
             )
         sizes = [resolution]
-        for _ in WEIGHTS[1:]:
+        for _ in SIZE_EXPONENTS[1:]:
             sizes.append((sizes[-1] + 1) // 2)
         self._windows = [_window(size).float().to(device) for size in sizes]
         self._halvings = [_halving(size).to(device) for size in sizes[:-1]]
 
     def __call__(self, pictures: Tensor, target: Tensor) -> Tensor:
-        """Return the similarity of pictures [..., R, R] of one channel, at most 1, shape [...]."""
+        """Return the similarity to `target`, at most 1, of pictures [..., R, R]; shape [...]."""
         total = pictures.new_zeros(pictures.shape[:-2])
-        last = len(WEIGHTS) - 1
-        for size, (weight, window) in enumerate(zip(WEIGHTS, self._windows, strict=True)):
+        last = len(SIZE_EXPONENTS) - 1
+        for size, (weight, window) in enumerate(zip(SIZE_EXPONENTS, self._windows, strict=True)):
             whole, contrast = _similarity(pictures, target, window.to(pictures))
             factor = whole if size == last else contrast
-            total = total + weight * factor.clamp_min(FLOOR).log()
+            total = total + weight * factor.clamp_min(MIN_SIMILARITY).log()
             if size < last:
                 halving = self._halvings[size].to(pictures)
                 pictures = _from_both_sides(pictures, halving)
@@ -60,7 +66,7 @@ class MultiScaleSimilarity:
 
 
 def _similarity(pictures: Tensor, target: Tensor, window: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the SSIM at one size, and its factor of contrast and structure, [...] each."""
+    """Return the SSIM at one size, and its part without brightness, shape [...] each."""
     mean, square, product = _from_both_sides(
         torch.stack((pictures, pictures.square(), pictures * target)), window
     )
@@ -79,10 +85,10 @@ def _from_both_sides(pictures: Tensor, matrix: Tensor) -> Tensor:
 
 
 def _window(size: int) -> Tensor:
-    """Return the weights of pixels in the window at each position along a side, in columns."""
-    width = min(WINDOW, size - 1 + size % 2)
+    """Return a matrix [size, positions]: a column has the window's weights at one position."""
+    width = min(WINDOW_SIDE, size - 1 + size % 2)
     offset = torch.arange(width, dtype=torch.float64) - width // 2
-    weights = torch.exp(-0.5 * (offset * (WINDOW / (SPREAD * width))) ** 2)
+    weights = torch.exp(-0.5 * (offset * (WINDOW_SIDE / (WINDOW_SPREAD * width))) ** 2)
     matrix = torch.zeros(size, size - width + 1, dtype=torch.float64)
     for first in range(matrix.shape[1]):
         matrix[first : first + width, first] = weights / weights.sum()
@@ -90,6 +96,9 @@ def _window(size: int) -> Tensor:
 
 
 def _halving(size: int) -> Tensor:
-    """Return the matrix that averages pairs of pixels; an odd side is padded with a 0 in front."""
+    """Return the matrix [size, half] that averages pairs of pixels.
+
+    Before an odd number of pixels it assumes a 0.
+    """
     half = (size + 1) // 2
     return 0.5 * torch.eye(half).repeat_interleave(2, dim=0)[size % 2 :]

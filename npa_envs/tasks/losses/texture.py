@@ -1,4 +1,4 @@
-"""Texture losses: distances between two textures that do not depend on positions."""
+"""Texture losses: distances between images by statistics of their parts, wherever these are."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from torch import Tensor
 
 from npa_envs.atomic_files import check_torch_archive, home_path, open_regular
 from npa_envs.errors import NPAError, shown, suggest
-from npa_envs.ops import world_mean
+from npa_envs.tasks.losses.image_distances import mean_by_world
 
 DEFAULT_LOSS = "patch_swd"
-"""The loss that needs no weights and no options."""
+"""Name of the default loss, which needs no download."""
 
 
 @dataclass(frozen=True)
@@ -28,36 +28,32 @@ class LossOptions:
 
     tiles: bool = True
     """Whether the target's opposite edges fit together, so that patches may cross them."""
-
     seed: int = 0
-    """Seed of the loss's directions, filters and positions."""
-
+    """Seed of the random directions, filters and positions that the loss uses."""
     vgg_weights: str = ""
     """File of VGG16's weights, for `vgg_ot`; empty: torch's usual folder of downloads."""
 
 
 DEFAULT_OPTIONS = LossOptions()
-"""Options for a target that tiles, with seed 0."""
+"""Options for a target whose opposite edges fit together, with seed 0."""
 
 TextureLoss = Callable[[Tensor], Tensor]
-"""The distance of images [B, K, R, R] from a target texture (dimensionless), shape [B].
+"""A function from images [B, K, R, R] to distances from a target texture (dimensionless), [B].
 
-It is differentiable. Calls draw no random numbers and do not synchronise. A world's loss is the
-same, bit for bit, in every batch (of `vgg_ot`: without gradient)."""
+It is differentiable. Calls use no random numbers and do not synchronise. The distance of an image
+is the same, bit for bit, in every batch (by `vgg_ot`: without gradient)."""
 
 
 @dataclass(frozen=True)
 class LossEntry:
-    """A texture loss of the table `TEXTURE_LOSSES`."""
+    """A row of the table `TEXTURE_LOSSES`."""
 
     summary: str
-    """One line for lists."""
-
+    """What the loss is, in one line."""
     make: Callable[[Tensor, LossOptions], TextureLoss]
-    """Returns the loss against a target, shape [K, R, R]."""
-
+    """Returns the loss for a target of shape [K, R, R] and options."""
     joint: bool = False
-    """Whether it compares colours and density together, K = 4, with `Texture.drawable`."""
+    """Whether it compares colours and density at once: K = 4; the target is `Texture.drawable`."""
 
 
 def check_loss_name(name: str) -> None:
@@ -73,14 +69,14 @@ def check_loss_name(name: str) -> None:
 
 
 def is_joint(name: str) -> bool:
-    """Return whether a loss, or a sum of losses, compares colours and density together."""
+    """Return whether a loss, or a sum such as "patch_ot+joint_swd", has `LossEntry.joint`."""
     return TEXTURE_LOSSES[name.split("+")[0]].joint
 
 
 def make_texture_loss(
     name: str, target: Tensor, options: LossOptions = DEFAULT_OPTIONS
 ) -> TextureLoss:
-    """Return a function from images to their texture loss against a target [K, R, R].
+    """Return the loss `name` of `TEXTURE_LOSSES` for a target [K, R, R].
 
     The target has colours (K = 3), a density (1) or both (4). Names of joint losses with "+"
     between them give their sum.
@@ -106,29 +102,29 @@ def _summed(losses: list[TextureLoss], images: Tensor) -> Tensor:
 
 # What the losses share: images at several sizes, their patches, quantiles.
 
-LEVELS = 4
-"""Largest number of image sizes, each half of the one before."""
+MAX_LEVELS = 4
+"""Maximum number of image sizes that are compared, each half of the one before."""
 
-MIN_SIDE = 12
-"""Least side of the smallest image size [pixels]."""
+MIN_IMAGE_SIDE = 12
+"""Minimum side of the smallest of these [pixels]."""
 
-POSITIONS = 64
-"""Largest number of positions along each side that are compared; larger images are subsampled."""
+MAX_POSITIONS = 64
+"""Maximum number of positions along each side that sliced distances compare in thinned images."""
 
 ALIGNMENT = 64
-"""Alignment of the matrices that are multiplied [bytes]."""
+"""Addresses of matrices that are multiplied are multiples of this [bytes]."""
 
 
 class TextureDistance:
-    """Base class of distances between images and a target of K channels, shape [K, R, R]."""
+    """Base class of texture losses: distances of images from a target of shape [K, R, R]."""
 
     same_in_every_batch: bool = False
-    """Whether `compare` returns the same for an image, bit for bit, in every batch."""
+    """Whether `compare` gives an image the same distance, bit for bit, in every batch."""
 
     def __init__(self, target: Tensor) -> None:
-        if target.shape[-1] < MIN_SIDE:
+        if target.shape[-1] < MIN_IMAGE_SIDE:
             raise NPAError(
-                f"resolution must be at least {MIN_SIDE} pixels, got {target.shape[-1]}: for "
+                f"resolution must be at least {MIN_IMAGE_SIDE} pixels, got {target.shape[-1]}: for "
                 "example 64"
             )
         self._shape = tuple(target.shape)
@@ -154,16 +150,16 @@ class TextureDistance:
 
 
 def level_count(resolution: int) -> int:
-    """Return at how many sizes images of a resolution [pixels] are compared."""
+    """Return the number of sizes at which images of a resolution [pixels] are compared."""
     count = 1
-    while count < LEVELS and resolution % 2 == 0 and resolution // 2 >= MIN_SIDE:
+    while count < MAX_LEVELS and resolution % 2 == 0 and resolution // 2 >= MIN_IMAGE_SIDE:
         resolution //= 2
         count += 1
     return count
 
 
 def pyramid(images: Tensor, count: int) -> list[Tensor]:
-    """Return images [B, K, R, R] and `count` - 1 smaller sizes, each by means of 2 x 2 pixels."""
+    """Return images [B, K, R, R] at `count` sizes; each averages 2 x 2 pixels of the one before."""
     levels = [images]
     while len(levels) < count:
         fine = levels[-1]
@@ -174,12 +170,15 @@ def pyramid(images: Tensor, count: int) -> list[Tensor]:
 
 
 def stride_of(level: Tensor, thinned: bool) -> int:
-    """Return the distance [pixels] between an image's compared positions; 1 unless `thinned`."""
-    return max(1, level.shape[-1] // POSITIONS) if thinned else 1
+    """Return the distance [pixels] between compared positions; without `thinned` it is 1."""
+    return max(1, level.shape[-1] // MAX_POSITIONS) if thinned else 1
 
 
 def patches(images: Tensor, size: int, *, stride: int, wrap: bool) -> Tensor:
-    """Return the M square patches of images, [B, M, K size²]; `wrap`: over opposite edges."""
+    """Return square patches of images [B, K, R, R], one every `stride` pixels, [B, M, K size²].
+
+    With `wrap` some lie across opposite edges.
+    """
     if wrap:
         half = size // 2
         images = torch.cat((images[:, :, -half:], images, images[:, :, :half]), dim=2)
@@ -189,10 +188,9 @@ def patches(images: Tensor, size: int, *, stride: int, wrap: bool) -> Tensor:
 
 
 def products(rows: Tensor, weights: Tensor) -> Tensor:
-    """Return the matrix product of rows [B, M, E] and weights [E, F], shape [B, M, F].
+    """Return the matrix products of rows [B, M, E], contiguous, and weights [E, F], [B, M, F].
 
-    It is computed image by image, from aligned memory: otherwise rounding may depend on the batch.
-    Rows must be contiguous.
+    They are computed image by image from aligned memory, or rounding may depend on the batch.
     """
     weights = weights.to(rows)
     tables = [one if one.data_ptr() % ALIGNMENT == 0 else one.clone() for one in rows]
@@ -200,7 +198,7 @@ def products(rows: Tensor, weights: Tensor) -> Tensor:
 
 
 def orthogonal(size: int, count: int, generator: torch.Generator) -> Tensor:
-    """Return `count` random orthonormal columns, shape [size, count]."""
+    """Return `count` random orthonormal vectors as columns, shape [size, count], float64."""
     normal = torch.randn(size, count, generator=generator, dtype=torch.float64)
     basis: Tensor = torch.linalg.qr(normal).Q
     return basis
@@ -222,17 +220,17 @@ def quantiles(values: Tensor, count: int) -> Tensor:
 # Sliced Wasserstein distances. A texture is described, at each image size, by many features at each
 # position. The distributions of a feature over the positions are compared by sorting its values.
 
-PATCH = 5
-"""Side of a patch [pixels]."""
+PATCH_SIDE = 5
+"""Side of a patch of sliced distances [pixels]."""
 
 FILTERS = 24
 """Random filters of the first layer; each gives two features, its positive and negative part."""
 
-SECOND_PATCH = 3
+SECOND_PATCH_SIDE = 3
 """Side of a filter of the second layer [pixels]."""
 
-FLOOR = 0.01
-"""Added to the target's variance, so that a uniform target works too."""
+VARIANCE_FLOOR = 0.01
+"""Added to the target's variance before division by it, so that a uniform target works too."""
 
 
 class SlicedWasserstein(TextureDistance):
@@ -241,9 +239,7 @@ class SlicedWasserstein(TextureDistance):
     At each image size it is the mean over the features of the squared 1D 2-Wasserstein distance
     between their distributions, divided by the target's variance; sizes are summed.
 
-    `describe` is the class of a descriptor: it maps images to F features at M positions, [B, M, F]
-    for each size. With `wrap` opposite edges are connected, else positions near them are left out.
-    With `thinned` there are at most `POSITIONS` along each side.
+    `describe` is the class of features: `PatchDescriptor` or `FilterDescriptor`.
     """
 
     same_in_every_batch = True
@@ -253,7 +249,7 @@ class SlicedWasserstein(TextureDistance):
     ) -> None:
         super().__init__(target)
         self.descriptor = describe(target, seed=options.seed)
-        """Describes images by features."""
+        """Maps images to features at their positions."""
         with torch.no_grad():
             # The target has as many quantiles as worlds have positions.
             thinned = self.descriptor(target[None], wrap=True, thinned=True)
@@ -262,7 +258,7 @@ class SlicedWasserstein(TextureDistance):
                 quantiles(features[0].T, compared.shape[1]).to(target)
                 for features, compared in zip(described, thinned, strict=True)
             ]
-            self._scales = [1.0 / (each[0].var(0).mean() + FLOOR) for each in described]
+            self._scales = [1.0 / (each[0].var(0).mean() + VARIANCE_FLOOR) for each in described]
 
     def compare(self, images: Tensor) -> Tensor:
         """Return the distance of images [B, K, R, R] from the target, [B]."""
@@ -271,30 +267,33 @@ class SlicedWasserstein(TextureDistance):
         for features, expected, scale in zip(described, self._quantiles, self._scales, strict=True):
             ordered = features.transpose(1, 2).contiguous().sort(dim=-1).values
             squares = (ordered - expected.to(ordered)).square()
-            distance = world_mean(squares.flatten(1)[..., None])[:, 0]
+            distance = mean_by_world(squares)
             total = total + scale.to(distance) * distance
         return total
 
 
 class PatchDescriptor:
-    """Features of images: patches of all channels, projected on a random orthonormal basis."""
+    """Features of images: patches of all channels in a random orthonormal basis."""
 
     def __init__(self, like: Tensor, *, seed: int) -> None:
         generator = torch.Generator().manual_seed(seed)
-        size = like.shape[0] * PATCH * PATCH
+        size = like.shape[0] * PATCH_SIDE * PATCH_SIDE
         self.directions = [
             orthogonal(size, size, generator).to(like) for _ in range(level_count(like.shape[-1]))
         ]
-        """Directions for each image size, columns of [K PATCH², K PATCH²]."""
+        """Basis of each image size: columns of [K PATCH_SIDE², K PATCH_SIDE²]."""
 
     def __call__(self, images: Tensor, *, wrap: bool, thinned: bool) -> list[Tensor]:
-        """Return for each size of images, [B, K, R, R], M projected patches, [B, M, K PATCH²].
+        """Return features of images [B, K, R, R] at M positions: [B, M, K PATCH_SIDE²] by size.
 
-        `wrap`: also across opposite edges; `thinned`: at most `POSITIONS` patches along each side.
+        With `wrap` opposite edges are connected, else positions near them are left out. With
+        `thinned` there are at most `MAX_POSITIONS` along each side.
         """
         sizes = pyramid(images, len(self.directions))
         return [
-            products(patches(level, PATCH, stride=stride_of(level, thinned), wrap=wrap), direction)
+            products(
+                patches(level, PATCH_SIDE, stride=stride_of(level, thinned), wrap=wrap), direction
+            )
             for level, direction in zip(sizes, self.directions, strict=True)
         ]
 
@@ -302,37 +301,40 @@ class PatchDescriptor:
 class FilterDescriptor:
     """Features of images: two layers of random filters with rectifiers between them.
 
-    Filters of the first layer sum to zero, but for one mean filter for each channel; those of the
-    second layer are random projections of patches of the first layer's features.
+    One filter of the first layer for each channel is its mean, and the others sum to zero. Filters
+    of the second layer are random projections of patches of the first layer's features.
     """
 
     def __init__(self, like: Tensor, *, seed: int) -> None:
         generator = torch.Generator().manual_seed(seed)
-        channels, area = like.shape[0], PATCH * PATCH
+        channels, area = like.shape[0], PATCH_SIDE * PATCH_SIDE
         self.levels: list[tuple[Tensor, Tensor]] = []
-        """Filters of both layers, in columns, for each size of the image."""
+        """Filters of the first and of the second layer, as columns, for each image size."""
         for _ in range(level_count(like.shape[-1])):
             first = torch.randn(channels * area, FILTERS, generator=generator, dtype=torch.float64)
             first -= first.mean(0)
             first /= first.norm(dim=0)
-            means = torch.eye(channels, dtype=torch.float64).repeat_interleave(area, 0) / PATCH
+            means = torch.eye(channels, dtype=torch.float64).repeat_interleave(area, 0) / PATCH_SIDE
             first[:, :channels] = means
-            second = orthogonal(2 * FILTERS * SECOND_PATCH**2, 2 * FILTERS, generator)
+            second = orthogonal(2 * FILTERS * SECOND_PATCH_SIDE**2, 2 * FILTERS, generator)
             self.levels.append((first.to(like), second.to(like)))
 
     def __call__(self, images: Tensor, *, wrap: bool, thinned: bool) -> list[Tensor]:
-        """Return for each image size the features of each layer, two tensors [B, M, 2 FILTERS]."""
+        """Return features of images [B, K, R, R] at M positions: two [B, M, 2 FILTERS] by size.
+
+        They are those of the two layers. `wrap` and `thinned` are as of `PatchDescriptor`.
+        """
         result = []
         for level, (first, second) in zip(
             pyramid(images, len(self.levels)), self.levels, strict=True
         ):
-            signed = products(patches(level, PATCH, stride=1, wrap=wrap), first)
+            signed = products(patches(level, PATCH_SIDE, stride=1, wrap=wrap), first)
             features = torch.cat((signed, -signed), dim=2).relu()
-            side = level.shape[-1] - (0 if wrap else PATCH - 1)
+            side = level.shape[-1] - (0 if wrap else PATCH_SIDE - 1)
             field = features.transpose(1, 2).reshape(len(images), -1, side, side)
             stride = stride_of(level, thinned)
             result.append(field[:, :, ::stride, ::stride].flatten(2).transpose(1, 2))
-            around = patches(field, SECOND_PATCH, stride=stride, wrap=wrap)
+            around = patches(field, SECOND_PATCH_SIDE, stride=stride, wrap=wrap)
             result.append(products(around, second))
         return result
 
@@ -340,13 +342,13 @@ class FilterDescriptor:
 # Optimal transport of raw patches.
 
 MATCHED_PATCH = 7
-"""Side of a matched patch [pixels]; at the smallest of four sizes it spans 56 image pixels."""
+"""Side of a patch of `PatchTransport` [pixels]; at the smallest of four sizes it spans 56."""
 
 WORLD_POSITIONS = 32
-"""Largest number of patches of a world along each side, for each size."""
+"""Maximum number of patches of a world along each side, for each size."""
 
 TARGET_POSITIONS = 64
-"""Largest number of patches of the target along each side, for each size."""
+"""Maximum number of patches of the target along each side, for each size."""
 
 
 class PatchTransport(TextureDistance):
@@ -354,7 +356,7 @@ class PatchTransport(TextureDistance):
 
     At each size every patch of a world is compared with the nearest patch of the target, and every
     patch of the target with the nearest of the world. The larger of both mean squared distances,
-    relative to the target's variance, is averaged over the sizes: it penalises both additional and
+    divided by the target's variance, is averaged over the sizes: it penalises both additional and
     missing parts. After the relaxed transport of Kolkin, Salavon and Shakhnarovich (2019), with
     patches in place of a network's features.
     """
@@ -368,7 +370,7 @@ class PatchTransport(TextureDistance):
             rows = patches(level, MATCHED_PATCH, stride=stride, wrap=options.tiles)[0].contiguous()
             spread = (rows.double() - rows.double().mean(0)).square().mean()
             self._expected.append(rows)
-            self._scales.append(1.0 / (spread + FLOOR))
+            self._scales.append(1.0 / (spread + VARIANCE_FLOOR))
 
     def compare(self, images: Tensor) -> Tensor:
         """Return the distance of images [B, K, R, R] from the target, [B]."""
@@ -382,7 +384,10 @@ class PatchTransport(TextureDistance):
 
 
 def _matched(rows: Tensor, expected: Tensor) -> Tensor:
-    """Return the mean squared distance to the nearest patch, the larger of both directions, [B]."""
+    """Return the mean squared distance to the nearest patch, the larger of both directions, [B].
+
+    `rows` [B, M, E] are the worlds' patches, `expected` [M', E] the target's.
+    """
     with torch.no_grad():
         squares = rows.square().sum(2)[:, :, None] + expected.square().sum(1)
         costs = squares - 2.0 * (rows @ expected.T)
@@ -397,8 +402,7 @@ def _matched(rows: Tensor, expected: Tensor) -> Tensor:
     # Σ (p − t)² over the target's patches, gathered by the world's: its gradient has a fixed order.
     ratio = rows.shape[1] / expected.shape[0]
     backward = ratio * (times * rows.square() - 2.0 * rows * sums)
-    both = [world_mean(part.flatten(1)[..., None])[:, 0] for part in (forward, backward)]
-    return torch.maximum(both[0], both[1] + rest)
+    return torch.maximum(mean_by_world(forward), mean_by_world(backward) + rest)
 
 
 # The paper's loss. Of VGG16 (Simonyan and Zisserman 2014) only the weights are needed, not
@@ -406,10 +410,10 @@ def _matched(rows: Tensor, expected: Tensor) -> Tensor:
 # periodically.
 
 VGG_POSITIONS = 1024
-"""Largest number of positions of a layer that are compared."""
+"""Maximum number of positions of a layer of VGG16 that are compared."""
 
 VGG_MIN_SIDE = 32
-"""Least side of images with more than one position in the deepest layer [pixels]."""
+"""Minimum side of images for VGG16 [pixels]: the deepest layer has four positions there."""
 
 WEIGHTS_FILE = "vgg16-397923af.pth"
 """Name of torchvision's file of weights trained on ImageNet."""
@@ -456,8 +460,8 @@ class VGGTransport(TextureDistance):
         for numbers, width in VGG_LAYERS.items():
             group = []
             for number in numbers:
-                weight = _checked(file, f"features.{number}.weight", (width, channels, 3, 3))
-                bias = _checked(file, f"features.{number}.bias", (width,))
+                weight = _weight(file, f"features.{number}.weight", (width, channels, 3, 3))
+                bias = _weight(file, f"features.{number}.bias", (width,))
                 group.append((weight.to(target), bias.to(target)))
                 channels = width
             self._groups.append(group)
@@ -473,7 +477,10 @@ class VGGTransport(TextureDistance):
             self._expected = self.features(target[None], wrap=options.tiles)
 
     def features(self, images: Tensor, *, wrap: bool) -> list[Tensor]:
-        """Return features [B, M, F] of each layer; pads periodically (`wrap`) or mirrored."""
+        """Return the features [B, M, F] of images in each of the five layers.
+
+        With `wrap` images are padded periodically, else by their mirror images.
+        """
         mode = "circular" if wrap else "reflect"
         # In the weights' precision.
         field = (images.to(self._mean) - self._mean) / self._deviation
@@ -499,10 +506,10 @@ class VGGTransport(TextureDistance):
 
 
 def relaxed_transport(first: Tensor, second: Tensor) -> Tensor:
-    """Return the relaxed earth mover's distance of two sets of feature vectors, shape [B].
+    """Return the relaxed earth mover's distance of feature vectors [B, M, F] and [B, M', F], [B].
 
-    Every vector (a row) moves to the one of the other set with the least cosine distance. The
-    larger mean cost of both directions is returned; each is a lower bound of transport's cost.
+    Every vector moves to that of the other set with the least cosine distance, its cost. Returned
+    is the mean cost of the dearer direction. Both are lower bounds of the earth mover's distance.
     """
     costs = 1.0 - _directions(first) @ _directions(second).transpose(1, 2)
     there, back = costs.amin(dim=2).mean(dim=1), costs.amin(dim=1).mean(dim=1)
@@ -510,24 +517,29 @@ def relaxed_transport(first: Tensor, second: Tensor) -> Tensor:
 
 
 def moment_distance(first: Tensor, second: Tensor) -> Tensor:
-    """Return the mean absolute difference of features' means, plus that of covariances, [B]."""
+    """Return mean |difference| of two sets' means plus that of their covariances, shape [B].
+
+    The sets are feature vectors [B, M, F] and [B, M', F].
+    """
     (mean, covariance), (other_mean, other_covariance) = _moments(first), _moments(second)
     difference = (mean - other_mean).abs().mean(dim=(1, 2))
     return difference + (covariance - other_covariance).abs().mean(dim=(1, 2))
 
 
 def _directions(rows: Tensor) -> Tensor:
+    """Return vectors of length 1, in the last dimension."""
     return rows * (rows.square().sum(dim=-1, keepdim=True) + TINY_SQUARE).rsqrt()
 
 
 def _moments(rows: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the mean [B, 1, F] and the covariance [B, F, F] of vectors [B, M, F]."""
     mean = rows.mean(dim=1, keepdim=True)
     centred = rows - mean
     return mean, centred.transpose(1, 2) @ centred / (rows.shape[1] - 1)
 
 
 def load_vgg_weights(path: str | Path = "") -> dict[str, Any]:
-    """Return the weights of VGG16 by name, on the CPU."""
+    """Return the weights of VGG16 by name, from a file or from torch's folder of downloads ("")."""
     folder = Path(torch.hub.get_dir()) / "checkpoints"
     file = home_path(path) if str(path) else folder / WEIGHTS_FILE
     if not os.path.exists(file):
@@ -555,7 +567,8 @@ def load_vgg_weights(path: str | Path = "") -> dict[str, Any]:
     return content
 
 
-def _checked(weights: Mapping[str, Any], name: str, shape: tuple[int, ...]) -> Tensor:
+def _weight(weights: Mapping[str, Any], name: str, shape: tuple[int, ...]) -> Tensor:
+    """Return the tensor `name`; raise NPAError unless it is there and has this shape."""
     tensor = weights.get(name)
     if not isinstance(tensor, Tensor) or tuple(tensor.shape) != shape:
         got = tuple(tensor.shape) if isinstance(tensor, Tensor) else "nothing"
@@ -588,4 +601,4 @@ TEXTURE_LOSSES: Mapping[str, LossEntry] = {
         "relaxed optimal transport of raw patches at several sizes", PatchTransport, joint=True
     ),
 }
-"""Every texture loss by name."""
+"""All texture losses by name."""

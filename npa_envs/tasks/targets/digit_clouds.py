@@ -22,30 +22,30 @@ from npa_envs.world.randomness import Randomness, normal_draws, uniform_draws
 
 Split = Literal["train", "test"]
 
-LEVELS = 2048
-"""Coordinates are integers below this while points are chosen, so that squared distances are exact
+COORDINATE_COUNT = 2048
+"""While points are chosen, coordinates are integers below this, so that squared distances are exact
 in float32 and every device chooses the same points."""
 
 INK = 0.5
-"""A position has ink where the picture has at least this fraction of its darkest pixel."""
+"""A position has ink if the picture is there at least this fraction as dark as at its darkest."""
 
-CANDIDATES = (2, 3)
-"""Least and largest number of candidates for each chosen point."""
+CANDIDATE_FACTORS = (2, 3)
+"""Minimum and maximum number of candidates for each chosen point."""
 
-FINEST = 1024
-"""Finest grid of candidates: cells along each side."""
+FINEST_GRID = 1024
+"""Number of cells along each side of the finest grid of candidates."""
 
-CHUNK = {"cpu": 256, "cuda": 1024}
-"""Pictures that are sampled in one batch, by device; a CPU's fit into its caches."""
+BATCH_SIZES = {"cpu": 256, "cuda": 1024}
+"""Maximum number of pictures that are sampled in one batch, by device; a CPU's fit into caches."""
 
-CHUNK_CELLS = 1 << 24
-"""Largest number of grid cells in one batch."""
+CELLS_PER_BATCH = 1 << 24
+"""Maximum number of grid cells in one batch."""
 
 MAX_IDX = 600_000_000
-"""Largest IDX file [bytes of data]; the largest of EMNIST has 547 million."""
+"""Maximum size of the data in an IDX file [bytes]; the largest of EMNIST has 547 million."""
 
-CACHED = 4
-"""Number of data sets in the cache."""
+CACHED_DATA_SETS = 4
+"""Maximum number of results of `load_clouds` that stay in memory."""
 
 
 @dataclass(frozen=True)
@@ -54,15 +54,13 @@ class PointClouds:
 
     x: Tensor
     """Positions in [0, 1]² [length units], shape [M, N, 2]; y is up."""
-
     label: Tensor
     """Classes, int64, shape [M]."""
-
     coverage: float
     """Fraction of the unit square that has ink, averaged over the clouds."""
 
 
-@functools.lru_cache(CACHED)
+@functools.lru_cache(CACHED_DATA_SETS)
 def load_clouds(
     data: str,
     split: Split,
@@ -72,7 +70,11 @@ def load_clouds(
     sample_seed: int = 0,
     device: torch.device,
 ) -> PointClouds:
-    """Return a cloud of `particle_count` points for each picture of a data set; cached."""
+    """Return a cloud of `particle_count` points for each picture of a data set.
+
+    `load_pictures` explains `data`, `split` and `folder`, `sample_ink` the points. Results are
+    cached.
+    """
     ink, label = load_pictures(data, split, folder=folder)
     x, area = sample_ink(ink, particle_count, sample_seed=sample_seed, device=device)
     height, width = ink.shape[1:]
@@ -87,36 +89,37 @@ def sample_ink(
     sample_seed: int = 0,
     device: str | torch.device = "cpu",
 ) -> tuple[Tensor, float]:
-    """Return farthest-point samples [M, N, 2] of the ink of M pictures [M, H, W].
+    """Return N = `particle_count` points with ink in each of M pictures, and their share of ink.
 
-    The second result is the fraction of pixels with ink, averaged over the pictures. Candidates are
-    one random position in each cell of a grid, where the picture, enlarged bilinearly, has ink; the
-    grid is refined until there are enough. Positions lie in [0, 1]² [length units], where the
-    longer side is 1; they are the same on every device.
+    The points [M, N, 2] lie in [0, 1]² [length units], where a picture's longer side is 1. They are
+    farthest-point samples of candidates: one random position in each cell of a grid, where the
+    picture, enlarged bilinearly, has ink. The grid is refined until there are enough. Points are
+    the same on every device. The second result is the fraction of the area that has ink, averaged
+    over the pictures. `ink` has shape [M, H, W].
     """
     darkest = ink.max((1, 2))
     if (darkest <= 0).any():
         raise NPAError(
             f"every picture must have ink, got an empty one at {int(np.argmin(darkest))}: remove it"
         )
-    least, most = (factor * particle_count for factor in CANDIDATES)
+    least, most = (factor * particle_count for factor in CANDIDATE_FACTORS)
     relative = torch.from_numpy(ink / darkest[:, None, None])
     x = torch.empty(len(ink), particle_count, 2, device=device)
     areas = torch.empty(len(ink))
     random = torch.Generator().manual_seed(sample_seed)
-    chunk = CHUNK[torch.device(device).type]
+    chunk = BATCH_SIZES[torch.device(device).type]
     waiting = torch.arange(len(ink))
     side = 1 << math.ceil(math.log2(2.0 * math.sqrt(least)))
     while len(waiting) > 0:
         cells, points = _grid_points(side, relative.shape[1:], random)
         finer = []
-        for part in torch.split(waiting, max(1, min(chunk, CHUNK_CELLS // side**2))):
+        for part in torch.split(waiting, max(1, min(chunk, CELLS_PER_BATCH // side**2))):
             enlarged = torch.nn.functional.interpolate(
                 relative[part][:, None], size=(side, side), mode="bilinear", align_corners=False
             )
             has_ink = enlarged.flatten(1)[:, cells] >= INK
             counts = has_ink.sum(1)
-            enough = (counts >= least) | (side >= FINEST)
+            enough = (counts >= least) | (side >= FINEST_GRID)
             finer.append(part[~enough])
             part, has_ink, counts = part[enough], has_ink[enough], counts[enough]
             if len(part) == 0:
@@ -127,25 +130,28 @@ def sample_ink(
             )
         waiting = torch.cat(finer)
         side *= 2
-    return (x + 0.5) / LEVELS, float(areas.mean())
+    return (x + 0.5) / COORDINATE_COUNT, float(areas.mean())
 
 
 def _grid_points(
     side: int, shape: tuple[int, ...], random: torch.Generator
 ) -> tuple[Tensor, Tensor]:
-    """Return the indices of a grid's cells in random order, and a random point in each."""
+    """Return the indices of a grid's side² cells in random order, and a random point in each.
+
+    Points have integer coordinates below `COORDINATE_COUNT`, for pictures of `shape` [H, W].
+    """
     height, width = shape
     longer = max(height, width)
     order = torch.randperm(side * side, generator=random)
     corner = torch.stack((order % side, side - 1 - order // side), dim=1)
     within = torch.rand(len(order), 2, generator=random)
-    points = (corner + within) * (LEVELS / side)
+    points = (corner + within) * (COORDINATE_COUNT / side)
     points *= torch.tensor((width / longer, height / longer))
-    return order, points.floor().clamp(max=LEVELS - 1)
+    return order, points.floor().clamp(max=COORDINATE_COUNT - 1)
 
 
 def _first(has_ink: Tensor, most: int) -> Tensor:
-    """Return the indices of the first `most` True values of each row, [M, most], padded with 0."""
+    """Return the indices of the first `most` True values of rows [M, E], [M, most], 0 for none."""
     # Entries are in random order, so the first ones are a fair choice.
     slot = (has_ink.cumsum(1) - 1).where(has_ink, most).clamp(max=most)
     index = torch.arange(has_ink.shape[1]).expand_as(slot)
@@ -153,7 +159,10 @@ def _first(has_ink: Tensor, most: int) -> Tensor:
 
 
 def _farthest_points(candidates: Tensor, counts: Tensor, particle_count: int) -> Tensor:
-    """Return N of the first `counts` candidates, each farthest from those before, [M, N, 2]."""
+    """Return N of the candidates [M, E, 2], each the farthest from all before it, [M, N, 2].
+
+    Of cloud m the first `counts[m]` candidates are valid.
+    """
     across, up = candidates.unbind(-1)
     valid = torch.arange(across.shape[1], device=across.device) < counts[:, None]
     # Invalid candidates are never the farthest, even after all valid ones are chosen.
@@ -173,7 +182,10 @@ def _farthest_points(candidates: Tensor, counts: Tensor, particle_count: int) ->
 def augmented(
     x: Tensor, rotation: float, stretch: float, jitter: float, generator: Randomness
 ) -> Tensor:
-    """Return clouds [B, N, 2] after random rotation, stretch, shear around (0.5, 0.5), noise."""
+    """Return clouds [B, N, 2] after random rotation, stretch, shear around (0.5, 0.5), noise.
+
+    The numbers are the fields of `PointClassificationConfig` with these names.
+    """
     world_count, particle_count = x.shape[:2]
     if rotation > 0.0 or stretch > 0.0:
         draws = 2.0 * uniform_draws(generator, (world_count, 4), x) - 1.0
@@ -198,16 +210,16 @@ BUILT_IN = ("digits", "mnist")
 """Data sets by name; everything else is a folder of IDX files."""
 
 TEST_FRACTION = 0.2
-"""Fraction of scikit-learn's digits, class by class, in the test split."""
+"""Fraction of each class of scikit-learn's digits that is in the test split."""
 
 SPLIT_SEED = 0
-"""Seed of that split."""
+"""Seed of the random choice of these digits."""
 
 IDX_NAMES = {
     "train": ("train-images-idx3-ubyte", "train-labels-idx1-ubyte"),
     "test": ("t10k-images-idx3-ubyte", "t10k-labels-idx1-ubyte"),
 }
-"""Names of MNIST's files of pictures and classes; each may end in .gz."""
+"""Names of MNIST's files of pictures and of classes, by split; each may also end in .gz."""
 
 MNIST_DOWNLOAD = "import torchvision; torchvision.datasets.MNIST({folder!r}, download=True)"
 
@@ -215,7 +227,10 @@ MNIST_DOWNLOAD = "import torchvision; torchvision.datasets.MNIST({folder!r}, dow
 def load_pictures(
     data: str, split: Split = "train", *, folder: str = "data"
 ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Return the ink of M pictures, in [0, 1], [M, H, W], top row first, and their classes, [M]."""
+    """Return the ink of M pictures, in [0, 1], [M, H, W], top row first, and their classes, [M].
+
+    `data` is "digits", "mnist", which is read from `folder`, or a folder of IDX files.
+    """
     if data == "digits":
         return _digits(split)
     path = home_path(folder) / "MNIST" / "raw" if data == "mnist" else home_path(data)
@@ -277,6 +292,7 @@ def read_idx(path: Path) -> NDArray[np.uint8]:
 
 
 def _digits(split: Split) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """Return ink and classes of scikit-learn's digits, as `load_pictures`."""
     try:
         from sklearn.datasets import load_digits
     except ImportError as error:
@@ -296,6 +312,7 @@ def _digits(split: Split) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
 
 
 def _found(folder: Path, name: str) -> Path:
+    """Return the file of this name, gzipped or not, in a folder; raise NPAError without one."""
     for file in (folder / name, folder / f"{name}.gz"):
         if os.path.isfile(file):
             return file

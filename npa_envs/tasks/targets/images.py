@@ -1,4 +1,4 @@
-"""Picture files of targets: reading, removing plain backgrounds, resampling."""
+"""Picture files of targets: reading, removal of plain backgrounds, scaling."""
 
 from __future__ import annotations
 
@@ -18,32 +18,32 @@ from npa_envs.atomic_files import read_bytes
 from npa_envs.errors import NPAError, shown
 
 OPAQUE = 128
-"""Least alpha of a pixel of the target, of 255."""
+"""Minimum alpha of a pixel that belongs to a target, out of 255."""
 
-_BACKGROUND_TOLERANCE = 28
-_UNIFORM = 0.95
-_MAX_CUT_OUT = 2048
-_MAX_FILE = 256 * 2**20
-_MAX_PADDED = 9216
+_BACKGROUND_TOLERANCE = 28  # of 255, in each of red, green and blue
+_UNIFORM = 0.95  # of the border's pixels
+_MAX_CUT_OUT = 2048  # pixels on each side
+_MAX_FILE = 256 * 2**20  # bytes
+_MAX_PADDED = 9216  # pixels on each side
 
 MAX_AREA = 2**26
-"""Largest picture [pixels]: 8192 x 8192."""
+"""Maximum number of pixels of a picture: 8192 x 8192."""
 
 FORMATS = ("PNG", "JPEG", "BMP", "GIF", "PPM", "TIFF", "WEBP")
 """Pillow's names of the allowed formats. Others may start other programs, as EPS does."""
 
-MAX_GRID = 6144
-"""Largest side of the grid that a picture is resampled to [pixels]."""
+MAX_GRID_SIDE = 6144
+"""Maximum side of the square grid to which a picture is scaled [pixels]."""
 
 MAX_POINT_COUNT = 2**24
-"""Largest number of points of a target."""
+"""Maximum number of points of a target."""
 
 FloatImage = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 
 def read_image(path: Path) -> Image.Image:
-    """Read a picture as RGBA; without transparency, its plain background is made transparent."""
+    """Read a picture as RGBA; the background of one without transparency is made transparent."""
     image = open_image(path)
     if np.asarray(image.getchannel("A")).min() == 255:
         return cut_out_background(image, label=str(path))
@@ -52,13 +52,13 @@ def read_image(path: Path) -> Image.Image:
 
 
 def with_background(image: Image.Image) -> Image.Image:
-    """Return an RGBA picture over a white background."""
+    """Return an RGBA picture, opaque: what is transparent becomes white."""
     white = Image.new("RGBA", image.size, (255, 255, 255, 255))
     return Image.alpha_composite(white, image)
 
 
 def open_image(path: Path) -> Image.Image:
-    """Read a picture as RGBA, with its background."""
+    """Read a picture as RGBA, as it is."""
     name = shown(str(path))
     content = read_bytes(path, limit=_MAX_FILE, what="target")
     if not content:
@@ -112,14 +112,14 @@ def _too_large(name: str, got: str) -> NPAError:
 
 
 def looks_like_path(source: str) -> bool:
-    """Return whether text has a folder or a suffix, or is the path of an existing file."""
+    """Return whether text contains a folder or a suffix, or is the path of an existing file."""
     if "/" in source or "\\" in source or Path(source).suffix:
         return True
     return os.path.exists(source)
 
 
 def scaled_square(image: Image.Image, side: int) -> FloatImage:
-    """Return a square picture scaled to [S, S, 4]: colours times alpha, and alpha, in [0, 1]."""
+    """Return a square picture scaled to [side, side, 4]: colours times alpha, alpha, in [0, 1]."""
     method = Image.Resampling.BOX if image.width >= side else Image.Resampling.BICUBIC
     # Pillow's premultiplied mode: colours of transparent pixels do not leak.
     scaled = image.convert("RGBa").resize((side, side), method)
@@ -127,7 +127,7 @@ def scaled_square(image: Image.Image, side: int) -> FloatImage:
 
 
 def require_opaque_pixels(image: Image.Image, *, label: str) -> None:
-    """Raise NPAError where no pixel of the RGBA picture has an alpha above one half."""
+    """Raise NPAError, which calls the picture `label`, if no pixel has an alpha above one half."""
     alpha = np.asarray(image.getchannel("A"))
     if alpha.size == 0 or alpha.max() < OPAQUE:
         highest = 0.0 if alpha.size == 0 else alpha.max() / 255
@@ -139,11 +139,11 @@ def require_opaque_pixels(image: Image.Image, *, label: str) -> None:
 
 
 def cut_out_background(image: Image.Image, *, label: str) -> Image.Image:
-    """Make the plain background of an opaque picture transparent.
+    """Return an opaque picture with its plain background made transparent.
 
     The background has the colour of the border and is connected with it; a hole that the object
     encloses stays opaque. The object's colour and alpha are estimated for pixels at its edge.
-    Sides above 2048 pixels are reduced first.
+    Sides above 2048 pixels are reduced first. Errors call the picture `label`.
     """
     image = image.reduce(math.ceil(max(image.size) / _MAX_CUT_OUT))
     rgb = np.asarray(image.convert("RGB")).astype(np.float32)
@@ -172,12 +172,20 @@ def cut_out_background(image: Image.Image, *, label: str) -> Image.Image:
 
 
 def resample(image: Image.Image, point_count: int, *, label: str = "picture") -> Image.Image:
-    """Scale a picture so that the number of its opaque pixels is nearest to `point_count`.
+    """Return an RGBA picture scaled so that about `point_count` of its pixels are opaque.
 
-    The sampling pitch is continuous, found by bisection, on a square grid that contains the whole
-    picture; other shapes than squares are padded. Colours are averaged with alpha as weight.
+    It is padded to a square. Colours are averaged with alpha as weight. Errors call it `label`.
     """
-    image = image.crop(image.getchannel("A").getbbox())
+    padded, span, pitch = _padded(image.crop(image.getchannel("A").getbbox()), point_count)
+    return _sample(padded, span, _best_pitch(padded, span, pitch, point_count, label))
+
+
+def _padded(image: Image.Image, point_count: int) -> tuple[Image.Image, int, float]:
+    """Return a picture in the middle of a transparent square, its longer side [pixels], its pitch.
+
+    A pitch is the side [pixels] of the squares that become one pixel each. This one would leave
+    `point_count` opaque pixels if they had the area of those before.
+    """
     area = _opaque_count(image)
     pitch = math.sqrt(area / point_count)
     # A picture far larger than the grid is reduced first, for speed, unless that loses fine parts.
@@ -194,6 +202,13 @@ def resample(image: Image.Image, point_count: int, *, label: str = "picture") ->
         span, margin = max(image.size), _margin(image, pitch)
     padded = Image.new("RGBA", (span + 2 * margin, span + 2 * margin), (0, 0, 0, 0))
     padded.paste(image, (margin + (span - image.width) // 2, margin + (span - image.height) // 2))
+    return padded, span, pitch
+
+
+def _best_pitch(
+    padded: Image.Image, span: int, pitch: float, point_count: int, label: str
+) -> float:
+    """Return the pitch, near a first one, that leaves about `point_count` opaque pixels."""
     alpha = padded.getchannel("A")
 
     def count(candidate: float) -> int:
@@ -201,12 +216,12 @@ def resample(image: Image.Image, point_count: int, *, label: str = "picture") ->
         return int((np.asarray(sampled) >= OPAQUE).sum())
 
     fine, coarse = pitch / 1.5, min(pitch * 1.5, span)
-    while span / fine <= MAX_GRID and count(fine) < point_count:
+    while span / fine <= MAX_GRID_SIDE and count(fine) < point_count:
         fine /= 1.5
-    if span / fine > MAX_GRID:
+    if span / fine > MAX_GRID_SIDE:
         raise NPAError(
             f"target {shown(label)} must give {point_count} points on a grid of at most "
-            f"{MAX_GRID} x {MAX_GRID} pixels, but its opaque pixels are few and far "
+            f"{MAX_GRID_SIDE} x {MAX_GRID_SIDE} pixels, but its opaque pixels are few and far "
             "apart: fill more of the picture, or lower target_point_count"
         )
     best, best_miss = pitch, abs(count(pitch) - point_count)
@@ -223,7 +238,7 @@ def resample(image: Image.Image, point_count: int, *, label: str = "picture") ->
             f"target {shown(label)} is too thin to be resampled to {point_count} points, no opaque "
             "pixel would be left: thicken it or raise target_point_count"
         )
-    return _sample(padded, span, best)
+    return best
 
 
 def _margin(image: Image.Image, pitch: float) -> int:
@@ -232,6 +247,7 @@ def _margin(image: Image.Image, pitch: float) -> int:
 
 
 def _sample(padded: Image.Image, span: int, pitch: float) -> Image.Image:
+    """Return the middle `span` pixels of a picture and a border, scaled by 1 / `pitch`."""
     side = math.ceil(span / pitch) + 2
     low = 0.5 * (padded.width - side * pitch)
     high = low + side * pitch
@@ -245,6 +261,7 @@ def _opaque_count(image: Image.Image) -> int:
 
 
 def _to_rgba(image: Image.Image) -> Image.Image:
+    """Return a picture of any of Pillow's modes as RGBA, 16 bits and floats scaled to 8 bits."""
     if image.mode.startswith("I") or image.mode == "F":
         # Pillow would clip sixteen bits at 255 instead of scaling them.
         levels = np.asarray(image).astype(np.float64)
@@ -256,6 +273,7 @@ def _to_rgba(image: Image.Image) -> Image.Image:
 
 
 def _connected_to_border(similar: Mask) -> Mask:
+    """Return which pixels of a mask are connected with its border, [H, W]."""
     connected = np.zeros_like(similar)
     connected[0], connected[-1] = similar[0], similar[-1]
     connected[:, 0], connected[:, -1] = similar[:, 0], similar[:, -1]
@@ -271,7 +289,7 @@ def _connected_to_border(similar: Mask) -> Mask:
 
 
 def _sums_of_nine(values: FloatImage) -> FloatImage:
-    """Return the sum of each pixel and its eight neighbours, [H, W, ...]; outside all is 0."""
+    """Return the sum of each pixel and its eight neighbours, 0 outside, shape [H, W, ...]."""
     padded = np.pad(values, [(1, 1), (1, 1), (0, 0)][: values.ndim])
     rows = padded[:-2] + padded[1:-1] + padded[2:]
     sums: FloatImage = rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:]
@@ -281,7 +299,10 @@ def _sums_of_nine(values: FloatImage) -> FloatImage:
 def _unmix_edge(
     rgb: FloatImage, inside: Mask, background: FloatImage
 ) -> tuple[FloatImage, FloatImage]:
-    """Return the object's colour and alpha, estimated for pixels at its edge."""
+    """Return colours and alpha of a picture of which `inside` is the object, blended at its edge.
+
+    For pixels at the edge they are estimated from the colours of the object and the background.
+    """
     core = _sums_of_nine(inside.astype(np.float32)) == 9.0
     near = _sums_of_nine(core.astype(np.float32))
     total = _sums_of_nine(rgb * core[..., None])

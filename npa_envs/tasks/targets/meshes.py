@@ -18,10 +18,10 @@ from npa_envs.tasks.targets.images import no_foreign_programs
 FloatArray = NDArray[np.float64]
 
 RADIUS = 0.85
-"""Largest distance from the origin to which every mesh is scaled [length units]."""
+"""Radius of the ball around the origin into which every mesh is scaled [length units]."""
 
 _MAX_FILE = 256 * 2**20
-_SIZES = 1e-30, 1e30
+_SIZE_RANGE = 1e-30, 1e30
 _MIN_AREA = 1e-12
 
 MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
@@ -34,22 +34,20 @@ class Mesh:
 
     vertices: FloatArray
     """Vertices [length units], shape [K, 3]."""
-
     faces: NDArray[np.int64]
     """Vertex indices of each triangle, counterclockwise from outside, shape [F, 3]."""
-
     colours: FloatArray
     """Red, green and blue of each vertex, in [0, 1], shape [K, 3]."""
 
     def fitted(self, radius: float = RADIUS) -> Mesh:
-        """Return the mesh with its bounding box centred, scaled into a ball of `radius`."""
+        """Return the mesh with its bounding box centred at 0, scaled into a ball of `radius`."""
         used = self.vertices[np.unique(self.faces)]
         middle = 0.5 * (used.min(axis=0) + used.max(axis=0))
         farthest = np.linalg.norm(used - middle, axis=1).max()
         return Mesh((self.vertices - middle) * (radius / farthest), self.faces, self.colours)
 
     def normals(self) -> FloatArray:
-        """Return unit normals at the vertices, weighted by the triangles' areas, shape [K, 3]."""
+        """Return unit normals at vertices, means over triangles weighted by area, shape [K, 3]."""
         a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
         flat = np.cross(b - a, c - a)
         sums = np.zeros_like(self.vertices)
@@ -70,7 +68,7 @@ def builtin_meshes() -> tuple[str, ...]:
 
 
 def load_mesh(source: str | Path) -> Mesh:
-    """Return a built-in mesh or the mesh in a file, scaled into a ball of radius 0.85."""
+    """Return a built-in mesh, by name, or the mesh in a file, scaled into a ball of radius 0.85."""
     if isinstance(source, str) and source in MESHES:
         with np.load(MESHES[source]) as file:
             return Mesh(file["vertices"], file["faces"].astype(np.int64), file["colours"]).fitted()
@@ -85,6 +83,7 @@ def load_mesh(source: str | Path) -> Mesh:
 
 
 def _read_mesh(path: Path) -> Mesh:
+    """Return the mesh in a file, as large as there; grey where the file has no colours."""
     try:
         import trimesh
     except ImportError as error:
@@ -105,6 +104,14 @@ def _read_mesh(path: Path) -> Mesh:
             f"target {shown(str(path))} cannot be read as a mesh ({type(error).__name__}: "
             f"{shown(error)}): save it again, for example as .ply or .glb"
         ) from error
+    _check_triangles(vertices, faces, path)
+    if colours.shape != vertices.shape or not np.isfinite(colours).all():
+        colours = np.full(vertices.shape, 0.6)
+    return Mesh(vertices, faces, colours)
+
+
+def _check_triangles(vertices: FloatArray, faces: NDArray[np.int64], path: Path) -> None:
+    """Raise NPAError unless a file's triangles exist, are finite, of a usual size, and no lines."""
     in_space = vertices.shape[1:] == (3,) and faces.shape[1:] == (3,)
     if not in_space or faces.size == 0 or vertices.size == 0 or not np.isfinite(vertices).all():
         raise NPAError(
@@ -118,10 +125,10 @@ def _read_mesh(path: Path) -> Mesh:
         )
     used = vertices[np.unique(faces)]
     size = float((used.max(axis=0) / 2 - used.min(axis=0) / 2).max()) * 2
-    if not _SIZES[0] <= size <= _SIZES[1] or np.abs(used).max() > _SIZES[1]:
+    if not _SIZE_RANGE[0] <= size <= _SIZE_RANGE[1] or np.abs(used).max() > _SIZE_RANGE[1]:
         raise NPAError(
-            f"target {shown(str(path))} must lie within {_SIZES[1]:g} of the origin and be of a "
-            f"size of at least {_SIZES[0]:g}, got a size of {size:.3g}: scale it"
+            f"target {shown(str(path))} must lie within {_SIZE_RANGE[1]:g} of the origin and be of "
+            f"a size of at least {_SIZE_RANGE[0]:g}, got a size of {size:.3g}: scale it"
         )
     a, b, c = ((vertices[faces[:, k]] - used.min(axis=0)) / size for k in range(3))
     if np.linalg.norm(np.cross(b - a, c - a), axis=1).max() < _MIN_AREA:
@@ -129,29 +136,26 @@ def _read_mesh(path: Path) -> Mesh:
             f"target {shown(str(path))} must have a surface, but the corners of every triangle "
             "lie on a line: give triangles with an area"
         )
-    if colours.shape != vertices.shape or not np.isfinite(colours).all():
-        colours = np.full(vertices.shape, 0.6)
-    return Mesh(vertices, faces, colours)
 
 
 # Pictures of meshes.
 
 LIGHT = (0.35, 0.80, 0.50)
-"""Direction towards the light, fixed in the world."""
+"""Direction towards the light, fixed in the world; it need not have length 1."""
 
 AMBIENT = 0.6
-"""Brightness of a surface that faces away from the light, as a fraction."""
+"""Brightness of a surface that faces away from the light, where 1 is one that faces it."""
 
 SAMPLES = 2
-"""Samples along each side of a pixel."""
+"""Number of samples along each side of a pixel."""
 
 BATCH_LIMIT = 2**22
-"""Largest number of samples, of vertices, and of triangles' vertices of views that are drawn in one
-batch; a single view may have more."""
+"""Maximum number of samples, and of vertices, of the views that are drawn in one batch; a single
+view may have more."""
 
 
 def draw_mesh(mesh: Mesh, cameras: Cameras) -> NDArray[np.float32]:
-    """Return pictures of a mesh [V, H, W, 4]: colours times alpha, and alpha, in [0, 1].
+    """Return pictures of a mesh by V cameras, [V, H, W, 4]: colours times alpha, alpha, in [0, 1].
 
     Surfaces are matt and lit from a direction that is fixed in the world. Both sides of a triangle
     are visible. Triangles with a vertex nearer than `cameras.near` are left out. The first row is

@@ -34,13 +34,10 @@ class PointTarget:
 
     name: str
     """The built-in name, the emoji, or the picture file's name without its suffix."""
-
     points: Tensor
     """Pixel centres [length units], shape [M, 2], float32, y upwards, their mean at the origin."""
-
     colours: Tensor
     """Red, green and blue of each point in [0, 1] (dimensionless), shape [M, 3], float32."""
-
     pixel_size: float
     """Distance h between neighbouring points [length units]."""
 
@@ -54,7 +51,7 @@ class PointTarget:
         return replace(self, points=self.points.to(device), colours=self.colours.to(device))
 
 
-SIDE = 1.8
+TARGET_SIDE = 1.8
 """Side of the smallest square around the origin that contains a target [length units]; pictures
 show [-1, 1]²."""
 
@@ -74,10 +71,10 @@ def load_target(
     """Make a target from a built-in name, a picture file or an emoji.
 
     A string is a built-in name if there is one, else a path if the file exists or the string has a
-    suffix or a folder in it, else an emoji. A `Path` is always a path. Pixels with an alpha of at
-    least one half become points, about `point_count`; the plain background of a picture without
-    transparency is removed. `keep_background`: the picture's whole rectangle is used, white where
-    it is transparent: for photographs.
+    suffix or a folder in it, else an emoji. A `Path` is always a path. The picture is scaled, and
+    pixels with an alpha of at least one half become points, about `point_count`. The plain
+    background of a picture without transparency is removed. With `keep_background`, for
+    photographs, the whole rectangle is used, white where it is transparent.
     """
     check_count("point_count", point_count, ": try 4096", at_most=MAX_POINT_COUNT)
     if not isinstance(source, str | Path):
@@ -104,7 +101,7 @@ def load_target(
 
 
 def target_from_image(image: Image.Image, *, name: str, point_count: int = 4096) -> PointTarget:
-    """Make a target from the opaque pixels of a picture."""
+    """Make a target called `name` from the opaque pixels of a picture, scaled to `point_count`."""
     rgba = image.convert("RGBA")
     require_opaque_pixels(rgba, label=name)
     pixels = np.array(resample(rgba, point_count, label=name))
@@ -112,7 +109,7 @@ def target_from_image(image: Image.Image, *, name: str, point_count: int = 4096)
     grid = np.stack([columns, -rows], axis=1).astype(np.float64)
     grid -= grid.mean(axis=0)
     # Half a pixel more on either side: a point represents a square of one pixel.
-    pixel_size = SIDE / (2 * float(np.abs(grid).max()) + 1)
+    pixel_size = TARGET_SIDE / (2 * float(np.abs(grid).max()) + 1)
     colours = pixels[rows, columns, :3].astype(np.float32) / 255
     return PointTarget(
         name=name,
@@ -132,10 +129,10 @@ FONTS = (
     "TwemojiMozilla.ttf",
     "JoyPixels.ttf",
 )
-"""Files of colour-emoji fonts, of Linux, macOS, Windows and others."""
+"""Names of files of colour-emoji fonts, of Linux, macOS, Windows and others."""
 
 # Bitmap fonts open only at the sizes that they hold: 109 is Noto's, 160, 96 ... are Apple's.
-_SIZES = (109, 160, 136, 128, 96, 72, 64, 48, 32)
+_FONT_SIZES = (109, 160, 136, 128, 96, 72, 64, 48, 32)
 _INK = (255, 0, 254)
 _KEYCAP, _PICTURE_STYLE = "\u20e3", "\ufe0f"
 
@@ -150,10 +147,10 @@ def is_emoji(text: str) -> bool:
 
 
 def find_emoji_fonts() -> list[ImageFont.FreeTypeFont]:
-    """Return the colour-emoji fonts that Pillow finds in the system's folders of fonts."""
+    """Return the fonts of `FONTS` that Pillow finds in the system's folders of fonts."""
     fonts = []
     for name in FONTS:
-        for size in _SIZES:
+        for size in _FONT_SIZES:
             with contextlib.suppress(OSError):
                 fonts.append(ImageFont.truetype(name, size))
                 break
@@ -186,6 +183,7 @@ def render_emoji(text: str) -> Image.Image:
 
 
 def _draw(font: ImageFont.FreeTypeFont, text: str) -> Image.Image | None:
+    """Return text in a font's own colours as RGBA, without margin; None: it has no such glyph."""
     side = 3 * int(font.size)
     image = Image.new("RGBA", (side, side), (0, 0, 0, 0))
     try:

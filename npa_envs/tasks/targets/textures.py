@@ -1,7 +1,7 @@
-"""Target textures: picture files, and built-in patterns that tile at any resolution.
+"""Target textures: from picture files, and built-in patterns whose opposite edges fit together.
 
-A pattern is a function of positions (u, v) in the periodic unit square. It returns red, green, blue
-and alpha in [0, 1]; alpha is the target's density.
+A pattern is a function of positions (u, v), arrays [H, W] in the periodic unit square. It returns
+red, green, blue and alpha there, in [0, 1], [H, W, 4]; alpha is the target's density.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ Array = NDArray[np.floating[Any]]
 Pattern = Callable[[Array, Array, np.random.Generator], Array]
 
 Layers = Iterator[tuple[NDArray[np.bool_], Array | float]]
-"""Parts of a pattern with their colours, each over those before it."""
+"""Masks [H, W] of the parts of a pattern with their colours; each part covers earlier ones."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,11 +45,9 @@ class TextureTarget:
 
     name: str
     """The built-in name, or the picture file's name without its suffix."""
-
     picture: Tensor
     """Red, green and blue, each times the density, and the density, dimensionless, shape
-    [R, R, 4], float32, as pictures of worlds: the first row is the bottom."""
-
+    [R, R, 4], float32; the first row is the bottom."""
     tiles: bool
     """Whether opposite edges fit together."""
 
@@ -91,7 +89,7 @@ COVERED = 0.5
 
 
 def _component_numbers(covered: Tensor) -> Tensor:
-    """Return the number of each pixel's connected component, 0 where not covered; [R, R]."""
+    """Return a number for each pixel's connected component, 0 where not covered, [R, R]."""
     numbers = torch.arange(1, covered.numel() + 1, dtype=torch.float64, device=covered.device)
     number = numbers.view_as(covered) * covered
     while True:
@@ -103,7 +101,7 @@ def _component_numbers(covered: Tensor) -> Tensor:
 
 
 def _neighbour_maximum(values: Tensor) -> Tensor:
-    """Return the maximum of each pixel and its eight neighbours in the periodic picture."""
+    """Return the maximum of each pixel and its eight neighbours in a periodic picture [R, R]."""
     wrapped = pad(values.double()[None, None], (1, 1, 1, 1), mode="circular")
     return max_pool2d(wrapped, kernel_size=3, stride=1)[0, 0]
 
@@ -120,8 +118,8 @@ def load_texture(
 
     The density is the picture's alpha: transparent parts stay empty, and a picture without
     transparency is covered evenly. The largest square in the middle of the picture is scaled to
-    `resolution` pixels along each side. `tiles`: the opposite edges of a picture file fit together;
-    built-in textures tile.
+    `resolution` pixels along each side. `tiles` says whether the opposite edges of a picture file
+    fit together, as those of built-in textures do.
     """
     if not isinstance(source, str | Path) or not str(source):
         raise NPAError(
@@ -151,22 +149,26 @@ def load_texture(
 
 
 def _target(name: str, picture: Array, tiles: bool) -> TextureTarget:
+    """Return the target with a picture of `TextureTarget.picture`'s channels and rows."""
     tensor = torch.tensor(np.ascontiguousarray(picture), dtype=torch.float32)
     return TextureTarget(name, tensor, tiles)
 
 
 MAX_RESOLUTION = 2048
-"""Largest side of a target [pixels]."""
+"""Maximum side of a target [pixels]."""
 
 STRIP_SAMPLES = 2**20
-"""Samples that are drawn in one strip, about."""
+"""Number of samples that are computed at once, in a strip of the picture, about."""
 
 OVERSAMPLING = 4
-"""Samples along each side of a pixel."""
+"""Number of samples along each side of a pixel."""
 
 
 def draw_pattern(name: str, resolution: int, *, seed: int = 0) -> Array:
-    """Draw a texture from its bottom row up: colours times alpha, and alpha, float64, [R, R, 4]."""
+    """Return the pattern `name` as a picture [R, R, 4], float64, with the bottom row first.
+
+    Channels are colours times alpha, and alpha. `seed` is that of random shapes.
+    """
     samples = resolution * OVERSAMPLING
     axis = (np.arange(samples) + 0.5) / samples
     strips = []
@@ -202,7 +204,7 @@ def cells(u: Array, v: Array, random: np.random.Generator) -> Array:
 
 
 def _painted(layers: Callable[[Array, Array, np.random.Generator], Layers]) -> Pattern:
-    """Return the pattern that paints all layers, one over the other, on a transparent ground."""
+    """Return the pattern that paints the layers one over the other on a transparent ground."""
 
     @functools.wraps(layers)
     def pattern(u: Array, v: Array, random: np.random.Generator) -> Array:
@@ -326,11 +328,11 @@ PATTERNS: dict[str, Pattern] = {
     pattern.__name__: pattern
     for pattern in (bubbles, cells, dots, droplets, grid, hearts, maze, stars, stripes)
 }
-"""Every built-in texture by name."""
+"""All built-in textures by name."""
 
 
 def _colours(*names: str) -> Array:
-    """Return colours such as "#20a040", shape [K, 3]."""
+    """Return colours such as "#20a040" as numbers in [0, 1], shape [K, 3]."""
     return np.array([ImageColor.getrgb(name)[:3] for name in names]) / 255.0
 
 

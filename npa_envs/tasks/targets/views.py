@@ -22,11 +22,11 @@ from npa_envs.tasks.targets.meshes import RADIUS, Mesh, draw_mesh, load_mesh
 DISTANCE = 3.2
 """Distance of cameras from the origin [length units]."""
 
-MAX_VIEWS = 2**27
-"""Largest number of pixels of all views of a target; a pixel takes 16 bytes."""
+MAX_PIXELS = 2**27
+"""Maximum number of pixels of all views of a target; a pixel takes 16 bytes."""
 
 ANGLE = 40.0
-"""Cameras' angle of view [degrees]: the unit ball fits into the picture."""
+"""Angle of view of cameras [degrees]: the unit ball fits into the picture."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,32 +34,29 @@ class Views:
     """Pictures and the cameras that took them."""
 
     cameras: Cameras
-    """V cameras."""
-
+    """Poses and lenses of V cameras."""
     pictures: Tensor
     """Red, green and blue, each times alpha, and alpha, dimensionless, shape [V, H, W, 4]; the
     first row is the upper one."""
 
     def to(self, device: str | torch.device) -> Views:
-        """Return the views on another device."""
+        """Return a copy on another device."""
         return Views(self.cameras.to(torch.device(device)), self.pictures.to(device))
 
 
 @dataclass(frozen=True, eq=False)
 class ViewTarget:
-    """A 3D target as pictures from all sides."""
+    """A 3D target: pictures of it from all sides."""
 
     name: str
     """The built-in name, or the file's or folder's name."""
-
     training: Views
     """The views that the loss compares."""
-
     held_out: Views
     """The views that metrics compare."""
 
     def to(self, device: str | torch.device) -> ViewTarget:
-        """Return the target on another device."""
+        """Return a copy on another device."""
         return ViewTarget(self.name, self.training.to(device), self.held_out.to(device))
 
 
@@ -85,9 +82,9 @@ def load_views(
     for name, value in {"resolution": resolution, **counts}.items():
         check_count(name, value)
     pixels = (training_count + held_out_count) * resolution**2
-    if pixels > MAX_VIEWS:
+    if pixels > MAX_PIXELS:
         raise NPAError(
-            f"all views together must have at most {MAX_VIEWS} pixels, got {shown(pixels)} of "
+            f"all views together must have at most {MAX_PIXELS} pixels, got {shown(pixels)} of "
             f"resolution={shown(resolution)}: lower it, or take fewer views"
         )
     folder = home_path(source)
@@ -109,7 +106,10 @@ def views_of_mesh(
 
 
 def surrounding_cameras(count: int, resolution: int, *, turn: float = 0.0) -> Cameras:
-    """Return cameras on a Fibonacci spiral, rotated by `turn` (of 1), pointing at the origin."""
+    """Return cameras on a Fibonacci spiral around the origin, at which they point.
+
+    The spiral is rotated by `turn` turns around the y axis.
+    """
     k = torch.arange(count, dtype=torch.float64)
     height = (2.0 * k + 1.0) / count - 1.0
     angle = math.tau * (k * (0.5 * (math.sqrt(5.0) - 1.0)) + turn)
@@ -126,12 +126,12 @@ def surrounding_cameras(count: int, resolution: int, *, turn: float = 0.0) -> Ca
 
 
 def composited(views: Tensor, background: Tensor) -> Tensor:
-    """Return views [..., 4] composited over a background [..., 3], shape [..., 3]."""
+    """Return the colours [..., 3] of views [..., 4] in front of a background [..., 3]."""
     return views[..., :3] + (1.0 - views[..., 3:]) * background
 
 
 def some_views(views: Views, index: Tensor) -> Views:
-    """Return the pictures and cameras with these indices."""
+    """Return the views with these indices, int64, shape [any]."""
     cameras = views.cameras
     intrinsics = cameras.intrinsics
     chosen = replace(
@@ -153,8 +153,8 @@ def nearest_camera(cameras: Cameras, elevation: float) -> int:
 
 # Folders of pictures and cameras in the format of NeRF-synthetic (Mildenhall et al. 2020).
 
-TRAINING = "transforms_train.json"
-HELD_OUT = ("transforms_test.json", "transforms_val.json")
+TRAINING_FILE = "transforms_train.json"
+HELD_OUT_FILES = ("transforms_test.json", "transforms_val.json")
 
 OPAQUE_ALPHA = 0.5
 """Alpha above which a pixel belongs to the scene."""
@@ -167,14 +167,14 @@ def read_nerf(
     folder: Path, resolution: int, training_count: int, held_out_count: int
 ) -> ViewTarget:
     """Return the target in a NeRF-synthetic folder, as `load_views` describes."""
-    held_out = next((folder / name for name in HELD_OUT if (folder / name).is_file()), None)
-    if held_out is None or not (folder / TRAINING).is_file():
+    held_out = next((folder / name for name in HELD_OUT_FILES if (folder / name).is_file()), None)
+    if held_out is None or not (folder / TRAINING_FILE).is_file():
         raise NPAError(
-            f"a folder of views must hold {TRAINING}, and {' or '.join(HELD_OUT)}, "
+            f"a folder of views must hold {TRAINING_FILE}, and {' or '.join(HELD_OUT_FILES)}, "
             f"{shown(str(folder))} does not: views to measure by must be others than those trained "
             "with"
         )
-    training = _read_views(folder / TRAINING, resolution, training_count)
+    training = _read_views(folder / TRAINING_FILE, resolution, training_count)
     measured = _read_views(held_out, resolution, held_out_count)
     radius = max(scene_radius(training), scene_radius(measured))
     if radius == 0.0:
