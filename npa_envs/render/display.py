@@ -1,4 +1,4 @@
-"""Display of pictures and films in notebooks (`show`, `show_worlds`), and in a window (`Window`)."""
+"""Pictures and films in notebooks (`show`, `show_worlds`), and a window (`Window`)."""
 
 from __future__ import annotations
 
@@ -63,11 +63,7 @@ class Shown:
 
 
 def show(frames: Frame | Iterable[Frame], *, fps: float = 25.0) -> Shown:
-    """Return what a notebook displays as a picture or, for several frames, as a repeating film.
-
-    Frames are uint8, shape [H, W, 3] each, such as `env.render()`; `fps` is their number per
-    second.
-    """
+    """Return a picture for a notebook, or a film of several; frames are uint8, [H, W, 3] each."""
     if isinstance(frames, np.ndarray) and frames.ndim == 3:
         frames = [frames]
     return Shown(frames, fps)
@@ -116,10 +112,7 @@ def side_by_side(pictures: NDArray[np.uint8]) -> Frame:
 
 
 def _spacing(x: Tensor) -> float:
-    """Return the usual distance of neighbours in the first world of x [B, N, D] [length units].
-
-    It is estimated from the area that particles cover, in 3D from the volume.
-    """
+    """Return the usual distance of neighbours in the first world, from the area they cover."""
     points = x[0].detach().double()
     points = points[points.isfinite().all(dim=-1)]
     if not len(points):
@@ -181,10 +174,7 @@ class Window:
             )
 
     def show(self, frame: Frame) -> None:
-        """Show a frame, uint8, shape [H, W, 3]; close the window if the user asked for it.
-
-        Waits as long as `fps` requires. A closed window shows nothing.
-        """
+        """Show a frame, uint8, [H, W, 3], and wait as `fps` requires; nothing if it is closed."""
         (pixels,) = checked_frames([frame])
         if self._surface is None:
             return

@@ -46,7 +46,6 @@ def encode_frame(frame: Frame, kind: Literal["PNG", "JPEG"]) -> bytes:
 
 
 def _encoded(frames: Iterable[Frame], **options: Any) -> bytes:
-    """Return the bytes of the file that Pillow saves with `options`."""
     first, *others = map(Image.fromarray, checked_frames(frames))
     buffer = io.BytesIO()
     first.save(buffer, append_images=others, **options)
@@ -109,10 +108,9 @@ def encode_webp(frames: Iterable[Frame], fps: float = 25, *, quality: int = 50) 
 
 
 def write_mp4(path: str | Path, frames: Iterable[Frame], fps: float = 25) -> None:
-    """Write frames, uint8, [H, W, 3] each, as an H.264 film that browsers play.
+    """Write frames, uint8, [H, W, 3] each, as an H.264 film that browsers play (with imageio).
 
-    Needs imageio and its ffmpeg. An odd width or height is made even by repeating the last column
-    or row.
+    An odd width or height is made even by repeating the last column or row.
     """
     pictures = checked_frames(frames)
     check_rate(fps)
@@ -265,15 +263,9 @@ def turntable_frames(
 ) -> list[NDArray[np.uint8]]:
     """Return pictures, uint8, [R, R, 3] each, of a 3D world from cameras on a circle around it.
 
-    Args:
-        views: Returns the world's pictures from V cameras, colours times alpha, and alpha, shape
-            [1, V, R, R, 4], such as `task.views` of one world.
-        frame_count: Number of pictures in a full turn.
-        resolution: Pixels R along each side.
-        elevation: Angle of the cameras above the horizon [degrees].
-        azimuth: Angle of the first camera around the vertical axis [degrees].
-        background: A colour name, "#rrggbb", or red, green and blue in [0, 1].
-        device: Device of the world.
+    `views` returns the world's pictures from V cameras: colours times alpha, and alpha, shape
+    [1, V, R, R, 4]. The cameras stand `elevation` degrees above the horizon, and the first one
+    `azimuth` degrees around the vertical axis. R is `resolution`, `device` the world's.
     """
     frame_count = checked_count("frame_count", frame_count)
     azimuth = checked_finite("azimuth", azimuth, " [degrees]")

@@ -1,7 +1,4 @@
-"""Files of 3D worlds for other programs: point clouds (PLY) and Gaussian splats (PLY, .splat).
-
-`gaussians` are the shapes, rotations, opacities and colours of the particles of one world.
-"""
+"""Files of 3D worlds for other programs: point clouds (PLY) and Gaussian splats (PLY, .splat)."""
 
 from __future__ import annotations
 

@@ -42,10 +42,7 @@ class WorldFilm:
     """Index of a frame -> steps since the initial world. Frames of damage are not in it."""
 
     def add(self, task: Task, worlds: Particles, step: int, damage: str = "") -> None:
-        """Append a picture of the first of `worlds` at `step`, as `task` draws it, with a caption.
-
-        If the world was damaged just now, `damage` describes that in the caption.
-        """
+        """Append a picture of the first world, with a caption: its step, and damage just now."""
         if not damage:
             self.steps[len(self.frames)] = step
         self.frames.append(to_uint8(task.picture(worlds.x, worlds.s)[0], self.background))
@@ -101,18 +98,10 @@ def film_world(
 ) -> tuple[Particles, WorldFilm]:
     """Run one world for `steps` steps; return it as it is then, and its film.
 
-    Args:
-        rule: The rule of its particles.
-        task: Draws the frames and gives the options of the rollout.
-        worlds: The world, a batch of one; it is not changed.
-        steps: Steps of the run.
-        generator: Source of the update masks and of the damages' places.
-        damages: Damages by step since the initial world; each has a frame of its own.
-        every: Steps between frames; None: a number that gives about 150 frames.
-        first_step: Age of `worlds` [steps].
-        film: The film that frames are appended to; None: a new one.
-        progress: Called with the number of steps since its last call.
-        stop: Called after each frame; if it returns True, the run ends.
+    There is a frame every `every` steps (None: about 150 in all), and one after each of `damages`,
+    whose steps count from the initial world; `first_step` is the age of `worlds`. Frames are
+    appended to `film`; None: to a new one. `progress` is called with the steps since its last call.
+    After each frame the run ends if `stop` returns True.
     """
     film = WorldFilm() if film is None else film
     last = first_step + steps
@@ -150,10 +139,9 @@ def write_3d_world(
     resolution: int = SCREEN,
     background: str = "white",
 ) -> list[Path]:
-    """Write a 3D world as a turntable (GIF) and as files of points; return the four paths.
+    """Write a 3D world as a turntable (GIF), and as three files of points; return their paths.
 
-    `task` turns states into Gaussians. `drawn_by` draws the turntable: it may be `task`, or one of
-    another resolution. `resolution` is the side of the turntable's pictures [pixels].
+    The task `drawn_by` draws the turntable, whose frames have `resolution` pixels on each side.
     """
     names = ("turntable.gif", "points.ply", "gaussians.ply", "cloud.splat")
     paths = [folder / name for name in names]

@@ -159,10 +159,7 @@ def _colours(s: Tensor, style: str) -> Tensor:
 
 
 def _projected(x: Tensor, azimuth: float, elevation: float) -> tuple[Tensor, Tensor]:
-    """Return coordinates right and up in the picture, [B, N, 2], and towards the viewer, [B, N, 1].
-
-    `x` are positions [B, N, 3] relative to the picture's middle; angles are in degrees.
-    """
+    """Return coordinates right and up in the picture, [B, N, 2], and to the viewer, [B, N, 1]."""
     turn, tilt = (math.radians(angle % 360.0) for angle in (azimuth, elevation))
     right, height, outward = x.unbind(-1)
     across = math.cos(turn) * right - math.sin(turn) * outward
@@ -175,11 +172,7 @@ def _projected(x: Tensor, azimuth: float, elevation: float) -> tuple[Tensor, Ten
 def _stack_layers(
     draw: Callable[[Tensor, Tensor], Tensor], points: Tensor, depth: Tensor, colour: Tensor
 ) -> Tensor:
-    """Return pictures [B, R, R, 4] (colours times alpha, alpha) of layers, the nearest on top.
-
-    `draw` returns splats of points [B, M, 2] with colours [B, M, 3]; depths [B, N, 1] increase
-    towards the viewer.
-    """
+    """Return pictures [B, R, R, 4] (colours times alpha, alpha) of layers, the nearest on top."""
     order = depth.argsort(dim=1, descending=True, stable=True)
     particles = torch.cat((points, colour), dim=-1)
     particles = particles.gather(1, order.expand_as(particles))
