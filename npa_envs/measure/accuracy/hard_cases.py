@@ -210,7 +210,7 @@ WORLD_COUNT, PARTICLE_COUNT, NAN_STEPS = 3, 150, 8
 
 
 def _worlds(session: CheckSession, space_dim: int, state_dim: int) -> tuple[Tensor, Tensor]:
-    """Return positions and states of worlds in two distant halves, with about 20 neighbours each."""
+    """Return positions and states of worlds in two distant halves; particles have 20 neighbours."""
     generator = torch.Generator().manual_seed(0)
     shape = (WORLD_COUNT, PARTICLE_COUNT)
     side = EPS * (3.0 if space_dim == 2 else 2.4)

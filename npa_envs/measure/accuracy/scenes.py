@@ -129,10 +129,10 @@ def _far(space_dim: int, generator: torch.Generator) -> Tensor:
 
 
 POSITIONS: dict[str, tuple[str, Callable[[int, torch.Generator], Tensor]]] = {
-    "one": ("a single particle", lambda d, generator: _uniform(d, generator, 1)),
+    "one": ("a single particle", lambda d, source: _uniform(d, source, 1)),
     "coincident": (
         "48 particles in one place",
-        lambda d, generator: _uniform(d, generator, 1).expand(1, 48, d),
+        lambda d, source: _uniform(d, source, 1).expand(1, 48, d),
     ),
     "touching": ("pairs from 1e-12 length units to ε/2 apart", _touching),
     "at_eps": ("pairs at ε, and at ε (1 ± 2⁻²⁰)", _at_eps),
@@ -140,15 +140,15 @@ POSITIONS: dict[str, tuple[str, Callable[[int, torch.Generator], Tensor]]] = {
     "coplanar": ("particles on a plane", _coplanar),
     "lattice": (
         "a lattice of ε/2: neighbours at ε exactly",
-        lambda d, generator: torch.cartesian_prod(*((torch.arange(5) - 2) * (EPS / 2.0),) * d)[None],
+        lambda d, source: torch.cartesian_prod(*((torch.arange(5) - 2) * (EPS / 2.0),) * d)[None],
     ),
     "cell_borders": (
         "particles on the borders of cells",
-        lambda d, generator: torch.randint(-4, 4, (1, 60, d), generator=generator) * (EPS / 2.0),
+        lambda d, source: torch.randint(-4, 4, (1, 60, d), generator=source) * (EPS / 2.0),
     ),
     "clump": (
         "100 particles in one cell",
-        lambda d, generator: 0.03 + _uniform(d, generator, 100, EPS / 4.0),
+        lambda d, source: 0.03 + _uniform(d, source, 100, EPS / 4.0),
     ),
     "far": ("crowds at 0, 1e3, 1e6, -1e30 and 3e38", _far),
     "seam": ("particles on both sides of the box's seam and on it", _seam),
