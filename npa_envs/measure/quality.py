@@ -570,7 +570,7 @@ def picture_rows(
     checkpoints: Sequence[int] = PICTURE_CHECKPOINTS,
     **options: Any,
 ) -> list[PictureRow]:
-    """Return each picture's row and the medians' at `checkpoints`; `options` are those of `grown`."""
+    """Return each picture's row and the medians' at `checkpoints`; `options`: those of `grown`."""
     if len(tasks) < 2:
         raise NPAError(f"pictures must be two or more, got {len(tasks)}: give another")
     worlds = grown(rule, tasks, checkpoints=checkpoints, **options)
