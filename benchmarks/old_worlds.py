@@ -95,40 +95,32 @@ def follow(arguments: argparse.Namespace) -> None:
 def endurance(
     home: long_runs.RuleWorlds, steps: int, generators: Sequence[torch.Generator]
 ) -> dict[str, Any]:
-    """Return losses and figures of all worlds of a case, each against itself when settled.
+    """Return losses and metrics of the worlds of a rule, run for `steps` steps.
 
-    Args:
-        home: The worlds.
-        steps: How long they are run.
-        generators: Of the run, and of the steps that tell the energy.
+    A world's metrics are divided by those of the same world at the settled step. `generators` are
+    the source of the run's update masks, and that of the steps that energies are measured in.
     """
-    settled = min(long_runs.SETTLED, steps // 2)
-    marks = [
-        round(settled * (steps / settled) ** (k / long_runs.MARKS))
-        for k in range(long_runs.MARKS + 1)
-    ]
     runner, energy_runner = (RuleRunner(home.rule, home.task, each) for each in generators)
     count = len(home.worlds.x)
-    first: list[dict[str, float]] = [{} for _ in range(count)]
+    settled: list[dict[str, float]] = [{} for _ in range(count)]
     largest: list[dict[str, float]] = [{} for _ in range(count)]
     over: dict[int, str] = {}
-    losses = {}
+    losses: dict[int, list[float]] = {}
     centroids = home.worlds.x.mean(1)
-    for step, worlds in runner.at(marks, home.worlds):
+    for step, worlds in runner.at(long_runs.mark_steps(steps), home.worlds):
         x, s, *_ = worlds
-        losses[step] = home.task.metric(x, s).tolist()
-        if step == settled:
+        if not losses:
             centroids = x.mean(1)
+        losses[step] = home.task.metric(x, s).tolist()
         for k in range(count):
             found = long_runs.measured(energy_runner, Particles(x[k : k + 1], s[k : k + 1]))
             if not found["not_finite"]:
-                first[k] = first[k] or dict(found)
+                settled[k] = settled[k] or dict(found)
                 found["drift"] = float((x[k].mean(0) - centroids[k]).norm())
-                for key, unit in (("extent", "extent"), ("energy", "energy"), ("drift", "extent")):
-                    found[key] /= max(first[k][unit], 1e-12)
-            beyond = [n for n, bound in long_runs.BOUNDS.items() if not found.get(n, 0.0) <= bound]
+                found = long_runs.relative(found, settled[k])
+            beyond = long_runs.exceeded(found, long_runs.BOUNDS)
             if beyond:
-                over.setdefault(k, f"{', '.join(beyond)} at step {step}")
+                over.setdefault(k, f"{beyond} at step {step}")
             for key, value in found.items():
                 largest[k][key] = max(value, largest[k].get(key, 0.0))
     return {

@@ -423,7 +423,7 @@ def main() -> None:
         own.add_argument("--pictures", type=Path, required=True, help="folder of PNG files")
         own.add_argument("--device", default="cpu")
         own.add_argument("--preset", default="paper", help="what the world is like")
-    long.add_argument("--steps", type=int, default=trained_rule_checks.STEPS)
+    long.add_argument("--steps", type=int, default=trained_rule_checks.LONG_RUN_STEPS)
     heal.add_argument("--count", type=int, default=32, help="seeds")
     heal.add_argument(
         "--steps", type=int, nargs=2, default=[1024, 500], help="before and after the damage"

@@ -1,4 +1,4 @@
-"""Quality of trained rules: loss, PSNR, healing, accuracy; scores of the shipped rules."""
+"""Measurements of trained rules: growth, healing, classes of clouds, many pictures; scores."""
 
 from __future__ import annotations
 
@@ -29,29 +29,29 @@ from npa_envs.world.randomness import Randomness, WorldRandom
 from npa_envs.world.rollout import rollout_particles
 
 PROGRESS_STEPS = 32
-"""Steps between two reports of progress."""
+"""Steps between two calls of `progress`."""
 
 FIRST_SEED = 1_000_000
-"""Seed of the first measured world; training uses others."""
+"""Random seed of the first measured world; training uses smaller ones."""
 
 CHECKPOINTS = (64, 128, 256, 512, 1024, 2048, 4096)
-"""Default steps at which a rule is measured."""
+"""Default steps from the start at which worlds are measured."""
 
 DIVERGED_FACTOR = 10.0
-"""A world has diverged if its loss is more than this many times that before the damage."""
+"""A damaged world has diverged if its last loss exceeds this multiple of that before the damage."""
 
 HEALED = 1.2
-"""A world is healed once its loss is at most this many times that before the damage."""
+"""A world is healed once its loss is at most this multiple of that before the damage."""
 
 
 @dataclass(frozen=True)
 class EvaluationRow:
-    """Means over worlds `step` steps after the seed; fields `..._worst` are of the worst world.
+    """Means over worlds at `step`; fields `..._worst` are those of the worst world.
 
-    `loss` is the task's metric. `psnr` compares the picture with the target's, four channels in
+    `loss` is the task's metric. `psnr` compares pictures with the target's, four channels in
     [0, 1], in 3D held-out views [dB]; None for tasks whose worlds need not match their target pixel
-    by pixel. `overflow` is mean |s - clip(s, -1, 1)|, `extent` the longest side of the bounding
-    box [length units].
+    by pixel. `overflow` is mean |s - clip(s, -1, 1)| (dimensionless), `extent` the longest side of
+    the particles' bounding box [length units].
     """
 
     step: int
@@ -71,10 +71,10 @@ class EvaluationRow:
 
 @dataclass(frozen=True)
 class HealingRow:
-    """Mean loss of grown worlds `before` and right `after` a damage, and at the `end`.
+    """Mean losses of grown worlds `before` a damage, right `after` it, and at the `end` of the run.
 
-    `steps_to_heal`: steps until the mean loss is at most `HEALED` times `before`, None if never.
-    `worlds_healed`: worlds that once heal by their own loss, and at the end have not diverged.
+    `steps_to_heal`: steps until the mean loss is at most `HEALED` times `before`; None: never.
+    `worlds_healed`: number of worlds whose own loss was so at some step, and did not diverge.
     """
 
     damage: str
@@ -97,10 +97,10 @@ def evaluate(
     progress: Callable[[int], None] | None = None,
     watch: Callable[[Tensor, Tensor, int], None] | None = None,
 ) -> list[EvaluationRow]:
-    """Grow one world from every seed and measure them at `checkpoints`, increasing steps.
+    """Grow one world from every seed; return a row for each of `checkpoints`, increasing steps.
 
     `progress` is called with the steps done since its last call, `watch` at each checkpoint with
-    positions, states and the step. The same seeds give the same table.
+    positions, states and the step. The same seeds give the same rows.
     """
     check_steps("checkpoints", checkpoints)
     runner, worlds = _from_seeds(rule, task, seeds, device, progress)
@@ -113,7 +113,7 @@ def evaluate(
 
 
 def measure(task: Task, x: Tensor, s: Tensor, step: int) -> EvaluationRow:
-    """Return the measurements of worlds that are `step` steps after their seed."""
+    """Return the measurements of worlds x and s of a task, `step` steps after their start."""
     loss, ratio = task.metric(x, s), None
     if task.has_views:
         ratio = cast(Morphogenesis3D, task).view_psnr(x, s)
@@ -135,7 +135,7 @@ def _overflow(s: Tensor) -> Tensor:
 
 
 def psnr(picture: Tensor, target: Tensor) -> Tensor:
-    """Return the PSNR [dB], shape [B], of pictures [B, R, R, 4] and a target [R, R, 4], clipped."""
+    """Return the PSNR [dB], [B], of pictures [B, R, R, 4] to a target, all clipped to [0, 1]."""
     error = (picture.clamp(0.0, 1.0) - target.clamp(0.0, 1.0)).square().flatten(1).mean(1)
     return -10.0 * torch.log10(error)
 
@@ -154,11 +154,11 @@ def healing(
     device: str | torch.device = "cpu",
     progress: Callable[[int], None] | None = None,
 ) -> list[HealingRow]:
-    """Grow worlds, damage them, and measure how long they take to heal.
+    """Grow a world from each seed, damage it, and return how it heals, one row for each damage.
 
-    There are two damages, each to the same grown worlds: a slit of width `cut_gap` through the
-    middle at a random angle, and states set to zero within `wipe_radius` of a random particle
-    [length units]. Losses are computed every `every` steps.
+    Two damages are done to the same worlds, `grow_steps` steps old: a slit of width `cut_gap`
+    through the centroid at a random angle, and zero states within `wipe_radius` of a random
+    particle [length units]. Damaged worlds run for `heal_steps`, with losses every `every` steps.
     """
     for name, count in (("grow_steps", grow_steps), ("heal_steps", heal_steps), ("every", every)):
         check_steps(name, [count])
@@ -180,42 +180,45 @@ def healing(
     rows = []
     for name, worlds in damaged.items():
         losses = torch.stack([task.metric(now.x, now.s) for _, now in runner.at(steps, worlds)])
-        diverged = ~(losses[-1] <= DIVERGED_FACTOR * before)
-        mean_healed = ((losses.mean(1) <= HEALED * before.mean()) & ~diverged.all()).tolist()
-        healed = [step for step, is_healed in zip(steps, mean_healed, strict=True) if is_healed]
-        rows.append(
-            HealingRow(
-                damage=name,
-                before=before.mean().item(),
-                after=losses[0].mean().item(),
-                steps_to_heal=healed[0] if healed else None,
-                worlds_healed=int(((losses <= HEALED * before).any(0) & ~diverged).sum()),
-                world_count=len(before),
-                end=losses[-1].mean().item(),
-            )
-        )
+        rows.append(_healing_row(name, before, steps, losses))
     return rows
+
+
+def _healing_row(damage: str, before: Tensor, steps: Sequence[int], losses: Tensor) -> HealingRow:
+    """Return the row of losses [B] `before` a damage, and [len(steps), B] at `steps` after it."""
+    diverged = ~(losses[-1] <= DIVERGED_FACTOR * before)
+    mean_healed = ((losses.mean(1) <= HEALED * before.mean()) & ~diverged.all()).tolist()
+    healed = [step for step, is_healed in zip(steps, mean_healed, strict=True) if is_healed]
+    return HealingRow(
+        damage=damage,
+        before=before.mean().item(),
+        after=losses[0].mean().item(),
+        steps_to_heal=healed[0] if healed else None,
+        worlds_healed=int(((losses <= HEALED * before).any(0) & ~diverged).sum()),
+        world_count=len(before),
+        end=losses[-1].mean().item(),
+    )
 
 
 # Rules that classify clouds
 
 CLOUD_CHECKPOINTS = (8, 16, 24, 32, 64, 128)
-"""Default steps at which the classes of clouds are read."""
+"""Default steps from zero states at which particles' votes are read."""
 
 CUT_FRACTION = 0.25
 """Fraction of its particles that a cut cloud loses."""
 
-BATCH = 256
-"""Clouds in a batch."""
+CLOUD_BATCH = 256
+"""Maximum number of clouds that run at once."""
 
 
 @dataclass(frozen=True)
 class AccuracyRow:
-    """Fractions in [0, 1] of all clouds, or of particles, `step` steps after zero states.
+    """How particles, which vote for the class of their cloud, vote `step` steps after zero states.
 
-    `majority`: clouds whose majority vote is right; `particle`: particles whose vote is right;
-    `agreement`: particles that vote as their cloud's majority. `loss` is the mean squared error to
-    the class, `overflow` mean |s - clip(s, -1, 1)|.
+    Fractions in [0, 1]: `majority`, of clouds whose majority votes for the right class; `particle`,
+    of particles that do; `agreement`, of particles that vote as their cloud's majority. `loss` is
+    the task's metric, `overflow` mean |s - clip(s, -1, 1)|.
     """
 
     step: int
@@ -228,10 +231,11 @@ class AccuracyRow:
 
 @dataclass(frozen=True)
 class ChangeRow:
-    """Votes of all clouds `steps` steps after their positions, but not their states, were changed.
+    """Votes of all clouds `steps` steps after their particles were cut off or moved (`change`).
 
-    `majority` and `particle` are fractions that vote for the class after the change,
-    `majority_before` the fraction of clouds whose majority votes for the class before it.
+    Fractions in [0, 1]: `majority`, of clouds whose majority votes for the class after the change;
+    `particle`, of particles that do; `majority_before`, of clouds whose majority votes for the
+    class before the change.
     """
 
     change: str
@@ -250,15 +254,16 @@ def accuracies(
     seed: int = 0,
     progress: Callable[[int], None] | None = None,
 ) -> list[AccuracyRow]:
-    """Let a rule classify all clouds of a task's split; return its accuracy at `checkpoints`.
+    """Let a rule classify all clouds of `task`, from zero states; return a row for each checkpoint.
 
-    The rule runs on the device of the task; `seed` is that of the update masks.
+    Checkpoints are increasing steps. A copy of the rule runs on the device of the task; `seed` is
+    that of the update masks. `progress` is called with the steps done since its last call.
     """
     check_steps("checkpoints", checkpoints)
     runner = _copied_runner(rule, task, task.clouds.x.device, seed, progress)
 
     def measured(index: Tensor) -> Iterator[tuple[Tensor, ...]]:
-        label, clouds = task.clouds.label[index], _blank_clouds(runner, index)
+        label, clouds = task.clouds.label[index], _zero_clouds(runner, index)
         labelled = runner.task.with_goal(label)
         for _, (x, s, *_) in runner.at(checkpoints, clouds):
             outputs = runner.task.outputs(s)
@@ -285,11 +290,11 @@ def changes_of_mind(
     seed: int = 0,
     progress: Callable[[int], None] | None = None,
 ) -> list[ChangeRow]:
-    """Classify clouds for `settle_steps`, change them, and return the accuracy after more `steps`.
+    """Classify all clouds for `settle_steps`, change them, and return rows after more `steps`.
 
-    A cut cloud loses a quarter of its particles, on a random side. A mutated one gets the positions
-    of a cloud of another class, all or in its upper half, and keeps its states. `seed` is that of
-    the update masks and of the cuts.
+    There are three changes, each to the same clouds: a quarter of the particles is cut off on a
+    random side; particles move to the positions of a cloud of another class, in the upper half or
+    all, and keep their states. `seed` is that of the update masks and of the cuts.
     """
     check_steps("settle_steps", [settle_steps])
     check_steps("steps", steps, at_least=0)
@@ -298,8 +303,8 @@ def changes_of_mind(
 
     def measured(index: Tensor) -> Iterator[tuple[Tensor, ...]]:
         label, other_label = classes[index], classes[partner[index]]
-        x, s, *_ = runner.run(_blank_clouds(runner, index), settle_steps)
-        other_x = _blank_clouds(runner, partner[index]).x
+        x, s, *_ = runner.run(_zero_clouds(runner, index), settle_steps)
+        other_x = _zero_clouds(runner, partner[index]).x
         for changed, goal in (
             (_cut(x, s, runner.generator), label),
             (_chimera(x, s, other_x), other_label),
@@ -319,7 +324,7 @@ def changes_of_mind(
     ]
 
 
-def _blank_clouds(runner: RuleRunner, index: Tensor) -> Particles:
+def _zero_clouds(runner: RuleRunner, index: Tensor) -> Particles:
     x = runner.task.clouds.x[index].to(next(runner.rule.parameters()).dtype)
     return Particles(x, x.new_zeros(*x.shape[:2], runner.task.config.state_dim))
 
@@ -327,10 +332,10 @@ def _blank_clouds(runner: RuleRunner, index: Tensor) -> Particles:
 def _cloud_means(
     task: PointClassification, measured: Callable[[Tensor], Iterable[Sequence[Tensor]]]
 ) -> list[list[float]]:
-    """Return a table of means over all clouds; `measured` maps B clouds' indices to cells [B]."""
+    """Return rows of means over all clouds; `measured` maps indices [B] to rows of cells [B]."""
     count = len(task.clouds.label)
     sums = torch.zeros((), dtype=torch.float64)
-    for index in torch.split(torch.arange(count, device=task.clouds.x.device), BATCH):
+    for index in torch.split(torch.arange(count, device=task.clouds.x.device), CLOUD_BATCH):
         rows = [[values.double().sum() for values in row] for row in measured(index)]
         sums = sums + torch.stack([torch.stack(row) for row in rows]).cpu()
     means: list[list[float]] = (sums / count).tolist()
@@ -338,7 +343,7 @@ def _cloud_means(
 
 
 def _cut(x: Tensor, s: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Return clouds less `CUT_FRACTION` of their particles: the farthest in a random direction."""
+    """Return clouds without `CUT_FRACTION` of their particles, farthest in a random direction."""
     normal = torch.randn(len(x), 2, generator=generator, device=x.device, dtype=x.dtype)
     order = (x * normal[:, None]).sum(-1).argsort(dim=1)
     indices = order[:, : max(1, round((1.0 - CUT_FRACTION) * x.shape[1])), None]
@@ -346,7 +351,7 @@ def _cut(x: Tensor, s: Tensor, generator: torch.Generator) -> tuple[Tensor, Tens
 
 
 def _chimera(x: Tensor, s: Tensor, other_x: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the lower halves of clouds with the upper halves of others, in order of height."""
+    """Return x, the lower halves of clouds and the upper halves of others, and s, by height."""
     order = x[..., 1].argsort(dim=1)[..., None]
     other_order = other_x[..., 1].argsort(dim=1)[..., None]
     half = x.shape[1] // 2
@@ -356,7 +361,7 @@ def _chimera(x: Tensor, s: Tensor, other_x: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _partners(label: Tensor) -> Tensor:
-    """Return a permutation that maps each cloud to one of another class, shape [M]."""
+    """Return for each of M clouds the index of one of another class, a permutation, [M]."""
     largest = int(label.bincount().max())
     if 2 * largest > len(label):
         raise NPAError(
@@ -381,11 +386,11 @@ def tables_of(
     progress: Callable[[int], None] | None = None,
     texture_metric: bool = False,
 ) -> dict[str, Sequence[Any]]:
-    """Measure a rule of any task; return tables by name.
+    """Measure a rule of any task; return tables (lists of rows) by name.
 
-    They are `growth` and, if `changed`, `healing`; for clouds `accuracy` and, if `changed`,
-    `changes`; with `texture_metric` also `judge`. Clouds run on their task's device, with the first
-    seed.
+    They are `growth` (`evaluate`) and, if `changed`, `healing`; with `texture_metric` also `judge`,
+    the rows of a `TextureMetric`. Of a rule that classifies clouds they are `accuracy` and, if
+    `changed`, `changes`; it runs on its task's device, with the first of `seeds`.
     """
     metric = TextureMetric(task) if texture_metric else None
     options: dict[str, Any] = {"progress": progress}
@@ -413,9 +418,9 @@ def tables_of(
 
 
 class RuleRunner:
-    """Runs worlds by a rule, with the task's rollout options, some replaced by `changed`.
+    """Runs worlds by a rule, with a task's rollout options, some of them replaced by `changed`.
 
-    `progress` is called with the steps done since its last call.
+    `generator` draws the update masks; `progress` is called with the steps since its last call.
     """
 
     def __init__(
@@ -433,10 +438,10 @@ class RuleRunner:
 
     @torch.no_grad()
     def run(self, worlds: Particles, steps: int) -> Particles:
-        """Return worlds after `steps` steps."""
-        most = steps if self._progress is None else PROGRESS_STEPS
+        """Return the worlds `steps` steps later; the given ones do not change."""
+        longest = steps if self._progress is None else PROGRESS_STEPS
         while steps > 0:
-            count = min(steps, most)
+            count = min(steps, longest)
             worlds = rollout_particles(
                 self.rule, worlds, count, generator=self.generator, **self._options
             )
@@ -446,7 +451,7 @@ class RuleRunner:
         return worlds
 
     def at(self, steps: Sequence[int], worlds: Particles) -> Iterator[tuple[int, Particles]]:
-        """Run worlds; yield each of the increasing `steps`, with the worlds then."""
+        """Run worlds; yield each of the increasing `steps`, and the worlds at that step."""
         for step, before in zip(steps, (0, *steps), strict=False):
             worlds = self.run(worlds, step - before)
             yield step, worlds
@@ -459,7 +464,7 @@ def _copied_runner(
     seed: int,
     progress: Callable[[int], None] | None,
 ) -> RuleRunner:
-    """Return a runner on a device with a copy of the rule, so that the caller's does not move."""
+    """Return a runner of a copy of the rule on `device`; `seed` is that of the update masks."""
     rule = copy.deepcopy(rule).to(device)
     return RuleRunner(
         rule, task.for_rule(rule), torch.Generator(device).manual_seed(seed), progress
@@ -486,7 +491,7 @@ def _from_seeds(
 
 
 def check_steps(name: str, steps: Sequence[int], at_least: int = 1) -> None:
-    """Check that steps are not empty, increase, and are `at_least` or more."""
+    """Raise NPAError unless there are `steps`, which increase and are all `at_least` or more."""
     ordered = all(a < b for a, b in itertools.pairwise(steps))
     if not steps or min(steps) < at_least or not ordered:
         raise NPAError(
@@ -497,21 +502,22 @@ def check_steps(name: str, steps: Sequence[int], at_least: int = 1) -> None:
 
 # Rules of many pictures: loss and PSNR of each picture with its code, and loss with another code.
 
-WORLDS = 64
-"""Worlds in a batch."""
+PICTURE_BATCH = 64
+"""Maximum number of worlds that grow pictures at once."""
 
 PICTURE_CHECKPOINTS = (64, 256, 1024)
-"""Default steps from the seed at which pictures are compared."""
+"""Default steps from the start at which pictures are compared."""
 
 MEDIAN = "(median)"
-"""`target` of rows of medians."""
+"""The `target` of a row with the medians of all pictures."""
 
 
 @dataclass(frozen=True)
 class PictureRow:
-    """Mean splat loss and PSNR [dB] of the worlds of one picture, or medians of all pictures.
+    """Means over the worlds of one picture (`target`), or medians of all pictures, at `step`.
 
-    `shuffled` is the loss of worlds that have the code of the next picture.
+    `loss` is the task's metric, `shuffled` that of worlds that grew by the code of the next
+    picture, `psnr` compares pictures with the target's [dB].
     """
 
     step: int
@@ -531,23 +537,23 @@ def grown(
     device: str | torch.device = "cpu",
     progress: Callable[[int], None] | None = None,
 ) -> list[Particles]:
-    """Return x [T, B, N, 2] and s [T, B, N, C] of T tasks at each of `checkpoints`.
+    """Grow the pictures of T tasks; return x [T, B, N, 2] and s [T, B, N, C] at each checkpoint.
 
-    Tasks differ in their codes only, and start from the same seeds. `progress` is called with the
-    steps done since its last call.
+    The tasks differ only in their target and its code. Each has B worlds, from the same B seeds.
+    Checkpoints are increasing steps. `progress` is called with the steps done since its last call.
     """
     check_steps("checkpoints", checkpoints)
-    at_a_time = max(1, WORLDS // len(seeds))
+    task_count = max(1, PICTURE_BATCH // len(seeds))
     batches: list[list[Particles]] = [[] for _ in checkpoints]
-    for first in range(0, len(tasks), at_a_time):
-        batch_tasks = tasks[first : first + at_a_time]
-        fresh = [
+    for begin in range(0, len(tasks), task_count):
+        batch_tasks = tasks[begin : begin + task_count]
+        starts = [
             task.seed(len(seeds), generator=WorldRandom(seeds, device=device), device=device)
             for task in batch_tasks
         ]
         random = WorldRandom([*seeds] * len(batch_tasks), device=device)
         runner = RuleRunner(rule, batch_tasks[0], random, progress)
-        worlds = combined(torch.cat, fresh)
+        worlds = combined(torch.cat, starts)
         for batch, (_, now) in zip(batches, runner.at(checkpoints, worlds), strict=True):
             batch.append(now)
     shape = len(tasks), len(seeds)
@@ -565,7 +571,7 @@ def picture_rows(
     checkpoints: Sequence[int] = PICTURE_CHECKPOINTS,
     **options: Any,
 ) -> list[PictureRow]:
-    """Return each picture's row and the medians' at `checkpoints`; `options`: others of `grown`."""
+    """Return each picture's row and the medians' at `checkpoints`; `options`: those of `grown`."""
     if len(tasks) < 2:
         raise NPAError(f"pictures must be two or more, got {len(tasks)}: give another")
     worlds = grown(rule, tasks, checkpoints=checkpoints, **options)
@@ -586,17 +592,16 @@ def picture_rows(
 # Scores of shipped rules: the tables of `npa-envs evaluate`, in a file next to each rule.
 
 SCORED_STEPS = (128, 256, 512, 1024, 4096)
-"""Steps that `score_line` shows, if measured."""
+"""Steps whose numbers `score_line` shows, if they were measured."""
 
 CLOUD_STEP = 32
-"""Step at which `score_line` shows the accuracy of clouds."""
+"""Step whose accuracy `score_line` shows for rules that classify clouds."""
 
 
 def scores(name: str) -> dict[str, Any]:
-    """Return the scores of a shipped rule: command, commit, date, machine, metric, and tables.
+    """Return the stored scores of a shipped rule: command, commit, date, machine, metric, tables.
 
-    Tables are lists of rows: `growth`, for some rules `healing`, for textures `judge`; for rules
-    that classify `accuracy` and `changes`.
+    The tables are those of `tables_of`, lists of rows as dicts, by their names.
     """
     rules = shipped_rules()
     if not isinstance(name, str) or name not in rules:
@@ -606,7 +611,7 @@ def scores(name: str) -> dict[str, Any]:
 
 
 def score_line(measured: Mapping[str, Any]) -> str:
-    """Return the result of `scores` as one line of text."""
+    """Return one line of text with the main numbers of a rule's scores (the result of `scores`)."""
     if "accuracy" in measured:
         (row,) = (row for row in measured["accuracy"] if row["step"] == CLOUD_STEP)
         clouds, particles = (f"{row[name]:.1%}" for name in ("majority", "particle"))

@@ -1,7 +1,7 @@
 """Interaction of two trained rules in one world (arXiv 2601.16096), in numbers.
 
-The effect of a rule on another is measured by the task metric of the other's particles, compared
-with the same seeds grown alone.
+The effect of rule B on rule A is measured by the loss (task metric) of A's particles, compared with
+worlds that have only A and start from the same random seeds.
 """
 
 from __future__ import annotations
@@ -33,27 +33,27 @@ from npa_envs.world.randomness import StreamId, WorldRandom
 from npa_envs.world.species import rollout_species
 
 MIXED = 0.25
-"""Least mixing index of species that mix (dimensionless)."""
+"""Mixing index from which on two species are said to mix (dimensionless)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class InteractionSettings:
-    """Settings of an interaction measurement."""
+    """Settings of an interaction measurement, which runs for all combinations of tuples."""
 
     seed_count: int = 8
-    """Worlds of each pair, each from its own seed; training uses others."""
+    """Number B of worlds of each pair of rules, from random seeds that training does not use."""
     distances: tuple[float, ...] = (0.0, 0.5, 1.0)
-    """Distances between the centres of the two seeds [length units]."""
+    """Distances between the centres of the two rules' particles at the start [length units]."""
     ratios: tuple[float, ...] = (0.5,)
-    """Fractions of the particles that are the measured rule's."""
+    """Fractions of the particles that belong to the measured rule."""
     eps_factors: tuple[float, ...] = (1.0,)
-    """Perception radii as multiples of the rules' own."""
+    """Perception radii / the radius that the rules were trained with (dimensionless)."""
     steps: int = 512
-    """Steps from the seeds."""
+    """Steps of each run."""
     particle_count: int | None = None
-    """Particles of both together; default: the most that one of the rules was trained with."""
+    """Particles of both rules together; None: the largest number that a rule was trained with."""
     margin: float = 0.2
-    """Fraction by which a loss must change to count as changed."""
+    """Relative change of a loss up to which it counts as unchanged."""
 
     def __post_init__(self) -> None:
         check_positive(self, int, "steps", "seed_count")
@@ -72,13 +72,12 @@ class InteractionSettings:
 
 @dataclass(frozen=True)
 class InteractionRow:
-    """One rule A (`rule`), grown together with rule B (`beside`); numbers are means of the worlds.
+    """Rule A (`rule`) in worlds with rule B (`beside`), after all steps; numbers are means.
 
-    `alone` and `together` are A's task metric of its own particles, `change` is together / alone,
-    `mixing` the `mixing_index` at the end, `displacement` the distance of A's centroid from its
-    position when grown alone [length units]. `distance` is between the centres of the seeds
-    [length units], `ratio` A's fraction of the particles. `..._low` and `..._high` are the ends of
-    95 % intervals.
+    At the start the centres are `distance` apart [length units]; `ratio` is A's fraction of the
+    particles. `alone` and `together` are the losses of A's particles without and with B, `change`
+    is together / alone, `displacement` the distance between A's centroids in both [length units],
+    `mixing` the `mixing_index`. `..._low` and `..._high` are the ends of 95 % intervals.
     """
 
     rule: str
@@ -99,10 +98,10 @@ class InteractionRow:
 
 
 def verdict(change: float, mixing: float, margin: float) -> str:
-    """Return "cooperates" for a change below 1 - margin, "undisturbed" for one up to 1 + margin.
+    """Return "cooperates" if `change` (together / alone) is below 1 - margin, as text.
 
-    A larger change, or NaN, is "disrupted". ", mixes" follows if the mixing index is at least
-    `MIXED`.
+    Up to 1 + margin it is "undisturbed", above or NaN "disrupted". ", mixes" follows if the mixing
+    index is at least `MIXED`.
     """
     word = "disrupted"
     if change < 1.0 - margin:
@@ -113,15 +112,15 @@ def verdict(change: float, mixing: float, margin: float) -> str:
 
 
 def ratio_interval(numerators: Tensor, denominators: Tensor) -> tuple[float, float]:
-    """Return the 95 % bootstrap interval, over worlds, of mean(numerators) / mean(denominators).
+    """Return both ends of the 95 % bootstrap interval of mean(numerators) / mean(denominators).
 
-    Numerators [B] may be infinite. Denominators [B] are finite and not negative; a ratio to 0 is
-    infinite.
+    Worlds are resampled. Numerators [B] may be infinite. Denominators [B] are finite and not
+    negative; a ratio to 0 is infinite.
     """
     count = len(numerators)
-    draws = np.random.default_rng(0).integers(count, size=(2000, count))
+    chosen = np.random.default_rng(0).integers(count, size=(2000, count))
     above, below = (
-        values.double().cpu().numpy()[draws].mean(axis=1) for values in (numerators, denominators)
+        values.double().cpu().numpy()[chosen].mean(axis=1) for values in (numerators, denominators)
     )
     ratios = np.divide(above, below, out=np.full_like(above, np.inf), where=below > 0.0)
     # Without interpolation, which between two infinite numbers is NaN.
@@ -130,10 +129,12 @@ def ratio_interval(numerators: Tensor, denominators: Tensor) -> tuple[float, flo
 
 
 def mixing_index(x: Tensor, counts: Sequence[int], *, eps: float) -> Tensor:
-    """Return how much the K >= 2 species of each world are mixed, in [0, 1], shape [B].
+    """Return how much K >= 2 species are mixed in each world, from 0 to 1 (dimensionless), [B].
 
-    It is the entropy of the species' fractions of a particle's density, divided by log K: the mean
-    over particles. 0: no particle perceives another species; 1: all species are perceived equally.
+    It is the mean over particles of the entropy of each species' fraction of the particle's
+    density, divided by log K. 0 means that no particle perceives another species, 1 that all
+    perceive all species equally. `counts` are the numbers of particles of each species, in x's
+    order.
     """
     rho = species_fields(x, counts, eps=eps).rho
     fractions = rho / rho.sum(dim=2, keepdim=True)
@@ -142,7 +143,7 @@ def mixing_index(x: Tensor, counts: Sequence[int], *, eps: float) -> Tensor:
 
 
 FRAME_TIMES = (0.0, 0.125, 0.25, 0.5, 1.0)
-"""Times of pictures, as fractions of the run."""
+"""Times of pictures / duration of the run."""
 
 
 class RuleUnderTest(NamedTuple):
@@ -153,14 +154,15 @@ class RuleUnderTest(NamedTuple):
     task: Task
 
     def with_count(self, particle_count: int) -> Task:
-        """Return the task with `particle_count` particles."""
+        """Return the rule's task in worlds with `particle_count` particles."""
         return self.task.resized(particle_count).for_rule(self.rule)
 
 
 class Encounters:
-    """Grows rules alone and together from the same seeds; caches results of rules alone.
+    """Grows pairs of rules together, and each one without the other, from the same random seeds.
 
-    `progress` is called with the steps done since its last call.
+    Rules that cannot share a world raise NPAError. `progress` is called with the steps done since
+    its last call.
     """
 
     def __init__(
@@ -177,7 +179,7 @@ class Encounters:
         self._progress = progress
         self._frame_steps = [round(time * settings.steps) for time in FRAME_TIMES]
         self._alone: dict[tuple[str, int, float], tuple[Tensor, Tensor]] = {}
-        """Losses [B] and centroids [B, 2] by rule, number of particles and radius factor."""
+        """Results of `_grown_alone` by rule, number of particles and factor on the radius."""
         for other in rules:
             weight = other.rule.hidden.weight
             x, s = weight.new_zeros(1, 2, 2), weight.new_zeros(1, 2, other.rule.state_dim)
@@ -192,10 +194,10 @@ class Encounters:
     def meet(
         self, first: RuleUnderTest, second: RuleUnderTest
     ) -> tuple[list[InteractionRow], dict[str, NDArray[np.uint8]]]:
-        """Grow and measure `first` together with `second`.
+        """Grow `first` together with `second`; return the row of `first` at each setting.
 
-        Returns a row for each setting, and pictures of the first worlds by their captions,
-        `len(FRAME_TIMES)` for each setting.
+        Also returns pictures, uint8, [R, R, 3], of the first world at each setting and each of
+        `FRAME_TIMES`, by their captions.
         """
         rows, frames, settings = [], {}, self.settings
         for factor, ratio, distance in itertools.product(
@@ -203,24 +205,13 @@ class Encounters:
         ):
             count = min(max(round(ratio * self.particle_count), 1), self.particle_count - 1)
             counts = count, self.particle_count - count
-            key = first.name, count, factor
-            if key not in self._alone:
-                *_, (_, worlds, diverged) = self._grow([first], counts[:1], 0.0, factor)
-                self._alone[key] = _loss_and_centroid(first, worlds, diverged)
-            losses_alone, centroids_alone = self._alone[key]
+            losses_alone, centroids_alone = self._grown_alone(first, count, factor)
             radius = "" if factor == 1.0 else f"eps x {factor:g}, "
             together = self._grow([first, second], counts, distance, factor)
             for step, worlds, diverged in together:  # noqa: B007 - read after the loop
                 if step in self._frame_steps:
-                    # The picture is centred between the two seeds.
-                    frames[f"{radius}d {distance:g}, r {ratio:g}, step {step}"] = draw_worlds(
-                        worlds.x[:1],
-                        worlds.s[:1],
-                        centre=(0.5 * distance, 0.0),
-                        resolution=160,
-                        pixel_size=0.5 * math.sqrt(4.0 / self.particle_count),
-                        half_width=1.2 + 0.5 * distance,
-                    )[0]
+                    caption = f"{radius}d {distance:g}, r {ratio:g}, step {step}"
+                    frames[caption] = self._picture(worlds, distance)
             losses, centroids = _loss_and_centroid(first, worlds.split(counts)[0], diverged)
             alone, beside = losses_alone.mean().item(), losses.mean().item()
             change = beside / alone if alone > 0.0 else math.inf
@@ -237,6 +228,25 @@ class Encounters:
             rows.append(row)
         return rows, frames
 
+    def _grown_alone(self, rule: RuleUnderTest, count: int, factor: float) -> tuple[Tensor, Tensor]:
+        """Return losses [B] and centroids [B, 2] of worlds of one rule, with `count` particles."""
+        key = rule.name, count, factor
+        if key not in self._alone:
+            *_, (_, worlds, diverged) = self._grow([rule], [count], 0.0, factor)
+            self._alone[key] = _loss_and_centroid(rule, worlds, diverged)
+        return self._alone[key]
+
+    def _picture(self, worlds: Particles, distance: float) -> NDArray[np.uint8]:
+        """Return a picture of the first world, centred between the two start positions."""
+        return draw_worlds(
+            worlds.x[:1],
+            worlds.s[:1],
+            centre=(0.5 * distance, 0.0),
+            resolution=160,
+            pixel_size=0.5 * math.sqrt(4.0 / self.particle_count),
+            half_width=1.2 + 0.5 * distance,
+        )[0]
+
     def _grow(
         self,
         rules: Sequence[RuleUnderTest],
@@ -244,11 +254,11 @@ class Encounters:
         distance: float,
         factor: float,
     ) -> Iterator[tuple[int, Particles, Tensor]]:
-        """Grow one or two species; yield the step, the worlds, and which have diverged, [B].
+        """Grow one or two species; yield steps, the worlds then, and whether each diverged, [B].
 
-        The first is seeded at the origin and has the same random stream as alone; the second is
-        seeded at `distance` along the first axis. Worlds that diverge stay as they were, so that
-        the others can be measured.
+        The first species starts at the origin, by random numbers that do not depend on the second;
+        the second starts at `distance` along the first axis. `factor` multiplies the perception
+        radius. Worlds that diverge stay as they were before.
         """
         weight = rules[0].rule.hidden.weight
         seeds = range(FIRST_SEED, FIRST_SEED + self.settings.seed_count)
@@ -284,18 +294,18 @@ class Encounters:
 def _loss_and_centroid(
     rule: RuleUnderTest, worlds: Particles, diverged: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return the rule's task metric of worlds (inf if diverged), [B], and centroids, [B, 2]."""
+    """Return the loss of worlds of one rule (inf if diverged), [B], and centroids, [B, 2]."""
     losses = rule.with_count(worlds.x.shape[1]).metric(worlds.x, worlds.s)
     return losses.masked_fill(diverged, math.inf), worlds.x.mean(dim=1)
 
 
 class InteractionRecord(Record[InteractionRow]):
-    """Rows of all pairs of rules and settings."""
+    """The rows of all pairs of rules and all settings, and their JSON file."""
 
     command, key = "rule-interaction", "settings"
 
     def parse(self, content: dict[str, Any]) -> list[InteractionRow]:
-        """Return the rows; null stands for infinite numbers."""
+        """Return the rows in the JSON object of a file, where null stands for infinity."""
         rows: list[dict[str, Any]] = [
             {k: math.inf if v is None else v for k, v in row.items()} for row in content["rows"]
         ]
@@ -303,7 +313,7 @@ class InteractionRecord(Record[InteractionRow]):
 
 
 def interaction_map(rows: Sequence[InteractionRow]) -> bytes:
-    """Return a PNG of heat maps by setting: loss of each rule (row) beside another / alone."""
+    """Return a PNG with a heat map for each setting: the loss of rule A (row) with B / without."""
     names = list(dict.fromkeys([row.rule for row in rows] + [row.beside for row in rows]))
     cells: dict[str, dict[tuple[str, str], float]] = {}
     for row in rows:

@@ -1,4 +1,4 @@
-"""Colours of pictures, densities and states."""
+"""Colours (red, green, blue) of pictures, densities and hidden states."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ Background = str | tuple[float, float, float]
 
 
 def to_uint8(picture: Tensor, background: Background = "white") -> NDArray[np.uint8]:
-    """Return pixels of splatted pictures over a background, with y upwards.
+    """Return pixels of pictures that `splat` returns, over a background, with y upwards.
 
-    Colours are averaged where the density is above 1, and mixed with the background where it is
-    below 1. Pixels that are not finite are background.
+    A pixel is the mean colour of its particles where the density is above 1, and their colour mixed
+    with the background where it is below 1. Pixels that are not finite are background.
 
     Args:
-        picture: Sums of red, green and blue and the density (dimensionless), shape [..., R, R, 4],
-            on any device; its first row is the lowest y, as `splat` makes it.
+        picture: Sums of red, green and blue, and the density (dimensionless), [..., R, R, 4], on
+            any device; the first row is the lowest y.
         background: A colour name such as "black", "#rrggbb", or red, green and blue in [0, 1].
 
     Returns:
-        Pixels of shape [..., R, R, 3]; the first row is the highest y.
+        Pixels on the CPU, shape [..., R, R, 3]; the first row is the highest y.
     """
     if not isinstance(picture, Tensor):
         raise NPAError(
@@ -55,7 +55,7 @@ def to_uint8(picture: Tensor, background: Background = "white") -> NDArray[np.ui
 
 
 def background_colour(background: Background) -> tuple[float, float, float]:
-    """Return red, green and blue in [0, 1] of a colour name, "#rrggbb" or a triple."""
+    """Return red, green and blue in [0, 1] of a colour name, "#rrggbb", or a triple in [0, 1]."""
     if isinstance(background, str):
         try:
             red, green, blue = ImageColor.getrgb(background)[:3]
@@ -79,19 +79,19 @@ def background_colour(background: Background) -> tuple[float, float, float]:
 # about perceptual.
 
 RAMP_STOPS = ("#2a1858", "#792a86", "#cc4a70", "#f2985f", "#fbe6bd")
-"""The ramp's colours from dark to light; reversed over a light background."""
+"""Colours of densities from dark to light; over a light background in reverse order."""
 
 RAMP_LENGTH = 1024
-"""Number of colours of a ramp."""
+"""Number of colours of densities, which `ramp` interpolates between `RAMP_STOPS`."""
 
 GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
-"""Angle between the hues of successive channels, which spreads any number of hues evenly."""
+"""Angle between the hues of successive channels [rad], which spreads any number of them evenly."""
 
 STATE_CHROMA = 0.16
-"""Largest OKLab a and b of a state."""
+"""Maximum |a| and |b| of a state's colour in OKLab (dimensionless)."""
 
 STATE_GAIN = 2.8
-"""Factor on states in the argument of tanh (dimensionless)."""
+"""Factor on states before tanh, which limits their colours (dimensionless)."""
 
 _LMS_FROM_RGB = (
     (0.4122214708, 0.5363325363, 0.0514459929),
@@ -116,9 +116,9 @@ _RGB_FROM_LMS = (
 
 
 def density_colours(density: Tensor, background: tuple[float, float, float]) -> NDArray[np.uint8]:
-    """Return colours, uint8, [..., 3], of finite densities [...] of 0 or more (dimensionless).
+    """Return colours, uint8, [..., 3], of finite densities >= 0 (dimensionless), shape [...].
 
-    Density 0 is the background, 1 the middle of `ramp`; larger densities tend to its end.
+    Density 0 has the colour `background`, 1 the middle of `ramp`, and infinity its end.
     """
     position = 1.0 - torch.exp2(-density.clamp(min=0.0))
     entry = (position * (RAMP_LENGTH - 1)).round().to(torch.int32).cpu().numpy()
@@ -128,7 +128,10 @@ def density_colours(density: Tensor, background: tuple[float, float, float]) -> 
 
 @functools.lru_cache(maxsize=16)
 def ramp(background: tuple[float, float, float]) -> NDArray[np.uint8]:
-    """Return the colour ramp of densities, uint8, [RAMP_LENGTH, 3], from the background on."""
+    """Return the colours of increasing densities, uint8, [RAMP_LENGTH, 3].
+
+    The first one is the background (red, green and blue in [0, 1]); the last one contrasts with it.
+    """
     stops = [[int(stop[k : k + 2], 16) / 255 for k in (1, 3, 5)] for stop in RAMP_STOPS]
     first = oklab(torch.tensor([background], dtype=torch.float64))
     # Over a light background the ramp gets darker with density.
@@ -136,8 +139,8 @@ def ramp(background: tuple[float, float, float]) -> NDArray[np.uint8]:
         stops.reverse()
     knots = torch.cat([first, oklab(torch.tensor(stops, dtype=torch.float64))]).numpy()
     lengths = np.cumsum([0.0, *np.linalg.norm(np.diff(knots, axis=0), axis=1)])
-    positions = np.linspace(0.0, lengths[-1], RAMP_LENGTH)
-    lab = np.stack([np.interp(positions, lengths, knots[:, k]) for k in range(3)], axis=1)
+    along = np.linspace(0.0, lengths[-1], RAMP_LENGTH)
+    lab = np.stack([np.interp(along, lengths, knots[:, k]) for k in range(3)], axis=1)
     colours = (srgb(torch.from_numpy(lab)) * 255).round().to(torch.uint8).numpy()
     # The cached array must not change.
     colours.setflags(write=False)
@@ -145,9 +148,9 @@ def ramp(background: tuple[float, float, float]) -> NDArray[np.uint8]:
 
 
 def state_colours(hidden: Tensor) -> Tensor:
-    """Return a colour in [0, 1], [..., 3], for each hidden state [..., H], H 0 or more.
+    """Return red, green and blue in [0, 1], [..., 3], for states of H >= 0 channels, [..., H].
 
-    Each channel adds its own hue and lightness; negative values the opposite ones. Zeros are grey.
+    Each channel adds its own hue and lightness, a negative value the opposite ones. Zeros are grey.
     """
     zeros = hidden.new_zeros(hidden.shape[:-1])
     angles = [channel * GOLDEN_ANGLE for channel in range(hidden.shape[-1])]
@@ -161,13 +164,13 @@ def state_colours(hidden: Tensor) -> Tensor:
 
 
 def oklab(rgb: Tensor) -> Tensor:
-    """Return OKLab coordinates (L, a, b), [..., 3], of sRGB colours in [0, 1]."""
+    """Return coordinates (L, a, b) in OKLab, [..., 3], of sRGB colours in [0, 1], [..., 3]."""
     linear = torch.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
     return _mix(_mix(linear, _LMS_FROM_RGB).pow(1.0 / 3.0), _LAB_FROM_ROOTS)
 
 
 def srgb(lab: Tensor) -> Tensor:
-    """Return sRGB colours, clipped to [0, 1], [..., 3], of OKLab coordinates (L, a, b)."""
+    """Return sRGB colours, clipped to [0, 1], [..., 3], of OKLab's (L, a, b), [..., 3]."""
     linear = _mix(_mix(lab, _ROOTS_FROM_LAB).pow(3.0), _RGB_FROM_LMS).clamp(0.0, 1.0)
     curved = 1.055 * linear.clamp(min=0.0031308).pow(1.0 / 2.4) - 0.055
     return torch.where(linear <= 0.0031308, 12.92 * linear, curved)

@@ -1,4 +1,4 @@
-"""Pictures and films in notebooks, and a window that shows frames."""
+"""Pictures and films in notebooks (`show`, `show_worlds`), and a window (`Window`)."""
 
 from __future__ import annotations
 
@@ -27,15 +27,18 @@ from npa_envs.render.picture_files import (
 from npa_envs.render.worlds import draw_worlds
 
 MAX_SHOWN = 16
-"""Largest number of worlds in a picture."""
+"""Maximum number of worlds in a picture; further ones are not drawn."""
 
 _GAP = 4
+"""White pixels between two worlds."""
 
 
 class Shown:
     """A picture or a repeating film, which a notebook displays when it is the value of a cell.
 
-    Frames are pictures of one size, uint8, shape [H, W, 3] each; `fps` is their number per second.
+    Args:
+        frames: One picture, or the film's, of one size, uint8, shape [H, W, 3] each.
+        fps: Frames per second.
     """
 
     def __init__(self, frames: Iterable[Frame], fps: float) -> None:
@@ -50,7 +53,7 @@ class Shown:
         return f"{what} of {width} × {height} pixels"
 
     def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> dict[str, Any]:
-        """Return what notebooks display: a JPEG (smaller than a PNG), or a WebP film in HTML."""
+        """Return data by MIME type, for IPython: text, and a JPEG or a film (WebP in HTML)."""
         bundle: dict[str, Any] = {"text/plain": repr(self)}
         if len(self.frames) == 1:
             picture = encode_frame(self.frames[0], "JPEG")
@@ -60,7 +63,7 @@ class Shown:
 
 
 def show(frames: Frame | Iterable[Frame], *, fps: float = 25.0) -> Shown:
-    """Return a picture [H, W, 3], such as `env.render()`, or several as a film, for a notebook."""
+    """Return a picture for a notebook, or a film of several; frames are uint8, [H, W, 3] each."""
     if isinstance(frames, np.ndarray) and frames.ndim == 3:
         frames = [frames]
     return Shown(frames, fps)
@@ -69,7 +72,7 @@ def show(frames: Frame | Iterable[Frame], *, fps: float = 25.0) -> Shown:
 def show_worlds(
     x: Tensor, s: Tensor, *, fps: float = 12.5, pixel_size: float | None = None, **drawing: Any
 ) -> Shown:
-    """Return worlds side by side for a notebook; a trajectory becomes a film.
+    """Return a picture of worlds side by side for a notebook, or the film of a trajectory.
 
     Args:
         x: Particle positions [length units], shape [B, N, D], or [K, B, N, D] of a trajectory, as
@@ -77,8 +80,9 @@ def show_worlds(
         s: Particle states (dimensionless), shape [B, N, C] or [K, B, N, C]; for a rule with a
             read-out give `rule.read_out(s)`.
         fps: Frames per second of a film.
-        pixel_size: Distance between particles [length units]; None: measured at the last step.
-        drawing: Other arguments of `draw_worlds`.
+        pixel_size: Usual distance of neighbours [length units]; None: estimated from the first
+            world of the last step.
+        drawing: Further arguments of `draw_worlds`.
     """
     tensors = isinstance(x, Tensor) and isinstance(s, Tensor)
     if not tensors or x.ndim != s.ndim or (x.ndim == 4 and len(x) != len(s)):
@@ -96,7 +100,7 @@ def show_worlds(
 
 
 def side_by_side(pictures: NDArray[np.uint8]) -> Frame:
-    """Return pictures [B, R, R, 3] as one picture, in a nearly square grid."""
+    """Return pictures [B, R, R, 3] as one, uint8, row by row in a nearly square grid."""
     count = len(pictures)
     across = math.ceil(math.sqrt(count))
     down = math.ceil(count / across)
@@ -108,7 +112,7 @@ def side_by_side(pictures: NDArray[np.uint8]) -> Frame:
 
 
 def _spacing(x: Tensor) -> float:
-    """Return an estimate of the distance between particles, from the area they cover."""
+    """Return the usual distance of neighbours in the first world, from the area they cover."""
     points = x[0].detach().double()
     points = points[points.isfinite().all(dim=-1)]
     if not len(points):
@@ -124,18 +128,18 @@ def _spacing(x: Tensor) -> float:
 # A window on the screen, which needs pygame.
 
 _open_window: Window | None = None
-"""The open window: pygame allows one for each process."""
+"""The open window of this process, or None: pygame allows one for each process."""
 
 
 class Window:
-    """A window on the screen, by pygame; without a screen it warns once and then does nothing.
+    """A window on the screen, by pygame. Without a screen it warns, and its methods do nothing.
 
     A process has one window: a new one closes the previous one.
 
     Args:
         title: Text of the title bar.
-        size: Side of the window [screen pixels]. Frames of another size are scaled to it.
-        fps: Largest number of frames per second, kept by waiting in `show`; None: no limit.
+        size: Side of the square window [screen pixels]. Frames of another size are scaled to it.
+        fps: Maximum number of frames per second, kept by waiting in `show`; None: no limit.
     """
 
     def __init__(self, title: str, size: int = 512, *, fps: float | None = None) -> None:
@@ -146,7 +150,7 @@ class Window:
         """Width and height [screen pixels]."""
         self.fps = fps
         self.closed = False
-        """Whether it was closed, by the user, `close` or a new window."""
+        """Whether the window was closed, by the user, by `close` or by a new window."""
         os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
         # SDL would turn SIGTERM into a QUIT event of the window.
         os.environ.setdefault("SDL_NO_SIGNAL_HANDLERS", "1")
@@ -170,7 +174,7 @@ class Window:
             )
 
     def show(self, frame: Frame) -> None:
-        """Show a frame, uint8, shape [H, W, 3]; handle events, and wait as `fps` requires."""
+        """Show a frame, uint8, [H, W, 3], and wait as `fps` requires; nothing if it is closed."""
         (pixels,) = checked_frames([frame])
         if self._surface is None:
             return
@@ -199,7 +203,7 @@ class Window:
             self._pygame.display.quit()
 
     def _open(self, title: str) -> str | None:
-        """Open the window; return None, or the reason why there is no screen."""
+        """Open the window; return None, or the reason why it cannot be opened, as text."""
         display = self._pygame.display
         try:
             display.init()

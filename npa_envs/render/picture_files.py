@@ -1,4 +1,4 @@
-"""Picture and film files, written completely or not at all.
+"""Files of pictures (PNG) and films (GIF, WebP, MP4, filmstrip), written whole or not at all.
 
 Frames are pictures of one size, uint8, shape [H, W, 3] each; `fps` is their number per second.
 """
@@ -29,18 +29,19 @@ Frame = NDArray[np.uint8]
 """Pixels of a picture, uint8, shape [H, W, 3]; the first row is the top."""
 
 GIF_HIGHEST_RATE = 50
-"""Largest `fps` of a GIF in players."""
+"""Maximum `fps` at which players show a GIF."""
 
 _MARGIN = 8
+"""Gap between the frames of a filmstrip [pixels]."""
 
 
 def write_png(path: str | Path, frame: Frame) -> None:
-    """Write one picture, uint8, shape [H, W, 3], as a PNG of small size."""
+    """Write one picture, uint8, shape [H, W, 3], as a PNG, slowly so that the file is small."""
     write_bytes(path, _encoded([frame], format="PNG", optimize=True))
 
 
 def encode_frame(frame: Frame, kind: Literal["PNG", "JPEG"]) -> bytes:
-    """Return a picture's file as bytes, encoded fast rather than small."""
+    """Return the bytes of a picture's file (uint8, [H, W, 3]), encoded fast rather than small."""
     return _encoded([frame], format=kind, compress_level=1, quality=90)
 
 
@@ -52,10 +53,10 @@ def _encoded(frames: Iterable[Frame], **options: Any) -> bytes:
 
 
 def write_gif(path: str | Path, frames: Iterable[Frame], fps: float = 25) -> None:
-    """Write a GIF that repeats for ever, with one palette for all frames and no dithering.
+    """Write frames, uint8, [H, W, 3] each, as a GIF that repeats for ever.
 
-    Times at which frames [H, W, 3] change are rounded to hundredths of a second. `fps` is at most
-    50; equal frames last 655 s at most.
+    All frames share 256 colours, without dithering. Times are rounded to hundredths of a second.
+    `fps` is at most 50. A picture that does not change for more than 655 s raises NPAError.
     """
     pictures = checked_frames(frames)
     check_rate(fps, highest=GIF_HIGHEST_RATE)
@@ -88,15 +89,15 @@ def write_gif(path: str | Path, frames: Iterable[Frame], fps: float = 25) -> Non
 def write_webp(
     path: str | Path, frames: Iterable[Frame], fps: float = 25, *, quality: int = 50
 ) -> None:
-    """Write frames [H, W, 3] as a WebP that repeats for ever, a fifth the size of a GIF.
+    """Write frames, uint8, [H, W, 3] each, as a WebP that repeats for ever.
 
-    `quality` is 0 to 100.
+    Its size is about a fifth of a GIF's. `quality` is from 0 (smallest file) to 100.
     """
     write_bytes(path, encode_webp(frames, fps, quality=quality))
 
 
 def encode_webp(frames: Iterable[Frame], fps: float = 25, *, quality: int = 50) -> bytes:
-    """Return the file that `write_webp` writes, as bytes."""
+    """Return the bytes of the file that `write_webp` writes."""
     check_rate(fps)
     if not (is_real(quality) and 0 <= quality <= 100):
         raise NPAError(f"quality must be in [0, 100], got {shown(quality)}: try 50")
@@ -107,7 +108,7 @@ def encode_webp(frames: Iterable[Frame], fps: float = 25, *, quality: int = 50) 
 
 
 def write_mp4(path: str | Path, frames: Iterable[Frame], fps: float = 25) -> None:
-    """Write frames [H, W, 3] as an H.264 film that browsers play; needs imageio and its ffmpeg.
+    """Write frames, uint8, [H, W, 3] each, as an H.264 film that browsers play (with imageio).
 
     An odd width or height is made even by repeating the last column or row.
     """
@@ -144,10 +145,10 @@ def write_filmstrip(
     columns: int | None = None,
     background: Background = "white",
 ) -> None:
-    """Write frames [H, W, 3] in a grid into one picture, each with a caption below.
+    """Write frames, uint8, [H, W, 3] each, as one picture: a grid, row by row, captions below.
 
-    It is a WebP file where the name ends in `.webp`, else a PNG file. A row has `columns` frames;
-    None: all of them, at most 8.
+    The file is a WebP if its name ends in `.webp`, else a PNG. `captions` are one for each frame;
+    None: no text. A row has `columns` frames; None: 8, or all frames if they are fewer.
     """
     pictures = checked_frames(frames)
     count = len(pictures)
@@ -162,10 +163,7 @@ def write_filmstrip(
     check_count("columns", across, ": try 4")
     across = min(across, count)
     height, width, _ = pictures[0].shape
-    # The largest font with which no caption is wider than a frame.
-    fonts = map(ImageFont.load_default, range(max(12, min(28, width // 12)), 10, -1))
-    fitting = (font for font in fonts if all(font.getlength(text) <= width for text in texts))
-    font = next(fitting, None) or ImageFont.load_default(10)
+    font = _caption_font(texts, width)
     _, top, _, bottom = font.getbbox("Ågjy")
     text_height = math.ceil(bottom - top) + _MARGIN if texts else 0
     cell = max([width, *(math.ceil(font.getlength(text)) for text in texts)])
@@ -189,14 +187,21 @@ def write_filmstrip(
             strip.save(temporary, format="PNG", optimize=True)
 
 
+def _caption_font(captions: Sequence[str], width: int) -> Any:
+    """Return the largest font that keeps every caption within `width` pixels, or the smallest."""
+    fonts = map(ImageFont.load_default, range(max(12, min(28, width // 12)), 10, -1))
+    fitting = (font for font in fonts if all(font.getlength(text) <= width for text in captions))
+    return next(fitting, None) or ImageFont.load_default(10)
+
+
 def check_rate(fps: float, *, highest: float = 1000) -> None:
-    """Check a film's rate [frames per second], at least 0.1."""
+    """Raise NPAError unless `fps` (frames per second) is a number in [0.1, `highest`]."""
     if not (is_real(fps) and 0.1 <= fps <= highest):
         raise NPAError(f"fps must be in [0.1, {highest}], got {shown(fps)}: try 25")
 
 
 def checked_frames(frames: Iterable[Frame]) -> list[Frame]:
-    """Return pictures as a list, after checking their number, shapes and dtype."""
+    """Return frames as a list; raise NPAError unless all are uint8, [H, W, 3], of one size."""
     try:
         pictures = [np.ascontiguousarray(frame) for frame in frames]
     except (TypeError, ValueError, RuntimeError) as error:
@@ -225,7 +230,7 @@ def checked_frames(frames: Iterable[Frame]) -> list[Frame]:
 
 
 def _shared_palette(pictures: list[Frame]) -> tuple[Image.Image, Frame, int]:
-    """Return a palette for all frames, the most frequent colour, and its index in the palette."""
+    """Return 256 colours for all frames, the most frequent colour, and its index among them."""
     step = max(1, math.ceil(sum(p.size // 3 for p in pictures) / 2**20))
     sample = np.concatenate([p.reshape(-1, 3)[k % step :: step] for k, p in enumerate(pictures)])
     _, which, counts = np.unique(
@@ -256,11 +261,11 @@ def turntable_frames(
     background: Background = "white",
     device: str | torch.device = "cpu",
 ) -> list[NDArray[np.uint8]]:
-    """Return pictures, uint8, [R, R, 3] each, of a world from cameras on a circle around it.
+    """Return pictures, uint8, [R, R, 3] each, of a 3D world from cameras on a circle around it.
 
-    `views` returns pictures of V cameras: colours times alpha, and alpha, [1, V, H, W, 4]. The
-    cameras stand at the angle `elevation` above the horizon, the first one at the angle `azimuth`
-    around the vertical axis [degrees]. `device` is that of the world.
+    `views` returns the world's pictures from V cameras: colours times alpha, and alpha, shape
+    [1, V, R, R, 4]. The cameras stand `elevation` degrees above the horizon, and the first one
+    `azimuth` degrees around the vertical axis. R is `resolution`, `device` the world's.
     """
     frame_count = checked_count("frame_count", frame_count)
     azimuth = checked_finite("azimuth", azimuth, " [degrees]")

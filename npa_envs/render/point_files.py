@@ -1,4 +1,4 @@
-"""Files of 3D worlds for other programs: point clouds and Gaussian splats."""
+"""Files of 3D worlds for other programs: point clouds (PLY) and Gaussian splats (PLY, .splat)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from npa_envs.errors import NPAError
 from npa_envs.tasks.gaussian_outputs import HARMONIC_0, Gaussians
 
 MIN_OPACITY = 1e-6
-"""Opacities are clipped to this distance from 0 and 1, so that logits are finite."""
+"""Opacities are clipped to [MIN_OPACITY, 1 - MIN_OPACITY], so that their logits are finite."""
 
 
 def write_points(path: str | Path, x: Tensor, gaussians: Gaussians) -> None:
@@ -29,7 +29,8 @@ def write_points(path: str | Path, x: Tensor, gaussians: Gaussians) -> None:
 def write_gaussians(path: str | Path, x: Tensor, gaussians: Gaussians) -> None:
     """Write one world, x [1, N, 3], as a PLY file of 3D Gaussian splatting (Kerbl et al. 2023).
 
-    Scales are logarithms, opacities logits; `f_rest` are coefficients of degree 1 by channel.
+    The file has logarithms of scales, logits of opacities, and colours as spherical harmonics:
+    `f_dc` of degree 0, `f_rest` of degree 1, channel by channel.
     """
     positions = _checked(x)
     harmonics = _numpy(gaussians.colours)
@@ -70,13 +71,14 @@ def write_splat(path: str | Path, x: Tensor, gaussians: Gaussians) -> None:
 
 
 def _ply_header(count: int, **properties: Sequence[str]) -> bytes:
-    """Return the header of a binary PLY file, from names of columns by type."""
+    """Return the header of a binary PLY file of `count` rows; `properties`: columns by type."""
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
     lines += [f"property {kind} {name}" for kind, names in properties.items() for name in names]
     return "\n".join((*lines, "end_header\n")).encode()
 
 
 def _checked(x: Tensor) -> NDArray[np.float32]:
+    """Return positions x [1, N, 3] as an array [N, 3]; other shapes raise NPAError."""
     if x.ndim != 3 or x.shape[0] != 1 or x.shape[2] != 3:
         raise NPAError(
             f"x must be the positions of one 3D world, [1, N, 3], got {tuple(x.shape)}: "
@@ -86,7 +88,7 @@ def _checked(x: Tensor) -> NDArray[np.float32]:
 
 
 def _numpy(values: Tensor) -> NDArray[np.float32]:
-    """Return a tensor's values in the first world, in float32."""
+    """Return the values of the first world of a tensor [B, ...], float32, shape [...]."""
     array: NDArray[np.float32] = values.detach()[0].float().cpu().numpy()
     return array
 

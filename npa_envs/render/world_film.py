@@ -1,4 +1,4 @@
-"""Films of a world: frames during a rollout with damage, and their files."""
+"""Films of one world: frames drawn during a rollout, which may have damage, and their files."""
 
 from __future__ import annotations
 
@@ -29,31 +29,32 @@ from npa_envs.world.particles import Particles
 from npa_envs.world.rollout import rollout_particles
 
 SCREEN = 256
-"""Least default resolution of a film [pixels]."""
+"""Minimum side of a film's frames [pixels], unless the user sets another one."""
 
 
 @dataclass
 class WorldFilm:
-    """Frames of one world, each with a caption."""
+    """Frames (uint8, [H, W, 3]) of one world in order of time, each with a caption."""
 
     background: str = "white"
     """The colour behind the particles: a name or "#rrggbb"."""
     frames: list[Frame] = field(default_factory=list)
     captions: list[str] = field(default_factory=list)
     steps: dict[int, int] = field(default_factory=dict)
-    """Steps since the initial world by index of frame, without frames just after damage."""
+    """Index of a frame -> steps since the initial world. Frames of damage are not in it."""
 
     def add(self, task: Task, worlds: Particles, step: int, damage: str = "") -> None:
-        """Append a picture of one world, and its caption; `damage` tells what just damaged it."""
+        """Append a picture of the first world, with a caption: its step, and damage just now."""
         if not damage:
             self.steps[len(self.frames)] = step
         self.frames.append(to_uint8(task.picture(worlds.x, worlds.s)[0], self.background))
         self.captions.append(f"step {step}: {damage}" if damage else f"step {step}")
 
     def filmstrip(self, count: int = 10) -> tuple[list[Frame], list[str]]:
-        """Return about `count` frames with captions: early, damaged, last, some between.
+        """Return about `count` frames, and their captions, that summarise the film.
 
-        A film that ends within the early steps gives damaged and evenly spaced ones.
+        They are those near steps 0, 16, 32, 64 and 128, all frames of damage, the last one, and
+        some between. A film that ends by step 128 gives frames of damage and evenly spaced ones.
         """
         # Most of the growth is there.
         early_steps = (0, 16, 32, 64, 128)
@@ -71,7 +72,7 @@ class WorldFilm:
         return [self.frames[k] for k in chosen], [self.captions[k] for k in chosen]
 
     def write(self, folder: Path, name: str, *, fps: float = 25.0) -> list[Path]:
-        """Write the film as GIF, MP4 and filmstrip, and return the files."""
+        """Write NAME.gif, NAME.mp4 and NAME-filmstrip.png to a folder; return their paths."""
         strip, captions = self.filmstrip()
         paths = [folder / f"{name}.gif", folder / f"{name}.mp4", folder / f"{name}-filmstrip.png"]
         write_gif(paths[0], self.frames, fps)
@@ -97,11 +98,12 @@ def film_world(
     progress: Callable[[int], None] = lambda _: None,
     stop: Callable[[], bool] = lambda: False,
 ) -> tuple[Particles, WorldFilm]:
-    """Run one world with damage; return it and its film, a frame every `every` steps.
+    """Run one world for `steps` steps; return it as it is then, and its film.
 
-    By default there are about 150 frames. `first_step` is the age of the world in steps.
-    `progress` is called with the number of steps since its last call. After each frame the run ends
-    if `stop` returns true.
+    There is a frame every `every` steps (None: about 150 in all), and one after each of `damages`,
+    whose steps count from the initial world; `first_step` is the age of `worlds`. Frames are
+    appended to `film`; None: to a new one. `progress` is called with the steps since its last call.
+    After each frame the run ends if `stop` returns True.
     """
     film = WorldFilm() if film is None else film
     last = first_step + steps
@@ -139,7 +141,10 @@ def write_3d_world(
     resolution: int = SCREEN,
     background: str = "white",
 ) -> list[Path]:
-    """Write a 3D world as a turntable, drawn by a task, and as point files; return their paths."""
+    """Write a 3D world as a turntable (GIF), and as three files of points; return their paths.
+
+    The task `drawn_by` draws the turntable, whose frames have `resolution` pixels on each side.
+    """
     names = ("turntable.gif", "points.ply", "gaussians.ply", "cloud.splat")
     paths = [folder / name for name in names]
     x, s, *_ = worlds

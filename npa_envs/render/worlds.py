@@ -1,4 +1,4 @@
-"""Pictures of worlds."""
+"""Pictures of particle worlds in 2D and 3D, one of each world (`draw_worlds`)."""
 
 from __future__ import annotations
 
@@ -31,22 +31,22 @@ from npa_envs.render.colours import (
 from npa_envs.rule.rule import COLOUR_OFFSET
 
 STYLES = ("particles", "density", "states")
-"""Styles of pictures: the particles' own colours, their density, their hidden states."""
+"""What pictures show: the particles' own colours, their density, or their hidden states."""
 
 COLOUR_CHANNELS = 3
-"""Number of the last channels of a state, which are its colour minus `COLOUR_OFFSET`."""
+"""The last 3 channels of a state are red, green and blue, minus `COLOUR_OFFSET` each."""
 
 LAYERS = 24
-"""Number of depth layers of a 3D world, with equal numbers of particles."""
+"""Number of layers that a 3D world is divided into by depth, with equally many particles each."""
 
 OPACITY = 5.0
 """Optical depth of a layer of density 1 in 3D (dimensionless)."""
 
 BEAD = 0.7
-"""Size of a particle in 3D, relative to 2D, where splats must close gaps."""
+"""Factor on `sigma` of particles in 3D (dimensionless); in 2D wider splats close gaps."""
 
 SHADE = 0.45
-"""Fraction by which particles at the far end of the view are darker."""
+"""Fraction by which 3D particles at the far end of the view are darker than at the near end."""
 
 
 def draw_worlds(
@@ -64,26 +64,25 @@ def draw_worlds(
     elevation: float = 20.0,
     background: Background = "white",
 ) -> NDArray[np.uint8]:
-    """Draw worlds: every particle is a Gaussian splat, y is up.
+    """Return a picture of each world: every particle is a Gaussian splat, y is up.
 
-    Colours do not depend on other pictures or worlds. Particles whose position (or state, where the
-    style shows it) is not finite are left out. 3D worlds are drawn in parallel projection: near
-    particles cover far ones, and far ones are darker.
+    The picture of a world does not depend on the other worlds. Particles whose position is not
+    finite are left out; so are those whose state is not finite, unless the style is "density". 3D
+    worlds are drawn in parallel projection: near particles cover far ones, and far ones are darker.
 
     Args:
         x: Particle positions [length units], shape [B, N, D], D = 2 or 3, on any device.
         s: Particle states (dimensionless), shape [B, N, C].
         style: "particles" shows the last three channels plus 0.5 as red, green and blue, clipped;
-            "density" the density, where that of the target is the middle of the colour ramp (in 3D
-            integrated along the line of sight, over half the depth of the view); "states" all
-            other channels, each with its own hue (grey: all states are 0).
+            "density" the sum of the splats (in 3D times `pixel_size` / `half_width`), where 1 is
+            the middle of a colour ramp; "states" all other channels, each with its own hue, and
+            grey where they are 0.
         resolution: Pixels R along each side, 2 or more.
-        pixel_size: Side of a pixel of the target, or usual distance between particles [length
-            units].
-        sigma: Standard deviation of a particle's splat, in units of `pixel_size` (dimensionless).
-        centre: Middle of the picture [length units], shape [D] or [B, D]; None is the origin.
+        pixel_size: Side of a pixel of the target, or usual distance of neighbours [length units].
+        sigma: Standard deviation of a particle's splat / `pixel_size` (dimensionless).
+        centre: Middle of the picture [length units], shape [D] or [B, D]; None: the origin.
         half_width: Distance from the middle of the picture to its edge [length units].
-        periodic: 2D only: the picture is the periodic box.
+        periodic: 2D only: whether the picture is a periodic box, whose sides are 2 `half_width`.
         azimuth: 3D only: angle of the camera around the vertical axis [degrees], counterclockwise
             from above; at 0 x points right and z towards the viewer.
         elevation: 3D only: angle of the camera above the horizon [degrees].
@@ -107,34 +106,31 @@ def draw_worlds(
     if periodic and x.shape[2] != 2:
         raise NPAError(f"periodic pictures are of 2D worlds, got D = {x.shape[2]}: leave it out")
     background_rgb = background_colour(background)
+    draw = partial(
+        periodic_splat if periodic else splat,
+        resolution=resolution, pixel_size=pixel_size, lo=-half_width, hi=half_width,
+    )  # fmt: skip
     with torch.no_grad():
-        points = (x - _middle(centre, x)).float()
-        colour = _colours(s.float(), style)
-        depth = None
+        points, depth = (x - _middle(centre, x)).float(), None
         if x.shape[2] == 3:
             points, depth = _projected(points, azimuth, elevation)
-        limit = 1e3 * (half_width + sigma * pixel_size)
-        visible = (points.abs() <= limit).all(-1, keepdim=True)
+        far = 1e3 * (half_width + sigma * pixel_size)
+        visible = (points.abs() <= far).all(-1, keepdim=True)
         if style != "density":
             visible = visible & s.isfinite().all(-1, keepdim=True)
         # A periodic splat draws every finite position; NaN draws nothing.
-        outside = math.nan if periodic else limit
-        points, colour = points.where(visible, outside), colour.where(visible, 0.0)
-        draw = partial(
-            periodic_splat if periodic else splat,
-            resolution=resolution, pixel_size=pixel_size, lo=-half_width, hi=half_width,
-        )  # fmt: skip
+        points = points.where(visible, math.nan if periodic else far)
+        colour = _colours(s.float(), style).where(visible, 0.0)
         if style == "density":
             density = draw(points, colour, sigma=sigma)[..., 3]
-            if depth is not None:
-                density = density * (pixel_size / half_width)
-            return density_colours(density.flip(-2), background_rgb)
+            scale = 1.0 if depth is None else pixel_size / half_width
+            return density_colours((density * scale).flip(-2), background_rgb)
         if depth is None:
             return to_uint8(draw(points, colour, sigma=sigma), background_rgb)
         depth = depth.where(visible, 0.0)
-        light = 1.0 - SHADE * (0.5 - 0.5 * depth / half_width).clamp(0.0, 1.0)
+        shaded = colour * (1.0 - SHADE * (0.5 - 0.5 * depth / half_width).clamp(0.0, 1.0))
         beads = partial(draw, sigma=BEAD * sigma)
-        return to_uint8(_stack_layers(beads, points, depth, colour * light), background_rgb)
+        return to_uint8(_stack_layers(beads, points, depth, shaded), background_rgb)
 
 
 def _middle(centre: Tensor | Sequence[float] | None, x: Tensor) -> Tensor:
@@ -149,6 +145,7 @@ def _middle(centre: Tensor | Sequence[float] | None, x: Tensor) -> Tensor:
 
 
 def _colours(s: Tensor, style: str) -> Tensor:
+    """Return red, green and blue in [0, 1] of each particle in a style, [B, N, 3]."""
     if style == "density":
         return s.new_zeros(*s.shape[:2], 3)
     if style == "states":
@@ -162,7 +159,7 @@ def _colours(s: Tensor, style: str) -> Tensor:
 
 
 def _projected(x: Tensor, azimuth: float, elevation: float) -> tuple[Tensor, Tensor]:
-    """Return positions on the picture plane, [B, N, 2], and towards the viewer, [B, N, 1]."""
+    """Return coordinates right and up in the picture, [B, N, 2], and to the viewer, [B, N, 1]."""
     turn, tilt = (math.radians(angle % 360.0) for angle in (azimuth, elevation))
     right, height, outward = x.unbind(-1)
     across = math.cos(turn) * right - math.sin(turn) * outward
@@ -175,13 +172,13 @@ def _projected(x: Tensor, azimuth: float, elevation: float) -> tuple[Tensor, Ten
 def _stack_layers(
     draw: Callable[[Tensor, Tensor], Tensor], points: Tensor, depth: Tensor, colour: Tensor
 ) -> Tensor:
-    """Return pictures [B, R, R, 4] of splats in layers by depth, the nearest layer on top."""
+    """Return pictures [B, R, R, 4] (colours times alpha, alpha) of layers, the nearest on top."""
     order = depth.argsort(dim=1, descending=True, stable=True)
     particles = torch.cat((points, colour), dim=-1)
     particles = particles.gather(1, order.expand_as(particles))
     picture, transmittance = points.new_zeros(()), points.new_ones(())
-    for part in particles.tensor_split(min(LAYERS, points.shape[1]), 1):
-        layer = draw(part[..., :2], part[..., 2:])
+    for layer_particles in particles.tensor_split(min(LAYERS, points.shape[1]), 1):
+        layer = draw(layer_particles[..., :2], layer_particles[..., 2:])
         density = layer[..., 3:]
         passed = torch.exp(-OPACITY * density)
         weight = transmittance * (1.0 - passed)

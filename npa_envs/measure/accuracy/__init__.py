@@ -1,4 +1,4 @@
-"""Checks of `npa-envs stress`: hard cases for accuracy and stability, each with an expectation."""
+"""The list of all checks of `npa-envs stress`: hard cases of accuracy and stability."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ from npa_envs.rule.files import shipped_rules
 
 
 def all_checks(*, quick: bool = False, rules: Mapping[str, str] | None = None) -> list[Check]:
-    """Return all checks, sorted by `GROUPS`; with `rules`, only the checks of these rules.
+    """Return all checks in the order of `GROUPS`, or only those of the given `rules`.
 
-    `rules` maps names to shipped rules or files. `quick` checks fewer shipped rules.
+    `rules` maps the name that a check shows to a shipped rule's name or a file. A quick list has
+    gradient checks of two shipped rules instead of four.
     """
     # Gradients are checked for one rule of each task.
     few = ("gecko", "dots") if quick else ("gecko", "dots", "digits", "duck")

@@ -1,4 +1,4 @@
-"""Checks of `npa-envs stress`: results and limits, how checks run, and their record."""
+"""How checks of `npa-envs stress` are registered and run; their results, limits and record."""
 
 from __future__ import annotations
 
@@ -26,21 +26,21 @@ GROUPS = {
     "gradients": "how gradients grow with the steps; finite differences; float32's errors",
     "precision": "order, batches, repetitions, CUDA graphs",
 }
-"""Every group of checks with its summary."""
+"""Groups of checks by name, in the order in which they run, with what each is about."""
 
 
 class Skipped(Exception):
-    """Raised by a check that cannot be measured; the message is the reason."""
+    """Raised by a check that cannot run on this device or for this rule; the message says why."""
 
 
 @dataclass(frozen=True)
 class CheckResult:
-    """Result of a check: measured numbers by name (`metrics`), and upper limits of some of them."""
+    """Measured numbers by name (`metrics`), upper limits of some of them, and the verdict."""
 
     metrics: Mapping[str, float] = field(default_factory=dict)
     limits: Mapping[str, float] = field(default_factory=dict)
     holds: str = ""
-    """The range in which the library is right, as text, if the check measures one."""
+    """The range in which the library is right, as text; "" if the check measures none."""
     note: str = ""
     """Why it was skipped, its error, or a remark."""
     verdict: Verdict = ""
@@ -49,6 +49,7 @@ class CheckResult:
     name: str = ""
     """Name of the check; `run_check` sets this field and those below."""
     expected: str = ""
+    """The result that the check expects, in a sentence."""
     seconds: float = 0.0
     """Duration [s]."""
     weights: str = ""
@@ -61,14 +62,14 @@ class CheckResult:
         object.__setattr__(self, "verdict", self.verdict or (default if within else "fail"))
 
     def fraction(self, name: str) -> float:
-        """Return a metric / its limit; fails above 1 or at NaN. 0 / 0 is 0, others / 0 infinite."""
+        """Return a metric / its limit; NaN if it is missing; 0 / 0 is 0, others / 0 infinite."""
         value, limit = self.metrics.get(name, math.nan), self.limits[name]
         if limit == 0.0:
             return value if value == 0.0 or math.isnan(value) else math.inf
         return value / limit
 
     def worst(self) -> str:
-        """Return the metric with the largest `fraction` of its limit, as text."""
+        """Return the metric with the largest `fraction`, or NaN, as text; "" without limits."""
         if not self.limits:
             return ""
         fractions = {name: self.fraction(name) for name in self.limits}
@@ -79,12 +80,13 @@ class CheckResult:
 
 @dataclass
 class CheckSession:
-    """Options of one run of `npa-envs stress`; `quick`: small worlds and few steps."""
+    """Options of one run of `npa-envs stress`, and what its checks share."""
 
     device: torch.device
     quick: bool = False
+    """Whether worlds are small and steps are few."""
     cache: dict[Any, Any] = field(default_factory=dict)
-    """Results that several checks share."""
+    """Rules and tasks that several checks use (`rule_worlds`)."""
 
     @property
     def cuda(self) -> bool:
@@ -92,27 +94,29 @@ class CheckSession:
         return self.device.type == "cuda"
 
     def generator(self, number: int = 0) -> torch.Generator:
-        """Return a random generator on the device, seeded by a number."""
+        """Return a new random generator on the session's device, with the seed `number`."""
         return torch.Generator(self.device).manual_seed(number)
 
 
 Run = Callable[..., CheckResult]
-"""Takes a rule or a space dimension, if the check has one, and a session."""
+"""Measures a hard case. Takes a rule's name or a case's dimension and boundary, and the session."""
 
 
 @dataclass(frozen=True)
 class Check:
-    """A hard case named GROUP/CASE, the expected result in a sentence, and its function."""
+    """A hard case: a function that measures it, and the expected result in a sentence."""
 
     name: str
+    """GROUP/CASE, such as "geometry/clump/2d/open"."""
     expected: str
     run: Run
+    """Called with the session."""
     rule: str = ""
-    """Name or file of the rule, for a check of a rule."""
+    """Name of the shipped rule, or file of the rule, that is checked; "" if no rule is."""
 
     @property
     def group(self) -> str:
-        """The name up to the slash, one of `GROUPS`."""
+        """The name up to the first slash, one of `GROUPS`."""
         return self.name.partition("/")[0]
 
     @property
@@ -122,23 +126,23 @@ class Check:
 
 
 CHECKS: list[Check] = []
-"""All checks without a rule and without a `Scene`."""
+"""Registered checks that need no rule; those of scenes are made by `scene_checks`."""
 
 RULE_CHECKS: list[Check] = []
-"""Checks that run for each of several rules."""
+"""Registered checks whose function takes a rule's name: `all_checks` makes one for each rule."""
 
 
 LABELS = {2: "2d", 3: "3d", False: "open", True: "periodic"}
-"""Names of space dimensions and boundaries, the arguments of checks."""
+"""How names of checks show the space dimension, and whether the box is periodic."""
 
 
 def check(
     name: str, *cases: int | tuple[int, bool], registry: list[Check] = CHECKS
 ) -> Callable[[Run], Run]:
-    """Return a decorator that registers a check, or one for each case: NAME/2d, NAME/2d/open.
+    """Return a decorator that adds the check `name` to `registry`, or one check for each case.
 
-    A case is a space dimension, or a pair of it and whether the box is periodic. The decorated
-    function's docstring is the check's expected result.
+    A case is a space dimension (NAME/2d), or a pair of it and whether the box is periodic
+    (NAME/2d/open). The docstring of the decorated function is the check's expected result.
     """
 
     def add(run: Run) -> Run:
@@ -153,7 +157,11 @@ def check(
 
 
 def chosen_checks(checks: Sequence[Check], names: Sequence[str]) -> list[Check]:
-    """Return the checks that names select: groups, checks, or beginnings of names up to a slash."""
+    """Return the checks that `names` select, or all checks if there are no names.
+
+    A name is that of a group or of a check, or the beginning of one up to a slash. One that selects
+    nothing raises NPAError.
+    """
 
     def selects(name: str, check: Check) -> bool:
         return f"{check.name}/".startswith(f"{name.rstrip('/')}/")
@@ -166,37 +174,37 @@ def chosen_checks(checks: Sequence[Check], names: Sequence[str]) -> list[Check]:
 
 
 class StressRecord(Record[CheckResult]):
-    """Results of a run's checks; in its file, metrics are called figures."""
+    """The results of checks and their JSON file, where metrics are called "figures"."""
 
     command = "stress"
 
     def content(self) -> dict[str, Any]:
-        """Return the record file's check results and their counts by verdict; NaN becomes "nan"."""
+        """Return the results of checks and their number by verdict, for JSON; NaN becomes "nan"."""
         checks = as_objects(self.rows)
         for fields in checks:
             fields["figures"] = fields.pop("metrics")
         return {"counts": self.counts(), "checks": _json_values(checks)}
 
     def parse(self, content: dict[str, Any]) -> list[CheckResult]:
-        """Return the check results in the content of a record file, to continue a stopped run."""
+        """Return the results that a record file's JSON object has, to resume a stopped run."""
         for fields in content["checks"]:
             for name, key in (("metrics", "figures"), ("limits", "limits")):
                 fields[name] = {inner: float(value) for inner, value in fields.pop(key).items()}
         return [CheckResult(**fields) for fields in content["checks"]]
 
     def store(self, result: CheckResult) -> None:
-        """Add a result, or replace the one of the same check, and write the file."""
+        """Add a result, or replace the result of the same check, and write the file."""
         self.rows = [*({row.name: row for row in self.rows} | {result.name: result}).values()]
         self.write()
 
     def result_of(self, check: Check) -> CheckResult | None:
-        """Return a check's stored result, or None if there is none for the rule's weights."""
+        """Return a check's stored result; None if there is none, or only of other weights."""
         digest = check.weights_digest
         rows = (row for row in self.rows if row.name == check.name and row.weights == digest)
         return next(rows, None)
 
     def is_done(self, check: Check) -> bool:
-        """Return whether a resumed run need not repeat a check."""
+        """Return whether a check has passed, so that a resumed run need not repeat it."""
         result = self.result_of(check)
         return result is not None and result.verdict in ("pass", "range")
 
@@ -206,14 +214,14 @@ class StressRecord(Record[CheckResult]):
         return {verdict: counts[verdict] for verdict in ("pass", "range", "fail", "skipped")}
 
     def by_group(self) -> dict[str, list[CheckResult]]:
-        """Return results by the group of their check."""
+        """Return results by the name of their group."""
         groups: dict[str, list[CheckResult]] = {}
         for result in self.rows:
             groups.setdefault(result.name.partition("/")[0], []).append(result)
         return groups
 
     def text(self) -> str:
-        """Return a table for each group, and the expected results of the checks that failed."""
+        """Return a table of each group, what failed checks expected, and the counts, as text."""
         parts = []
         for results in self.by_group().values():
             texts = [result.holds or result.worst() or result.note for result in results]
@@ -234,7 +242,7 @@ class StressRecord(Record[CheckResult]):
 
 
 def _json_values(value: Any) -> Any:
-    """Return nested dicts and lists with numbers that are not finite as text."""
+    """Return nested dicts and lists, in which infinite numbers and NaN are replaced by text."""
     if isinstance(value, Mapping):
         return {key: _json_values(inner) for key, inner in value.items()}
     if isinstance(value, list):
@@ -252,8 +260,8 @@ def run_checks(
 ) -> None:
     """Run the checks that have not passed before, and store their results in the record.
 
-    No check starts after `max_seconds`: those without a result are stored as skipped. After each
-    check `progress` is called with 1.
+    After `max_seconds` no further check starts, and checks without a result are stored as skipped;
+    None: no limit. After each check `progress` is called with 1.
     """
     time_is_up = time_limit(max_seconds)
     for check in checks:
@@ -286,7 +294,7 @@ def run_check(check: Check, session: CheckSession) -> CheckResult:
 
 
 def heat_maps(record: StressRecord) -> dict[str, bytes]:
-    """Return a PNG heat map for each group of checks: measured numbers divided by their limits."""
+    """Return a heat map (a PNG file) by group: metrics / their limits, a row for each check."""
     drawn = {}
     for group, results in record.by_group().items():
         limited = [result for result in results if result.metrics and result.limits]

@@ -1,4 +1,7 @@
-"""Checks of perception in hard cases: positions, states, gradients, order and batches."""
+"""Checks of perception where it is hard: positions, states, gradients, order and batches.
+
+The docstring of a check (`_run_...`) is the result that it expects, which reports show.
+"""
 
 from __future__ import annotations
 
@@ -41,11 +44,11 @@ from npa_envs.world.division import living
 from npa_envs.world.rollout import rollout
 
 NEAR_THRESHOLD = 1e-3
-"""Relative distance from the threshold within which perception must not change more than this."""
+"""Within this relative distance from the threshold, perception must change by twice it at most."""
 
 
 def scene_checks() -> list[Check]:
-    """Return a check for each `Scene`."""
+    """Return a check of each `Scene`: perception and its gradients against the reference."""
     return [
         Check(
             f"geometry/{scene.name}/{space_dim}d/{'periodic' if periodic else 'open'}",
@@ -197,16 +200,17 @@ def _run_outside(space_dim: int, session: CheckSession) -> CheckResult:
 # The group `values`: unusual states, which must not affect other worlds.
 
 POWERS = range(-30, 31, 2)
-"""Scales of states, as powers of ten, at which float32 is right."""
+"""Powers of ten by which states are multiplied."""
 
 WORLD, OTHER_WORLDS, PARTICLE = 1, [0, 2], 7
-"""Index of the broken particle's world, those of the others, and that of the particle."""
+"""Index of the world with a broken particle, of the other worlds, and of the particle."""
 
-WORLD_COUNT, PARTICLE_COUNT, STEPS = 3, 150, 8
+WORLD_COUNT, PARTICLE_COUNT, NAN_STEPS = 3, 150, 8
+"""Numbers of worlds and of particles in each, and steps of a rollout that starts with a NaN."""
 
 
 def _worlds(session: CheckSession, space_dim: int, state_dim: int) -> tuple[Tensor, Tensor]:
-    """Return x and s of worlds in two halves far apart; particles have about 20 neighbours."""
+    """Return positions and states of worlds in two distant halves; particles have 20 neighbours."""
     generator = torch.Generator().manual_seed(0)
     shape = (WORLD_COUNT, PARTICLE_COUNT)
     side = EPS * (3.0 if space_dim == 2 else 2.4)
@@ -309,11 +313,11 @@ def _run_nan_state(session: CheckSession) -> CheckResult:
     with_nan = clean.clone()
     with_nan[WORLD, PARTICLE, 0] = math.nan
     (x, s), (clean_x, clean_s) = (
-        rollout(rule, x, states, STEPS, generator=session.generator())
+        rollout(rule, x, states, NAN_STEPS, generator=session.generator())
         for states in (with_nan, clean)
     )
     broken = (~s[WORLD].isfinite()).any(-1) | (~x[WORLD].isfinite()).any(-1)
-    away = (clean_x[WORLD] - clean_x[WORLD, PARTICLE]).norm(dim=-1) > (2 * STEPS) * EPS
+    away = (clean_x[WORLD] - clean_x[WORLD, PARTICLE]).norm(dim=-1) > (2 * NAN_STEPS) * EPS
     metrics = {
         "other_worlds_x": differing(x[OTHER_WORLDS], clean_x[OTHER_WORLDS]),
         "other_worlds_s": differing(s[OTHER_WORLDS], clean_s[OTHER_WORLDS]),
@@ -362,9 +366,9 @@ def _run_differences(space_dim: int, periodic: bool, session: CheckSession) -> C
 def _difference(scene: Scene, session: CheckSession, what: str) -> float:
     """Return the relative error of a directional derivative against a finite difference.
 
-    `what` is varied: "states" or "positions". Positions move along a smooth periodic field that is
-    0 at the origin, so that coincident particles stay together. There is no moment correction,
-    through which no gradient flows.
+    The derivative is by `what`, "states" or "positions". Positions move along a smooth periodic
+    field that is 0 at the origin, so that coincident particles stay together. Perception is without
+    moment correction, through which no gradient flows.
     """
     x, s = scene.x.to(session.device), scene.s.to(session.device)
     weights = functional_weights(x, s)
@@ -396,11 +400,11 @@ def _difference(scene: Scene, session: CheckSession, what: str) -> float:
 # The group `precision`: changes that must have little or no effect.
 
 TWO_ERRORS = 2.0
-"""Allowed distance of two results, in errors that the group `geometry` allows for one."""
+"""Maximum distance of two results / the error that the group `geometry` allows for one."""
 
 
 def _every_scene(space_dim: int, session: CheckSession) -> Iterator[tuple[Scene, Tensor, Tensor]]:
-    """Yield every scene, with its positions and states in float32 on the device."""
+    """Yield every scene, and its positions and states in float32 on the session's device."""
     for periodic in (False, True):
         for scene in scenes(space_dim, periodic=periodic):
             x, s = (tensor.to(session.device, torch.float32) for tensor in (scene.x, scene.s))

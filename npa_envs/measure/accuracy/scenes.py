@@ -1,4 +1,4 @@
-"""Scenes that are hard to perceive, and errors against the float64 reference."""
+"""Scenes that are hard to perceive, their perception, and its errors against the reference."""
 
 from __future__ import annotations
 
@@ -19,35 +19,37 @@ SIDE = 1.0
 """Side of the periodic scenes' boxes [length units]."""
 
 STATE_DIM = 5
-"""State channels of the scenes."""
+"""Number of state channels C of the scenes."""
 
 Box = tuple[float, ...] | None
+"""Sides of a periodic box [length units], one for each dimension; None: open space."""
 
 
 @dataclass(frozen=True)
 class Scene:
-    """Worlds that are hard to perceive, in float64; float32 represents their positions exactly."""
+    """Worlds that are hard to perceive."""
 
     name: str
     summary: str
-    """Positions of the particles in words."""
+    """Where the particles are, in words."""
     x: Tensor
+    """Positions [length units], [B, N, D], float64 numbers that float32 represents exactly."""
     box: Box
 
     @property
     def s(self) -> Tensor:
-        """States of the particles, [B, N, C]: random, and always the same (`states_at`)."""
+        """States of the particles, [B, N, C], random and always the same (`states_at`)."""
         return states_at(self.x)
 
 
 def states_at(x: Tensor) -> Tensor:
-    """Return normally distributed states for positions x, float64, exact in float32 too."""
+    """Return random states [B, N, C] for positions x, the same each time; exact in float32 too."""
     shape = (*x.shape[:2], STATE_DIM)
     return torch.randn(shape, generator=torch.Generator().manual_seed(5)).double()
 
 
 def scenes(space_dim: int, *, periodic: bool) -> list[Scene]:
-    """Return every scene of open space or of a periodic box of side `SIDE`."""
+    """Return all scenes in open space, or all in a periodic box, of 2 or 3 dimensions."""
     selected: list[Scene] = []
     for name, (summary, make_positions) in POSITIONS.items():
         generator = torch.Generator().manual_seed(len(selected))
@@ -68,13 +70,12 @@ def _uniform(space_dim: int, generator: torch.Generator, count: int, side: float
 
 
 def _direction(space_dim: int) -> Tensor:
-    """Return a unit vector that is not along an axis."""
+    """Return a unit vector that is along no axis, [D]."""
     slanted = torch.tensor([0.48, 0.64, 0.6] if space_dim == 3 else [0.6, 0.8])
     return slanted.double()
 
 
 def _touching(space_dim: int, generator: torch.Generator) -> Tensor:
-    """Return worlds of one pair each, from 1e-12 length units to ε/2 apart."""
     distances = torch.tensor([1e-12, 1e-9, 1e-6, 1e-3, 0.5], dtype=torch.float64)
     distances[3:] *= EPS
     apart = distances[:, None] * _direction(space_dim)
@@ -82,7 +83,6 @@ def _touching(space_dim: int, generator: torch.Generator) -> Tensor:
 
 
 def _at_eps(space_dim: int, generator: torch.Generator) -> Tensor:
-    """Return one world with four pairs, ε/2 and ε apart, and slightly less and more than ε."""
     step = 2.0**-20
     first = torch.full((4, space_dim), -0.375, dtype=torch.float64)
     first[:, 1] += torch.arange(4) * 2.0 * EPS
@@ -121,18 +121,18 @@ def _tight_box(space_dim: int, generator: torch.Generator) -> Tensor:
 
 
 def _far(space_dim: int, generator: torch.Generator) -> Tensor:
-    """Return one world with crowds at the origin and far away; squares of the farthest overflow."""
     x = _uniform(space_dim, generator, 80)
+    # Squares of the last two are too large for float32.
     for k, offset in enumerate((1e3, 1e6, -1e30, 3e38)):
         x[:, 20 * k : 20 * k + 10, 0] += offset
     return x
 
 
 POSITIONS: dict[str, tuple[str, Callable[[int, torch.Generator], Tensor]]] = {
-    "one": ("a single particle", lambda d, draws: _uniform(d, draws, 1)),
+    "one": ("a single particle", lambda d, source: _uniform(d, source, 1)),
     "coincident": (
         "48 particles in one place",
-        lambda d, draws: _uniform(d, draws, 1).expand(1, 48, d),
+        lambda d, source: _uniform(d, source, 1).expand(1, 48, d),
     ),
     "touching": ("pairs from 1e-12 length units to ε/2 apart", _touching),
     "at_eps": ("pairs at ε, and at ε (1 ± 2⁻²⁰)", _at_eps),
@@ -140,29 +140,29 @@ POSITIONS: dict[str, tuple[str, Callable[[int, torch.Generator], Tensor]]] = {
     "coplanar": ("particles on a plane", _coplanar),
     "lattice": (
         "a lattice of ε/2: neighbours at ε exactly",
-        lambda d, draws: torch.cartesian_prod(*((torch.arange(5) - 2) * (EPS / 2.0),) * d)[None],
+        lambda d, source: torch.cartesian_prod(*((torch.arange(5) - 2) * (EPS / 2.0),) * d)[None],
     ),
     "cell_borders": (
         "particles on the borders of cells",
-        lambda d, draws: torch.randint(-4, 4, (1, 60, d), generator=draws) * (EPS / 2.0),
+        lambda d, source: torch.randint(-4, 4, (1, 60, d), generator=source) * (EPS / 2.0),
     ),
     "clump": (
         "100 particles in one cell",
-        lambda d, draws: 0.03 + _uniform(d, draws, 100, EPS / 4.0),
+        lambda d, source: 0.03 + _uniform(d, source, 100, EPS / 4.0),
     ),
     "far": ("crowds at 0, 1e3, 1e6, -1e30 and 3e38", _far),
     "seam": ("particles on both sides of the box's seam and on it", _seam),
     "tight_box": ("particles in a box of exactly 2 ε", _tight_box),
 }
-"""Summary of each scene, and the function that makes its positions."""
+"""Summary of each scene by name, and the function of D and a generator that makes its positions."""
 
 
 def threshold_scenes(space_dim: int, threshold: float) -> tuple[Tensor, Tensor]:
-    """Return worlds whose first particle's moment matrix has a determinant near a threshold.
+    """Return worlds in which a moment matrix has a determinant near a threshold.
 
-    The other particles are one on each axis but the last, and one whose height sets the
-    determinant. Returns positions [B, 1 + D, D] and the determinants' relative distances from the
-    threshold, [B].
+    It is the matrix of particle 0. One further particle lies on each axis but the last, and the
+    height of one more sets the determinant. Returns positions [B, 1 + D, D], and the relative
+    distance of each world's determinant from the threshold, [B].
     """
     offsets = torch.tensor([1e-1, 1e-3, 1e-5, 1e-7, 0.0, -1e-7, -1e-5, -1e-3, -1e-1]).double()
     worlds = torch.zeros(len(offsets), 1 + space_dim, space_dim, dtype=torch.float64)
@@ -191,17 +191,17 @@ LIMITS = {
     "states_float64": 1e-14,
     "positions_float64": 2e-14,
 }
-"""Allowed relative errors of z, and of gradients of a random functional by states and positions.
+"""Maximum relative errors of a perception, WHAT_DTYPE, of well-conditioned scenes.
 
-`error_limits` raises them for ill-conditioned scenes.
+WHAT is a field of `PerceptionOutcome`. For other scenes `error_limits` has larger ones.
 """
 
 PRECISIONS = {"float32": torch.float32, "float64": torch.float64}
-"""Dtypes by their names."""
+"""Dtypes that are checked, by name."""
 
 
 class PerceptionOutcome(NamedTuple):
-    """A perception, [B, N, P], and gradients of a random functional by states and positions."""
+    """A perception z, [B, N, P], and gradients of a linear functional of it, shaped as s and x."""
 
     z: Tensor
     states: Tensor
@@ -209,7 +209,7 @@ class PerceptionOutcome(NamedTuple):
 
 
 def relative_error(value: Tensor, expected: Tensor) -> float:
-    """Return the largest |value - expected| / |expected| (norms) of B worlds, [B, ...] each."""
+    """Return the largest |value - expected| / |expected| of worlds, [B, ...]; a norm of 0 is 1."""
     exact = expected.detach().cpu().double().flatten(1)
     away = (value.detach().cpu().double().flatten(1) - exact).norm(dim=1)
     size = exact.norm(dim=1)
@@ -221,7 +221,7 @@ def relative_error(value: Tensor, expected: Tensor) -> float:
 def perception_errors(
     outcome: PerceptionOutcome, expected: PerceptionOutcome, precision: str = "float32"
 ) -> dict[str, float]:
-    """Return the relative errors of a perception and its gradients, with the keys of `LIMITS`."""
+    """Return relative errors of a perception and gradients, by keys of `LIMITS` with this dtype."""
     pairs = zip(PerceptionOutcome._fields, outcome, expected, strict=True)
     return {f"{what}_{precision}": relative_error(a, b) for what, a, b in pairs}
 
@@ -229,13 +229,13 @@ def perception_errors(
 def against_reference(
     x: Tensor, s: Tensor, box: Box, device: torch.device
 ) -> tuple[PerceptionOutcome, PerceptionOutcome]:
-    """Return perception and gradients in float32 on a device, and by the reference in float64."""
+    """Return perception and gradients by the library (float32, on `device`), and the reference."""
     outcome = perceived(x.to(device, torch.float32), s.to(device, torch.float32), box)
     return outcome, perceived(x.cpu().double(), s.cpu().double(), box, by_reference=True)
 
 
 def not_finite(tensors: Iterable[Tensor]) -> float:
-    """Return how many elements of tensors are infinite or NaN."""
+    """Return the number of elements of tensors that are infinite or NaN."""
     return float(sum(int((~tensor.isfinite()).sum()) for tensor in tensors))
 
 
@@ -246,10 +246,10 @@ def differing(value: Tensor, expected: Tensor) -> float:
 
 
 def functional_weights(x: Tensor, s: Tensor) -> Tensor:
-    """Return random weights [B, N, P], for a linear functional of the perception of worlds."""
+    """Return random weights [B, N, P], always the same, of a linear functional of perceptions."""
     width = s.shape[2] * (2 + x.shape[2]) + x.shape[2]
-    draws = torch.Generator().manual_seed(3)
-    return torch.randn(*x.shape[:2], width, generator=draws).to(x)
+    generator = torch.Generator().manual_seed(3)
+    return torch.randn(*x.shape[:2], width, generator=generator).to(x)
 
 
 def perceived(
@@ -263,8 +263,8 @@ def perceived(
 ) -> PerceptionOutcome:
     """Return the perception z of worlds and its gradients, by the library or the reference.
 
-    Gradients are of Σ z `weights`, by default `functional_weights`. `changed` is applied to x, s
-    and the weights first.
+    Gradients are of Σ z `weights`; None: of `functional_weights`. x, s and the weights are replaced
+    by `changed` of them first.
     """
     x, s = changed(x.detach()).requires_grad_(), changed(s.detach()).requires_grad_()
     operator = reference.perceive if by_reference else perceive
@@ -275,11 +275,12 @@ def perceived(
 
 
 def error_limits(x: Tensor, s: Tensor, box: Box, expected: PerceptionOutcome) -> dict[str, float]:
-    """Return the relative errors allowed for a scene, with the keys of `LIMITS`.
+    """Return the maximum relative errors of worlds, by the keys of `LIMITS`.
 
-    An error may be as large as the effect of rounding every input four times, which is large where
-    sums cancel or results grow with 1 / distance. Coincident particles are moved together. Far away
-    in open space only differences of positions are rounded.
+    An error may be four times the effect of rounding all inputs, which is large where sums cancel
+    or results grow with 1 / distance. `expected` is the reference's outcome without rounding.
+    Coincident particles stay together. Positions in open space are rounded as if they were within
+    `SIDE` of the origin.
     """
     generator = torch.Generator().manual_seed(4)
     change = 1e-11
@@ -287,9 +288,9 @@ def error_limits(x: Tensor, s: Tensor, box: Box, expected: PerceptionOutcome) ->
     def rounded(values: Tensor) -> Tensor:
         rows = values.flatten(0, 1)
         which = torch.unique(rows, dim=0, return_inverse=True)[1]
-        draws = torch.rand(rows.shape, generator=generator, dtype=rows.dtype)[which]
+        random = torch.rand(rows.shape, generator=generator, dtype=rows.dtype)[which]
         size = rows if box is not None else rows.clamp(-SIDE, SIDE)
-        return (rows + change * (2.0 * draws - 1.0) * size).view_as(values)
+        return (rows + change * (2.0 * random - 1.0) * size).view_as(values)
 
     limits = dict(LIMITS)
     for _ in range(4):

@@ -1,8 +1,9 @@
-"""Checks of trained rules in worlds of their task: 100 000 steps, gradients, CUDA graphs."""
+"""Checks of trained rules in worlds of their tasks: 100 000 steps, gradients, CUDA graphs."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import torch
@@ -28,18 +29,18 @@ from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import WorldRandom
 from npa_envs.world.rollout import rollout_particles
 
-TASKS = ("morphogenesis2d", "morphogenesis3d", "texture", "point_classification")
-"""Tasks whose rules can be checked."""
+CHECKED_TASKS = ("morphogenesis2d", "morphogenesis3d", "texture", "point_classification")
+"""Names of the tasks whose rules can be checked."""
 
 QUICK_PARTICLES, QUICK_CLOUD = 1024, 128
-"""Most particles of a world, and of a cloud, in a quick run."""
+"""Maximum number of particles in a world, and in a cloud of points, in a quick run."""
 
 MIN_VIEWS: dict[str, Any] = {"resolution": 16, "training_views": 1, "held_out_views": 1}
-"""Fields of 3D tasks whose target is not used, as large views take long to make."""
+"""Fields of a 3D task's configuration for few, small views of its target, as no check uses it."""
 
 
 class RuleWorlds(NamedTuple):
-    """A float32 rule, its task, and worlds of the task with their goals, if any."""
+    """A trained rule in float32, its task, and start worlds of the task (with goals, if any)."""
 
     rule: NPARule
     task: Task
@@ -47,9 +48,9 @@ class RuleWorlds(NamedTuple):
 
 
 def task_name(rule: str) -> str:
-    """Return the name of the task that a rule was trained on, from its file."""
+    """Return the task that a rule (shipped name or file) was trained on, one of `CHECKED_TASKS`."""
     metadata = rule_metadata(rule_file(rule))
-    if metadata.get("task") not in TASKS:
+    if metadata.get("task") not in CHECKED_TASKS:
         raise NPAError(
             f"the rule's file must name the task of its training, {rule!r} names "
             f"{metadata.get('task')!r}: give a rule that npa-envs train has saved"
@@ -60,9 +61,10 @@ def task_name(rule: str) -> str:
 def rule_worlds(
     session: CheckSession, name: str, *, world_count: int = 1, particles: float = 1.0
 ) -> RuleWorlds:
-    """Return a rule, shipped or of a file, with fresh worlds of its task.
+    """Return a rule (shipped, or a file) with `world_count` start worlds of its task.
 
-    `particles` is a factor on the trained number of particles, which a quick run limits.
+    `particles` is a factor on the number of particles that the rule was trained with, which a quick
+    session limits. The rule and its task are cached in the session.
     """
     if (name, particles) not in session.cache:
         rule = load_rule(name, device=session.device).float().requires_grad_(False)
@@ -81,16 +83,17 @@ def rule_worlds(
 
 # The group `time`: every shipped rule for 100 000 steps.
 
-STEPS, QUICK_STEPS = 100_000, 200
+LONG_RUN_STEPS, QUICK_STEPS = 100_000, 200
+"""Steps of the run, and of a quick one."""
 
 SETTLED = 512
-"""Step whose worlds later ones are compared with; half of the run where that is sooner."""
+"""Step of the settled world, which later ones are compared with; a short run's middle if sooner."""
 
 MARKS = 16
-"""Measurements of worlds after that."""
+"""Number of measurements after the settled world's."""
 
 ENERGY_STEPS = 16
-"""Steps whose mean is the energy: of a world at rest single steps differ by a hundred times."""
+"""Steps that energies are averaged over: of a world at rest single steps differ a hundredfold."""
 
 BOUNDS = {
     "not_finite": 0.0,
@@ -100,18 +103,31 @@ BOUNDS = {
     "energy": 4.0,
     "drift": 1.0,
 }
-"""Bounds of metrics, which are maxima over the steps after the world has settled.
+"""Upper bounds of the metrics of a world, from the settled one on (all dimensionless).
 
-`extent`: longest side of the bounding box, over that of the settled world. `overflow`: mean
-|s − clip(s, −1, 1)|. `largest_state`: the largest |s|. `energy`: mean over particles of |Δx|²/ε² +
-mean Δs² of a step, over that of the settled world, both averaged over `ENERGY_STEPS`. `drift`:
-distance of the centroid from the settled one, in extents of the settled world; only for moving
-particles in open space.
+- `not_finite`: how many numbers of positions and states are infinite or NaN.
+- `extent`: longest side of the particles' bounding box / that of the settled world.
+- `overflow`: mean |s - clip(s, -1, 1)|, how far states lie outside of [-1, 1].
+- `largest_state`: the largest |s|.
+- `energy`: mean over particles of a step's |Δx|²/ε² + mean Δs² / that of the settled world.
+- `drift`: distance between the centroids of the world and of the settled one / extent of the
+  settled one; only for moving particles in open space.
 """
 
 
+def mark_steps(steps: int) -> list[int]:
+    """Return steps of measurements, the settled world's to `steps`, evenly spaced in logarithm."""
+    settled = min(SETTLED, steps // 2)
+    return [round(settled * (steps / settled) ** (k / MARKS)) for k in range(MARKS + 1)]
+
+
 def measured(runner: RuleRunner, worlds: Particles) -> dict[str, float]:
-    """Return worlds' metrics by the names in `BOUNDS`; "energy" runs `ENERGY_STEPS` more steps."""
+    """Return metrics of worlds (maxima or means over them) by the names in `BOUNDS`, without drift.
+
+    Extents are in length units, energies those of the next `ENERGY_STEPS` steps, which `runner`
+    runs; neither is relative to a settled world (see `relative`). If a number is infinite or NaN,
+    only `not_finite` is returned.
+    """
     with torch.no_grad():
         x, s, *_ = worlds
         not_finite = (~x.isfinite()).sum() + (~s.isfinite()).sum()
@@ -133,42 +149,50 @@ def measured(runner: RuleRunner, worlds: Particles) -> dict[str, float]:
         }
 
 
+def relative(metrics: Mapping[str, float], settled: Mapping[str, float]) -> dict[str, float]:
+    """Return metrics whose extent, energy and drift are divided by the settled world's."""
+    units = {"extent": "extent", "energy": "energy", "drift": "extent"}
+    # In a world at rest the energy is rounding.
+    return {
+        name: value / max(settled[units[name]], 1e-12) if name in units else value
+        for name, value in metrics.items()
+    }
+
+
+def exceeded(metrics: Mapping[str, float], limits: Mapping[str, float]) -> str:
+    """Return the names of metrics that are NaN or above their limits, with commas, "" if none."""
+    return ", ".join(name for name, limit in limits.items() if not metrics.get(name, 0.0) <= limit)
+
+
 @check("time", registry=RULE_CHECKS)
 def _run_long(name: str, session: CheckSession) -> CheckResult:
     """No number becomes infinite or NaN; the extent at most doubles, updates have at most four
     times the energy of the settled world's, states stay within 8 and on average within 1.1, the
     centroid moves by an extent at most."""
     start = rule_worlds(session, name)
-    steps = QUICK_STEPS if session.quick else STEPS
-    settled = min(SETTLED, steps // 2)
-    # Evenly spread on a logarithmic scale.
-    marks = [round(settled * (steps / settled) ** (k / MARKS)) for k in range(MARKS + 1)]
+    steps = QUICK_STEPS if session.quick else LONG_RUN_STEPS
     runner, energy_runner = (
         RuleRunner(start.rule, start.task, session.generator(number)) for number in (1, 2)
     )
     open_space = start.task.box is None and not start.rule.static
     metrics: dict[str, float] = {"steps": float(steps), "particles": float(start.worlds.x.shape[1])}
     limits = {key: limit for key, limit in BOUNDS.items() if key != "drift" or open_space}
-    first: dict[str, float] = {}
+    settled: dict[str, float] = {}
     centroid = start.worlds.x.mean(1)
     note = ""
-    for step, worlds in runner.at(marks, start.worlds):
+    for step, worlds in runner.at(mark_steps(steps), start.worlds):
         current = measured(energy_runner, worlds)
-        x = worlds.x
-        if not first and not current["not_finite"]:
-            first, centroid = dict(current), x.mean(1)
         if not current["not_finite"]:
+            if not settled:
+                settled, centroid = dict(current), worlds.x.mean(1)
             if open_space:
-                current["drift"] = float((x.mean(1) - centroid).norm(dim=-1).max())
-            for key, unit in (("extent", "extent"), ("energy", "energy"), ("drift", "extent")):
-                if key in current:
-                    # In a world at rest the rest is rounding.
-                    current[key] /= max(first[unit], 1e-12)
+                current["drift"] = float((worlds.x.mean(1) - centroid).norm(dim=-1).max())
+            current = relative(current, settled)
         for key, value in current.items():
             metrics[key] = max(value, metrics.get(key, 0.0))
-        over = [key for key, limit in limits.items() if not current.get(key, 0.0) <= limit]
+        over = exceeded(current, limits)
         if over and not note:
-            note = f"{', '.join(over)} above the bound at step {step}"
+            note = f"{over} above the bound at step {step}"
         if current["not_finite"]:
             break
     return CheckResult(metrics, limits, note=note)
@@ -177,13 +201,14 @@ def _run_long(name: str, session: CheckSession) -> CheckResult:
 # The group `gradients`: growth with the steps, errors of float32.
 
 GRADIENT_STEPS, QUICK_GRADIENT_STEPS = 512, 32
-"""Steps of the longest differentiated rollouts."""
+"""Steps of the longest rollout that gradients are computed through, and of a quick session's."""
 
 
 class RolloutOutcome(NamedTuple):
-    """Worlds after a rollout, and gradients of a random linear functional of them.
+    """Positions and states after a rollout, and gradients of a random linear functional of them.
 
-    Gradients are by all weights, [1, W], and by the initial states.
+    `by_weights` is the gradient by all W weights of the rule, [1, W]; `by_states` the gradient by
+    the initial states, [B, N, C].
     """
 
     x: Tensor
@@ -193,14 +218,14 @@ class RolloutOutcome(NamedTuple):
 
 
 def powers_of_two(most: int) -> list[int]:
-    """Return 1, 2, 4, ... up to `most`."""
+    """Return all powers of two, from 1 on, that are at most `most`."""
     return [2**k for k in range(int(math.log2(most)) + 1)]
 
 
 def outcome(
     start: RuleWorlds, session: CheckSession, steps: int, dtype: torch.dtype
 ) -> RolloutOutcome:
-    """Return worlds and gradients after a rollout in `dtype`; each dtype has the same masks."""
+    """Roll out in `dtype`, with masks that all dtypes share; return the worlds and gradients."""
     rule = NPARule(**start.rule.hyper_parameters()).to(start.worlds.x.device)
     rule.load_state_dict(start.rule.state_dict())
     rule.to(dtype)
@@ -252,7 +277,7 @@ def _run_float32(name: str, session: CheckSession) -> CheckResult:
     steps they still agree to 1e-2 is reported."""
     start = _gradient_worlds(session, name)
     if start.rule.divides:
-        raise Skipped("particles divide by draws that are others in float64")
+        raise Skipped("random numbers by which particles divide are others in float64")
     counts = powers_of_two(QUICK_GRADIENT_STEPS if session.quick else 128)
     metrics: dict[str, float] = {}
     usable = dict.fromkeys(RolloutOutcome._fields, 0)

@@ -1,4 +1,7 @@
-"""Losses of rules under other conditions and after damage: records, tables and pictures."""
+"""Losses of rules under other conditions and after damage: measurement, record, tables, pictures.
+
+The trained loss is that under the conditions of training.
+"""
 
 from __future__ import annotations
 
@@ -36,27 +39,27 @@ from npa_envs.world.particles import Particles
 from npa_envs.world.randomness import StreamId
 
 WORKS = 2.0
-"""A rule works under a condition if its loss is at most this many times the trained one."""
+"""A rule works at a value of a condition if its loss / the trained loss is at most this."""
 
 MAX_PARTICLES = {"cpu": 1 << 17, "cuda": 1 << 21}
-"""Most particles of all worlds together; values that need more are left out."""
+"""Maximum number of particles in all worlds together, by kind of device."""
 
 
 @dataclass(frozen=True)
 class Response:
-    """The losses of all seeds at one value of a condition."""
+    """The losses of all seeds at one value of a condition of `CONDITIONS`."""
 
     condition: str
     value: float | str
     steps: int
-    """Steps from the seed."""
+    """Steps from the start to the losses."""
     losses: tuple[float, ...]
-    """Loss of each seed, NaN if a world is not finite; empty if the value was left out."""
+    """Loss of each seed, NaN if a world is not finite; empty if the value was not measured."""
     note: str = ""
-    """Why the value was left out."""
+    """Why the value was not measured; "" if it was."""
 
     def mean(self) -> float:
-        """Return the mean loss of the seeds; NaN if one is not finite, or there are none."""
+        """Return the mean loss of the seeds, NaN if a loss is not finite or none was measured."""
         return math.fsum(self.losses) / len(self.losses) if self.losses else math.nan
 
 
@@ -76,9 +79,9 @@ class RuleRecord(Record[Response]):
     ) -> None:
         super().__init__(facts, path, responses)
         self.curves = list(curves)
-        """Loss curve after each damage, the control first."""
+        """Loss curve of the control, and then of each damage."""
         self.about: dict[str, Any] = {"done": True, "seconds": 0.0, "command": "", "date": ""}
-        """Other fields of the file: `rule`, `task`, `metric`, trained `update_prob`, `done`, ..."""
+        """Other fields of the file: `rule`, `task`, `metric`, `update_prob` of training, ..."""
         self.about |= about
 
     @property
@@ -92,7 +95,7 @@ class RuleRecord(Record[Response]):
         return bool(self.about["done"])
 
     def content(self) -> dict[str, Any]:
-        """Return the fields of the file, except the facts."""
+        """Return the fields of the file except the facts of the run, for JSON."""
         curves = [asdict(curve) for curve in self.curves]
         for fields, curve in zip(curves, self.curves, strict=True):
             fields["twins"] = fields.pop("undamaged")
@@ -100,7 +103,7 @@ class RuleRecord(Record[Response]):
         return {**self.about, "courses": curves, "responses": as_objects(self.rows)}
 
     def parse(self, content: dict[str, Any]) -> list[Response]:
-        """Set curves and other fields from a file's JSON object; return its responses."""
+        """Set `curves` and `about` from the JSON object of a file; return its responses."""
 
         def numbers(values: list[float | None]) -> tuple[float, ...]:
             return tuple(map(number, values))
@@ -115,7 +118,7 @@ class RuleRecord(Record[Response]):
         return [Response(**row | {"losses": numbers(row["losses"])}) for row in rows]
 
     def responses_to(self, condition: str) -> list[Response]:
-        """Return the responses to a condition."""
+        """Return the responses at the values of a condition, in order."""
         return [response for response in self.rows if response.condition == condition]
 
     def trained(self) -> Response:
@@ -126,10 +129,9 @@ class RuleRecord(Record[Response]):
 def measure_rule(
     record: RuleRecord, trial: RuleTrial, *, enough: Callable[[], bool] = lambda: False
 ) -> None:
-    """Measure what is missing in a rule's record; save it after each value of a condition.
+    """Measure what is missing in a rule's record; write it after each value of a condition.
 
-    Values that need more than `MAX_PARTICLES` are left out. Once `enough` returns True, no further
-    value is measured, and the record stays unfinished.
+    Once `enough` returns True, no further value is measured, and the record is not done.
     """
     begin = time.perf_counter() - record.about["seconds"]
     grown, trained = grow(trial)
@@ -143,9 +145,9 @@ def measure_rule(
             "done": False,
         }
     record.write()
-    rest = responses(trial, trained, done=len(record.rows))
+    missing = responses(trial, trained, done=len(record.rows))
     while not enough():
-        response = next(rest, None)
+        response = next(missing, None)
         record.about["seconds"] = round(time.perf_counter() - begin, 2)
         if response is None:
             record.about["done"] = True
@@ -157,7 +159,7 @@ def measure_rule(
 def grow(
     trial: RuleTrial, condition: str = "", value: float | str = 1.0
 ) -> tuple[Particles, Response]:
-    """Grow worlds as in training, or with `condition` at `value`; return them and their losses."""
+    """Grow worlds as in training, or with `condition` at `value`; return worlds and losses."""
     initial = trial.initial_worlds(
         fraction=float(value) if condition == "particles" else 1.0,
         shape=str(value) if condition == "shape" else "trained",
@@ -180,12 +182,16 @@ def grow(
 
 @torch.no_grad()
 def responses(trial: RuleTrial, trained: Response, *, done: int = 0) -> Iterator[Response]:
-    """Yield losses at each value of each condition of the plan, without the first `done`."""
+    """Yield the losses at each value of each condition of the plan, without the first `done`.
+
+    At the values of training they are those of `trained`. Values that need more particles than
+    `MAX_PARTICLES`, or more memory than there is, are not measured.
+    """
     every = [(name, value) for name, values in trial.plan.values.items() for value in values]
-    as_trained = {"update_prob": trial.task.update_prob, "noise": 0.0, "shape": "trained"}
+    trained_values = {"update_prob": trial.task.update_prob, "noise": 0.0, "shape": "trained"}
     for condition, value in every[done:]:
-        # Values of other conditions are factors on what was trained.
-        if value == as_trained.get(condition, 1.0):
+        # Values of other conditions are factors on those of training.
+        if value == trained_values.get(condition, 1.0):
             yield Response(condition, value, trained.steps, trained.losses)
             continue
         fraction = float(value) if condition == "particles" else 1.0
@@ -203,9 +209,9 @@ def responses(trial: RuleTrial, trained: Response, *, done: int = 0) -> Iterator
 
 
 def where_it_works(record: RuleRecord, condition: str) -> str:
-    """Return the values of a condition at which a rule works, as text; "" if none was measured.
+    """Return the values of a condition at which a rule works, as text; "" if it has no responses.
 
-    It works if all seeds are finite and the mean loss is at most `WORKS` times the trained one.
+    It works if all worlds are finite and the mean loss is at most `WORKS` times the trained loss.
     """
     measured = record.responses_to(condition)
     if not measured:
@@ -219,21 +225,22 @@ def where_it_works(record: RuleRecord, condition: str) -> str:
 
 
 def tables(records: Sequence[RuleRecord]) -> str:
-    """Return all tables in Markdown."""
+    """Return all tables of several rules, with their headings, in Markdown."""
     ranges = [[r.rule, *(where_it_works(r, name) or NONE for name in CONDITIONS)] for r in records]
     works = markdown_table(["rule", *CONDITIONS], ranges)
     parts = [
         "Where rules work: values at which the mean loss is at most "
-        f"{WORKS:g} times that as trained and all seeds are finite:\n\n{works}",
+        f"{WORKS:g} times that under training conditions and all seeds are finite:\n\n{works}",
         f"Recovered seeds, and their median recovery time [steps]:\n\n{_by_damage(records)}",
     ]
     for condition, summary in CONDITIONS.items():
         if table := _by_value(records, condition):
-            parts.append(f"Loss over that as trained, by {summary}:\n\n{table}")
+            parts.append(f"Loss over that under training conditions, by {summary}:\n\n{table}")
     return "\n\n".join(parts) + "\n"
 
 
 def _by_damage(records: Sequence[RuleRecord]) -> str:
+    """Return a Markdown table by rule and damage: recovered seeds / seeds, and the median steps."""
     done = {curve.damage for record in records for curve in record.curves}
     names = [name for name in (CONTROL, *DAMAGES) if name in done]
     rows = []
@@ -248,7 +255,10 @@ def _by_damage(records: Sequence[RuleRecord]) -> str:
 
 
 def _by_value(records: Sequence[RuleRecord], condition: str) -> str:
-    """Return a Markdown table: rules' losses as trained; losses / these by value of `condition`."""
+    """Return a Markdown table: each rule's trained loss, and loss / trained loss at each value.
+
+    If a trained loss is 0, its row has the losses themselves.
+    """
     values = list(
         dict.fromkeys(r.value for record in records for r in record.responses_to(condition))
     )
@@ -262,7 +272,7 @@ def _by_value(records: Sequence[RuleRecord], condition: str) -> str:
                 cells[response.value] = short(mean / trained) if trained else short(mean)
         if record.responses_to(condition):
             rows.append([record.rule, short(trained), *cells.values()])
-    return markdown_table(["rule", "loss as trained", *map(short, values)], rows) if rows else ""
+    return markdown_table(["rule", "trained loss", *map(short, values)], rows) if rows else ""
 
 
 # Curves with bands over the seeds: a picture for each task, a row for each of its rules.
@@ -276,7 +286,7 @@ DRAWN = {
 
 
 def pictures(records: Sequence[RuleRecord]) -> dict[str, bytes]:
-    """Return PNG files by their tasks' names. Needs matplotlib."""
+    """Return a PNG file of all records of a task, by the task's name. Needs matplotlib."""
     tasks = dict.fromkeys(record.about["task"] for record in records)
     return {task: _draw([r for r in records if r.about["task"] == task]) for task in tasks}
 
@@ -308,7 +318,7 @@ def _draw(records: Sequence[RuleRecord]) -> bytes:
 def _draw_seeds(
     panel: Any, across: Sequence[float], columns: Sequence[Sequence[float]], colour: str, name: str
 ) -> None:
-    """Plot the seeds' median and range in each of `columns` over `across`; NaN makes gaps."""
+    """Plot the median and the range of each of `columns` at `across` (x); NaN makes gaps."""
     diverged = [any(map(math.isnan, column)) for column in columns]
     # The upper median of an even number.
     low, middle, high = (

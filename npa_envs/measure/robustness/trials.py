@@ -1,7 +1,7 @@
-"""Test worlds of a rule from seeds unseen in training, conditions, damage, and recovery.
+"""Test worlds of a trained rule: conditions that differ from training, damage, and recovery.
 
 A damaged world is compared with its undamaged copy: the same world without the damage, run with the
-same masks.
+same update masks. Worlds start from random seeds that training does not use.
 """
 
 from __future__ import annotations
@@ -29,42 +29,42 @@ from npa_envs.world.divergence import divergence
 from npa_envs.world.particles import Particles, combined
 from npa_envs.world.randomness import StreamId, WorldRandom
 
-# Seeds of other shapes; ring, square and two blobs have the trained density.
+# Start worlds of other shapes; ring, square and two blobs have the density of training.
 
 SIZE_FACTOR = 1.5
-"""Factor on the radius of the larger disk; its inverse is that of the smaller one."""
+"""Radius of the shape "larger" / the radius of training; the inverse for "smaller"."""
 
 BLOB_DISTANCE = 1.25
-"""Distance of each blob's centre from the origin, in radii of a blob (dimensionless)."""
+"""Distance of each blob's centre from the origin / radius of a blob (dimensionless)."""
 
 Shape = Callable[[int, int, float, WorldRandom], Tensor]
-"""Makes positions [B, N, D] from N, D, the disk's radius and a random source."""
+"""Returns positions [B, N, D] for N, D, the radius of training and B worlds' random streams."""
 
 
 def disk(particle_count: int, space_dim: int, radius: float, random: WorldRandom) -> Tensor:
-    """Return positions in a disk, in 3D a ball, [B, N, D]."""
+    """Return uniform positions in a disk around the origin, in 3D in a ball, [B, N, D]."""
     sizes = (random.world_count, particle_count, space_dim, radius)
     return uniform_ball(*sizes, generator=random, device=random.device)
 
 
 def ring(particle_count: int, space_dim: int, radius: float, random: WorldRandom) -> Tensor:
-    """Return positions in a ring around a disk, of its area; in 3D in a spherical shell."""
+    """Return positions in a ring of inner radius `radius` and a disk's area, in 3D in a shell."""
     x = disk(particle_count, space_dim, radius, random)
     distance: Tensor = torch.linalg.vector_norm(x, dim=-1, keepdim=True).clamp_min(1e-12)
-    # Moves each particle so that the ring inside of it has the area that the disk had.
+    # Move each particle so that the ring inside of it has the area that the disk had.
     outer = (distance**space_dim + radius**space_dim) ** (1.0 / space_dim)
     return x * (outer / distance)
 
 
 def square(particle_count: int, space_dim: int, radius: float, random: WorldRandom) -> Tensor:
-    """Return positions in a square of a disk's area, in 3D in a cube of a ball's volume."""
+    """Return positions in a square of the disk's area, in 3D in a cube of the ball's volume."""
     side = radius * (math.sqrt(math.pi) if space_dim == 2 else (4.0 * math.pi / 3.0) ** (1.0 / 3.0))
     sizes = (random.world_count, particle_count, (side,) * space_dim)
     return uniform_box(*sizes, generator=random, device=random.device)
 
 
 def two_blobs(particle_count: int, space_dim: int, radius: float, random: WorldRandom) -> Tensor:
-    """Return positions in two disks side by side, in 3D balls, of one disk's total area."""
+    """Return positions in two disks with the disk's area together, in 3D in two balls."""
     small = radius * 0.5 ** (1.0 / space_dim)
     x = disk(particle_count, space_dim, small, random)
     side = torch.arange(particle_count, device=x.device) % 2 * 2 - 1
@@ -80,7 +80,7 @@ SHAPES: dict[str, Shape] = {
     "larger": lambda n, d, radius, random: disk(n, d, SIZE_FACTOR * radius, random),
     "smaller": lambda n, d, radius, random: disk(n, d, radius / SIZE_FACTOR, random),
 }
-"""Shapes by name, without the trained one."""
+"""Shapes of start worlds by name, without that of training."""
 
 # Conditions and plans
 
@@ -92,22 +92,23 @@ CONDITIONS = {
     "noise": "noise of every position in each step, over the perception radius",
     "shape": "shape of the seed",
 }
-"""Conditions, varied one at a time, with their summaries."""
+"""Names of the conditions, which are varied one at a time, and what their values are."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrialPlan:
-    """Steps, worlds and values of conditions with which a task's rules are measured."""
+    """Steps, worlds and values of conditions with which the rules of a task are measured."""
 
     grow_steps: int
-    """Steps from the seed to the damage, or to the loss under a condition."""
+    """Steps from the start to the damage, or to the loss under a condition."""
     heal_steps: tuple[int, ...]
-    """Steps after the damage at which losses are measured, from 0 on."""
+    """Steps after the damage at which losses are measured, the first of them 0."""
     chunk: int
     """Steps of growth are a multiple of this, also where they are scaled by dt or update_prob."""
     worlds_per_seed: int = 1
+    """Worlds whose mean loss is the loss of a seed."""
     values: Mapping[str, tuple[float | str, ...]]
-    """Increasing values of each condition, with the trained one."""
+    """Values by condition, in increasing order, with that of training among them."""
 
 
 _HEAL_STEPS = (0, 16, 32, 48, 64, 96, 128, 192, 256, 384, 512, 768, 1024)
@@ -137,11 +138,11 @@ PLANS = {
         values={name: values for name, values in _VALUES.items() if name != "shape"},
     ),
 }
-"""Plans by task."""
+"""Plans by the name of the task."""
 
 
 def quick_plan(task_name: str) -> TrialPlan:
-    """Return a plan for a task of `PLANS` that takes seconds: few steps, few values."""
+    """Return a plan of few steps and few values for a task of `PLANS`, which takes seconds."""
     values: dict[str, tuple[float | str, ...]] = {
         "eps": (0.7, 1.0, 1.4),
         "particles": (0.5, 1.0),
@@ -163,13 +164,14 @@ def quick_plan(task_name: str) -> TrialPlan:
 # Test worlds
 
 LOSS_PARTICLES = 1 << 17
-"""Most particles of a batch of worlds for a loss, as views of Gaussians take much memory."""
+"""Maximum number of particles in a batch of a loss, as views of Gaussians take much memory."""
 
 
 class RuleTrial:
-    """A rule with its task and worlds from seeds unseen in training.
+    """A trained rule, its task, and B worlds, `plan.worlds_per_seed` from each of `seeds`.
 
-    With a rule of many pictures, world k grows picture k modulo their number.
+    `name` is a shipped rule or a file; `particle_count` None: that of training. If the rule grows
+    many pictures, a world's random seed modulo their number selects the picture.
     """
 
     def __init__(
@@ -195,29 +197,29 @@ class RuleTrial:
         self.task: Any = trained.task
         self.metric_name = trained.task.trial_name
         self.particle_count = int(self.task.config.particle_count)
-        """Trained number of particles in a world."""
+        """Number of particles in a world under the conditions of training."""
         each = plan.worlds_per_seed
         self._world_seeds = [seed * each + k for seed in seeds for k in range(each)]
         self.world_count = len(self._world_seeds)
-        """Worlds B of all seeds."""
+        """Number B of all worlds."""
         self._tasks: dict[int, list[Any]] = {self.particle_count: [self.task]}
         if self.rule.codes is not None:
             tasks = tasks_of_codes(name, self.rule, device, **fields)
             self._tasks[self.particle_count] = [*tasks]
         picture_count = len(self._tasks[self.particle_count])
         self._pictures = torch.tensor(self._world_seeds, device=device) % picture_count
-        """Index of each world's task, [B]."""
+        """Index of the picture that each world grows, [B]."""
 
     def random(self, purpose: int) -> WorldRandom:
-        """Return new random streams of all worlds, for a purpose, a `StreamId`."""
+        """Return random streams of all worlds, always the same for a `purpose` (a `StreamId`)."""
         return WorldRandom(self._world_seeds, device=self.device).substream(purpose)
 
     def particles(self, fraction: float) -> int:
-        """Return a fraction of the trained number of particles."""
+        """Return the number of particles that is this fraction of that of training, 2 or more."""
         return max(2, round(fraction * self.particle_count))
 
     def tasks_of(self, particle_count: int) -> list[Any]:
-        """Return tasks with `particle_count` particles: one, or one for each picture."""
+        """Return a task for each picture that the rule grows, with `particle_count` particles."""
         if particle_count not in self._tasks:
             self._tasks[particle_count] = [
                 task.resized(particle_count).for_rule(self.rule)
@@ -226,21 +228,24 @@ class RuleTrial:
         return self._tasks[particle_count]
 
     def _by_task(self, x: Tensor) -> Iterator[tuple[Any, Tensor]]:
-        """Yield each picture's task and its worlds' indices in x, which may be several copies."""
+        """Yield the task of each picture and the indices of its worlds in x, [m B, N, D].
+
+        x may have all B worlds m times, one copy after the other.
+        """
         pictures = self._pictures.repeat(len(x) // self.world_count)
         tasks = self.tasks_of(x.shape[1])
         for k in sorted(set(pictures.tolist())):
             yield tasks[k], (pictures == k).nonzero()[:, 0]
 
     def with_codes_restored(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return states with their picture's code in the first channels, if the rule has codes."""
+        """Return a copy of the states, with the picture's code in its channels if it has one."""
         s = s.clone()
         for task, index in self._by_task(x):
             s[index] = task.with_target_code(s[index])
         return s
 
     def initial_worlds(self, fraction: float = 1.0, shape: str = "trained") -> Particles:
-        """Return fresh worlds with a fraction of the trained particles, in a shape of `SHAPES`."""
+        """Return start worlds: a fraction of the particles, in the trained shape or of `SHAPES`."""
         count = self.particles(fraction)
         random = self.random(StreamId.GROWTH)
         x, s, *_, goal = self.tasks_of(count)[0].seed(
@@ -259,8 +264,8 @@ class RuleTrial:
     ) -> tuple[Particles, Tensor]:
         """Return worlds after the last of `steps`, and losses at each of them, [len(steps), B].
 
-        `changed` overrides options of `rollout`. A world that is not finite has the loss NaN from
-        then on; it does not affect the others.
+        `changed` are options of `rollout` that replace the task's. A world that is not finite has
+        the loss NaN from then on, and does not affect the others.
         """
         task = self.tasks_of(initial.x.shape[1])[0]
         runner = RuleRunner(self.rule, task, random, **changed)
@@ -277,9 +282,9 @@ class RuleTrial:
     def losses(self, worlds: Particles, eps: float) -> Tensor:
         """Return the task's metric [B] of worlds that were run with perception radius `eps`.
 
-        In open space the dynamics do not change if positions and ε are scaled by one factor, so
-        positions are measured at the scale of training. Those in boxes and of static particles are
-        not scaled.
+        In open space, dynamics do not change if positions and ε are multiplied by one factor, so
+        the metric is that of the positions at the ε of training. In a box, and if particles are
+        static, it is that of the positions as they are.
         """
         task = self.task
         if task.box is None and not self.rule.static and eps != task.eps:
@@ -293,38 +298,41 @@ class RuleTrial:
         return losses
 
     def by_seed(self, losses: Tensor) -> Tensor:
-        """Return the mean loss of each seed's worlds, [..., seeds], from [..., B]."""
+        """Return the mean loss of each seed's worlds, [..., seeds], of losses [..., B]."""
         return losses.double().reshape(*losses.shape[:-1], len(self.seeds), -1).mean(-1)
 
 
 # Damage
 
 STATE_NOISE = 0.3
-"""Standard deviation of the noise of states (dimensionless)."""
+"""Standard deviation of the noise that the damage "noise" adds to states (dimensionless)."""
 
 Box = tuple[float, ...] | None
 Change = Callable[[Tensor, Tensor, WorldRandom, Box], tuple[Tensor, Tensor]]
-"""Makes damaged worlds from positions, states, a random source and sides of the box."""
+"""Returns damaged x and s for x, s, random streams and sides of the box; None: open space."""
 
 
 class Damage(NamedTuple):
-    """A kind of damage, and the rules that it suits."""
+    """A kind of damage, and the rules whose worlds it is done to."""
 
     apply: Change
     static: bool
-    """It also applies to particles that cannot move."""
+    """Whether it is also done to particles that cannot move."""
     halves: bool = False
-    """It removes half of the particles."""
+    """Whether it removes half of the particles."""
 
 
 def wipe(x: Tensor, s: Tensor, random: WorldRandom, box: Box) -> tuple[Tensor, Tensor]:
-    """Set all states in a disk around a random particle to zero, in 3D a ball."""
+    """Return x, and s with zero states in a disk around a random particle, in 3D in a ball."""
     centre = random_particle(x, random)
     return x, wipe_state(x, s, centre=centre, radius=DAMAGE_SIZES["wipe"], box=box)
 
 
 def slit(x: Tensor, s: Tensor, random: WorldRandom, box: Box) -> tuple[Tensor, Tensor]:
-    """Cut a slit at a random angle through the centroid, or in a periodic box a random particle."""
+    """Return x and s after a cut at a random angle, whose two sides move apart.
+
+    It goes through the centroid, in a periodic box through a random particle.
+    """
     centre = world_mean(x) if box is None else random_particle(x, random)
     normal = random.normal(x.shape[2], dtype=x.dtype)
     change = partial(cut, normal=normal, gap=DAMAGE_SIZES["cut"])
@@ -332,7 +340,7 @@ def slit(x: Tensor, s: Tensor, random: WorldRandom, box: Box) -> tuple[Tensor, T
 
 
 def pull_together(x: Tensor, s: Tensor, random: WorldRandom, box: Box) -> tuple[Tensor, Tensor]:
-    """Move all particles in a disk around a random particle to its position."""
+    """Return x, where all particles in a disk around a random one moved to its position, and s."""
     change = partial(clump, radius=DAMAGE_SIZES["clump"], factor=1.0)
     return _around(x, s, random_particle(x, random), box, change)
 
@@ -340,29 +348,29 @@ def pull_together(x: Tensor, s: Tensor, random: WorldRandom, box: Box) -> tuple[
 def _around(
     x: Tensor, s: Tensor, centre: Tensor, box: Box, change: Callable[..., tuple[Tensor, Tensor]]
 ) -> tuple[Tensor, Tensor]:
-    """Return x and s after `change` of offsets from each world's centre, to nearest images."""
+    """Return x and s after `change` of the offsets of nearest images from `centre`, [B, D]."""
     away, s = change(offsets_from(x, centre, box), s, centre=torch.zeros_like(centre))
     return nearest_image(away + centre[:, None], box), s
 
 
 def add_state_noise(x: Tensor, s: Tensor, random: WorldRandom, box: Box) -> tuple[Tensor, Tensor]:
-    """Return the positions as they are, and states plus normal noise of `STATE_NOISE`."""
+    """Return x, and s plus normal noise of standard deviation `STATE_NOISE`."""
     return x, s + STATE_NOISE * random.normal(*s.shape[1:], dtype=s.dtype)
 
 
 def remove_half(x: Tensor, s: Tensor, random: WorldRandom, box: Box) -> tuple[Tensor, Tensor]:
-    """Keep N // 2 particles, chosen at random."""
+    """Return x and s of N // 2 particles, chosen at random."""
     return _lowest_half(x, s, random.uniform(x.shape[1]))
 
 
 def remove_side(x: Tensor, s: Tensor, random: WorldRandom, box: Box) -> tuple[Tensor, Tensor]:
-    """Keep the N // 2 particles on one side of a line at a random angle, in 3D of a plane."""
+    """Return x and s of the N // 2 particles on one side of a line at a random angle."""
     normal = random.normal(x.shape[2], dtype=x.dtype)
     return _lowest_half(x, s, (x * normal[:, None]).sum(-1))
 
 
 def _lowest_half(x: Tensor, s: Tensor, key: Tensor) -> tuple[Tensor, Tensor]:
-    """Keep the N // 2 particles with the lowest keys [B, N], in their order."""
+    """Return x and s of the N // 2 particles with the lowest keys [B, N], in their order."""
     indices = key.argsort(dim=1)[:, : x.shape[1] // 2].sort(dim=1).values[..., None]
     return x.take_along_dim(indices, dim=1), s.take_along_dim(indices, dim=1)
 
@@ -381,19 +389,21 @@ DAMAGES = {
 # Recovery
 
 RECOVERED = 1.1
-"""A world has recovered once its loss is at most this many times its undamaged copy's at that step.
-"""
+"""A world has recovered once its loss / that of its undamaged copy at that step is at most this."""
 
 CONTROL = "nothing"
-"""Name of the control: undamaged worlds with other masks than the undamaged copies."""
+"""Name of the control's loss curve: undamaged worlds, with other masks than undamaged copies."""
 
 MASKS_AFTER_DAMAGE, MASKS_OF_CONTROL = 1001, 1002
-"""Random streams of the update masks after the damage, and of the control's."""
+"""Numbers of the random streams of update masks, after damage and of the control."""
 
 
 @dataclass(frozen=True)
 class LossCurve:
-    """Losses of all seeds at `steps` after a damage, and of `undamaged` copies; NaN: not finite."""
+    """Losses of each seed at `steps` after a damage, and of its undamaged copy.
+
+    Losses are NaN from the step on at which a world is not finite.
+    """
 
     damage: str
     steps: tuple[int, ...]
@@ -401,7 +411,7 @@ class LossCurve:
     undamaged: tuple[tuple[float, ...], ...]
 
     def recovery_steps(self) -> list[int | None]:
-        """Return for each seed the first of `steps` at which it has recovered, or None."""
+        """Return for each seed the first of `steps` at which it has recovered; None: never."""
         first: list[int | None] = []
         for losses, undamaged in zip(self.losses, self.undamaged, strict=True):
             # Comparisons with NaN are false.
@@ -410,13 +420,13 @@ class LossCurve:
         return first
 
     def ratios(self, index: int) -> list[float]:
-        """Return each seed's loss divided by its undamaged copy's, at `steps[index]`."""
+        """Return each seed's loss / that of its undamaged copy at `steps[index]`."""
         pairs = zip(self.losses, self.undamaged, strict=True)
         return [ratio(losses[index], undamaged[index]) for losses, undamaged in pairs]
 
 
 def ratio(loss: float, reference: float) -> float:
-    """Return a loss divided by a reference; 0 / 0 is 1, any other number / 0 infinite."""
+    """Return `loss` / `reference`; 0 / 0 is 1, another number / 0 is infinite."""
     if reference == 0.0:
         return 1.0 if loss == 0.0 else math.nan if math.isnan(loss) else math.inf
     return loss / reference
@@ -424,10 +434,10 @@ def ratio(loss: float, reference: float) -> float:
 
 @torch.no_grad()
 def healing(trial: RuleTrial, grown: Particles) -> list[LossCurve]:
-    """Damage grown worlds in every way; return a curve for the control and for each damage.
+    """Damage grown worlds in every way; return the loss curves of the control and of each damage.
 
-    Where a damage removes half of the particles, the undamaged copies are worlds that were grown
-    from half as many.
+    If a damage removes half of the particles, undamaged copies are worlds that grew with half as
+    many from the start.
     """
     growth = trial.random(StreamId.GROWTH)
     smaller, _ = trial.run(trial.initial_worlds(0.5), growth, [trial.plan.grow_steps])
@@ -450,9 +460,9 @@ def _loss_curves(
     *,
     control: bool,
 ) -> list[LossCurve]:
-    """Run undamaged copies and damaged worlds as one batch; return the loss curve of each damage.
+    """Run undamaged copies and damaged worlds in one batch; return the loss curve of each damage.
 
-    `control`: the first curve is that of undamaged worlds with other masks.
+    With `control`, the first curve is that of undamaged worlds with other masks.
     """
     steps = trial.plan.heal_steps
     masks, other_masks = (
@@ -468,7 +478,7 @@ def _loss_curves(
     worlds, keys = zip(*batch.values(), strict=True)
     random = WorldRandom.from_keys(torch.cat(keys))
     _, losses = trial.run(combined(torch.cat, worlds), random, steps)
-    # One row for each world of the batch's parts and each seed.
+    # Of each entry of the batch a row for each seed.
     rows = trial.by_seed(losses.view(len(steps), len(batch), -1)).permute(1, 2, 0).tolist()
     reference, *others = (tuple(map(tuple, row)) for row in rows)
     names = list(batch)[1:]
