@@ -135,7 +135,7 @@ def own_rewards(infos: dict[str, Any]) -> Any:
 
 
 def row_space(space: Any) -> Box:
-    """Return the space of one particle, for a world's space of shape [N, ...]."""
+    """Return one particle's part, shape [...], of a world's space of shape [N, ...]."""
     if not isinstance(space, Box) or len(space.shape) < 2:
         raise NPAError(
             "rows need an environment that gives and takes one for each particle, got the space "
@@ -146,7 +146,7 @@ def row_space(space: Any) -> Box:
 
 
 def check_row_actions(actions: Any, *shape: int) -> None:
-    """Check the shape of actions; a wrong one could be read as actions of other rows."""
+    """Raise NPAError if `actions` have another shape: they could be read as those of other rows."""
     if tuple(np.shape(actions)) != shape:
         raise NPAError(
             f"actions must have shape [rows, A] = {shape}, got {tuple(np.shape(actions))}: "
@@ -245,7 +245,7 @@ class ChangesObservations:
 
     @abstractmethod
     def changed(self, observations: Any) -> Any:
-        """Return the wrapper's observations for those of the environment, [N, P] or [B, N, P]."""
+        """Return observations of the environment, [N, P] or [B, N, P], changed by the wrapper."""
 
 
 class Observations(ChangesObservations, AnyObservationWrapper):
@@ -273,25 +273,31 @@ class EpisodeWrapper(AnyVectorWrapper):
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Start episodes, as the environment does."""
+        """Start episodes; return the environment's results, changed by `after_reset`."""
         # A copy, as wrappers of Gymnasium remove the mask from the dict.
         observations, infos = self.env.reset(seed=seed, options=options and dict(options))
         self.clock.reset(options)
         return self.after_reset(observations, infos)
 
     def step(self, actions: Any) -> VectorStep:
-        """Step all worlds, as the environment does."""
+        """Step all worlds; return the environment's results, changed by `after_step`."""
         outcome: VectorStep = self.env.step(actions)
         self.clock.step(*outcome[2:])
         return self.after_step(outcome)
 
     @abstractmethod
     def after_reset(self, observations: Any, infos: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
-        """Return the wrapper's results of a reset; called when the clock is up to date."""
+        """Return observations and infos of a reset as the wrapper changes them.
+
+        `clock` has counted the reset already.
+        """
 
     @abstractmethod
     def after_step(self, outcome: VectorStep) -> VectorStep:
-        """Return the wrapper's results of a step; called when the clock is up to date."""
+        """Return the results of a step, `outcome` of the environment, as the wrapper changes them.
+
+        `clock` has counted the step already.
+        """
 
 
 class RewardSums(EpisodeWrapper):
@@ -329,7 +335,7 @@ class RewardSums(EpisodeWrapper):
         return observations, rewards, terminations, truncations, infos | entries
 
     def reset_sums(self, worlds: NDArray[np.bool_]) -> None:
-        """Set the sums of the worlds in a mask, [B], to zero."""
+        """Set the sums of the worlds at which a mask [B] is True to zero."""
         if self.sums is not None and worlds.any():
             self.sums = self.sums.index_fill(0, world_indices(worlds, self.sums.device), 0.0)
 
@@ -355,7 +361,7 @@ class VectorObservations(ChangesObservations, EpisodeWrapper):
         return observations, rewards, terminations, truncations, infos
 
     def _updated(self, observations: Any) -> Any:
-        """Update the statistics with those observations that are new, and return all changed."""
+        """Update the statistics with the new ones of `observations`, and return all, changed."""
         observed: Any = self.clock.observed
         if observed.all():
             self.update(observations)

@@ -206,7 +206,7 @@ def _budgets(options: CompareOptions) -> dict[Axis, float]:
 def _chosen_methods(
     arguments: Sequence[str], known: Iterable[str]
 ) -> tuple[list[str], dict[str, str]]:
-    """Return the names of the methods to run; of those given as NAME=METHOD also METHOD by NAME."""
+    """Return the names of the methods to run, and METHOD by NAME of arguments NAME=METHOD."""
     from npa_envs.agents.learning import method_options
 
     known = list(known)
@@ -252,7 +252,10 @@ def _method_options(
 
 
 def _jobs(options: CompareOptions) -> int:
-    """Return the number of runs at a time; with `learning_seconds`, a multiple of the devices."""
+    """Return how many runs learn at the same time.
+
+    Raises NPAError if it is no multiple of the number of devices where wall time is compared.
+    """
     count = len(options.devices or (options.device,))
     jobs = count if options.jobs is None else options.jobs
     if options.learning_seconds is not None and jobs % count:

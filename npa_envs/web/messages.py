@@ -95,6 +95,10 @@ class Range(NamedTuple):
         return int(value) if self.whole else float(value)
 
 
+SEEDS = Range(0, 2**53, whole=True)
+"""The seeds of worlds: JavaScript has these whole numbers."""
+
+
 class Brush(NamedTuple):
     """A brush of the viewer: its button, and when it sends messages."""
 
@@ -169,8 +173,3 @@ def _checked_vector(name: str, value: Any, length: int, like: Tensor) -> Tensor:
     if not fits or max(map(abs, value)) > 1e4:
         raise NPAError(f"{name} must be {length} finite numbers, got {shown(value)}")
     return like.new_tensor([value])
-
-
-def checked_seed(value: Any) -> int:
-    """Return `value` if it is a valid seed, a whole number from 0 to 2^53; else raise NPAError."""
-    return int(Range(0, 2**53, whole=True).checked("seed", value))
