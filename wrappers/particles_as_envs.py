@@ -1,4 +1,4 @@
-"""Particles as environments of their own, the rows of a vector environment, as RLlib needs it."""
+"""Particles as environments of their own, the rows of a vector environment, as RLlib needs them."""
 
 from __future__ import annotations
 

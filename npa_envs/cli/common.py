@@ -195,7 +195,7 @@ class MeasureOptions(RunOptions, TimeLimitOptions):
 
 
 def check_numbers(options: Any, **least: int) -> None:
-    """Raise NPAError for options, not None, below their numbers in `least`, or `max_seconds` <= 0."""
+    """Check that options, unless None, are at least as in `least`, and `max_seconds` above 0."""
     for name, smallest in least.items():
         value = getattr(options, name)
         if value is not None and value < smallest:

@@ -126,30 +126,9 @@ def make_plan(options: CompareOptions) -> ComparisonPlan:
     from npa_envs.agents.comparison import npa_bench
     from npa_envs.agents.comparison.plan import LEFT_OUT, PROBLEMS, ComparisonPlan, make_problem
     from npa_envs.agents.learning import METHODS
-    from npa_envs.agents.learning.problem import RUNS
 
-    common.check_numbers(options, seed_count=1, episodes=1, jobs=1, threads=1)
-    if options.seed_count is not None and options.seed_count > RUNS:
-        raise NPAError(
-            f"seed_count must be at most {RUNS}, got {options.seed_count}: later runs would learn "
-            "in the worlds of evaluations"
-        )
-    quick = options.quick
+    options, quick = _checked(options), options.quick
     suite = None if options.suite is None else npa_bench.SUITES[options.suite]
-    if suite:
-        for name in ("learning_seconds", "particle_steps", "episodes"):
-            if getattr(options, name) is not None:
-                raise NPAError(
-                    f"--{name.replace('_', '-')} must not be given with --suite, whose protocol is "
-                    "frozen: leave it out, or compare without a suite"
-                )
-    elif quick:
-        options = replace(
-            options,
-            tasks=options.tasks or ("morphogenesis2d",),
-            methods=options.methods or ("gradient", "evolution", "zero"),
-            seed_count=options.seed_count or 1,
-        )
     tasks = common.chosen_names("task", options.tasks, suite.tasks if suite else PROBLEMS)
     if suite and quick and not options.tasks:
         tasks = tasks[:1]
@@ -184,6 +163,30 @@ def make_plan(options: CompareOptions) -> ComparisonPlan:
         methods=methods, seeds=tuple(range(options.seed_count or seeds)), budgets=budgets,
         options=changed_options, own=own, left_out=left_out,
         episodes=options.episodes or (4 if quick else episodes), settings=_settings(options),
+    )  # fmt: skip
+
+
+def _checked(options: CompareOptions) -> CompareOptions:
+    """Return the options with the defaults of `--quick`; raise NPAError for wrong ones."""
+    from npa_envs.agents.learning.problem import RUNS
+
+    common.check_numbers(options, seed_count=1, episodes=1, jobs=1, threads=1)
+    if options.seed_count is not None and options.seed_count > RUNS:
+        raise NPAError(
+            f"seed_count must be at most {RUNS}, got {options.seed_count}: later runs would learn "
+            "in the worlds of evaluations"
+        )
+    for name in ("learning_seconds", "particle_steps", "episodes"):
+        if options.suite is not None and getattr(options, name) is not None:
+            raise NPAError(
+                f"--{name.replace('_', '-')} must not be given with --suite, whose protocol is "
+                "frozen: leave it out, or compare without a suite"
+            )
+    if options.suite is not None or not options.quick:
+        return options
+    return replace(
+        options, tasks=options.tasks or ("morphogenesis2d",), seed_count=options.seed_count or 1,
+        methods=options.methods or ("gradient", "evolution", "zero"),
     )  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""The base class of worlds that a page shows and changes while they run, and particles' colours."""
+"""Base class of worlds that a page shows and changes while they run; colours of particles."""
 
 from __future__ import annotations
 

@@ -75,10 +75,8 @@ function namedLocals(parameters, integers, vectors) {
   };
 }
 
-const AXES = ["X", "Y", "Z"];
-
-// The factors of a particle's neighbours in the sums.
-const LISTS = ["smoothing", "slopeX", "slopeY", "slopeZ"];
+// The axes, and the factors of a particle's neighbours in the sums.
+const AXES = ["X", "Y", "Z"], LISTS = ["smoothing", "slopeX", "slopeY", "slopeZ"];
 
 // sumNeighbours(states, own, listBytes, stateAt, smoothing, slopeX, slopeY, slopeZ, sums): addresses in bytes; `own` is
 // that of the particle's state.
