@@ -135,7 +135,7 @@ def own_rewards(infos: dict[str, Any]) -> Any:
 
 
 def row_space(space: Any) -> Box:
-    """Return one particle's part, shape [...], of a world's space of shape [N, ...]."""
+    """Return the space of a row, which is one particle's, for a world's space of shape [N, ...]."""
     if not isinstance(space, Box) or len(space.shape) < 2:
         raise NPAError(
             "rows need an environment that gives and takes one for each particle, got the space "
@@ -361,7 +361,7 @@ class VectorObservations(ChangesObservations, EpisodeWrapper):
         return observations, rewards, terminations, truncations, infos
 
     def _updated(self, observations: Any) -> Any:
-        """Update the statistics with the new ones of `observations`, and return all, changed."""
+        """Update the statistics with the new observations, and return all observations, changed."""
         observed: Any = self.clock.observed
         if observed.all():
             self.update(observations)

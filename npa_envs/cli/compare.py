@@ -257,7 +257,7 @@ def _method_options(
 def _jobs(options: CompareOptions) -> int:
     """Return how many runs learn at the same time.
 
-    Raises NPAError if it is no multiple of the number of devices where wall time is compared.
+    Raises NPAError if this is no multiple of the number of devices where wall time is compared.
     """
     count = len(options.devices or (options.device,))
     jobs = count if options.jobs is None else options.jobs

@@ -159,7 +159,7 @@ class Command(Generic[ConfigT]):
 def _parse_fields(
     defaults: ConfigT, task_name: str, arguments: Sequence[str]
 ) -> tuple[TrainOptions, ConfigT]:
-    """Parse options that have the names of the fields of `defaults`, a task of one species."""
+    """Return the options of the run, and `defaults` with the values of options for its fields."""
     description = f"Train on {task_name}. Defaults shown are those of the preset."
     if {"-h", "--help"} & set(arguments):
         description += f" All options: npa-envs train {task_name} --help-all"
@@ -228,7 +228,7 @@ class JointOptions(JointTrainConfig[SpeciesOptions]):
 def _parse_joint(
     base: JointTrainConfig[CoMorphogenesis2DConfig], task_name: str, arguments: Sequence[str]
 ) -> tuple[TrainOptions, JointTrainConfig[CoMorphogenesis2DConfig]]:
-    """Parse options that change the fields of all species of `base`."""
+    """As `_parse_fields`; an option for a field of a species changes it for all species."""
     task = base.task
     targets = tuple(species.target for species in task.species)
     species_options: list[SpeciesOptions] = []

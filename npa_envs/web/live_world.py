@@ -32,6 +32,7 @@ class LiveWorld(ABC):
         self.playing = True
         """Whether it runs; else it makes steps only by the message "step"."""
         self.speed = 1
+        """Steps from one frame to the next."""
         self.show = "colours"
         self._loss_wanted = False
         self._colouring = Colouring()

@@ -342,7 +342,7 @@ class RuleWorld(LiveWorld):
         room = MAX_PARTICLES[self._device.type] - self.particles.x.shape[1]
         if count > room:
             raise NPAError(f"the world has room for {max(room, 0)} particles more, got {count}")
-        # A new species divides densities by its own number of particles, as in a world alone.
+        # A new species divides densities by its own number of particles, as in a world of its own.
         index = self._species_index(use.rule, float(count))
         zeros = self.particles.map(lambda value: value.new_zeros(1, count, *value.shape[2:]))
         ball = uniform_ball(

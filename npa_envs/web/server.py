@@ -150,7 +150,7 @@ def make_app(site: Site) -> Starlette:
     async def connect(page: WebSocket) -> None:
         host, origin = page.headers.get("host", ""), page.headers.get("origin")
         if not site.allows_host(host) or origin not in (None, f"http://{host}", f"https://{host}"):
-            return await page.close(1008, "this server answers its own page alone")
+            return await page.close(1008, "this server answers only its own page")
         if not site.allows_token(page.query_params.get("token")):
             return await page.close(1008, "the token is missing or wrong")
         await page.accept()
