@@ -192,7 +192,7 @@ class ParticleRowsBase:
 
 
 class EpisodeClock:
-    """Step counts and restarts of each world of a vector environment, on the CPU.
+    """Counts steps of each world of a vector environment, and notes restarts, on the CPU.
 
     With `AutoresetMode.SAME_STEP` it waits for the device only in steps in which episodes end.
     """
@@ -373,7 +373,10 @@ class VectorObservations(ChangesObservations, EpisodeWrapper):
 
 
 class WrapperBase(RecordConstructorArgs):
-    """First base class of wrappers that exist for one world and, named "Vector...", for many."""
+    """First base class of wrappers that exist twice: for one world, and as "Vector..." for many.
+
+    It checks the class of the environment, and records `arguments` for the environment's spec.
+    """
 
     def __init__(self, env: Any, **arguments: Any) -> None:
         self.many = isinstance(self, EpisodeWrapper)

@@ -86,8 +86,9 @@ SECURITY = {
 class Site:
     """What a server serves: its worlds, address and token.
 
-    `make_world` makes the world of a page, in the thread that runs it. With `one_at_a_time` worlds
-    do not run together: a CUDA graph of one thread must not capture another's work.
+    `make_world` makes the world of a page, in the thread that runs it. `films` is the folder for
+    films. With `one_at_a_time` worlds do not run at the same time: a CUDA graph of one thread must
+    not capture another's work.
     """
 
     def __init__(
