@@ -135,7 +135,7 @@ def own_rewards(infos: dict[str, Any]) -> Any:
 
 
 def row_space(space: Any) -> Box:
-    """Return the space of one particle, for a world's space of shape [N, ...]."""
+    """Return the space of a row, which is one particle's, for a world's space of shape [N, ...]."""
     if not isinstance(space, Box) or len(space.shape) < 2:
         raise NPAError(
             "rows need an environment that gives and takes one for each particle, got the space "
@@ -146,7 +146,7 @@ def row_space(space: Any) -> Box:
 
 
 def check_row_actions(actions: Any, *shape: int) -> None:
-    """Check the shape of actions; a wrong one could be read as actions of other rows."""
+    """Raise NPAError if `actions` have another shape: they could be read as those of other rows."""
     if tuple(np.shape(actions)) != shape:
         raise NPAError(
             f"actions must have shape [rows, A] = {shape}, got {tuple(np.shape(actions))}: "
@@ -192,7 +192,7 @@ class ParticleRowsBase:
 
 
 class EpisodeClock:
-    """Step counts and restarts of each world of a vector environment, on the CPU.
+    """Counts steps of each world of a vector environment, and notes restarts, on the CPU.
 
     With `AutoresetMode.SAME_STEP` it waits for the device only in steps in which episodes end.
     """
@@ -245,7 +245,7 @@ class ChangesObservations:
 
     @abstractmethod
     def changed(self, observations: Any) -> Any:
-        """Return the wrapper's observations for those of the environment, [N, P] or [B, N, P]."""
+        """Return observations of the environment, [N, P] or [B, N, P], changed by the wrapper."""
 
 
 class Observations(ChangesObservations, AnyObservationWrapper):
@@ -273,25 +273,31 @@ class EpisodeWrapper(AnyVectorWrapper):
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Start episodes, as the environment does."""
+        """Start episodes; return the environment's results, changed by `after_reset`."""
         # A copy, as wrappers of Gymnasium remove the mask from the dict.
         observations, infos = self.env.reset(seed=seed, options=options and dict(options))
         self.clock.reset(options)
         return self.after_reset(observations, infos)
 
     def step(self, actions: Any) -> VectorStep:
-        """Step all worlds, as the environment does."""
+        """Step all worlds; return the environment's results, changed by `after_step`."""
         outcome: VectorStep = self.env.step(actions)
         self.clock.step(*outcome[2:])
         return self.after_step(outcome)
 
     @abstractmethod
     def after_reset(self, observations: Any, infos: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
-        """Return the wrapper's results of a reset; called when the clock is up to date."""
+        """Return observations and infos of a reset as the wrapper changes them.
+
+        `clock` has counted the reset already.
+        """
 
     @abstractmethod
     def after_step(self, outcome: VectorStep) -> VectorStep:
-        """Return the wrapper's results of a step; called when the clock is up to date."""
+        """Return the results of a step, `outcome` of the environment, as the wrapper changes them.
+
+        `clock` has counted the step already.
+        """
 
 
 class RewardSums(EpisodeWrapper):
@@ -329,7 +335,7 @@ class RewardSums(EpisodeWrapper):
         return observations, rewards, terminations, truncations, infos | entries
 
     def reset_sums(self, worlds: NDArray[np.bool_]) -> None:
-        """Set the sums of the worlds in a mask, [B], to zero."""
+        """Set the sums of the worlds at which a mask [B] is True to zero."""
         if self.sums is not None and worlds.any():
             self.sums = self.sums.index_fill(0, world_indices(worlds, self.sums.device), 0.0)
 
@@ -355,7 +361,7 @@ class VectorObservations(ChangesObservations, EpisodeWrapper):
         return observations, rewards, terminations, truncations, infos
 
     def _updated(self, observations: Any) -> Any:
-        """Update the statistics with those observations that are new, and return all changed."""
+        """Update the statistics with the new observations, and return all observations, changed."""
         observed: Any = self.clock.observed
         if observed.all():
             self.update(observations)
@@ -367,7 +373,10 @@ class VectorObservations(ChangesObservations, EpisodeWrapper):
 
 
 class WrapperBase(RecordConstructorArgs):
-    """First base class of wrappers that exist for one world and, named "Vector...", for many."""
+    """First base class of wrappers that exist twice: for one world, and as "Vector..." for many.
+
+    It checks the class of the environment, and records `arguments` for the environment's spec.
+    """
 
     def __init__(self, env: Any, **arguments: Any) -> None:
         self.many = isinstance(self, EpisodeWrapper)

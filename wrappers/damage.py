@@ -65,7 +65,7 @@ class _DamagesWorlds(WrapperBase):
         return due
 
     def _damaged_particles(self, due: NDArray[np.bool_]) -> Particles:
-        """Return the particles of all worlds, damaged by the events `due` there [E, B]."""
+        """Return new particles of all worlds, damaged by the events in the mask `due` [E, B]."""
         worlds = self._base.worlds
         particles = Particles(worlds.x.clone(), worlds.s.clone())
         for k, (event, mask) in enumerate(zip(self.events, due, strict=True), self._first):
@@ -73,12 +73,9 @@ class _DamagesWorlds(WrapperBase):
                 chosen = world_indices(mask, worlds.x.device)
                 stream = worlds.random.take(chosen).substream(StreamId.DAMAGE).substream(k)
                 damaged = damage_worlds(
-                    particles.take(chosen),
-                    kind=event.kind,
-                    size=event.size,
-                    box=worlds.physics.periodic_box,
-                    generator=stream,
-                )
+                    particles.take(chosen), kind=event.kind, size=event.size,
+                    box=worlds.physics.periodic_box, generator=stream,
+                )  # fmt: skip
                 particles.put_(chosen, damaged)
         return particles
 
@@ -112,7 +109,10 @@ class DamageEvents(_DamagesWorlds, AnyWrapper):
         return self._damaged(observation, info)
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Step the world; then the events of this step damage it, unless the episode is over."""
+        """Step the world, then damage it by the events of this step, unless the episode is over.
+
+        Observation and info are those of the damaged world.
+        """
         observation, reward, terminated, truncated, info = self.env.step(action)
         self._elapsed += 1
         if not (terminated or truncated):
@@ -140,12 +140,12 @@ class VectorDamageEvents(_DamagesWorlds, EpisodeWrapper):
     """
 
     def after_reset(self, observations: Any, infos: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
-        """Damage the restarted worlds that have an event at step 0."""
+        """Damage the restarted worlds that have an event at step 0; return the changed results."""
         due = self._due(self.clock.elapsed) & self.clock.restarted
         return self._damaged(due, observations, infos) if due.any() else (observations, infos)
 
     def after_step(self, outcome: VectorStep) -> VectorStep:
-        """Damage the worlds with an event at this step of their episodes."""
+        """Damage the worlds that have an event at this step; return the changed results."""
         observations, rewards, terminations, truncations, infos = outcome
         due = self._due(self.clock.elapsed) & (self.clock.restarted | ~self.clock.ended)
         if due.any():

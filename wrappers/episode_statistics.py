@@ -75,6 +75,6 @@ class TorchRecordEpisodeStatistics(RewardSums):
         return rewards, {self._key: episode, f"_{self._key}": mask}
 
     def reset_sums(self, worlds: NDArray[np.bool_]) -> None:
-        """Reset reward sums and starting times of the worlds in a mask, [B]."""
+        """Reset reward sums and starting times of the worlds at which a mask [B] is True."""
         super().reset_sums(worlds)
         self._began[worlds] = time.perf_counter()

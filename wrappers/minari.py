@@ -102,7 +102,7 @@ def _recorded(env: Any, policy: Callable[[Any], Any], seeds: list[int]) -> list[
 
 
 def _mapped(function: Callable[..., Any], *values: Any) -> Any:
-    """Return `function(*values)`; of dictionaries a dictionary of its results by key."""
+    """Return `function(*values)`; if values are dictionaries, a dictionary of it for each key."""
     if isinstance(values[0], dict):
         return {name: _mapped(function, *(v[name] for v in values)) for name in values[0]}
     return function(*values)
@@ -150,12 +150,9 @@ def write_dataset(
             # Minari warns about missing authors, addresses and links to code.
             warnings.simplefilter("ignore", UserWarning)
             dataset = minari.create_dataset_from_buffers(
-                dataset_id,
-                [next(episodes)],
-                env=spec,
-                algorithm_name=algorithm,
+                dataset_id, [next(episodes)], env=spec, algorithm_name=algorithm,
                 description=description,
-            )
+            )  # fmt: skip
             for episode in episodes:
                 dataset.update_dataset_from_buffer([episode])
         namespace = dataset_id.rpartition("/")[0]

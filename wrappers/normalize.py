@@ -64,7 +64,7 @@ class RunningMoments:
         return {"mean": self.mean.cpu().clone(), "var": self.var.cpu().clone(), "count": count}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Set mean, variance and count to those that `state_dict` returned."""
+        """Set mean, variance and count, as `state_dict` returned them."""
         expected = {"mean": self.mean.shape, "var": self.var.shape, "count": torch.Size()}
         for name in state.keys() ^ expected.keys():
             fault = "unknown" if name in state else "missing"
@@ -133,9 +133,8 @@ class _PerceptionNormalizer(WrapperBase):
         density = square[-space_dim:].mean(dim=0, keepdim=True)
         self.statistics.update(
             torch.cat((mean[:centred], torch.zeros_like(square[: state_dim + 1]))),
-            torch.cat((var[:centred], gradients, density)),
-            len(z),
-        )
+            torch.cat((var[:centred], gradients, density)), len(z),
+        )  # fmt: skip
 
     def changed(self, observations: Any) -> Any:
         """Return perception normalised and clipped, in new float32 arrays or tensors."""

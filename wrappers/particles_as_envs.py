@@ -1,4 +1,4 @@
-"""Particles as the rows of another Gymnasium vector environment, as RLlib needs it."""
+"""Particles as environments of their own, the rows of a vector environment, as RLlib needs them."""
 
 from __future__ import annotations
 
@@ -58,8 +58,8 @@ class ParticleRows(ParticleRowsBase, BatchedSpaces):
     def step(self, actions: Any) -> VectorStep:
         """Step all worlds by actions [B N, A]; return the rows' results and no infos.
 
-        Actions of a wrong shape raise an NPAError, and those that are not finite a DivergedError,
-        before the worlds change.
+        Raises NPAError for actions of a wrong shape, and DivergedError for actions that are not
+        finite; the worlds then stay as they are.
         """
         rows, rewards, ended, cut, _ = self.step_worlds(actions)
         return to_host(rows), to_host(rewards).astype(np.float64), to_host(ended), to_host(cut), {}

@@ -116,7 +116,8 @@ def rllib_rows_config(name: str, *, world_count: int = 4, **keywords: Any) -> PP
     register_env(name, partial(_make_rows, name))
     config: PPOConfig = PPOConfig().environment(name, env_config=keywords)
     mode = gymnasium.VectorizeMode.VECTOR_ENTRY_POINT
-    return config.env_runners(gym_env_vectorize_mode=mode, num_envs_per_env_runner=rows)
+    config.env_runners(gym_env_vectorize_mode=mode, num_envs_per_env_runner=rows)
+    return config
 
 
 def _check_id(name: str, known: Collection[str], others: Collection[str], function: str) -> None:

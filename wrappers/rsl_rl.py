@@ -29,7 +29,7 @@ class RslRlParticleEnv(ParticleRowsBase, VecEnv):  # type: ignore[misc]
     Args:
         env: A vector environment of this package, wrapped or not, made with `output="torch"`, with
             same-step autoreset and `copy=True` (the default), as RSL-RL stores the tensors.
-        seed: World w begins with the episode of seed + w; None: a drawn one.
+        seed: World w begins with the episode of seed + w; None: a random one.
     """
 
     def __init__(self, env: AnyVectorEnv, *, seed: int | None = None) -> None:

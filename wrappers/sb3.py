@@ -40,7 +40,7 @@ class SharedInfo(dict[str, Any]):
 
     def _refuse(self, *_: Any, **__: Any) -> NoReturn:
         raise NPAError(
-            "info of a row whose episode goes on is shared by all such rows: "
+            "info of a row whose episode continues is shared by all such rows: "
             "put a copy into the list, infos[row] = dict(infos[row])"
         )
 
@@ -64,7 +64,7 @@ class RowVecEnv(VecEnv):
         """Rows of a world, R."""
         self.spec = getattr(env, "spec", None)
         self.shared_info: dict[str, Any] = SharedInfo()
-        """The info of all rows whose episodes go on."""
+        """The info of all rows whose episodes continue."""
         self._actions: NDArray[np.float32] | None = None
         self._observations: Any = None
         super().__init__(world_count * row_count, observation_space, action_space)
@@ -111,7 +111,7 @@ class RowVecEnv(VecEnv):
     def seed(self, seed: int | None = None) -> list[int | None]:
         """Set the seeds of the next reset, seed + k for world k; return each row's seed.
 
-        If `seed` is None, it is drawn.
+        If `seed` is None, it is random.
         """
         first = int(np.random.default_rng().integers(2**32) if seed is None else seed)
         worlds = np.arange(self.world_count).repeat(self.row_count)
@@ -273,12 +273,9 @@ class ParticleVecEnv(_EpisodeRows):
         self.bootstrap = bootstrap
         self.particle_count = base.config.particle_count
         super().__init__(
-            env,
-            base.num_envs,
-            self.particle_count,
-            row_space(env.single_observation_space),
+            env, base.num_envs, self.particle_count, row_space(env.single_observation_space),
             row_space(env.single_action_space),
-        )
+        )  # fmt: skip
 
 
 class WorldVecEnv(_EpisodeRows):
@@ -318,7 +315,7 @@ class RowPolicy:
 
     Args:
         model: The model; training it further changes the policy.
-        deterministic: Whether it acts by its mean instead of a draw.
+        deterministic: Whether it acts by its mean instead of a random action.
         tag: One-hot species to append to each row, shape [species]; None: nothing.
     """
 
@@ -415,10 +412,8 @@ class SpeciesVecEnv(RowVecEnv):
         live = {name: as_tensor(infos[name]["live"]) for name in self.rows_of}
         row_observations, row_rewards, ended, cut = on_host(
             torch.where(self._repeated(live)[..., None], self._rows(observed), 0.0),
-            self._repeated(rewards),
-            self._repeated(terminations),
-            self._repeated(truncations),
-        )
+            self._repeated(rewards), self._repeated(terminations), self._repeated(truncations),
+        )  # fmt: skip
         done = ended | cut
         first = infos[self.rows_of[0]]
         if "final_obs" in first:
@@ -445,7 +440,7 @@ class SpeciesVecEnv(RowVecEnv):
         Args:
             model: The model.
             species: Name of the species, one of `rows_of`.
-            deterministic: Whether it acts by its mean instead of a draw.
+            deterministic: Whether it acts by its mean instead of a random action.
         """
         if species not in self.rows_of:
             raise NPAError(

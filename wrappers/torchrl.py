@@ -87,12 +87,9 @@ class NPATorchRLEnv(EnvBase):  # type: ignore[misc]
         else:
             reward = self._spread(reward)
         return self._entries(
-            observation,
-            reward=reward,
-            done=self._spread(terminated | truncated),
-            terminated=self._spread(terminated),
-            truncated=self._spread(truncated),
-        )
+            observation, reward=reward, done=self._spread(terminated | truncated),
+            terminated=self._spread(terminated), truncated=self._spread(truncated),
+        )  # fmt: skip
 
     def _set_seed(self, seed: int | None) -> None:
         self._first_seed = seed

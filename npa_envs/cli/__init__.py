@@ -57,9 +57,9 @@ HINTS = {
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line, by default the process's arguments, and return the exit code.
+    """Run the command in `arguments`, by default those of the process; return the exit code.
 
-    The code is 0; 1 if a check or a run failed; `ERROR`; or `INTERRUPTED`, after Ctrl-C.
+    The code is 0; 1 if a check or a run failed; 2 after an error (`ERROR`); 130 after Ctrl-C.
     """
     # Read when torch is loaded. On a busy machine, threads that wait in busy loops make every
     # operation several times as slow.

@@ -1,4 +1,4 @@
-"""Parts of all commands: options, output folders, checks, progress bars."""
+"""What several commands share: options, output folders, checks of options, progress bars."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ class RuleOptions(RunOptions):
 
 
 def named_rules(arguments: Iterable[str]) -> dict[str, str]:
-    """Return a dict from rules' names to what `load_rule` takes: a name, a file or a run folder."""
+    """Return sources for `load_rule` by rule's name, of names, files or run folders."""
     from npa_envs.rule.files import preset_rules, rule_name, shipped_rules
 
     arguments = list(arguments)
@@ -123,7 +123,7 @@ def named_rules(arguments: Iterable[str]) -> dict[str, str]:
 
 
 def duration(seconds: float) -> str:
-    """Return a time [s] as text, in seconds, minutes or hours."""
+    """Return a time [s] as rounded text, for example "3 minutes"."""
     for unit, size in (("hours", 3600.0), ("minutes", 60.0)):
         if seconds >= 1.5 * size:
             return f"{seconds / size:.0f} {unit}"
@@ -195,10 +195,7 @@ class MeasureOptions(RunOptions, TimeLimitOptions):
 
 
 def check_numbers(options: Any, **least: int) -> None:
-    """Raise NPAError for an option that is neither None nor at least its number in `least`.
-
-    Also for `max_seconds`, if there is this option, unless it is positive.
-    """
+    """Check that options, unless None, are at least as in `least`, and `max_seconds` above 0."""
     for name, smallest in least.items():
         value = getattr(options, name)
         if value is not None and value < smallest:
@@ -209,7 +206,10 @@ def check_numbers(options: Any, **least: int) -> None:
 
 
 def named_values(name: str, arguments: Iterable[str]) -> dict[str, Any]:
-    """Parse the arguments NAME=VALUE of the option `name`; values are JSON or plain text."""
+    """Return values by NAME of arguments NAME=VALUE; each is read as JSON, or else stays text.
+
+    `name` is the option that has these arguments, for errors.
+    """
     values: dict[str, Any] = {}
     for word in arguments:
         key, mark, value = word.partition("=")
@@ -223,7 +223,10 @@ def named_values(name: str, arguments: Iterable[str]) -> dict[str, Any]:
 
 
 def problem_of(options: Any, num_envs: int, steps: int | None = None) -> Problem:
-    """Return the environment of `options` as a problem to learn; default `steps`: as registered."""
+    """Return the problem to learn the environment of `options`, in `num_envs` worlds at a time.
+
+    `steps` is the length of episodes; None: as registered.
+    """
     from npa_envs.agents.learning.problem import Problem, registration_of
 
     steps = registration_of(options.env).steps if steps is None else steps
@@ -275,7 +278,10 @@ def resolve_run(arguments: Sequence[str], out_of: Callable[[Sequence[str]], Path
 
 
 def chosen_names(noun: str, names: Sequence[str], known: Iterable[str]) -> list[str]:
-    """Return `names` in the order of `known`, or all known ones; an error calls them `noun`."""
+    """Return `names` in the order of `known`; all of `known` if there are none.
+
+    Raises NPAError for an unknown name, which it calls a `noun`.
+    """
     known = list(known)
     for name in names:
         if name not in known:
@@ -300,7 +306,10 @@ def torch_threads(count: int) -> Iterator[None]:
 def progress_bar(
     total: int | None, *, show: bool, unit: str = "step"
 ) -> Iterator[Callable[[int], Any]]:
-    """Show a progress bar; yield a function that is called with the steps since its last call."""
+    """Show a progress bar of `total` units; None: their number is unknown.
+
+    Yields a function to call with the number of units that were done since its last call.
+    """
     with tqdm(total=total, disable=not show, unit=unit) as bar:
         yield bar.update
 
@@ -309,7 +318,7 @@ def progress_bar(
 def measuring(
     options: Any, total: int | None, unit: str = "step"
 ) -> Iterator[Callable[[int], Any]]:
-    """Show a progress bar and use `options.threads` CPU threads within a `with` block."""
+    """As `progress_bar`, also with `options.threads` CPU threads within the `with` block."""
     with (
         progress_bar(total, show=options.progress, unit=unit) as advance,
         torch_threads(options.threads),

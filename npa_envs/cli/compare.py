@@ -126,30 +126,9 @@ def make_plan(options: CompareOptions) -> ComparisonPlan:
     from npa_envs.agents.comparison import npa_bench
     from npa_envs.agents.comparison.plan import LEFT_OUT, PROBLEMS, ComparisonPlan, make_problem
     from npa_envs.agents.learning import METHODS
-    from npa_envs.agents.learning.problem import RUN_SEED_COUNT
 
-    common.check_numbers(options, seed_count=1, episodes=1, jobs=1, threads=1)
-    if options.seed_count is not None and options.seed_count > RUN_SEED_COUNT:
-        raise NPAError(
-            f"seed_count must be at most {RUN_SEED_COUNT}, got {options.seed_count}: later "
-            "runs would learn in the worlds of evaluations"
-        )
-    quick = options.quick
+    options, quick = _checked(options), options.quick
     suite = None if options.suite is None else npa_bench.SUITES[options.suite]
-    if suite:
-        for name in ("learning_seconds", "particle_steps", "episodes"):
-            if getattr(options, name) is not None:
-                raise NPAError(
-                    f"--{name.replace('_', '-')} must not be given with --suite, whose protocol is "
-                    "frozen: leave it out, or compare without a suite"
-                )
-    elif quick:
-        options = replace(
-            options,
-            tasks=options.tasks or ("morphogenesis2d",),
-            methods=options.methods or ("gradient", "evolution", "zero"),
-            seed_count=options.seed_count or 1,
-        )
     tasks = common.chosen_names("task", options.tasks, suite.tasks if suite else PROBLEMS)
     if suite and quick and not options.tasks:
         tasks = tasks[:1]
@@ -187,6 +166,30 @@ def make_plan(options: CompareOptions) -> ComparisonPlan:
     )  # fmt: skip
 
 
+def _checked(options: CompareOptions) -> CompareOptions:
+    """Return the options with the defaults of `--quick`; raise NPAError for wrong ones."""
+    from npa_envs.agents.learning.problem import RUN_SEED_COUNT
+
+    common.check_numbers(options, seed_count=1, episodes=1, jobs=1, threads=1)
+    if options.seed_count is not None and options.seed_count > RUN_SEED_COUNT:
+        raise NPAError(
+            f"seed_count must be at most {RUN_SEED_COUNT}, got {options.seed_count}: later "
+            "runs would learn in the worlds of evaluations"
+        )
+    for name in ("learning_seconds", "particle_steps", "episodes"):
+        if options.suite is not None and getattr(options, name) is not None:
+            raise NPAError(
+                f"--{name.replace('_', '-')} must not be given with --suite, whose protocol is "
+                "frozen: leave it out, or compare without a suite"
+            )
+    if options.suite is not None or not options.quick:
+        return options
+    return replace(
+        options, tasks=options.tasks or ("morphogenesis2d",), seed_count=options.seed_count or 1,
+        methods=options.methods or ("gradient", "evolution", "zero"),
+    )  # fmt: skip
+
+
 def _budgets(options: CompareOptions) -> dict[BudgetKind, float]:
     seconds, steps = options.learning_seconds, options.particle_steps
     if options.quick and steps is None and seconds is None:
@@ -206,7 +209,7 @@ def _budgets(options: CompareOptions) -> dict[BudgetKind, float]:
 def _chosen_methods(
     arguments: Sequence[str], known: Iterable[str]
 ) -> tuple[list[str], dict[str, str]]:
-    """Return the names of the methods to run; of those given as NAME=METHOD also METHOD by NAME."""
+    """Return the names of the methods to run, and METHOD by NAME of arguments NAME=METHOD."""
     from npa_envs.agents.learning import method_options
 
     known = list(known)
@@ -252,7 +255,10 @@ def _method_options(
 
 
 def _jobs(options: CompareOptions) -> int:
-    """Return the number of runs at a time; with `learning_seconds`, a multiple of the devices."""
+    """Return how many runs learn at the same time.
+
+    Raises NPAError if this is no multiple of the number of devices where wall time is compared.
+    """
     count = len(options.devices or (options.device,))
     jobs = count if options.jobs is None else options.jobs
     if options.learning_seconds is not None and jobs % count:

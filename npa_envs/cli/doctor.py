@@ -139,7 +139,7 @@ def _no_cuda(built: str | None) -> DoctorLine:
         fix = "slow for large worlds: use the presets fast and tiny, which are made for CPUs"
         return DoctorLine("cuda", "no NVIDIA GPU, or no driver for it", fix, optional=True)
     if built is None:
-        why = "this torch is a build for CPUs alone"
+        why = "this torch is a build for CPUs only"
         fix = "pip uninstall torch, then install its CUDA build: https://pytorch.org/get-started"
     elif (hidden := os.environ.get("CUDA_VISIBLE_DEVICES")) is not None:
         why = f"CUDA_VISIBLE_DEVICES is '{hidden}'"

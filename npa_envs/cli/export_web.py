@@ -67,12 +67,9 @@ def main(arguments: Sequence[str]) -> int:
         save_demo_json(dict(zip(names, rules, strict=True)), options.out, particle_counts=counts)
     else:
         export_web(
-            sources,
-            options.out,
-            title=title,
-            particle_count=options.particle_count,
+            sources, options.out, title=title, particle_count=options.particle_count,
             previews=options.gallery,
-        )
+        )  # fmt: skip
     size = options.out.stat().st_size
     print(f"wrote {options.out} ({size / 1000:.0f} kB)")
     return 0

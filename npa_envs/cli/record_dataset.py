@@ -77,12 +77,10 @@ def main(arguments: Sequence[str]) -> int:
                 advance(1)
 
         folder = write_dataset(
-            options.dataset,
-            spec_of(problem.env_id, dict(problem.keywords), problem.episode_steps),
-            episodes(),
-            algorithm=options.policy,
+            options.dataset, spec_of(problem.env_id, dict(problem.keywords), problem.episode_steps),
+            episodes(), algorithm=options.policy,
             description=command_text("record-dataset", arguments, "--root"),
-        )
+        )  # fmt: skip
     print(f"{options.episodes} episodes, mean return {sum(returns) / len(returns):.3f}: {folder}")
     return 0
 

@@ -37,7 +37,7 @@ class RobustnessOptions(common.MeasureOptions):
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Measure the rules that are left; print and write all tables."""
+    """Measure the rules that have no result yet; print and write all tables."""
     options = common.parse_options(RobustnessOptions, "robustness", arguments)
     from npa_envs.atomic_files import write_text
     from npa_envs.measure.accuracy.trained_rule_checks import task_name
@@ -66,11 +66,9 @@ def main(arguments: Sequence[str]) -> int:
         # A rule that is trained again keeps its name, but not its weights.
         records[name] = report.RuleRecord(
             facts | {"weights": rule_digest(load_rule(sources[name]))},
-            folder and folder / f"robustness_{name}.json",
-            rule=name,
-            done=False,
+            folder and folder / f"robustness_{name}.json", rule=name, done=False,
             command=command_text("robustness", arguments, "--out"),
-        ).read()
+        ).read()  # fmt: skip
     with common.measuring(options, len(names), "rule") as advance:
         for name, record in records.items():
             if not record.done and not enough():

@@ -1,4 +1,4 @@
-"""`npa-envs stress`: checks of hard cases, each with an expectation and a verdict."""
+"""`npa-envs stress`: checks that results are right in hard cases; no tests of load."""
 
 from __future__ import annotations
 

@@ -161,7 +161,10 @@ def main(arguments: Sequence[str]) -> int:
 def combinations(
     over: Sequence[str], task_words: Sequence[str], folder: Path = Path()
 ) -> list[SweepRun]:
-    """Return a run of `task_words` for each combination of the values of `over` (NAME=A,B,C)."""
+    """Return a run for each combination of the values of `over`, each NAME=A,B,C.
+
+    A run has the arguments `task_words` and its values, and a folder of its own below `folder`.
+    """
     from npa_envs.training import TASKS
 
     if not task_words or task_words[0] not in TASKS:

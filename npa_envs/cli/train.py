@@ -90,7 +90,10 @@ def default_preset(task_name: str, device: str) -> str:
 
 
 def starting_configuration(task_name: str, arguments: Sequence[str]) -> TrainConfig[Any]:
-    """Return the configuration of the preset, file or resumed run, before options change it."""
+    """Return the configuration of the preset, file or resumed run that `arguments` name.
+
+    Other options have not changed it yet.
+    """
     first = common.first_options(arguments)
     device = first.device if first.device and first.config is None else "cpu"
     base = preset(first.preset or default_preset(task_name, device), task_name)
@@ -156,7 +159,7 @@ class Command(Generic[ConfigT]):
 def _parse_fields(
     defaults: ConfigT, task_name: str, arguments: Sequence[str]
 ) -> tuple[TrainOptions, ConfigT]:
-    """Parse options that have the names of the fields of `defaults`, a task of one species."""
+    """Return the options of the run, and `defaults` with the values of options for its fields."""
     description = f"Train on {task_name}. Defaults shown are those of the preset."
     if {"-h", "--help"} & set(arguments):
         description += f" All options: npa-envs train {task_name} --help-all"
@@ -178,7 +181,7 @@ def _parse_fields(
 
 
 def _with_common_fields(config: Any) -> Any:
-    """Return an equal configuration, of a subclass whose help shows only the `Common` fields."""
+    """Return an equal configuration, of a subclass whose help shows only the most used fields."""
     cls: Any = type(config)
     suppress: Any = tyro.conf.Suppress
     types: dict[str, Any] = {}
@@ -225,7 +228,7 @@ class JointOptions(JointTrainConfig[SpeciesOptions]):
 def _parse_joint(
     base: JointTrainConfig[CoMorphogenesis2DConfig], task_name: str, arguments: Sequence[str]
 ) -> tuple[TrainOptions, JointTrainConfig[CoMorphogenesis2DConfig]]:
-    """Parse options that change the fields of all species of `base`."""
+    """As `_parse_fields`; an option for a field of a species changes it for all species."""
     task = base.task
     targets = tuple(species.target for species in task.species)
     species_options: list[SpeciesOptions] = []
@@ -258,7 +261,7 @@ def _of_type(cls: Any, source: Any, **changes: Any) -> Any:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Train; return 0 when the run is finished or out of time, 130 after Ctrl-C."""
+    """Train; return 0 if the run is finished or out of time, 130 after Ctrl-C."""
     if arguments and arguments[0] in {"-h", "--help"}:
         print(HELP)
         return 0
@@ -373,7 +376,7 @@ def finish(
 
 
 def thread_count(config: TrainConfig[Any]) -> int:
-    """Return the number of CPU threads: 1 for batches too small to gain from a second one."""
+    """Return the number of CPU threads: 1 for batches too small to gain from more, else torch's."""
     batch = config.world_count * sum(task.particle_count for task in _species(config))
     return 1 if batch < 4096 else torch.get_num_threads()
 
@@ -381,8 +384,8 @@ def thread_count(config: TrainConfig[Any]) -> int:
 def process_count(task_name: str, options: TrainOptions, config: TrainConfig[Any]) -> int:
     """Return the number of processes: by default 2 if small batches leave cores of the CPU idle.
 
-    1 for runs of less than a minute, in which the start of the second process takes too long, and
-    for resumed runs of one process, which draw other random numbers than two.
+    It is 1 for runs of less than a minute, in which the start of a second process takes too long,
+    and for resumed runs of one process, whose random numbers are not those of two.
     """
     count = requested_processes(options.gpus, options.processes, config.device)
     if count is not None:

@@ -72,11 +72,9 @@ def main(arguments: Sequence[str]) -> int:
     from npa_envs.web.server import Site, address_of, open_port, serve
 
     site = Site(
-        make_world,
-        films=common.writable_folder(options.out),
-        host=options.host,
+        make_world, films=common.writable_folder(options.out), host=options.host,
         one_at_a_time=device.type == "cuda",
-    )
+    )  # fmt: skip
     listener = open_port(options.host, options.port)
     with contextlib.closing(listener), common.torch_threads(options.threads):
         address = address_of(site, listener)

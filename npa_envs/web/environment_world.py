@@ -25,10 +25,11 @@ from npa_envs.world.particles import Particles
 def make_environment(
     id: str, policy: str = "zero", *, device: str = "cpu", **keywords: Any
 ) -> tuple[Any, Callable[[Any], Any]]:
-    """Return an environment, and a function from its observations to actions.
+    """Return a Gymnasium environment, and the policy: a function from observations to actions.
 
     `id` is one of this package or, as MODULE:ID, of a module that registers it. `policy` is "zero",
-    "random", or the source of a rule. Keywords that are None keep their defaults.
+    "random", or a rule as for `load_rule`. `keywords` are those of `gymnasium.make`; None counts as
+    not given.
     """
     others = {*GARDEN_IDS, *(environment.id for environment in CODED)}
     if id in others:
@@ -60,7 +61,7 @@ def make_environment(
 
 
 class EnvironmentWorld(LiveWorld):
-    """The world of an environment that a policy runs; `close` closes the environment."""
+    """The world of an environment whose actions a policy chooses, as `make_environment` makes both."""
 
     def __init__(self, env: Any, policy: Callable[[Any], Any], *, seed: int = 0) -> None:
         super().__init__(seed)

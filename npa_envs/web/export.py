@@ -24,7 +24,7 @@ from npa_envs.rule.rule import NPARule, check_rule
 from npa_envs.tasks.damage import CLUMP_FACTOR, DAMAGE_SIZES
 from npa_envs.tasks.point_classification import PALETTE, UNDECIDED, PointClassification
 from npa_envs.web.live_world import colour_tables
-from npa_envs.web.messages import checked_seed
+from npa_envs.web.messages import SEEDS
 from npa_envs.web.rule_world import MIN_SEED, RuleWorld
 from npa_envs.world.species import AGREEMENTS
 
@@ -32,7 +32,7 @@ PAGE = Path(__file__).resolve().parent / "page"
 """The folder of the page's files."""
 
 MAX_WEIGHTS = 2**20
-"""Most weights of a rule in a page: 5.6 MB of text, and very slow in a browser."""
+"""Maximum number of weights of a page's rule: 5.6 MB of text, and very slow in a browser."""
 
 POLICY = (
     "default-src 'none'; script-src {scripts} 'wasm-unsafe-eval'; style-src {styles}; "
@@ -108,7 +108,7 @@ def export_web(
         raise NPAError(f"title must be text, or None for the first rule's name, got {shown(title)}")
     texts = [str(source) for source in sources]
     names = distinct_names(texts, "a page")
-    seed = checked_seed(seed)
+    seed = int(SEEDS.checked("seed", seed))
     # Opened first: an error in the path is reported before the slow growth of previews.
     with atomic_path(path) as temporary:
         rules = [page_rule(source, particle_count=particle_count) for source in texts]
@@ -122,7 +122,7 @@ def export_web(
 
 
 def distinct_names(sources: Sequence[str], what: str) -> list[str]:
-    """Return the names of rules; raise NPAError if two are equal. `what` begins its message."""
+    """Return the names of rules; raise NPAError, which begins with `what`, if two are equal."""
     names = [rule_name(source) for source in sources]
     if not names or len(set(names)) < len(names):
         raise NPAError(
@@ -133,7 +133,10 @@ def distinct_names(sources: Sequence[str], what: str) -> list[str]:
 
 
 def page_rule(source: str, *, particle_count: int | None = None) -> dict[str, Any]:
-    """Return a rule and its world as JSON for rule_world.js, with arrays as float32 in base64."""
+    """Return a rule and its world as JSON for rule_world.js; arrays are float32 in base64.
+
+    `source` is a rule as for `load_rule`; `particle_count` None: as trained.
+    """
     check_browser_rule(load_rule(source), rule_name(source))
     live = RuleWorld(source, device=torch.device("cpu"), particle_count=particle_count, choices={})
     rule, task = live.main.rule, live.task
@@ -190,7 +193,7 @@ def check_browser_rule(rule: NPARule, name: str) -> None:
 
 
 def preview(source: str, *, particle_count: int | None = None) -> str:
-    """Return a picture of a rule's world after some steps as a data URL of a WebP file."""
+    """Return a picture of a rule's world after some steps, as the data URL of a WebP file."""
     live = RuleWorld(source, device=torch.device("cpu"), particle_count=particle_count, choices={})
     live.speed = 256 if live.task.aligned else 128
     live.advance()

@@ -1,4 +1,4 @@
-"""The base class of worlds that a page shows and changes while they run, and particles' colours."""
+"""Base class of worlds that a page shows and changes while they run; colours of particles."""
 
 from __future__ import annotations
 
@@ -16,15 +16,7 @@ from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.ops import species_fields
 from npa_envs.render.colours import GOLDEN_ANGLE, STATE_CHROMA, STATE_GAIN, ramp, srgb
 from npa_envs.tasks.damage import check_damage, damage_worlds
-from npa_envs.web.messages import (
-    BRUSHES,
-    Brush,
-    BrushUse,
-    FrameEvent,
-    Range,
-    WorldEvent,
-    checked_seed,
-)
+from npa_envs.web.messages import BRUSHES, SEEDS, Brush, BrushUse, FrameEvent, Range, WorldEvent
 from npa_envs.world.brushes import clump, cut, inject, push, state_around
 from npa_envs.world.particles import Particles
 
@@ -36,10 +28,11 @@ class LiveWorld(ABC):
     """The world, as a batch of one."""
 
     def __init__(self, seed: int) -> None:
-        self.seed = checked_seed(seed)
+        self.seed = int(SEEDS.checked("seed", seed))
         self.playing = True
         """Whether it runs; else it makes steps only by the message "step"."""
         self.speed = 1
+        """Steps from one frame to the next."""
         self.show = "colours"
         self._loss_wanted = False
         self._colouring = Colouring()
@@ -78,7 +71,7 @@ class LiveWorld(ABC):
                 self._run_timed(1)
             case "reset":
                 seed = message.get("seed")
-                self.reset(None if seed is None else checked_seed(seed))
+                self.reset(None if seed is None else int(SEEDS.checked("seed", seed)))
                 return True
             case "set":
                 return self._set(str(message.get("name")), message.get("value"))
@@ -106,12 +99,12 @@ class LiveWorld(ABC):
         return FrameEvent(self.step, positions, colours, self._milliseconds, loss)
 
     def take_events(self) -> list[Mapping[str, Any]]:
-        """Return the events since the last call: curves, errors, changed descriptions."""
+        """Return the events of the world since the last call, to send to the page."""
         events, self._events = self._events, []
         return events
 
     def close(self) -> None:  # noqa: B027
-        """Release the world's resources."""
+        """Close what the world has opened; by default nothing."""
 
     def reset(self, seed: int | None) -> None:
         """Start a new world from a seed; None: from the next one."""
@@ -119,7 +112,7 @@ class LiveWorld(ABC):
         self._begin(self.seed)
 
     def _begin(self, seed: int | None) -> None:
-        """Start a new world from a seed; None: from any one."""
+        """Start a new world from a seed; None: the next episode of an environment."""
         self.step, self._milliseconds = 0, 0.0
         self._travelled: Tensor | None = None
         self._updated: Tensor | None = None
@@ -231,7 +224,7 @@ class Colouring:
         self._basis: Tensor | None = None
 
     def __call__(self, show: str, world: ColouredWorld) -> NDArray[np.uint8]:
-        """Return particles' colours, uint8, shape [N, 3]; `show` is one of `shows_of`."""
+        """Return particles' colours, uint8, shape [N, 3]; `show` is a name of `shows_of`."""
         if world.x.shape[1] == 0:
             return np.zeros((0, 3), dtype=np.uint8)
         match show.split():
@@ -283,7 +276,11 @@ class Colouring:
 
 
 def shows_of(state_dim: int, *, species: bool = True) -> list[str]:
-    """Return all values of `show` for particles with `state_dim` state channels."""
+    """Return what colours can show of particles with `state_dim` state channels.
+
+    "components" are the first three principal components of the states, "mask" is which particles
+    the last step updated. Without `species` there is one species, and masks are unknown.
+    """
     last = ("species", "speed", "mask") if species else ("speed",)
     states = (f"state {k}" for k in range(state_dim))
     return ["colours", "density", "components", *last, *states]
@@ -311,9 +308,10 @@ def _or_zeros(values: Tensor | None, world: ColouredWorld) -> Tensor:
 
 
 def colour_tables(species_count: int) -> dict[str, NDArray[np.uint8]]:
-    """Return the colours that colours.js reads, uint8, shape [K, 3]: of densities, states, species.
+    """Return the colours that colours.js reads, by name, each uint8, shape [K, 3].
 
-    `state` has those of `signed_colours` at equal steps of 1 / (1 + exp(-STATE_GAIN value)).
+    "ramp" is `colour_ramp`, and "species" has a colour for each species. "state" has those of
+    `signed_colours` at equal steps of 1 / (1 + exp(-STATE_GAIN value)).
     """
     values = torch.logit(torch.linspace(0.0, 1.0, 1025)) / STATE_GAIN
     state = _bytes(signed_colours(values))

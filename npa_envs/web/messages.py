@@ -6,10 +6,10 @@ it reaches by worker_connection.js. Messages are JSON objects with a `type` and 
 
     play    on                run the world (true) or pause it
     step                      one step, while the world is paused
-    reset   seed?             a new world; without a seed from the next one
-    set     name, value       name: a key of the world's `settings`, "rule", "show", or "loss" (true
-                              while its plot is open; otherwise no loss is computed)
-    brush                     one use of a brush: `BrushUse.read` has the fields
+    reset   seed?             a new world from a seed; without it, from the next seed
+    set     name, value       name: "speed" or another key of `settings`, "rule", "show", or "loss"
+                              (true while its plot is open; otherwise no loss is computed)
+    brush   tool, at, move, radius, strength, source?, rule?, view?    one use: see `BrushUse`
     damage  name              one of the world's `damages`, at a random position
     drawn                     the page has drawn a frame; at most two frames are sent and not drawn,
                               so the engine waits for a slow or hidden page
@@ -42,7 +42,7 @@ from npa_envs.errors import NPAError, shown, suggest
 
 
 class WorldEvent(TypedDict, total=False):
-    """The event "world"; the page has values for missing fields, `BLANK` of page.js."""
+    """The event "world"; the page takes missing fields from `BLANK` of page.js."""
 
     type: Required[Literal["world"]]
     title: str
@@ -57,7 +57,7 @@ class WorldEvent(TypedDict, total=False):
     others: list[str]  # Rules that the brushes graft and add can put into the world.
     species: list[str]  # Rules of the world's particles.
     shows: list[str]  # Values of the setting "show".
-    show: str  # What colours mean; `Colouring` of live_world.py makes them.
+    show: str  # What colours show: a name of `shows_of` of live_world.py.
     tools: list[dict[str, Any]]  # The world's brushes: `name`, and the fields of `Brush`.
     damages: list[str]  # Kinds of damage, as the page's buttons name them.
     settings: dict[str, dict[str, Any]]  # By name: `value`, and the fields of `Range`.
@@ -93,6 +93,10 @@ class Range(NamedTuple):
                 f"{name} must be {what} in [{self.low:g}, {self.high:g}], got {shown(value)}"
             )
         return int(value) if self.whole else float(value)
+
+
+SEEDS = Range(0, 2**53, whole=True)
+"""The seeds of worlds; whole numbers in JavaScript are exact up to the last one."""
 
 
 class Brush(NamedTuple):
@@ -132,7 +136,7 @@ Icons are in page.js."""
 class BrushUse(NamedTuple):
     """One use of a brush; it is read from a message "brush"."""
 
-    brush: str  # Name of the brush, `tool` in the message.
+    brush: str  # Name of the brush; `tool` in the message.
     at: Tensor  # Position [length units], shape [1, D].
     move: Tensor  # Movement from there [length units], shape [1, D]; by default zeros.
     radius: float  # Radius of the brush, or width of the gap of `cut` [length units].
@@ -169,8 +173,3 @@ def _checked_vector(name: str, value: Any, length: int, like: Tensor) -> Tensor:
     if not fits or max(map(abs, value)) > 1e4:
         raise NPAError(f"{name} must be {length} finite numbers, got {shown(value)}")
     return like.new_tensor([value])
-
-
-def checked_seed(value: Any) -> int:
-    """Return `value` if it is a valid seed, a whole number from 0 to 2^53; else raise NPAError."""
-    return int(Range(0, 2**53, whole=True).checked("seed", value))

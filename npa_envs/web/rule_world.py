@@ -32,16 +32,16 @@ from npa_envs.world.rollout import at_rest, rollout_particles
 from npa_envs.world.species import AGREEMENTS, species_particles
 
 MAX_PARTICLES = {"cpu": 16384, "cuda": 131072}
-"""Most particles of a world, by device type."""
+"""Maximum number of particles of a world, by device type."""
 
 MIN_SEED = 16
-"""Fewest particles that the brush `add` adds."""
+"""Minimum number of particles that the brush `add` adds."""
 
 REST_CHECK_STEPS = 64
 """Steps between two checks whether the world is at rest."""
 
 LOSS_FRACTION = 0.1
-"""Largest fraction of the time for computing losses while their plot is open."""
+"""Maximum fraction of the time that losses take while their plot is open."""
 
 
 @dataclass
@@ -60,7 +60,12 @@ class LiveRule:
 class RuleWorld(LiveWorld):
     """A world of one rule, and of other rules that the brushes graft and add put into it.
 
-    `choices` has the sources of the other rules by name; None: the shipped ones.
+    Args:
+        source: The rule, as for `load_rule`.
+        device: Where the world runs.
+        seed: Seed of the first world.
+        particle_count: Particles of a newly seeded world; None: as trained.
+        choices: Other rules that the page offers, by name, as for `load_rule`; None: shipped ones.
     """
 
     def __init__(
@@ -80,7 +85,7 @@ class RuleWorld(LiveWorld):
         others = {name: name for name in shipped_rules()} if choices is None else dict(choices)
         name = rule_name(source)
         self._choices = others | {name: source}
-        self._plant(name, particle_count)
+        self._choose_rule(name, particle_count)
 
     def _live_rule(self, name: Any) -> LiveRule:
         if not isinstance(name, str) or name not in self._choices:
@@ -99,8 +104,8 @@ class RuleWorld(LiveWorld):
             self._choices[name], rule, self._device, particle_count=particle_count, **options
         )
 
-    def _plant(self, name: Any, particle_count: int | None = None) -> None:
-        """Choose a rule with the task that it was trained on, and start a new world."""
+    def _choose_rule(self, name: Any, particle_count: int | None = None) -> None:
+        """Take the rule `name` with the task that it was trained on, and start a new world."""
         main = self._live_rule(name)
         self.trained = self._trained(main.name, particle_count)
         self.main = main
@@ -171,7 +176,7 @@ class RuleWorld(LiveWorld):
         return allowed
 
     def _may_join(self, name: str) -> bool:
-        """Return whether particles of this rule can be put into the world."""
+        """Return whether brushes can put particles of the rule `name` into the world."""
         main = self.main.rule
         try:
             other = self._live_rule(name).rule
@@ -198,7 +203,7 @@ class RuleWorld(LiveWorld):
 
     def _set(self, name: str, value: Any) -> bool:
         if name == "rule":
-            self._plant(value)
+            self._choose_rule(value)
         elif name == "count" and name in self._ranges():
             count = int(self._ranges()[name].checked(name, value))
             if count != self.count:
@@ -337,7 +342,7 @@ class RuleWorld(LiveWorld):
         room = MAX_PARTICLES[self._device.type] - self.particles.x.shape[1]
         if count > room:
             raise NPAError(f"the world has room for {max(room, 0)} particles more, got {count}")
-        # A new species divides densities by its own number of particles, as in a world alone.
+        # A new species divides densities by its own number of particles, as in a world of its own.
         index = self._species_index(use.rule, float(count))
         zeros = self.particles.map(lambda value: value.new_zeros(1, count, *value.shape[2:]))
         ball = uniform_ball(
@@ -350,12 +355,12 @@ class RuleWorld(LiveWorld):
         self._arrange(together([self.particles, added]), species)
 
     def _all_coded(self, s: Tensor) -> Tensor:
-        """Return states [1, N, C] of all particles with the target codes of their rules."""
+        """Return states s [1, N, C] in which each particle has the target code of its rule."""
         groups = zip(self.live_rules, s.split_with_sizes(self.counts, dim=1), strict=True)
         return torch.cat([self._coded(live_rule, states) for live_rule, states in groups], dim=1)
 
     def _coded(self, live_rule: LiveRule, s: Tensor) -> Tensor:
-        """Return states of particles with the target code of their rule, if it has codes."""
+        """Return states s of a rule's particles with its target code, if it has codes."""
         if live_rule.rule.codes is None:
             return s
         is_main = live_rule.name == self.main.name
@@ -520,12 +525,12 @@ class RunWorld(RuleWorld):
         else:
             # Another run was started in the folder.
             self._rules.clear()
-            self._plant(self.main.name, self._each)
+            self._choose_rule(self.main.name, self._each)
             self._events.append({"type": "reordered"})
         self._run_identities = identities
 
     def _identities(self, rules: Mapping[str, NPARule]) -> list[Any]:
-        """Return hyper-parameters and tasks of the run's rules, which are others in another run."""
+        """Return hyper-parameters and task of each of the run's rules; another run has others."""
         identities: list[Any] = []
         for name, rule in rules.items():
             path = self._files[name]

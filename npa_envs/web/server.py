@@ -52,22 +52,22 @@ PORT = 8765
 """First default port."""
 
 MAX_SESSIONS = 4
-"""Most open pages; each has its own world."""
+"""Maximum number of open pages; each has its own world."""
 
 FRAMES_AHEAD = 2
-"""Most frames that are sent and not drawn yet."""
+"""Maximum number of frames that are sent and not drawn yet."""
 
 FRAME_SECONDS = 1.0 / 60.0
-"""Least time between two frames [s]."""
+"""Minimum time between two frames [s]."""
 
 MESSAGES_KEPT = 256
-"""Most messages in a queue; others are dropped."""
+"""Maximum number of messages in a queue; further ones are dropped."""
 
 MAX_PICTURES = 500
-"""Most pictures of a film, 20 seconds; each takes a megabyte of memory when it is written."""
+"""Maximum number of pictures of a film, 20 seconds; writing takes a megabyte for each."""
 
 MAX_PICTURE = 1024
-"""Most pixels on each side of a film's pictures."""
+"""Maximum number of pixels on each side of a film's pictures."""
 
 HEADER = struct.Struct("<IIIff")
 """A frame's step, particles, dimension, milliseconds, loss (NaN: not computed)."""
@@ -86,8 +86,9 @@ SECURITY = {
 class Site:
     """What a server serves: its worlds, address and token.
 
-    `make_world` makes the world of a page, in the thread that runs it. With `one_at_a_time` worlds
-    do not run together: a CUDA graph of one thread must not capture another's work.
+    `make_world` makes the world of a page, in the thread that runs it. `films` is the folder for
+    films. With `one_at_a_time` worlds do not run at the same time: a CUDA graph of one thread must
+    not capture another's work.
     """
 
     def __init__(
@@ -150,7 +151,7 @@ def make_app(site: Site) -> Starlette:
     async def connect(page: WebSocket) -> None:
         host, origin = page.headers.get("host", ""), page.headers.get("origin")
         if not site.allows_host(host) or origin not in (None, f"http://{host}", f"https://{host}"):
-            return await page.close(1008, "this server answers its own page alone")
+            return await page.close(1008, "this server answers only its own page")
         if not site.allows_token(page.query_params.get("token")):
             return await page.close(1008, "the token is missing or wrong")
         await page.accept()
@@ -193,7 +194,7 @@ def _refused(reason: str) -> Response:
 
 
 def frame_bytes(frame: FrameEvent) -> bytes:
-    """Return a frame as bytes: header, positions, colours."""
+    """Return a frame as the bytes that server_connection.js reads: header, positions, colours."""
     count, dimension = frame.positions.shape
     loss = float("nan") if frame.loss is None else frame.loss
     header = HEADER.pack(frame.step, count, dimension, frame.milliseconds, loss)
@@ -409,7 +410,7 @@ def write_film(pictures: Sequence[bytes], folder: Path) -> Iterator[Path]:
 
 
 def open_port(host: str, port: int | None) -> socket.socket:
-    """Return a listening socket on a port; None: the first free one from `PORT` on."""
+    """Return a socket that listens on a port; None: the first free one from `PORT` on."""
     if port is not None and not 0 <= port <= 65535:
         raise NPAError(f"port must be in [0, 65535], got {port}: leave it out for a free one")
     ports = [port] if port is not None else [*range(PORT, PORT + 20), 0]
@@ -436,7 +437,7 @@ def open_port(host: str, port: int | None) -> socket.socket:
 
 
 def address_of(site: Site, listener: socket.socket) -> str:
-    """Return the URL of the page."""
+    """Return the URL of the page, with the token if one is required."""
     port = listener.getsockname()[1]
     # For a server on all addresses, the link names this computer.
     name = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(site.host, site.host)

@@ -1,5 +1,5 @@
-// The kernels of `plainKernels` of physics.js in WebAssembly, because its vectors of four float32 are several times as
-// fast as JavaScript. The page builds the module when it starts: `xCode` writes kernel x by functions that return the
+// The kernels of `plainKernels` of physics.js in WebAssembly, whose vectors of four float32 make a step more than twice
+// as fast. The page builds the module when it starts: `xCode` writes kernel x by functions that return the
 // bytes of instructions (the assembler below), and `assemble` joins the kernels. So no compiler is needed, and sizes
 // are constants in the code. Instructions and format: https://webassembly.github.io/spec/core/binary/.
 
@@ -75,10 +75,8 @@ function namedLocals(parameters, integers, vectors) {
   };
 }
 
-const AXES = ["X", "Y", "Z"];
-
-// The factors of a particle's neighbours in the sums.
-const LISTS = ["smoothing", "slopeX", "slopeY", "slopeZ"];
+// The axes, and the factors of a particle's neighbours in the sums.
+const AXES = ["X", "Y", "Z"], LISTS = ["smoothing", "slopeX", "slopeY", "slopeZ"];
 
 // sumNeighbours(states, own, listBytes, stateAt, smoothing, slopeX, slopeY, slopeZ, sums): addresses in bytes; `own` is
 // that of the particle's state.
@@ -313,8 +311,7 @@ function reserveIn(memory) {
 export function simdKernels(width, dimension) {
   const memory = new WebAssembly.Memory({ initial: MEMORY_PAGES });
   const code = assemble({
-    sumNeighbours: sumNeighboursCode(width, dimension),
-    listNeighbours: listNeighboursCode(dimension),
+    sumNeighbours: sumNeighboursCode(width, dimension), listNeighbours: listNeighboursCode(dimension),
     applyLayer: applyLayerCode(),
   });
   const instance = new WebAssembly.Instance(new WebAssembly.Module(code), { page: { memory } });
@@ -363,12 +360,7 @@ export function simdKernels(width, dimension) {
   }
 
   return {
-    name: "WebAssembly",
-    floats,
-    integers: (length) => reserve(Int32Array, length),
-    sumNeighbours,
-    listNeighbours,
-    makeLayer: (...matrix) => tiledLayer(floats, ...matrix),
-    applyLayer,
+    name: "WebAssembly", floats, integers: (length) => reserve(Int32Array, length),
+    sumNeighbours, listNeighbours, makeLayer: (...matrix) => tiledLayer(floats, ...matrix), applyLayer,
   };
 }

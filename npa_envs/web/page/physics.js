@@ -51,13 +51,8 @@ export function prepareRule(description, kernels) {
 export function plainKernels() {
   const floats = (length) => new Float32Array(length);
   return {
-    name: "JavaScript",
-    floats,
-    integers: (length) => new Int32Array(length),
-    sumNeighbours,
-    listNeighbours,
-    makeLayer: (...matrix) => tiledLayer(floats, ...matrix),
-    applyLayer,
+    name: "JavaScript", floats, integers: (length) => new Int32Array(length),
+    sumNeighbours, listNeighbours, makeLayer: (...matrix) => tiledLayer(floats, ...matrix), applyLayer,
   };
 }
 

@@ -71,8 +71,7 @@ function stateGradient(rule, axes) {
 
 // The shaders `density` and `advance` of one rule: sizes are constants in them.
 function shaders(rule) {
-  const { space_dim: dimension, state_dim: channels, inputs, hidden_dim: hidden, outputs } = rule;
-  const axes = ["x", "y", "z"].slice(0, dimension);
+  const { state_dim: channels, inputs, hidden_dim: hidden, outputs } = rule;
   return `
   struct World {
     sides: vec4f, per: vec4f, cells: vec4u,
@@ -111,7 +110,13 @@ function shaders(rule) {
     fields[i] = vec4f(gradient, 1.0 / rho);
   }
 
-  @compute @workgroup_size(${GROUP})
+${advanceShader(rule)}`;
+}
+
+// The shader that perceives active particles, and applies the network to what they perceive.
+function advanceShader({ state_dim: channels, inputs, outputs, ...rule }) {
+  const axes = ["x", "y", "z"].slice(0, rule.space_dim);
+  return `  @compute @workgroup_size(${GROUP})
   fn advance(@builtin(global_invocation_id) id: vec3u) {
     let row = id.x;
     if (row >= world.rows) { return; }
@@ -174,7 +179,7 @@ export class GpuPhysics {
     };
     const input = STORAGE | COPY_DST;
     this.points = buffer(16 * capacity, input);
-    this.home = buffer(4 * capacity, input);
+    this.home = buffer(4 * capacity, input); // the cell of each particle
     this.starts = buffer(4 * (MAX_CELLS[dimension] ** dimension + 1), input);
     this.states = buffer(4 * width * capacity, input);
     this.fields = buffer(16 * capacity, STORAGE);

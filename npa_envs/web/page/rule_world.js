@@ -44,7 +44,7 @@ const BRUSHES = {
     const count = Math.max(live.constants.MIN_SEED, Math.round(amount * live.seedCount));
     const room = (live.rule.world.settings.count?.high ?? live.seedCount) - live.world.count;
     if (count > room) throw Error(`the world has room for ${Math.max(0, room)} particles more, got ${count}`);
-    // A new species divides densities by its own number of particles, as in a world alone.
+    // A new species divides densities by its own number of particles, as in a world of its own.
     const index = live.speciesOf(rule, count);
     const ball = live.random.ball(count, dimension, radius);
     for (let k = 0; k < ball.length; k++) ball[k] += at[k % dimension];
