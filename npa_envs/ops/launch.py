@@ -105,7 +105,7 @@ def launch(
 
 @contextlib.contextmanager
 def tracing() -> Iterator[None]:
-    """Make `launch` do nothing in this thread's block: torch asks only for shapes of results."""
+    """Make this thread's `launch` do nothing in the block: torch asks only for results' shapes."""
     _thread.traced, before = True, _thread.traced
     try:
         yield
@@ -415,7 +415,7 @@ class RecordedLaunches:
     def replay(
         self, begin: int = 0, end: int | None = None, *, last_count: int | None = None
     ) -> None:
-        """Launch [begin, end) of the sequence again; `last_count`: first size of the last one."""
+        """Repeat launches [begin, end); `last_count` replaces the first size of the last one."""
         launches = self._launches[begin:end]
         for prepared, size in launches[:-1]:
             prepared.run(size)
@@ -423,7 +423,7 @@ class RecordedLaunches:
         prepared.run(size if last_count is None else (last_count, *size[1:]))
 
 
-class Launch(NamedTuple):
+class NotedLaunch(NamedTuple):
     """Description of one launch of a Warp kernel."""
 
     kernel: str
@@ -437,9 +437,9 @@ class Launch(NamedTuple):
 
 
 @contextlib.contextmanager
-def noted_launches() -> Iterator[list[Launch]]:
+def noted_launches() -> Iterator[list[NotedLaunch]]:
     """Yield a list that receives each launch made within the block, by any thread."""
-    noted: list[Launch] = []
+    noted: list[NotedLaunch] = []
     _observers.append(noted)
     try:
         yield noted
@@ -447,11 +447,11 @@ def noted_launches() -> Iterator[list[Launch]]:
         _observers.remove(noted)
 
 
-_observers: list[list[Launch]] = []
+_observers: list[list[NotedLaunch]] = []
 """Lists to which launches are added."""
 
 
-def _description_of(kernel: Any, size: tuple[int, ...]) -> Launch:
+def _description_of(kernel: Any, size: tuple[int, ...]) -> NotedLaunch:
     purpose = (inspect.getdoc(kernel.func) or "").split("\n")[0]
     module = kernel.module.name.removeprefix("npa_envs.").removeprefix("kernels.")
-    return Launch(kernel.func.__name__, module, " x ".join(map(str, size)), purpose)
+    return NotedLaunch(kernel.func.__name__, module, " x ".join(map(str, size)), purpose)

@@ -364,7 +364,7 @@ def updates_in_parts(
 
 
 class NeighbourState:
-    """Worlds x and s, sorted into cells with densities; neither is checked, or may change.
+    """Worlds x and s, unchecked, sorted into cells with densities; they must not change.
 
     `world_indices`, int64, shape [B], are the worlds' indices in a larger batch, into which
     perception is written; None: the worlds are the whole batch.
