@@ -64,7 +64,7 @@ def _check_tangents(arguments: dict[str, Any]) -> None:
                 raise NPAError(
                     f"{name} must carry no tangent of forward-mode derivatives "
                     "(torch.autograd.forward_ad, strategy='forward-mode'), got one: kernels have "
-                    "backward passes alone; take backward(), torch.autograd.grad or "
+                    "only backward passes; take backward(), torch.autograd.grad or "
                     f"strategy='reverse-mode', {HINT}"
                 )
 
