@@ -40,9 +40,9 @@ _MAPPED_PACKAGES = ("envs", "wrappers", "agents")
 def _extend_path(package_path: list[str], package_file: str) -> None:
     """Append the repository's root to `package_path`, if `package_file` is in a checkout of it.
 
-    These are `npa_envs.__path__` and `npa_envs.__file__`. Python started in the repository's root
-    imports the folder `npa_envs/` before an installed package. The path of an installed package
-    does not change, so that a folder `envs` of another project in site-packages is never imported.
+    Python started in the repository's root imports the folder `npa_envs/` before an installed
+    package, and would miss the others. The path of an installed package does not change, so that a
+    folder `envs` of another project in site-packages is never imported.
     """
     package = _Path(package_file).resolve().parent
     root = package.parent

@@ -75,7 +75,7 @@ def open_regular(path: str | Path, *, limit: int, what: str = "the file") -> IO[
 
 
 def read_bytes(path: str | Path, *, limit: int, what: str = "the file") -> bytes:
-    """Return the bytes of a file, at most `limit`, opened by `open_regular`."""
+    """Return the bytes of a regular file of at most `limit` bytes, which errors call `what`."""
     with open_regular(path, limit=limit, what=what) as file:
         try:
             # Some system files contain more than their size says.
@@ -98,7 +98,7 @@ def read_json(path: str | Path, *, limit: int = 16 * _MIB) -> Any:
 
 
 def check_torch_archive(file: IO[bytes], *, checksums: bool = True) -> None:
-    """Check a file of `torch.save` before torch unpacks it: its checksums, unless False, and sizes.
+    """Check the sizes in a file of `torch.save` before torch unpacks it, and if asked, `checksums`.
 
     Compressed content, which torch does not write, is rejected: it could take any amount of memory.
     """
@@ -173,7 +173,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def made_folder(path: Path) -> Iterator[None]:
-    """Create a folder and its missing parents; if the block raises, remove them if empty."""
+    """Create a folder and missing parents; if the block raises, remove the empty ones again."""
     missing = [folder for folder in (path, *path.parents) if not folder.exists()]
     try:
         path.mkdir(parents=True, exist_ok=True)

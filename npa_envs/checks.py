@@ -198,7 +198,7 @@ def _side_stream(device: torch.device, thread: int) -> torch.cuda.Stream:
 
 
 def constant(number: float) -> float:
-    """Return `number`; while `torch.compile(dynamic=True)` traces, its value and not a symbol.
+    """Return `number`, or its value if it is a symbol of `torch.compile(dynamic=True)`.
 
     Custom operators take Python numbers, not the compiler's symbols.
     """
@@ -302,7 +302,7 @@ def checked_eps(name: str, eps: float, space_dim: int, dtype: torch.dtype) -> fl
 
 
 def check_scale(eps: float, eps0: float, space_dim: int, dtype: torch.dtype) -> None:
-    """Check that (eps / eps0)^(1+D), a factor of density gradients, does not leave the dtype."""
+    """Check that (eps / eps0)^(1+D), a factor of density gradients, is in the dtype's range."""
     limits = torch.finfo(dtype)
     # By logarithms, as the power may overflow.
     scale = (1 + space_dim) * (math.log(eps) - math.log(eps0))
@@ -352,7 +352,7 @@ def checked_box(
 def check_field(
     config: object, name: str, ok: bool, requirement: str, hint: str = "", *, example: object = None
 ) -> None:
-    """Raise NPAError unless `ok`: the field `name` of a configuration must `requirement`.
+    """Raise NPAError unless `ok`; it says that the configuration's field must `requirement`.
 
     The error ends with `hint`; without one, with the field's default, or `example` if it has none.
     """
@@ -371,7 +371,7 @@ def _check_fields(
 def check_positive(
     config: object, cls: type, *names: str, at_least: int = 1, at_most: int = sys.maxsize
 ) -> None:
-    """Check that fields are, if `cls` is float, finite and > 0; else ints within the bounds."""
+    """Check that fields are ints within the bounds or, if `cls` is float, finite and above 0."""
     if cls is float:
         rule = "be a finite number greater than 0"
         _check_fields(config, names, lambda v: is_real(v) and v > 0, rule, 1.0)

@@ -48,7 +48,7 @@ def _pool() -> ThreadPoolExecutor:
 
 
 def _use_one_thread() -> None:
-    """Use one thread in a forked process: torch would wait for threads that its parent has."""
+    """Use one thread in a forked process, where torch would wait for its parent's threads."""
     global _forked
     _forked = True
     _pool.cache_clear()
@@ -71,7 +71,7 @@ def thread_count() -> int:
 
 
 def even_ranges(count: int, smallest: int) -> list[range]:
-    """Return even ranges that divide [0, count) among CPU threads, each of at least `smallest`."""
+    """Return ranges that split [0, count) evenly for CPU threads, of `smallest` indices or more."""
     if count < 2 * smallest:
         return [range(count)]
     threads = thread_count()

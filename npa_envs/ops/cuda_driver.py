@@ -96,7 +96,7 @@ def _follows_kernel(stream: int) -> bool:
 
 
 class DriverLaunch:
-    """Repeats Warp's `launch` through the driver API, with parameters at `addresses` in memory."""
+    """Warp's `launch`, repeated by the driver API with the parameters at `addresses` in memory."""
 
     def __init__(self, launch: Any, device: torch.device, addresses: Any) -> None:
         capability = launch.device.get_cuda_compile_arch() or 0

@@ -37,7 +37,7 @@ def check_derivatives(**arguments: Any) -> None:
     """Raise NPAError within a function of `torch.func`, or if an argument has a tangent.
 
     A tangent is a derivative of forward mode. It would be lost silently where no tensor requires a
-    gradient. Arguments are given by their names.
+    gradient. Keywords are the names of the arguments.
     """
     # In this order: a compiler cannot trace the second condition.
     if not torch.compiler.is_compiling() and _transforms_active():
@@ -64,7 +64,7 @@ def _check_tangents(arguments: dict[str, Any]) -> None:
                 raise NPAError(
                     f"{name} must carry no tangent of forward-mode derivatives "
                     "(torch.autograd.forward_ad, strategy='forward-mode'), got one: kernels have "
-                    "backward passes alone; take backward(), torch.autograd.grad or "
+                    "only backward passes; take backward(), torch.autograd.grad or "
                     f"strategy='reverse-mode', {HINT}"
                 )
 

@@ -27,7 +27,7 @@ def draw(
     """Return random numbers of each world, [B, count], from a counter-based generator.
 
     They depend only on the world's entries of `keys`, `episodes` and `steps`, shape [B], and on
-    `number`, which numbers the calls of a step. Distributions are "uniform" in [0, 1), with 24 or
+    `number`, the index of a call in its step. Distributions are "uniform" in [0, 1), with 24 or
     53 random bits; standard "normal", always finite; "bernoulli", ones with a probability of
     bound / 2^32; "integers" in [0, bound).
     """

@@ -41,7 +41,7 @@ MIN_STEERING = 1e-19
 
 
 class VectorSizes(NamedTuple):
-    """Numbers of scalars and vectors of an equivariant rule; `invariants` has the mixed ones."""
+    """Numbers of perceived scalars, perceived vectors and mixed vectors of an equivariant rule."""
 
     space_dim: int
     """Space dimension D."""
@@ -194,9 +194,9 @@ def _read_rows_backward(
 
 
 def _launch_steering(name: str, threads: int, *tensors: Tensor) -> None:
-    """Launch a kernel of steering on network outputs, mixed vectors, signs and further tensors.
+    """Launch "steer" or "pull_back_steering", on CUDA or by `threads` threads of portable kernels.
 
-    `name` is "steer" or "pull_back_steering", `threads` the number of those of a portable kernel.
+    The tensors are network outputs, mixed vectors, signs, and the kernel's further ones.
     """
     output, mixed, signs, *_ = tensors
     count, space_dim = map(int, mixed.shape[1:])

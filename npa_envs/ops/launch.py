@@ -89,7 +89,7 @@ def launch(
     if 0 in size:
         return
     for noted in _observers:
-        noted.append(_description_of(kernel, size))
+        noted.append(_described_launch(kernel, size))
     if _thread.recording is not None:
         _thread.recording.add(kernel, size, device, *arguments, block_dim=block_dim).run(size)
         return
@@ -105,7 +105,7 @@ def launch(
 
 @contextlib.contextmanager
 def tracing() -> Iterator[None]:
-    """Make `launch` do nothing in this thread's block: torch asks only for shapes of results."""
+    """Make this thread's `launch` do nothing in the block: torch asks only for results' shapes."""
     _thread.traced, before = True, _thread.traced
     try:
         yield
@@ -134,25 +134,24 @@ def _prepare(
 ) -> _PreparedLaunch:
     """Return a prepared launch of a kernel with these arguments; nothing is launched yet."""
     values = [
-        _description(value, _type_of(declared)) if isinstance(value, Tensor) else value
+        _array_descriptor(value, _type_of(declared)) if isinstance(value, Tensor) else value
         for value, declared in zip(arguments, kernel.adj.args, strict=True)
     ]
-    warp_place = warp_device(device)
+    target = warp_device(device)
     loaded = (kernel.module, device) in loaded_modules
-    # One process at a time compiles a module.
-    alone = contextlib.nullcontext() if loaded else in_turn(kernel.module.name)
-    with kernel_lock, quiet_warp(), alone:
+    one_process = contextlib.nullcontext() if loaded else in_turn(kernel.module.name)
+    with kernel_lock, quiet_warp(), one_process:
         packed = wp.launch(
             kernel,
             size,
             inputs=values,
-            device=warp_place,
-            block_dim=block_dim if warp_place.is_cuda else None,
+            device=target,
+            block_dim=block_dim if target.is_cuda else None,
             record_tape=False,
             record_cmd=True,
         )
         loaded_modules.add((kernel.module, device))
-    return (_CudaLaunch if warp_place.is_cuda else _CpuLaunch)(packed, device, *arguments)
+    return (_CudaLaunch if target.is_cuda else _CpuLaunch)(packed, device, *arguments)
 
 
 loaded_modules: set[tuple[Any, torch.device]] = set()
@@ -172,12 +171,12 @@ class _PreparedLaunch:
     """
 
     def __init__(self, packed: Any, device: torch.device, *arguments: Any) -> None:
-        self._launch = packed
+        self._warp_launch = packed
         self._device = device
         self._bounds: dict[tuple[int, ...], Any] = {}
         parameters = packed.params[1:]
         fields = [(f"a{k}", type(value)) for k, value in enumerate(parameters)]
-        self._memory: Any = _struct(tuple(fields))(*parameters)
+        self._memory: Any = _argument_struct(tuple(fields))(*parameters)
         """Struct of all arguments, which the kernel reads."""
         self._names = [name for name, _ in fields]
         self._writers: list[tuple[int, Callable[[Any], None]]] = []
@@ -202,13 +201,13 @@ class _PreparedLaunch:
             value = arguments[k]
             if value != last[k]:
                 last[k] = value
-                declared = self._launch.kernel.adj.args[k].type
+                declared = self._warp_launch.kernel.adj.args[k].type
                 number = declared(*value) if isinstance(value, tuple) else value
                 setattr(self._memory, self._names[k], number)
 
     def set_address(self, index: int, tensor: Tensor) -> None:
         """Point an array argument at another tensor of the same shape and dtype."""
-        getattr(self._memory, self._names[index]).data = tensor.data_ptr() or _null(tensor)
+        getattr(self._memory, self._names[index]).data = tensor.data_ptr() or _empty_address(tensor)
 
     def run(self, size: tuple[int, ...]) -> None:
         """Launch the kernel with `size` threads along each dimension."""
@@ -218,15 +217,17 @@ class _PreparedLaunch:
         """Return Warp's struct of a launch of `size` threads along each dimension."""
         bounds = self._bounds.get(size)
         if bounds is None:
-            if len(self._bounds) > MAX_BOUNDS:
-                self._bounds.clear()
-            self._launch.set_dim(size)
-            bounds = self._bounds[size] = self._launch.bounds
+            # CPU threads share Warp's launch.
+            with kernel_lock:
+                if len(self._bounds) > MAX_BOUNDS:
+                    self._bounds.clear()
+                self._warp_launch.set_dim(size)
+                bounds = self._bounds[size] = self._warp_launch.bounds
         return bounds
 
 
 @functools.lru_cache(maxsize=1024)
-def _struct(fields: tuple[tuple[str, type], ...]) -> Any:
+def _argument_struct(fields: tuple[tuple[str, type], ...]) -> Any:
     return type("Arguments", (ctypes.Structure,), {"_fields_": list(fields)})
 
 
@@ -234,7 +235,7 @@ class _CpuLaunch(_PreparedLaunch):
     """A launch on CPU threads, which share the first dimension if the kernel is in `MIN_RANGES`."""
 
     def run(self, size: tuple[int, ...]) -> None:
-        smallest = MIN_RANGES.get(self._launch.kernel)
+        smallest = MIN_RANGES.get(self._warp_launch.kernel)
         ranges = [] if smallest is None else even_ranges(size[0], smallest)
         if len(ranges) > 1:
             run_together([functools.partial(self._run_range, size, part) for part in ranges])
@@ -248,7 +249,7 @@ class _CpuLaunch(_PreparedLaunch):
         self._run_in_this_thread(memory, (len(indices), *size[1:]))
 
     def _run_in_this_thread(self, memory: Any, size: tuple[int, ...]) -> None:
-        self._launch.hooks.forward(ctypes.byref(self._bounds_of(size)), ctypes.byref(memory))
+        self._warp_launch.hooks.forward(ctypes.byref(self._bounds_of(size)), ctypes.byref(memory))
 
 
 class _CudaLaunch(_PreparedLaunch):
@@ -271,8 +272,8 @@ class _CudaLaunch(_PreparedLaunch):
         # Ten times faster than `torch.cuda.current_stream`, which makes an object of it.
         stream = torch._C._cuda_getCurrentRawStream(index)
         if not self._by_driver.run(bounds.size, stream):
-            self._launch.bounds = bounds
-            self._launch.launch(_warp_stream(self._device, stream))
+            self._warp_launch.bounds = bounds
+            self._warp_launch.launch(_warp_stream(self._device, stream))
 
 
 @cached_under_lock(64)
@@ -300,12 +301,12 @@ class _ArrayArgument:
             return
         size, dense = tensor.shape, tensor.is_contiguous()
         if size != self._size or tensor.dtype is not self._dtype or not dense:
-            _overwrite(self._descriptor, _description(tensor, self._type))
+            _overwrite(self._descriptor, _array_descriptor(tensor, self._type))
             self._size, self._dtype = size if dense else (), tensor.dtype
-        self._descriptor.data = tensor.data_ptr() or _null(tensor)
+        self._descriptor.data = tensor.data_ptr() or _empty_address(tensor)
 
 
-def _null(tensor: Tensor) -> int:
+def _empty_address(tensor: Tensor) -> int:
     """Return 0, the address of an empty tensor; raise NPAError if the tensor is not empty."""
     if tensor.numel():
         raise NPAError(
@@ -319,7 +320,7 @@ def _overwrite(memory: Any, value: Any) -> None:
     ctypes.memmove(ctypes.addressof(memory), ctypes.addressof(value), ctypes.sizeof(value))
 
 
-def _description(tensor: Tensor, array_type: Any) -> Any:
+def _array_descriptor(tensor: Tensor, array_type: Any) -> Any:
     """Return Warp's array descriptor of a tensor, flattened where the kernel's array is 1D."""
     tensor = tensor.detach()
     if array_type.ndim == 1:
@@ -415,7 +416,7 @@ class RecordedLaunches:
     def replay(
         self, begin: int = 0, end: int | None = None, *, last_count: int | None = None
     ) -> None:
-        """Launch [begin, end) of the sequence again; `last_count`: first size of the last one."""
+        """Repeat launches [begin, end); `last_count` replaces the first size of the last one."""
         launches = self._launches[begin:end]
         for prepared, size in launches[:-1]:
             prepared.run(size)
@@ -423,7 +424,7 @@ class RecordedLaunches:
         prepared.run(size if last_count is None else (last_count, *size[1:]))
 
 
-class Launch(NamedTuple):
+class NotedLaunch(NamedTuple):
     """Description of one launch of a Warp kernel."""
 
     kernel: str
@@ -437,9 +438,9 @@ class Launch(NamedTuple):
 
 
 @contextlib.contextmanager
-def noted_launches() -> Iterator[list[Launch]]:
+def noted_launches() -> Iterator[list[NotedLaunch]]:
     """Yield a list that receives each launch made within the block, by any thread."""
-    noted: list[Launch] = []
+    noted: list[NotedLaunch] = []
     _observers.append(noted)
     try:
         yield noted
@@ -447,11 +448,11 @@ def noted_launches() -> Iterator[list[Launch]]:
         _observers.remove(noted)
 
 
-_observers: list[list[Launch]] = []
+_observers: list[list[NotedLaunch]] = []
 """Lists to which launches are added."""
 
 
-def _description_of(kernel: Any, size: tuple[int, ...]) -> Launch:
+def _described_launch(kernel: Any, size: tuple[int, ...]) -> NotedLaunch:
     purpose = (inspect.getdoc(kernel.func) or "").split("\n")[0]
     module = kernel.module.name.removeprefix("npa_envs.").removeprefix("kernels.")
-    return Launch(kernel.func.__name__, module, " x ".join(map(str, size)), purpose)
+    return NotedLaunch(kernel.func.__name__, module, " x ".join(map(str, size)), purpose)

@@ -223,11 +223,11 @@ def _perceive_rows(
 
 
 class _PerceiveRows(torch.autograd.Function):
-    """Autograd function of `_perceived`; its backward pass is `perceive_rows_backward`."""
+    """Autograd function of `_saved_perception`; its backward pass is `perceive_rows_backward`."""
 
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
-        saved, row_particle = _perceived(*arguments, True)
+        saved, row_particle = _saved_perception(*arguments, True)
         _, s, _, static, _, masked, *_, physics = arguments
         ctx.set_materialize_grads(False)
         ctx.shape, ctx.masked, ctx.physics = s.shape, masked, physics
@@ -257,7 +257,7 @@ class _PerceiveRows(torch.autograd.Function):
         return x_bar, states_bar, *[None] * 7
 
 
-def _perceived(
+def _saved_perception(
     x: Tensor,
     s: Tensor,
     mask: Tensor | None,
@@ -316,7 +316,7 @@ def perceive_rows(
     if torch.is_grad_enabled() and (x.requires_grad or s.requires_grad):
         perception, *maps = _PerceiveRows.apply(*arguments)  # type: ignore[no-untyped-call]
     else:
-        saved, row_particle = _perceived(*arguments, False)
+        saved, row_particle = _saved_perception(*arguments, False)
         perception, maps = saved.perception, [saved.row_of, row_particle, saved.starts]
     row_of, row_particle, starts = maps if rows is None else rows[:3]
     return perception, Rows(row_of, row_particle, starts, x.shape[0] * x.shape[1] if masked else 0)
@@ -364,7 +364,7 @@ def updates_in_parts(
 
 
 class NeighbourState:
-    """Worlds x and s, sorted into cells with densities; neither is checked, or may change.
+    """Worlds x and s, unchecked, sorted into cells with densities; they must not change.
 
     `world_indices`, int64, shape [B], are the worlds' indices in a larger batch, into which
     perception is written; None: the worlds are the whole batch.

@@ -144,7 +144,7 @@ class Physics(NamedTuple):
         return self.eps / self.eps0
 
     def constants(self) -> Physics:
-        """Return the constants, while torch.compile traces in a form that it takes for constant."""
+        """Return the constants, in a form that torch.compile takes for constant while it traces."""
         if not torch.compiler.is_compiling():
             return self
         # Compilers lose fields that `_replace` or a default would fill in.

@@ -236,10 +236,17 @@ def sort_worlds(
     ordered = _empty_worlds(plan, x, s is not None, with_rows)
     if capacity:
         _sort_by_blocks(plan, capacity, x, s, mask, ordered)
-        return ordered
-    if plan.runs("sort") == "world" and earlier <= MAX_THREAD_MASK:
+    elif plan.runs("sort") == "world" and earlier <= MAX_THREAD_MASK:
         _sort_by_threads(plan, x, s, mask, ordered)
-        return ordered
+    else:
+        _sort_in_passes(plan, x, s, mask, ordered)
+    return ordered
+
+
+def _sort_in_passes(
+    plan: KernelPlan, x: Tensor, s: Tensor | None, mask: Tensor | None, ordered: SortedWorlds
+) -> None:
+    """Write worlds of any size to `ordered`: particles are counted, placed by cell and moved."""
     assert not is_recording(), "torch's operations between these launches would not be recorded"
     kernels = sort_kernels(plan.space_dim, plan.scalar, plan.width)
     device, total = x.device, plan.total
@@ -269,7 +276,6 @@ def sort_worlds(
         arrived,
         *ordered,
     )
-    return ordered
 
 
 def _empty_worlds(plan: KernelPlan, x: Tensor, with_states: bool, with_rows: bool) -> SortedWorlds:

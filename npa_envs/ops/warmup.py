@@ -60,30 +60,7 @@ def warmup(
         for space_dim in space_dims:
             x = torch.zeros(1, 2, space_dim, dtype=dtype, device=device, requires_grad=True)
             s = torch.zeros(1, 2, state_dim, dtype=dtype, device=device, requires_grad=True)
-            _pull_back(perceive(x, s, 0.1, detach_positions=False))
-            limits = Limits(1.0, 1.0, 1.0, 1.0)
-            physics = Physics(space_dim, state_dim, 0.1, 0.1, max_displacement=0.1, limits=limits)
-            # Small, medium and large worlds run different kernels.
-            for count in (2, SHARED_WORLD, SHARED_WORLD + 1):
-                positions, states = (v.detach()[:, :1].expand(-1, count, -1) for v in (x, s))
-                NeighbourState(positions, states, physics).perceive()
-                _warm_steps(positions, states, physics)
-                if space_dim == 2:
-                    target, middle = x.new_zeros(8, 8, 4), x.new_zeros(2)
-                    picture_losses(
-                        positions, states, target, goal=middle, shift=0.0, pixel_size=0.1
-                    )
-            _warm_static(x, s, physics)
-            _warm_network(x, physics)
-            _warm_invariants(x, state_dim)
-            enabled, diverged = torch.ones(2, 1, dtype=torch.uint8, device=device)
-            copies = x.detach().clone(), s.detach().clone()
-            acted = ActedWorlds(*copies, None, None, enabled, diverged)
-            PreparedActions(acted, physics)(x.new_zeros(1, 2, physics.action_dim))
-            if space_dim == 2:
-                _pull_back(splat(x, x.new_zeros(1, 2, 3), resolution=8, pixel_size=0.1))
-            else:
-                _warm_views(x)
+            _warm_worlds(x, s)
 
 
 def _checked_choice(name: str, value: Any, known: tuple[Any, ...]) -> list[Any]:
@@ -107,6 +84,32 @@ def _warm_rewards(elapsed: torch.Tensor) -> None:
         endings=flag.new_zeros(2),
     )
     update_episodes(number[None])
+
+
+def _warm_worlds(x: torch.Tensor, s: torch.Tensor) -> None:
+    """Run all operators on worlds of two particles, and those of steps on larger worlds."""
+    space_dim, state_dim = x.shape[2], s.shape[2]
+    _pull_back(perceive(x, s, 0.1, detach_positions=False))
+    limits = Limits(1.0, 1.0, 1.0, 1.0)
+    physics = Physics(space_dim, state_dim, 0.1, 0.1, max_displacement=0.1, limits=limits)
+    # Small, medium and large worlds run different kernels.
+    for count in (2, SHARED_WORLD, SHARED_WORLD + 1):
+        positions, states = (v.detach()[:, :1].expand(-1, count, -1) for v in (x, s))
+        NeighbourState(positions, states, physics).perceive()
+        _warm_steps(positions, states, physics)
+        if space_dim == 2:
+            target, middle = x.new_zeros(8, 8, 4), x.new_zeros(2)
+            picture_losses(positions, states, target, goal=middle, shift=0.0, pixel_size=0.1)
+    _warm_static(x, s, physics)
+    _warm_network(x, physics)
+    _warm_invariants(x, state_dim)
+    enabled, diverged = torch.ones(2, 1, dtype=torch.uint8, device=x.device)
+    acted = ActedWorlds(x.detach().clone(), s.detach().clone(), None, None, enabled, diverged)
+    PreparedActions(acted, physics)(x.new_zeros(1, 2, physics.action_dim))
+    if space_dim == 2:
+        _pull_back(splat(x, x.new_zeros(1, 2, 3), resolution=8, pixel_size=0.1))
+    else:
+        _warm_views(x)
 
 
 def _warm_steps(x: torch.Tensor, s: torch.Tensor, physics: Physics) -> None:

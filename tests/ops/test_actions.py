@@ -19,7 +19,7 @@ ERRORS = {torch.float32: 1e-6, torch.float64: 3e-15}
 
 @pytest.fixture
 def world(space_dim, dtype, device):
-    """Actions of which about half are longer than one, positions and states."""
+    """Return random actions, about half with displacements longer than 1; positions; states."""
     g = torch.Generator().manual_seed(1)
     action = torch.randn(B, N, space_dim + C, generator=g, dtype=torch.float64)
     x = 2.0 * torch.rand(B, N, space_dim, generator=g, dtype=torch.float64) - 1.0
@@ -36,7 +36,7 @@ def physics_of(
 
 
 def applied(action, x, s, mask=None, noise=None, enabled=None, diverged=None, **rules):
-    """Return new positions and states, and which worlds diverged; x and s are left alone."""
+    """Return positions and states after actions on copies of x and s, and which worlds diverged."""
     x, s = x.clone(), s.clone()
     if diverged is None:
         diverged = torch.zeros(len(x), dtype=torch.uint8, device=x.device)
@@ -46,7 +46,7 @@ def applied(action, x, s, mask=None, noise=None, enabled=None, diverged=None, **
 
 
 def formula(action, x, s, mask=None, noise=None, moving=True, box=None):
-    """The new positions and states in float64, without limits."""
+    """Return the positions and states after actions, by the formula in float64, without limits."""
     action = action.double() if mask is None else action.double() * mask[..., None]
     x, s = x if noise is None else x + noise, s.double()
     x = x.double()
@@ -69,7 +69,7 @@ def assert_near(values, expected, dtype):
 @pytest.mark.parametrize("noisy", [False, True], ids=["quiet", "noisy"])
 @pytest.mark.parametrize("masked", [False, True], ids=["all", "masked"])
 def test_particles_follow_the_formula(masked, noisy, moving, world, dtype):
-    """Outside the mask noise alone moves them, whatever their actions are."""
+    """Outside of the mask only noise moves them, whatever their actions are."""
     action, x, s = world
     if not moving:
         action = action[..., :C].contiguous()
@@ -159,7 +159,7 @@ def test_nothing_happens_where_it_is_switched_off_and_marks_are_kept(world, devi
 
 
 def prepared(x, s):
-    """Return the actions on copies of a world, with these copies, and what switches them off."""
+    """Return `PreparedActions` on copies of a world, the copies, and its `enabled` tensor."""
     enabled = torch.ones(1, dtype=torch.uint8, device=x.device)
     diverged = torch.zeros(x.shape[0], dtype=torch.uint8, device=x.device)
     worlds = ActedWorlds(x.clone(), s.clone(), None, None, enabled, diverged)

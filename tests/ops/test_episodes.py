@@ -18,7 +18,7 @@ B, PARTS = 64, 3
 
 
 def worlds(device):
-    """Worlds of many kinds: diverged, successful, late, with losses that are not finite."""
+    """Return random arguments of `EpisodeUpdate`: diverged, successful and late worlds."""
     generator = torch.Generator().manual_seed(0)
 
     def draw(*shape):
@@ -41,7 +41,7 @@ def worlds(device):
 
 
 def expected(rules, arguments):
-    """Numbers, flags and endings after a step."""
+    """Return `numbers`, `flags` and `endings` that `EpisodeUpdate` should write."""
     parts, diverged = arguments["parts"], arguments["diverged"].bool()
     penalised = diverged & (rules.on_divergence != "ignore")
     ended = diverged & (rules.on_divergence == "terminate")

@@ -58,7 +58,7 @@ every_operator = pytest.mark.parametrize("name", OPERATORS)
 
 
 def outcome(name, x, s):
-    """A value, and the gradient of its sum by the states, as given in memory."""
+    """Return an operator's result, and the gradient of its sum with respect to the states."""
     s = s.detach().requires_grad_()
     value = OPERATORS[name](x, s)
     return value.detach(), *torch.autograd.grad(value.sum(), s)
@@ -197,7 +197,7 @@ def test_a_tangent_is_rejected(name, gradients, device):
 
 
 def acted_and_observed(x, s):
-    """Return worlds after two actions, and what they observe then; launches are recorded."""
+    """Return worlds after two actions, and their perception twice, by recorded launches."""
     x, s = x.detach().clone(), s.detach().clone()
     diverged, enabled = torch.zeros(len(x), dtype=torch.uint8), torch.ones(1, dtype=torch.uint8)
     limits = Limits(perception=1.0, position=0.6, state=10.0)

@@ -18,7 +18,7 @@ GRADIENT_BOUND = {torch.float32: 3e-5, torch.float64: 1e-12}  # 5e-6, 8e-15
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """What a random scene is made of."""
+    """Sizes and options of a random scene of Gaussians."""
 
     worlds: int = 1
     particles: int = 50
@@ -72,7 +72,7 @@ class Scene:
         return dataclasses.replace(cameras, world_to_camera=motions, intrinsics=lenses)
 
     def of(self, dtype, device):
-        """Return Gaussians that want gradients, and cameras."""
+        """Return Gaussians that require gradients, and cameras."""
         gaussians = [t.to(device, dtype).requires_grad_() for t in self.gaussians]
         return gaussians, self.cameras.to(device).to(dtype)
 
@@ -121,7 +121,7 @@ def expected_pictures(gaussians, cameras, *, background=None, dilation=0.3):
 
 
 def gradients_of(image, alpha, inputs):
-    """Return the gradients of image and alpha along random cotangents, then of alpha alone."""
+    """Return gradients of image and alpha for random cotangents, then of only alpha."""
     bars = cotangents((image, alpha))
     both = torch.autograd.grad((image, alpha), inputs, bars, retain_graph=True)
     return [*both, *torch.autograd.grad(alpha, inputs[:4], bars[1])]
@@ -267,7 +267,7 @@ def test_gaussians_that_are_not_finite_leave_the_picture_alone(name, value, devi
 
 
 def test_without_room_the_farthest_are_missing(device):
-    """A picture has room for so many pairs of a tile and a Gaussian."""
+    """A picture has room for a limited number of pairs of a tile and a Gaussian."""
     scene = Scene(worlds=2, particles=40, size=(64, 64), scales=(0.1, 0.2), spread=0.8)
     gaussians, cameras = scene.of(torch.float32, device)
     with torch.no_grad():

@@ -37,7 +37,7 @@ def trained_like_rule(device, space_dim=2, state_dim=16, hidden_dim=128, static=
 
 
 def random_rows(rule, folded, row_count):
-    """Rows of perception whose hidden units all keep away from zero, where relu has a corner."""
+    """Return random rows of perception for which no hidden unit is near 0, the corner of relu."""
     generator = torch.Generator().manual_seed(1)
     rows = torch.zeros(2 * row_count, folded.row_width)
     perception = torch.randn(2 * row_count, rule.perception_dim, generator=generator)
@@ -49,7 +49,7 @@ def random_rows(rule, folded, row_count):
 
 
 def pulled_back(function, inputs, cotangent):
-    """Return what a function gives, then the gradients of its inputs."""
+    """Return a function's result, then the gradients of its inputs for a cotangent."""
     inputs = [value.detach().requires_grad_() for value in inputs]
     update = function(*inputs)
     return update.detach(), *torch.autograd.grad(update, inputs, cotangent.expand_as(update))

@@ -112,7 +112,7 @@ def test_particles_that_nearly_touch_have_finite_gradients(dtype, space_dim, dis
 
 @pytest.mark.parametrize("box", [None, "oblong"])
 def test_states_whose_squares_overflow_are_perceived(dtype, space_dim, box, device):
-    """Lengths of gradients are taken without their squares where those are no numbers."""
+    """Lengths of gradients are computed without squares where squares would be infinite."""
     box = sides(box, space_dim)
     largest = 33 if dtype == torch.float32 else 300
 
@@ -138,7 +138,7 @@ def test_states_whose_squares_overflow_are_perceived(dtype, space_dim, box, devi
 
 
 def test_a_clump_takes_no_more_memory_than_the_same_particles_apart(space_dim):
-    """All in one cell: time is quadratic in them, but nothing is kept for each pair."""
+    """All are in one cell: time is quadratic in their number, memory is not."""
 
     def allocated(particle_count, side):
         x, s = random_world(1, particle_count, space_dim, 16, dtype=torch.float32, device="cpu")
@@ -182,7 +182,7 @@ def test_observation_is_perception_in_the_callers_order_and_clipped(
 
 
 def answers(x, s, bars):
-    """Return what environments observe, then perception and its adjoints in space and in a box."""
+    """Return perception of environments and of rollouts, with its gradients, open and in a box."""
     results = [observed(x, s).perceive()]
     for box, detached in itertools.product((None, (1.4, 1.8)), (True, False)):
         leaves = [value.clone().requires_grad_() for value in (x, s)]

@@ -20,7 +20,7 @@ PICTURE_BOUND = 200
 
 @dataclass(frozen=True)
 class Drawing:
-    """Worlds and how they are drawn."""
+    """Random worlds, with the window or cameras that draw them."""
 
     particles: tuple[Tensor, ...]
     """What particles are, shape [B, N, ...] each."""
@@ -50,7 +50,7 @@ class Picture(Drawing):
         return self.particles[0]
 
     def drawn(self):
-        """Return the pictures, and the gradients of a sum of them by what particles are."""
+        """Return the pictures, and gradients of a random sum of them with respect to particles."""
         leaves = [value.clone().requires_grad_() for value in self.particles]
         picture = (periodic_splat if self.periodic else splat)(
             *leaves, resolution=self.resolution, pixel_size=self.pixel_size, sigma=self.sigma,
@@ -64,7 +64,7 @@ class Picture(Drawing):
 
     @property
     def allowed(self):
-        """How far rounding may move a pixel."""
+        """Return the error of a pixel that rounding may cause."""
         peak = (self.resolution * self.pixel_size / (self.hi - self.lo)) ** 2
         largest = float(self.particles[1].abs().max().clamp(min=1.0))
         return PICTURE_BOUND * UNIT[self.x.dtype] * self.x.shape[1] * peak * largest
@@ -122,7 +122,7 @@ def test_periodic_pictures_turn_with_their_particles(drawn):
 
 @dataclass(frozen=True)
 class Scene(Drawing):
-    """3D worlds, of means, scales, quaternions, opacities and colours, and how they are seen."""
+    """3D worlds (means, scales, quaternions, opacities and colours) and their cameras."""
 
     cameras: Cameras
     allowed: float = 0.0

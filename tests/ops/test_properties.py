@@ -153,7 +153,7 @@ def test_a_rollout_does_not_depend_on_the_unit_of_length(w):
 
 @every(double_worlds)
 def test_a_world_goes_in_a_batch_as_it_goes_alone(w):
-    """Up to rounding: a product of matrices may round rows otherwise where there are more."""
+    """Up to rounding: a matrix product may round rows differently where there are more of them."""
     clear_of_threshold(w)
     rule = rule_of(w, static=w.seed % 3 == 0)
     together = run(w, rule, 1, generator=streams(w))

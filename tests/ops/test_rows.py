@@ -55,7 +55,7 @@ def assert_equals_float64(x, s, masked=False, **options):
 
 @pytest.fixture(params=[0, 4096], ids=("one thread", "several threads"))
 def shared(request, monkeypatch):
-    """Particles of the largest world in which several threads of a GPU share a particle."""
+    """Set the maximum number of particles of worlds in which several threads share a particle."""
     monkeypatch.setattr(backend, "SHARED_WORLD", request.param)
     backend.choose.cache_clear()
     yield request.param
@@ -74,13 +74,13 @@ def test_rows_equal_those_of_float64(space_dim, box, state_dim, masked, shared, 
 @all_or_half
 @pytest.mark.parametrize("count", [40, 80, 140, 300, 900])
 def test_rows_of_crowded_worlds_are_right(space_dim, count, masked, shared, device):
-    """Everybody sees everybody: on CUDA, lists overflow, and before that a thread's part of one."""
+    """All particles are neighbours: on CUDA lists overflow, or only a thread's part of a list."""
     x, s = random_world(2, count, space_dim, 16, dtype=torch.float32, device=device)
     assert_equals_float64(0.03 * x, s, masked, eps=0.2)
 
 
 def squeezed(x, box):
-    """Return worlds in a box, of which some particles have more than 256 neighbours."""
+    """Return worlds in a box, in which some particles have more than 256 neighbours."""
     x = x / 1.4
     x[:, :200] *= 0.2
     return x

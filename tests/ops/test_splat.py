@@ -15,7 +15,7 @@ OPTIONS = {"resolution": 24, "pixel_size": 0.11, "sigma": 0.9}
 
 
 def scattered(world_count, particle_count, dtype, device):
-    """Particles inside the window, on its edge and outside."""
+    """Return particles inside the window, on its edge and outside, and their colours."""
     generator = torch.Generator().manual_seed(0)
     x = torch.rand(world_count, particle_count, 2, generator=generator) * 2.6 - 1.3
     colour = torch.rand(world_count, particle_count, 3, generator=generator)
@@ -23,7 +23,7 @@ def scattered(world_count, particle_count, dtype, device):
 
 
 def in_the_box(world_count, particle_count, dtype, device):
-    """Particles all over the box, some of them almost on its edges."""
+    """Return particles all over the box, some almost on its edges, and their colours."""
     x, colour = scattered(world_count, particle_count, dtype, device)
     x = x / 1.3
     x[:, 0], x[:, 1], x[:, 2, 0] = -0.9999, 0.9999, -0.9999
@@ -31,7 +31,7 @@ def in_the_box(world_count, particle_count, dtype, device):
 
 
 def periodic_oracle(x, colour, *, resolution, pixel_size, sigma, lo=-1.0, hi=1.0):
-    """Every particle with its eight images, each over the whole picture, in plain torch."""
+    """Return the pictures of `periodic_splat` in plain torch: each particle with its images."""
     spread = sigma * resolution * pixel_size / (hi - lo)
     radius = -(-3.0 * spread // 1.0)
     place = (x - lo) / (hi - lo) * resolution - 0.5

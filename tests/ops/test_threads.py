@@ -19,7 +19,7 @@ needs_fork = pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 
 @pytest.fixture
 def set_threads():
-    """Sets torch's threads; they are put back after the test."""
+    """Return a function that sets torch's number of threads until the end of the test."""
     before = torch.get_num_threads()
     yield torch.set_num_threads
     torch.set_num_threads(before)
@@ -51,7 +51,7 @@ def test_an_error_in_another_thread_is_raised_after_every_call(set_threads):
 
 
 def threads_of_a_worker():
-    """Return the number of threads of a new process, then whether it can be set."""
+    """Return this process's default number of threads, then whether it can be set."""
     default = cpu_threads.thread_count()
     torch.set_num_threads(torch.get_num_threads() + 1)
     return default, cpu_threads.thread_count() == torch.get_num_threads()

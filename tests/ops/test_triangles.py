@@ -4,7 +4,7 @@ from npa_envs.ops.pictures.triangles import nearest_triangles
 
 
 def brute_force(place, nearness, colours, faces, seen, width, height):
-    """Return the same pictures, pixel by pixel: weights solve for the pixel's middle."""
+    """Return the expected pictures: for each pixel, weights of corners that give its middle."""
     picture = torch.zeros(len(place), height, width, 4, dtype=torch.float64)
     for camera in range(len(place)):
         nearest = torch.zeros(height, width, dtype=torch.float64)
