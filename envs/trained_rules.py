@@ -1,7 +1,4 @@
-"""Trained rules in environments: a rule grows start worlds, or steps worlds that an agent acts on.
-
-Also functions that load, run and check the rules of environments.
-"""
+"""Trained rules in environments: rules that grow start worlds, and rules that step worlds."""
 
 from __future__ import annotations
 
@@ -218,7 +215,7 @@ class RuleDrivenWorlds(BatchedWorlds):
         return observed if out is None else out.copy_(observed)
 
     def begin(self, world_indices: Tensor, start: Start, *, check: bool) -> None:
-        """Begin episodes of worlds, int64 [B'], at `start`, and store their `context`."""
+        """Begin episodes as the base class does, and store their `context`."""
         super().begin(world_indices, start, check=check)
         draws = self.random.take(world_indices).substream(StreamId.GOAL)
         context = self.task.episode_context(start, self.loss[world_indices], draws)

@@ -264,7 +264,7 @@ class WorldConfig:
         return cls(**{name: as_python(value) for name, value in keywords.items()})
 
     def as_config(self, config_type: type[TaskConfig], **changes: Any) -> TaskConfig:
-        """Return a training task's configuration with the fields that both have, and `changes`."""
+        """Return a training task's configuration from the fields that both have, and `changes`."""
         names = [field.name for field in fields(config_type)]  # type: ignore[arg-type]
         shared = {name: getattr(self, name) for name in names if hasattr(self, name)}
         return config_type(**(shared | changes))

@@ -163,7 +163,7 @@ class SpeciesConfig(WorldConfig):
 
 
 class Population(NamedTuple):
-    """Particles of B worlds, sorted by species; removed particles are the same in all worlds."""
+    """Particles of B worlds, sorted by species; if some were removed, the same in each world."""
 
     x: Tensor
     """Positions [length units], shape [B, N, 2]."""
