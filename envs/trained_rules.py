@@ -202,7 +202,7 @@ class RuleDrivenWorlds(BatchedWorlds):
             self.task.step(x[one], s[one], action[one], random)
             for one, random in zip(each, streams, strict=True)
         ]
-        # All streams have advanced by as many draws.
+        # All streams have advanced by as many random numbers.
         self.random.sync_with(streams[-1], self.task.config.rule_steps)
         x, s = (torch.cat(part) for part in zip(*worlds, strict=True))
         return x, s
@@ -217,8 +217,8 @@ class RuleDrivenWorlds(BatchedWorlds):
     def begin(self, world_indices: Tensor, start: Start, *, check: bool) -> None:
         """Begin episodes as the base class does, and store their `context`."""
         super().begin(world_indices, start, check=check)
-        draws = self.random.take(world_indices).substream(StreamId.GOAL)
-        context = self.task.episode_context(start, self.loss[world_indices], draws)
+        random = self.random.take(world_indices).substream(StreamId.GOAL)
+        context = self.task.episode_context(start, self.loss[world_indices], random)
         if self.context is None:
             shapes = ((self.world_count, *value.shape[1:]) for value in context)
             self.context = type(context)(*map(Tensor.new_zeros, context, shapes))

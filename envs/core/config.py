@@ -133,7 +133,7 @@ class WorldConfig:
     """Radius ε0 that perception is scaled to: the one that rules are trained at [length units]."""
 
     alpha: float = 0.5
-    """Largest displacement in one step, as a fraction of ε (dimensionless)."""
+    """Maximum displacement in one step, as a fraction of ε (dimensionless)."""
 
     state_scale: float = 1.0
     """Change of a state channel by an action of 1 (dimensionless)."""

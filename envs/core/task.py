@@ -258,10 +258,10 @@ class EnvTask(WorldTask[Config]):
             # Other streams than those of episodes with these seeds.
             random = WorldRandom(seeds, device=self.device).substream(StreamId.GROWTH)
             start = self._as_start("fresh", self.fresh(random))
-            fresh, size = Particles(start.x, start.s, goal=start.goal), self.config.seed_pool
+            made, size = Particles(start.x, start.s, goal=start.goal), self.config.seed_pool
             if self._pool is None:
-                self._pool = fresh.map(lambda value: value.new_empty(size, *value.shape[1:]))
-            self._pool.put_(torch.tensor(missing, device=self.device), fresh)
+                self._pool = made.map(lambda value: value.new_empty(size, *value.shape[1:]))
+            self._pool.put_(torch.tensor(missing, device=self.device), made)
             self._pooled.update(missing)
         assert self._pool is not None, "the first call makes worlds"
         taken = self._pool.take(indices)

@@ -230,8 +230,8 @@ class InvasionTask(PictureLossTask):
         """Return losses by name, [B, N]; invaders have equal ones, and a world's sum is 0."""
         losses = self.task.particle_contributions(*population.of(0))
         count, invader_count = losses.shape[1], sum(population.counts[1:])
-        part = world_mean(losses[..., None])[:, 0] * (-count / max(invader_count, 1))
-        return {"picture": torch.cat((losses, part[:, None].expand(-1, invader_count)), dim=1)}
+        mean = world_mean(losses[..., None])[:, 0] * (-count / max(invader_count, 1))
+        return {"picture": torch.cat((losses, mean[:, None].expand(-1, invader_count)), dim=1)}
 
     def with_opponent(self, action: Tensor, population: Population, random: WorldRandom) -> Tensor:
         """Return `action`, [B, N, A], with random rows for invaders if opponent="random"."""
