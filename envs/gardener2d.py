@@ -60,15 +60,15 @@ class GardenerTask(GardenTask[Gardener2DEnvConfig]):
     def disturb(self, particles: Particles, random: WorldRandom) -> Particles:
         """Return worlds after a random gust and a random blight, of the given chances."""
         x, s, *_ = particles
-        config, draws = self.config, random.substream(StreamId.DAMAGE)
-        chance, angle = draws.uniform(2), 2.0 * math.pi * draws.uniform(1)
-        centre = random_particle(x, draws)
+        config, random = self.config, random.substream(StreamId.DAMAGE)
+        chance, angle = random.uniform(2), 2.0 * math.pi * random.uniform(1)
+        centre = random_particle(x, random)
         happens = (chance[:, :1] < config.gust_chance).to(x.dtype)
         move = config.gust_length * happens * torch.cat((angle.cos(), angle.sin()), dim=1)
         box = self.periodic_sides
         x = push(x, centre=centre, move=move, radius=config.gust_radius, box=box)
         # A negative radius wipes nothing.
-        centre = random_particle(x, draws)
+        centre = random_particle(x, random)
         happens = chance[:, 1] < config.blight_chance
         radius = torch.where(happens, config.blight_radius, -1.0)
         s = wipe_state(x, s, centre=centre, radius=radius, box=box)

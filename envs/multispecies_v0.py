@@ -45,7 +45,7 @@ class MultiSpeciesEnv(CrowdEnv):
     `species_0` is the only agent.
 
     In `parallel_env` all agents act at once. In `env` and `raw_env` they act in turn, by
-    PettingZoo's own conversion, and the world moves on after the last one. `env` also clips actions
+    PettingZoo's own conversion, and the world is stepped after the last. `env` also clips actions
     into their space. `pettingzoo.make`, of PettingZoo 1.27 or newer, takes the ids once
     `npa_envs.envs.multispecies_v0` is imported. `batched` steps
     [many worlds at once](../species.md#many-worlds-at-once), to train on.

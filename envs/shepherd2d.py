@@ -187,7 +187,7 @@ def double_angle(tangent: Tensor) -> Tensor:
 
 
 def axis_turn(first: Tensor, now: Tensor) -> Tensor:
-    """Return (cos 2φ, sin 2φ), [B, 2], of how far φ the longer axis turned; of `moments_of`."""
+    """Return (cos 2φ, sin 2φ), [B, 2]; φ: angle of the longer axes of two `moments_of`."""
 
     def axis(moments: Tensor) -> tuple[Tensor, Tensor]:
         across, slant = moments[:, 2] - moments[:, 4], 2.0 * moments[:, 3]
@@ -216,7 +216,7 @@ class _GoalReward:
     def compute_reward(
         self, achieved_goal: Any, desired_goal: Any, info: Mapping[str, Any] | Any
     ) -> NDArray[np.float64] | Any:
-        """Return the rewards, float32, [...], for any achieved and desired goals, [..., 3]."""
+        """Return the rewards, [...], for any achieved and desired goals, [..., 3] each."""
         # By torch, as in steps: NumPy's square roots round differently on some processors.
         achieved = torch.tensor(np.asarray(achieved_goal))
         desired = torch.tensor(np.asarray(desired_goal))

@@ -1,7 +1,4 @@
-"""Trained rules in environments: a rule grows start worlds, or steps worlds that an agent acts on.
-
-Also functions that load, run and check the rules of environments.
-"""
+"""Trained rules in environments: rules that grow start worlds, and rules that step worlds."""
 
 from __future__ import annotations
 
@@ -205,7 +202,7 @@ class RuleDrivenWorlds(BatchedWorlds):
             self.task.step(x[one], s[one], action[one], random)
             for one, random in zip(each, streams, strict=True)
         ]
-        # All streams have advanced by as many draws.
+        # All streams have advanced by as many random numbers.
         self.random.sync_with(streams[-1], self.task.config.rule_steps)
         x, s = (torch.cat(part) for part in zip(*worlds, strict=True))
         return x, s
@@ -218,10 +215,10 @@ class RuleDrivenWorlds(BatchedWorlds):
         return observed if out is None else out.copy_(observed)
 
     def begin(self, world_indices: Tensor, start: Start, *, check: bool) -> None:
-        """Begin episodes of worlds, int64 [B'], at `start`, and store their `context`."""
+        """Begin episodes as the base class does, and store their `context`."""
         super().begin(world_indices, start, check=check)
-        draws = self.random.take(world_indices).substream(StreamId.GOAL)
-        context = self.task.episode_context(start, self.loss[world_indices], draws)
+        random = self.random.take(world_indices).substream(StreamId.GOAL)
+        context = self.task.episode_context(start, self.loss[world_indices], random)
         if self.context is None:
             shapes = ((self.world_count, *value.shape[1:]) for value in context)
             self.context = type(context)(*map(Tensor.new_zeros, context, shapes))

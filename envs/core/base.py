@@ -32,7 +32,7 @@ SHOWN_ACROSS = 4
 
 
 class ParticleSpaces:
-    """Spaces with a row for each particle; converts users' actions, and observations for them."""
+    """Spaces of observations and actions with a row for each particle, and conversions of both."""
 
     def __init__(self, physics: Physics, config: EnvConfig) -> None:
         count, limit = config.particle_count, physics.limits.perception
@@ -45,11 +45,11 @@ class ParticleSpaces:
         self._output = config.output
 
     def action(self, action: Any, world_count: int | None) -> Tensor:
-        """Return checked actions, float32, [B, N, A]; `world_count` None: [N, A] of one world."""
+        """Return checked actions, float32, [B, N, A]; `world_count` None: of one world, B = 1."""
         return batch_tensor(action, world_count, self._shape, "N, A")
 
     def observation_output(self, observation: Tensor) -> Any:
-        """Return observations, [B, N, P] or [N, P], as `config.output`: NumPy array or tensor."""
+        """Return observations, [B, N, P] or [N, P], as array or tensor, as `config.output` says."""
         return to_output(observation, self._output)
 
     def final_observation_output(self, observation: Tensor, ended: NDArray[np.bool_]) -> Any:
@@ -93,7 +93,7 @@ def batch_tensor(
 def action_tensor(
     name: str, action: Any, expected: tuple[int, ...], space: str, letters: str = ""
 ) -> Tensor:
-    """Return an action as float32 after a check of its shape; a tensor keeps its device.
+    """Return an action of shape `expected` as float32, after a check; a tensor keeps its device.
 
     The error message calls the action `name`, and refers to the space called `space`.
     """
@@ -194,7 +194,7 @@ class WorldsEnv(ShownEnv):
     spec: Any
 
     def _make_worlds(self, keywords: dict[str, Any], world_count: int, steps: int | None) -> None:
-        """Set `config`, `worlds`, `task` and `spaces`; `steps`: maximum of an episode, or None."""
+        """Set `config`, `worlds`, `task` and `spaces`; `steps`: maximum of an episode."""
         self.config = self.task_type.config_type.from_keywords(keywords)
         self.render_mode = self.config.render_mode
         worlds_type = self.task_type.worlds_type or ParticleWorlds
@@ -210,7 +210,7 @@ class WorldsEnv(ShownEnv):
         values: Any,
         buffer: Tensor | None = None,
     ) -> Tensor:
-        """Call `change(world_indices, values)`; return all observations after it, in `buffer`."""
+        """Call `change(world_indices, values)`; return observations, in `buffer` if given."""
         with self.worlds.device_context():
             change(world_indices, values)
             observation: Tensor = self.worlds.perceive(buffer)
@@ -219,7 +219,7 @@ class WorldsEnv(ShownEnv):
         return observation
 
     def losses_of(self, numbers: Any) -> dict[str, Any]:
-        """Return the loss and its terms as in infos; `numbers`: rows of `StepReport.numbers`."""
+        """Return the loss and its terms by name, as in infos, from `StepReport.numbers`."""
         named, names = StepNumbers.from_rows(numbers), self.worlds.episodes.term_names
         return {"loss": named.loss} | named_terms("loss", names, named.terms)
 

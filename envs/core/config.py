@@ -133,7 +133,7 @@ class WorldConfig:
     """Radius ε0 that perception is scaled to: the one that rules are trained at [length units]."""
 
     alpha: float = 0.5
-    """Largest displacement in one step, as a fraction of ε (dimensionless)."""
+    """Maximum displacement in one step, as a fraction of ε (dimensionless)."""
 
     state_scale: float = 1.0
     """Change of a state channel by an action of 1 (dimensionless)."""
@@ -264,7 +264,7 @@ class WorldConfig:
         return cls(**{name: as_python(value) for name, value in keywords.items()})
 
     def as_config(self, config_type: type[TaskConfig], **changes: Any) -> TaskConfig:
-        """Return a training task's configuration with the fields that both have, and `changes`."""
+        """Return a training task's configuration from the fields that both have, and `changes`."""
         names = [field.name for field in fields(config_type)]  # type: ignore[arg-type]
         shared = {name: getattr(self, name) for name in names if hasattr(self, name)}
         return config_type(**(shared | changes))

@@ -70,7 +70,7 @@ class GraphedSteps:
         return self.__dict__ | none | {"host_is_current": False}
 
     def act(self, action: Tensor) -> None:
-        """Apply actions, [B, N, A], and evaluate; the host can wait for the side stream's mark."""
+        """Apply actions, [B, N, A], and evaluate; then set the mark that the host waits for."""
         if self._is_one_graph:
             # Copying actions costs less than the launches that the graph replaces.
             self._actions.load(action)
@@ -148,7 +148,7 @@ class GraphedStarts:
 
 
 class GraphedStart:
-    """Starts `size` worlds by a CUDA graph; worlds may repeat, and start the same way again."""
+    """Starts `size` worlds by a CUDA graph; if there are fewer, an index is repeated."""
 
     def __init__(
         self, start: Callable[[Tensor], NeighbourState], size: int, device: torch.device

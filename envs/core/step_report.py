@@ -134,7 +134,7 @@ class WorldEpisodes:
 
     @makes_plain_tensors
     def _attach(self) -> None:
-        """Make `update` and the host's tensors, which refer to the current `report`."""
+        """Make `update` and the host's copies for the tensors of the current `report`."""
         read = (self._endings, self.report.numbers)
         self.host_endings, self.host_numbers = (
             map(pinned_like, read) if self._endings.is_cuda else read
@@ -152,7 +152,7 @@ class WorldEpisodes:
         )
 
     def put_losses(self, world_indices: Tensor, names: tuple[str, ...], terms: Tensor) -> None:
-        """Store terms, [terms, B'], of the losses of worlds that were replaced; rewards are 0."""
+        """Store the named terms, [terms, B'], of losses of replaced worlds, and rewards of 0."""
         if not self.term_names:
             self.term_names = names
             self.report = StepReport.empty(len(self.elapsed), len(names), terms.device)
@@ -204,11 +204,11 @@ class ParticleRewards:
         """Each particle's reward of the last step, shape [B, N]."""
 
     def place(self, world_indices: Tensor, task: EnvTask[Any], placed: Particles) -> None:
-        """Set rewards to 0 in worlds, int64 [B'], of `task`, whose particles `placed` replaces."""
+        """Set rewards to 0 in worlds, [B'], with new particles `placed`; `task` has their goals."""
         self.reward.index_fill_(0, world_indices, 0.0)
 
     def gains(self, task: EnvTask[Any], particles: Particles) -> Tensor:
-        """Return each particle's reward before `write`, [B, N]; `particles` are after the step."""
+        """Return each particle's reward of a step, [B, N], for `write`; `particles`: after it."""
         raise NotImplementedError
 
     def write(self, gains: Tensor, reward: Tensor, by_world: Tensor, enabled: Tensor) -> None:

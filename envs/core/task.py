@@ -258,10 +258,10 @@ class EnvTask(WorldTask[Config]):
             # Other streams than those of episodes with these seeds.
             random = WorldRandom(seeds, device=self.device).substream(StreamId.GROWTH)
             start = self._as_start("fresh", self.fresh(random))
-            fresh, size = Particles(start.x, start.s, goal=start.goal), self.config.seed_pool
+            made, size = Particles(start.x, start.s, goal=start.goal), self.config.seed_pool
             if self._pool is None:
-                self._pool = fresh.map(lambda value: value.new_empty(size, *value.shape[1:]))
-            self._pool.put_(torch.tensor(missing, device=self.device), fresh)
+                self._pool = made.map(lambda value: value.new_empty(size, *value.shape[1:]))
+            self._pool.put_(torch.tensor(missing, device=self.device), made)
             self._pooled.update(missing)
         assert self._pool is not None, "the first call makes worlds"
         taken = self._pool.take(indices)
@@ -345,7 +345,7 @@ def start_method(task: EnvTask[Any]) -> str:
 
 
 def check_start(task: EnvTask[Any], start: Start, world_count: int, shapes: Any) -> None:
-    """Check shapes and types of start worlds, without synchronising; `shapes`: of all x and s."""
+    """Check shapes and types of some start worlds, without synchronising; `shapes`: of all."""
     name = start_method(task)
     if not isinstance(start, Start):
         raise NPAError(
@@ -365,7 +365,7 @@ def check_start(task: EnvTask[Any], start: Start, world_count: int, shapes: Any)
 def checked_losses(
     task: EnvTask[Any], losses: Any, world_count: int, names: tuple[str, ...]
 ) -> list[Tensor]:
-    """Return the terms of `losses`, [B] each, checked; `names`: of earlier terms, () at first."""
+    """Return the terms of `losses`, [B] each, after a check; `names`: terms of earlier calls."""
     name = f"{type(task).__name__}.losses"
     if not isinstance(losses, Mapping) or not losses or not all(type(n) is str for n in losses):
         actual = list(losses) if isinstance(losses, Mapping) else type(losses).__name__

@@ -32,7 +32,7 @@ REASONS = np.array([reason(ending) for ending in range(2 * TIME_LIMIT)], dtype=o
 
 
 class BatchedSpaces(VectorEnv[Any, Any, Any]):
-    """Base class of vector environments; the spaces of all worlds, large, are made when used."""
+    """Base class of vector environments, which make the large spaces of all worlds when used."""
 
     @cached_property
     def observation_space(self) -> Space[Any]:  # type: ignore[override]
@@ -143,31 +143,35 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
         if restarting:
             self.worlds.restart(np.flatnonzero(over), observation)
         ended = endings != 0
-        final = self.autoreset_mode is AutoresetMode.SAME_STEP and bool(ended.any())
+        any_ended = bool(ended.any())
+        restarts = any_ended and self.autoreset_mode is AutoresetMode.SAME_STEP
         # A restart overwrites the report, so it is copied first.
-        *results, infos = self._report(stepped, copy=self.copies or final)
-        if final:
-            which = self._mask(ended)
-            final_infos = {n: which if n.startswith("_") else v for n, v in infos.items()}
-            final_infos |= {"reason": REASONS[endings], "_reason": which}
-            final_observation = observation
-            if self.copies and ended.all():
-                observation = torch.empty_like(observation)
-            else:
-                final_observation = observation.clone()
-            self.worlds.restart(np.flatnonzero(ended), observation)
-            *_, infos = self._report(~ended, copy=self.copies)
-            infos |= {
-                "final_obs": self.spaces.final_observation_output(final_observation, ended),
-                "_final_obs": which,
-            }
-            infos |= {"final_info": final_infos, "_final_info": self._mask(ended)}
+        *results, infos = self._report(stepped, copy=self.copies or restarts)
+        if any_ended:
+            infos |= {"reason": REASONS[endings], "_reason": self._mask(ended)}
+        if restarts:
+            observation, infos = self._restart_ended(ended, observation, infos)
         else:
             self._ended = ended
-            if ended.any():
-                infos |= {"reason": REASONS[endings], "_reason": self._mask(ended)}
         self._show()
         return self.spaces.observation_output(observation), *results, infos
+
+    def _restart_ended(
+        self, ended: NDArray[np.bool_], last: Tensor, infos: dict[str, Any]
+    ) -> tuple[Tensor, dict[str, Any]]:
+        """Restart the worlds that `ended`; return observations, and infos with the `last` ones."""
+        which = self._mask(ended)
+        final_infos = {n: which if n.startswith("_") else v for n, v in infos.items()}
+        observation = last
+        if self.copies and ended.all():
+            observation = torch.empty_like(last)
+        else:
+            last = last.clone()
+        self.worlds.restart(np.flatnonzero(ended), observation)
+        *_, infos = self._report(~ended, copy=self.copies)
+        final_observation = self.spaces.final_observation_output(last, ended)
+        infos |= {"final_obs": final_observation, "_final_obs": which}
+        return observation, infos | {"final_info": final_infos, "_final_info": self._mask(ended)}
 
     close = VectorEnv.close
 
@@ -197,10 +201,7 @@ class NPAVectorEnv(WorldsEnv, BatchedSpaces):
     def _report(
         self, stepped: NDArray[np.bool_] | None, *, copy: bool
     ) -> tuple[Any, Any, Any, dict[str, Any]]:
-        """Return rewards, terminations, truncations and infos.
-
-        `stepped`, [B]: worlds that made the step; None: all. `copy`: later steps change nothing.
-        """
+        """Return rewards, terminations, truncations, infos; `stepped`, [B]: worlds that acted."""
         worlds = self.worlds
         report = worlds.episodes.report.copy() if copy else worlds.episodes.report
         rows = self._report_rows(report)
@@ -233,7 +234,7 @@ def unbound(values: Any) -> Sequence[Any]:
 
 
 def with_masks(values: dict[str, Any], which: Any) -> dict[str, Any]:
-    """Return infos: each value by its name, and `which` worlds have it, [B], by `_name`."""
+    """Return infos: each value by its `name`, and the mask of worlds with it, [B], by `_name`."""
     infos = {}
     for name, value in values.items():
         infos[name], infos[f"_{name}"] = value, which

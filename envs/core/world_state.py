@@ -92,7 +92,7 @@ def check_default_dtype() -> None:
 
 
 class WorldState:
-    """Particles of B worlds on a device, and a random stream for each world."""
+    """Particles of B worlds on a device, and a stream of random numbers for each world."""
 
     def __init__(
         self,

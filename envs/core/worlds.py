@@ -110,7 +110,7 @@ class BatchedWorlds(WorldState):
         return start
 
     def begin(self, world_indices: Tensor, start: Start, *, check: bool) -> None:
-        """Begin episodes of worlds, int64 [B'], at `start`; `check`: whether losses are finite."""
+        """Begin episodes of worlds, int64 [B'], at `start`; `check`: losses must be finite."""
         self.place(world_indices, Particles(start.x, start.s, goal=start.goal))
         if check:
             self.check_losses(world_indices)
@@ -119,7 +119,7 @@ class BatchedWorlds(WorldState):
     @torch.no_grad()
     @makes_plain_tensors
     def place(self, world_indices: Tensor, placed: Particles) -> None:
-        """Replace particles, and goals if `placed` has any, of worlds, int64 [B']; no reward."""
+        """Replace particles of worlds, int64 [B'], and goals if given, without a reward."""
         task, goal = self.task, placed.goal
         placed = placed._replace(goal=None).map(Tensor.contiguous)
         if self.goal_task is not task:
@@ -181,7 +181,7 @@ class BatchedWorlds(WorldState):
         return endings, observation
 
     def queue(self, action: Tensor, out: Tensor | None = None) -> Tensor:
-        """Make a step, mark `side_stream`; return observations, [B, ...], in `out` if given."""
+        """Step the worlds, mark `side_stream`; return observations, [B, ...], in `out` if given."""
         raise NotImplementedError
 
     def host_observation(self, observation: Tensor) -> Tensor:
@@ -286,7 +286,7 @@ class ParticleWorlds(BatchedWorlds):
     @torch.no_grad()
     @makes_plain_tensors
     def queue(self, action: Tensor, out: Tensor | None = None) -> Tensor:
-        """Step the worlds without synchronising; return observations, [B, N, P], in `out`."""
+        """Step the worlds without synchronising; return observations, in `out` if it is given."""
         self.steps.act(action)
         return self._observed(self.steps, out)
 

@@ -39,7 +39,7 @@ Config = TypeVar("Config", bound=GardenConfig)
 
 
 class TargetDeficit:
-    """What worlds lack near each of some places: brush-weighted sums of the target minus theirs."""
+    """What worlds lack at each place: sums over the target minus sums over their particles."""
 
     def __init__(self, places: Tensor, target: PointTarget, config: GardenConfig) -> None:
         self.places, self._config = places, config
@@ -139,7 +139,7 @@ class GardenTask(RuleDrivenTask[Config], GrownTask[Config]):
         return particles
 
     def episode_context(self, start: Start, loss: Tensor, random: WorldRandom) -> Any:
-        """Return for rewards the losses of the grown pictures, as they are and as if grey."""
+        """Return the losses of the grown pictures, and how much they rise if these are grey."""
         zeros = torch.zeros_like(start.s)
         grey = sum(self.losses(start.x, zeros).values(), torch.zeros_like(loss))
         # The loss of a picture that did not grow may not rise at all.
@@ -165,14 +165,14 @@ class GardenTask(RuleDrivenTask[Config], GrownTask[Config]):
         return observed.clamp(-OBSERVATION_LIMIT, OBSERVATION_LIMIT)
 
     def observed_picture(self, particles: Particles) -> Tensor:
-        """Return pictures, [B, R, R, 4]; with `observe_error` then target minus picture, 8."""
+        """Return pictures, [B, R, R, 4]; `observe_error` adds the target minus them."""
         picture = self.task.picture(particles.x, particles.s)
         if not self.config.observe_error:
             return picture
         return torch.cat((picture, self.task.target_picture - picture), dim=-1)
 
     def moments(self, particles: Particles) -> Tensor:
-        """Return `moments_of` x, and means of s, x s, y s; x, y from the mean, [B, 5 + 3 C]."""
+        """Return `moments_of` x, means of s, x s, y s (x, y from the mean), [B, 5 + 3 C]."""
         x, s, *_ = particles
         away = x - world_mean(x)[:, None]
         values = torch.cat((s, away[..., :1] * s, away[..., 1:] * s), dim=-1)

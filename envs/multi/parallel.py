@@ -171,7 +171,7 @@ def in_turns(
 
 
 def register(name: str, module: str, keywords: dict[str, Any]) -> None:
-    """Register the id `name` of functions of `module` with PettingZoo, parallel and AEC."""
+    """Register the id `name` with PettingZoo, for `parallel_env` and `env` of `module`."""
     for api, function in (("parallel", "parallel_env"), ("aec", "env")):
         # PettingZoo before 1.27 has no registries.
         if name not in getattr(pettingzoo, f"{api}_registry", {name}):

@@ -171,7 +171,7 @@ class CoMorphogenesisConfig(PictureLossConfig):
 
 
 class CoMorphogenesisTask(PictureLossTask):
-    """The task of growing a picture from each species, of its own target."""
+    """The task of growing a picture from each species, each with its own target."""
 
     config_type = CoMorphogenesisConfig
     least_species = 1
@@ -194,7 +194,7 @@ class CoMorphogenesisTask(PictureLossTask):
 
 @dataclass(frozen=True, kw_only=True)
 class InvasionConfig(OnePictureConfig):
-    """`OnePictureConfig` with what acts for the invaders, which are all species but 0."""
+    """`OnePictureConfig` with what acts for invaders: all species except species 0."""
 
     choices = OnePictureConfig.choices | {"opponent": (None, "random")}
     fixed = OnePictureConfig.fixed | {"reward": "in invasion, where the sum of all rewards is zero"}
@@ -230,8 +230,8 @@ class InvasionTask(PictureLossTask):
         """Return losses by name, [B, N]; invaders have equal ones, and a world's sum is 0."""
         losses = self.task.particle_contributions(*population.of(0))
         count, invader_count = losses.shape[1], sum(population.counts[1:])
-        part = world_mean(losses[..., None])[:, 0] * (-count / max(invader_count, 1))
-        return {"picture": torch.cat((losses, part[:, None].expand(-1, invader_count)), dim=1)}
+        mean = world_mean(losses[..., None])[:, 0] * (-count / max(invader_count, 1))
+        return {"picture": torch.cat((losses, mean[:, None].expand(-1, invader_count)), dim=1)}
 
     def with_opponent(self, action: Tensor, population: Population, random: WorldRandom) -> Tensor:
         """Return `action`, [B, N, A], with random rows for invaders if opponent="random"."""
@@ -309,7 +309,7 @@ SETTINGS: dict[str, tuple[str, Mapping[str, Any]]] = {
 
 
 def task_settings(name: str) -> tuple[str, dict[str, Any]]:
-    """Return a task's name and keywords for its name, without keywords, or for an id."""
+    """Return the task and the keywords of an id; a task's name has no keywords."""
     task, keywords = SETTINGS.get(name, (name, {})) if isinstance(name, str) else (name, {})
     return task, dict(keywords)
 

@@ -113,8 +113,8 @@ class SpeciesConfig(WorldConfig):
         """Particles of each species at the start of an episode."""
         if self.particle_counts:
             return self.particle_counts
-        even, rest = divmod(self.particle_count, self.species_count)
-        return tuple(even + int(k < rest) for k in range(self.species_count))
+        even, remainder = divmod(self.particle_count, self.species_count)
+        return tuple(even + int(k < remainder) for k in range(self.species_count))
 
     @property
     def agent_particle_counts(self) -> tuple[int, ...]:
@@ -163,7 +163,7 @@ class SpeciesConfig(WorldConfig):
 
 
 class Population(NamedTuple):
-    """Particles of B worlds, sorted by species; removed particles are the same in all worlds."""
+    """Particles of B worlds, sorted by species; if some were removed, the same in each world."""
 
     x: Tensor
     """Positions [length units], shape [B, N, 2]."""

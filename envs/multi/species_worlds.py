@@ -213,7 +213,7 @@ class SpeciesWorlds(WorldState):
     @torch.no_grad()
     @makes_plain_tensors
     def step(self, action: Tensor) -> AgentOutcome:
-        """Apply finite actions, [B, N, A], compute rewards, and remove agents that ended.
+        """Apply finite actions, [B, N, A], and remove agents that ended; return the results.
 
         Raises:
             DivergedError: An agent is out of bounds, and `on_divergence` is "raise".
@@ -285,7 +285,7 @@ class SpeciesWorlds(WorldState):
         return self.perception()
 
     def population(self, world: int) -> Population:
-        """Return the remaining particles of one world, whose index is `world`."""
+        """Return the remaining particles of the world with this index."""
         self._copy_from_groups()
         columns = np.flatnonzero(self.present[world][self.owner])
         index = to_device_async(columns, self.device)
@@ -339,7 +339,7 @@ class SpeciesWorlds(WorldState):
         )
 
     def _remove_ended(self, endings: NDArray[np.uint8], observation: Tensor) -> Tensor:
-        """Remove ended agents' particles; return what the others perceive without them."""
+        """Remove ended agents' particles; return `observation` as the others perceive then."""
         self._stop_finished()
         self._ungroup()
         self.present &= (endings != REMOVED) & (endings != LEFT)
@@ -392,7 +392,7 @@ class SpeciesWorlds(WorldState):
 
 
 class WorldGroup:
-    """Those of a batch's worlds that have the same particles left, stepped together."""
+    """Worlds of a batch with the same particles left, stepped together."""
 
     def __init__(
         self,
@@ -454,7 +454,7 @@ class WorldGroup:
         }
 
     def perception(self, population: Population | None = None, *, stepped: bool = False) -> Tensor:
-        """Return what particles perceive, [B', N', P]; arguments: of `loss_terms`, `perception`."""
+        """Return what particles perceive, [B', N', P]; `stepped`: with neighbours of the step."""
         x, s, counts, _ = population or self.population
         neighbours = self._neighbours if stepped else None
         rows = (neighbours or NeighbourState(x, s, self._physics)).perceive()

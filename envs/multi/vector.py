@@ -120,8 +120,8 @@ class MultiSpeciesVectorEnv(AgentsEnv):
         shapes = [(self.world_count, *space.shape) for space in self.single_action_spaces.values()]
         with worlds.device_context():
             action = joined_actions(actions, self.possible_agents, shapes, worlds.device)
-            rest = worlds.particle_count - action.shape[1]
-            outcome = worlds.step(F.pad(action, (0, 0, 0, rest)) if rest else action)
+            opponents = worlds.particle_count - action.shape[1]
+            outcome = worlds.step(F.pad(action, (0, 0, 0, opponents)) if opponents else action)
             observation, final = outcome.observation, None
             over = np.flatnonzero(~worlds.running)
             if len(over) and self.autoreset_mode is AutoresetMode.SAME_STEP:

@@ -1,4 +1,4 @@
-"""What holds for every environment, alone and batched: one class over all ids."""
+"""What holds for every environment, single and batched: one class over all ids."""
 
 import json
 import pickle
@@ -261,18 +261,18 @@ class TestEveryEnvironment:
             envs.step(action)
             *_, before = others.step(action)
         mask = np.array([True, False, False, True])
-        _, fresh = self.make_vec(4).reset(seed=0)
+        _, first = self.make_vec(4).reset(seed=0)
         for batch in (ended, envs):
             _, infos = batch.reset(options={"reset_mask": torch.from_numpy(mask)})
             assert self.is_species or np.asarray(infos["_loss"]).tolist() == mask.tolist()
         assert ((losses(infos) == losses(before)) != mask).all()
         refused(r"the episodes of worlds \[1, 2\] are over", ended.step, actions[3])
-        # Where the others may go on, they go on as if nothing had happened to their neighbours.
+        # Where the others may continue, they do as if nothing had happened to their neighbours.
         for action in actions[3:]:
             left, right = losses(envs.step(action)[4]), losses(others.step(action)[4])
             assert ((left == right) != mask).all()
         _, again = envs.reset(seed=0, options={"reset_mask": mask})
-        assert ((losses(again) == losses(fresh)) == mask).all()
+        assert ((losses(again) == losses(first)) == mask).all()
 
     @pytest.mark.parametrize(
         ("case", "style"),

@@ -1,4 +1,4 @@
-"""Batches, worlds whose numbers run away, and torch's modes: each world is as if it were alone."""
+"""Batches, worlds that diverge, and torch's modes: each world is like a single environment."""
 
 import functools
 from concurrent.futures import ThreadPoolExecutor

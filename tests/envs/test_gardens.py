@@ -1,4 +1,4 @@
-"""Living worlds: brushes, weather, rewards; two gardeners; worlds whose code the agent chooses."""
+"""Gardens: brushes, disturbances, rewards; two gardeners; worlds whose code the agent chooses."""
 
 import warnings
 from itertools import pairwise

@@ -1,4 +1,4 @@
-"""Species and particles as agents: turns, deaths, opponents, pictures, PettingZoo's own tests."""
+"""Species and particles as agents: turns, deaths, opponents, pictures, PettingZoo's tests."""
 
 import numpy as np
 import pettingzoo

@@ -1,4 +1,4 @@
-"""What an own task returns is checked: its mistakes are errors that name the method."""
+"""What a user's task returns is checked: mistakes are errors that name the method."""
 
 import random as python_random
 
@@ -28,7 +28,7 @@ class Gather(EnvTask):
 
 
 def changed(method, change):
-    """Return a task of which one method's answer is changed."""
+    """Return a task with a change of what one method returns."""
 
     def answer(self, *given):
         return change(getattr(Gather, method)(self, *given))

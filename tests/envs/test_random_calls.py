@@ -1,4 +1,4 @@
-"""Random calls, right and wrong, of every single environment, by a model of what they owe.
+"""Random calls, right and wrong, of every single environment, by a model of correct answers.
 
 What is refused leaves the worlds as they were; what is not keeps the documented types, shapes,
 limits, rewards, episode ends and reasons. Many worlds have no model of their own, as they equal

@@ -1,4 +1,4 @@
-"""Small and large forms of environments: frozen settings, checkers, batches."""
+"""Small and large forms of environments: their settings, Gymnasium's checker, batches."""
 
 import hashlib
 import json

@@ -1,4 +1,4 @@
-"""What species are paid, by numbers computed by hand or by the tasks of single worlds."""
+"""Rewards of species, by numbers computed by hand or by the tasks of single worlds."""
 
 import numpy as np
 import pytest
@@ -123,7 +123,7 @@ def test_all_of_a_symbiosis_are_paid_alike():
 def test_leaving_the_world_never_pays_nor_gives_back_what_came_at_no_charge(keywords):
     env = pair("segregation", position_limit=0.29, seed_radius=0.01, **keywords)
     at_start = env.reset(seed=0)[1]["species_1"]["loss"]
-    # A radius apart, each sees itself alone, and the least loss is reached.
+    # A radius apart, each perceives only itself, and the least loss is reached.
     assert at_start == 0.0 if keywords else at_start > 0.99
     env.place_particles([[0.0, 0.0], [0.15, 0.0]], np.zeros((2, 16)))
     _, rewards, terminations, _, infos = env.step(apart(env))

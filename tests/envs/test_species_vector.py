@@ -1,4 +1,4 @@
-"""Batches of worlds of several species: world k is the single environment, whoever dies."""
+"""Batches of worlds of several species: world k is the single environment, also after deaths."""
 
 import numpy as np
 import pytest
@@ -98,7 +98,7 @@ def test_a_batch_equals_single_environments_while_species_die_here_and_there(tas
 
 
 def test_telling_species_apart_needs_memory_of_its_own(monkeypatch):
-    # 64 worlds of 41 particles: P is 66, and 8 species append 24 numbers, of which 4 copies live.
+    # 64 worlds of 41 particles: P is 66, and 8 species append 24 numbers; 4 copies exist.
     free = world_state.needed_bytes(64, 41, batch().worlds.physics, torch.device("cpu"))
     monkeypatch.setattr(world_state, "free_bytes", lambda device: free + 4 * 4 * 64 * 41 * 24 - 1)
     assert batch(world_count=64, species_count=8).worlds.perception_dim == 66
