@@ -186,8 +186,7 @@ class GaussianRules(nn.Module):
     def sample(
         self, observation: Tensor, generator: Randomness | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Return random actions [B, N, A], unclipped, for observations [B, N, P], and their
-        log-probabilities [B, N]; `generator`: None for torch's own."""
+        """Return random actions for observations [B, N, P], unclipped, and log-probabilities."""
         mean, log_std = self.rules.mean(observation), self.row_log_std()
         noise = normal_draws(generator, mean.shape, mean)
         action = mean + log_std.exp() * noise
@@ -291,7 +290,7 @@ def seeded_critic(progress: Progress, input_dim: int, inputs: CriticInput) -> Cr
         return Critic(input_dim, progress.problem.counts, inputs).to(progress.device)
 
 
-def share_of_worlds(progress: Progress, total: int) -> tuple[list[int], Randomness]:
+def worlds_of_process(progress: Progress, total: int) -> tuple[list[int], Randomness]:
     """Return the indices of this process's worlds out of `total`, and their random numbers' source.
 
     That is one torch generator, or with several processes a stream for each world.

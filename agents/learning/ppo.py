@@ -30,7 +30,7 @@ from npa_envs.agents.learning.actor_critic import (
     gradients_of,
     seeded_critic,
     set_gradients,
-    share_of_worlds,
+    worlds_of_process,
 )
 from npa_envs.agents.learning.problem import (
     WORLDS_PER_SEED,
@@ -80,8 +80,7 @@ class PPOOptions(CommonOptions):
     """Reward of each particle: "particle", its own part of its world's reward; "marginal", the
     difference that its action makes to the world's. None: its world's reward."""
     masked: bool = False
-    """Whether to ignore actions in steps whose update mask left out their particles; not with
-    several species."""
+    """Ignore actions of particles that the update mask left out; not with several species."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -231,7 +230,7 @@ class PPOLearner:
         self.options, self.schedule = options, options.schedule(progress.initial)
         self.processes, self._seed = progress.processes, progress.seed
         self._total = problem.num_envs if options.num_envs is None else options.num_envs
-        self._indices, self.random = share_of_worlds(progress, self._total)
+        self._indices, self.random = worlds_of_process(progress, self._total)
         self.envs = problem.make_envs(
             len(self._indices),
             device=device,

@@ -56,8 +56,7 @@ def import_ribs() -> Any:
 def make_archive(weight_count: int, axes: tuple[Axis, ...], seed: int = 0) -> Any:
     """Return an empty `ribs.archives.GridArchive` of candidates with `weight_count` weights.
 
-    It keeps only qualities above 0: other worlds stopped changing or diverged. `seed` is that of
-    its random choices.
+    It keeps qualities above 0: other worlds stopped changing or diverged. It draws by `seed`.
     """
     return import_ribs().archives.GridArchive(
         solution_dim=weight_count,
