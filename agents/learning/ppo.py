@@ -192,7 +192,7 @@ class RoundBuffers:
 
 
 class GraphedParts:
-    """Methods of a `PPOLearner` as CUDA graphs on CUDA, as they are on a CPU.
+    """Methods of a `PPOLearner`, which run as CUDA graphs on CUDA, and as they are on a CPU.
 
     `graphed.draw_actions()` does what `learner.draw_actions()` does, and so on. They have neither
     arguments nor results: they read and write the tensors of `buffers` that their docstrings name.
@@ -279,7 +279,7 @@ class PPOLearner:
 
     @torch.no_grad()
     def play(self) -> Round:
-        """Roll out T steps and estimate advantages; return both as views of `buffers`."""
+        """Roll out T steps of all worlds, and estimate advantages; return views of the buffers."""
         buffers, options = self.buffers, self.options
         buffers.observations[0].copy_(buffers.observations[-1])
         last_observations = {}

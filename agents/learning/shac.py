@@ -174,7 +174,7 @@ class SHACLearner:
         return StepWindow(features, losses)
 
     def _continue_from(self, x: Tensor, s: Tensor) -> None:
-        """Set the worlds of the next window, new ones where an episode is over."""
+        """Take these worlds into the next window; begin new ones where an episode is over."""
         limits = self.task.physics.limits
         # Worlds that diverge are clamped to the environment's limits until their restart.
         x, s = (

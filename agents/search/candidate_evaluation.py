@@ -189,7 +189,7 @@ class Candidates:
         return Trials(found, snapshots.map(lambda values: values[-1]))
 
     def _run(self, weights: Tensor) -> tuple[Particles, Tensor]:
-        """Return worlds at late times, [T, G, B, N, ...], and `speed` of each candidate, [G]."""
+        """Return worlds at T late times, [T, G, B, N, ...], and the `speed` of candidates, [G]."""
         world, count = self.world, len(weights)
         random = WorldRandom(self._seeds * count, device=self.device)
         shape = random.world_count, world.particle_count, 2
