@@ -297,7 +297,7 @@ class PaintPolicy(SpreadPolicy):
 
 
 class MendPolicy(SpreadPolicy):
-    """Repair damage: particles with zero states take the mean state of their neighbours.
+    """Spread out, and repair damage: zero states become the mean state of the neighbours.
 
     Args:
         blank: States with a norm below this count as zero (dimensionless).

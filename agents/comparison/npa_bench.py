@@ -68,7 +68,7 @@ class Suite:
 
     @property
     def tasks(self) -> dict[str, str]:
-        """Environment id of each problem by its `task_name`."""
+        """Environment ids of the problems by their `task_name`."""
         return {task_name(env_id): env_id for env_id in self.budgets}
 
     @property
@@ -215,7 +215,7 @@ def _stored_row(
 
 
 def _joined(suite: Suite, stored: Mapping[str, Any], row: dict[str, Any]) -> dict[str, Any]:
-    """Return the new row with the runs of `stored` that it does not repeat added."""
+    """Return the new row, plus the runs of the stored row that it does not repeat."""
     new = {(run["id"], run["seed"]) for run in row["runs"]}
     old = [dict(run) for run in stored["runs"] if (run["id"], run["seed"]) not in new]
     if not old:
@@ -239,7 +239,7 @@ def _joined(suite: Suite, stored: Mapping[str, Any], row: dict[str, Any]) -> dic
 
 
 def _united(first: str | None, second: str | None) -> str | None:
-    """Return two lists of items, each a text with semicolons between, as one without duplicates."""
+    """Merge two texts, each a list of items separated by semicolons, without duplicates."""
     if first == second:
         return first
     items = [item for text in (first, second) for item in str(text).split("; ")]

@@ -49,10 +49,7 @@ TABLE, RESULTS, CURVES = "comparison.md", "comparison.json", "comparison.csv"
 def write_table(
     plan: ComparisonPlan, records: Sequence[RunRecord], folder: Path, command: str
 ) -> str:
-    """Write the results by method as comparison.md and .json, the curves as .csv; return the .md.
-
-    The files name `command`, the command line of the comparison.
-    """
+    """Write comparison.md and .json (results by method) and .csv (curves); return the Markdown."""
     table = report_rows(records)
     shown = markdown(table)
     facts = {"command": command, **asdict(plan), "left_out": sorted(map(list, plan.left_out))}

@@ -205,7 +205,7 @@ def final_picture(
 
 
 def main(folder: Path) -> None:
-    """Load the libraries that the run in `folder` needs; then do each run that is ordered."""
+    """Load the libraries that the run in `folder` needs; do each run that standard input orders."""
     orders: SimpleQueue[tuple[str, str, str]] = SimpleQueue()
 
     def listen() -> None:
@@ -245,7 +245,7 @@ LAST_OUTPUT = 2000
 
 @dataclass
 class RunProcess(Child):
-    """A run in progress, its process and temporary folder; `teacher`: folder of rules to clone."""
+    """A run in progress: its process, its temporary folder; `teacher`: folder of rules to clone."""
 
     job: Job
     teacher: str
@@ -377,7 +377,7 @@ def run_jobs(
 
 
 def _new_process(folder: Path, threads: int) -> subprocess.Popen[bytes]:
-    """Start a process that loads the libraries of the run in `folder` and waits for orders."""
+    """Start and return a process that loads the libraries of a run and waits for orders."""
     with (folder / OUTPUT).open("wb") as output:
         return subprocess.Popen(
             [*PROGRAM, str(folder)],

@@ -179,15 +179,14 @@ class GaussianRules(nn.Module):
 
     @torch.no_grad()
     def set_noise(self, factor: float) -> None:
-        """Rescale standard deviations by `factor` / `noise_factor`; then that is `factor`."""
+        """Rescale the standard deviations so that `noise_factor` becomes `factor`."""
         self.log_std.add_(math.log(factor / self.noise_factor))
         self.noise_factor = factor
 
     def sample(
         self, observation: Tensor, generator: Randomness | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Return random actions [B, N, A], unclipped, for observations [B, N, P], and their
-        log-probabilities [B, N]; `generator`: None for torch's own."""
+        """Return random unclipped actions, [B, N, A], and their log-probabilities, [B, N]."""
         mean, log_std = self.rules.mean(observation), self.row_log_std()
         noise = normal_draws(generator, mean.shape, mean)
         action = mean + log_std.exp() * noise
@@ -269,7 +268,7 @@ class Critic(nn.Module):
 
     @torch.no_grad()
     def rescale(self, targets: Tensor, processes: ProcessGroup = ALONE) -> None:
-        """Update the running RMS of targets of all processes; the values of observations stay."""
+        """Update the scale of outputs, the running RMS of targets; values do not change."""
         before = self.scale.clone()
         square = targets.square().mean()
         processes.reduce([square])
@@ -291,8 +290,8 @@ def seeded_critic(progress: Progress, input_dim: int, inputs: CriticInput) -> Cr
         return Critic(input_dim, progress.problem.counts, inputs).to(progress.device)
 
 
-def share_of_worlds(progress: Progress, total: int) -> tuple[list[int], Randomness]:
-    """Return the indices of this process's worlds out of `total`, and their random numbers' source.
+def worlds_of_process(progress: Progress, total: int) -> tuple[list[int], Randomness]:
+    """Return the indices of this process's worlds out of `total`, and a source of random numbers.
 
     That is one torch generator, or with several processes a stream for each world.
     """

@@ -87,7 +87,7 @@ def train(progress: Progress, options: CloneOptions = CloneOptions()) -> RuleSet
 def _from_teacher(
     progress: Progress, rules: RuleSet, options: CloneOptions
 ) -> tuple[Callable[[], int], Demonstrations]:
-    """Return a function that adds steps of worlds to a buffer and counts them, and the buffer."""
+    """Return a function that steps worlds into a buffer and counts their steps, and the buffer."""
     problem, device, source = progress.problem, progress.device, options.teacher
     if source is None:
         raise NPAError("teacher must be given to clone, or a dataset: for example teacher='heart'")
@@ -150,7 +150,7 @@ def unexplained_variance(rules: RuleSet, observation: Tensor, action: Tensor) ->
 class Demonstrations:
     """Ring buffer of observations and actions of up to `capacity` worlds, [N, P] and [N, A] each.
 
-    `observation`, [B, N, P], and `action`, [B, N, A], are examples of what it stores.
+    Shapes, types and device are those of `observation`, [B, N, P], and `action`, [B, N, A].
     """
 
     def __init__(self, capacity: int, observation: Tensor, action: Tensor) -> None:

@@ -30,7 +30,7 @@ from npa_envs.agents.learning.actor_critic import (
     gradients_of,
     seeded_critic,
     set_gradients,
-    share_of_worlds,
+    worlds_of_process,
 )
 from npa_envs.agents.learning.problem import (
     WORLDS_PER_SEED,
@@ -80,8 +80,7 @@ class PPOOptions(CommonOptions):
     """Reward of each particle: "particle", its own part of its world's reward; "marginal", the
     difference that its action makes to the world's. None: its world's reward."""
     masked: bool = False
-    """Whether to ignore actions in steps whose update mask left out their particles; not with
-    several species."""
+    """Ignore actions of particles that the update mask left out; not with several species."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -193,7 +192,7 @@ class RoundBuffers:
 
 
 class GraphedParts:
-    """Methods of a `PPOLearner` as CUDA graphs on CUDA, as they are on a CPU.
+    """Methods of a `PPOLearner`, which run as CUDA graphs on CUDA, and as they are on a CPU.
 
     `graphed.draw_actions()` does what `learner.draw_actions()` does, and so on. They have neither
     arguments nor results: they read and write the tensors of `buffers` that their docstrings name.
@@ -231,7 +230,7 @@ class PPOLearner:
         self.options, self.schedule = options, options.schedule(progress.initial)
         self.processes, self._seed = progress.processes, progress.seed
         self._total = problem.num_envs if options.num_envs is None else options.num_envs
-        self._indices, self.random = share_of_worlds(progress, self._total)
+        self._indices, self.random = worlds_of_process(progress, self._total)
         self.envs = problem.make_envs(
             len(self._indices),
             device=device,
@@ -280,7 +279,7 @@ class PPOLearner:
 
     @torch.no_grad()
     def play(self) -> Round:
-        """Roll out T steps and estimate advantages; return both as views of `buffers`."""
+        """Roll out T steps of all worlds, and estimate advantages; return views of the buffers."""
         buffers, options = self.buffers, self.options
         buffers.observations[0].copy_(buffers.observations[-1])
         last_observations = {}

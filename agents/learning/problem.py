@@ -406,8 +406,7 @@ def check_run_seed(seed: Any) -> None:
 def world_seeds(seed: int, count: int, resumption: int = 0) -> list[int]:
     """Return the seeds of `count` worlds of the run with `seed`; no other run has these.
 
-    resumption: How often the run was resumed. Each time has new seeds, until `WORLDS_PER_SEED` are
-    used; then they repeat.
+    `resumption` is the number of resumes of the run; seeds repeat after `WORLDS_PER_SEED` worlds.
     """
     check_run_seed(seed)
     if count > WORLDS_PER_SEED:

@@ -124,14 +124,14 @@ class RuleSet(nn.Module):
         return self.actions(observation, self.mean_by_rule)
 
     def mean_by_rule(self, rule: NPARule, rows: Tensor) -> Tensor:
-        """Return what `mean` does, of one rule for K rows of observations, [K, P]: [K, A]."""
+        """Return actions [K, A], as `mean` does, by one rule at K rows of observations [K, P]."""
         delta, state_step = bounded_update(rule, rows)
         return torch.cat((delta, state_step / self.interface.state_scale), dim=-1)
 
     def actions(
         self, observation: Tensor, action_by_rule: Callable[[NPARule, Tensor], Tensor]
     ) -> Tensor:
-        """Return actions [B, N, A]; `action_by_rule` gives those of K rows [K, P] of one rule."""
+        """Return actions [B, N, A]; `action_by_rule` maps a rule and rows [K, P] to its [K, A]."""
         actions = []
         for rule, span in zip(self, self.spans, strict=True):
             rows = observation[:, span]
@@ -175,7 +175,7 @@ class RuleSetPolicy(Policy):
 
 
 class _ClampInward(torch.autograd.Function):
-    """Clamp values to ± `limit`; beyond it, only gradients whose descent leads back inside pass."""
+    """Clamp values to ± `limit`. Beyond it only gradients pass whose descent leads back inside."""
 
     @staticmethod
     def forward(ctx: Any, values: Tensor, limit: float) -> Tensor:
@@ -197,7 +197,7 @@ class ClampedWeights(FoldedRule):
     rule: ClampedRule
 
     def __call__(self, rows: Tensor) -> Tensor:
-        """Map K perceptions, [z | 1 | 0], to K updates, [δ | clamped Δs | 0], row by row."""
+        """Map K rows of input to K updates, as `FoldedRule` does, with clamped state steps."""
         return self.rule.clamped(super().__call__(rows))
 
 
@@ -224,7 +224,7 @@ class ClampedRule(NPARule):
         return torch.cat((update[..., :first], state_step), dim=-1)
 
     def is_plain(self) -> bool:
-        """Return whether the network that is clamped is two layers, so that `folded` has it."""
+        """Return whether the rule that is clamped is plain, so that `folded` may replace it."""
         return self.rule_is_plain
 
     def folded(self) -> FoldedRule:

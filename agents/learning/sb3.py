@@ -336,7 +336,7 @@ class GardenPolicy:
 
     @classmethod
     def load(cls, path: str | Path) -> GardenPolicy:
-        """Return the policy in a file of `save`, which is unpickled: trust who made the file."""
+        """Return the policy in a file that `save` wrote; it is unpickled, so trust who made it."""
         name = Path(path).stem
         if name not in ALGORITHMS or not Path(path).is_file():
             raise NPAError(

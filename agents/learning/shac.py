@@ -22,7 +22,7 @@ from npa_envs.agents.learning.actor_critic import (
     gradients_of,
     seeded_critic,
     set_gradients,
-    share_of_worlds,
+    worlds_of_process,
 )
 from npa_envs.agents.learning.problem import DifferentiableTask
 from npa_envs.agents.learning.progress import Progress, annealed
@@ -80,7 +80,7 @@ def train(progress: Progress, options: SHACOptions = SHACOptions()) -> RuleSet:
 
     def iteration() -> int:
         learner.learn(annealed(options.learning_rate, options.last_rate, progress.spent_fraction))
-        return options.num_envs * learner.window * progress.problem.particle_count
+        return options.num_envs * learner.window_steps * progress.problem.particle_count
 
     return progress.run(learner.rules, iteration, learner)
 
@@ -89,8 +89,7 @@ class StepWindow(NamedTuple):
     """Features and losses of B worlds before and after each of h steps, differentiable."""
 
     features: Tensor
-    """Inputs of the critic: positions about the centroid, states and the world's loss, in F = D + C
-    + 1 columns, shape [h + 1, B, N, F]."""
+    """Inputs of the critic, [h + 1, B, N, F]: centred positions, states and the world's loss."""
     losses: Tensor
     """Losses of the worlds, shape [h + 1, B]."""
 
@@ -110,10 +109,10 @@ class SHACLearner:
     def __init__(self, progress: Progress, options: SHACOptions) -> None:
         problem, device = progress.problem, progress.device
         self.options, self.device, self.processes = options, device, progress.processes
-        self._indices, self.random = share_of_worlds(progress, options.num_envs)
+        self._indices, self.random = worlds_of_process(progress, options.num_envs)
         self.rules = progress.first_rules(zero_output=True)
         count = -(-problem.episode_steps // options.steps)
-        self.window = -(-problem.episode_steps // count)
+        self.window_steps = -(-problem.episode_steps // count)
         """Steps of a window, h."""
         self.task = DifferentiableTask(problem, device)
         width = problem.physics.space_dim + problem.physics.state_dim + 1
@@ -127,7 +126,7 @@ class SHACLearner:
         }
         self.window_count = count
         self._minibatches = Minibatches(
-            self.window, len(self._indices), (1,), options.minibatches, self.random
+            self.window_steps, len(self._indices), (1,), options.minibatches, self.random
         )
         self.resume(0, 0)
 
@@ -152,8 +151,7 @@ class SHACLearner:
 
     def play(self) -> StepWindow:
         """Run the worlds for a window and return it; restart worlds whose episode is over."""
-        task, steps = self.task, self.window
-        begin, limits = self.worlds, task.physics.limits
+        task, steps, begin = self.task, self.window_steps, self.worlds
         begin_episodes(self.random)
         later = task.rollout(
             self.rules,
@@ -172,12 +170,18 @@ class SHACLearner:
         losses = task.world_losses(every).view(steps + 1, -1)
         level = losses[..., None, None].expand(*s.shape[:-1], 1)
         features = torch.cat((x - x.mean(dim=-2, keepdim=True), s, level), dim=-1)
+        self._continue_from(x[-1].detach(), s[-1].detach())
+        return StepWindow(features, losses)
+
+    def _continue_from(self, x: Tensor, s: Tensor) -> None:
+        """Take these worlds into the next window; begin new ones where an episode is over."""
+        limits = self.task.physics.limits
         # Worlds that diverge are clamped to the environment's limits until their restart.
         x, s = (
-            torch.nan_to_num(values[-1].detach()).clamp(-limit, limit)
+            torch.nan_to_num(values).clamp(-limit, limit)
             for values, limit in ((x, limits.position), (s, limits.state))
         )
-        self.worlds = begin._replace(x=x, s=s)
+        self.worlds = self.worlds._replace(x=x, s=s)
         begin_episodes(self.random)
         self.windows_left = [left - 1 for left in self.windows_left]
         over = [world for world, left in enumerate(self.windows_left) if left == 0]
@@ -185,7 +189,6 @@ class SHACLearner:
             self.worlds.put_(torch.tensor(over, device=self.device), self._new_worlds(over))
         for world in over:
             self.windows_left[world] = self.window_count
-        return StepWindow(features, losses)
 
     def _new_worlds(self, worlds: list[int]) -> Particles:
         random = self.random
@@ -195,7 +198,7 @@ class SHACLearner:
 
     def objective(self, window: StepWindow) -> Tensor:
         """Return what the rules ascend, shape []: discounted rewards plus the value at the end."""
-        gamma, steps = self.options.gamma, self.window
+        gamma, steps = self.options.gamma, self.window_steps
         discounts = gamma ** torch.arange(steps, device=self.device, dtype=torch.float32)
         returns = (discounts[:, None] * window.rewards).sum(dim=0)
         value = world_values(self.target, window.features[-1])

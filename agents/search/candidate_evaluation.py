@@ -180,6 +180,16 @@ class Candidates:
         return Trials(found, combined(torch.cat, [batch.worlds for batch in batches]))
 
     def _try(self, weights: Tensor) -> Trials:
+        """Run and evaluate G candidates, with weights [G, W], in one batch of worlds."""
+        snapshots, speeds = self._run(weights)
+        found = [
+            self._found(snapshots.map(lambda values: values[:, k]), float(speed))  # noqa: B023
+            for k, speed in enumerate(speeds)
+        ]
+        return Trials(found, snapshots.map(lambda values: values[-1]))
+
+    def _run(self, weights: Tensor) -> tuple[Particles, Tensor]:
+        """Return worlds at T late times, [T, G, B, N, ...], and the `speed` of candidates, [G]."""
         world, count = self.world, len(weights)
         random = WorldRandom(self._seeds * count, device=self.device)
         shape = random.world_count, world.particle_count, 2
@@ -194,21 +204,18 @@ class Candidates:
         assert path is not None, "it is asked for"
         travelled = (path[-1] - path[late - 1]).mean(dim=1) / ((SNAPSHOTS - late) * every)
         speeds = travelled.view(count, -1).mean(dim=1) / world.eps
-        later = after.map(
+        snapshots = after.map(
             lambda values: values[late:].view(SNAPSHOTS - late, count, -1, *values.shape[2:])
         )
-        found: list[Found | None] = []
-        for k in range(count):
-            snapshots = later.map(lambda values: values[:, k])  # noqa: B023
-            quality = float(quality_of(snapshots))
-            # It is 0 or NaN where worlds came to rest or diverged.
-            if quality > 0.0:
-                worlds = snapshots.map(lambda values: values.flatten(0, 1))
-                measures = float(speeds[k]), *self.crowding_and_mixing(worlds)
-                found.append(Found(quality, measures))
-            else:
-                found.append(None)
-        return Trials(found, later.map(lambda values: values[-1]))
+        return snapshots, speeds
+
+    def _found(self, snapshots: Particles, speed: float) -> Found | None:
+        quality = float(quality_of(snapshots))
+        # It is 0 or NaN where worlds came to rest or diverged.
+        if not quality > 0.0:
+            return None
+        worlds = snapshots.map(lambda values: values.flatten(0, 1))
+        return Found(quality, (speed, *self.crowding_and_mixing(worlds)))
 
     def crowding_and_mixing(self, worlds: Particles) -> tuple[float, float]:
         """Return the descriptors `crowding` and `mixing` of `SearchWorld.axes`, averaged."""

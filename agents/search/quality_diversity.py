@@ -56,8 +56,7 @@ def import_ribs() -> Any:
 def make_archive(weight_count: int, axes: tuple[Axis, ...], seed: int = 0) -> Any:
     """Return an empty `ribs.archives.GridArchive` of candidates with `weight_count` weights.
 
-    It keeps only qualities above 0: other worlds stopped changing or diverged. `seed` is that of
-    its random choices.
+    It keeps qualities above 0 (other worlds came to rest or diverged), and draws elites by `seed`.
     """
     return import_ribs().archives.GridArchive(
         solution_dim=weight_count,
@@ -325,7 +324,7 @@ def growth_of(archive: Any, evaluations: int) -> Growth:
 
 
 def tried_again(search: Search, seeds: Sequence[int]) -> Growth:
-    """Evaluate a search's elites again in worlds of other seeds; return their archive's growth."""
+    """Evaluate a search's elites again in worlds of other seeds; return their statistics."""
     candidates = Candidates(search.world, device=search.candidates.device, seeds=seeds)
     archive = make_archive(candidates.weight_count, search.axes)
     elites = search.elites()
