@@ -137,7 +137,10 @@ def read_state_dict(data: bytes) -> RuleParts:
 def _parts(
     weights: dict[str, Tensor], scalars: Mapping[Any, Any], **hyper_parameters: Any
 ) -> RuleParts:
-    """Return `RuleParts` in 2D if not said otherwise, with `eps0` and `alpha` of `scalars`."""
+    """Return the `RuleParts` of weights, hyper-parameters, and `eps0` and `alpha` in `scalars`.
+
+    Without `space_dim` the rule is a 2D one.
+    """
     common = {name: _scalar(name, scalars.get(name)) for name in ("eps0", "alpha")}
     sizes = {"space_dim": _DEMO_SPACE_DIM, "hidden_dim": len(weights["hidden.weight"])}
     return RuleParts(sizes | common | hyper_parameters, weights)
@@ -348,7 +351,7 @@ def _check_not_expanded(name: str, tensor: Tensor) -> None:
 
 
 def _matrix(name: str, value: Any) -> Tensor:
-    """Return a checked weight or bias; the weight of a 1x1 convolution as a matrix."""
+    """Return the weight or bias `name`, checked; the weight of a 1x1 convolution as a matrix."""
     rank = 1 if name.endswith("bias") else 2
     if not isinstance(value, Tensor):
         raise NPAError(f"{name} must be a tensor, got a {type(value).__name__}")

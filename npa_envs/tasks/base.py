@@ -197,7 +197,7 @@ class ParticleTask(Generic[ConfigT]):
         return Particles(x, x.new_zeros(*x.shape[:2], self.config.state_dim))
 
     def damage(self, worlds: Particles, generator: Randomness) -> Particles:
-        """Return worlds after the random damage of training; goals may change. By default none."""
+        """Return worlds after the damage of training; goals may change. By default: `worlds`."""
         return worlds
 
     def begin(self, iteration: int) -> None:

@@ -27,7 +27,7 @@ from npa_envs.world.randomness import Randomness
 
 @dataclass(frozen=True, kw_only=True)
 class CoMorphogenesis2DConfig:
-    """Several pictures that grow in one world, each by its own rule."""
+    """Settings of several pictures that grow in one world, each by its own rule."""
 
     species: tuple[Morphogenesis2DConfig, ...] = (
         Morphogenesis2DConfig(),
@@ -54,7 +54,7 @@ class CoMorphogenesis2DConfig:
 
     @property
     def counts(self) -> tuple[int, ...]:
-        """Particles of each species."""
+        """Number of particles of each species."""
         return tuple(config.particle_count for config in self.species)
 
     @property
@@ -65,9 +65,9 @@ class CoMorphogenesis2DConfig:
 
 
 class CoMorphogenesis2D(ParticleTask[Any]):
-    """Several pictures that grow in one world; each species is the particles of one picture.
+    """The task of growing several pictures in one world, each by its own rule.
 
-    Particles of a species have consecutive indices. Each species has its own rule.
+    The particles of one picture are a species; they have consecutive indices.
     """
 
     def __init__(
@@ -119,7 +119,7 @@ class CoMorphogenesis2D(ParticleTask[Any]):
         return together([task.damage(each, generator) for task, each in species])
 
     def with_process_mean(self, mean: Callable[[Tensor], Tensor]) -> Self:
-        """Return a copy in which `mean` is the `process_mean` of each species' task."""
+        """Return a copy in which each species' task averages over training processes by `mean`."""
         return self._with(tasks=[task.with_process_mean(mean) for task in self.tasks])
 
     def loss(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:
@@ -150,7 +150,7 @@ class CoMorphogenesis2D(ParticleTask[Any]):
 
 
 def _shifted(worlds: Particles, distance: float) -> Particles:
-    """Return worlds moved along the x axis."""
+    """Return worlds moved along the x axis by a distance [length units]."""
     x, y = worlds.x.unbind(dim=-1)
     return worlds._replace(x=torch.stack((x + distance, y), dim=-1))
 

@@ -162,7 +162,8 @@ class ManyPictures(Morphogenesis2D):
     def picture(self, x: Tensor, s: Tensor, *, centred: bool = True) -> Tensor:
         """Return each world's picture: red, green, blue (sums over splats), density, [B, R, R, 4].
 
-        It is multiplied by the number of the world's target, or by 1 if the task has no goals yet.
+        It is multiplied by the factor that makes the density of the world's target about 1, or by 1
+        if the task has no goals yet.
         """
         picture = super().picture(x, s, centred=centred)
         if self._goal is None:

@@ -240,7 +240,10 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         return s if self._code is None else replace_code(s, self._code)
 
     def damage(self, worlds: Particles, generator: Randomness) -> Particles:
-        """Return worlds after random damage; with `division` half of the particles die, not all."""
+        """Return worlds after random damage.
+
+        With `division` each particle dies with probability one half, but never all of a world.
+        """
         if not (self.config.division and self.config.damage_radius > 0.0):
             return super().damage(worlds, generator)
         # Survivors are grown particles, among which newly divided ones must find their role.

@@ -242,7 +242,7 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
     def particle_contributions(self, x: Tensor, s: Tensor) -> Tensor:
         """Return N times each particle's contribution to its world's `metric`, shape [B, N].
 
-        It is by `contributions_to_loss`, of factors on particles' opacities.
+        `contributions_to_loss` computes it, with factors on particles' opacities.
         """
         with torch.enable_grad():
             gaussians = self.gaussians(s.detach())

@@ -25,7 +25,7 @@ MIN_SIMILARITY = 1e-4
 
 
 def mean_by_world(values: Tensor) -> Tensor:
-    """Return the mean of each world's numbers [B, ...], shape [B], bit for bit in any batch."""
+    """Return the mean of each world's numbers [B, ...], with the same bits in every batch, [B]."""
     return world_mean(values.flatten(1)[..., None])[:, 0]
 
 

@@ -151,7 +151,7 @@ def _grid_points(
 
 
 def _first(has_ink: Tensor, most: int) -> Tensor:
-    """Return the indices of the first `most` True values of rows [M, E], [M, most], 0 for none."""
+    """Return the indices of the first `most` True values of rows, padded with 0, [M, most]."""
     # Entries are in random order, so the first ones are a fair choice.
     slot = (has_ink.cumsum(1) - 1).where(has_ink, most).clamp(max=most)
     index = torch.arange(has_ink.shape[1]).expand_as(slot)
@@ -184,7 +184,7 @@ def augmented(
 ) -> Tensor:
     """Return clouds [B, N, 2] after random rotation, stretch, shear around (0.5, 0.5), noise.
 
-    The numbers are the fields of `PointClassificationConfig` with these names.
+    Their sizes are the fields of `PointClassificationConfig` with these names.
     """
     world_count, particle_count = x.shape[:2]
     if rotation > 0.0 or stretch > 0.0:
