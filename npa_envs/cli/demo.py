@@ -97,7 +97,7 @@ def train_small(options: DemoOptions, device: torch.device) -> Iterator[str]:
     from npa_envs.measure.quality import measure
     from npa_envs.render.world_film import film_world
     from npa_envs.rule.files import load_rule
-    from npa_envs.tasks.morphogenesis2d import HALF_SEEDS
+    from npa_envs.tasks.morphogenesis2d import SPECIES_RUN
     from npa_envs.training import RunFolder, override, preset, task_entry, train
 
     # One core learns the target in half a minute.
@@ -118,7 +118,7 @@ def train_small(options: DemoOptions, device: torch.device) -> Iterator[str]:
         learning_rate=5e-3,
         pool_size=8,
         # A run as short as this one learns most from seeds.
-        **HALF_SEEDS,
+        **SPECIES_RUN,
     )
     yield f"training on {options.target}: {config.task.particle_count} particles"
     start = time.perf_counter()

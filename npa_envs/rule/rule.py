@@ -341,10 +341,10 @@ class NPARule(nn.Module):
 
     def has_network(self) -> bool:
         """Return whether no subclass, hook or layer alters what `NPARule` computes."""
-        cls, own = type(self), self.__dict__
+        cls, attributes = type(self), self.__dict__
         # Plain loops, as each rollout comes here; torch.compile traces no set operation.
         for name in STEP_PARTS:
-            if name in own:
+            if name in attributes:
                 return False
             if cls is not NPARule and getattr(cls, name) is not getattr(NPARule, name):
                 return False

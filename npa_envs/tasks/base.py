@@ -237,7 +237,7 @@ class ParticleTask(Generic[ConfigT]):
                 f"goal must have entries of at least 0 and below {count}, got "
                 f"{shown(goal.tolist())}: for example torch.tensor([0])"
             )
-        return self._with(_goal=goal)
+        return self._copy_with(_goal=goal)
 
     @property
     def goal(self) -> Tensor:
@@ -258,7 +258,7 @@ class ParticleTask(Generic[ConfigT]):
 
         `mean` returns the mean of a tensor over all of them.
         """
-        return self._with(_mean_of_processes=mean)
+        return self._copy_with(_mean_of_processes=mean)
 
     def with_target_code(self, s: Tensor) -> Tensor:
         """Return states [B, N, C] with the code of the world's target in their first channels.
@@ -331,7 +331,7 @@ class ParticleTask(Generic[ConfigT]):
         """Return each particle's colour as pictures show it, shape [B, N, 3]."""
         return s[..., -3:] + COLOUR_OFFSET
 
-    def _with(self, **fields: object) -> Self:
+    def _copy_with(self, **fields: object) -> Self:
         """Return a shallow copy whose attributes `fields` have new values."""
         # Not by copy.copy, which would leave out what `__getstate__` keeps from pickles.
         bound = object.__new__(type(self))

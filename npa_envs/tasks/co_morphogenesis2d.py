@@ -15,8 +15,8 @@ from npa_envs.errors import NPAError
 from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
 from npa_envs.tasks.base import ParticleTask
 from npa_envs.tasks.morphogenesis2d import (
-    HALF_SEEDS,
     MORPHOGENESIS2D_PRESETS,
+    SPECIES_RUN,
     Morphogenesis2D,
     Morphogenesis2DConfig,
 )
@@ -120,7 +120,7 @@ class CoMorphogenesis2D(ParticleTask[Any]):
 
     def with_process_mean(self, mean: Callable[[Tensor], Tensor]) -> Self:
         """Return a copy in which each species' task averages over training processes by `mean`."""
-        return self._with(tasks=[task.with_process_mean(mean) for task in self.tasks])
+        return self._copy_with(tasks=[task.with_process_mean(mean) for task in self.tasks])
 
     def loss(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the sum of the species' training losses, and terms of species k as "k.term"."""
@@ -170,7 +170,7 @@ _RUNS: Mapping[str, Mapping[str, Any]] = {
         "max_age_range": (64, 16_384), "damage_and_keep_share": 0.0, "damage_share": 0.25,
         "stillness_min_age": 512, "stillness_power": 1.0, "dead_zone": 0.0,
     },
-    "fast": {**HALF_SEEDS, "learning_rate": 4e-3},
+    "fast": {**SPECIES_RUN, "learning_rate": 4e-3},
 }  # fmt: skip
 """Settings of the runs that docs/species.md measured, by AdamW."""
 

@@ -112,7 +112,7 @@ class ManyPictures(Morphogenesis2D):
         if rule.codes is not None:
             with torch.no_grad():
                 self._read_codes(rule.codes)
-        return self._with(_codes=rule.codes)
+        return self._copy_with(_codes=rule.codes)
 
     def seed(
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"

@@ -190,7 +190,7 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
                 f"the rule must have a read-out of {OUTPUTS} outputs, or none, got readout_dim="
                 f"{rule.readout_dim}: it was made for another task"
             )
-        return self._with(_rule=rule if rule.readout_dim else None)
+        return self._copy_with(_rule=rule if rule.readout_dim else None)
 
     @property
     def rule_shape(self) -> dict[str, Any]:
