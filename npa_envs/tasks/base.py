@@ -281,10 +281,7 @@ class ParticleTask(Generic[ConfigT]):
         return task
 
     def compare(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the batch's weighted distance from the target, [], and its terms by name, [].
-
-        Terms have no weights.
-        """
+        """Return the weighted distance from the target and its unweighted terms by name, all []."""
         raise NotImplementedError
 
     def penalties(self, worlds: Particles) -> dict[str, tuple[float, Tensor]]:

@@ -183,12 +183,12 @@ _SPECIES: Mapping[str, Mapping[str, Any]] = {
 
 def _joint_preset(name: str) -> JointTrainConfig[CoMorphogenesis2DConfig]:
     """Return the preset of 2D morphogenesis of this name, with a heart as second species."""
-    alone = MORPHOGENESIS2D_PRESETS[name]
-    first = replace(alone.task, **_SPECIES.get(name, {}))
+    preset = MORPHOGENESIS2D_PRESETS[name]
+    first = replace(preset.task, **_SPECIES.get(name, {}))
     species = (first, replace(first, target="heart"))
     task = CoMorphogenesis2DConfig(species=species, distance=PRESET_DISTANCE)
     # A preset names no initial rules of species.
-    run = {**vars(alone), "task": task, "initial_rule": "", **_RUNS.get(name, {})}
+    run = {**vars(preset), "task": task, "initial_rule": "", **_RUNS.get(name, {})}
     return JointTrainConfig(**{**run, "out": Path("runs/co_morphogenesis2d")})
 
 

@@ -76,19 +76,19 @@ class ManyPictures(Morphogenesis2D):
             raise NPAError(
                 "targets need a rule that knows directions, got equivariant=True: leave one out"
             )
-        alone = [
+        tasks = [
             Morphogenesis2D(replace(config, target=source, targets=()), device=device)
             for source in named.values()
         ]
-        super().__init__(config, target=alone[0].target, device=device)
+        super().__init__(config, target=tasks[0].target, device=device)
         self.names = tuple(named)
         """Names of the targets."""
-        sizes = torch.tensor([task.target.pixel_size for task in alone])
+        sizes = torch.tensor([task.target.pixel_size for task in tasks])
         self._pixel_size = float(sizes.square().mean().sqrt())
         self._scales = (sizes / self._pixel_size).square().to(device)
         self.goal_count = len(named)
         drawn = [
-            self._splat(task.target.points[None], task.target.colours[None])[0] for task in alone
+            self._splat(task.target.points[None], task.target.colours[None])[0] for task in tasks
         ]
         self._target_pictures = torch.stack(drawn) * self._scales[:, None, None, None]
         self._target_mean = torch.zeros_like(self._target_mean)

@@ -57,7 +57,7 @@ class TextureConfig(TaskConfig):
     "vgg_ot", or the sum of some, such as "patch_ot+joint_swd"."""
 
     loss_seed: int = 0
-    """Seed that the loss draws its directions, filters and positions from, once."""
+    """Seed of the random directions, filters and positions that the loss uses."""
 
     vgg_weights: str = ""
     """File of VGG16's weights for "vgg_ot"; empty: torch's usual folder of downloads."""

@@ -193,11 +193,11 @@ def augmented(
     """
     world_count, particle_count = x.shape[:2]
     if rotation > 0.0 or stretch > 0.0:
-        draws = 2.0 * uniform_draws(generator, (world_count, 4), x) - 1.0
-        angle = math.radians(rotation) * draws[:, 0]
+        random_numbers = 2.0 * uniform_draws(generator, (world_count, 4), x) - 1.0
+        angle = math.radians(rotation) * random_numbers[:, 0]
         cos, sin = angle.cos(), angle.sin()
-        wide, high = 1.0 + stretch * draws[:, 1], 1.0 + stretch * draws[:, 2]
-        shear = stretch * draws[:, 3]
+        wide, high = 1.0 + stretch * random_numbers[:, 1], 1.0 + stretch * random_numbers[:, 2]
+        shear = stretch * random_numbers[:, 3]
         across, up = (x - 0.5).unbind(-1)
         across = wide[:, None] * across + shear[:, None] * up
         up = high[:, None] * up

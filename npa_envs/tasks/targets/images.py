@@ -300,9 +300,9 @@ def _sums_of_nine(values: FloatImage) -> FloatImage:
 def _unmix_edge(
     rgb: FloatImage, inside: Mask, background: FloatImage
 ) -> tuple[FloatImage, FloatImage]:
-    """Return colours and alpha of a picture of which `inside` is the object, blended at its edge.
+    """Return the object's colours [H, W, 3] and alpha [H, W] in a picture; it is `inside`.
 
-    For pixels at the edge they are estimated from the colours of the object and the background.
+    For pixels at its edge they are estimated from the colours of the object and the background.
     """
     core = _sums_of_nine(inside.astype(np.float32)) == 9.0
     near = _sums_of_nine(core.astype(np.float32))
