@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from npa_envs.tasks.morphogenesis2d import HALF_SEEDS, Morphogenesis2DTrainConfig
+from npa_envs.tasks.morphogenesis2d import SPECIES_RUN, Morphogenesis2DTrainConfig
 from npa_envs.training import preset
 
 SEEDS = tuple(range(1000, 1008))
@@ -121,7 +121,7 @@ FROM_16: Fields = {
 
 FAST_BEFORE: Fields = {
     **NO_STRAYS,
-    **HALF_SEEDS,
+    **SPECIES_RUN,
     "stillness_min_age": 512,
     "learning_rate": 2e-3,
     "schedule": "milestones",

@@ -302,7 +302,7 @@ class DifferentiableTask(ParticleTask[Any]):
 
     def with_goal(self, goal: Tensor | None) -> Self:
         """Return a copy whose losses are for these goals of worlds, shape [B]; None: the task."""
-        return self if goal is None else self._with(inner=self.inner.with_goal(goal))
+        return self if goal is None else self._copy_with(inner=self.inner.with_goal(goal))
 
     def compare(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the loss and its terms by name, averaged over worlds and species, shape []."""

@@ -97,7 +97,7 @@ def train_small(options: DemoOptions, device: torch.device) -> Iterator[str]:
     from npa_envs.measure.quality import measure
     from npa_envs.render.world_film import film_world
     from npa_envs.rule.files import load_rule
-    from npa_envs.tasks.morphogenesis2d import HALF_SEEDS
+    from npa_envs.tasks.morphogenesis2d import SPECIES_RUN
     from npa_envs.training import RunFolder, override, preset, task_entry, train
 
     # One core learns the target in half a minute. A run as short as this learns most from seeds.
@@ -105,7 +105,7 @@ def train_small(options: DemoOptions, device: torch.device) -> Iterator[str]:
         "fast", target=options.target, device=options.device, out=options.out / "training",
         world_count=4, seed_radius=0.2, particle_count=256, target_point_count=256, eps=0.28,
         hidden_dim=64, resolution=48, steps=(12, 24), iterations=400, learning_rate=5e-3,
-        pool_size=8, **HALF_SEEDS,
+        pool_size=8, **SPECIES_RUN,
     )  # fmt: skip
     yield f"training on {options.target}: {config.task.particle_count} particles"
     start = time.perf_counter()

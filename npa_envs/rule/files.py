@@ -96,13 +96,13 @@ def load_rule(source: str | Path, *, device: str | torch.device = "cpu") -> NPAR
         content, ours = b"", path.suffix == ".safetensors"
         if ours:
             header, weights = _read_ours(path, with_weights=True)
-            fields = {name: _parse(header, name, cls) for name, cls in _FIELDS.items()}
+            fields = {name: _hyper_parameter(header, name, cls) for name, cls in _FIELDS.items()}
             parts = RuleParts(fields, weights)
         else:
             content = read_bytes(path, limit=_MAX_FILE)
             is_demo = path.suffix == ".json"
             parts = read_demo_json(content, name) if is_demo else read_state_dict(content)
-        rule = _assemble(parts)
+        rule = _rule_of(parts)
         if ours and header.get("checksum") != _checksum(header, weights):
             raise NPAError(
                 "the checksum must be that of the weights and of the metadata, got another one: "
@@ -312,7 +312,7 @@ def _checksum(header: Mapping[str, str], weights: Mapping[str, Tensor]) -> str:
     return digest.hexdigest()
 
 
-def _parse(header: Mapping[str, str], name: str, cls: type) -> Any:
+def _hyper_parameter(header: Mapping[str, str], name: str, cls: type) -> Any:
     """Return the hyper-parameter `name` in a file's metadata, of type `cls`."""
     if name not in header:
         raise NPAError(f"the metadata lacks {name!r}: save the rule again with npa_envs.save_rule")
@@ -349,7 +349,7 @@ def _shapes(weights: Mapping[str, Tensor]) -> dict[str, tuple[int, ...]]:
     return {name: tuple(tensor.shape) for name, tensor in weights.items()}
 
 
-def _assemble(parts: RuleParts) -> NPARule:
+def _rule_of(parts: RuleParts) -> NPARule:
     """Return the rule with these hyper-parameters and weights; torch's random state is kept."""
     rule = _without_weights(parts.hyper_parameters)
     expected, got = _shapes(rule.state_dict()), _shapes(parts.weights)

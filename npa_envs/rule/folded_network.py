@@ -135,7 +135,7 @@ Network = FoldedRule | FoldedInvariants
 def fold_weights(
     hidden_weight: Tensor, output_weight: Tensor, dead_zone: float = 0.0
 ) -> FoldedRule:
-    """Return the `FoldedRule` of two padded matrices, differentiable in these."""
+    """Return the `FoldedRule` of its first two fields, differentiable in these."""
     arranged = arrange_weights(hidden_weight, output_weight)
     if arranged is None:
         return FoldedRule(hidden_weight, output_weight, dead_zone=dead_zone)

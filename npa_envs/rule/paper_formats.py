@@ -55,24 +55,19 @@ ZIP_MARK = b"PK\x03\x04"
 """First bytes of a file of torch.save in its zip format, which has checksums."""
 
 _EQUIVARIANT_NAMES = {
-    "model.W_hidden": "W_hidden",
-    "model.W_out": "W_out",
-    "model.mlp.0.weight": "w1.weight",
-    "model.mlp.0.bias": "w1.bias",
-    "model.mlp.2.weight": "w2.weight",
-    "model.mlp.2.bias": "w2.bias",
-}
+    "model.W_hidden": "W_hidden", "model.W_out": "W_out",
+    "model.mlp.0.weight": "w1.weight", "model.mlp.0.bias": "w1.bias",
+    "model.mlp.2.weight": "w2.weight", "model.mlp.2.bias": "w2.bias",
+}  # fmt: skip
 """Names of an equivariant rule's tensors: in a state dict -> in the web demo."""
 
 _WEIGHT_NAMES = {
-    "model.0.weight": "hidden.weight",
-    "model.0.bias": "hidden.bias",
+    "model.0.weight": "hidden.weight", "model.0.bias": "hidden.bias",
     "model.2.weight": "output.weight",
-    "decoder.0.weight": "readout.0.weight",
-    "decoder.0.bias": "readout.0.bias",
-    "decoder.2.weight": "readout.2.weight",
-    "decoder.2.bias": "readout.2.bias",
-}
+    "decoder.0.weight": "readout.0.weight", "decoder.0.bias": "readout.0.bias",
+    "decoder.2.weight": "readout.2.weight", "decoder.2.bias": "readout.2.bias",
+}  # fmt: skip
+"""Names of another rule's tensors: in a state dict -> in `NPARule`."""
 _DECODER_NAMES = {name for name in _WEIGHT_NAMES if name.startswith("decoder")}
 _IGNORED = {"N0"}
 
@@ -131,13 +126,16 @@ def read_state_dict(data: bytes) -> RuleParts:
     if has_readout:
         sizes["readout_hidden_dim"] = weights["readout.0.weight"].shape[0]
         sizes["readout_dim"] = weights["readout.2.weight"].shape[0]
-    return _parts(weights, state, **sizes)
+    return _rule_parts(weights, state, **sizes)
 
 
-def _parts(
+def _rule_parts(
     weights: dict[str, Tensor], scalars: Mapping[Any, Any], **hyper_parameters: Any
 ) -> RuleParts:
-    """Return `RuleParts` in 2D if not said otherwise, with `eps0` and `alpha` of `scalars`."""
+    """Return the `RuleParts` of weights, hyper-parameters, and `eps0` and `alpha` in `scalars`.
+
+    Without `space_dim` the rule is a 2D one.
+    """
     common = {name: _scalar(name, scalars.get(name)) for name in ("eps0", "alpha")}
     sizes = {"space_dim": _DEMO_SPACE_DIM, "hidden_dim": len(weights["hidden.weight"])}
     return RuleParts(sizes | common | hyper_parameters, weights)
@@ -180,7 +178,7 @@ def _equivariant_parts(
         "mixing": mixing.contiguous(),
         "steering": tensors["W_out"][:, 0].contiguous(),
     }
-    return _parts(weights, scalars, state_dim=state_dim, equivariant=True, mixed_vectors=mixed)
+    return _rule_parts(weights, scalars, state_dim=state_dim, equivariant=True, mixed_vectors=mixed)
 
 
 def read_demo_json(data: bytes, name: str | None) -> RuleParts:
@@ -189,7 +187,7 @@ def read_demo_json(data: bytes, name: str | None) -> RuleParts:
     if "W_hidden" not in entry:
         return _plain_demo_parts(entry, index)
     tensors = {
-        known: _decode(entry, known, 1 if known.endswith("bias") else 2, index)
+        known: _decoded_tensor(entry, known, 1 if known.endswith("bias") else 2, index)
         for known in _EQUIVARIANT_NAMES.values()
     }
     # Each number is repeated.
@@ -199,9 +197,9 @@ def read_demo_json(data: bytes, name: str | None) -> RuleParts:
 
 def _plain_demo_parts(entry: Mapping[str, Any], index: int | None) -> RuleParts:
     """Return `RuleParts` of a rule that is not equivariant; `index` is its place in a stack."""
-    first = _decode(entry, "w1.weight", 2, index)
-    bias = _decode(entry, "w1.bias", 1, index)
-    second = _decode(entry, "w2.weight.T", 2, index)
+    first = _decoded_tensor(entry, "w1.weight", 2, index)
+    bias = _decoded_tensor(entry, "w1.bias", 1, index)
+    second = _decoded_tensor(entry, "w2.weight.T", 2, index)
     hidden_dim, padded = first.shape
     state_dim = padded // _TEXEL - 1
     update_dim = state_dim + _DEMO_SPACE_DIM
@@ -219,7 +217,7 @@ def _plain_demo_parts(entry: Mapping[str, Any], index: int | None) -> RuleParts:
         "hidden.bias": bias[:hidden_dim].clone(),
         "output.weight": torch.cat([displacement_rows, state_rows]).contiguous(),
     }
-    return _parts(weights, entry, state_dim=state_dim)
+    return _rule_parts(weights, entry, state_dim=state_dim)
 
 
 def _demo_rule(content: Any, name: str | None) -> tuple[Mapping[str, Any], int | None]:
@@ -298,9 +296,9 @@ def _demo_entry(name: str, rule: NPARule, particle_count: int) -> dict[str, Any]
         "eps0": _as_float32(rule.eps0),
         "N0": particle_count,
         "alpha": _as_float32(rule.alpha),
-        "w1.weight": _encode(_texels(weights["hidden.weight"])),
-        "w1.bias": _encode(weights["hidden.bias"]),
-        "w2.weight.T": _encode(_texels(torch.cat([states, displacement]).T)),
+        "w1.weight": _encoded_tensor(_texels(weights["hidden.weight"])),
+        "w1.bias": _encoded_tensor(weights["hidden.bias"]),
+        "w2.weight.T": _encoded_tensor(_texels(torch.cat([states, displacement]).T)),
     }
 
 
@@ -309,7 +307,7 @@ def _texels(matrix: Tensor) -> Tensor:
     return torch.nn.functional.pad(matrix, (0, -matrix.shape[1] % _TEXEL))
 
 
-def _encode(tensor: Tensor) -> dict[str, Any]:
+def _encoded_tensor(tensor: Tensor) -> dict[str, Any]:
     data = base64.b64encode(tensor.contiguous().numpy().astype("<f4").tobytes()).decode()
     return {"shape": list(tensor.shape), "dtype": "float32", "data64": data}
 
@@ -348,7 +346,7 @@ def _check_not_expanded(name: str, tensor: Tensor) -> None:
 
 
 def _matrix(name: str, value: Any) -> Tensor:
-    """Return a checked weight or bias; the weight of a 1x1 convolution as a matrix."""
+    """Return the weight or bias `name`, checked; the weight of a 1x1 convolution as a matrix."""
     rank = 1 if name.endswith("bias") else 2
     if not isinstance(value, Tensor):
         raise NPAError(f"{name} must be a tensor, got a {type(value).__name__}")
@@ -400,7 +398,7 @@ def _as_float32(number: float) -> float:
     return torch.tensor(number, dtype=torch.float32).item()
 
 
-def _decode(entry: Mapping[str, Any], name: str, rank: int, index: int | None) -> Tensor:
+def _decoded_tensor(entry: Mapping[str, Any], name: str, rank: int, index: int | None) -> Tensor:
     """Return the tensor `name`, of `rank` dimensions, of a rule in the authors' JSON.
 
     `index` is the rule's place in a stack; None: the rule stands by itself.

@@ -255,7 +255,10 @@ class NPARule(nn.Module):
 
     @property
     def vector_form(self) -> VectorSizes:
-        """Numbers of an equivariant rule's perceived scalars and vectors, and of mixed vectors."""
+        """Numbers of scalars and vectors that an equivariant rule perceives, and of mixed vectors.
+
+        Mixed vectors are linear combinations of the perceived ones.
+        """
         vectors = self.state_dim * self.state_gradient + self.density_gradient
         return VectorSizes(
             self.space_dim, 2 * self.state_dim, vectors, self.mixed_vectors, self.chiral
@@ -263,12 +266,18 @@ class NPARule(nn.Module):
 
     @property
     def input_dim(self) -> int:
-        """Number of the hidden layer's inputs: P, or an equivariant rule's scalars and products."""
+        """Number of the hidden layer's inputs: P.
+
+        Those of an equivariant rule are perceived scalars and products of mixed vectors.
+        """
         return self.vector_form.input_dim if self.equivariant else self.perception_dim
 
     @property
     def output_dim(self) -> int:
-        """Number of the second layer's outputs: A - code_dim; equivariant rules: gates and Δs."""
+        """Number of the second layer's outputs: A - code_dim.
+
+        Those of an equivariant rule are gates, the factors of mixed vectors in δ, and Δs.
+        """
         if not self.equivariant or self.static:
             return self.update_dim - self.code_dim
         return self.vector_form.gate_count + self.state_dim
@@ -314,7 +323,7 @@ class NPARule(nn.Module):
         return self._with_code_zeros(self.output.weight, dim=0)
 
     def _with_code_zeros(self, outputs: Tensor, *, dim: int) -> Tensor:
-        """Return updates with zeros inserted for the code, after δ in dimension `dim`."""
+        """Return updates or weights with zeros for the code inserted after δ in dimension `dim`."""
         if self.code_dim == 0:
             return outputs
         moves, states = outputs.tensor_split([self.update_dim - self.state_dim], dim=dim)
@@ -332,10 +341,10 @@ class NPARule(nn.Module):
 
     def has_network(self) -> bool:
         """Return whether no subclass, hook or layer alters what `NPARule` computes."""
-        cls, own = type(self), self.__dict__
+        cls, attributes = type(self), self.__dict__
         # Plain loops, as each rollout comes here; torch.compile traces no set operation.
         for name in STEP_PARTS:
-            if name in own:
+            if name in attributes:
                 return False
             if cls is not NPARule and getattr(cls, name) is not getattr(NPARule, name):
                 return False
@@ -353,7 +362,7 @@ class NPARule(nn.Module):
         )
 
     def network(self) -> Network | None:
-        """Return the network as matrix products on rows, for steps.
+        """Return the network as matrix products on padded perception vectors, for steps.
 
         None: a subclass, hook or layer changes the network, so a step calls `forward`.
         """
@@ -362,7 +371,7 @@ class NPARule(nn.Module):
         return self._folded_invariants() if self.has_network() else None
 
     def _folded_invariants(self) -> FoldedInvariants:
-        """Return an equivariant rule's network on rows; differentiable in the parameters."""
+        """Return an equivariant rule's network for steps; differentiable in the parameters."""
         width = self.perception_dim + 1
         weight, signs = signed_gates(self.output.weight, self.steering)
         return FoldedInvariants(
@@ -384,7 +393,10 @@ class NPARule(nn.Module):
         return weights + ([self.fate.weight, self.fate.bias] if self.divides else [])
 
     def folded(self) -> FoldedRule:
-        """Return a plain rule's network on rows; differentiable in the parameters."""
+        """Return a plain rule's network for steps, with its bias in the first matrix.
+
+        It is differentiable in the parameters.
+        """
         return self._folded(self.update_weight)
 
     def _folded(self, update_weight: Tensor) -> FoldedRule:

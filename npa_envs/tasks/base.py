@@ -197,7 +197,7 @@ class ParticleTask(Generic[ConfigT]):
         return Particles(x, x.new_zeros(*x.shape[:2], self.config.state_dim))
 
     def damage(self, worlds: Particles, generator: Randomness) -> Particles:
-        """Return worlds after the random damage of training; goals may change. By default none."""
+        """Return worlds after the damage of training; goals may change. By default: `worlds`."""
         return worlds
 
     def begin(self, iteration: int) -> None:
@@ -237,7 +237,7 @@ class ParticleTask(Generic[ConfigT]):
                 f"goal must have entries of at least 0 and below {count}, got "
                 f"{shown(goal.tolist())}: for example torch.tensor([0])"
             )
-        return self._with(_goal=goal)
+        return self._copy_with(_goal=goal)
 
     @property
     def goal(self) -> Tensor:
@@ -258,7 +258,7 @@ class ParticleTask(Generic[ConfigT]):
 
         `mean` returns the mean of a tensor over all of them.
         """
-        return self._with(_mean_of_processes=mean)
+        return self._copy_with(_mean_of_processes=mean)
 
     def with_target_code(self, s: Tensor) -> Tensor:
         """Return states [B, N, C] with the code of the world's target in their first channels.
@@ -281,10 +281,7 @@ class ParticleTask(Generic[ConfigT]):
         return task
 
     def compare(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the batch's weighted distance from the target, [], and its terms by name, [].
-
-        Terms have no weights.
-        """
+        """Return the weighted distance from the target and its unweighted terms by name, all []."""
         raise NotImplementedError
 
     def penalties(self, worlds: Particles) -> dict[str, tuple[float, Tensor]]:
@@ -331,7 +328,7 @@ class ParticleTask(Generic[ConfigT]):
         """Return each particle's colour as pictures show it, shape [B, N, 3]."""
         return s[..., -3:] + COLOUR_OFFSET
 
-    def _with(self, **fields: object) -> Self:
+    def _copy_with(self, **fields: object) -> Self:
         """Return a shallow copy whose attributes `fields` have new values."""
         # Not by copy.copy, which would leave out what `__getstate__` keeps from pickles.
         bound = object.__new__(type(self))

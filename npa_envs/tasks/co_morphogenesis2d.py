@@ -15,8 +15,8 @@ from npa_envs.errors import NPAError
 from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
 from npa_envs.tasks.base import ParticleTask
 from npa_envs.tasks.morphogenesis2d import (
-    HALF_SEEDS,
     MORPHOGENESIS2D_PRESETS,
+    SPECIES_RUN,
     Morphogenesis2D,
     Morphogenesis2DConfig,
 )
@@ -27,7 +27,7 @@ from npa_envs.world.randomness import Randomness
 
 @dataclass(frozen=True, kw_only=True)
 class CoMorphogenesis2DConfig:
-    """Several pictures that grow in one world, each by its own rule."""
+    """Settings of several pictures that grow in one world, each by its own rule."""
 
     species: tuple[Morphogenesis2DConfig, ...] = (
         Morphogenesis2DConfig(),
@@ -54,7 +54,7 @@ class CoMorphogenesis2DConfig:
 
     @property
     def counts(self) -> tuple[int, ...]:
-        """Particles of each species."""
+        """Number of particles of each species."""
         return tuple(config.particle_count for config in self.species)
 
     @property
@@ -65,9 +65,9 @@ class CoMorphogenesis2DConfig:
 
 
 class CoMorphogenesis2D(ParticleTask[Any]):
-    """Several pictures that grow in one world; each species is the particles of one picture.
+    """The task of growing several pictures in one world, each by its own rule.
 
-    Particles of a species have consecutive indices. Each species has its own rule.
+    The particles of one picture are a species; they have consecutive indices.
     """
 
     def __init__(
@@ -119,8 +119,8 @@ class CoMorphogenesis2D(ParticleTask[Any]):
         return together([task.damage(each, generator) for task, each in species])
 
     def with_process_mean(self, mean: Callable[[Tensor], Tensor]) -> Self:
-        """Return a copy in which `mean` is the `process_mean` of each species' task."""
-        return self._with(tasks=[task.with_process_mean(mean) for task in self.tasks])
+        """Return a copy in which each species' task averages over training processes by `mean`."""
+        return self._copy_with(tasks=[task.with_process_mean(mean) for task in self.tasks])
 
     def loss(self, worlds: Particles) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the sum of the species' training losses, and terms of species k as "k.term"."""
@@ -150,7 +150,7 @@ class CoMorphogenesis2D(ParticleTask[Any]):
 
 
 def _shifted(worlds: Particles, distance: float) -> Particles:
-    """Return worlds moved along the x axis."""
+    """Return worlds moved along the x axis by a distance [length units]."""
     x, y = worlds.x.unbind(dim=-1)
     return worlds._replace(x=torch.stack((x + distance, y), dim=-1))
 
@@ -170,7 +170,7 @@ _RUNS: Mapping[str, Mapping[str, Any]] = {
         "max_age_range": (64, 16_384), "damage_and_keep_share": 0.0, "damage_share": 0.25,
         "stillness_min_age": 512, "stillness_power": 1.0, "dead_zone": 0.0,
     },
-    "fast": {**HALF_SEEDS, "learning_rate": 4e-3},
+    "fast": {**SPECIES_RUN, "learning_rate": 4e-3},
 }  # fmt: skip
 """Settings of the runs that docs/species.md measured, by AdamW."""
 
@@ -183,12 +183,12 @@ _SPECIES: Mapping[str, Mapping[str, Any]] = {
 
 def _joint_preset(name: str) -> JointTrainConfig[CoMorphogenesis2DConfig]:
     """Return the preset of 2D morphogenesis of this name, with a heart as second species."""
-    alone = MORPHOGENESIS2D_PRESETS[name]
-    first = replace(alone.task, **_SPECIES.get(name, {}))
+    preset = MORPHOGENESIS2D_PRESETS[name]
+    first = replace(preset.task, **_SPECIES.get(name, {}))
     species = (first, replace(first, target="heart"))
     task = CoMorphogenesis2DConfig(species=species, distance=PRESET_DISTANCE)
     # A preset names no initial rules of species.
-    run = {**vars(alone), "task": task, "initial_rule": "", **_RUNS.get(name, {})}
+    run = {**vars(preset), "task": task, "initial_rule": "", **_RUNS.get(name, {})}
     return JointTrainConfig(**{**run, "out": Path("runs/co_morphogenesis2d")})
 
 

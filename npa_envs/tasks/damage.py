@@ -130,15 +130,15 @@ NEAREST, FARTHEST = 2.0, 4.0
 
 
 def tear_off(x: Tensor, *, radius: float, generator: Randomness) -> Tensor:
-    """Return positions [B, N, D] of which a quarter of the worlds, at random, has lost a flake.
+    """Return positions [B, N, D] after a random quarter of the worlds has lost a flake.
 
     A flake is a ball around a random particle, of a random radius up to `radius` [length units]. It
     is moved out of the world in one piece, to `far_points`. Its particles perceive each other, and
     may drift on where a lone particle has learned to rest.
     """
     centre = random_particle(x, generator)
-    draws = uniform_draws(generator, (len(x), 2), x)
-    flake_radius = torch.where(draws[:, :1] < DAMAGE_CHANCE, radius * draws[:, 1:], -1.0)
+    uniform = uniform_draws(generator, (len(x), 2), x)
+    flake_radius = torch.where(uniform[:, :1] < DAMAGE_CHANCE, radius * uniform[:, 1:], -1.0)
     torn = (x - centre[:, None]).norm(dim=-1) <= flake_radius
     return torch.where(torn[..., None], x + (far_points(x, 1, generator) - centre[:, None]), x)
 

@@ -76,19 +76,19 @@ class ManyPictures(Morphogenesis2D):
             raise NPAError(
                 "targets need a rule that knows directions, got equivariant=True: leave one out"
             )
-        alone = [
+        tasks = [
             Morphogenesis2D(replace(config, target=source, targets=()), device=device)
             for source in named.values()
         ]
-        super().__init__(config, target=alone[0].target, device=device)
+        super().__init__(config, target=tasks[0].target, device=device)
         self.names = tuple(named)
         """Names of the targets."""
-        sizes = torch.tensor([task.target.pixel_size for task in alone])
+        sizes = torch.tensor([task.target.pixel_size for task in tasks])
         self._pixel_size = float(sizes.square().mean().sqrt())
         self._scales = (sizes / self._pixel_size).square().to(device)
         self.goal_count = len(named)
         drawn = [
-            self._splat(task.target.points[None], task.target.colours[None])[0] for task in alone
+            self._splat(task.target.points[None], task.target.colours[None])[0] for task in tasks
         ]
         self._target_pictures = torch.stack(drawn) * self._scales[:, None, None, None]
         self._target_mean = torch.zeros_like(self._target_mean)
@@ -112,7 +112,7 @@ class ManyPictures(Morphogenesis2D):
         if rule.codes is not None:
             with torch.no_grad():
                 self._read_codes(rule.codes)
-        return self._with(_codes=rule.codes)
+        return self._copy_with(_codes=rule.codes)
 
     def seed(
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
@@ -162,7 +162,8 @@ class ManyPictures(Morphogenesis2D):
     def picture(self, x: Tensor, s: Tensor, *, centred: bool = True) -> Tensor:
         """Return each world's picture: red, green, blue (sums over splats), density, [B, R, R, 4].
 
-        It is multiplied by the number of the world's target, or by 1 if the task has no goals yet.
+        It is multiplied by the factor that makes the density of the world's target about 1, or by 1
+        if the task has no goals yet.
         """
         picture = super().picture(x, s, centred=centred)
         if self._goal is None:

@@ -206,7 +206,7 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
             code = codes[self.target.name]
         else:
             code = codes.encode(self.target_picture[None].to(codes.table))[0]
-        return self._with(_code=code.detach())
+        return self._copy_with(_code=code.detach())
 
     def seed(
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
@@ -222,25 +222,33 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
             s[:, 0, LIFE] = 1.0
             return Particles(torch.zeros_like(x), s)
         if config.equivariant and max(config.seed_axis, config.seed_across) > 0.0:
-            drawn = uniform_draws(generator, (world_count, 1), x)
-            angle = 2.0 * math.pi * (drawn if config.angles > 0 else torch.zeros_like(drawn))
-            cos, sin = angle.cos(), angle.sin()
-            along = x[..., 0] * cos + x[..., 1] * sin
-            across = x[..., 1] * cos - x[..., 0] * sin
-            s[..., 0] = config.seed_axis * along / config.seed_radius
-            if config.seed_across > 0.0:
-                s[..., 1] = config.seed_across * across / config.seed_radius
+            self._write_axis(x, s, generator)
         if self._code is not None:
             blank = s.new_zeros(*s.shape[:2], len(self._code))
             s = self.with_target_code(torch.cat((blank, s), dim=-1))
         return Particles(x, s)
+
+    def _write_axis(self, x: Tensor, s: Tensor, generator: Randomness) -> None:
+        """Write to s, in place, first states that rise along an axis of each world's disk."""
+        config = self.config
+        drawn = uniform_draws(generator, (len(x), 1), x)
+        angle = 2.0 * math.pi * (drawn if config.angles > 0 else torch.zeros_like(drawn))
+        cos, sin = angle.cos(), angle.sin()
+        along = x[..., 0] * cos + x[..., 1] * sin
+        across = x[..., 1] * cos - x[..., 0] * sin
+        s[..., 0] = config.seed_axis * along / config.seed_radius
+        if config.seed_across > 0.0:
+            s[..., 1] = config.seed_across * across / config.seed_radius
 
     def with_target_code(self, s: Tensor) -> Tensor:
         """Return states with the target's code in their first channels; without codes, `s`."""
         return s if self._code is None else replace_code(s, self._code)
 
     def damage(self, worlds: Particles, generator: Randomness) -> Particles:
-        """Return worlds after random damage; with `division` half of the particles die, not all."""
+        """Return worlds after random damage.
+
+        With `division` each particle dies with probability one half, but never all of a world.
+        """
         if not (self.config.division and self.config.damage_radius > 0.0):
             return super().damage(worlds, generator)
         # Survivors are grown particles, among which newly divided ones must find their role.
@@ -248,7 +256,7 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         survive = uniform_draws(generator, x.shape[:2], x) < SURVIVING
         survivors = torch.where(survive[..., None], s, 0.0)
         survivors = torch.where(living(survivors).any(dim=1)[:, None, None], survivors, s)
-        others = self._with(config=replace(self.config, damage_radius=0.0))
+        others = self._copy_with(config=replace(self.config, damage_radius=0.0))
         return others.damage(worlds._replace(s=survivors), generator)
 
     def picture(self, x: Tensor, s: Tensor, *, centred: bool = True) -> Tensor:
@@ -433,13 +441,13 @@ def turned(x: Tensor, turn: Tensor) -> Tensor:
 Morphogenesis2DTrainConfig = TrainConfig[Morphogenesis2DConfig]
 """A training run of 2D morphogenesis."""
 
-_TOGETHER: Mapping[str, Any] = {
+_STABILITY: Mapping[str, Any] = {
     "escape_weight": 10.0, "bound_weight": 10.0, "drift_weight": 1.0, "clump_radius": 0.2,
     "cut_gap": 0.1,
 }  # fmt: skip
 """Settings of the task for long stability and for healing clumps and cuts (docs/stability.md)."""
 
-HALF_SEEDS: Mapping[str, Any] = {
+SPECIES_RUN: Mapping[str, Any] = {
     "optimiser": "adamw", "seed_interval": 1, "max_age_range": (0, 0), "damage_share": 1.0,
     "stillness_weight": 0.0,
 }  # fmt: skip
@@ -451,7 +459,7 @@ MORPHOGENESIS2D_PRESETS = presets_of(
     # Found by experiment on pictures that nobody tuned for: docs/recipes.md.
     best=TrainConfig(
         task=Morphogenesis2DConfig(
-            escape_share=2e-4, damage_radius=0.2, cut_share=0.5, **_TOGETHER,
+            escape_share=2e-4, damage_radius=0.2, cut_share=0.5, **_STABILITY,
         ),
         repeats=1, iterations=8000, pool_size=64, steps=(48, 80), optimiser="muon",
         learning_rate=3e-3, weight_decay=0.1, schedule="cosine", max_age_range=(16, 16_384),
@@ -463,7 +471,7 @@ MORPHOGENESIS2D_PRESETS = presets_of(
     fast=fast_run(
         task=Morphogenesis2DConfig(
             target_point_count=512, particle_count=512, eps=0.2, seed_radius=0.4, resolution=64,
-            escape_share=1e-3, **_TOGETHER,
+            escape_share=1e-3, **_STABILITY,
         ),
         iterations=2400, pool_size=32, steps=(16, 32), optimiser="muon", learning_rate=5e-3,
         schedule="cosine", max_age_range=(24, 256), damage_share=0.5, stillness_min_age=64,

@@ -190,7 +190,7 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
                 f"the rule must have a read-out of {OUTPUTS} outputs, or none, got readout_dim="
                 f"{rule.readout_dim}: it was made for another task"
             )
-        return self._with(_rule=rule if rule.readout_dim else None)
+        return self._copy_with(_rule=rule if rule.readout_dim else None)
 
     @property
     def rule_shape(self) -> dict[str, Any]:
@@ -242,7 +242,7 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
     def particle_contributions(self, x: Tensor, s: Tensor) -> Tensor:
         """Return N times each particle's contribution to its world's `metric`, shape [B, N].
 
-        It is by `contributions_to_loss`, of factors on particles' opacities.
+        `contributions_to_loss` computes it, with factors on particles' opacities.
         """
         with torch.enable_grad():
             gaussians = self.gaussians(s.detach())

@@ -157,11 +157,11 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
 
     def for_rule(self, rule: NPARule) -> Self:
         """Return a copy of the task whose losses and pictures use the rule's read-out."""
-        return self._with(_rule=rule)
+        return self._copy_with(_rule=rule)
 
     def held_out(self) -> Self:
         """Return a copy of the task with the clouds of "test"."""
-        task = self._with(split="test")
+        task = self._copy_with(split="test")
         vars(task).pop("clouds", None)
         return task
 

@@ -57,7 +57,7 @@ class TextureConfig(TaskConfig):
     "vgg_ot", or the sum of some, such as "patch_ot+joint_swd"."""
 
     loss_seed: int = 0
-    """Seed that the loss draws its directions, filters and positions from, once."""
+    """Seed of the random directions, filters and positions that the loss uses."""
 
     vgg_weights: str = ""
     """File of VGG16's weights for "vgg_ot"; empty: torch's usual folder of downloads."""
@@ -238,7 +238,7 @@ class Texture(ParticleTask[TextureConfig]):
     def particle_contributions(self, x: Tensor, s: Tensor) -> Tensor:
         """Return N times each particle's contribution to its world's `metric`, shape [B, N].
 
-        It is by `contributions_to_loss`, of factors on particles' splats.
+        `contributions_to_loss` computes it, with factors on particles' splats.
         """
         x, s = x.detach(), s.detach()
         x = x - x[:, :1]
@@ -294,7 +294,7 @@ class Texture(ParticleTask[TextureConfig]):
     def joint_image(self, channels: Tensor) -> Tensor:
         """Return what joint losses compare: colours and density^0.5, times the weights' roots.
 
-        The shape is [..., 4, R, R], that of the `channels` of a picture.
+        `channels` of pictures and the result have shape [..., 4, R, R].
         """
         density = (channels[..., 3:, :, :] + DENSITY_FLOOR) ** JOINT_POWER
         colour_scale = self.config.colour_weight**0.5

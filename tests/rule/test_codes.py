@@ -13,7 +13,7 @@ NAMES = ("gecko", "heart", "ring")
 
 
 def coded(device="cpu", dtype=torch.float64, **options):
-    """Return a rule of seven channels, three of which are a code."""
+    """Return a rule whose seven state channels begin with a code of three."""
     options = {"state_dim": 7, "code_dim": 3, "code_names": NAMES, "eps0": 0.3, **options}
     return lively_rule(device, dtype, **options)
 

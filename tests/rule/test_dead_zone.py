@@ -29,7 +29,7 @@ def without_zone(rule: NPARule) -> NPARule:
 
 
 def by_hand(rule, x, s, steps, eps):
-    """All particles updated in each step: the network's numbers beyond the zone, in plain torch."""
+    """Return (x, s) after `steps` in plain torch, in which all particles are updated."""
     for _ in range(steps):
         y = rule.output(torch.relu(rule.hidden(oracle.perceive(x, s, eps, rule.eps0))))
         y = torch.where(y.abs() > rule.dead_zone, y, torch.zeros_like(y))
@@ -149,7 +149,7 @@ def test_several_species_observe_what_they_are_told():
 
 
 class TestRest:
-    """Worlds that come to rest: each particle goes on until its states are near 1, then stays."""
+    """Worlds that come to rest: each particle changes until its states are near 1, then stays."""
 
     @pytest.fixture(autouse=True)
     def short_parts_without_gradients(self, monkeypatch):

@@ -28,7 +28,7 @@ def equivariant(device="cpu", dtype=torch.float64, **options):
 
 
 def turns_of(space_dim, count=16):
-    """Return rotations, shape [count, D, D], in float64."""
+    """Return random rotation matrices, shape [count, D, D], float64."""
     matrices = torch.randn(count, space_dim, space_dim, generator=torch.Generator().manual_seed(5))
     q, r = torch.linalg.qr(matrices.double())
     q = q * r.diagonal(dim1=1, dim2=2).sign()[:, None]
@@ -38,7 +38,7 @@ def turns_of(space_dim, count=16):
 
 @torch.no_grad()
 def largest_difference(rule, x, s, turns):
-    """Return how far turned worlds end from where the world, turned afterwards, ends.
+    """Return how far worlds that were turned first end from the world that is turned afterwards.
 
     All of them draw the same numbers. Also returns how far particles have moved.
     """
@@ -187,7 +187,7 @@ def test_species_of_both_kinds_share_a_world():
 
 
 class Unfolded(NPARule):
-    """The same rule, run as the module that it is."""
+    """The same rule, which steps run by `forward` and not by its folded network."""
 
     def __init__(self, rule):
         self.share(rule)

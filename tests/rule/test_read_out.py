@@ -15,7 +15,7 @@ GOAL = torch.tensor([0.9, -0.7])
 
 
 class ReadOutTask(CircleTask):
-    """Every particle's two outputs are to be `GOAL`."""
+    """The task that every particle's two outputs of the read-out are `GOAL`."""
 
     rule: NPARule | None = None
 

@@ -310,12 +310,12 @@ def ones(*shape):
 
 
 def padded(tensor):
-    """The tensor with its rows padded to whole texels, of four numbers."""
+    """Return a tensor whose rows are padded with zeros to a multiple of four numbers."""
     return torch.nn.functional.pad(tensor.detach(), (0, -tensor.shape[-1] % 4))
 
 
 def demo_tensors(rule):
-    """The tensors of a rule as the web demo has them: displacement last."""
+    """Return the tensors of a rule as the web demo has them: rows of displacement come last."""
     output = rule.output.weight
     return {
         "w1.weight": padded(rule.hidden.weight),
@@ -330,7 +330,7 @@ def demo_entry(tensors):
 
 
 def demo_stack(rules):
-    """An entry of several rules: each array has a row for each rule."""
+    """Return the JSON of a stack of rules: each array has one more dimension, the rules."""
     return demo_entry({name: torch.stack([rule[name] for rule in rules]) for name in rules[0]})
 
 
@@ -361,7 +361,7 @@ def test_rules_of_the_web_demo_are_the_same_rules(tmp_path, state_dim):
 
 
 def equivariant_state(seed=0, state_dim=3, mixed=2, hidden_dim=5):
-    """The tensors of an equivariant rule by the names of the authors' state dict."""
+    """Return random tensors of an equivariant rule by their names in the authors' state dict."""
     generator = torch.Generator().manual_seed(seed)
     inputs, outputs = 2 * state_dim + mixed * (mixed + 1) // 2, state_dim + mixed
     shapes = {
@@ -392,7 +392,7 @@ def equivariant_update(state, z):
 
 
 def equivariant_tensors(state):
-    """The tensors as the web demo has them: padded, the mixtures' weights four times."""
+    """Return the tensors as the web demo has them: padded, weights of mixed vectors four times."""
     return {
         "W_hidden": state["model.W_hidden"].repeat_interleave(4, dim=-1),
         "W_out": state["model.W_out"].repeat_interleave(4, dim=-1),

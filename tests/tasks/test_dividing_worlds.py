@@ -19,7 +19,7 @@ def make_task(**fields):
 
 
 def half_alive(task, seed=0):
-    """Worlds of the task with 32 living particles, the dead amidst them."""
+    """Return two worlds of 64 particles, of which the first 32 live; the dead are in the middle."""
     x = task.places(2, torch.Generator().manual_seed(seed), torch.device("cpu"))
     s = torch.rand(2, 64, task.config.state_dim, generator=torch.Generator().manual_seed(1)) - 0.5
     s[:, :32, LIFE], s[:, 32:] = 1.0, 0.0

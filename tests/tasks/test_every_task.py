@@ -28,7 +28,7 @@ VARIANTS = [
 
 @pytest.fixture
 def tiny(folder, tmp_path):
-    """Returns tiny runs of tasks, each in its own folder."""
+    """Return a function that returns the settings of a task's tiny run in a temporary folder."""
 
     def make(name, out="run", **fields):
         if name == "point_classification":
@@ -104,7 +104,7 @@ def test_gradients_equal_finite_differences(tiny, name, fields):
 
 
 def slope_of(task, x, s, k):
-    """The slope of a world's loss by how strongly particle `k` is drawn, by differences."""
+    """Return the slope of a world's loss by a factor on particle k's splat, by differences."""
     if task.box:
         # A copy in the same place adds to the colours and the density.
         x, colours = x - x[:, :1], s[..., -3:] + 0.5

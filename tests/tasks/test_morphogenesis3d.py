@@ -79,7 +79,7 @@ def test_states_are_colours_where_there_is_no_read_out(task):
 
 
 def under_the_surface(count, depth):
-    """Points below the doughnut's surface, coloured as it is lit: [1, N, 3] both."""
+    """Return points below the doughnut's surface, and its colours there as lit: [1, N, 3] each."""
     mesh, random = load_mesh("doughnut"), np.random.default_rng(0)
     a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
     outward = np.cross(b - a, c - a)

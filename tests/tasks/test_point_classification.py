@@ -211,7 +211,7 @@ def test_clouds_are_cut_and_mutated_as_told():
 
 @pytest.fixture(scope="module")
 def trained(folder, tmp_path_factory):
-    """A rule that has learned three shapes, in some seconds."""
+    """Return a rule that has learned three shapes in a few seconds."""
     fields = {"particle_count": 32, "hidden_dim": 32, "readout_hidden_dim": 16, "world_count": 16}
     fields |= {"iterations": 250, "milestones": (200,), "steps": (5, 9)}
     fields |= {"rotation": 10.0, "jitter": 0.005, "mutated_share": 0.3}

@@ -60,7 +60,7 @@ def test_top_of_the_picture_has_high_y_and_its_left_low_x(tmp_path, monkeypatch)
 
 
 def encoded(image, codec="PNG", fraction=1.0):
-    """The first part of a picture's file."""
+    """Return the first `fraction` of the bytes of a picture's file."""
     buffer = io.BytesIO()
     image.save(buffer, codec)
     return buffer.getvalue()[: int(fraction * buffer.tell())]

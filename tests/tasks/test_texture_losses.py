@@ -38,7 +38,7 @@ SMALL = TextureConfig(target="hearts", particle_count=300, resolution=24, hidden
 
 @pytest.fixture(scope="module")
 def vgg16():
-    """The network as torchvision builds it, with average pooling and random weights."""
+    """Return VGG16 as torchvision builds it, with average pooling and random weights."""
     layers, channels = [], 3
     torch.manual_seed(0)
     for group in WIDTHS:
@@ -81,7 +81,7 @@ def texture(name, resolution=32, dtype=torch.float32, density=False):
 
 
 def drawable(name, resolution=48, dtype=torch.float64):
-    """The picture of a texture that particles can draw, colours and density."""
+    """Return a texture as sharp as particles can draw it: colours and density."""
     task = Texture(TextureConfig(target=name, particle_count=1024, resolution=resolution))
     return task.joint_image(task.drawable.movedim(-1, 0)).to(dtype)
 
@@ -95,7 +95,7 @@ def noise(*shape, dtype=torch.float64, seed=0):
 
 
 def rolled_patches(image, size):
-    """Every patch of a torus as a row, in NumPy: channel, then row, then column."""
+    """Return all patches of a periodic image as rows: channel, then row, then column."""
     reach = size // 2
     shifts = [(r, c) for r in range(-reach, reach + 1) for c in range(-reach, reach + 1)]
     columns = [
@@ -113,7 +113,7 @@ def halves(image, count):
 
 
 def plain_distance(tables, expected_tables):
-    """The sum over sizes of the mean squared difference of sorted columns, over the variance."""
+    """Return the sum over sizes of mean squared differences of sorted columns over the variance."""
     total = 0.0
     for actual, expected in zip(tables, expected_tables, strict=True):
         difference = np.sort(actual, axis=0) - np.sort(expected, axis=0)

@@ -15,7 +15,7 @@ SMALL = TextureConfig(target="bubbles", particle_count=300, resolution=24, eps=0
 
 
 def lattice(side):
-    """A particle in the middle of each pixel, [1, side², 2]."""
+    """Return positions of a particle in the middle of each pixel, [1, side², 2]."""
     axis = (2.0 * torch.arange(side) + 1.0) / side - 1.0
     y, x = torch.meshgrid(axis, axis, indexing="ij")
     return torch.stack((x, y), dim=-1).view(1, -1, 2)

@@ -116,7 +116,7 @@ def test_mesh_files_are_read_with_their_colours(tmp_path):
 
 
 def nerf_folder(folder, side=40):
-    """A scene as NeRF-synthetic ones are: z up, cameras at 4 units, of a coloured mesh."""
+    """Write a NeRF-synthetic folder of a coloured mesh: z is up, cameras are at 4 units."""
     mesh = load_mesh("rocket")
     z_up = mesh.vertices[:, [0, 2, 1]] * (1.0, -1.0, 1.0) * 1.5
     turned = Mesh(z_up, mesh.faces, mesh.colours)

@@ -25,7 +25,7 @@ MIN_SIMILARITY = 1e-4
 
 
 def mean_by_world(values: Tensor) -> Tensor:
-    """Return the mean of each world's numbers [B, ...], shape [B], bit for bit in any batch."""
+    """Return the mean of each world's numbers [B, ...], with the same bits in every batch, [B]."""
     return world_mean(values.flatten(1)[..., None])[:, 0]
 
 
@@ -47,8 +47,8 @@ class MultiScaleSimilarity:
         sizes = [resolution]
         for _ in SIZE_EXPONENTS[1:]:
             sizes.append((sizes[-1] + 1) // 2)
-        self._windows = [_window(size).float().to(device) for size in sizes]
-        self._halvings = [_halving(size).to(device) for size in sizes[:-1]]
+        self._windows = [_window_matrix(size).float().to(device) for size in sizes]
+        self._halvings = [_halving_matrix(size).to(device) for size in sizes[:-1]]
 
     def __call__(self, pictures: Tensor, target: Tensor) -> Tensor:
         """Return the similarity to `target`, at most 1, of pictures [..., R, R]; shape [...]."""
@@ -84,7 +84,7 @@ def _from_both_sides(pictures: Tensor, matrix: Tensor) -> Tensor:
     return (pictures @ matrix).mT @ matrix
 
 
-def _window(size: int) -> Tensor:
+def _window_matrix(size: int) -> Tensor:
     """Return a matrix [size, positions]: a column has the window's weights at one position."""
     width = min(WINDOW_SIDE, size - 1 + size % 2)
     offset = torch.arange(width, dtype=torch.float64) - width // 2
@@ -95,7 +95,7 @@ def _window(size: int) -> Tensor:
     return matrix
 
 
-def _halving(size: int) -> Tensor:
+def _halving_matrix(size: int) -> Tensor:
     """Return the matrix [size, half] that averages pairs of pixels.
 
     Before an odd number of pixels it assumes a 0.

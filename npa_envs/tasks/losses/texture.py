@@ -393,16 +393,15 @@ def _matched(rows: Tensor, expected: Tensor) -> Tensor:
         costs = squares - 2.0 * (rows @ expected.T)
         there, back = costs.argmin(2), costs.argmin(1)
         # The target patches to which each patch of a world is nearest: their number and sum.
-        chosen = (back[:, None] == torch.arange(rows.shape[1], device=rows.device)[:, None]).to(
-            rows
-        )
+        index = torch.arange(rows.shape[1], device=rows.device)[:, None]
+        chosen = (back[:, None] == index).to(rows)
         times, sums = chosen.sum(2, keepdim=True), chosen @ expected
-        rest = expected.square().mean()
+        mean_square = expected.square().mean()
     forward = (rows - expected[there]).square()
     # Σ (p − t)² over the target's patches, gathered by the world's: its gradient has a fixed order.
     ratio = rows.shape[1] / expected.shape[0]
     backward = ratio * (times * rows.square() - 2.0 * rows * sums)
-    return torch.maximum(mean_by_world(forward), mean_by_world(backward) + rest)
+    return torch.maximum(mean_by_world(forward), mean_by_world(backward) + mean_square)
 
 
 # The paper's loss. Of VGG16 (Simonyan and Zisserman 2014) only the weights are needed, not
@@ -581,8 +580,7 @@ def _weight(weights: Mapping[str, Any], name: str, shape: tuple[int, ...]) -> Te
 
 TEXTURE_LOSSES: Mapping[str, LossEntry] = {
     "vgg_ot": LossEntry(
-        "the paper's: optimal transport of VGG16 features; needs weights",
-        VGGTransport,
+        "the paper's: optimal transport of VGG16 features; needs weights", VGGTransport
     ),
     "patch_swd": LossEntry(
         "sliced Wasserstein distance of raw patches at several sizes",

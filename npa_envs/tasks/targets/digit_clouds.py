@@ -114,10 +114,7 @@ def sample_ink(
         cells, points = _grid_points(side, relative.shape[1:], random)
         finer = []
         for part in torch.split(waiting, max(1, min(chunk, CELLS_PER_BATCH // side**2))):
-            enlarged = torch.nn.functional.interpolate(
-                relative[part][:, None], size=(side, side), mode="bilinear", align_corners=False
-            )
-            has_ink = enlarged.flatten(1)[:, cells] >= INK
+            has_ink = _has_ink(relative[part], side)[:, cells]
             counts = has_ink.sum(1)
             enough = (counts >= least) | (side >= FINEST_GRID)
             finer.append(part[~enough])
@@ -126,11 +123,19 @@ def sample_ink(
                 continue
             areas[part] = counts / len(cells)
             x[part.to(device)] = _farthest_points(
-                points[_first(has_ink, most)].to(device), counts.to(device), particle_count
+                points[_first_true(has_ink, most)].to(device), counts.to(device), particle_count
             )
         waiting = torch.cat(finer)
         side *= 2
     return (x + 0.5) / COORDINATE_COUNT, float(areas.mean())
+
+
+def _has_ink(relative: Tensor, side: int) -> Tensor:
+    """Return whether pictures [M, H, W], enlarged to side x side, have `INK`, [M, side²]."""
+    enlarged = torch.nn.functional.interpolate(
+        relative[:, None], size=(side, side), mode="bilinear", align_corners=False
+    )
+    return enlarged.flatten(1) >= INK
 
 
 def _grid_points(
@@ -150,8 +155,8 @@ def _grid_points(
     return order, points.floor().clamp(max=COORDINATE_COUNT - 1)
 
 
-def _first(has_ink: Tensor, most: int) -> Tensor:
-    """Return the indices of the first `most` True values of rows [M, E], [M, most], 0 for none."""
+def _first_true(has_ink: Tensor, most: int) -> Tensor:
+    """Return the indices of the first `most` True values of rows, padded with 0, [M, most]."""
     # Entries are in random order, so the first ones are a fair choice.
     slot = (has_ink.cumsum(1) - 1).where(has_ink, most).clamp(max=most)
     index = torch.arange(has_ink.shape[1]).expand_as(slot)
@@ -184,15 +189,15 @@ def augmented(
 ) -> Tensor:
     """Return clouds [B, N, 2] after random rotation, stretch, shear around (0.5, 0.5), noise.
 
-    The numbers are the fields of `PointClassificationConfig` with these names.
+    Their sizes are the fields of `PointClassificationConfig` with these names.
     """
     world_count, particle_count = x.shape[:2]
     if rotation > 0.0 or stretch > 0.0:
-        draws = 2.0 * uniform_draws(generator, (world_count, 4), x) - 1.0
-        angle = math.radians(rotation) * draws[:, 0]
+        random_numbers = 2.0 * uniform_draws(generator, (world_count, 4), x) - 1.0
+        angle = math.radians(rotation) * random_numbers[:, 0]
         cos, sin = angle.cos(), angle.sin()
-        wide, high = 1.0 + stretch * draws[:, 1], 1.0 + stretch * draws[:, 2]
-        shear = stretch * draws[:, 3]
+        wide, high = 1.0 + stretch * random_numbers[:, 1], 1.0 + stretch * random_numbers[:, 2]
+        shear = stretch * random_numbers[:, 3]
         across, up = (x - 0.5).unbind(-1)
         across = wide[:, None] * across + shear[:, None] * up
         up = high[:, None] * up
@@ -244,7 +249,7 @@ def load_pictures(
             f"data must be a known data set or a folder of IDX files, got {shown(data)}: "
             f"{suggest(data, BUILT_IN)}"
         )
-    images, labels = (read_idx(_found(path, name)) for name in IDX_NAMES[split])
+    images, labels = (read_idx(_idx_file(path, name)) for name in IDX_NAMES[split])
     if images.ndim != 3 or labels.shape != images.shape[:1] or images.size == 0:
         raise NPAError(
             f"the {split} files of {shown(str(path))} must hold pictures [M, H, W] and classes "
@@ -311,7 +316,7 @@ def _digits(split: Split) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
     return np.asarray(bunch.images, np.float32)[chosen] / 16.0, label[chosen]
 
 
-def _found(folder: Path, name: str) -> Path:
+def _idx_file(folder: Path, name: str) -> Path:
     """Return the file of this name, gzipped or not, in a folder; raise NPAError without one."""
     for file in (folder / name, folder / f"{name}.gz"):
         if os.path.isfile(file):

@@ -91,7 +91,7 @@ def open_image(path: Path) -> Image.Image:
 
 @contextlib.contextmanager
 def no_foreign_programs() -> Iterator[None]:
-    """Keep Pillow from starting other programs while a library opens pictures with it."""
+    """Return a context in which Pillow starts no other programs for libraries that use it."""
     before = EpsImagePlugin.gs_binary
     EpsImagePlugin.gs_binary = False
     try:
@@ -174,7 +174,8 @@ def cut_out_background(image: Image.Image, *, label: str) -> Image.Image:
 def resample(image: Image.Image, point_count: int, *, label: str = "picture") -> Image.Image:
     """Return an RGBA picture scaled so that about `point_count` of its pixels are opaque.
 
-    It is padded to a square. Colours are averaged with alpha as weight. Errors call it `label`.
+    It is padded to a square. Colours are means with alpha as weight. Errors call the picture
+    `label`.
     """
     padded, span, pitch = _padded(image.crop(image.getchannel("A").getbbox()), point_count)
     return _sample(padded, span, _best_pitch(padded, span, pitch, point_count, label))
@@ -183,8 +184,8 @@ def resample(image: Image.Image, point_count: int, *, label: str = "picture") ->
 def _padded(image: Image.Image, point_count: int) -> tuple[Image.Image, int, float]:
     """Return a picture in the middle of a transparent square, its longer side [pixels], its pitch.
 
-    A pitch is the side [pixels] of the squares that become one pixel each. This one would leave
-    `point_count` opaque pixels if they had the area of those before.
+    A pitch is the side [pixels] of the squares that become one pixel each. This one is estimated
+    from the area that is opaque, for `point_count` pixels.
     """
     area = _opaque_count(image)
     pitch = math.sqrt(area / point_count)
@@ -208,7 +209,7 @@ def _padded(image: Image.Image, point_count: int) -> tuple[Image.Image, int, flo
 def _best_pitch(
     padded: Image.Image, span: int, pitch: float, point_count: int, label: str
 ) -> float:
-    """Return the pitch, near a first one, that leaves about `point_count` opaque pixels."""
+    """Return the pitch that leaves about `point_count` opaque pixels, by bisection from `pitch`."""
     alpha = padded.getchannel("A")
 
     def count(candidate: float) -> int:
@@ -247,7 +248,7 @@ def _margin(image: Image.Image, pitch: float) -> int:
 
 
 def _sample(padded: Image.Image, span: int, pitch: float) -> Image.Image:
-    """Return the middle `span` pixels of a picture and a border, scaled by 1 / `pitch`."""
+    """Return the middle `span` pixels of a picture, and a few around, scaled by 1 / `pitch`."""
     side = math.ceil(span / pitch) + 2
     low = 0.5 * (padded.width - side * pitch)
     high = low + side * pitch
@@ -299,9 +300,9 @@ def _sums_of_nine(values: FloatImage) -> FloatImage:
 def _unmix_edge(
     rgb: FloatImage, inside: Mask, background: FloatImage
 ) -> tuple[FloatImage, FloatImage]:
-    """Return colours and alpha of a picture of which `inside` is the object, blended at its edge.
+    """Return the object's colours [H, W, 3] and alpha [H, W] in a picture; it is `inside`.
 
-    For pixels at the edge they are estimated from the colours of the object and the background.
+    For pixels at its edge they are estimated from the colours of the object and the background.
     """
     core = _sums_of_nine(inside.astype(np.float32)) == 9.0
     near = _sums_of_nine(core.astype(np.float32))

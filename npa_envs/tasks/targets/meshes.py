@@ -111,7 +111,7 @@ def _read_mesh(path: Path) -> Mesh:
 
 
 def _check_triangles(vertices: FloatArray, faces: NDArray[np.int64], path: Path) -> None:
-    """Raise NPAError unless a file's triangles exist, are finite, of a usual size, and no lines."""
+    """Raise NPAError unless a file's triangles exist, are finite, of a usual size, and not flat."""
     in_space = vertices.shape[1:] == (3,) and faces.shape[1:] == (3,)
     if not in_space or faces.size == 0 or vertices.size == 0 or not np.isfinite(vertices).all():
         raise NPAError(

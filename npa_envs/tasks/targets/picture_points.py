@@ -168,7 +168,7 @@ def render_emoji(text: str) -> Image.Image:
         )
     singles = [font for font in fonts if font.getlength(text) <= 1.5 * font.getlength("\U0001f600")]
     for font in singles:
-        image = _draw(font, text)
+        image = _drawn_emoji(font, text)
         if image is not None:
             return image
     names = ", ".join(font.getname()[0] or "a font" for font in fonts)
@@ -182,7 +182,7 @@ def render_emoji(text: str) -> Image.Image:
     )
 
 
-def _draw(font: ImageFont.FreeTypeFont, text: str) -> Image.Image | None:
+def _drawn_emoji(font: ImageFont.FreeTypeFont, text: str) -> Image.Image | None:
     """Return text in a font's own colours as RGBA, without margin; None: it has no such glyph."""
     side = 3 * int(font.size)
     image = Image.new("RGBA", (side, side), (0, 0, 0, 0))

@@ -128,7 +128,7 @@ def load_texture(
         )
     check_count("resolution", resolution, ": try 128", at_most=MAX_RESOLUTION)
     if isinstance(source, str) and source in PATTERNS:
-        return _target(source, draw_pattern(source, resolution), True)
+        return _texture_target(source, draw_pattern(source, resolution), True)
     path = home_path(source)
     if isinstance(source, str) and not looks_like_path(str(path)):
         raise NPAError(
@@ -145,10 +145,10 @@ def load_texture(
         )
     left, top = (image.width - side) // 2, (image.height - side) // 2
     square = image.crop((left, top, left + side, top + side))
-    return _target(path.stem, scaled_square(square, resolution)[::-1], tiles)
+    return _texture_target(path.stem, scaled_square(square, resolution)[::-1], tiles)
 
 
-def _target(name: str, picture: Array, tiles: bool) -> TextureTarget:
+def _texture_target(name: str, picture: Array, tiles: bool) -> TextureTarget:
     """Return the target with a picture of `TextureTarget.picture`'s channels and rows."""
     tensor = torch.tensor(np.ascontiguousarray(picture), dtype=torch.float32)
     return TextureTarget(name, tensor, tiles)
@@ -193,7 +193,7 @@ def stripes(u: Array, v: Array, _: np.random.Generator) -> Array:
 def cells(u: Array, v: Array, random: np.random.Generator) -> Array:
     """Voronoi cells of random points in warm colours, with dark walls between them."""
     centres = _scattered(random, 20, 0.17)
-    distance = np.stack([np.hypot(*_away(u, v, centre)) for centre in centres])
+    distance = np.stack([np.hypot(*_offsets(u, v, centre)) for centre in centres])
     order = np.argsort(distance, axis=0)
     nearest = np.take_along_axis(distance, order[:2], axis=0)
     shades = _colours("#e9c46a", "#f4a261", "#e76f51", "#d4a373", "#faedcd")
@@ -223,7 +223,7 @@ def dots(u: Array, v: Array, _: np.random.Generator) -> Layers:
     """Rimmed dots of two sorts on a slanted lattice, nothing between them."""
     inner, rim = _colours("#f4a261", "#2a9d8f"), _colours("#6b2d0c", "#0b3b3f")
     for j, k in itertools.product(range(4), range(4)):
-        away = np.hypot(*_away(u, v, np.array((k / 4.0 + j / 8.0, j / 4.0))))
+        away = np.hypot(*_offsets(u, v, np.array((k / 4.0 + j / 8.0, j / 4.0))))
         yield away < 0.09, rim[k % 2]
         yield away < 0.062, inner[k % 2]
 
@@ -233,16 +233,16 @@ def bubbles(u: Array, v: Array, random: np.random.Generator) -> Layers:
     """Rings of several sizes with a glint, nothing around them."""
     centres = _scattered(random, 12, 0.23)
     gaps = [
-        min(math.hypot(*_away(one[0], one[1], other)) for other in centres if other is not one)
+        min(math.hypot(*_offsets(one[0], one[1], other)) for other in centres if other is not one)
         for one in centres
     ]
     tints = _colours("#48cae4", "#0096c7", "#5e60ce", "#80ffdb")
     for k, centre in enumerate(centres):
         radius, tint = 0.46 * gaps[k], tints[k % len(tints)]
-        away = np.hypot(*_away(u, v, centre))
+        away = np.hypot(*_offsets(u, v, centre))
         yield away < radius, 0.45 + 0.55 * tint
         yield (away > 0.72 * radius) & (away < radius), 0.75 * tint
-        glint = np.hypot(*_away(u, v, centre + radius * np.array([-0.3, 0.35])))
+        glint = np.hypot(*_offsets(u, v, centre + radius * np.array([-0.3, 0.35])))
         yield glint < 0.2 * radius, 1.0
 
 
@@ -281,7 +281,7 @@ def hearts(u: Array, v: Array, _: np.random.Generator) -> Layers:
     centres = [((k + 0.5 * (j % 2)) / 4.0, j / 4.0) for j in range(4) for k in range(4)]
     inner, rim = _colours("#e63946", "#ffafcc"), _colours("#8d0f20", "#d6407f")
     for number, centre in enumerate(centres):
-        across, up = (offset / 0.084 for offset in _away(u, v, np.array(centre)))
+        across, up = (offset / 0.084 for offset in _offsets(u, v, np.array(centre)))
         # Two round halves above a point.
         depth = across**2 + (1.15 * up - 0.25 - 0.72 * np.sqrt(np.abs(across))) ** 2
         depth = np.where(np.abs(across) < 1.5, depth, np.inf)
@@ -295,7 +295,7 @@ def droplets(u: Array, v: Array, random: np.random.Generator) -> Layers:
     centres = _scattered(random, 14, 0.21)
     rim, *inner = _colours("#03045e", "#90e0ef", "#4895ef", "#3f37c9")
     for number, centre in enumerate(centres):
-        across, up = (offset / 0.068 for offset in _away(u, v, centre))
+        across, up = (offset / 0.068 for offset in _offsets(u, v, centre))
         across, up = 0.94 * across + 0.34 * up, 0.94 * up - 0.34 * across
         # A disk below, drawn out to a point above.
         taper = np.where(up > 0.0, np.clip(1.0 - up / 2.0, 0.0, 1.0) ** 0.9, 1.0)
@@ -314,7 +314,7 @@ def stars(u: Array, v: Array, random: np.random.Generator) -> Layers:
     ground, *tints = _colours("#14213d", "#fca311", "#f1faee")
     yield np.ones(u.shape, dtype=bool), ground
     for number, (centre, turn) in enumerate(zip(centres, turns, strict=True)):
-        across, up = _away(u, v, centre)
+        across, up = _offsets(u, v, centre)
         # The angle to the nearest of the five points, and the straight edge that lies there.
         fifth, inner = 2.0 * math.pi / 5.0, 0.45
         half = 0.5 * fifth
@@ -344,7 +344,7 @@ def _opaque(colour: Array) -> Array:
     return _with_alpha(colour, np.ones(colour.shape[:2], dtype=bool))
 
 
-def _away(u: Any, v: Any, centre: Array) -> tuple[Any, Any]:
+def _offsets(u: Any, v: Any, centre: Array) -> tuple[Any, Any]:
     """Return the shortest offsets of positions (u, v) from `centre` in the periodic unit square."""
     across, along = u - centre[0], v - centre[1]
     return across - np.round(across), along - np.round(along)
@@ -355,7 +355,7 @@ def _scattered(random: np.random.Generator, count: int, gap: float) -> list[Arra
     centres: list[Array] = []
     while len(centres) < count:
         centre = random.random(2)
-        if all(math.hypot(*_away(centre[0], centre[1], other)) >= gap for other in centres):
+        if all(math.hypot(*_offsets(centre[0], centre[1], other)) >= gap for other in centres):
             centres.append(centre)
         # Lowered at each try, so that the loop ends.
         gap *= 0.999

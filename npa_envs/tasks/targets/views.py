@@ -97,7 +97,7 @@ def load_views(
 def views_of_mesh(
     mesh: Mesh, name: str, resolution: int, training_count: int, held_out_count: int
 ) -> ViewTarget:
-    """Return views of a mesh that fits into the ball of radius 0.85, from cameras all around."""
+    """Return views of a mesh, which fits into the ball of radius 0.85, from cameras all around."""
     views = []
     for count, turn in ((training_count, 0.0), (held_out_count, 0.5)):
         cameras = surrounding_cameras(count, resolution, turn=turn)
