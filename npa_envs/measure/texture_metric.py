@@ -1,7 +1,8 @@
-"""The metric of textures: three distances from the target that no training loss contains.
+"""The metric of textures: a picture's distance from the target, by no loss that training uses.
 
-Each is divided by the distance of a drawing of the target by particles, or by 2 % of the distance
-of grey noise if that is larger.
+It has three parts: patches, power spectra and colours of pairs of pixels. Each is divided by the
+distance that particles reach which draw the target itself, or by 2 % of that of grey noise if this
+is larger.
 """
 
 from __future__ import annotations
@@ -17,30 +18,32 @@ from npa_envs.tasks.losses.texture import quantiles
 from npa_envs.tasks.texture import Texture, colour_image
 
 REFERENCE = 128
-"""Resolution for which lengths are given in pixels; they are scaled for others."""
+"""Resolution [pixels] at which the lengths below hold; at others they are scaled with it."""
 PATCH = 24
 """Side of a patch [pixels], which no training loss uses."""
 DIRECTIONS = 64
-"""Random directions that patches are projected on."""
+"""Number of random directions that patches are projected on."""
 BANDS = 7
-"""Logarithmic bands of the wave number, `BAND_RATIO` wide, up to half a wave per pixel."""
+"""Number of bands of the wave number, up to half a wave per pixel."""
 BAND_RATIO = math.sqrt(2.0)
+"""Highest wave number of a band / lowest."""
 ORIENTATIONS = 8
-"""Orientations of waves in half a turn."""
-DISTANCES = (1, 2, 4, 6, 9, 13, 19, 28)
+"""Number of orientations of waves in half a turn."""
+PAIR_DISTANCES = (1, 2, 4, 6, 9, 13, 19, 28)
 """Distances of the pairs of pixels whose colours are counted [pixels]."""
-AXES = ((0, 1), (1, 1), (1, 0), (1, -1))
-"""Directions of these pairs, rows and columns."""
+PAIR_DIRECTIONS = ((0, 1), (1, 1), (1, 0), (1, -1))
+"""Directions of these pairs: rows down, columns to the right."""
 DRAWINGS = 4
-"""Drawings of the target by particles, whose mean distance is the unit."""
+"""Number of drawings of the target by particles, whose mean distance is the unit."""
 
 
 @dataclass(frozen=True)
 class TextureRow:
-    """Pictures' distances from the target, over those of particles that draw it; means over worlds.
+    """Distances of worlds' pictures from the target at `step`, means over the worlds.
 
-    `patches` are sliced Wasserstein distances of patches, `spectra` distances of oriented power
-    spectra, `colours` those of co-occurring colours; `ratio` is the mean of the three.
+    1 is the distance of particles that draw the target itself. `patches` are sliced Wasserstein
+    distances of patches, `spectra` distances of oriented power spectra, `colours` those of the
+    colours of pairs of pixels. `ratio` is the mean of the three, `ratio_worst` the largest world's.
     """
 
     step: int
@@ -52,9 +55,9 @@ class TextureRow:
 
 
 class TextureMetric:
-    """Distance of pictures from the target of a texture task; other tasks raise NPAError.
+    """Computes distances of pictures from the target of a texture task; others raise NPAError.
 
-    It is computed in float64 with directions from a fixed seed, so that CPU and GPU agree.
+    It uses float64 and the same random directions each time, so that CPU and GPU agree.
     """
 
     def __init__(self, task: object) -> None:
@@ -96,7 +99,10 @@ class TextureMetric:
 
     @torch.no_grad()
     def __call__(self, pictures: Tensor) -> Tensor:
-        """Return ratios of patches, spectra and colours, float64, [B, 3], for [B, R, R, 4]."""
+        """Return distances of patches, spectra, colours of pictures [B, R, R, 4], float64, [B, 3].
+
+        Their unit is the distance of particles that draw the target.
+        """
         if pictures.shape[1:] != self._task.target_picture.shape:
             raise NPAError(
                 f"pictures must have shape [B, R, R, 4] with R as the target's "
@@ -106,13 +112,14 @@ class TextureMetric:
         return self._distances(images) / self._units
 
     def row(self, x: Tensor, s: Tensor, step: int) -> TextureRow:
-        """Return the row of worlds that are `step` steps after their seed."""
+        """Return the row of worlds x and s at `step`, as the task draws them."""
         ratios = self(self._task.picture(x, s))
         each = ratios.mean(1)
         patches, spectra, colours = ratios.mean(0).tolist()
         return TextureRow(step, each.mean().item(), each.max().item(), patches, spectra, colours)
 
     def _distances(self, images: Tensor) -> Tensor:
+        """Return distances of patches, spectra and colours, without unit, [B, 3]."""
         distances = []
         for image in images[:, None]:
             patches = (self._projections(image, True) - self._patches).square().mean()
@@ -122,7 +129,10 @@ class TextureMetric:
         return torch.stack(distances)
 
     def _projections(self, image: Tensor, wrap: bool) -> Tensor:
-        """Return the quantiles of the patches' projections, [DIRECTIONS, R²]; `wrap`: periodic."""
+        """Return quantiles of the projections of an image's patches, [DIRECTIONS, R²].
+
+        With `wrap`, the image is periodic.
+        """
         waves = torch.fft.rfft2(image)
         projected = torch.fft.irfft2((waves * self._filters).sum(1), s=image.shape[-2:])
         count = image.shape[-1] ** 2
@@ -132,14 +142,18 @@ class TextureMetric:
         return quantiles(projected.flatten(1), count)
 
     def _amplitudes(self, image: Tensor) -> Tensor:
-        """Return the square root of each channel's power in each bin of waves, [4, bins]."""
+        """Return roots of an image's power by channel and by bin of waves, [4, bins]."""
         flat = (image - image.mean(dim=(2, 3), keepdim=True)) * self._window
         power = torch.fft.fft2(flat, norm="forward").abs().square() / self._window.square().mean()
         sums: Tensor = power[0].flatten(1) @ self._bins
         return sums.sqrt()
 
     def _counts(self, image: Tensor, wrap: bool) -> Tensor:
-        """Return the fractions of pairs of pixels with each two of K colours, [pairs, K, K]."""
+        """Return fractions of pairs of pixels with each two of K colours, [pairs, K, K].
+
+        `pairs` are all combinations of distances and directions. With `wrap`, the image is
+        periodic.
+        """
         away = (image[0].movedim(0, -1)[..., None, :] - self._codes).square().sum(-1)
         near = torch.exp(-0.5 * away / 0.15**2)
         # One more code for colours that are near no other.
@@ -147,8 +161,8 @@ class TextureMetric:
         near = near / near.sum(-1, keepdim=True)
         result = []
         side = near.shape[0]
-        for distance in DISTANCES:
-            for down, across in AXES:
+        for distance in PAIR_DISTANCES:
+            for down, across in PAIR_DIRECTIONS:
                 steps = max(1, round(distance * self._scale))
                 moved = near.roll((-down * steps, -across * steps), dims=(0, 1))
                 first = near
@@ -162,14 +176,17 @@ class TextureMetric:
 
 
 def _images(pictures: Tensor) -> Tensor:
-    """Return colours and density of pictures [B, R, R, 4], float64, shape [B, 4, R, R]."""
+    """Return red, green, blue and density of pictures [B, R, R, 4], float64, [B, 4, R, R]."""
     channels = pictures.double().movedim(-1, 1)
     # The plain density, no power of it, as the faintest parts of edges should count little.
     return torch.cat((colour_image(channels), channels[:, 3:]), dim=1)
 
 
 def _wave_bins(resolution: int) -> Tensor:
-    """Return the bin of each wave by wave number and orientation, int64, [R²]; 0: none."""
+    """Return a bin for each wave of an image, by wave number and orientation, int64, [R²].
+
+    Bins count from 1; 0 is the constant wave, which is in none.
+    """
     waves = torch.fft.fftfreq(resolution, dtype=torch.float64)
     down, across = torch.meshgrid(waves, waves, indexing="ij")
     length = torch.hypot(down, across)
@@ -184,7 +201,7 @@ def _wave_bins(resolution: int) -> Tensor:
 
 
 def _codes(colours: Tensor, count: int) -> Tensor:
-    """Return K = `count` k-means centres [K, F] of colours [M, F], from far apart initial ones."""
+    """Return `count` = K typical colours [K, F] of colours [M, F], the centres of k-means."""
     centres = colours.mean(0, keepdim=True)
     for _ in range(count - 1):
         away = torch.cdist(colours, centres).amin(1)
