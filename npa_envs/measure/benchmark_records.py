@@ -118,10 +118,7 @@ def number(value: float | None) -> float:
 
 
 def time_limit(max_seconds: float | None) -> Callable[[], bool]:
-    """Return a function that returns whether `max_seconds` have passed since this call.
-
-    With None it always returns False.
-    """
+    """Return a function that returns whether `max_seconds` have passed since now; None: never."""
     end = math.inf if max_seconds is None else time.monotonic() + max_seconds
     return lambda: time.monotonic() >= end
 
@@ -130,10 +127,7 @@ def time_limit(max_seconds: float | None) -> Callable[[], bool]:
 
 
 def measured_facts(device: torch.device, commit: str | None, **settings: Any) -> dict[str, Any]:
-    """Return the facts of a run: device, machine, `settings`, commit and versions.
-
-    `commit` None: that of the checkout.
-    """
+    """Return a run's facts: device, settings, commit (None: the checkout's), versions, ..."""
     return {
         "device": device.type,
         "machine": machine(device),
@@ -244,10 +238,7 @@ def _cell(value: object, missing: str) -> str:
 
 
 def tables_json(tables: Mapping[str, Sequence[Any]], **facts: str) -> str:
-    """Return tables (rows of dataclasses by name) and `facts` as the text of a JSON object.
-
-    Infinite numbers and NaN become null.
-    """
+    """Return tables of rows by name, and `facts`, as JSON; infinite numbers and NaN become null."""
     return json_text({**facts, **{name: as_objects(rows) for name, rows in tables.items()}})
 
 
@@ -278,10 +269,7 @@ def short(value: float | str) -> str:
 
 
 def mean_with_error(mean: float, error: float, digits: int = 3) -> str:
-    """Return "mean ± standard error" with `digits` decimals; an `error` of NaN is left out.
-
-    A mean of NaN gives `NONE`.
-    """
+    """Return "mean ± standard error" with `digits` decimals; `NONE` if the mean is NaN."""
     if math.isnan(mean):
         return NONE
     return f"{mean:.{digits}f}" + ("" if math.isnan(error) else f" ± {error:.{digits}f}")

@@ -81,10 +81,7 @@ Matrix = tuple[Sequence[str], Sequence[str], Sequence[Sequence[float | None]]]
 
 
 def heat_map(matrices: Mapping[str, Matrix], *, colours: str, largest: float) -> bytes:
-    """Return a PNG file of matrices by title, one below the other, with a number in each cell.
-
-    The colour map `colours` ranges from 1 / `largest` to `largest`, in logarithm.
-    """
+    """Return a PNG of matrices by title; logarithmic colours from 1 / `largest` to `largest`."""
     from matplotlib.colors import LogNorm
 
     size = max(len(columns) for _, columns, _ in matrices.values())

@@ -7,6 +7,7 @@ is larger.
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 
@@ -71,22 +72,17 @@ class TextureMetric:
         self._scale = resolution / REFERENCE
         device = task.target_picture.device
         generator = torch.Generator().manual_seed(0)
-        side = max(2, min(resolution, round(PATCH * self._scale)))
-        directions = torch.randn(DIRECTIONS, 4, side, side, generator=generator).double()
-        directions /= directions.flatten(1).norm(dim=1)[:, None, None, None]
-        filters = torch.zeros(DIRECTIONS, 4, resolution, resolution, dtype=torch.float64)
-        filters[..., :side, :side] = directions
-        self._side = side
-        self._filters = torch.fft.rfft2(filters.to(device)).conj()
+        self._side = max(2, min(resolution, round(PATCH * self._scale)))
+        self._filters = _patch_filters(self._side, resolution, generator, device)
         bins = _wave_bins(resolution)[:, None] == torch.arange(1, 1 + BANDS * ORIENTATIONS)
         self._bins = bins.double().to(device)
+        wrap = task.target.tiles
         self._window = torch.ones(resolution, resolution, dtype=torch.float64, device=device)
-        if not task.target.tiles:
+        if not wrap:
             ramp = torch.hann_window(resolution, periodic=False, dtype=torch.float64)
             self._window = torch.outer(ramp, ramp).to(device)
         target = _images(task.drawable[None])
-        self._codes = _codes(target[0].flatten(1).T, 12)
-        wrap = task.target.tiles
+        self._palette = _typical_colours(target[0].flatten(1).T, 12)
         self._patches = self._projections(target, wrap)
         self._spectra = self._amplitudes(target)
         self._colours = self._counts(target, wrap)
@@ -99,10 +95,7 @@ class TextureMetric:
 
     @torch.no_grad()
     def __call__(self, pictures: Tensor) -> Tensor:
-        """Return distances of patches, spectra, colours of pictures [B, R, R, 4], float64, [B, 3].
-
-        Their unit is the distance of particles that draw the target.
-        """
+        """Return the three distances of `TextureRow` for each picture, float64, [B, 3]."""
         if pictures.shape[1:] != self._task.target_picture.shape:
             raise NPAError(
                 f"pictures must have shape [B, R, R, 4] with R as the target's "
@@ -119,7 +112,6 @@ class TextureMetric:
         return TextureRow(step, each.mean().item(), each.max().item(), patches, spectra, colours)
 
     def _distances(self, images: Tensor) -> Tensor:
-        """Return distances of patches, spectra and colours, without unit, [B, 3]."""
         distances = []
         for image in images[:, None]:
             patches = (self._projections(image, True) - self._patches).square().mean()
@@ -129,10 +121,7 @@ class TextureMetric:
         return torch.stack(distances)
 
     def _projections(self, image: Tensor, wrap: bool) -> Tensor:
-        """Return quantiles of the projections of an image's patches, [DIRECTIONS, R²].
-
-        With `wrap`, the image is periodic.
-        """
+        """Return quantiles of the projections of an image's patches, [DIRECTIONS, R²]."""
         waves = torch.fft.rfft2(image)
         projected = torch.fft.irfft2((waves * self._filters).sum(1), s=image.shape[-2:])
         count = image.shape[-1] ** 2
@@ -149,30 +138,36 @@ class TextureMetric:
         return sums.sqrt()
 
     def _counts(self, image: Tensor, wrap: bool) -> Tensor:
-        """Return fractions of pairs of pixels with each two of K colours, [pairs, K, K].
-
-        `pairs` are all combinations of distances and directions. With `wrap`, the image is
-        periodic.
-        """
-        away = (image[0].movedim(0, -1)[..., None, :] - self._codes).square().sum(-1)
+        """Return fractions of pairs of pixels with each two of K colours, [pairs, K, K]."""
+        away = (image[0].movedim(0, -1)[..., None, :] - self._palette).square().sum(-1)
         near = torch.exp(-0.5 * away / 0.15**2)
-        # One more code for colours that are near no other.
+        # One more entry for colours that are near no other.
         near = torch.cat((near, torch.full_like(near[..., :1], 0.05)), dim=-1)
         near = near / near.sum(-1, keepdim=True)
         result = []
         side = near.shape[0]
-        for distance in PAIR_DISTANCES:
-            for down, across in PAIR_DIRECTIONS:
-                steps = max(1, round(distance * self._scale))
-                moved = near.roll((-down * steps, -across * steps), dims=(0, 1))
-                first = near
-                if not wrap:
-                    rows = slice(0, side - down * steps)
-                    columns = slice(max(0, -across * steps), side - max(0, across * steps))
-                    first, moved = near[rows, columns], moved[rows, columns]
-                first, moved = first.flatten(0, 1), moved.flatten(0, 1)
-                result.append(first.T @ moved / len(first))
+        for distance, (down, across) in itertools.product(PAIR_DISTANCES, PAIR_DIRECTIONS):
+            steps = max(1, round(distance * self._scale))
+            moved = near.roll((-down * steps, -across * steps), dims=(0, 1))
+            start = near
+            if not wrap:
+                rows = slice(0, side - down * steps)
+                columns = slice(max(0, -across * steps), side - max(0, across * steps))
+                start, moved = near[rows, columns], moved[rows, columns]
+            start, moved = start.flatten(0, 1), moved.flatten(0, 1)
+            result.append(start.T @ moved / len(start))
         return torch.stack(result)
+
+
+def _patch_filters(
+    side: int, resolution: int, generator: torch.Generator, device: torch.device
+) -> Tensor:
+    """Return spectra that project an image's patches on random directions, [DIRECTIONS, 4, ...]."""
+    directions = torch.randn(DIRECTIONS, 4, side, side, generator=generator).double()
+    directions /= directions.flatten(1).norm(dim=1)[:, None, None, None]
+    filters = torch.zeros(DIRECTIONS, 4, resolution, resolution, dtype=torch.float64)
+    filters[..., :side, :side] = directions
+    return torch.fft.rfft2(filters.to(device)).conj()
 
 
 def _images(pictures: Tensor) -> Tensor:
@@ -183,10 +178,7 @@ def _images(pictures: Tensor) -> Tensor:
 
 
 def _wave_bins(resolution: int) -> Tensor:
-    """Return a bin for each wave of an image, by wave number and orientation, int64, [R²].
-
-    Bins count from 1; 0 is the constant wave, which is in none.
-    """
+    """Return each wave's bin by wave number and orientation, from 1 on, int64, [R²]; 0: none."""
     waves = torch.fft.fftfreq(resolution, dtype=torch.float64)
     down, across = torch.meshgrid(waves, waves, indexing="ij")
     length = torch.hypot(down, across)
@@ -200,7 +192,7 @@ def _wave_bins(resolution: int) -> Tensor:
     return torch.where(length > 0.0, bins, torch.zeros_like(bins)).long().flatten()
 
 
-def _codes(colours: Tensor, count: int) -> Tensor:
+def _typical_colours(colours: Tensor, count: int) -> Tensor:
     """Return `count` = K typical colours [K, F] of colours [M, F], the centres of k-means."""
     centres = colours.mean(0, keepdim=True)
     for _ in range(count - 1):

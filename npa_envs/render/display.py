@@ -36,9 +36,7 @@ _GAP = 4
 class Shown:
     """A picture or a repeating film, which a notebook displays when it is the value of a cell.
 
-    Args:
-        frames: One picture, or the film's, of one size, uint8, shape [H, W, 3] each.
-        fps: Frames per second.
+    Frames are pictures of one size, uint8, shape [H, W, 3] each; `fps` is their number per second.
     """
 
     def __init__(self, frames: Iterable[Frame], fps: float) -> None:

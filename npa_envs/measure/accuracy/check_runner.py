@@ -157,11 +157,7 @@ def check(
 
 
 def chosen_checks(checks: Sequence[Check], names: Sequence[str]) -> list[Check]:
-    """Return the checks that `names` select, or all checks if there are no names.
-
-    A name is that of a group or of a check, or the beginning of one up to a slash. One that selects
-    nothing raises NPAError.
-    """
+    """Return the checks of these groups or names, or beginnings of names; without names all."""
 
     def selects(name: str, check: Check) -> bool:
         return f"{check.name}/".startswith(f"{name.rstrip('/')}/")

@@ -122,11 +122,10 @@ def mark_steps(steps: int) -> list[int]:
 
 
 def measured(runner: RuleRunner, worlds: Particles) -> dict[str, float]:
-    """Return metrics of worlds (maxima or means over them) by the names in `BOUNDS`, without drift.
+    """Return the metrics of `BOUNDS` except drift, before they are `relative`.
 
-    Extents are in length units, energies those of the next `ENERGY_STEPS` steps, which `runner`
-    runs; neither is relative to a settled world (see `relative`). If a number is infinite or NaN,
-    only `not_finite` is returned.
+    Energies are those of the next `ENERGY_STEPS` steps. If a number of the worlds is infinite or
+    NaN, only `not_finite` is returned.
     """
     with torch.no_grad():
         x, s, *_ = worlds

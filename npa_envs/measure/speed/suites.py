@@ -215,10 +215,7 @@ SKIPPED = {
 
 @dataclass(frozen=True)
 class SkipRow:
-    """A computation that rollouts leave out under a condition; times of a step [µs].
-
-    `done_us` is with it, `skipped_us` without it, and `saved` the fraction saved, as text.
-    """
+    """A computation that rollouts skip under a condition; times of a step with and without [µs]."""
 
     left_out: str
     condition: str

@@ -151,10 +151,7 @@ def synchronize(device: torch.device) -> None:
 def timed(
     run: Callable[[], object], device: torch.device, repeats: int, *, calls: int | None = None
 ) -> Timing:
-    """Return the time of a call of `run`, from 3 or more readings, `repeats` unless it is slow.
-
-    A reading is the mean of `calls` calls; None: of as many as last `MIN_SECONDS`.
-    """
+    """Return a call's time: each reading is a mean of `calls` calls; None: of `MIN_SECONDS`."""
 
     def reading(count: int) -> float:
         synchronize(device)
