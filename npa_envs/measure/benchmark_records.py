@@ -1,8 +1,7 @@
 """Records of measurements (JSON files), the facts of their runs, and tables as text.
 
 The facts of a run are what its results depend on: device, machine, commit, versions, settings. A
-record is written after every result, so that a stopped run can resume. Records of a run with other
-facts are rejected.
+record is written after every result, so that a stopped run can resume; other facts are an error.
 """
 
 from __future__ import annotations

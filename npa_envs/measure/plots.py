@@ -25,8 +25,7 @@ def check_matplotlib() -> None:
 def write_plots(draw: Callable[[], Mapping[str, bytes]], path: Path, what: str) -> list[str]:
     """Write the PNG files that `draw` returns by name; return a line of text for each.
 
-    A file's name replaces "*" in `path`. Without matplotlib nothing is written, and the line says
-    why; there `what` is the plots' name.
+    A file's name replaces "*" in `path`. Without matplotlib the line says that there are no `what`.
     """
     try:
         check_matplotlib()

@@ -176,8 +176,7 @@ def part_of(
 ) -> list[Item]:
     """Return part K of N parts of the items, for `part` "K/N" such as "2/8"; None: all items.
 
-    Items with equal `group_of(item)` are in one part. Give the same items in the same order on all
-    machines.
+    Items of equal `group_of(item)` are in one part. All machines need the same items and order.
     """
     if part is None:
         return list(items)

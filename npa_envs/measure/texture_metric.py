@@ -1,8 +1,7 @@
 """The metric of textures: a picture's distance from the target, by no loss that training uses.
 
-It has three parts: patches, power spectra and colours of pairs of pixels. Each is divided by the
-distance that particles reach which draw the target itself, or by 2 % of that of grey noise if this
-is larger.
+It has three parts: patches, power spectra, colours of pairs of pixels. Each is divided by that of
+particles that draw the target itself, or by 2 % of that of grey noise if this is larger.
 """
 
 from __future__ import annotations

@@ -30,7 +30,6 @@ MAX_SHOWN = 16
 """Maximum number of worlds in a picture; further ones are not drawn."""
 
 _GAP = 4
-"""White pixels between two worlds."""
 
 
 class Shown:

@@ -49,7 +49,6 @@ class CheckResult:
     name: str = ""
     """Name of the check; `run_check` sets this field and those below."""
     expected: str = ""
-    """The result that the check expects, in a sentence."""
     seconds: float = 0.0
     """Duration [s]."""
     weights: str = ""

@@ -427,8 +427,7 @@ def ratio(loss: float, reference: float) -> float:
 def healing(trial: RuleTrial, grown: Particles) -> list[LossCurve]:
     """Damage grown worlds in every way; return the loss curves of the control and of each damage.
 
-    If a damage removes half of the particles, undamaged copies are worlds that grew with half as
-    many from the start.
+    If a damage removes half of the particles, undamaged copies grew with half as many.
     """
     growth = trial.random(StreamId.GROWTH)
     smaller, _ = trial.run(trial.initial_worlds(0.5), growth, [trial.plan.grow_steps])

@@ -174,12 +174,8 @@ def _axis_values(session: TimingSession) -> dict[str, Sequence[int]]:
         values: tuple[Sequence[int], ...] = (256, 1024), (16, 64), (1, 2), (4, 16)
     else:
         powers, worlds = (range(10, 21), 8) if session.cuda else (range(8, 17), 5)
-        values = (
-            [2**k for k in powers],
-            (8, 16, 32, 64, 128, 256),
-            [2**k for k in range(worlds)],
-            (4, 8, 16, 32, 64),
-        )
+        neighbours, channels = (8, 16, 32, 64, 128, 256), (4, 8, 16, 32, 64)
+        values = [2**k for k in powers], neighbours, [2**k for k in range(worlds)], channels
     return dict(zip(AXES, values, strict=True))
 
 
@@ -385,11 +381,9 @@ class BenchReport:
 
     suite: str
     command: str
-    """The command line of the run."""
     commit: str
     """Commit that was measured."""
     threads: int
-    """Number of torch's CPU threads."""
     session: TimingSession
     tables: Tables
 

@@ -24,8 +24,7 @@ from npa_envs.world.rollout import rollout
 class Workload:
     """A rollout of T steps: B worlds of N uniformly scattered particles, and an untrained rule.
 
-    With the default perception radius `eps` [length units] particles have about 66 neighbours in
-    2D. Positions and states are always the same.
+    With the default radius `eps` [length units] particles have about 66 neighbours in 2D.
     """
 
     space_dim: int
